@@ -1,0 +1,88 @@
+"""The errors that hapticdb raises on purpose.
+
+::
+
+    HapticDBError
+    ├── UsageError (ValueError)               options that contradict one another
+    │   └── GridError                         a grid that cannot be, or does not match
+    ├── FileError (ValueError)                an input file that cannot be used
+    │   ├── OutsideGridError                  a part that does not fit the grid
+    │   └── GeometryChangedError              an object's file is gone or another
+    ├── MissingExtraError (ImportError)       a format needs an extra that is not installed
+    ├── ObjectNotFoundError (LookupError)     no object of that id
+    └── DatabaseError                         the database, not the question
+        ├── EnvironmentNotFoundError (FileNotFoundError)
+        ├── EnvironmentExistsError (FileExistsError)
+        ├── NotAnEnvironmentError             a file of another kind
+        ├── NewerVersionError                 written by a newer hapticdb
+        ├── DamagedError                      an environment whose pages are broken
+        ├── ReadOnlyError (PermissionError)   a write where only reading is possible
+        └── BusyError (TimeoutError)          another writer held the database too long
+
+Every message is one line: what, where, and what next. Where a builtin fits, the error is one of
+that kind, too.
+"""
+
+
+class HapticDBError(Exception):
+    """Root of all errors that hapticdb raises on purpose."""
+
+
+class UsageError(HapticDBError, ValueError):
+    """Options or arguments that contradict one another or lie outside their range."""
+
+
+class GridError(UsageError):
+    """A grid that cannot be built, or that differs from the environment's."""
+
+
+class FileError(HapticDBError, ValueError):
+    """An input file that is missing, empty, damaged or of a kind that cannot be read."""
+
+
+class OutsideGridError(FileError):
+    """A part whose bounding box leaves the grid of the environment."""
+
+
+class GeometryChangedError(FileError):
+    """The file behind an object is gone, or no longer holds the same geometry."""
+
+
+class MissingExtraError(HapticDBError, ImportError):
+    """A file format needs an extra that is not installed."""
+
+
+class ObjectNotFoundError(HapticDBError, LookupError):
+    """No object of that id in the environment."""
+
+
+class DatabaseError(HapticDBError):
+    """The database cannot do what was asked."""
+
+
+class EnvironmentNotFoundError(DatabaseError, FileNotFoundError):
+    """No environment at that address."""
+
+
+class EnvironmentExistsError(DatabaseError, FileExistsError):
+    """An environment is there already."""
+
+
+class NotAnEnvironmentError(DatabaseError):
+    """A file or database of another kind."""
+
+
+class NewerVersionError(DatabaseError):
+    """An environment written by a newer hapticdb."""
+
+
+class DamagedError(DatabaseError):
+    """An environment whose contents are broken."""
+
+
+class ReadOnlyError(DatabaseError, PermissionError):
+    """A write to a database that can only be read."""
+
+
+class BusyError(DatabaseError, TimeoutError):
+    """Another writer held the database for longer than the time allowed."""

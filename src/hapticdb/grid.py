@@ -1,0 +1,249 @@
+"""Grid: metres <-> voxels <-> keys."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import GridError
+from hapticdb.kernels import curves
+
+CurveName = Literal["z", "hilbert", "lexicographic"]
+CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
+CURVE_CODES = {
+    "lexicographic": curves.LEXICOGRAPHIC,
+    "z": curves.Z_ORDER,
+    "hilbert": curves.HILBERT,
+}
+MAX_BITS = 21
+BRICK_BITS = 3
+CELL_BITS = 5
+ROOM = 1.6
+"""Edge of a fitted grid in longest sides of the bounding box: the room around the first file."""
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A cube of ``2^bits`` voxels an axis, and the order of its keys.
+
+    Attributes
+    ----------
+    voxel_size : float
+        Edge s of a voxel, metres.
+    origin : tuple of 3 floats
+        Lower corner of voxel (0, 0, 0), metres, world frame.
+    bits : int
+        Bits an axis, 1 to 21.
+    curve : {"z", "hilbert", "lexicographic"}
+        Order of the keys; see `hapticdb.kernels.curves`.
+
+    Notes
+    -----
+    Voxel (i, j, k) covers ``[i s, (i + 1) s)`` on each axis from the origin: half-open for points,
+    so that each has one voxel. Surfaces are voxelized with closed boxes.
+    """
+
+    voxel_size: float
+    origin: tuple[float, float, float]
+    bits: int
+    curve: CurveName = "z"
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.voxel_size) and self.voxel_size > 0):
+            raise GridError(f"voxel size {self.voxel_size} m: give a positive length")
+        if not 1 <= self.bits <= MAX_BITS:
+            raise GridError(f"{self.bits} bits an axis: give 1 to {MAX_BITS}")
+        if self.curve not in CURVE_CODES:
+            raise GridError(f"curve {self.curve!r}: choose one of {', '.join(CURVE_NAMES)}")
+        if len(self.origin) != 3 or not all(math.isfinite(x) for x in self.origin):
+            raise GridError(f"origin {self.origin}: give three finite coordinates in metres")
+        object.__setattr__(self, "voxel_size", float(self.voxel_size))
+        object.__setattr__(self, "origin", tuple(float(x) for x in self.origin))
+
+    @property
+    def side(self) -> int:
+        """Voxels an axis."""
+        return 1 << self.bits
+
+    @property
+    def edge(self) -> float:
+        """Edge of the whole cube, metres."""
+        return self.voxel_size * self.side
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lower and upper corner (2, 3), metres, world frame."""
+        low = np.array(self.origin)
+        return np.stack([low, low + self.edge])
+
+    @property
+    def curve_code(self) -> int:
+        """Number of the curve, as kernels take it."""
+        return CURVE_CODES[self.curve]
+
+    @property
+    def is_hierarchical(self) -> bool:
+        """Whether a key's leading bits name the cube that holds the voxel."""
+        return self.curve != "lexicographic"
+
+    def voxels_of(self, points: ArrayLike) -> NDArray[np.int64]:
+        """Voxels (N, 3) that hold points (N, 3) in metres; they may lie outside the grid."""
+        scaled = self.to_voxel_units(np.asarray(points, dtype=np.float64))
+        return np.floor(scaled).astype(np.int64)
+
+    def to_voxel_units(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Points (..., 3) in metres as multiples of the voxel size from the origin."""
+        scaled: NDArray[np.float64] = (points - np.array(self.origin)) / self.voxel_size
+        return scaled
+
+    def centers(self, ijk: ArrayLike) -> NDArray[np.float64]:
+        """Centres (N, 3) in metres of voxels (N, 3)."""
+        voxels = np.asarray(ijk, dtype=np.int64)
+        centers: NDArray[np.float64] = np.array(self.origin) + self.voxel_size * (voxels + 0.5)
+        return centers
+
+    def contains(self, ijk: ArrayLike) -> NDArray[np.bool_]:
+        """Whether each voxel (N, 3) lies inside the grid, (N,)."""
+        voxels = np.asarray(ijk, dtype=np.int64).reshape(-1, 3)
+        inside: NDArray[np.bool_] = np.all((voxels >= 0) & (voxels < self.side), axis=1)
+        return inside
+
+    def encode(self, ijk: ArrayLike) -> NDArray[np.int64]:
+        """Keys (N,) of voxels (N, 3).
+
+        Raises
+        ------
+        GridError
+            When a voxel lies outside the grid.
+        """
+        voxels = np.asarray(ijk, dtype=np.int64).reshape(-1, 3)
+        inside = self.contains(voxels)
+        if not inside.all():
+            bad = voxels[~inside][0].tolist()
+            raise GridError(f"voxel {bad} lies outside the grid of {self.side} voxels an axis")
+        return curves.encode(voxels, self.bits, self.curve_code)
+
+    def decode(self, keys: ArrayLike) -> NDArray[np.int64]:
+        """Voxels (N, 3) of keys (N,).
+
+        Raises
+        ------
+        GridError
+            When a key lies outside ``[0, 8^bits)``.
+        """
+        values = np.asarray(keys, dtype=np.int64).reshape(-1)
+        if values.size and (values.min() < 0 or int(values.max()) >> (3 * self.bits)):
+            raise GridError(f"a key lies outside the curve of {self.bits} bits an axis")
+        return curves.decode(values, self.bits, self.curve_code)
+
+    def describe(self) -> str:
+        """One line for people: voxels an axis, voxel size, curve."""
+        return (
+            f"{self.side}^3 voxels of {self.voxel_size * 1000:.4g} mm, origin "
+            f"({', '.join(f'{x:.6g}' for x in self.origin)}) m, {self.curve} order"
+        )
+
+
+@dataclass(frozen=True)
+class GridOptions:
+    """What a user says about a grid; what is left out is fitted to the first file.
+
+    Attributes
+    ----------
+    bits : int or None
+        Bits an axis; 10 unless the other options determine it.
+    voxel_size : float or None
+        Metres.
+    extent : float or None
+        Edge of the grid in longest sides of the first file's bounding box.
+    origin : sequence of 3 floats or None
+        Lower corner, metres; the grid is centred on the first file without it.
+    curve : curve name or None
+        Z-order unless given.
+    """
+
+    bits: int | None = None
+    voxel_size: float | None = None
+    extent: float | None = None
+    origin: Sequence[float] | None = None
+    curve: CurveName | None = None
+
+    def __post_init__(self) -> None:
+        if None not in (self.bits, self.voxel_size, self.extent):
+            raise GridError("bits, voxel size and extent contradict one another: give two of them")
+        if self.extent is not None and not (math.isfinite(self.extent) and self.extent > 0):
+            raise GridError(f"extent {self.extent}: give a positive number of longest sides")
+        # what can be checked before a file is read is checked before a file is read
+        Grid(
+            self.voxel_size if self.voxel_size is not None else 1.0,
+            _triple(self.origin) if self.origin is not None else (0.0, 0.0, 0.0),
+            self.bits if self.bits is not None else 1,
+            self.curve or "z",
+        )
+
+    def fit(self, bounds: NDArray[np.float64]) -> Grid:
+        """Grid for a scene of bounds (2, 3), metres: a cube, centred unless an origin is given."""
+        longest = float((bounds[1] - bounds[0]).max())
+        if longest <= 0 and self.voxel_size is None:
+            raise GridError("the first file is a single point: give --voxel-size")
+        center = (bounds[0] + bounds[1]) / 2
+        bits, size = self._resolve(longest)
+        edge = size * (1 << bits)
+        origin = center - edge / 2 if self.origin is None else np.array(_triple(self.origin))
+        return Grid(size, _triple(origin), bits, self.curve or "z")
+
+    def _resolve(self, longest: float) -> tuple[int, float]:
+        """Bits an axis and voxel size for a scene of that longest side."""
+        wanted = (self.extent or ROOM) * longest
+        if self.voxel_size is None:
+            bits = self.bits or 10
+            return bits, wanted / (1 << bits)
+        if self.bits is not None:
+            return self.bits, self.voxel_size
+        bits = max(1, math.ceil(math.log2(max(wanted / self.voxel_size, 2.0))))
+        if bits > MAX_BITS:
+            raise GridError(
+                f"voxel size {self.voxel_size} m needs {bits} bits an axis for a scene of "
+                f"{longest:.6g} m; the most is {MAX_BITS}: give a larger one"
+            )
+        return bits, self.voxel_size
+
+    def check_matches(self, grid: Grid, bounds: NDArray[np.float64] | None = None) -> None:
+        """Refuse options that differ from an existing grid; `extent` needs the file's bounds."""
+        differences = []
+        if self.bits is not None and self.bits != grid.bits:
+            differences.append(f"bits {self.bits} instead of {grid.bits}")
+        if self.voxel_size is not None and not _is_close(self.voxel_size, grid.voxel_size):
+            differences.append(f"voxel size {self.voxel_size:.9g} instead of {grid.voxel_size:.9g}")
+        if self.origin is not None and not np.allclose(
+            self.origin, grid.origin, rtol=0, atol=1e-9 * grid.edge
+        ):
+            differences.append(f"origin {_triple(self.origin)} instead of {grid.origin}")
+        if self.curve is not None and self.curve != grid.curve:
+            differences.append(f"curve {self.curve} instead of {grid.curve}")
+        if self.extent is not None and bounds is not None and not differences:
+            fitted = self.fit(bounds)
+            if not _is_close(fitted.edge, grid.edge):
+                differences.append(
+                    f"extent {self.extent:g} (an edge of {fitted.edge:.6g} m) instead of an edge "
+                    f"of {grid.edge:.6g} m"
+                )
+        if differences:
+            raise GridError(
+                f"the environment has another grid: {'; '.join(differences)}; "
+                "leave these options out to use its grid"
+            )
+
+
+def _is_close(a: float, b: float) -> bool:
+    return math.isclose(a, b, rel_tol=1e-9)
+
+
+def _triple(values: Sequence[float] | NDArray[np.float64]) -> tuple[float, float, float]:
+    if len(values) != 3:
+        raise GridError(f"origin {tuple(values)}: give three coordinates in metres")
+    x, y, z = (float(v) for v in values)
+    return x, y, z

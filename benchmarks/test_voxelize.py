@@ -1,0 +1,204 @@
+"""Voxelizing an assembly at 1024^3: hapticdb beside a plain test of every voxel, and Open3D.
+
+The assembly is `assembly_vw_t1/vw_t1.glb` under HAPTICDB_TEST_DATA, every instance a part of its
+own, or a ring of tori where that is not set. Its grid is the tight cube: the edge is the longest
+side of the bounding box, a hair larger so that the upper border lies inside. A speed counts object
+voxels: each part's voxels, once for each part. With --benchmark-disable a few parts run as a test.
+
+Open3D merges no voxels over parts either: it is run on the same parts, one grid a part, and on a
+part of them only, since it is slow; its count differs, as its boxes are not closed in the same way.
+"""
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numba
+import numpy as np
+import pytest
+import trimesh
+from numpy.typing import NDArray
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from hapticdb.kernels.voxelize import count_voxels, voxelize
+
+T = TypeVar("T")
+BITS = 10
+EDGE = 2.0**BITS
+Triangles = NDArray[np.float64]
+Bricks = tuple[NDArray[np.int64], NDArray[np.uint8]]
+
+
+class Assembly(NamedTuple):
+    """Parts (T, 3, 3) in voxels of the tight cube, and the name of the model that they make."""
+
+    name: str
+    parts: list[Triangles]
+
+
+def tori() -> trimesh.Scene:
+    """Build a ring of 60 tori, turned about the ring, of a size that gives small triangles."""
+    torus = trimesh.creation.torus(0.1, 0.03, major_sections=96, minor_sections=40)
+    scene = trimesh.Scene()
+    for angle in np.linspace(0, 2 * np.pi, 60, endpoint=False):
+        turn = trimesh.transformations.rotation_matrix(angle, (1, 2, 3))
+        turn[:3, 3] = np.cos(angle), np.sin(angle), 0.4 * np.cos(5 * angle)
+        scene.add_geometry(torus, transform=turn)
+    return scene
+
+
+@pytest.fixture(scope="module")
+def assembly() -> Assembly:
+    folder = os.environ.get("HAPTICDB_TEST_DATA")
+    path = Path(folder or "") / "assembly_vw_t1" / "vw_t1.glb"
+    scene = trimesh.load_scene(path, process=False) if folder else tori()
+    parts = []
+    for node in scene.graph.nodes_geometry:
+        world_from_node, name = scene.graph[node]
+        mesh = scene.geometry[name]
+        points = trimesh.transform_points(mesh.vertices, world_from_node)
+        parts.append(np.asarray(points[mesh.faces], dtype=np.float64))
+    low = np.min([part.min(axis=(0, 1)) for part in parts], axis=0)
+    high = np.max([part.max(axis=(0, 1)) for part in parts], axis=0)
+    scale = EDGE * (1 - 1e-9) / float((high - low).max())
+    placed = [(part - low) * scale for part in parts]
+    return Assembly(path.name if folder else "a ring of 60 tori", placed)
+
+
+def subset(assembly: Assembly, benchmark: BenchmarkFixture, one_in: int = 1) -> list[Triangles]:
+    """Every n-th part; of all a few small ones where benchmarks only run as tests."""
+    if benchmark.disabled:
+        return sorted(assembly.parts, key=len)[:3]
+    return assembly.parts[::one_in]
+
+
+def measure(benchmark: BenchmarkFixture, run: Callable[[], list[T]], rounds: int) -> list[T]:
+    """Time `run`, warmed up, and return what it returns."""
+    result: list[T] = benchmark.pedantic(run, rounds=rounds, warmup_rounds=1)  # type: ignore[no-untyped-call]
+    return result
+
+
+def report(benchmark: BenchmarkFixture, assembly: Assembly, parts: list[Any], voxels: int) -> None:
+    """Print the speed beside the conditions, and keep both with the benchmark's results."""
+    benchmark.extra_info.update(
+        model=assembly.name,
+        parts=len(parts),
+        triangles=sum(map(len, parts)),
+        object_voxels=voxels,
+    )
+    if benchmark.stats is not None:
+        speed = voxels / benchmark.stats.stats.median
+        benchmark.extra_info["object_voxels_per_second"] = speed
+        print(f"\n{benchmark.name}: {benchmark.extra_info}")
+
+
+@numba.njit(nogil=True)  # type: ignore[untyped-decorator] # numba has no types
+def plain_kernel(triangles: Triangles, edge: int, dense: NDArray[np.uint8]) -> None:
+    """Mark dense (n, n, n) by the 13 axes in every voxel of each bounding box.
+
+    axes (10, 5): a direction, and its least and greatest value over the corners of voxels that
+    touch; the box normals are the bounding box.
+    """
+    axes = np.zeros((10, 5))
+    local = np.empty((3, 3))
+    first = np.empty(3, np.int64)
+    last = np.empty(3, np.int64)
+    for t in range(triangles.shape[0]):
+        for axis in range(3):
+            low = min(triangles[t, 0, axis], triangles[t, 1, axis], triangles[t, 2, axis])
+            high = max(triangles[t, 0, axis], triangles[t, 1, axis], triangles[t, 2, axis])
+            first[axis] = max(np.ceil(low - 1e-9) - 1, 0)
+            last[axis] = min(np.floor(high + 1e-9), edge - 1)
+            for n in range(3):
+                local[n, axis] = triangles[t, n, axis] - first[axis]
+        for n in range(3):
+            x = local[(n + 1) % 3, 0] - local[n, 0]
+            y = local[(n + 1) % 3, 1] - local[n, 1]
+            z = local[(n + 1) % 3, 2] - local[n, 2]
+            axes[1 + 3 * n, 1], axes[1 + 3 * n, 2] = -z, y
+            axes[2 + 3 * n, 0], axes[2 + 3 * n, 2] = z, -x
+            axes[3 + 3 * n, 0], axes[3 + 3 * n, 1] = -y, x
+        # the normal, from the components of the first and last edge that stand in their axes
+        axes[0, 0] = axes[1, 2] * axes[8, 0] - axes[2, 0] * axes[7, 2]
+        axes[0, 1] = axes[2, 0] * axes[9, 1] - axes[3, 1] * axes[8, 0]
+        axes[0, 2] = axes[3, 1] * axes[7, 2] - axes[1, 2] * axes[9, 1]
+        for n in range(10):
+            x, y, z = axes[n, 0], axes[n, 1], axes[n, 2]
+            slack = 1e-9 * np.sqrt(x * x + y * y + z * z)
+            a = x * local[0, 0] + y * local[0, 1] + z * local[0, 2]
+            b = x * local[1, 0] + y * local[1, 1] + z * local[1, 2]
+            c = x * local[2, 0] + y * local[2, 1] + z * local[2, 2]
+            axes[n, 3] = min(a, b, c) - slack - max(x, 0.0) - max(y, 0.0) - max(z, 0.0)
+            axes[n, 4] = max(a, b, c) + slack - min(x, 0.0) - min(y, 0.0) - min(z, 0.0)
+        for i in range(last[0] - first[0] + 1):
+            for j in range(last[1] - first[1] + 1):
+                for k in range(last[2] - first[2] + 1):
+                    for n in range(10):
+                        at = axes[n, 0] * i + axes[n, 1] * j + axes[n, 2] * k
+                        if at < axes[n, 3] or at > axes[n, 4]:
+                            break
+                    else:
+                        dense[first[0] + i, first[1] + j, first[2] + k] = 1
+
+
+def plain(part: Triangles) -> int:
+    """Count the part's voxels by the plain test, into a dense array over its bounding box."""
+    corner = np.floor(part.min(axis=(0, 1))) - 1
+    size = int(np.ceil(part.max() - corner.min())) + 2
+    shape = np.ceil(part.max(axis=(0, 1)) - corner).astype(np.int64) + 2
+    dense = np.zeros(shape, np.uint8)
+    # the grid's border cuts here as it does there
+    low = np.maximum(-corner, 0).astype(np.int64)
+    high = np.minimum(EDGE - corner, shape).astype(np.int64)
+    plain_kernel(part - corner, size, dense)
+    return int(dense[low[0] : high[0], low[1] : high[1], low[2] : high[2]].sum())
+
+
+def test_hapticdb(benchmark: BenchmarkFixture, assembly: Assembly) -> None:
+    parts = subset(assembly, benchmark)
+
+    def run() -> list[Bricks]:
+        return [voxelize(part, BITS) for part in parts]
+
+    bricks = measure(benchmark, run, rounds=9)
+    voxels = sum(count_voxels(occupancy) for _, occupancy in bricks)
+    assert voxels > 0
+    report(benchmark, assembly, parts, voxels)
+
+
+def test_plain_separating_axes(benchmark: BenchmarkFixture, assembly: Assembly) -> None:
+    parts = subset(assembly, benchmark)
+
+    def run() -> list[int]:
+        return [plain(part) for part in parts]
+
+    counts = measure(benchmark, run, rounds=2)
+    assert counts == [count_voxels(voxelize(part, BITS)[1]) for part in parts]
+    report(benchmark, assembly, parts, sum(counts))
+
+
+def open3d_grids(parts: list[Triangles]) -> Callable[[], list[Any]]:
+    """Make what voxelizes the parts with Open3D; says so and skips where it cannot be had."""
+    try:
+        import open3d  # noqa: PLC0415 - a guarded yardstick
+    except ImportError as error:
+        pytest.skip(f"nothing to compare with, open3d does not load: {error}")
+    meshes = []
+    for part in parts:
+        points = open3d.utility.Vector3dVector(part.reshape(-1, 3))
+        faces = np.arange(3 * len(part), dtype=np.int32).reshape(-1, 3)
+        meshes.append(open3d.geometry.TriangleMesh(points, open3d.utility.Vector3iVector(faces)))
+    make = open3d.geometry.VoxelGrid.create_from_triangle_mesh_within_bounds
+    corner, far = np.zeros(3), np.full(3, EDGE)
+    return lambda: [make(mesh, 1.0, corner, far) for mesh in meshes]
+
+
+def test_open3d(benchmark: BenchmarkFixture, assembly: Assembly) -> None:
+    parts = subset(assembly, benchmark, one_in=20)
+    run = open3d_grids(parts)
+    grids = measure(benchmark, run, rounds=5)
+    voxels = sum(len(grid.get_voxels()) for grid in grids)
+    own = sum(count_voxels(voxelize(part, BITS)[1]) for part in parts)
+    assert 0.9 < voxels / own < 1.1
+    report(benchmark, assembly, parts, voxels)

@@ -1,0 +1,288 @@
+"""Bricks under construction: a hash table from a brick's place to its 512 bits.
+
+A brick is a cube of 8 x 8 x 8 voxels, and bit number n of its occupancy is the Z-order of (i, j, k)
+modulo 8. So each of its eight 64-bit words is a cube of 4 x 4 x 4 voxels, and a run of voxels along
+any axis sets its bits in a word by one OR with a shifted mask.
+
+An axis is named by its *place*: 2 for i, 1 for j, 0 for k, where its bit stands in each group of
+three. While bricks are being filled, their key is *packed*, (i >> 3, j >> 3, k >> 3) in 18 bits
+each: cheaper to form than the Z-order key, which is needed once a brick, at the end.
+
+The table grows by doubling, so memory is in proportion to the bricks that exist and never to the
+grid. It lives in the arrays of one `Bricks`; how many of them are in use is counted by the caller.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels.curves import compact, z_encode
+
+FIRST_CAPACITY = 256
+RUNS_AT_ONCE = 1024
+PLACE_BITS = 18
+PLACE_MASK = (1 << PLACE_BITS) - 1
+
+
+class Bricks(NamedTuple):
+    """Arrays of the table. Capacity C grows; slots are twice as many, so probes stay short.
+
+    keys (C,) int64, packed; words (C, 8) int64, zero where unused; slots (2 C,) int32, the index of
+    the brick whose hash ends here or -1; recent (256, 2) int64, a key and its index.
+    """
+
+    keys: NDArray[np.int64]
+    words: NDArray[np.int64]
+    slots: NDArray[np.int32]
+    recent: NDArray[np.int64]
+
+
+def _run_masks() -> NDArray[np.int64]:
+    """Masks (3, 4, 4): bits of the voxels first..last of a word along the axis of a place."""
+    masks = np.zeros((3, 4, 4), dtype=np.int64)
+    for place in range(3):
+        for first in range(4):
+            for last in range(first, 4):
+                bits = sum(1 << ((n + 6 * (n >> 1)) << place) for n in range(first, last + 1))
+                masks[place, first, last] = bits
+    return masks
+
+
+RUN_MASKS = _run_masks()
+
+
+@leaf
+def first_slot(key, mask):
+    """Where the search for a packed key begins. No product leaves 63 bits, so none overflows."""
+    mixed = (key & 0x7FFFFFF) * 0x5BD1E995 + (key >> 27) * 0x2545F491
+    return (mixed >> 20 ^ mixed) & mask
+
+
+@leaf
+def new_bricks(capacity):
+    """Return an empty table for that many bricks, a power of two."""
+    keys = np.empty(capacity, np.int64)
+    words = np.zeros((capacity, 8), np.int64)
+    slots = np.empty(2 * capacity, np.int32)
+    slots[:] = -1
+    recent = np.empty((256, 2), np.int64)
+    recent[:] = -1
+    return Bricks(keys, words, slots, recent)
+
+
+@leaf
+def grown(bricks, n_bricks, wanted):
+    """Copy the first `n_bricks` bricks into a larger table, with room for `wanted`."""
+    capacity = 2 * bricks.keys.shape[0]
+    while capacity < wanted:
+        capacity *= 2
+    larger = new_bricks(capacity)
+    mask = 2 * capacity - 1
+    for n in range(n_bricks):
+        larger.keys[n] = bricks.keys[n]
+        for word in range(8):
+            larger.words[n, word] = bricks.words[n, word]
+        slot = first_slot(larger.keys[n], mask)
+        while larger.slots[slot] >= 0:
+            slot = (slot + 1) & mask
+        larger.slots[slot] = n
+    return larger
+
+
+@leaf
+def mark_while_room(bricks, n_bricks, runs, done, n_runs):
+    """Mark rows done..n_runs of runs until the table is full; return rows done and its count.
+
+    No array is replaced or handed on in here: numba counts references atomically where it is, and
+    that took half of the time of voxelizing when a run was one call.
+    """
+    keys, words, slots, recent = bricks
+    mask = slots.shape[0] - 1
+    while done < n_runs:
+        place = runs[done, 3]
+        last = runs[done, 4]
+        first = runs[done, 2 - place]
+        if n_bricks + bricks_of_run(first, last) > keys.shape[0]:
+            break
+        runs[done, 2 - place] = 0
+        i, j, k = runs[done, 0], runs[done, 1], runs[done, 2]
+        runs[done, 2 - place] = first
+        column = ((i >> 3) << (2 * PLACE_BITS)) | ((j >> 3) << PLACE_BITS) | (k >> 3)
+        column_word = (i & 4) | ((j & 4) >> 1) | ((k & 4) >> 2)
+        i, j, k = i & 3, j & 3, k & 3
+        shift = ((i + 6 * (i >> 1)) << 2) + ((j + 6 * (j >> 1)) << 1) + k + 6 * (k >> 1)
+        last_word = last >> 2
+        start = first & 3
+        for at in range(first >> 2, last_word + 1):
+            key = column | ((at >> 1) << (PLACE_BITS * place))
+            memo = (key ^ (key >> 15) ^ (key >> 30)) & 255
+            if recent[memo, 0] != key:
+                slot = first_slot(key, mask)
+                while slots[slot] >= 0 and keys[slots[slot]] != key:
+                    slot = (slot + 1) & mask
+                if slots[slot] < 0:
+                    slots[slot] = n_bricks
+                    keys[n_bricks] = key
+                    n_bricks += 1
+                recent[memo, 0] = key
+                recent[memo, 1] = slots[slot]
+            end = (last & 3) if at == last_word else 3
+            word = column_word | ((at & 1) << place)
+            words[recent[memo, 1], word] |= RUN_MASKS[place, start, end] << shift
+            start = 0
+        done += 1
+    return done, n_bricks
+
+
+@leaf
+def bricks_of_run(first, last):
+    """At most so many bricks are crossed by a run."""
+    return ((last - first) >> 3) + 2
+
+
+@leaf
+def mark_runs(bricks, n_bricks, runs, n_runs):
+    """Mark the first `n_runs` rows of runs (R, 5) int64; return the table and its new count.
+
+    A row is a voxel (i, j, k), the place of the axis along which the run goes on, and its last
+    coordinate there.
+    """
+    done, n_bricks = mark_while_room(bricks, n_bricks, runs, 0, n_runs)
+    while done < n_runs:
+        first, last = runs[done, 2 - runs[done, 3]], runs[done, 4]
+        bricks = grown(bricks, n_bricks, n_bricks + bricks_of_run(first, last))
+        done, n_bricks = mark_while_room(bricks, n_bricks, runs, done, n_runs)
+    return bricks, n_bricks
+
+
+@entry
+def z_keys_kernel(packed, out):
+    """Z-order keys of the first B bricks. packed (C,) int64; out (B,) int64."""
+    for n in range(out.shape[0]):
+        key = packed[n]
+        out[n] = z_encode(
+            key >> (2 * PLACE_BITS), (key >> PLACE_BITS) & PLACE_MASK, key & PLACE_MASK
+        )
+
+
+@entry
+def mark_points_kernel(points, bits):
+    """Mark the voxels that hold points (N, 3), half-open. Returns packed keys, words, count."""
+    edge = float(1 << bits)
+    bricks, n_bricks = new_bricks(FIRST_CAPACITY), 0
+    runs, n_runs = np.empty((RUNS_AT_ONCE, 5), np.int64), 0
+    for n in range(points.shape[0]):
+        x, y, z = points[n, 0], points[n, 1], points[n, 2]
+        if not (0.0 <= x < edge and 0.0 <= y < edge and 0.0 <= z < edge):
+            continue
+        if n_runs == RUNS_AT_ONCE:
+            bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)
+            n_runs = 0
+        runs[n_runs, 0] = int(x)
+        runs[n_runs, 1] = int(y)
+        runs[n_runs, 2] = int(z)
+        runs[n_runs, 3] = 0
+        runs[n_runs, 4] = int(z)
+        n_runs += 1
+    bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)
+    return bricks.keys, bricks.words, n_bricks
+
+
+@leaf
+def ones(x):
+    """Count the bits set in x, 0 <= x < 2^32."""
+    x -= (x >> 1) & 0x55555555
+    x = (x & 0x33333333) + ((x >> 2) & 0x33333333)
+    x = (x + (x >> 4)) & 0x0F0F0F0F
+    return ((x * 0x01010101) >> 24) & 0xFF
+
+
+@entry
+def count_kernel(words):
+    """Count the bits set in words (W,) int64."""
+    total = 0
+    for n in range(words.shape[0]):
+        word = words[n]
+        total += ones(word & 0xFFFFFFFF) + ones((word >> 32) & 0xFFFFFFFF)
+    return total
+
+
+@entry
+def brick_voxels_kernel(bricks_z, words, out):
+    """Voxels of bricks. bricks_z (B,), words (B, 8) int64; out (voxels, 3) int64."""
+    row = 0
+    for n in range(bricks_z.shape[0]):
+        key = bricks_z[n]
+        i = compact(key >> 2) << 3
+        j = compact(key >> 1) << 3
+        k = compact(key) << 3
+        for w in range(8):
+            word = words[n, w]
+            if word == 0:
+                continue
+            for b in range(64):
+                if (word >> b) & 1:
+                    bit = (w << 6) | b
+                    out[row, 0] = i | compact(bit >> 2)
+                    out[row, 1] = j | compact(bit >> 1)
+                    out[row, 2] = k | compact(bit)
+                    row += 1
+
+
+def sorted_bricks(
+    packed: NDArray[np.int64], words: NDArray[np.int64], n_bricks: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """First `n_bricks` of packed keys and words in Z-order: keys (B,), occupancy (B, 64)."""
+    bricks_z = np.empty(n_bricks, dtype=np.int64)
+    z_keys_kernel(packed, bricks_z)
+    order = np.argsort(bricks_z)
+    return bricks_z[order], words[order].astype("<i8", copy=False).view(np.uint8)
+
+
+def mark_points(
+    points: NDArray[np.float64], bits: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Bricks of the voxels that hold points.
+
+    Parameters
+    ----------
+    points : NDArray[np.float64]
+        (N, 3), in voxels from the grid's origin. Those outside the grid, or not finite, are left
+        out.
+    bits : int
+        Bits an axis of the grid, 1 to 21.
+
+    Returns
+    -------
+    bricks_z : NDArray[np.int64]
+        (B,) Z-order keys of the bricks, ascending, each once.
+    occupancy : NDArray[np.uint8]
+        (B, 64), bit number n the voxel of Z-order n modulo 8, least significant first.
+
+    Notes
+    -----
+    Boxes are half-open here: voxel (i, j, k) holds the points of [i, i + 1) x ...
+    """
+    places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    return sorted_bricks(*mark_points_kernel(places, bits))
+
+
+def _words_of(occupancy: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Words (B, 8) of occupancies (B, 64), in this machine's byte order."""
+    contiguous = np.ascontiguousarray(occupancy, dtype=np.uint8).reshape(-1, 64)
+    return contiguous.view("<i8").astype(np.int64, copy=False)
+
+
+def count_voxels(occupancy: NDArray[np.uint8]) -> int:
+    """Count the voxels set in occupancies (B, 64)."""
+    return int(count_kernel(_words_of(occupancy).reshape(-1)))
+
+
+def brick_voxels(bricks_z: NDArray[np.int64], occupancy: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Voxels (n, 3) of bricks (B,) with occupancies (B, 64): by brick, then by bit number."""
+    words = _words_of(occupancy)
+    out = np.empty((int(count_kernel(words.reshape(-1))), 3), dtype=np.int64)
+    brick_voxels_kernel(np.ascontiguousarray(bricks_z, dtype=np.int64), words, out)
+    return out

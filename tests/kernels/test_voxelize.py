@@ -1,0 +1,287 @@
+"""Voxelizing against the exact oracle of naive.py, on random, degenerate and border cases."""
+
+from concurrent.futures import ThreadPoolExecutor
+from fractions import Fraction
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb.kernels.voxelize import brick_voxels, count_voxels, mark_points, voxelize
+from naive import Voxel, bricks_of_voxels, voxels_of_points, voxels_of_triangles, z_order
+
+JIT = not numba.config.DISABLE_JIT
+few = settings(max_examples=150 if JIT else 20, deadline=None)
+Triangles = NDArray[np.float64]
+
+# quarters meet the voxels' faces, edges and vertices; the range leaves the grid on both sides
+quarters = st.integers(-8, 40).map(lambda n: n / 4)
+corner = st.tuples(quarters, quarters, quarters)
+triangle = st.tuples(corner, corner, corner)
+triangles = st.lists(triangle, min_size=1, max_size=4).map(lambda rows: np.array(rows, np.float64))
+
+
+def voxels(tris: Triangles, bits: int) -> set[Voxel]:
+    """Voxels that the kernel marks, by way of the bricks."""
+    rows = brick_voxels(*voxelize(tris, bits)).tolist()
+    found = {(i, j, k) for i, j, k in rows}
+    assert len(found) == len(rows)
+    return found
+
+
+def rectangle(a: list[float], b: list[float], c: list[float]) -> Triangles:
+    """Build two triangles: the parallelogram of corner a and its neighbours b and c."""
+    p, q, r = np.array(a), np.array(b), np.array(c)
+    return np.array([[p, q, r], [q, q + r - p, r]])
+
+
+def random_triangles(seed: int, count: int, size: float, edge: float) -> Triangles:
+    """Triangles of about that size, their middles anywhere in the grid."""
+    rng = np.random.default_rng(seed)
+    middles = rng.uniform(0, edge, (count, 1, 3))
+    return middles + rng.uniform(-0.5, 0.5, (count, 3, 3)) * size
+
+
+# --- equal to the oracle ------------------------------------------------------------------------
+
+
+@few
+@given(triangles)
+def test_triangles_on_the_lattice_equal_the_oracle(tris: Triangles) -> None:
+    assert voxels(tris, 3) == voxels_of_triangles(tris.tolist(), 3)
+
+
+@pytest.mark.parametrize(
+    ("size", "count"), [(0.01, 300), (0.3, 300), (1, 200), (3, 100), (10, 40), (50, 6)]
+)
+def test_random_triangles_equal_the_oracle(size: float, count: int) -> None:
+    tris = random_triangles(7, count if JIT else 1 + count // 10, size, 64)
+    for tri in tris:
+        assert voxels(tri[None], 6) == voxels_of_triangles([tri.tolist()], 6)
+    assert voxels(tris, 6) == voxels_of_triangles(tris.tolist(), 6)
+
+
+@few
+@given(triangle, st.permutations(range(3)), st.integers(0, 7), st.floats(0, 1))
+def test_flattened_triangles_equal_the_oracle(
+    tri: tuple[tuple[float, ...], ...], order: list[int], planes: int, between: float
+) -> None:
+    """Segments, points and triangles in border planes, square to the axes and not."""
+    corners = np.array(tri)
+    for axis in range(3):
+        if planes >> axis & 1:
+            corners[:, axis] = corners[0, axis]
+    flat = corners[order]
+    segment = np.array([corners[0], corners[1], corners[1]])[order]
+    point = corners[[0, 0, 0]]
+    split = np.array([corners[0], corners[1], np.round(4 * between) / 4 * corners[1]])[order]
+    for tris in (flat, segment, point, split):
+        assert voxels(tris[None], 3) == voxels_of_triangles([tris.tolist()], 3)
+
+
+@few
+@given(
+    triangle,
+    st.floats(0, 1),
+    st.integers(-56, -4),
+    st.tuples(*[st.floats(-1, 1)] * 3),
+    st.permutations(range(3)),
+)
+def test_slivers_equal_the_oracle(
+    tri: tuple[tuple[float, ...], ...],
+    between: float,
+    exponent: int,
+    aside: tuple[float, ...],
+    order: list[int],
+) -> None:
+    """Triangles with a corner 2^-4 to 2^-56 voxel beside a side; near the tolerance, bracketed."""
+    a, b = np.array(tri[0]), np.array(tri[1])
+    sliver = np.array([a, b, a + between * (b - a) + 2.0**exponent * np.array(aside)])[order]
+    found = voxels(sliver[None], 3)
+    assert voxels_of_triangles([sliver.tolist()], 3, Fraction(9, 10**10)) <= found
+    assert found <= voxels_of_triangles([sliver.tolist()], 3, Fraction(11, 10**10))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_tilted_large_triangles_equal_the_oracle(seed: int) -> None:
+    """More columns than are buffered at once, and more bricks than the table first holds."""
+    rng = np.random.default_rng(seed)
+    edge = 64.0 if JIT else 48.0
+    tri = np.array([[edge, 0, 0], [0, edge, 0], [0, 0, edge]]) + rng.uniform(-3, 3, (3, 3))
+    assert voxels(tri[None], 6) == voxels_of_triangles([tri.tolist()], 6)
+
+
+@few
+@given(st.lists(st.tuples(*[st.floats(-2, 18)] * 3) | corner, max_size=30))
+def test_points_equal_the_oracle(rows: list[tuple[float, ...]]) -> None:
+    points = np.array(rows, np.float64).reshape(-1, 3)
+    expected = bricks_of_voxels(voxels_of_points(rows, 4))
+    keys, occupancy = mark_points(points, 4)
+    assert {int(z): bits.tobytes() for z, bits in zip(keys, occupancy, strict=True)} == expected
+
+
+# --- closed forms -------------------------------------------------------------------------------
+
+
+def test_a_face_between_two_layers_marks_both() -> None:
+    square = rectangle([2, 2, 4], [5, 2, 4], [2, 5, 4])
+    expected = {(i, j, k) for i in range(1, 6) for j in range(1, 6) for k in (3, 4)}
+    assert voxels(square, 3) == expected
+
+
+def test_a_face_inside_a_layer_marks_it_alone() -> None:
+    square = rectangle([2.5, 4.5, 2.5], [5.5, 4.5, 2.5], [2.5, 4.5, 5.5])
+    assert voxels(square, 3) == {(i, 4, k) for i in range(2, 6) for k in range(2, 6)}
+
+
+def test_a_lattice_point_marks_its_eight_voxels() -> None:
+    point = np.full((1, 3, 3), 3.0)
+    assert len(voxels(point, 3)) == 8
+
+
+def test_a_separation_below_the_tolerance_touches() -> None:
+    for gap, layers in ((5e-10, {3, 4}), (2e-9, {4})):
+        square = rectangle([2, 2, 4 + gap], [5, 2, 4 + gap], [2, 5, 4 + gap])
+        assert {k for _, _, k in voxels(square, 3)} == layers
+
+
+def test_halving_the_voxel_marks_four_times_as_many() -> None:
+    rng = np.random.default_rng(1)
+    directions = rng.normal(size=(200 if JIT else 8, 3, 3))
+    tris = 64 + 60 * directions / np.linalg.norm(directions, axis=2, keepdims=True)
+    edge = 7 if JIT else 5
+    tris *= 2.0 ** (edge - 7)
+    counts = [sum(count_voxels(voxelize(t[None] * s, 8)[1]) for t in tris) for s in (1, 2)]
+    assert 3.5 < counts[1] / counts[0] < 4.1
+
+
+# --- what the result does not depend on ---------------------------------------------------------
+
+
+def test_order_and_split_of_the_triangles_do_not_matter() -> None:
+    rng = np.random.default_rng(3)
+    tris = np.concatenate(
+        [random_triangles(n, 40 if JIT else 8, size, 64) for n, size in enumerate((0.1, 2, 9))]
+    )
+    keys, occupancy = voxelize(tris, 6)
+    for _ in range(3):
+        shuffled = tris[rng.permutation(len(tris))]
+        again = voxelize(shuffled[:, rng.permutation(3)], 6)
+        assert np.array_equal(keys, again[0])
+        assert np.array_equal(occupancy, again[1])
+        cuts = np.sort(rng.integers(0, len(tris), 4))
+        united = set().union(*(voxels(part, 6) for part in np.split(shuffled, cuts)))
+        assert united == voxels(tris, 6)
+
+
+def test_threads_do_not_matter() -> None:
+    parts = [random_triangles(n, 200 if JIT else 8, 5, 64) for n in range(8)]
+    with ThreadPoolExecutor(4) as pool:
+        together = list(pool.map(lambda part: voxelize(part, 6), parts))
+    for part, (keys, occupancy) in zip(parts, together, strict=True):
+        alone = voxelize(part, 6)
+        assert np.array_equal(keys, alone[0])
+        assert np.array_equal(occupancy, alone[1])
+
+
+@few
+@given(triangles, st.tuples(*[st.integers(0, 2**21 - 24)] * 3))
+def test_a_shift_by_whole_voxels_shifts_the_voxels(
+    tris: Triangles, shift: tuple[int, int, int]
+) -> None:
+    tris = tris + 4  # clear of the lower border
+    shifted = voxels(tris + np.array(shift, np.float64), 21)
+    assert shifted == {(i + shift[0], j + shift[1], k + shift[2]) for i, j, k in voxels(tris, 5)}
+
+
+@few
+@given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 0.4, 3.0]))
+def test_random_triangles_at_the_far_end_of_the_largest_grid_equal_the_oracle(
+    seed: int, size: float
+) -> None:
+    tris = random_triangles(seed, 3, size, 8) + (2.0**21 - 8)
+    found = voxels(tris, 21)
+    assert voxels_of_triangles(tris.tolist(), 21, Fraction(9, 10**10)) <= found
+    assert found <= voxels_of_triangles(tris.tolist(), 21, Fraction(11, 10**10))
+
+
+# --- sizes --------------------------------------------------------------------------------------
+
+
+def test_memory_follows_the_surface_and_not_the_grid() -> None:
+    far = 2.0**21 - 2
+    tris = np.array([np.full((3, 3), 1.5), np.full((3, 3), far + 0.5)])
+    keys, occupancy = voxelize(tris, 21)
+    assert keys.tolist() == [0, z_order(2**18 - 1, 2**18 - 1, 2**18 - 1)]
+    assert count_voxels(occupancy) == 2
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_needle_through_the_grid_marks_what_it_passes(axis: int) -> None:
+    bits = 21 if JIT else 10
+    needle = np.full((1, 3, 3), 3.5)
+    needle[0, :, axis] = 0.25, 2.0**bits - 0.25, 7.0
+    needle[0, 2, (axis + 1) % 3] = 3.75
+    assert count_voxels(voxelize(needle, bits)[1]) == 2**bits
+
+
+def test_a_diagonal_through_the_grid_costs_its_length() -> None:
+    bits = 18 if JIT else 9
+    diagonal = np.array([[[0.0] * 3, [2.0**bits] * 3, [2.0**bits] * 3]])
+    # n voxels on the diagonal, and at each of the n - 1 vertices between them the six others
+    assert count_voxels(voxelize(diagonal, bits)[1]) == 2**bits + 6 * (2**bits - 1)
+
+
+@pytest.mark.parametrize("far", [1e6, 1e30, 1e300])
+def test_a_triangle_far_beyond_the_grid_is_cut_at_its_borders(far: float) -> None:
+    sheet = np.array([[[-far, -far, 5.5], [far, -far, 5.5], [0.0, far, 5.5]]])
+    assert voxels(sheet, 3) == {(i, j, 5) for i in range(8) for j in range(8)}
+    assert voxels(sheet + np.array([0, 0, 9.0]), 3) == set()
+    assert voxels(np.full((1, 3, 3), -far), 3) == set()
+
+
+def test_no_triangles_make_no_bricks() -> None:
+    keys, occupancy = voxelize(np.empty((0, 3, 3)), 10)
+    assert keys.shape == (0,)
+    assert occupancy.shape == (0, 64)
+    assert count_voxels(occupancy) == 0
+    assert brick_voxels(keys, occupancy).shape == (0, 3)
+
+
+def test_points_that_are_not_finite_or_outside_mark_nothing() -> None:
+    points = np.array([[np.nan, 1, 1], [np.inf, 1, 1], [8.0, 1, 1], [-1e-9, 1, 1], [1e300] * 3])
+    assert len(mark_points(points, 3)[0]) == 0
+
+
+# --- bricks -------------------------------------------------------------------------------------
+
+
+def test_bricks_are_sorted_and_their_bits_in_z_order() -> None:
+    tris = random_triangles(5, 30 if JIT else 6, 20, 32)
+    keys, occupancy = voxelize(tris, 5)
+    expected = bricks_of_voxels(voxels_of_triangles(tris.tolist(), 5))
+    assert keys.tolist() == list(expected)
+    assert occupancy.tobytes() == b"".join(expected.values())
+    assert keys.dtype == np.int64
+    assert occupancy.dtype == np.uint8
+
+
+def test_voxels_of_bricks_come_by_brick_then_by_bit() -> None:
+    tris = random_triangles(6, 10 if JIT else 4, 20, 32)
+    keys, occupancy = voxelize(tris, 5)
+    rows = brick_voxels(keys, occupancy)
+    orders = [z_order(*row) for row in rows.tolist()]
+    assert orders == sorted(orders)
+    assert len(rows) == count_voxels(occupancy) == np.unpackbits(occupancy).sum()
+
+
+def test_full_bricks_count_all_their_voxels() -> None:
+    occupancy = np.full((3, 64), 255, np.uint8)
+    assert count_voxels(occupancy) == 3 * 512
+    rows = brick_voxels(np.array([0, 1, 7]), occupancy)
+    assert rows.min() == 0
+    assert rows.max() == 15
+    assert len(np.unique(rows, axis=0)) == 3 * 512

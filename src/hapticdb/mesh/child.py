@@ -1,0 +1,153 @@
+"""The process that parses one file, under a limit of memory and time, and hands back arrays.
+
+Run by path with a request on standard input (see `reader.py`); answers on standard output. A
+parser that eats memory, crashes or hangs takes only this process with it.
+"""
+
+# The package's own __init__ brings in kernels and databases, a second of imports that parsing has
+# no use for. A bare package of the same name and place stands in for it in this process.
+import sys
+import types
+from pathlib import Path
+
+if __name__ == "__main__":
+    _package = types.ModuleType("hapticdb")
+    _package.__path__ = [str(Path(__file__).parent.parent)]
+    sys.modules["hapticdb"] = _package
+
+import contextlib
+import ctypes
+import json
+import os
+import resource
+import signal
+from typing import Any, BinaryIO
+
+_PR_SET_PDEATHSIG = 1
+
+BASE_BYTES = 512 << 20
+BYTES_PER_BYTE = 64
+BYTES_PER_PACKED_BYTE = 500
+"""Memory for a file: a base, and so much for each of its bytes, more where these are packed.
+
+Measured at a mesh of 327,680 triangles, bytes of resident memory a byte of the file: OBJ 12,
+OFF 12, PLY 11 (text 15), STL 7 (text 5), GLB 12, 3MF 10, DAE 5; LAZ 21, and 101 where every point
+is alike but for its place; STEP 114 (0.2 MB).
+"""
+_PACKED = {
+    ".3mf",
+    ".laz",
+    ".step",
+    ".stp",
+}
+
+
+def main() -> None:
+    """Answer one request, and end."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's; it ends this process
+    request = json.loads(sys.stdin.buffer.read())
+    _die_with_parent(request["parent"])
+    answer = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # libraries print; their words must not mix with the arrays
+    sys.path[:] = request["sys_path"]
+    _answer(answer, Path(request["path"]), request)
+    answer.flush()
+    os._exit(0)  # tearing down a large parser's memory takes longer than leaving it
+
+
+def _die_with_parent(parent: int) -> None:
+    """End when the parent does, however it ends (Linux; elsewhere the limit of time ends it)."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:
+        os._exit(1)
+
+
+def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
+    """Parse and write: a line of JSON that describes the arrays, then the arrays."""
+    from hapticdb.mesh.parse import cause_of, parse, reader_of  # noqa: PLC0415 - after sys.path
+    from hapticdb.mesh.raw import UnreadableError  # noqa: PLC0415
+
+    before = None
+    try:
+        reader_of(path)  # its libraries are no part of what the file may use
+        before = limit_memory(path, request["memory_limit"])
+        limit_time(request["time_limit"])
+        cleaned = parse(path, request["metres"])
+    except (UnreadableError, MemoryError, ImportError) as error:
+        if before is not None:
+            resource.setrlimit(_memory_kind(), before)
+        cause = str(error) if isinstance(error, UnreadableError) else cause_of(error)
+        out.write(json.dumps({"error": cause}).encode() + b"\n")
+        return
+    arrays = [a for geometry in cleaned.geometries for a in geometry if a is not None]
+    head = {
+        "geometries": [
+            [len(vertices), None if faces is None else len(faces)]
+            for vertices, faces in cleaned.geometries
+        ],
+        "parts": [
+            [part.name, part.geometry, part.world_from_part.tolist(), part.defects.as_dict()]
+            for part in cleaned.parts
+        ],
+        "defects": cleaned.defects.as_dict(),
+    }
+    out.write(json.dumps(head).encode() + b"\n")
+    out.writelines(array.data if array.flags.c_contiguous else array.tobytes() for array in arrays)
+
+
+def _memory_kind() -> int:
+    """Which limit: on Linux data, which counts no reserved address space, else address space."""
+    return resource.RLIMIT_DATA if sys.platform == "linux" else resource.RLIMIT_AS
+
+
+def _bytes_now() -> int:
+    """Memory that this process holds by the count that the limit goes by."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/self/status").read_text().splitlines():
+            if line.startswith("VmData:"):
+                return int(line.split()[1]) << 10
+    return 0
+
+
+def _bytes_available() -> int:
+    """Memory that the machine can give without swapping; unknown is plenty."""
+    with contextlib.suppress(OSError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return int(line.split()[1]) << 10
+    return 1 << 62
+
+
+def allowance(path: Path) -> int:
+    """Bytes that parsing a file may take: in proportion to it, and to what the machine has."""
+    suffix = path.suffix.lower()
+    n_bytes = path.stat().st_size
+    if suffix == ".gltf":
+        from hapticdb.mesh.gltf import external_bytes  # noqa: PLC0415 - imports trimesh
+
+        n_bytes += external_bytes(path)
+    factor = BYTES_PER_PACKED_BYTE if suffix in _PACKED else BYTES_PER_BYTE
+    return min(BASE_BYTES + factor * n_bytes, _bytes_available() * 3 // 4)
+
+
+def limit_memory(path: Path, limit: int | None) -> tuple[int, int]:
+    """Set the limit of memory on top of what is held already; returns the limit before."""
+    kind = _memory_kind()
+    before = resource.getrlimit(kind)
+    wanted = _bytes_now() + (allowance(path) if limit is None else limit)
+    hard = before[1]
+    resource.setrlimit(kind, (wanted if hard < 0 else min(wanted, hard), hard))
+    return before
+
+
+def limit_time(seconds: float) -> None:
+    """Set the limit of processor time: the parent's clock ends a child, unless it is gone."""
+    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
+    # Threads of a parser add up their times.
+    wanted = int(seconds * (os.cpu_count() or 1)) + 10
+    resource.setrlimit(resource.RLIMIT_CPU, (wanted if hard < 0 else min(wanted, hard), hard))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""Checks every number that a reader found, counts what is wrong, and lets only sound parts on."""
+
+import unicodedata
+from dataclasses import dataclass, replace
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.mesh.part import Defects
+from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+Geometry = tuple[NDArray[np.float64], NDArray[np.int64] | None]
+
+# Twice a triangle's area over its longest edge squared: rounding of float64 edges stays below.
+_FLAT = 1e-12
+
+
+@dataclass(frozen=True)
+class CleanPart:
+    """A part before it meets its arrays: `geometry` is a number in `Cleaned.geometries`."""
+
+    name: str
+    geometry: int
+    world_from_part: NDArray[np.float64]
+    defects: Defects
+
+
+@dataclass(frozen=True)
+class Cleaned:
+    """Sound parts of a file in metres, the arrays that they share, and what was wrong in all."""
+
+    geometries: list[Geometry]
+    parts: list[CleanPart]
+    defects: Defects
+
+
+def clean(parsed: Parsed, metres: float) -> Cleaned:
+    """Refuse and count what cannot be used; bring the rest to metres.
+
+    Parameters
+    ----------
+    parsed : Parsed
+        Contents of a file.
+    metres : float
+        Length of the unit of a file that carries none.
+    """
+    scale = metres if parsed.metres is None else parsed.metres
+    if not (np.isfinite(scale) and scale > 0):
+        raise UnreadableError(f"its unit of length is {scale} metres")
+    checked = [_checked(shape, scale) for shape in parsed.shapes]
+    parts: list[CleanPart] = []
+    total = parsed.defects
+    names = _Names()
+    for placement in parsed.placements:
+        geometry, defects = checked[placement.shape]
+        n_found = len(geometry[0] if geometry[1] is None else geometry[1])
+        part = _placed(placement, geometry, defects, scale) if n_found else None
+        if part is not None:
+            parts.append(replace(part, name=names.unique(part.name)))
+            total += part.defects
+        elif n_found:
+            total += replace(defects, degenerate=0, non_finite=defects.non_finite + n_found)
+        else:
+            total += defects or Defects(empty=1)
+    if not parts:
+        found = total.describe()
+        raise UnreadableError(
+            f"it holds no usable triangle or point ({found})" if found else "it holds no triangles"
+        )
+    used = sorted({part.geometry for part in parts})
+    number = {old: new for new, old in enumerate(used)}
+    return Cleaned(
+        [checked[old][0] for old in used],
+        [replace(part, geometry=number[part.geometry]) for part in parts],
+        total,
+    )
+
+
+def _checked(shape: Shape, scale: float) -> tuple[Geometry, Defects]:
+    """Sound geometry of a shape in metres, and what was wrong with it."""
+    vertices = np.asarray(shape.vertices)
+    if vertices.ndim != 2 or vertices.shape[1] != 3:
+        raise UnreadableError("its vertices do not have three coordinates each")
+    with np.errstate(over="ignore", invalid="ignore"):
+        if shape.faces is None:
+            points = _metric(vertices, scale)
+            finite = np.isfinite(points).all(axis=1)
+            lost = Defects(non_finite=int((~finite).sum()))
+            return (points[finite], None), shape.defects + lost
+        faces = np.asarray(shape.faces).astype(np.int64, copy=False).reshape(-1, 3)
+        inside = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
+        out_of_range = len(faces) - int(inside.sum())
+        vertices, faces = _compact(vertices, faces[inside] if out_of_range else faces)
+        positions = _metric(vertices, scale)
+        finite = np.asarray(np.isfinite(positions).all(axis=1))
+        sound = finite[faces].all(axis=1)
+        non_finite = len(faces) - int(sound.sum())
+        if non_finite:
+            positions, faces = _compact(positions, faces[sound])
+        degenerate = _count_degenerate(positions, faces, np.eye(3))
+    lost = Defects(degenerate=degenerate, non_finite=non_finite, out_of_range=out_of_range)
+    return (positions, faces), shape.defects + lost
+
+
+def _metric(vertices: NDArray[np.generic], scale: float) -> NDArray[np.float64]:
+    """Positions in metres, contiguous."""
+    positions = np.ascontiguousarray(vertices, dtype=np.float64)
+    return positions if scale == 1.0 else positions * scale
+
+
+def _compact(
+    vertices: NDArray[Scalar], faces: NDArray[np.int64]
+) -> tuple[NDArray[Scalar], NDArray[np.int64]]:
+    """Drop the vertices that no face uses; their order stays.
+
+    Pieces of a file may share one large array of vertices, so a small piece sorts its own indices
+    and does not sweep the array.
+    """
+    if faces.size * 8 < len(vertices):
+        used, renumbered = np.unique(faces, return_inverse=True)
+        return vertices[used], renumbered.reshape(-1, 3).astype(np.int64, copy=False)
+    mask = np.zeros(len(vertices), dtype=bool)
+    mask[faces] = True
+    if mask.all():
+        return vertices, np.ascontiguousarray(faces)
+    return vertices[mask], (np.cumsum(mask) - 1)[faces]
+
+
+def _count_degenerate(
+    positions: NDArray[np.float64], faces: NDArray[np.int64], linear: NDArray[np.float64]
+) -> int:
+    """Triangles without area once `linear` (3, 3) is applied."""
+    # Edges first, then the transform: far from the origin the other way round loses digits.
+    first = positions[faces[:, 0]]
+    a = (positions[faces[:, 1]] - first) @ linear.T
+    b = (positions[faces[:, 2]] - first) @ linear.T
+    # By columns: twice as fast as numpy's cross product of rows.
+    x = a[:, 1] * b[:, 2] - a[:, 2] * b[:, 1]
+    y = a[:, 2] * b[:, 0] - a[:, 0] * b[:, 2]
+    z = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    longest = np.maximum(_squares(a), _squares(b))
+    longest = np.maximum(longest, _squares(b - a))
+    return int((np.sqrt(x * x + y * y + z * z) <= _FLAT * longest).sum())
+
+
+def _squares(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Squared length of each row (N, 3)."""
+    return np.asarray(np.einsum("ij,ij->i", rows, rows), dtype=np.float64)
+
+
+def _placed(
+    placement: Placement, geometry: Geometry, defects: Defects, scale: float
+) -> CleanPart | None:
+    """Part where the file puts it; None where no point of it would be finite."""
+    vertices, faces = geometry
+    world = np.array(placement.world_from_part, dtype=np.float64)
+    if np.isfinite(world).all() and not np.array_equal(world[3], [0, 0, 0, 1]):
+        raise UnreadableError(f"the transform of '{_printable(placement.name)}' is not affine")
+    world[:3, 3] *= scale
+    with np.errstate(over="ignore", invalid="ignore"):
+        # Squares of lengths must be finite as well, for areas and separations.
+        reach = np.abs(world[:3, :3]) @ np.abs(vertices).max(axis=0) + np.abs(world[:3, 3])
+        if not np.isfinite(reach @ reach):
+            return None
+        linear = world[:3, :3]
+        if faces is not None and abs(np.linalg.det(linear)) <= 1e-9 * np.linalg.norm(linear) ** 3:
+            flattened = _count_degenerate(vertices, faces, linear)
+            defects = replace(defects, degenerate=flattened)
+    return CleanPart(_printable(placement.name), placement.shape, world, defects)
+
+
+def _printable(name: str) -> str:
+    """Name that any terminal, database and JSON reader takes: no controls, no half characters."""
+    whole = name.encode("utf-8", "replace").decode("utf-8")
+    return "".join(" " if unicodedata.category(c) == "Cc" else c for c in whole).strip() or "part"
+
+
+class _Names:
+    """Makes names unique in the order of the file: 'wheel', 'wheel #2', 'wheel #3'."""
+
+    def __init__(self) -> None:
+        self._taken: set[str] = set()
+        self._count: dict[str, int] = {}
+
+    def unique(self, name: str) -> str:
+        """Name, numbered if it was given before."""
+        candidate = name
+        while candidate in self._taken:
+            self._count[name] = self._count.get(name, 1) + 1
+            candidate = f"{name} #{self._count[name]}"
+        self._taken.add(candidate)
+        return candidate

@@ -1,0 +1,94 @@
+"""Picks the reader of a format, and puts any reader's failure into one line of plain words."""
+
+import importlib
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+
+from hapticdb.mesh.clean import Cleaned, clean
+from hapticdb.mesh.raw import Parsed, UnreadableError
+
+READERS = {
+    ".3mf": "threemf",
+    ".dae": "dae",
+    ".glb": "gltf",
+    ".gltf": "gltf",
+    ".las": "las",
+    ".laz": "las",
+    ".obj": "wavefront",
+    ".off": "off",
+    ".ply": "ply",
+    ".step": "step",
+    ".stl": "stl",
+    ".stp": "step",
+}
+"""Module of the reader, by suffix in lower case."""
+
+
+def reader_of(path: Path) -> Callable[[Path], Parsed]:
+    """Reader of a format; importing it brings in its libraries and no others."""
+    module = importlib.import_module(f"hapticdb.mesh.{READERS[path.suffix.lower()]}")
+    reader: Callable[[Path], Parsed] = module.read
+    return reader
+
+
+def parse(path: Path, metres: float) -> Cleaned:
+    """Sound parts of a file, read in this process.
+
+    Parameters
+    ----------
+    path : Path
+        A file with one of the suffixes in `READERS`.
+    metres : float
+        Length of the unit of a file that carries none.
+
+    Raises
+    ------
+    UnreadableError
+        For every reason, of this package or of a library.
+    """
+    read = reader_of(path)
+    try:
+        return clean(read(path), metres)
+    except UnreadableError:
+        raise
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # parsers fail in every way; Rust ones panic
+        raise UnreadableError(cause_of(error)) from error
+
+
+def cause_of(error: BaseException) -> str:
+    """Why a library gave up, in words for whoever has the file and not the library's source."""
+    detail = " ".join(str(error).split())
+    if isinstance(error, MemoryError):
+        return "reading it takes more memory than a file of its size may use"
+    if isinstance(error, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(error, ImportError):
+        return f"its reader cannot be loaded: {detail}"
+    if isinstance(error, FileNotFoundError):
+        return f"it refers to {error.filename or detail}, which is missing"
+    if isinstance(error, (zipfile.BadZipFile, zlib.error)):
+        return f"its archive is damaged or cut short ({detail})"
+    if isinstance(error, UnicodeError):
+        return "it is damaged: its text is not UTF-8"
+    if isinstance(error, OSError):
+        return f"reading failed: {error.strerror or detail}"
+    if isinstance(error, KeyError):
+        return f"it is damaged: it refers to {_shown(error)}, which it does not define"
+    if isinstance(error, (IndexError, StopIteration, AssertionError, struct.error)):
+        return "it is damaged or cut short"
+    if isinstance(error, (TypeError, AttributeError)):
+        return "it is damaged: something in it is missing or of the wrong kind"
+    return f"it is damaged or not supported: {detail or type(error).__name__}"
+
+
+def _shown(error: KeyError) -> str:
+    """Name of what was missing, if it can be printed."""
+    key = error.args[0] if error.args else None
+    if isinstance(key, str) and key.isprintable() and key.strip():
+        return f"'{key}'"
+    return str(key) if isinstance(key, int) else "something"

@@ -1,0 +1,162 @@
+"""What a mesh file holds once read: parts, where they stand, and what was wrong with them."""
+
+import hashlib
+from dataclasses import asdict, dataclass, field, fields
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+_WORDS = {
+    "degenerate": "degenerate",
+    "non_finite": "non-finite",
+    "out_of_range": "out of range",
+    "incomplete": "incomplete",
+    "unsupported": "of an unsupported kind",
+    "empty": "empty",
+}
+
+
+@dataclass(frozen=True)
+class Defects:
+    """Counts of what was wrong in a file or a part; they add.
+
+    Parameters
+    ----------
+    degenerate : int
+        Triangles without area, as placed. Kept: they mark the voxels that they touch.
+    non_finite : int
+        Triangles and points with a coordinate that is NaN or infinite. Refused.
+    out_of_range : int
+        Triangles with an index outside the vertices. Refused.
+    incomplete : int
+        Faces of fewer than three corners. Refused.
+    unsupported : int
+        Pieces of a kind that has no surface or is not read: lines, triangle fans, curves.
+    empty : int
+        Nodes, solids and meshes without any triangle or point.
+    """
+
+    degenerate: int = 0
+    non_finite: int = 0
+    out_of_range: int = 0
+    incomplete: int = 0
+    unsupported: int = 0
+    empty: int = 0
+
+    def __add__(self, other: "Defects") -> "Defects":
+        """Sum, count by count."""
+        return Defects(
+            **{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)}
+        )
+
+    def __bool__(self) -> bool:
+        """Whether anything was wrong."""
+        return any(self.as_dict().values())
+
+    def as_dict(self) -> dict[str, int]:
+        """All counts by name."""
+        return asdict(self)
+
+    def describe(self) -> str:
+        """Put the counts above zero in words, '12 degenerate, 3 non-finite'; '' when clean."""
+        return ", ".join(f"{n} {_WORDS[name]}" for name, n in self.as_dict().items() if n)
+
+
+@dataclass(frozen=True, eq=False)
+class Part:
+    """One instance in a file: a triangle mesh or a point cloud, and where it stands.
+
+    Parameters
+    ----------
+    name : str
+        Node path below the root, joined by '/'; unique within the file.
+    vertices : NDArray[float64]
+        (V, 3) metres, part frame, finite; of a mesh, those that a triangle uses. Instances of
+        one mesh share the array.
+    faces : NDArray[int64] | None
+        (F, 3) indices of vertices; None for a point cloud.
+    world_from_part : NDArray[float64]
+        (4, 4) affine, metres; may mirror, scale or flatten.
+    defects : Defects
+        What was wrong with this instance.
+    """
+
+    name: str
+    vertices: NDArray[np.float64]
+    faces: NDArray[np.int64] | None
+    world_from_part: NDArray[np.float64]
+    defects: Defects = field(default_factory=Defects)
+    # Instances of one mesh share this, so that its digest is computed once.
+    shared: dict[str, str] = field(default_factory=dict, repr=False)
+
+    @property
+    def is_cloud(self) -> bool:
+        """Whether the part is points and not triangles."""
+        return self.faces is None
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the geometry in the part's frame, 64 hex digits; placement is no part."""
+        if "digest" not in self.shared:
+            content = hashlib.sha256()
+            content.update(b"cloud" if self.faces is None else b"mesh")
+            arrays: list[NDArray[Any]] = [self.vertices]
+            if self.faces is not None:
+                arrays.append(self.faces)
+            for array in arrays:
+                little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+                content.update(len(little).to_bytes(8, "little"))
+                content.update(little.data)
+            self.shared["digest"] = content.hexdigest()
+        return self.shared["digest"]
+
+    def world_points(
+        self, world_from_part: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Vertices (V, 3), metres, world frame; placed elsewhere by `world_from_part`."""
+        placed = self.world_from_part if world_from_part is None else world_from_part
+        return np.asarray(self.vertices @ placed[:3, :3].T + placed[:3, 3], dtype=np.float64)
+
+    def triangles(self, world_from_part: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
+        """Corners (F, 3, 3), metres, world frame; (0, 3, 3) for a point cloud.
+
+        Parameters
+        ----------
+        world_from_part : NDArray[float64], optional
+            (4, 4) placement to use instead of the file's.
+        """
+        if self.faces is None:
+            return np.empty((0, 3, 3))
+        return self.world_points(world_from_part)[self.faces]
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Least and greatest corner (2, 3) of the placed part, metres, world frame."""
+        points = self.world_points()
+        return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+@dataclass(frozen=True, eq=False)
+class MeshFile:
+    """All usable parts of one file, in the order of the file.
+
+    Parameters
+    ----------
+    link : str
+        Absolute path of the file, symbolic links resolved.
+    parts : list[Part]
+        At least one; each has at least one triangle or point.
+    defects : Defects
+        Sum over the parts, and over what was refused or empty and became no part.
+    """
+
+    link: str
+    parts: list[Part]
+    defects: Defects
+
+    @property
+    def bounds(self) -> NDArray[np.float64]:
+        """Least and greatest corner (2, 3) of all parts, metres, world frame."""
+        boxes = np.stack([part.bounds for part in self.parts])
+        return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])

@@ -1,0 +1,134 @@
+"""What a format's reader hands on: shapes as the file has them, and where each one stands."""
+
+import warnings
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.mesh.part import Defects
+
+Node = TypeVar("Node", bound=Hashable)
+
+MAX_NODES = 2_000_000
+"""Placements that one file may ask for: assemblies nested in assemblies multiply."""
+
+
+class UnreadableError(Exception):
+    """Why a file cannot be read, in words that need neither the file's name nor a traceback."""
+
+
+@dataclass(frozen=True)
+class Shape:
+    """Geometry as read: indices may lie outside, coordinates may be NaN.
+
+    Parameters
+    ----------
+    vertices : NDArray
+        (V, 3) in the file's unit, any number type.
+    faces : NDArray | None
+        (F, 3) of any integer type; None for a point cloud.
+    defects : Defects
+        What the reader itself had to drop.
+    """
+
+    vertices: NDArray[np.generic]
+    faces: NDArray[np.generic] | None
+    defects: Defects = field(default_factory=Defects)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """One instance of a shape: its node path and its (4, 4) transform in the file's unit."""
+
+    name: str
+    shape: int
+    world_from_part: NDArray[np.float64]
+
+
+@dataclass
+class Parsed:
+    """A file's contents before any check.
+
+    `metres` is the length of the file's unit, None where the format carries none.
+    """
+
+    shapes: list[Shape]
+    placements: list[Placement]
+    metres: float | None = None
+    defects: Defects = field(default_factory=Defects)
+
+
+def placed_once(named: Iterable[tuple[str, Shape]], defects: Defects | None = None) -> Parsed:
+    """Contents of a file without placements: each shape once, where it is."""
+    pairs = list(named)
+    placements = [Placement(name, i, np.eye(4)) for i, (name, _) in enumerate(pairs)]
+    return Parsed([shape for _, shape in pairs], placements, None, defects or Defects())
+
+
+def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.generic]:
+    """All numbers of a text, separated by white space; anything else is an error."""
+    if not text or text.isspace():
+        return np.empty(0, dtype=dtype)
+    with warnings.catch_warnings():
+        # numpy stops at the first word that is no number, and by default only warns.
+        warnings.simplefilter("error", DeprecationWarning)
+        try:
+            return np.fromstring(text, dtype=dtype, sep=" ")
+        except (DeprecationWarning, ValueError):
+            raise UnreadableError("it holds a word where a number should be") from None
+
+
+def fan(polygons: Sequence[Sequence[int]]) -> tuple[NDArray[np.int64], int]:
+    """Triangles (F, 3) that fan out from each polygon's first corner, and how many had under 3."""
+    by_size: dict[int, list[Sequence[int]]] = {}
+    for polygon in polygons:
+        by_size.setdefault(len(polygon), []).append(polygon)
+    pieces = [np.empty((0, 3), dtype=np.int64)]
+    for size, alike in by_size.items():
+        if size >= 3:
+            pieces.append(fan_of_equal(np.array(alike, dtype=np.int64)))
+    return np.concatenate(pieces), sum(len(p) for size, p in by_size.items() if size < 3)
+
+
+def fan_of_equal(polygons: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Triangles (P (k - 2), 3) of polygons (P, k), k >= 3."""
+    corners = np.arange(1, polygons.shape[1] - 1)
+    first = np.broadcast_to(polygons[:, :1], (len(polygons), len(corners)))
+    return np.stack([first, polygons[:, corners], polygons[:, corners + 1]], axis=2).reshape(-1, 3)
+
+
+def walk(
+    roots: Iterable[tuple[Node, NDArray[np.float64]]],
+    children: Callable[[Node], Iterable[tuple[Node, NDArray[np.float64]]]],
+) -> Iterator[tuple[list[Node], NDArray[np.float64]]]:
+    """Every placement of every node under `roots`: path from the root, and world_from_node.
+
+    Depth first, in the order of the file; a node reached along two paths comes twice. The list is
+    the walk's own and changes after each step. Not recursive: depth costs no stack.
+    """
+    path: list[Node] = []
+    on_path: set[Node] = set()
+    levels = [(iter(roots), np.eye(4))]
+    n_nodes = 0
+    while levels:
+        step = next(levels[-1][0], None)
+        if step is None:
+            levels.pop()
+            if path:
+                on_path.discard(path.pop())
+            continue
+        node, parent_from_node = step
+        if node in on_path:
+            raise UnreadableError("one of its nodes is its own ancestor")
+        n_nodes += 1
+        if n_nodes > MAX_NODES:
+            raise UnreadableError(f"it places more than {MAX_NODES:,} nodes")
+        with np.errstate(over="ignore", invalid="ignore"):
+            world_from_node = levels[-1][1] @ parent_from_node
+        path.append(node)
+        on_path.add(node)
+        yield path, world_from_node
+        levels.append((iter(children(node)), world_from_node))

@@ -1,0 +1,277 @@
+"""Reads a file in a child process: the parent's side.
+
+The child is started by its path and not by `multiprocessing`, which would run the user's main
+module again. It sends each array once, however many parts share it.
+"""
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import FileError, MissingExtraError, UsageError
+from hapticdb.mesh.clean import Cleaned, CleanPart
+from hapticdb.mesh.parse import READERS, parse
+from hapticdb.mesh.part import Defects, MeshFile, Part
+from hapticdb.mesh.raw import UnreadableError
+
+UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
+"""Units of length that `unit` takes, in metres."""
+
+_EXTRAS = {"las": ("pointcloud", ("laspy", "lazrs")), "step": ("step", ("cascadio",))}
+_CHILD = Path(__file__).with_name("child.py")
+_SECONDS = 60.0
+_SECONDS_PER_MIB = 20.0
+_LONGEST_CAUSE = 300
+
+
+def read_file(
+    path: str | os.PathLike[str],
+    *,
+    unit: str | None = None,
+    memory_limit: int | None = None,
+    time_limit: float | None = None,
+) -> MeshFile:
+    """All usable parts of a mesh, CAD or point-cloud file, in metres.
+
+    The file is parsed in a child process of bounded memory and time, so that no file can bring
+    down or hang its reader.
+
+    Parameters
+    ----------
+    path : str or path
+        GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); LAS, LAZ (extra
+        `pointcloud`). The suffix says which.
+    unit : {'mm', 'cm', 'm', 'in'}, optional
+        Unit of a file whose format carries none (OBJ, STL, PLY, OFF, LAS, LAZ); metres if not
+        given. A glTF, 3MF, DAE or STEP file carries its own, and that one holds.
+    memory_limit : int, optional
+        Bytes that parsing may take; by default 512 MiB and a multiple of the file's size, and
+        three quarters of the machine's free memory at most.
+    time_limit : float, optional
+        Seconds that parsing may take; by default 60 and 20 for each MiB of the file.
+
+    Returns
+    -------
+    MeshFile
+        Parts in the order of the file, and counts of what was wrong.
+
+    Raises
+    ------
+    FileError
+        If the file is missing, damaged, of an unknown kind, or holds no usable triangle or point;
+        one line that names file and cause.
+    MissingExtraError
+        If the format needs an extra that is not installed.
+    UsageError
+        If the unit is unknown.
+    """
+    metres, file = _checked(path, unit)
+    seconds = time_limit
+    if seconds is None:
+        seconds = _SECONDS + _SECONDS_PER_MIB * file.stat().st_size / (1 << 20)
+    request = {
+        "path": str(file),
+        "metres": metres,
+        "memory_limit": memory_limit,
+        "time_limit": seconds,
+        "parent": os.getpid(),
+        "sys_path": sys.path,
+    }
+    try:
+        return _mesh_file(file, _ask_child(request, seconds))
+    except UnreadableError as error:
+        raise FileError(_one_line(path, error)) from None
+
+
+def parse_in_process(path: str | os.PathLike[str], *, unit: str | None = None) -> MeshFile:
+    """`read_file` without a child and without limits: for files that are known and sound."""
+    metres, file = _checked(path, unit)
+    try:
+        return _mesh_file(file, parse(file, metres))
+    except UnreadableError as error:
+        raise FileError(_one_line(path, error)) from None
+
+
+def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float, Path]:
+    """Length of the unit, and the file as far as it can be judged from outside."""
+    if unit is not None and unit not in UNITS:
+        raise UsageError(f"unknown unit '{unit}'; choose one of {', '.join(UNITS)}")
+    file = Path(path)
+    try:
+        file = file.resolve()
+        refusal = _refusal(file)
+    except (OSError, ValueError, RuntimeError) as error:
+        refusal = (getattr(error, "strerror", None) or str(error)).lower()
+    if refusal is not None:
+        raise FileError(_one_line(path, refusal))
+    _require_extra(READERS[file.suffix.lower()], file.suffix)
+    return UNITS[unit or "m"], file
+
+
+def _refusal(file: Path) -> str | None:
+    """Why a file need not be given to any parser, None if it may be."""
+    if file.is_dir():
+        return "it is a directory; name the files in it"
+    if not file.exists():
+        return "there is no such file"
+    if not file.is_file():
+        return "it is no regular file"
+    if file.suffix.lower() not in READERS:
+        known = ", ".join(suffix[1:] for suffix in READERS)
+        return f"'{file.suffix}' is no known kind of file; known are {known}"
+    with file.open("rb") as stream:
+        return None if stream.read(1) else "it is empty"
+
+
+def _require_extra(reader: str, suffix: str) -> None:
+    """Say which extra a format needs, before a child fails for want of it."""
+    extra, modules = _EXTRAS.get(reader, ("", ()))
+    if any(importlib.util.find_spec(module) is None for module in modules):
+        raise MissingExtraError(
+            f"{suffix} files need an extra; install it with: pip install 'hapticdb[{extra}]'"
+        )
+
+
+def _one_line(path: str | os.PathLike[str], cause: object) -> str:
+    """One printable line that names file and cause."""
+    words = " ".join(str(cause).split())
+    if len(words) > _LONGEST_CAUSE:
+        words = words[: _LONGEST_CAUSE - 3] + "..."
+    text = f"cannot read {os.fspath(path)}: {words}".encode("utf-8", "backslashreplace").decode()
+    return "".join(c if c.isprintable() else " " for c in text)
+
+
+def _ask_child(request: dict[str, Any], seconds: float) -> Cleaned:
+    """Start a child, send the request, take its answer; no child outlives this call."""
+    # One arena and one thread: what a library reserves per thread would count as the file's.
+    settings = {
+        "OPENBLAS_NUM_THREADS": "1",
+        "OMP_NUM_THREADS": "1",
+        "MKL_NUM_THREADS": "1",
+        "MALLOC_ARENA_MAX": "2",
+    }
+    # A child that is killed cannot remove its own files.
+    with (
+        tempfile.TemporaryDirectory(prefix="hapticdb-", ignore_cleanup_errors=True) as scratch,
+        tempfile.TemporaryFile() as words,
+    ):
+        child = subprocess.Popen(  # noqa: S603 - our own interpreter and file
+            [sys.executable, "-P", str(_CHILD)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=words,
+            env=os.environ | settings | {"TMPDIR": scratch},
+        )
+        late = threading.Event()
+        timer = threading.Timer(seconds, _end, (child, late))
+        timer.daemon = True
+        timer.start()
+        try:
+            cleaned = _talk(child, request)
+        finally:
+            timer.cancel()
+            child.kill()
+            child.wait()
+            for pipe in (child.stdin, child.stdout):
+                if pipe is not None:
+                    pipe.close()
+        if cleaned is None:
+            if late.is_set():
+                raise UnreadableError(f"reading it took longer than {seconds:g} s")
+            raise UnreadableError(_why_ended(child.returncode, words))
+        return cleaned
+
+
+def _end(child: subprocess.Popen[bytes], late: threading.Event) -> None:
+    """End a child that took too long, and leave word of it."""
+    late.set()
+    child.kill()
+
+
+def _talk(child: subprocess.Popen[bytes], request: dict[str, Any]) -> Cleaned | None:
+    """Send the request and take the answer; None if the child ended before it had answered."""
+    if child.stdin is None or child.stdout is None:  # both are pipes: for the type checker
+        return None
+    try:
+        child.stdin.write(json.dumps(request).encode())
+        child.stdin.close()
+        line = child.stdout.readline()
+        cleaned = _received(json.loads(line), child.stdout) if line.endswith(b"\n") else None
+    except (BrokenPipeError, EOFError):
+        return None
+    if cleaned is None:
+        child.wait()
+    return cleaned
+
+
+def _received(head: dict[str, Any], stream: IO[bytes]) -> Cleaned:
+    """Answer of the child: parts from its head, arrays from the stream behind it."""
+    if "error" in head:
+        raise UnreadableError(head["error"])
+    geometries: list[tuple[NDArray[np.float64], NDArray[np.int64] | None]] = []
+    for n_vertices, n_faces in head["geometries"]:
+        vertices = np.empty((n_vertices, 3), dtype=np.float64)
+        _fill(vertices, stream)
+        faces = None
+        if n_faces is not None:
+            faces = np.empty((n_faces, 3), dtype=np.int64)
+            _fill(faces, stream)
+        geometries.append((vertices, faces))
+    parts = [
+        CleanPart(name, geometry, np.array(transform, dtype=np.float64), Defects(**defects))
+        for name, geometry, transform, defects in head["parts"]
+    ]
+    return Cleaned(geometries, parts, Defects(**head["defects"]))
+
+
+def _fill(array: NDArray[Any], stream: IO[bytes]) -> None:
+    """Read an array's bytes."""
+    view = memoryview(array.data).cast("B")
+    while view.nbytes:
+        n_read = stream.readinto(view)  # type: ignore[attr-defined]
+        if not n_read:
+            raise EOFError
+        view = view[n_read:]
+
+
+def _why_ended(returncode: int, words: IO[bytes]) -> str:
+    """Why a child ended without an answer."""
+    if returncode == -signal.SIGXCPU:
+        return "reading it took too long"
+    if returncode < 0:
+        name = signal.Signals(-returncode).name
+        return f"its parser crashed ({name}), perhaps for want of memory; the file may be damaged"
+    words.seek(0)
+    lines = words.read()[-4096:].decode("utf-8", "replace").split("\n")
+    last = next((line for line in reversed(lines) if line.strip()), "no word of why")
+    return f"its parser ended with status {returncode}: {last}"
+
+
+def _mesh_file(file: Path, cleaned: Cleaned) -> MeshFile:
+    """Parts with their arrays."""
+    shared: list[dict[str, str]] = [{} for _ in cleaned.geometries]
+    for vertices, faces in cleaned.geometries:
+        vertices.flags.writeable = False
+        if faces is not None:
+            faces.flags.writeable = False
+    parts = [
+        Part(
+            part.name,
+            *cleaned.geometries[part.geometry],
+            part.world_from_part,
+            part.defects,
+            shared[part.geometry],
+        )
+        for part in cleaned.parts
+    ]
+    return MeshFile(str(file), parts, cleaned.defects)

@@ -1,0 +1,168 @@
+"""3MF: one part a build item and component, named along the objects that hold it.
+
+Read here and not through trimesh, which stops in silence after (edges times nodes) steps, so that
+nested assemblies lose instances, and keeps one of two build items of the same part number.
+"""
+
+import array
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.parsers import expat
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, numbers, walk
+
+_METRES = {
+    "micron": 1e-6,
+    "millimeter": 1e-3,
+    "centimeter": 1e-2,
+    "inch": 0.0254,
+    "foot": 0.3048,
+    "meter": 1.0,
+}
+Key = tuple[str, str]
+"""An object: the model file inside the archive, and its id there."""
+Link = tuple[Key, NDArray[np.float64]]
+
+
+@dataclass
+class _Object:
+    """One object of a 3MF model: a mesh, or components."""
+
+    name: str
+    corners: "array.array[float]" = field(default_factory=lambda: array.array("d"))
+    indices: "array.array[int]" = field(default_factory=lambda: array.array("q"))
+    components: list[Link] = field(default_factory=list)
+
+
+@dataclass
+class _Model:
+    """All model files of an archive that the build needs."""
+
+    objects: dict[Key, _Object] = field(default_factory=dict)
+    items: list[Link] = field(default_factory=list)
+    metres: float = 1e-3
+
+
+def read(path: Path) -> Parsed:
+    """Parts of a 3MF file's build, in the unit that it names (millimetres if none)."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            model = _read_archive(archive)
+    except zipfile.BadZipFile:
+        raise UnreadableError("it is no 3MF file, or cut short: not a ZIP archive") from None
+    shapes: dict[Key, int] = {}
+    placements: list[Placement] = []
+    for keys, world_from_object in walk(model.items, lambda key: model.objects[key].components):
+        thing = model.objects[keys[-1]]
+        if thing.components:
+            continue
+        names = [model.objects[key].name for key in keys]
+        number = shapes.setdefault(keys[-1], len(shapes))
+        placements.append(Placement("/".join(names), number, world_from_object))
+    return Parsed([_shape(model.objects[key]) for key in shapes], placements, model.metres)
+
+
+def _read_archive(archive: zipfile.ZipFile) -> _Model:
+    """Root model, and those that its components lie in."""
+    members = {name.lower().strip("/"): name for name in archive.namelist()}
+    root = next((name for name in members if name.endswith("3d/3dmodel.model")), None)
+    if root is None:
+        raise UnreadableError("it is no 3MF file: no 3D/3dmodel.model in it")
+    model = _Model()
+    waiting, seen = [root], {root}
+    while waiting:
+        member = waiting.pop()
+        _read_model(archive, members[member], member, model, is_root=member == root)
+        referred = {key[0] for thing in model.objects.values() for key, _ in thing.components}
+        for name in sorted(referred - seen):
+            if name not in members:
+                raise UnreadableError(f"it refers to {name}, which is not in the archive")
+            waiting.append(name)
+            seen.add(name)
+    links = [*model.items, *(c for thing in model.objects.values() for c in thing.components)]
+    for key, _ in links:
+        if key not in model.objects:
+            raise UnreadableError(f"it places object {key[1]}, which is not defined")
+    return model
+
+
+def _read_model(
+    archive: zipfile.ZipFile, name: str, member: str, model: _Model, *, is_root: bool
+) -> None:
+    """Add one model file's objects, and the root's build items, to `model`."""
+    parser = expat.ParserCreate(namespace_separator=" ")
+    parser.buffer_text = True
+    thing = _Object("")
+
+    def start(tag: str, attributes: dict[str, str]) -> None:
+        nonlocal thing
+        kind = tag.rpartition(" ")[2]
+        if kind == "vertex":
+            x, y, z = attributes["x"], attributes["y"], attributes["z"]
+            thing.corners.extend((float(x), float(y), float(z)))
+        elif kind == "triangle":
+            thing.indices.extend(_index(attributes[v]) for v in ("v1", "v2", "v3"))
+        elif kind == "component":
+            thing.components.append(_link(attributes, member))
+        elif kind == "object":
+            number = attributes["id"]
+            thing = _Object(attributes.get("name") or f"object {number}")
+            model.objects[member, number] = thing
+        elif kind == "item" and is_root:
+            model.items.append(_link(attributes, member))
+        elif kind == "model" and is_root:
+            model.metres = _metres(attributes.get("unit", "millimeter"))
+
+    parser.StartElementHandler = start
+    # Entities can multiply without bound, and 3MF forbids a DOCTYPE, their only source.
+    parser.StartDoctypeDeclHandler = _refuse_doctype
+    # A stream and no tree: memory goes with the geometry, whatever the archive unpacks to.
+    with archive.open(name) as stream:
+        try:
+            parser.ParseFile(stream)
+        except expat.ExpatError as error:
+            raise UnreadableError(f"its model is damaged or cut short: {error}") from None
+
+
+def _refuse_doctype(*_: object) -> None:
+    """Refuse a model with a document type."""
+    raise UnreadableError("its model has a DOCTYPE, which 3MF forbids")
+
+
+def _metres(unit: str) -> float:
+    """Length of a 3MF unit."""
+    if unit not in _METRES:
+        raise UnreadableError(f"its unit '{unit}' is none of {', '.join(_METRES)}")
+    return _METRES[unit]
+
+
+def _index(word: str) -> int:
+    """Read the number of a vertex; what no int64 holds is out of range like any other."""
+    value = int(word)
+    return value if 0 <= value < 2**62 else -1
+
+
+def _link(attributes: dict[str, str], member: str) -> Link:
+    """Object that a component or build item places, and where."""
+    file = next((v for k, v in attributes.items() if k.endswith(" path")), member)
+    key = (file.lower().strip("/"), attributes["objectid"])
+    transform = np.eye(4)
+    words = attributes.get("transform")
+    if words is not None:
+        values = numbers(words, np.float64)
+        if values.size != 12:
+            raise UnreadableError("a transform has other than twelve numbers")
+        # Row vectors: a point's row times this (4, 3).
+        transform[:3, :] = np.asarray(values, dtype=np.float64).reshape(4, 3).T
+    return key, transform
+
+
+def _shape(thing: _Object) -> Shape:
+    """Arrays of an object's mesh."""
+    corners = np.frombuffer(thing.corners, dtype=np.float64) if thing.corners else np.empty(0)
+    indices = np.frombuffer(thing.indices, dtype=np.int64) if thing.indices else np.empty(0, int)
+    return Shape(corners.reshape(-1, 3), indices.reshape(-1, 3))

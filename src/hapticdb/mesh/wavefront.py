@@ -1,0 +1,109 @@
+"""OBJ: each object and group of a Wavefront file a part, named 'object/group'.
+
+Read here and not through trimesh, which joins both names by '_', counts negative indices from the
+end of the file instead of from the line that holds them, takes index 0 for the first vertex, and
+gives up the whole file for one face out of range.
+"""
+
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.mesh.part import Defects
+from hapticdb.mesh.raw import (
+    Parsed,
+    Shape,
+    UnreadableError,
+    fan,
+    fan_of_equal,
+    numbers,
+    placed_once,
+)
+
+_TEXTURE_AND_NORMAL = re.compile(r"/[^\s]*")
+_NO_SURFACE = {"l", "p", "curv", "curv2", "surf"}
+_OUTSIDE = -1
+
+
+@dataclass
+class _Group:
+    """Faces of one object and group: lines, and how many vertices stood before each."""
+
+    lines: list[str] = field(default_factory=list)
+    n_before: list[int] = field(default_factory=list)
+    unsupported: int = 0
+
+
+def read(path: Path) -> Parsed:
+    """Objects and groups of an OBJ file; without any, one part named after the file."""
+    text = path.read_bytes().decode("utf-8", "replace")
+    vertex_lines: list[str] = []
+    groups: dict[tuple[str, str], _Group] = {}
+    key = ("", "")
+    for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
+        word, _, rest = line.strip().replace("\t", " ").partition(" ")
+        if word == "v":
+            vertex_lines.append(rest)
+        elif word == "f":
+            group = groups.setdefault(key, _Group())
+            group.lines.append(rest)
+            group.n_before.append(len(vertex_lines))
+        elif word == "o":
+            key = (rest.strip(), "")
+        elif word == "g":
+            key = (key[0], rest.strip())
+        elif word in _NO_SURFACE:
+            groups.setdefault(key, _Group()).unsupported += 1
+    vertices = _vertices(vertex_lines)
+    parts = [
+        ("/".join(filter(None, names)) or path.stem, _shape(group, vertices))
+        for names, group in groups.items()
+    ]
+    return placed_once(parts)
+
+
+def _vertices(lines: list[str]) -> NDArray[np.float64]:
+    """Vertices (V, 3); weights and colours that follow the coordinates are left out."""
+    words = [line.split(None, 3)[:3] for line in lines]
+    if any(len(three) < 3 for three in words):
+        raise UnreadableError("a vertex has fewer than three coordinates")
+    flat = numbers(" ".join(" ".join(three) for three in words), np.float64)
+    if flat.size != 3 * len(lines):
+        raise UnreadableError("a vertex has fewer than three coordinates")
+    return np.asarray(flat, dtype=np.float64).reshape(-1, 3)
+
+
+def _shape(group: _Group, vertices: NDArray[np.float64]) -> Shape:
+    """One group's triangles over the vertices of the whole file."""
+    text = "\n".join(group.lines)
+    corners = _TEXTURE_AND_NORMAL.sub("", text)
+    sizes = {len(line.split()) for line in corners.split("\n")} if group.lines else set()
+    size = sizes.pop() if len(sizes) == 1 else 0
+    # All polygons of one size and no index counted backwards: one pass through numpy.
+    if size >= 3 and "-" not in corners:
+        polygons = np.asarray(numbers(corners, np.int64), dtype=np.int64).reshape(-1, size) - 1
+        faces, incomplete = fan_of_equal(polygons), 0
+    else:
+        lines = corners.split("\n") if group.lines else []
+        faces, incomplete = fan(
+            [_polygon(line, n) for line, n in zip(lines, group.n_before, strict=True)]
+        )
+    return Shape(vertices, faces, Defects(incomplete=incomplete, unsupported=group.unsupported))
+
+
+def _polygon(line: str, n_before: int) -> list[int]:
+    """Corners of one face, from 0; a negative index counts back from the line that holds it."""
+    corners = []
+    for word in line.split():
+        try:
+            index = int(word)
+        except ValueError:
+            raise UnreadableError("a face holds a word where an index should be") from None
+        if index < 0:
+            index += n_before + 1
+        # Absolute and relative alike, what is not above 0 now is no vertex.
+        corners.append(index - 1 if 0 < index < 2**62 else _OUTSIDE)
+    return corners

@@ -1,0 +1,100 @@
+"""Small mesh files, written for tests, and what a refused one says."""
+
+import base64
+import json
+import struct
+import zipfile
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hapticdb.errors import FileError
+from hapticdb.mesh import MeshFile, parse_in_process
+
+TRIANGLE = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype=np.float32)
+
+
+def gltf(
+    tree: dict[str, Any],
+    path: Path,
+    vertices: NDArray[np.float32] = TRIANGLE,
+    indices: Sequence[int] = (0, 1, 2),
+) -> Path:
+    """A glTF file of one mesh (accessor 0 positions, 1 indices) unless `tree` says otherwise."""
+    positions = vertices
+    corners = np.asarray(indices, dtype=np.uint32)
+    content = positions.tobytes() + corners.tobytes()
+    whole: dict[str, Any] = {
+        "asset": {"version": "2.0"},
+        "buffers": [
+            {
+                "byteLength": len(content),
+                "uri": "data:application/octet-stream;base64," + base64.b64encode(content).decode(),
+            }
+        ],
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": 0, "byteLength": positions.nbytes},
+            {"buffer": 0, "byteOffset": positions.nbytes, "byteLength": corners.nbytes},
+        ],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5125, "count": corners.size, "type": "SCALAR"},
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
+        "nodes": [{"mesh": 0}],
+        "scenes": [{"nodes": [0]}],
+        "scene": 0,
+    }
+    path.write_text(json.dumps(whole | tree))
+    return path
+
+
+def glb_of(path: Path, out: Path) -> Path:
+    """The same file as GLB, its buffer still inside the JSON."""
+    text = path.read_bytes()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4s2I2I", b"glTF", 2, 20 + len(text), len(text), 0x4E4F534A)
+    out.write_bytes(head + text)
+    return out
+
+
+def threemf(path: Path, resources: str, build: str, unit: str = 'unit="millimeter"') -> Path:
+    core = "http://schemas.microsoft.com/3dmanufacturing/core/2015/02"
+    model = (
+        f'<?xml version="1.0"?><model {unit} xmlns="{core}"><resources>{resources}</resources>'
+        f"<build>{build}</build></model>"
+    )
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("3D/3dmodel.model", model)
+    return path
+
+
+MESH_3MF = (
+    '<mesh><vertices><vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/>'
+    '<vertex x="0" y="1" z="0"/></vertices><triangles><triangle v1="0" v2="1" v3="2"/>'
+    "</triangles></mesh>"
+)
+
+
+def text(path: Path, content: str) -> Path:
+    path.write_text(content)
+    return path
+
+
+def names(file: MeshFile) -> list[str]:
+    return [part.name for part in file.parts]
+
+
+def cause(path: Path, read: Callable[..., MeshFile] = parse_in_process, **options: float) -> str:
+    """The one line that a file is refused with."""
+    with pytest.raises(FileError) as raised:
+        read(path, **options)
+    line = str(raised.value)
+    assert str(path) in line
+    assert "\n" not in line
+    assert line.isprintable()
+    return line

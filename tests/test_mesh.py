@@ -1,0 +1,310 @@
+"""Files become parts: names, places, units, and counts of what was wrong."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticdb.errors import UsageError
+from hapticdb.mesh import UNITS, Defects, parse_in_process, read_file
+from hapticdb.mesh.clean import clean
+from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, fan
+from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, names, text, threemf
+
+# --- names and places -----------------------------------------------------------------------
+
+
+def test_every_instance_is_a_part_named_by_its_node_path(tmp_path: Path) -> None:
+    tree = {
+        "nodes": [
+            {"name": "car", "children": [1, 2, 3], "translation": [10, 0, 0]},
+            {"name": "wheel", "mesh": 0, "translation": [0, 1, 0]},
+            {"name": "wheel", "mesh": 0, "translation": [0, 2, 0]},
+            {"name": "a/b", "children": [4]},
+            {"name": "nut", "mesh": 0, "scale": [2, 2, 2]},
+        ]
+    }
+    file = parse_in_process(gltf(tree, tmp_path / "car.gltf"))
+    assert names(file) == ["car/wheel", "car/wheel #2", "car/a/b/nut"]
+    assert [part.bounds[0].tolist() for part in file.parts] == [[10, 1, 0], [10, 2, 0], [10, 0, 0]]
+    assert file.parts[2].bounds[1].tolist() == [12, 2, 0]
+    assert len({id(part.vertices) for part in file.parts}) == 1
+    assert len({part.digest for part in file.parts}) == 1
+
+
+def test_the_order_of_a_nodes_transforms_is_scale_rotation_translation(tmp_path: Path) -> None:
+    half = np.sqrt(0.5)
+    node = {"mesh": 0, "translation": [5, 0, 0], "rotation": [0, 0, half, half], "scale": [2, 1, 1]}
+    file = parse_in_process(gltf({"nodes": [node]}, tmp_path / "turned.gltf"))
+    np.testing.assert_allclose(
+        file.parts[0].triangles()[0], np.array([[5, 0, 0], [5, 2, 0], [4, 0, 0]]), atol=1e-15
+    )
+
+
+def test_pieces_of_one_mesh_are_one_part(tmp_path: Path) -> None:
+    piece = {"attributes": {"POSITION": 0}, "indices": 1}
+    lines = {"attributes": {"POSITION": 0}, "mode": 1}
+    path = gltf({"meshes": [{"primitives": [piece, piece, lines]}]}, tmp_path / "pieces.gltf")
+    file = parse_in_process(path)
+    assert len(file.parts) == 1
+    assert file.parts[0].faces is not None
+    assert file.parts[0].faces.tolist() == [[0, 1, 2], [0, 1, 2]]
+    assert len(file.parts[0].vertices) == 3
+    assert file.defects == Defects(unsupported=1)
+
+
+def test_what_hangs_under_a_camera_is_read(tmp_path: Path) -> None:
+    nodes = [{"name": "eye", "camera": 0, "children": [1]}, {"name": "tool", "mesh": 0}]
+    tree = {
+        "nodes": nodes,
+        "cameras": [{"type": "perspective", "perspective": {"yfov": 1.0, "znear": 0.1}}],
+    }
+    assert names(parse_in_process(gltf(tree, tmp_path / "eye.gltf"))) == ["eye/tool"]
+
+
+def test_a_glb_reads_like_its_gltf(tmp_path: Path) -> None:
+    one = gltf({"nodes": [{"name": "n", "mesh": 0, "scale": [1, 2, 3]}]}, tmp_path / "one.gltf")
+    other = glb_of(one, tmp_path / "other.glb")
+    a, b = parse_in_process(one).parts[0], parse_in_process(other).parts[0]
+    assert (a.name, a.digest) == (b.name, b.digest)
+    np.testing.assert_array_equal(a.world_from_part, b.world_from_part)
+
+
+def test_names_hold_nothing_that_a_terminal_or_database_chokes_on(tmp_path: Path) -> None:
+    tree = {"nodes": [{"name": "a\x00b\n\ud800", "mesh": 0}]}
+    assert names(parse_in_process(gltf(tree, tmp_path / "odd.gltf"))) == ["a b ?"]
+
+
+def test_objects_and_groups_of_an_obj_are_parts(tmp_path: Path) -> None:
+    path = text(
+        tmp_path / "two.obj",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\no body\ng left\nusemtl a\nf 1 2 3\nusemtl b\nf 3 2 1\n"
+        "g right\nf 1/1/1 2/1/1 3/1/1\no lid\nf 1 2 3\n",
+    )
+    file = parse_in_process(path)
+    assert names(file) == ["body/left", "body/right", "lid"]
+    assert [len(part.triangles()) for part in file.parts] == [2, 1, 1]
+
+
+def test_a_negative_obj_index_counts_from_its_own_line(tmp_path: Path) -> None:
+    path = text(
+        tmp_path / "relative.obj",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -3 -2 -1\nv 0 0 5\nv 1 0 5\nv 0 1 5\nf -3 -2 -1\n",
+    )
+    heights = parse_in_process(path).parts[0].triangles()[:, :, 2]
+    assert heights.tolist() == [[0, 0, 0], [5, 5, 5]]
+
+
+def test_each_solid_of_a_text_stl_is_a_part(tmp_path: Path) -> None:
+    facet = (
+        "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n"
+        "endfacet\n"
+    )
+    path = text(
+        tmp_path / "solids.stl",
+        f"solid vertex Holder\n{facet}endsolid solid Holder\nsolid\n{facet}{facet}endsolid\n"
+        "solid hollow\nendsolid hollow\n",
+    )
+    file = parse_in_process(path)
+    assert names(file) == ["vertex Holder", "solids"]
+    assert [len(part.triangles()) for part in file.parts] == [1, 2]
+    assert file.defects == Defects(empty=1)
+
+
+def test_nested_components_of_a_3mf_keep_every_instance(tmp_path: Path) -> None:
+    def twice(object_id: int, inner: int) -> str:
+        one = f'<component objectid="{inner}" transform="1 0 0 0 1 0 0 0 1 {object_id} 0 0"/>'
+        whole = f'<component objectid="{inner}"/>'
+        return f'<object id="{object_id}" name="n{object_id}"><components>{one}{whole}</components></object>'  # noqa: E501
+
+    resources = f'<object id="1" name="bolt">{MESH_3MF}</object>' + "".join(
+        twice(i, i - 1) for i in range(2, 7)
+    )
+    file = parse_in_process(
+        threemf(tmp_path / "nest.3mf", resources, '<item objectid="6" partnumber="p"/>' * 2)
+    )
+    assert len(file.parts) == 2 * 2**5
+    assert file.parts[0].name == "n6/n5/n4/n3/n2/bolt"
+    assert len(set(names(file))) == len(file.parts)
+    assert len({id(part.vertices) for part in file.parts}) == 1
+    np.testing.assert_allclose(file.parts[0].bounds[0], [0.020, 0, 0])
+
+
+def test_collada_nodes_name_and_place_their_geometry(tmp_path: Path) -> None:
+    path = text(
+        tmp_path / "nodes.dae",
+        """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema"
+        version="1.4.1"><asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset>
+        <library_geometries><geometry id="g" name="leaf"><mesh><source id="p">
+        <float_array id="pa" count="12">0 0 0 1 0 0 1 1 0 0 1 0</float_array><technique_common>
+        <accessor source="#pa" count="4" stride="3"><param name="X" type="float"/>
+        <param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common>
+        </source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
+        <polylist count="2"><input semantic="VERTEX" source="#v" offset="0"/>
+        <vcount>4 3</vcount><p>0 1 2 3 0 1 2</p></polylist></mesh></geometry></library_geometries>
+        <library_visual_scenes><visual_scene id="s"><node id="a" name="tree">
+        <translate>100 0 0</translate><node id="b" name="branch"><scale>2 2 2</scale>
+        <instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes>
+        <scene><instance_visual_scene url="#s"/></scene></COLLADA>""",
+    )
+    file = parse_in_process(path)
+    assert names(file) == ["tree/branch"]
+    assert len(file.parts[0].triangles()) == 3
+    np.testing.assert_allclose(
+        file.parts[0].bounds, np.array([[1, 0, 0], [1.02, 0.02, 0]]), rtol=1e-6
+    )
+
+
+# --- units ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("unit", "metres"), [(None, 1.0), *UNITS.items()])
+def test_a_file_without_a_unit_takes_the_one_given(
+    tmp_path: Path, unit: str | None, metres: float
+) -> None:
+    path = text(tmp_path / "a.off", "OFF\n3 1 0\n0 0 0\n2 0 0\n0 4 0\n3 0 1 2\n")
+    part = parse_in_process(path, unit=unit).parts[0]
+    np.testing.assert_allclose(part.bounds[1], [2 * metres, 4 * metres, 0])
+
+
+def test_a_file_with_a_unit_keeps_it(tmp_path: Path) -> None:
+    plain = gltf({}, tmp_path / "a.gltf")
+    assert parse_in_process(plain, unit="mm").parts[0].bounds[1].tolist() == [1, 1, 0]
+    resources = f'<object id="1">{MESH_3MF}</object>'
+    build = '<item objectid="1" transform="1 0 0 0 1 0 0 0 1 100 0 0"/>'
+    inches = threemf(tmp_path / "a.3mf", resources, build, 'unit="inch"')
+    np.testing.assert_allclose(
+        parse_in_process(inches, unit="mm").parts[0].bounds[1], [101 * 0.0254, 0.0254, 0]
+    )
+
+
+def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="furlong"):
+        read_file(gltf({}, tmp_path / "a.gltf"), unit="furlong")
+
+
+# --- what is wrong is counted -----------------------------------------------------------------
+
+
+def test_every_kind_of_bad_triangle_is_counted_and_only_sound_ones_stay(tmp_path: Path) -> None:
+    path = text(
+        tmp_path / "bad.obj",
+        "v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nv inf 0 0\nv 9 9 9\n"
+        "f 1 2 3\nf 1 2 2\nf 1 2 4\nf 2 3 5\nf 1 2 7\nf 0 1 2\nf 1 2 -9\nf 1 2\nl 1 2\n"
+        "f 1 2 99999999999999999999999\n",
+    )
+    file = parse_in_process(path)
+    assert file.defects == Defects(
+        degenerate=1, non_finite=2, out_of_range=4, incomplete=1, unsupported=1
+    )
+    part = file.parts[0]
+    assert part.faces is not None
+    assert part.faces.tolist() == [[0, 1, 2], [0, 1, 1]]
+    assert part.vertices.tolist() == TRIANGLE.tolist()
+    assert file.defects.describe() == (
+        "1 degenerate, 2 non-finite, 4 out of range, 1 incomplete, 1 of an unsupported kind"
+    )
+
+
+def test_an_index_out_of_its_piece_does_not_reach_into_the_next(tmp_path: Path) -> None:
+    piece = {"attributes": {"POSITION": 0}, "indices": 1}
+    plain = {"attributes": {"POSITION": 2}}
+    path = gltf({}, tmp_path / "reach.gltf", indices=[0, 1, 4])
+    tree = json.loads(path.read_text())
+    tree["accessors"].append(dict(tree["accessors"][0]))
+    tree["meshes"] = [{"primitives": [piece, plain]}]
+    path.write_text(json.dumps(tree))
+    file = parse_in_process(path)
+    assert file.defects == Defects(out_of_range=1)
+    assert len(file.parts[0].triangles()) == 1
+
+
+def test_mirrored_flattened_and_scaled_placements(tmp_path: Path) -> None:
+    nodes = [
+        {"mesh": 0, "name": "mirrored", "scale": [-1, 1, 1]},
+        {"mesh": 0, "name": "to a line", "scale": [1, 0, 1]},
+        {"mesh": 0, "name": "large", "scale": [1000, 1000, 1000]},
+        {"mesh": 0, "name": "nowhere", "translation": [float("nan"), 0, 0]},
+        {"mesh": 0, "name": "far", "scale": [1e200, 1, 1]},
+    ]
+    tree = {"nodes": nodes, "scenes": [{"nodes": [0, 1, 2, 3, 4]}]}
+    file = parse_in_process(gltf(tree, tmp_path / "scales.gltf"))
+    assert names(file) == ["mirrored", "to a line", "large"]
+    assert [part.defects.degenerate for part in file.parts] == [0, 1, 0]
+    assert file.defects == Defects(degenerate=1, non_finite=2)
+
+
+def test_points_that_are_not_finite_are_refused_and_counted(tmp_path: Path) -> None:
+    path = text(
+        tmp_path / "cloud.ply",
+        "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\n"
+        "property float z\nend_header\n0 0 0\nnan 0 0\n1 2 3\n",
+    )
+    file = parse_in_process(path)
+    assert file.parts[0].is_cloud
+    assert file.parts[0].faces is None
+    assert file.parts[0].world_points().tolist() == [[0, 0, 0], [1, 2, 3]]
+    assert file.parts[0].triangles().shape == (0, 3, 3)
+    assert file.defects == Defects(non_finite=1)
+
+
+def test_las_points_keep_their_place(tmp_path: Path) -> None:
+    laspy = pytest.importorskip("laspy", reason="the extra 'pointcloud' is not installed")
+    cloud = laspy.create()
+    cloud.x, cloud.y, cloud.z = [1.0, 2.0], [10.5, 20.0], [3.0, -4.0]
+    for name in ("a.las", "a.laz"):
+        cloud.write(str(tmp_path / name))
+        part = parse_in_process(tmp_path / name).parts[0]
+        assert part.is_cloud
+        np.testing.assert_allclose(part.bounds, np.array([[1, 10.5, -4], [2, 20, 3]]))
+
+
+def test_defects_add_and_describe() -> None:
+    total = Defects(degenerate=12) + Defects(non_finite=3)
+    assert total.describe() == "12 degenerate, 3 non-finite"
+    assert total.as_dict()["degenerate"] == 12
+    assert Defects().describe() == ""
+    assert not Defects()
+    assert total
+
+
+@given(
+    st.lists(
+        st.tuples(st.integers(-2, 6), st.integers(-2, 6), st.integers(-2, 6)),
+        max_size=20,
+    ),
+    st.lists(
+        st.tuples(*[st.floats(-10, 10) | st.sampled_from([np.nan, np.inf])] * 3),
+        min_size=1,
+        max_size=5,
+    ),
+)
+def test_what_stays_is_sound_and_everything_is_accounted_for(
+    corners: list[tuple[int, int, int]], points: list[tuple[float, float, float]]
+) -> None:
+    vertices = np.array(points, dtype=np.float64)
+    faces = np.array(corners, dtype=np.int64).reshape(-1, 3)
+    inside = [f for f in corners if all(0 <= i < len(points) for i in f)]
+    sound = [f for f in inside if np.isfinite(vertices[list(f)]).all()]
+    parsed = Parsed([Shape(vertices, faces)], [Placement("p", 0, np.eye(4))])
+    if not sound:
+        with pytest.raises(UnreadableError):
+            clean(parsed, 1.0)
+        return
+    cleaned = clean(parsed, 1.0)
+    kept, indices = cleaned.geometries[0]
+    assert indices is not None
+    np.testing.assert_array_equal(kept[indices], vertices[np.array(sound)])
+    assert cleaned.defects.out_of_range == len(corners) - len(inside)
+    assert cleaned.defects.non_finite == len(inside) - len(sound)
+    assert len(np.unique(indices)) == len(kept)
+
+
+@given(st.lists(st.lists(st.integers(0, 50), max_size=7), max_size=10))
+def test_a_fan_has_two_triangles_fewer_than_corners(polygons: list[list[int]]) -> None:
+    faces, incomplete = fan(polygons)
+    assert len(faces) == sum(max(len(p) - 2, 0) for p in polygons)
+    assert incomplete == sum(len(p) < 3 for p in polygons)

@@ -1,0 +1,164 @@
+"""Files of poses: a line a pose, position in metres and unit quaternion, the scalar first.
+
+The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order; further columns are ignored.
+Quaternions are normalised; ``q`` and ``-q`` are the same pose.
+"""
+
+import csv
+import io
+import math
+import os
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import FileError, UsageError
+
+COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
+
+_HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
+
+
+def rotation_of(quaternions: ArrayLike) -> NDArray[np.float64]:
+    """Rotation matrices (M, 3, 3) of unit quaternions (M, 4), the scalar first."""
+    w, x, y, z = np.asarray(quaternions, dtype=np.float64).reshape(-1, 4).T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.asarray(np.moveaxis(np.array(rows), 2, 0))
+
+
+def quaternion_of(rotations: ArrayLike) -> NDArray[np.float64]:
+    """Unit quaternions (M, 4), the scalar first and not negative, of rotations (M, 3, 3).
+
+    Each of the four products of a quaternion's component with all of it is linear in the matrix;
+    the longest is taken, so that no rotation divides by a small number (Shepperd 1978).
+    """
+    r = np.asarray(rotations, dtype=np.float64).reshape(-1, 3, 3)
+    xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
+    x, y, z = r[:, 2, 1] - r[:, 1, 2], r[:, 0, 2] - r[:, 2, 0], r[:, 1, 0] - r[:, 0, 1]
+    xy, xz, yz = r[:, 0, 1] + r[:, 1, 0], r[:, 0, 2] + r[:, 2, 0], r[:, 1, 2] + r[:, 2, 1]
+    products = np.array(
+        [
+            [1.0 + xx + yy + zz, x, y, z],
+            [x, 1.0 + xx - yy - zz, xy, xz],
+            [y, xy, 1.0 - xx + yy - zz, yz],
+            [z, xz, yz, 1.0 - xx - yy + zz],
+        ]
+    )
+    longest = np.argmax(products[np.arange(4), np.arange(4)], axis=0)
+    chosen = np.moveaxis(products, 2, 0)[np.arange(len(r)), longest]
+    chosen /= np.linalg.norm(chosen, axis=1, keepdims=True)
+    return np.asarray(np.where(chosen[:, :1] < 0.0, -chosen, chosen))
+
+
+def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
+    """Write poses to a file, whole or not at all.
+
+    Parameters
+    ----------
+    path : path
+        The file; one that is there is replaced.
+    poses : array_like
+        (M, 4, 4) rigid transforms `world_from_tool`, metres.
+    """
+    matrices = np.asarray(poses, dtype=np.float64)
+    if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
+        raise UsageError(f"poses must have the shape (M, 4, 4), not {matrices.shape}")
+    if not np.isfinite(matrices).all():
+        raise UsageError("poses must be finite numbers")
+    rows = np.hstack([matrices[:, :3, 3], quaternion_of(matrices[:, :3, :3])]) + 0.0
+    lines = [",".join(COLUMNS), *(",".join(f"{value:.15g}" for value in row) for row in rows)]
+    target = Path(path)
+    partial = target.with_name(f".{target.name}.{os.getpid()}.partial")
+    try:
+        partial.write_text("\n".join(lines) + "\n", encoding="ascii", newline="\n")
+        partial.replace(target)
+    except OSError as error:
+        raise FileError(f"cannot write {target}: {error.strerror}") from error
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def read_poses(path: str | os.PathLike[str]) -> NDArray[np.float64]:
+    """Poses (M, 4, 4) `world_from_tool` of a file, in its order."""
+    rows = _read_rows(Path(path))
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = rotation_of(rows[:, 3:])
+    poses[:, :3, 3] = rows[:, :3]
+    return poses
+
+
+def _read_text(path: Path) -> str:
+    try:
+        content = path.read_bytes()
+    except FileNotFoundError:
+        raise FileError(f"no file of poses at {path}") from None
+    except OSError as error:
+        raise FileError(f"cannot read {path}: {error.strerror}") from error
+    if not content.strip():
+        raise FileError(f"{path} is empty; {_HINT}")
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = "\0"
+    if "\0" in text:
+        raise FileError(f"{path} is no text file; {_HINT}")
+    return text
+
+
+def _read_rows(path: Path) -> NDArray[np.float64]:
+    """Numbers (M, 7) in the order of `COLUMNS`, the quaternions normalised."""
+    reader = csv.reader(io.StringIO(_read_text(path), newline=""), strict=True)
+    places: list[int] = []
+    rows: list[list[float]] = []
+    try:
+        for fields in reader:
+            if not any(field.strip() for field in fields):
+                continue
+            where = f"{path}, line {reader.line_num}"
+            if places:
+                rows.append(_pose(fields, places, where))
+            else:
+                places = _columns(fields, where)
+    except csv.Error as error:
+        raise FileError(f"{path}, line {reader.line_num}: {error}; {_HINT}") from error
+    if not rows:
+        raise FileError(f"{path} holds no poses after its header; {_HINT}")
+    return np.array(rows)
+
+
+def _columns(fields: list[str], where: str) -> list[int]:
+    """Where the header has each of `COLUMNS`."""
+    names = [field.strip().lower() for field in fields]
+    missing = [name for name in COLUMNS if name not in names]
+    if len(missing) == len(COLUMNS):
+        raise FileError(f"{where}: no header; {_HINT}")
+    if missing:
+        raise FileError(f"{where}: the header lacks {', '.join(missing)}; {_HINT}")
+    doubled = [name for name in COLUMNS if names.count(name) > 1]
+    if doubled:
+        raise FileError(f"{where}: the header names {', '.join(doubled)} twice; {_HINT}")
+    return [names.index(name) for name in COLUMNS]
+
+
+def _pose(fields: list[str], places: list[int], where: str) -> list[float]:
+    """Seven finite numbers of one line, the quaternion normalised."""
+    values: list[float] = []
+    for name, place in zip(COLUMNS, places, strict=True):
+        if place >= len(fields):
+            raise FileError(f"{where}: no value for {name}")
+        try:
+            value = float(fields[place])
+        except ValueError:
+            raise FileError(f"{where}: {name} is {fields[place][:40]!r}, not a number") from None
+        if not math.isfinite(value):
+            raise FileError(f"{where}: {name} is {value}, not a finite number")
+        values.append(value)
+    norm = math.hypot(*values[3:])
+    if not (norm > 1e-9 and math.isfinite(norm)):
+        raise FileError(f"{where}: the quaternion {values[3:]} is no rotation")
+    return [*values[:3], *(value / norm for value in values[3:])]

@@ -1,0 +1,242 @@
+"""Paths that slide a tool over the upper side of a scene.
+
+The scene is seen from above: a map of heights, from its triangles or from its voxels. The tool
+follows a swaying line over it, turns slowly, is tilted to lie along the surface, and at every
+pose is let down until its first point touches, then pressed in by a set depth.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from hapticdb.errors import UsageError
+from hapticdb.sample.parts import SamplePart
+from hapticdb.sample.shapes import Floats
+
+STEEPEST = 1.2
+"""Slope of the tool's own way, rise over run: where the scene falls off faster, it glides down."""
+
+STEP = 0.003
+"""Metres between the heights that are taken from triangles."""
+
+DENSER = 4
+"""Poses tried for each one kept: so many that equal steps of the tool can be picked among them."""
+
+
+class HeightMap(NamedTuple):
+    """Tops of the columns of a scene.
+
+    corner (2,) and step in metres; top (nx, ny) metres, -inf where there is nothing.
+    """
+
+    corner: Floats
+    step: float
+    top: Floats
+
+    def at(self, x: Floats, y: Floats) -> Floats:
+        """Heights in metres at places of any shape, -inf beyond the map."""
+        i = np.floor((x - self.corner[0]) / self.step).astype(np.int64)
+        j = np.floor((y - self.corner[1]) / self.step).astype(np.int64)
+        nx, ny = self.top.shape
+        inside = (i >= 0) & (i < nx) & (j >= 0) & (j < ny)
+        heights = self.top[np.clip(i, 0, nx - 1), np.clip(j, 0, ny - 1)]
+        return np.asarray(np.where(inside, heights, -np.inf))
+
+
+def heights_of_voxels(centers: ArrayLike, voxel_size: float) -> HeightMap:
+    """Map of the tops of voxels; centers (V, 3) and voxel_size in metres."""
+    points = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
+    if len(points) == 0:
+        raise UsageError("there are no voxels to slide over")
+    corner = points[:, :2].min(axis=0) - 0.5 * voxel_size
+    cell = np.floor((points[:, :2] - corner) / voxel_size).astype(np.int64)
+    top = np.full(tuple(cell.max(axis=0) + 1), -np.inf)
+    np.maximum.at(top, (cell[:, 0], cell[:, 1]), points[:, 2] + 0.5 * voxel_size)
+    return HeightMap(corner, voxel_size, top)
+
+
+def heights_of_triangles(triangles: ArrayLike, step: float = STEP) -> HeightMap:
+    """Map of the upper side of triangles (T, 3, 3), exact at the middle of each cell."""
+    t = np.asarray(triangles, dtype=np.float64)
+    corner = t[..., :2].min(axis=(0, 1))
+    shape = np.floor((t[..., :2].max(axis=(0, 1)) - corner) / step).astype(np.int64) + 1
+    top = np.full(tuple(shape), -np.inf)
+    normal = np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
+    t, normal = t[normal[:, 2] > 1e-12], normal[normal[:, 2] > 1e-12]
+    if len(t) == 0:
+        raise UsageError("no triangle faces upward: there is nothing to slide over")
+    # height = c0 + cx x + cy y over a triangle, whose three sides are where e0 + ex x + ey y = 0
+    plane = -normal[:, :2] / normal[:, 2:]
+    lines = [np.column_stack([t[:, 0, 2] - (plane * t[:, 0, :2]).sum(axis=1), plane])]
+    for k in range(3):
+        start, edge = t[:, k, :2], t[:, (k + 1) % 3, :2] - t[:, k, :2]
+        across = np.column_stack([-edge[:, 1], edge[:, 0]])
+        lines.append(np.column_stack([-(across * start).sum(axis=1), across]))
+    low = np.ceil((t[..., :2].min(axis=1) - corner) / step - 0.5).astype(np.int64)
+    high = np.floor((t[..., :2].max(axis=1) - corner) / step - 0.5).astype(np.int64)
+    size = np.maximum(high - low + 1, 0)
+    cells = size[:, 0] * size[:, 1]
+    for chunk in np.array_split(np.arange(len(t)), max(1, int(cells.sum()) // 500_000)):
+        owner = np.repeat(chunk, cells[chunk])
+        first = np.repeat(np.cumsum(cells[chunk]) - cells[chunk], cells[chunk])
+        rank = np.arange(len(owner)) - first
+        i = low[owner, 0] + rank // size[owner, 1]
+        j = low[owner, 1] + rank % size[owner, 1]
+        x, y = corner[0] + (i + 0.5) * step, corner[1] + (j + 0.5) * step
+        height, *sides = (f[owner, 0] + f[owner, 1] * x + f[owner, 2] * y for f in lines)
+        over = (sides[0] >= -1e-12) & (sides[1] >= -1e-12) & (sides[2] >= -1e-12)
+        np.maximum.at(top, (i[over], j[over]), height[over])
+    return HeightMap(corner, step, top)
+
+
+def _walk(map_: HeightMap, reach: float, count: int, seed: int, longest: float) -> Floats:
+    """Places (count, 2) along a swaying line over the longer side of the map.
+
+    It keeps half the tool's reach off the ends, and is cut about its middle to `longest` metres.
+    """
+    phase = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
+    size: Floats = np.array(map_.top.shape) * map_.step
+    major = int(np.argmax(size))
+    span = min(max(float(size[major]) - reach, 0.5 * float(size[major])), longest)
+    u = np.linspace(-0.5, 0.5, count)
+    places = np.empty((count, 2))
+    places[:, major] = -span * u
+    sway = 0.22 * min(float(size[1 - major]), span)
+    places[:, 1 - major] = sway * np.sin(2.0 * np.pi * 1.25 * u + phase)
+    return np.asarray(places + map_.corner + 0.5 * size)
+
+
+def _slopes(map_: HeightMap, places: Floats, reach: float) -> Floats:
+    """Slopes (M, 2) of the plane through the heights around each place."""
+    offset = np.linspace(-0.4, 0.4, 9) * reach
+    dx, dy = (axis.ravel() for axis in np.meshgrid(offset, offset))
+    z = map_.at(places[:, :1] + dx, places[:, 1:] + dy)
+    known = np.isfinite(z)
+    weight = known / np.maximum(known.sum(axis=1, keepdims=True), 1)
+    z = np.where(known, z, 0.0)
+    z -= (weight * z).sum(axis=1, keepdims=True)
+    slopes = np.zeros((len(places), 2))
+    for axis, d in enumerate((dx, dy)):
+        centred = d - (weight * d).sum(axis=1, keepdims=True)
+        spread = (weight * centred**2).sum(axis=1)
+        slopes[:, axis] = (weight * centred * z).sum(axis=1) / np.maximum(spread, 1e-3 * reach**2)
+    return np.clip(slopes, -STEEPEST, STEEPEST)
+
+
+def _rotations(slopes: Floats, yaw: Floats) -> Floats:
+    """Rotations (M, 3, 3) that lay the tool's z axis along the surface's normal, turned by yaw."""
+    normal = np.column_stack([-slopes, np.ones(len(slopes))])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    ahead = np.column_stack([np.cos(yaw), np.sin(yaw), np.zeros(len(yaw))])
+    ahead -= (ahead * normal).sum(axis=1, keepdims=True) * normal
+    ahead /= np.linalg.norm(ahead, axis=1, keepdims=True)
+    return np.stack([ahead, np.cross(normal, ahead), normal], axis=2)
+
+
+def _let_down(map_: HeightMap, places: Floats, rotations: Floats, tool_points: Floats) -> Floats:
+    """Heights (M,) of the tool's origin at which its first point touches; -inf over nothing."""
+    heights = np.empty(len(places))
+    for chunk in np.array_split(np.arange(len(places)), max(1, len(places) // 500)):
+        points = tool_points @ rotations[chunk].transpose(0, 2, 1)
+        below = map_.at(points[..., 0] + places[chunk, :1], points[..., 1] + places[chunk, 1:])
+        heights[chunk] = (below - points[..., 2]).max(axis=1)
+    return heights
+
+
+def _gliding(heights: Floats, rise: float) -> Floats:
+    """The least way on or over the heights that rises and falls by at most `rise` a step."""
+    ramp = rise * np.arange(len(heights))
+    forward = np.maximum.accumulate(heights + ramp) - ramp
+    backward = np.maximum.accumulate((heights - ramp)[::-1])[::-1] + ramp
+    return np.asarray(np.maximum(forward, backward))
+
+
+def slide_over(
+    map_: HeightMap,
+    tool_points: ArrayLike,
+    count: int,
+    press: Floats | float,
+    seed: int = 0,
+    longest: float = np.inf,
+) -> Floats:
+    """Poses that slide a tool over a map of heights.
+
+    Parameters
+    ----------
+    map_ : HeightMap
+        The scene from above.
+    tool_points : array_like
+        (N, 3) points of the tool's surface, metres, tool frame; its underside towards -z.
+    count : int
+        How many poses.
+    press : float or ndarray
+        Metres, or (count,) metres, by which the deepest point is pressed in.
+    seed : int
+        Chooses where the line sways.
+    longest : float
+        Metres that the line may run at most.
+
+    Returns
+    -------
+    ndarray
+        (count, 4, 4) `world_from_tool`; neighbours are nearly equally far apart.
+    """
+    if count < 2:
+        raise UsageError(f"a path needs two poses or more, not {count}")
+    tool = np.asarray(tool_points, dtype=np.float64).reshape(-1, 3)
+    if len(tool) == 0:
+        raise UsageError("the tool has no points")
+    reach = float(np.ptp(tool[:, :2], axis=0).max())
+    places = _walk(map_, reach, DENSER * count, seed, longest)
+    run = float(np.linalg.norm(places[1] - places[0]))
+    blur = max(0.35 * reach / max(run, 1e-12), 1.0)
+    blur = min(blur, 0.05 * len(places))
+    slopes = gaussian_filter1d(_slopes(map_, places, reach), blur, axis=0, mode="nearest")
+    u = np.linspace(0.0, 1.0, len(places))
+    swings = min(1.5, 0.08 * run * len(places) / max(reach, 1e-12))
+    rotations = _rotations(slopes, 0.5 * np.pi + 0.9 * np.sin(2.0 * np.pi * swings * u))
+    heights = _let_down(map_, places, rotations, tool)
+    if not np.isfinite(heights).any():
+        raise UsageError("there is nothing to slide over under the path")
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, :3] = rotations
+    poses[:, :3, 3] = np.column_stack([places, _gliding(heights, STEEPEST * run)])
+    chosen = poses[_evenly(poses, reach, count)]
+    chosen[:, 2, 3] -= press
+    return np.asarray(chosen)
+
+
+def _evenly(poses: Floats, reach: float, count: int) -> NDArray[np.int64]:
+    """Numbers of `count` poses between which the tool's farthest point moves about equally."""
+    shifts = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turns = np.linalg.norm(np.diff(poses[:, :3, :3], axis=0), axis=(1, 2)) * 0.5 * reach
+    way = np.concatenate([[0.0], np.cumsum(shifts + turns)])
+    return np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(poses) - 1)
+
+
+def slide_over_voxels(
+    centers: ArrayLike, voxel_size: float, tool_points: ArrayLike, count: int = 1000, seed: int = 0
+) -> Floats:
+    """Poses (count, 4, 4) that slide a tool over voxels, pressed in by 0.5 to 1.5 voxels.
+
+    centers (V, 3), voxel_size and tool_points (N, 3) in metres. A step is a voxel or two:
+    in a scene too long for that, the path keeps to its middle.
+    """
+    if not voxel_size > 0.0:
+        raise UsageError(f"a voxel's edge must be positive, not {voxel_size}")
+    press = voxel_size * (1.0 - 0.5 * np.cos(np.linspace(0.0, 10.0 * np.pi, count)))
+    map_ = heights_of_voxels(centers, voxel_size)
+    return slide_over(map_, tool_points, count, press, seed, longest=count * voxel_size)
+
+
+def slide_path(parts: Sequence[SamplePart], tool_points: ArrayLike, count: int = 1000) -> Floats:
+    """Poses (count, 4, 4) over the sample's car: hood, windscreen, roof, rear window, boot.
+
+    The deepest point is pressed 1 mm below the surface itself, so that the path touches whatever
+    the edge of the voxels that the car is imported with.
+    """
+    outside = [p.triangles() for p in parts if p.name.startswith(("body/", "trim/"))]
+    return slide_over(heights_of_triangles(np.concatenate(outside)), tool_points, count, 0.001)

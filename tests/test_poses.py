@@ -1,0 +1,141 @@
+"""Files of poses: what is written comes back, and what cannot be read is told in one line."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from hapticdb.errors import FileError, UsageError
+from hapticdb.poses import quaternion_of, read_poses, rotation_of, write_poses
+
+HEADER = "x,y,z,qw,qx,qy,qz\n"
+
+components = st.floats(-1.0, 1.0, allow_subnormal=False)
+quaternions = arrays(np.float64, (5, 4), elements=components).filter(
+    lambda q: bool((np.linalg.norm(q, axis=1) > 1e-3).all())
+)
+
+
+@given(quaternions)
+def test_a_rotation_comes_back_from_its_quaternion(q: NDArray[np.float64]) -> None:
+    unit = q / np.linalg.norm(q, axis=1, keepdims=True)
+    rotation = rotation_of(unit)
+    assert np.allclose(rotation @ rotation.transpose(0, 2, 1), np.eye(3), atol=1e-12)
+    assert np.allclose(np.linalg.det(rotation), 1.0, atol=1e-12)
+    assert np.allclose(rotation_of(quaternion_of(rotation)), rotation, atol=1e-12)
+    assert np.allclose(np.abs((quaternion_of(rotation) * unit).sum(axis=1)), 1.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_half_turns_come_back(axis: int) -> None:
+    q = np.zeros(4)
+    q[axis + 1] = 1.0
+    assert np.allclose(np.abs(quaternion_of(rotation_of(q))), q)
+
+
+def test_the_scalar_comes_first_and_turns_are_right_handed() -> None:
+    quarter = rotation_of([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])[0]
+    assert np.allclose(quarter @ [1.0, 0.0, 0.0], [0.0, 1.0, 0.0])
+
+
+@given(quaternions, arrays(np.float64, (5, 3), elements=st.floats(-1e6, 1e6)))
+def test_poses_come_back_from_a_file(
+    tmp_path_factory: pytest.TempPathFactory, q: NDArray[np.float64], p: NDArray[np.float64]
+) -> None:
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, :3] = rotation_of(q / np.linalg.norm(q, axis=1, keepdims=True))
+    poses[:, :3, 3] = p
+    path = tmp_path_factory.mktemp("poses") / "path.csv"
+    write_poses(path, poses)
+    assert np.allclose(read_poses(path), poses, rtol=1e-14, atol=1e-12)
+    assert [f.name for f in path.parent.iterdir()] == ["path.csv"]
+
+
+def test_quaternions_are_normalised(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text(HEADER + "1,2,3,2,0,0,0\n")
+    assert np.array_equal(read_poses(path)[0, :3], np.column_stack([np.eye(3), [1, 2, 3]]))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xef\xbb\xbfx,y,z,qw,qx,qy,qz\r\n1,2,3,1,0,0,0\r\n",
+        b"x,y,z,qw,qx,qy,qz\r1,2,3,1,0,0,0\r",
+        b" X , Y,Z,QW,QX,QY,QZ\n\n 1, 2 ,3,1,0,0,0\n\n\n",
+        b"time,qw,qx,qy,qz,x,y,z\n9,1,0,0,0,1,2,3\n",
+        b'"x","y","z","qw","qx","qy","qz"\n"1","2","3","1","0","0","0"',
+    ],
+)
+def test_marks_line_ends_blanks_quotes_and_order_do_not_matter(
+    tmp_path: Path, content: bytes
+) -> None:
+    path = tmp_path / "p.csv"
+    path.write_bytes(content)
+    assert np.array_equal(read_poses(path)[0, :3, 3], [1.0, 2.0, 3.0])
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "empty"),
+        (b" \n\n", "empty"),
+        (b"x,y,z,qw,qx,qy,qz\n", "no poses"),
+        (b"1,2,3,1,0,0,0\n", "no header"),
+        (b"x,y,z,qw,qx,qy\n1,2,3,1,0,0\n", "lacks qz"),
+        (b"x,x,y,z,qw,qx,qy,qz\n1,1,2,3,1,0,0,0\n", "x twice"),
+        (b"x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0,0\n1,2,oh,1,0,0,0\n", "line 3: z is 'oh'"),
+        (b"x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0\n", "line 2: no value for qz"),
+        (b"x,y,z,qw,qx,qy,qz\n1,2,,1,0,0,0\n", "line 2: z is ''"),
+        (b"x,y,z,qw,qx,qy,qz\nnan,2,3,1,0,0,0\n", "line 2: x is nan"),
+        (b"x,y,z,qw,qx,qy,qz\n1,2,3,inf,0,0,0\n", "line 2: qw is inf"),
+        (b"x,y,z,qw,qx,qy,qz\n1,2,3,0,0,0,0\n", "line 2: the quaternion"),
+        (b"x,y,z,qw,qx,qy,qz\n1,2,3,1e300,1.7e308,1.7e308,1.7e308\n", "line 2: the quaternion"),
+        (b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe", "no text file"),
+        (b"glTF\x02\x00\x00\x00", "no text file"),
+        (b'x,y,z,qw,qx,qy,qz\n"1,2,3,1,0,0,0\n', "line 2"),
+    ],
+)
+def test_what_cannot_be_read_is_told_in_one_line(tmp_path: Path, content: bytes, says: str) -> None:
+    path = tmp_path / "p.csv"
+    path.write_bytes(content)
+    with pytest.raises(FileError) as caught:
+        read_poses(path)
+    message = str(caught.value)
+    assert says in message
+    assert str(path) in message
+    assert "\n" not in message
+
+
+@given(st.binary(max_size=200))
+def test_no_bytes_end_in_another_error(
+    tmp_path_factory: pytest.TempPathFactory, content: bytes
+) -> None:
+    path = tmp_path_factory.mktemp("poses") / "p.csv"
+    path.write_bytes(HEADER.encode() + content)
+    try:
+        assert np.isfinite(read_poses(path)).all()
+    except FileError as error:
+        assert "\n" not in str(error)  # noqa: PT017 - either outcome is right
+
+
+def test_a_missing_file_and_a_folder_are_told_apart(tmp_path: Path) -> None:
+    with pytest.raises(FileError, match="no file of poses"):
+        read_poses(tmp_path / "none.csv")
+    with pytest.raises(FileError, match="cannot read"):
+        read_poses(tmp_path)
+
+
+def test_what_is_no_list_of_poses_is_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    with pytest.raises(UsageError):
+        write_poses(path, np.eye(4))
+    with pytest.raises(UsageError):
+        write_poses(path, np.full((1, 4, 4), np.nan))
+    with pytest.raises(FileError):
+        write_poses(tmp_path / "none" / "p.csv", np.eye(4)[None])
+    assert not list(tmp_path.iterdir())

@@ -1,0 +1,1 @@
+"""Stores: one class an engine, behind the protocols of `hapticdb.store.base`."""

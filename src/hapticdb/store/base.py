@@ -1,0 +1,210 @@
+"""What an engine does for an environment: the Store protocol and the rows that cross it."""
+
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import BRICK_BITS, Grid
+
+Layout = Literal["voxel", "brick"]
+LAYOUTS: tuple[Layout, ...] = get_args(Layout)
+BRICK_SHIFT = 3 * BRICK_BITS
+"""Bits of a voxel's key below its brick's."""
+BRICK_BYTES = 64
+
+Keys = NDArray[np.int64]
+
+
+class Rows(NamedTuple):
+    """Rows of the index table, a batch.
+
+    keys : (R,) int64, ascending: voxel keys, or brick keys.
+    ids : (R,) int64, ids of objects.
+    occupancy : (64 R,) uint8, row after row; empty on the voxel layout.
+    """
+
+    keys: Keys
+    ids: NDArray[np.int64]
+    occupancy: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        """Count the rows (a tuple of three would say three)."""
+        return len(self.keys)
+
+
+def row_shift(layout: Layout) -> int:
+    """Bits of a voxel's key below the key of its row."""
+    return BRICK_SHIFT if layout == "brick" else 0
+
+
+@dataclass(frozen=True)
+class Object:
+    """One object, as the table `object` holds it.
+
+    Attributes
+    ----------
+    id : int
+        Given by the store when written; never used again after a removal. 0 before.
+    name : str
+        Path of the part inside its file.
+    link : str
+        Absolute path of the file that holds its surface.
+    digest : str
+        Of its geometry, in its own frame.
+    transform : (4, 4) float64
+        world_from_part, metres.
+    voxels : int
+        How many voxels its surface touches.
+    bounds : (2, 3) float64
+        Lower and upper corner, metres, world frame.
+    attributes : mapping
+        What else is known, as JSON: ``unit`` is the unit its file was read in.
+    revision : int
+        Of the environment, when the object was last written.
+    """
+
+    name: str
+    link: str
+    digest: str
+    transform: NDArray[np.float64]
+    voxels: int
+    bounds: NDArray[np.float64]
+    attributes: Mapping[str, object] = field(default_factory=dict)
+    id: int = 0
+    revision: int = 0
+
+
+@dataclass(frozen=True)
+class Change:
+    """One committed write: what readers refresh from.
+
+    ranges (C, 2) int64: lowest and highest voxel key of each run of keys touched, ascending.
+    """
+
+    revision: int
+    action: Literal["add", "move", "remove"]
+    id: int
+    ranges: NDArray[np.int64]
+
+
+class Store(Protocol):
+    """Where an environment lives. Methods take and return whole batches; one call, one round trip.
+
+    A store belongs to one thread at a time. Reads outside `snapshot` see what is committed when
+    each begins; inside, all see one revision.
+    """
+
+    @property
+    def url(self) -> str:
+        """Where it is, as messages name it: without a password."""
+
+    @property
+    def grid(self) -> Grid:
+        """The environment's grid, fixed when it was made."""
+
+    @property
+    def layout(self) -> Layout:
+        """Which index table it has, fixed when it was made."""
+
+    @property
+    def is_read_only(self) -> bool:
+        """Whether writes are refused."""
+
+    def close(self) -> None:
+        """Give back what the connection holds."""
+
+    def discard(self) -> None:
+        """Close and delete an environment that nothing went into."""
+
+    def snapshot(self) -> AbstractContextManager[None]:
+        """All reads inside see one committed revision."""
+
+    def version(self) -> int:
+        """A number that has changed when the last read may have seen another revision."""
+
+    def revision(self) -> int:
+        """Number of the last committed write; 0 for an empty environment."""
+
+    # -- the haptic query
+    def lookup(self, keys: Keys) -> Rows:
+        """Rows of distinct ascending keys (U,), in the form that this engine answers fastest."""
+
+    def lookup_each(self, keys: Keys) -> Rows:
+        """The same by one statement a key: the paper's point query sequence."""
+
+    def scan(self, lows: Keys, highs: Keys) -> Rows:
+        """Rows with a key in any closed range, ascending and disjoint, in one statement."""
+
+    def count(self, lows: Keys, highs: Keys) -> int:
+        """Count what `scan` would return, inside the engine."""
+
+    # -- objects
+    def objects(self) -> list[Object]:
+        """All objects, ordered by id."""
+
+    def add(self, record: Object, rows: Rows) -> int:
+        """Write an object and its rows (any ids in them) in one transaction; returns its id."""
+
+    def replace(self, record: Object, rows: Rows, old: Iterable[tuple[int, int]]) -> None:
+        """Exchange an object's rows, found in the key ranges `old`, in one transaction."""
+
+    def remove(self, object_id: int, old: Iterable[tuple[int, int]]) -> None:
+        """Remove an object and its rows, found in the key ranges `old`, in one transaction."""
+
+    def changes(self, since: int = 0) -> Iterator[Change]:
+        """Committed writes after that revision, oldest first."""
+
+    # -- statistics
+    def size(self) -> "Size":
+        """Rows, bytes and leaf blocks."""
+
+    def quantiles(self, resolution: int) -> tuple[Keys, int]:
+        """Bounds (R + 1,) of the equi-count histogram of all row keys, and the rows behind it."""
+
+    def analyze(self, resolution: int) -> None:
+        """Renew the statistics that `quantiles` answers from."""
+
+    def costs(self, machine: str) -> Mapping[str, float] | None:
+        """Figures that `save_costs` kept for that machine."""
+
+    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
+        """Keep the fitted cost figures of a machine."""
+
+
+class Size(NamedTuple):
+    """How large an index table is; bytes of the whole database, its write-ahead log included."""
+
+    rows: int
+    bytes: int
+    leaf_blocks: int
+
+
+class Frame(NamedTuple):
+    """A located shell as `SupportsStatement` binds it: parallel arrays in the order of the points.
+
+    points, normals (N, 3) float64, world frame; addresses (N,) int64 as `kernels.contact.locate`
+    gives them, -1 outside the grid; center (3,) metres, world frame; stiffness N/m; exclude (E,)
+    int64, ids.
+    """
+
+    points: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    addresses: Keys
+    center: NDArray[np.float64]
+    stiffness: float
+    exclude: Keys
+
+
+@runtime_checkable
+class SupportsStatement(Protocol):
+    """An engine that computes the wrench inside one statement (the paper's Figure 3)."""
+
+    def statement(self, frame: Frame) -> NDArray[np.float64]:
+        """Wrench (6,) of the frame, N and N m about its centre."""
+
+    def statement_hits(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""

@@ -1,0 +1,412 @@
+"""SQLite through apsw: the embedded engine, one file.
+
+Three traps of the binding, each covered by a test: an ``np.int64`` binds as an eight-byte blob, a
+bare array to ``carray(?)`` binds as nothing (both in silence), and an empty array cannot be bound.
+So keys cross as ``apsw.carray`` of contiguous int64 arrays that are not empty, and single numbers
+as Python's own.
+"""
+
+import contextlib
+import json
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, cast
+
+import apsw
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import BusyError, EnvironmentExistsError, ObjectNotFoundError
+from hapticdb.grid import CurveName, Grid
+from hapticdb.store import sqlite_file, sqlite_force
+from hapticdb.store.base import (
+    BRICK_BYTES,
+    LAYOUTS,
+    Change,
+    Frame,
+    Keys,
+    Layout,
+    Object,
+    Rows,
+    Size,
+    row_shift,
+)
+from hapticdb.store.quantiles import exact_quantiles
+
+NO_KEYS = np.empty(0, dtype=np.int64)
+# bytes and not an array of numpy's own: kernels see one type, read-only, on every path
+NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
+NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
+
+LOOKUP = {
+    "voxel": "SELECT z_val, id FROM carray(?1) AS asked CROSS JOIN voxel ON z_val = asked.value",
+    "brick": """SELECT z_val, id, occupancy
+                  FROM carray(?1) AS asked CROSS JOIN brick ON z_val = asked.value""",
+}
+LOOKUP_ONE = {
+    "voxel": "SELECT z_val, id FROM voxel WHERE z_val = ?1",
+    "brick": "SELECT z_val, id, occupancy FROM brick WHERE z_val = ?1",
+}
+# one prepared statement for any number of ranges: 20 us where a VALUES list of the same 20 ranges
+# takes 28 (benchmarks/test_frame.py), since no text is built or parsed
+SCAN = {
+    "voxel": """SELECT z_val, id FROM carray(?1) AS low CROSS JOIN voxel
+                 WHERE z_val BETWEEN low.value AND nth(?2, low.rowid)""",
+    "brick": """SELECT z_val, id, occupancy FROM carray(?1) AS low CROSS JOIN brick
+                 WHERE z_val BETWEEN low.value AND nth(?2, low.rowid)""",
+}
+# whole arrays cross at once: 8 times faster than executemany, and without the interpreter lock
+INSERT = {
+    "voxel": "INSERT INTO voxel SELECT value, ?2 FROM carray(?1)",
+    "brick": f"""INSERT INTO brick SELECT value, ?2,
+                        substr(?3, {BRICK_BYTES} * rowid - {BRICK_BYTES - 1}, {BRICK_BYTES})
+                   FROM carray(?1)""",
+}
+CHUNK = 1 << 22
+COUNT = {
+    layout: f"""SELECT count(*) FROM carray(?1) AS low CROSS JOIN {layout}
+                 WHERE z_val BETWEEN low.value AND nth(?2, low.rowid)"""
+    for layout in LAYOUTS
+}
+
+
+class SQLiteStore:
+    """An environment in one SQLite file. Open with `open`, make with `create`."""
+
+    def __init__(self, connection: apsw.Connection, path: Path, *, read_only: bool) -> None:
+        self._connection = connection
+        self._cursor = connection.cursor()
+        self.path = path
+        self.url = str(path)
+        self.is_read_only = read_only
+        self._stamp = (
+            sqlite_file.stamp(path) if read_only and sqlite_file.needs_immutable(path) else None
+        )
+        self._depth = 0
+        self.grid, self.layout = self._read_environment()
+        self._shift = row_shift(self.layout)
+        connection.create_scalar_function("nth", cast("Any", _nth), 2, deterministic=True)
+        sqlite_force.register(connection, self.grid, self.layout)
+
+    @classmethod
+    def open(cls, path: str | Path, *, read_only: bool = False) -> "SQLiteStore":
+        """Open an existing environment."""
+        where = Path(path)
+        connection = sqlite_file.open_file(where, read_only=read_only)
+        try:
+            with sqlite_file.named_errors(str(where)):
+                return cls(connection, where, read_only=read_only)
+        except BaseException:
+            connection.close()
+            raise
+
+    @classmethod
+    def create(cls, path: str | Path, grid: Grid, layout: Layout = "brick") -> "SQLiteStore":
+        """Make a new environment with its grid; its file appears whole or not at all."""
+        row = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout)
+
+        def fill(connection: apsw.Connection) -> None:
+            connection.execute("INSERT INTO environment VALUES (1, ?, ?, ?, ?, ?, ?, ?)", row)
+
+        sqlite_file.create_file(Path(path), fill)
+        return cls.open(path)
+
+    def close(self) -> None:
+        """Close the connection; the last one folds the write-ahead log into the file."""
+        self._connection.close()
+
+    def discard(self) -> None:
+        """Close and delete an environment that nothing went into."""
+        self.close()
+        sqlite_file.remove_file(self.path)
+
+    # -- reading -----------------------------------------------------------------------------
+
+    def _fetch(self, sql: str, bindings: Sequence[Any] = ()) -> list[Any]:
+        """Run one statement to its end."""
+        try:
+            if self._stamp is not None:
+                self._check_unchanged()
+            return self._cursor.execute(sql, bindings).fetchall()
+        except apsw.Error:
+            with sqlite_file.named_errors(self.url):
+                raise
+
+    def _check_unchanged(self) -> None:
+        """Refuse to answer once somebody else has written: an immutable opening takes no locks."""
+        if sqlite_file.stamp(self.path) != self._stamp:
+            raise BusyError(f"{self.url} has been written since it was opened: open it again")
+
+    def _read_environment(self) -> tuple[Grid, Layout]:
+        rows = self._fetch(
+            "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout FROM environment"
+        )
+        if len(rows) != 1 or rows[0][6] not in LAYOUTS:
+            raise sqlite_file.damaged(self.url, "no grid")
+        size, x, y, z, bits, curve, layout = rows[0]
+        return Grid(size, (x, y, z), bits, cast("CurveName", curve)), layout
+
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All reads inside see one committed revision. May be nested."""
+        self._depth += 1
+        if self._depth == 1:
+            self._fetch("BEGIN")
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            if self._depth == 0:
+                self._fetch("COMMIT")
+
+    def version(self) -> int:
+        """SQLite's data version: changes when another connection's commit has been seen."""
+        return self._connection.data_version()
+
+    def revision(self) -> int:
+        """Number of the last committed write; 0 for an empty environment."""
+        return int(self._fetch("SELECT coalesce(max(revision), 0) FROM change")[0][0])
+
+    # -- the haptic query --------------------------------------------------------------------
+
+    def _rows(self, found: list[Any]) -> Rows:
+        if not found:
+            return NO_ROWS
+        if self._shift == 0:
+            pairs = np.array(found, dtype=np.int64)
+            return Rows(pairs[:, 0].copy(), pairs[:, 1].copy(), NO_OCCUPANCY)
+        keys, ids, bricks = zip(*found, strict=True)
+        joined = b"".join(bricks)
+        if len(joined) != BRICK_BYTES * len(keys):
+            raise sqlite_file.damaged(self.url, "a brick of the wrong length")
+        return Rows(
+            np.array(keys, dtype=np.int64),
+            np.array(ids, dtype=np.int64),
+            np.frombuffer(joined, dtype=np.uint8),
+        )
+
+    def lookup(self, keys: Keys) -> Rows:
+        """Rows of distinct ascending keys (U,), in one statement."""
+        if not keys.size:
+            return NO_ROWS
+        return self._rows(self._fetch(LOOKUP[self.layout], (apsw.carray(keys),)))
+
+    def lookup_each(self, keys: Keys) -> Rows:
+        """Rows of distinct ascending keys (U,), one statement a key."""
+        sql = LOOKUP_ONE[self.layout]
+        found: list[Any] = []
+        for key in keys.tolist():
+            found += self._fetch(sql, (key,))
+        return self._rows(found)
+
+    def scan(self, lows: Keys, highs: Keys) -> Rows:
+        """Rows with a key in any of the closed ranges, ascending and disjoint."""
+        if not lows.size:
+            return NO_ROWS
+        ends = apsw.pyobject(highs.tolist())
+        return self._rows(self._fetch(SCAN[self.layout], (apsw.carray(lows), ends)))
+
+    def count(self, lows: Keys, highs: Keys) -> int:
+        """How many rows `scan` would return, counted inside the engine."""
+        if not lows.size:
+            return 0
+        ends = apsw.pyobject(highs.tolist())
+        return int(self._fetch(COUNT[self.layout], (apsw.carray(lows), ends))[0][0])
+
+    # -- the paper's Figure 3 ----------------------------------------------------------------
+
+    def statement(self, frame: Frame) -> NDArray[np.float64]:
+        """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
+        found = self._fetch(*sqlite_force.wrench_statement(self.layout, frame))
+        return np.frombuffer(found[0][0], dtype=np.float64)
+
+    def statement_hits(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
+        found = self._fetch(*sqlite_force.hits_statement(self.layout, frame))
+        pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
+        return pairs[:, 0] - 1, pairs[:, 1].copy()
+
+    # -- objects -----------------------------------------------------------------------------
+
+    def objects(self) -> list[Object]:
+        """All objects, ordered by id."""
+        return [
+            Object(
+                id=row[0],
+                name=row[1],
+                link=row[2],
+                digest=row[3],
+                transform=np.frombuffer(row[4], dtype="<f8").reshape(4, 4),
+                voxels=row[5],
+                bounds=np.frombuffer(row[6], dtype="<f8").reshape(2, 3),
+                attributes=json.loads(row[7]),
+                revision=row[8],
+            )
+            for row in self._fetch(
+                "SELECT id, name, link, digest, transform, voxels, bounds, attributes, revision "
+                "FROM object ORDER BY id"
+            )
+        ]
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """One transaction that begins by taking the write lock."""
+        with sqlite_file.named_errors(self.url):
+            self._connection.execute("BEGIN IMMEDIATE")
+            try:
+                yield
+            except BaseException:
+                self._connection.execute("ROLLBACK")
+                raise
+            self._connection.execute("COMMIT")
+
+    def add(self, record: Object, rows: Rows) -> int:
+        """Write an object and its rows in one transaction; returns its id."""
+        with self._writing():
+            revision = self.revision() + 1
+            try:
+                self._connection.execute(
+                    "INSERT INTO object (name, link, digest, transform, voxels, bounds, attributes,"
+                    " revision) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                    (record.name, record.link, *_contents(record), revision),
+                )
+            except apsw.ConstraintError as error:
+                raise EnvironmentExistsError(
+                    f"{record.name} of {record.link} is in {self.url} already; remove it first"
+                ) from error
+            object_id = self._connection.last_insert_rowid()
+            self._insert(rows, object_id)
+            self._log(revision, "add", object_id, rows.keys)
+        return object_id
+
+    def replace(self, record: Object, rows: Rows, old: Iterable[tuple[int, int]]) -> None:
+        """Exchange an object's rows, found in the key ranges `old`, in one transaction."""
+        with self._writing():
+            revision = self.revision() + 1
+            gone = self._delete(record.id, old)
+            self._connection.execute(
+                "UPDATE object SET digest = ?, transform = ?, voxels = ?, bounds = ?,"
+                " attributes = ?, revision = ? WHERE id = ?",
+                (*_contents(record), revision, record.id),
+            )
+            if not self._connection.changes():
+                raise ObjectNotFoundError(f"no object {record.id} in {self.url}: see its objects")
+            self._insert(rows, record.id)
+            self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
+
+    def remove(self, object_id: int, old: Iterable[tuple[int, int]]) -> None:
+        """Remove an object and its rows, found in the key ranges `old`, in one transaction."""
+        with self._writing():
+            revision = self.revision() + 1
+            self._connection.execute("DELETE FROM object WHERE id = ?", (object_id,))
+            if not self._connection.changes():
+                raise ObjectNotFoundError(f"no object {object_id} in {self.url}: see its objects")
+            gone = self._delete(object_id, old)
+            self._log(revision, "remove", object_id, gone)
+
+    def _insert(self, rows: Rows, object_id: int) -> None:
+        """Insert a batch of rows, ascending by key: one statement for up to CHUNK of them."""
+        for at in range(0, len(rows), CHUNK):
+            keys = apsw.carray(rows.keys[at : at + CHUNK])
+            if self._shift == 0:
+                self._connection.execute(INSERT["voxel"], (keys, object_id))
+            else:
+                part = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + CHUNK)]
+                self._connection.execute(INSERT["brick"], (keys, object_id, part.tobytes()))
+
+    def _delete(self, object_id: int, old: Iterable[tuple[int, int]]) -> Keys:
+        """Delete an object's rows inside key ranges; returns their keys."""
+        sql = f"DELETE FROM {self.layout} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
+        gone: list[int] = []
+        for low, high in old:
+            gone += [row[0] for row in self._connection.execute(sql, (low, high, object_id))]
+        return np.array(gone, dtype=np.int64)
+
+    def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
+        """Record which keys a write touched, rounded to cells (to slabs in lexicographic order)."""
+        shift = 15 if self.grid.is_hierarchical else 2 * self.grid.bits
+        cubes = np.unique(row_keys >> (shift - self._shift))
+        starts = np.flatnonzero(np.diff(cubes, prepend=-2) > 1)
+        ends = np.append(starts[1:], len(cubes)) - 1
+        ranges = np.stack([cubes[starts] << shift, ((cubes[ends] + 1) << shift) - 1], axis=1)
+        self._connection.execute(
+            "INSERT INTO change VALUES (?, ?, ?, ?)",
+            (revision, action, object_id, ranges.astype("<i8").tobytes()),
+        )
+
+    def changes(self, since: int = 0) -> Iterator[Change]:
+        """Committed writes after that revision, oldest first."""
+        for revision, action, object_id, ranges in self._fetch(
+            "SELECT revision, action, id, ranges FROM change WHERE revision > ? ORDER BY revision",
+            (since,),
+        ):
+            pairs = np.frombuffer(ranges, dtype="<i8").reshape(-1, 2)
+            yield Change(revision, action, object_id, pairs.astype(np.int64))
+
+    # -- statistics --------------------------------------------------------------------------
+
+    def size(self) -> Size:
+        """Rows, bytes of the file and its write-ahead log, leaf blocks of the index table."""
+        with self.snapshot():
+            rows = self._fetch(f"SELECT count(*) FROM {self.layout}")[0][0]
+            blocks = self._fetch(
+                "SELECT pageno FROM dbstat WHERE name = ?1 AND aggregate = TRUE", (self.layout,)
+            )
+        wal = Path(f"{self.path}-wal")
+        total = self.path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
+        return Size(int(rows), total, int(blocks[0][0]) if blocks else 1)
+
+    def quantiles(self, resolution: int) -> tuple[Keys, int]:
+        """Bounds (R + 1,) of the equi-count histogram of all row keys, and the rows behind it.
+
+        The kept vector while no object was written since, else a scan of the whole index.
+        """
+        with self.snapshot():
+            kept = self._fetch(
+                "SELECT bounds, n_rows FROM quantile WHERE resolution = ?"
+                " AND revision = (SELECT coalesce(max(revision), 0) FROM change)",
+                (resolution,),
+            )
+            if kept:
+                return np.frombuffer(kept[0][0], dtype="<i8").astype(np.int64), int(kept[0][1])
+            return exact_quantiles(self._connection, self.layout, resolution)
+
+    def analyze(self, resolution: int) -> None:
+        """Compute and keep the quantile vector of that resolution."""
+        bounds, n_rows = self.quantiles(resolution)
+        with self._writing():
+            # another process may have written since: then the vector carries the older revision's
+            # rows under the newer number, off by that one write, as statistics are allowed to be
+            self._connection.execute(
+                "INSERT OR REPLACE INTO quantile"
+                " SELECT ?, coalesce(max(revision), 0), ?, ? FROM change",
+                (resolution, n_rows, bounds.astype("<i8").tobytes()),
+            )
+
+    def costs(self, machine: str) -> Mapping[str, float] | None:
+        """Figures that `save_costs` kept for that machine."""
+        kept = self._fetch("SELECT figures FROM cost WHERE machine = ?", (machine,))
+        return cast("Mapping[str, float]", json.loads(kept[0][0])) if kept else None
+
+    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
+        """Keep the fitted cost figures of a machine."""
+        with self._writing():
+            self._connection.execute(
+                "INSERT OR REPLACE INTO cost VALUES (?, ?)", (machine, json.dumps(dict(figures)))
+            )
+
+
+def _nth(values: list[int], ordinal: int) -> int:
+    """Value of a bound list by ordinal, from 1: the other end of a range."""
+    return values[ordinal - 1]
+
+
+def _contents(record: Object) -> tuple[Any, ...]:
+    """Bindings of an object's columns from digest to attributes."""
+    return (
+        record.digest,
+        np.ascontiguousarray(record.transform, dtype="<f8").tobytes(),
+        int(record.voxels),
+        np.ascontiguousarray(record.bounds, dtype="<f8").tobytes(),
+        json.dumps(dict(record.attributes), sort_keys=True),
+    )

@@ -1,0 +1,235 @@
+"""Opening and creating SQLite files: what is told apart, and how an engine's error is named."""
+
+import contextlib
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import cast
+
+import apsw
+
+from hapticdb.errors import (
+    BusyError,
+    DamagedError,
+    DatabaseError,
+    EnvironmentExistsError,
+    EnvironmentNotFoundError,
+    NewerVersionError,
+    NotAnEnvironmentError,
+    ReadOnlyError,
+)
+from hapticdb.store.schema import FORMAT_VERSION, MIGRATIONS, SQLITE_APPLICATION_ID
+
+BUSY_TIMEOUT_MS = 10_000
+CACHE_KIB = 256 * 1024
+"""Page cache of one connection: the bricks of a large car; memory is taken as it is filled."""
+HEADER_BYTES = 100
+MAGIC = b"SQLite format 3\0"
+
+
+@contextlib.contextmanager
+def named_errors(path: str) -> Iterator[None]:
+    """Turn the engine's errors into ours: what, where, what next."""
+    try:
+        yield
+    except (apsw.CorruptError, apsw.NotADBError, apsw.FormatError) as error:
+        raise damaged(path, str(error)) from error
+    except (apsw.ReadOnlyError, apsw.PermissionsError) as error:
+        raise ReadOnlyError(
+            f"{path} can only be read: open a copy that you may write to ({error})"
+        ) from error
+    except (apsw.BusyError, apsw.LockedError) as error:
+        raise BusyError(f"{path} is being written by another process: try again later") from error
+    except apsw.FullError as error:
+        raise DatabaseError(f"{path}: the disk is full; what was committed is safe") from error
+    except apsw.IOError as error:
+        raise DatabaseError(f"{path}: the disk does not answer ({error})") from error
+    except apsw.CantOpenError as error:
+        raise DatabaseError(f"{path} cannot be opened: check its folder's rights") from error
+    except apsw.SQLError as error:
+        if str(error).startswith(("no such table", "no such column")):
+            raise damaged(path, str(error)) from error
+        raise
+
+
+def damaged(path: str, cause: str) -> DamagedError:
+    """Build the error for an environment whose contents are broken."""
+    return DamagedError(f"{path} is damaged ({cause}): restore a copy or import the files again")
+
+
+def check_kind(path: Path) -> None:
+    """Tell an environment from a missing file, a folder, a file of another kind, a cut one.
+
+    Looks at the header's first 100 bytes (https://sqlite.org/fileformat2.html, section 1.3):
+    before the engine opens it, so that a foreign file is never touched.
+    """
+    if not path.exists():
+        raise EnvironmentNotFoundError(
+            f"no environment at {path}; make one with 'hapticdb import {path} FILE'"
+        )
+    if not path.is_file():
+        raise NotAnEnvironmentError(f"{path} is not a file, so it is no environment")
+    try:
+        with path.open("rb") as file:
+            header = file.read(HEADER_BYTES)
+    except OSError as error:
+        raise DatabaseError(f"{path} cannot be read: {error.strerror}") from error
+    foreign = NotAnEnvironmentError(f"{path} is no hapticdb environment; give another path")
+    if not header:
+        raise NotAnEnvironmentError(f"{path} is empty; remove it, or give another path")
+    if header[:16] != MAGIC[: len(header[:16])]:
+        raise foreign
+    if len(header) < HEADER_BYTES:
+        raise damaged(str(path), "its header is cut off")
+    wal = Path(f"{path}-wal")
+    if wal.exists() and wal.stat().st_size:
+        return  # the header may be older than the log: the engine decides
+    if int.from_bytes(header[68:72], "big") != SQLITE_APPLICATION_ID:
+        raise foreign
+    page = int.from_bytes(header[16:18], "big")
+    expected = int.from_bytes(header[28:32], "big") * (65536 if page == 1 else page)
+    if path.stat().st_size < expected:
+        raise damaged(str(path), f"{path.stat().st_size} bytes of {expected}")
+
+
+def open_file(path: Path, *, read_only: bool) -> apsw.Connection:
+    """Open an existing environment; migrate it when it is older and may be written."""
+    check_kind(path)
+    with named_errors(str(path)):
+        connection = _connect_to_read(path) if read_only else _connect_to_write(path)
+    try:
+        _check_version(connection, path, read_only=read_only)
+    except BaseException:
+        connection.close()
+        raise
+    return connection
+
+
+def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
+    """Make an environment of the newest format; `fill` writes what belongs into it from the start.
+
+    The file appears at its path whole or not at all: it is made under another name beside it.
+    """
+    if path.exists():
+        raise EnvironmentExistsError(f"{path} exists already; open it, or give another path")
+    if not path.parent.is_dir():
+        raise EnvironmentNotFoundError(f"folder {path.parent} does not exist; make it first")
+    if not os.access(path.parent, os.W_OK):
+        raise ReadOnlyError(f"folder {path.parent} cannot be written to; give another path")
+    _sweep_unfinished(path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        with named_errors(str(path)), contextlib.closing(apsw.Connection(str(unfinished))) as new:
+            new.execute("PRAGMA journal_mode = OFF").fetchall()
+            migrate(new, 0)
+            fill(new)
+            new.execute("PRAGMA journal_mode = WAL").fetchall()
+        try:
+            os.link(unfinished, path)  # unlike a renaming, it never replaces another's file
+        except FileExistsError as error:
+            raise EnvironmentExistsError(f"{path} exists already; open it") from error
+        except OSError:
+            unfinished.rename(path)  # a file system without hard links
+    finally:
+        for suffix in ("", "-wal", "-shm", "-journal"):
+            Path(f"{unfinished}{suffix}").unlink(missing_ok=True)
+
+
+def remove_file(path: Path) -> None:
+    """Delete a database and what the engine keeps beside it."""
+    for suffix in ("", "-wal", "-shm"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
+
+
+def _sweep_unfinished(path: Path) -> None:
+    """Remove what a process that was killed while making this file left behind."""
+    for left in path.parent.glob(f".{path.name}.*.new"):
+        pid = left.name.split(".")[-2]
+        if pid.isdigit() and not Path(f"/proc/{pid}").exists():
+            left.unlink(missing_ok=True)
+
+
+def migrate(connection: apsw.Connection, version: int) -> None:
+    """Run the migrations after `version`, each in one transaction with the number it leads to."""
+    for number, migration in enumerate(MIGRATIONS[version:], start=version + 1):
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            if _pragma(connection, "user_version") < number:  # another process may have been faster
+                for statement in migration.sqlite:
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA application_id = {SQLITE_APPLICATION_ID}")
+                connection.execute(f"PRAGMA user_version = {number}")
+            connection.execute("COMMIT")
+        except BaseException:
+            connection.execute("ROLLBACK")
+            raise
+
+
+def stamp(path: Path) -> tuple[int, int, bool]:
+    """What changes when somebody writes a file that was opened as immutable."""
+    status = path.stat()
+    return status.st_mtime_ns, status.st_size, Path(f"{path}-wal").exists()
+
+
+def needs_immutable(path: Path) -> bool:
+    """Whether only an immutable opening can read this file: nobody here can write its folder.
+
+    A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, and no log is
+    there whose pages would be missed, SQLite can still read the file alone.
+    """
+    return not os.access(path.parent, os.W_OK) and not any(
+        Path(f"{path}{suffix}").exists() for suffix in ("-wal", "-shm")
+    )
+
+
+def _connect_to_read(path: Path) -> apsw.Connection:
+    options = "?immutable=1" if needs_immutable(path) else "?mode=ro"
+    connection = apsw.Connection(
+        path.resolve().as_uri() + options, flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+    )
+    _settle(connection)
+    return connection
+
+
+def _connect_to_write(path: Path) -> apsw.Connection:
+    if not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
+        raise ReadOnlyError(f"{path} can only be read: open a copy that you may write to")
+    connection = apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READWRITE)
+    _settle(connection)
+    return connection
+
+
+def _pragma(connection: apsw.Connection, name: str) -> int:
+    return int(cast("int", connection.execute(f"PRAGMA {name}").fetchall()[0][0]))
+
+
+def _settle(connection: apsw.Connection) -> None:
+    connection.set_busy_timeout(BUSY_TIMEOUT_MS)
+    connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
+    # in WAL mode NORMAL survives the death of the process; only a power cut can lose the last
+    # commits, and leaves the database valid even then
+    connection.execute("PRAGMA synchronous = NORMAL")
+    # a blob is never taken for text, nor a string in double quotes for a literal
+    connection.config(apsw.SQLITE_DBCONFIG_DQS_DML, 0)
+    connection.config(apsw.SQLITE_DBCONFIG_DQS_DDL, 0)
+
+
+def _check_version(connection: apsw.Connection, path: Path, *, read_only: bool) -> None:
+    with named_errors(str(path)):
+        version = _pragma(connection, "user_version")
+        if _pragma(connection, "application_id") != SQLITE_APPLICATION_ID:
+            raise NotAnEnvironmentError(f"{path} is no hapticdb environment; give another path")
+        if version > FORMAT_VERSION:
+            raise NewerVersionError(
+                f"{path} has format {version}, newer than the {FORMAT_VERSION} known here: "
+                "install a newer hapticdb"
+            )
+        if version < 1:
+            raise damaged(str(path), f"format {version}")
+        if version < FORMAT_VERSION:
+            if read_only:
+                raise ReadOnlyError(
+                    f"{path} has the older format {version}: open it once to write, "
+                    "and it is brought up to date"
+                )
+            migrate(connection, version)

@@ -1,0 +1,39 @@
+"""What every test shares: the folder of real CAD, a few shells, and the header."""
+
+import os
+from pathlib import Path
+
+import apsw
+import numba
+import numpy as np
+import pytest
+
+from hapticdb import PointShell
+from hapticdb.statistics import _fibonacci_sphere
+
+
+def real_folder() -> Path | None:
+    """Folder of real CAD files, from the environment variable HAPTICDB_TEST_DATA."""
+    named = os.environ.get("HAPTICDB_TEST_DATA")
+    return Path(named).resolve() if named else None
+
+
+def pytest_report_header() -> list[str]:
+    folder = real_folder()
+    if folder is not None and not (folder / "SOURCES.md").is_file():
+        pytest.exit(f"HAPTICDB_TEST_DATA={folder} holds no SOURCES.md: give the right folder")
+    where = f"real CAD from {folder}" if folder else "the sample stands in for real CAD"
+    jit = "off" if numba.config.DISABLE_JIT else "on"
+    return [f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, JIT {jit}"]
+
+
+@pytest.fixture(scope="session")
+def test_data() -> Path | None:
+    return real_folder()
+
+
+@pytest.fixture(scope="session")
+def sphere() -> PointShell:
+    """300 points on a sphere of 12 mm about the tool's origin, normals inward."""
+    out = _fibonacci_sphere(300)
+    return PointShell(points=out * 0.012, normals=-out, center=np.zeros(3), is_closed=True)

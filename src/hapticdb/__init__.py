@@ -1,0 +1,69 @@
+"""Feel a virtual environment too large for memory: haptic queries on an SQL database.
+
+>>> import hapticdb
+>>> env = hapticdb.open("car.db")                             # doctest: +SKIP
+>>> shell = hapticdb.PointShell.from_file("wrench.stl")       # doctest: +SKIP
+>>> env.touch(shell, pose).force                              # doctest: +SKIP
+"""
+
+from hapticdb.environment import Environment, Touch, create, open  # noqa: A004 - as in tarfile.open
+from hapticdb.errors import (
+    BusyError,
+    DamagedError,
+    DatabaseError,
+    EnvironmentExistsError,
+    EnvironmentNotFoundError,
+    FileError,
+    GeometryChangedError,
+    GridError,
+    HapticDBError,
+    MissingExtraError,
+    NewerVersionError,
+    NotAnEnvironmentError,
+    ObjectNotFoundError,
+    OutsideGridError,
+    ReadOnlyError,
+    UsageError,
+)
+from hapticdb.force import TangentPlane
+from hapticdb.grid import Grid, GridOptions
+from hapticdb.ingest import FileReport, ImportOptions, import_files
+from hapticdb.pointshell import PointShell
+from hapticdb.query import Query
+from hapticdb.statistics import CostModel, QuantileVector
+from hapticdb.store.base import Object
+
+__all__ = [
+    "BusyError",
+    "CostModel",
+    "DamagedError",
+    "DatabaseError",
+    "Environment",
+    "EnvironmentExistsError",
+    "EnvironmentNotFoundError",
+    "FileError",
+    "FileReport",
+    "GeometryChangedError",
+    "Grid",
+    "GridError",
+    "GridOptions",
+    "HapticDBError",
+    "ImportOptions",
+    "MissingExtraError",
+    "NewerVersionError",
+    "NotAnEnvironmentError",
+    "Object",
+    "ObjectNotFoundError",
+    "OutsideGridError",
+    "PointShell",
+    "QuantileVector",
+    "Query",
+    "ReadOnlyError",
+    "TangentPlane",
+    "Touch",
+    "UsageError",
+    "create",
+    "import_files",
+    "open",
+]
+__version__ = "0.1.0"

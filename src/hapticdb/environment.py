@@ -1,0 +1,435 @@
+"""Environment: an opened database."""
+
+import os
+from collections.abc import Iterable, Mapping
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import (
+    FileError,
+    GeometryChangedError,
+    ObjectNotFoundError,
+    ReadOnlyError,
+    UsageError,
+)
+from hapticdb.force import TangentPlane
+from hapticdb.grid import Grid
+from hapticdb.grouping import DEFAULT_MAXGAP, Ranges, box_ranges
+from hapticdb.ingest import (
+    FileReport,
+    ImportOptions,
+    ProgressCallback,
+    check_placed_inside,
+    ingest_file,
+    rows_of_part,
+)
+from hapticdb.kernels import curves
+from hapticdb.kernels.voxelize import brick_voxels
+from hapticdb.mesh import Part, read_file
+from hapticdb.pointshell import PointShell
+from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Query, Strategy, as_ids
+from hapticdb.statistics import (
+    DEFAULT_RESOLUTION,
+    CostModel,
+    QuantileVector,
+    calibrate,
+    machine_name,
+)
+from hapticdb.store.base import Keys, Layout, Object, Size, Store
+from hapticdb.store.connect import create_store, open_store
+
+
+class Touch:
+    """What a tool felt in one frame.
+
+    Attributes
+    ----------
+    force : (3,) float64
+        N, world frame, on the tool.
+    torque : (3,) float64
+        N m about the tool's centre of mass, world frame.
+    hits : (H,) int64
+        Indices of the shell's points inside a voxel, ascending.
+    depths : (H,) float64
+        Metres below each hit's tangent plane; 0 above it.
+    query : Query
+        How the database was asked.
+    """
+
+    __slots__ = ("_answer", "_known", "depths", "force", "hits", "query", "torque")
+
+    def __init__(self, answer: Answer, known: Mapping[int, Object]) -> None:
+        self._answer = answer
+        self._known = known
+        self.force: NDArray[np.float64] = answer.wrench[:3]
+        self.torque: NDArray[np.float64] = answer.wrench[3:]
+        self.hits: NDArray[np.int64] = answer.hits
+        self.depths: NDArray[np.float64] = answer.depths
+        self.query: Query = answer.query
+
+    @property
+    def contacts(self) -> NDArray[np.int64]:
+        """Indices (C,) of the shell's points whose depth is above 0, ascending."""
+        return self.hits[self.depths > 0]
+
+    @property
+    def objects(self) -> list[Object]:
+        """Objects of all hits, ordered by id."""
+        return [self._known[i] for i in self._answer.ids]
+
+    @property
+    def pairs(self) -> NDArray[np.int64]:
+        """Every hit with every object in its voxel, (P, 2): index of the point, id."""
+        return self._answer.pairs()
+
+    def __repr__(self) -> str:
+        x, y, z = self.force
+        return (
+            f"Touch(force=({x:.4g}, {y:.4g}, {z:.4g}) N, {len(self.hits)} hits, "
+            f"{len(self.contacts)} contacts, objects {list(self._answer.ids)})"
+        )
+
+
+class Environment:
+    """A static scene in one database, opened. Belongs to one thread at a time.
+
+    Use `hapticdb.open` and `hapticdb.create`; also as a context manager, which closes it.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._query = HapticQuery(store, self._statistics)
+        self._fitted: tuple[QuantileVector, CostModel] | None = None
+        self._known: dict[int, Object] = {}
+        self._known_at: int | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Give the database back."""
+        self._store.close()
+
+    @property
+    def url(self) -> str:
+        """Where the environment is."""
+        return self._store.url
+
+    @property
+    def grid(self) -> Grid:
+        """Metres <-> voxels <-> keys."""
+        return self._store.grid
+
+    @property
+    def layout(self) -> Layout:
+        """``voxel`` or ``brick``: which index table it has."""
+        return self._store.layout
+
+    @property
+    def store(self) -> Store:
+        """The engine below: for tools that ask it directly, such as benchmarks."""
+        return self._store
+
+    def size(self) -> Size:
+        """Rows, bytes and leaf blocks of the database."""
+        return self._store.size()
+
+    # -- objects -----------------------------------------------------------------------------
+
+    def objects(self) -> list[Object]:
+        """All objects, ordered by id."""
+        return self._store.objects()
+
+    def object(self, object_id: int) -> Object:
+        """One object.
+
+        Raises
+        ------
+        ObjectNotFoundError
+            When there is none of that id.
+        """
+        for obj in self._store.objects():
+            if obj.id == object_id:
+                return obj
+        raise ObjectNotFoundError(
+            f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
+        )
+
+    def add(
+        self,
+        file: str | os.PathLike[str],
+        *,
+        unit: str | None = None,
+        jobs: int | None = None,
+        progress: ProgressCallback | None = None,
+    ) -> FileReport:
+        """Import a file's parts on this environment's grid, each in a transaction of its own.
+
+        Parameters
+        ----------
+        file : path
+            Mesh, CAD or point-cloud file; see `hapticdb.mesh.read_file`.
+        unit : {"mm", "cm", "m", "in"} or None
+            Of a file that carries none; metres unless given.
+        jobs : int or None
+            Threads that voxelize; one a processor unless given.
+        progress : callable or None
+            Called after each part with a `hapticdb.ingest.Progress`.
+
+        Raises
+        ------
+        FileError
+            When the file cannot be used, or a part lies outside the grid: nothing is written then.
+        """
+        self._check_writable()
+        options = ImportOptions(unit=unit, jobs=jobs, layout=self.layout)
+        report = ingest_file(self._store, read_file(file, unit=unit), options, progress)
+        if report.added:
+            self._store.analyze(DEFAULT_RESOLUTION)
+            self._forget()
+        return report
+
+    def remove(self, object_id: int) -> None:
+        """Remove an object and its rows, in one transaction."""
+        self._check_writable()
+        old = self._ranges_of(self.object(object_id))
+        self._store.remove(object_id, _pairs(old))
+        self._forget()
+
+    def move(self, object_id: int, transform: ArrayLike) -> Object:
+        """Place an object anew, in one transaction; its geometry is read from its file again.
+
+        Parameters
+        ----------
+        object_id : int
+            Which object.
+        transform : (4, 4) array
+            world_from_part, metres; replaces the present one.
+
+        Raises
+        ------
+        GeometryChangedError
+            When the object's file is gone or holds another geometry.
+        OutsideGridError
+            When it would leave the grid.
+        """
+        self._check_writable()
+        placed = _as_transform(transform)
+        old = self.object(object_id)
+        part = _part_of(old)
+        bounds = check_placed_inside(part, old.link, self.grid, placed)
+        rows, n_voxels = rows_of_part(part, self.grid, self.layout, placed)
+        new = Object(
+            id=old.id,
+            name=old.name,
+            link=old.link,
+            digest=old.digest,
+            transform=placed,
+            voxels=n_voxels,
+            bounds=bounds,
+            attributes=old.attributes,
+        )
+        self._store.replace(new, rows, _pairs(self._ranges_of(old)))
+        self._forget()
+        return self.object(object_id)
+
+    def voxels(self, object_id: int) -> NDArray[np.int64]:
+        """Voxels (n, 3) that an object's surface touches, in the order of their keys."""
+        with self._store.snapshot():
+            rows = self._store.scan(*self._ranges_of(self.object(object_id)))
+        mine = rows.ids == object_id
+        keys = rows.keys[mine]
+        if self.layout == "voxel":
+            return self.grid.decode(keys)
+        bits = max(self.grid.bits - 3, 0)
+        bricks = curves.encode(
+            curves.decode(keys, bits, self.grid.curve_code), bits, curves.Z_ORDER
+        )
+        ijk = brick_voxels(bricks, rows.occupancy.reshape(-1, 64)[mine])
+        return ijk[np.argsort(self.grid.encode(ijk))]
+
+    # -- the haptic query --------------------------------------------------------------------
+
+    def touch(
+        self,
+        shell: PointShell,
+        pose: ArrayLike,
+        strategy: Strategy = "auto",
+        *,
+        exclude: Iterable[int] = (),
+        maxgap: int = DEFAULT_MAXGAP,
+        law: TangentPlane | None = None,
+    ) -> Touch:
+        """Force and torque that the environment exerts on the tool at one pose.
+
+        Parameters
+        ----------
+        shell : PointShell
+            Points in metres and inward unit normals, tool frame.
+        pose : (4, 4) array
+            world_from_tool, rigid, metres.
+        strategy : str
+            How the database is asked: ``statement``, ``array``, ``points``, ``maxgap``,
+            ``cbgroup``, or ``auto``, what the cost model expects to be fastest for this frame.
+            All find the same hits, ids and wrench, bit for bit.
+        exclude : iterable of int
+            Ids of objects that are not felt: a part taken out must not hit itself.
+        maxgap : int
+            Of the strategy ``maxgap``: neighbours at most so many voxel keys apart share a range.
+        law : TangentPlane or None
+            The force law; 1000 N/m unless given.
+
+        Raises
+        ------
+        UsageError
+            When the pose is not rigid or the strategy unknown.
+        ObjectNotFoundError
+            When an excluded object does not exist.
+
+        Notes
+        -----
+        Points outside the grid miss. All statements of a touch read one committed revision.
+        """
+        ids = as_ids(exclude) if exclude else NOTHING_EXCLUDED
+        force_law = law or _DEFAULT_LAW
+        answer = self._query.run(shell, pose, strategy, maxgap, ids, force_law)
+        if self._store.version() != self._known_at:
+            with self._store.snapshot():
+                self._known = {obj.id: obj for obj in self._store.objects()}
+                answer = self._query.run(shell, pose, strategy, maxgap, ids, force_law)
+                self._known_at = self._store.version()
+        if ids.size:
+            self._check_known(ids)
+        return Touch(answer, self._known)
+
+    def _check_known(self, ids: Keys) -> None:
+        for i in ids.tolist():
+            if i not in self._known:
+                raise ObjectNotFoundError(
+                    f"no object {i} in {self.url} to exclude; 'hapticdb objects {self.url}' "
+                    "lists them"
+                )
+
+    # -- statistics --------------------------------------------------------------------------
+
+    def quantiles(self, resolution: int = DEFAULT_RESOLUTION) -> QuantileVector:
+        """Quantile vector of the index's keys (the paper's Definition 2)."""
+        return QuantileVector.of(self._store, resolution)
+
+    def calibrate(self, *, seed: int = 0, keep: bool = True) -> CostModel:
+        """Measure what queries cost here; used from now on, and kept for this machine.
+
+        Parameters
+        ----------
+        seed : int
+            Of the places that are measured.
+        keep : bool
+            Write the figures into the database, when it can be written.
+        """
+        costs = calibrate(self._store, seed=seed)
+        if keep and not self._store.is_read_only:
+            self._store.save_costs(machine_name(), costs.figures())
+        self._fitted = (self.quantiles(), costs)
+        return costs
+
+    def _statistics(self) -> tuple[QuantileVector, CostModel]:
+        """What grouping by cost needs, fitted when first asked for: under a second."""
+        if self._fitted is None:
+            quantiles = self.quantiles()
+            kept = self._store.costs(machine_name())
+            if not quantiles.n_rows:
+                costs = CostModel.of_equal_parts()
+            elif kept is not None:
+                costs = CostModel.from_figures(kept)
+            else:
+                costs = calibrate(self._store)
+            self._fitted = (quantiles, costs)
+        return self._fitted
+
+    def _forget(self) -> None:
+        """Drop what an edit of our own has made stale."""
+        self._fitted = None
+        self._known_at = None
+
+    def _check_writable(self) -> None:
+        if self._store.is_read_only:
+            raise ReadOnlyError(f"{self.url} was opened to read: open it without read_only")
+
+    def _ranges_of(self, obj: Object) -> Ranges:
+        """Key ranges that cover an object's bounding box, a voxel wider on each side."""
+        low, high = self.grid.voxels_of(obj.bounds)
+        return box_ranges(self.grid, self.layout, low - 1, high + 1)
+
+
+_DEFAULT_LAW = TangentPlane()
+
+
+def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment:  # noqa: A001 - the word users expect, as in tarfile.open
+    """Open an environment.
+
+    Parameters
+    ----------
+    url : str or path
+        A path, or ``sqlite:///path``.
+    read_only : bool
+        Refuse every write; works on files and folders that cannot be written.
+
+    Raises
+    ------
+    EnvironmentNotFoundError, NotAnEnvironmentError, NewerVersionError, DamagedError
+        When there is none, or something else, or one that cannot be read.
+    """
+    return Environment(open_store(url, read_only=read_only))
+
+
+def create(url: str | os.PathLike[str], grid: Grid, *, layout: Layout = "brick") -> Environment:
+    """Make an environment with that grid and open it.
+
+    Raises
+    ------
+    EnvironmentExistsError
+        When something is there already.
+    UsageError
+        When bricks are asked for in lexicographic order.
+    """
+    return Environment(create_store(url, grid, layout))
+
+
+def _pairs(ranges: Ranges) -> Iterable[tuple[int, int]]:
+    return zip(ranges.lows.tolist(), ranges.highs.tolist(), strict=True)
+
+
+def _as_transform(transform: ArrayLike) -> NDArray[np.float64]:
+    placed = np.array(transform, dtype=np.float64)
+    if placed.shape != (4, 4) or not np.isfinite(placed).all() or (placed[3] != (0, 0, 0, 1)).any():
+        raise UsageError("a transform that is no placement: give a finite 4 x 4 matrix in metres")
+    return placed
+
+
+def _part_of(obj: Object) -> Part:
+    """Geometry of an object, from its file, checked to be the one that was imported."""
+    unit = obj.attributes.get("unit")
+    try:
+        parts = read_file(obj.link, unit=unit if isinstance(unit, str) else None).parts
+    except FileError as error:
+        raise GeometryChangedError(
+            f"object {obj.id} ({obj.name}) cannot be moved, its file cannot be read: {error}"
+        ) from error
+    for part in parts:
+        if part.name == obj.name and part.digest == obj.digest:
+            return part
+    raise GeometryChangedError(
+        f"object {obj.id} ({obj.name}) cannot be moved: {obj.link} no longer holds the geometry "
+        "that was imported; restore the file, or remove the object and import it again"
+    )

@@ -1,0 +1,33 @@
+"""Hits -> wrench: the force law (the paper, section 3).
+
+The arithmetic runs in `hapticdb.kernels.contact`, fused with the refinement of a frame's rows, and
+once more inside the engine for the strategy `statement`; both share the same leaves.
+"""
+
+import math
+from dataclasses import dataclass
+
+from hapticdb.errors import UsageError
+
+
+@dataclass(frozen=True)
+class TangentPlane:
+    """Tangent-plane law of VPS (McNeely, Puterbaugh and Troy, SIGGRAPH 1999).
+
+    Through the centre c of the voxel that holds the shell point p goes a plane with the point's
+    inward normal n: d = max(0, (c - p) . n), F = K d n, tau = (p - x_cm) x F. With N >= 10 hits
+    force and torque are divided by N / 10. The force jumps where a point crosses a voxel's border:
+    a property of the law.
+
+    Attributes
+    ----------
+    stiffness : float
+        K, N/m.
+    """
+
+    stiffness: float = 1000.0
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.stiffness) and self.stiffness >= 0):
+            raise UsageError(f"stiffness {self.stiffness} N/m: give a finite number, 0 or more")
+        object.__setattr__(self, "stiffness", float(self.stiffness))

@@ -1,0 +1,334 @@
+"""Parts -> voxels -> rows: parallel over parts, one transaction an object, in the file's order.
+
+Threads suffice: the voxelizer and the engine both run without the interpreter lock. Objects are
+written in the order of the files and of their parts, whatever the number of jobs, so that an
+interrupted import that is run again ends with the same rows and ids as an undisturbed one.
+"""
+
+import contextlib
+import os
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import (
+    FileError,
+    GeometryChangedError,
+    HapticDBError,
+    MissingExtraError,
+    OutsideGridError,
+    UsageError,
+)
+from hapticdb.grid import BRICK_BITS, CurveName, Grid, GridOptions
+from hapticdb.kernels import curves, voxelize
+from hapticdb.mesh import Defects, MeshFile, Part, read_file
+from hapticdb.statistics import DEFAULT_RESOLUTION
+from hapticdb.store.base import Layout, Object, Rows, Store
+from hapticdb.store.connect import check_curve, create_store, exists, open_store
+
+NO_OCCUPANCY = np.empty(0, dtype=np.uint8)
+AT_BORDER = 1e-6
+"""Voxels by which rounding may carry a part across the grid's border without an error."""
+
+
+class Progress(NamedTuple):
+    """How far an import is: sent after each part."""
+
+    link: str
+    parts_done: int
+    parts_total: int
+    voxels: int
+
+
+ProgressCallback = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class FileReport:
+    """What became of one file.
+
+    Attributes
+    ----------
+    link : str
+        The file.
+    status : {"imported", "complete", "failed"}
+        Something was written; everything was there already; nothing was, see `error`.
+    added : tuple of Object
+        Objects written now, in the file's order.
+    present : int
+        Objects that were there already.
+    defects : Defects
+        What was wrong in the file.
+    error : HapticDBError or None
+        Why the file was skipped.
+    """
+
+    link: str
+    status: Literal["imported", "complete", "failed"]
+    added: tuple[Object, ...] = ()
+    present: int = 0
+    defects: Defects = field(default_factory=Defects)
+    error: HapticDBError | None = None
+
+
+@dataclass(frozen=True)
+class ImportOptions:
+    """How files are read and voxelized.
+
+    Attributes
+    ----------
+    unit : {"mm", "cm", "m", "in"} or None
+        Of files that carry none; metres unless given.
+    grid : GridOptions
+        For a new environment; must agree with an existing one.
+    layout : {"voxel", "brick"} or None
+        For a new environment (bricks unless given); must agree with an existing one.
+    jobs : int or None
+        Threads that voxelize; one a processor unless given.
+    """
+
+    unit: str | None = None
+    grid: GridOptions = field(default_factory=GridOptions)
+    layout: Layout | None = None
+    jobs: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.jobs is not None and self.jobs < 1:
+            raise UsageError(f"{self.jobs} jobs: give 1 or more")
+        curve: CurveName = self.grid.curve or "z"
+        check_curve(curve, self.layout or "brick")
+
+
+def import_files(
+    url: str | os.PathLike[str],
+    files: Sequence[str | os.PathLike[str]],
+    options: ImportOptions | None = None,
+    progress: ProgressCallback | None = None,
+) -> list[FileReport]:
+    """Import files into an environment, which is made when it does not exist.
+
+    A file that cannot be used is reported and skipped; the others go in. A new environment into
+    which nothing went is not left behind.
+
+    Raises
+    ------
+    GridError, UsageError
+        When the options cannot be, or contradict an existing environment.
+    DatabaseError
+        When the environment cannot be opened or written.
+    """
+    chosen = options or ImportOptions()
+    if not files:
+        raise UsageError("no files: name at least one to import")
+    store = open_store(url) if exists(url) else None
+    if store is not None:
+        with _closing_on_error(store):
+            _check_layout(store, chosen.layout)
+            chosen.grid.check_matches(store.grid)
+    is_new = store is None
+    reports: list[FileReport] = []
+    n_written = 0
+    try:
+        for n, file in enumerate(files):
+            try:
+                mesh_file = read_file(file, unit=chosen.unit)
+                if store is None:
+                    grid = chosen.grid.fit(mesh_file.bounds)
+                    _check_inside(mesh_file, grid)
+                    store = create_store(url, grid, chosen.layout or "brick")
+                elif n == 0 and not is_new:
+                    chosen.grid.check_matches(store.grid, _first_bounds(store, mesh_file))
+                report = ingest_file(store, mesh_file, chosen, progress)
+            except (FileError, MissingExtraError) as error:
+                report = FileReport(os.fspath(file), "failed", error=error)
+            n_written += len(report.added)
+            reports.append(report)
+        if store is not None and n_written:
+            store.analyze(DEFAULT_RESOLUTION)
+    finally:
+        if store is not None:
+            if is_new and not n_written and not store.revision():
+                store.discard()
+            else:
+                store.close()
+    return reports
+
+
+def ingest_file(
+    store: Store,
+    mesh_file: MeshFile,
+    options: ImportOptions,
+    progress: ProgressCallback | None = None,
+) -> FileReport:
+    """Write those parts of a file that the environment does not hold yet.
+
+    Raises
+    ------
+    OutsideGridError
+        When a part leaves the grid; then no part of the file is written.
+    GeometryChangedError
+        When the environment holds a part of that name with another geometry.
+    """
+    present = {obj.name: obj.digest for obj in store.objects() if obj.link == mesh_file.link}
+    missing = [part for part in mesh_file.parts if part.name not in present]
+    for part in mesh_file.parts:
+        if present.get(part.name, part.digest) != part.digest:
+            raise GeometryChangedError(
+                f"{mesh_file.link}: part {part.name!r} has changed since it was imported; "
+                "remove that object, then import again"
+            )
+    _check_inside(mesh_file, store.grid, missing)
+    added: list[Object] = []
+    n_present = len(mesh_file.parts) - len(missing)
+    voxels = 0
+    jobs = options.jobs or os.cpu_count() or 1
+    for obj, rows in _voxelized(missing, mesh_file.link, store, options.unit, jobs):
+        added.append(replace(obj, id=store.add(obj, rows)))
+        voxels += obj.voxels
+        if progress is not None:
+            done = n_present + len(added)
+            progress(Progress(mesh_file.link, done, len(mesh_file.parts), voxels))
+    return FileReport(
+        mesh_file.link,
+        "imported" if added else "complete",
+        tuple(added),
+        n_present,
+        mesh_file.defects,
+    )
+
+
+def _voxelized(
+    parts: Iterable[Part], link: str, store: Store, unit: str | None, jobs: int
+) -> Iterator[tuple[Object, Rows]]:
+    """Objects and rows of parts, in their order, a few parts ahead of the writer."""
+
+    def work(part: Part) -> tuple[Object, Rows]:
+        rows, n_voxels = rows_of_part(part, store.grid, store.layout)
+        attributes = {"unit": unit} if unit else {}
+        return (
+            Object(
+                name=part.name,
+                link=link,
+                digest=part.digest,
+                transform=part.world_from_part,
+                voxels=n_voxels,
+                bounds=part.bounds,
+                attributes=attributes,
+            ),
+            rows,
+        )
+
+    waiting: deque[Future[tuple[Object, Rows]]] = deque()
+    pool = ThreadPoolExecutor(jobs, thread_name_prefix="voxelize")
+    try:
+        for part in parts:
+            waiting.append(pool.submit(work, part))
+            if len(waiting) > 2 * jobs:
+                yield waiting.popleft().result()
+        while waiting:
+            yield waiting.popleft().result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def rows_of_part(
+    part: Part,
+    grid: Grid,
+    layout: Layout,
+    world_from_part: NDArray[np.float64] | None = None,
+) -> tuple[Rows, int]:
+    """Voxelize a part: its rows, ascending by key, and how many voxels its surface touches.
+
+    Parameters
+    ----------
+    part : Part
+        Triangles mark every voxel whose closed box they meet; points the voxel that holds them.
+    world_from_part : (4, 4) float64 or None
+        Placement in metres; the file's unless given.
+    """
+    if part.is_cloud:
+        points = grid.to_voxel_units(part.world_points(world_from_part))
+        bricks, occupancy = voxelize.mark_points(points, grid.bits)
+    else:
+        triangles = grid.to_voxel_units(part.triangles(world_from_part))
+        bricks, occupancy = voxelize.voxelize(triangles, grid.bits)
+    return _rows_of_bricks(bricks, occupancy, grid, layout)
+
+
+def rows_of_voxels(ijk: NDArray[np.int64], grid: Grid, layout: Layout) -> Rows:
+    """Rows of voxels (n, 3) that were made and not imported: analytic scenes."""
+    bricks, occupancy = voxelize.mark_points(ijk.astype(np.float64) + 0.5, grid.bits)
+    return _rows_of_bricks(bricks, occupancy, grid, layout)[0]
+
+
+def _rows_of_bricks(
+    bricks: NDArray[np.int64], occupancy: NDArray[np.uint8], grid: Grid, layout: Layout
+) -> tuple[Rows, int]:
+    """Rows in the environment's layout and order of bricks (B,) in Z-order and their bits."""
+    n_voxels = voxelize.count_voxels(occupancy)
+    if layout == "voxel":
+        keys = np.sort(grid.encode(voxelize.brick_voxels(bricks, occupancy)))
+        return Rows(keys, np.zeros(len(keys), dtype=np.int64), NO_OCCUPANCY), n_voxels
+    if grid.curve != "z":
+        bits = max(grid.bits - BRICK_BITS, 0)
+        places = curves.decode(bricks, bits, curves.Z_ORDER)
+        bricks = curves.encode(places, bits, grid.curve_code)
+        order = np.argsort(bricks)
+        bricks, occupancy = bricks[order], occupancy[order]
+    return Rows(bricks, np.zeros(len(bricks), dtype=np.int64), occupancy.reshape(-1)), n_voxels
+
+
+def check_placed_inside(
+    part: Part, link: str, grid: Grid, world_from_part: NDArray[np.float64] | None = None
+) -> NDArray[np.float64]:
+    """Bounds (2, 3) of a placed part in metres; refuses one that leaves the grid."""
+    points = part.world_points(world_from_part)
+    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+    scaled = grid.to_voxel_units(bounds)
+    # a point on the upper border has no voxel; a surface there still touches the last one
+    over = scaled[1] >= grid.side if part.is_cloud else scaled[1] > grid.side + AT_BORDER
+    if not np.isfinite(bounds).all() or (scaled[0] < -AT_BORDER).any() or over.any():
+        raise OutsideGridError(
+            f"{link}: part {part.name!r} spans {_box(bounds)} m, outside the grid's "
+            f"{_box(grid.bounds)} m; move it, or make an environment with a larger --extent"
+        )
+    return bounds
+
+
+def _check_inside(mesh_file: MeshFile, grid: Grid, parts: Sequence[Part] | None = None) -> None:
+    for part in mesh_file.parts if parts is None else parts:
+        check_placed_inside(part, mesh_file.link, grid)
+
+
+def _box(bounds: NDArray[np.float64]) -> str:
+    low, high = (", ".join(f"{x:.6g}" for x in corner) for corner in bounds)
+    return f"({low}) to ({high})"
+
+
+def _check_layout(store: Store, layout: Layout | None) -> None:
+    if layout is not None and layout != store.layout:
+        raise UsageError(
+            f"{store.url} has the layout {store.layout}, not {layout}; leave --layout out"
+        )
+
+
+def _first_bounds(store: Store, mesh_file: MeshFile) -> NDArray[np.float64] | None:
+    """Bounds that `--extent` was meant for: only the first file decided on the grid."""
+    first = next(iter(store.objects()), None)
+    if first is None or first.link == mesh_file.link:
+        return mesh_file.bounds
+    return None
+
+
+@contextlib.contextmanager
+def _closing_on_error(store: Store) -> Iterator[None]:
+    try:
+        yield
+    except BaseException:
+        store.close()
+        raise

@@ -1,0 +1,167 @@
+"""Grouping of sorted keys into ranges (the paper, section 5), and ranges that cover a box."""
+
+import numpy as np
+
+from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels.curves import LEXICOGRAPHIC, key_of
+
+
+@leaf
+def rows_below(x, bounds, rows_per_bucket):
+    """Expected rows with a key < x. bounds (R + 1,) int64, ascending -> float.
+
+    A bucket [b[i-1], b[i]) counts in proportion to what lies below x; one of zero width counts
+    whole as soon as its value does.
+    """
+    low = 0
+    high = bounds.shape[0]
+    while low < high:
+        middle = (low + high) >> 1
+        if bounds[middle] < x:
+            low = middle + 1
+        else:
+            high = middle
+    if low == 0:
+        return 0.0
+    if low == bounds.shape[0]:
+        return (low - 1) * rows_per_bucket
+    left = bounds[low - 1]
+    return (low - 1 + (x - left) / (bounds[low] - left)) * rows_per_bucket
+
+
+@entry
+def gap_rows(left, right, bounds, rows_per_bucket):
+    """Expected rows with a key in [left, right]. bounds (R + 1,) int64, ascending -> float."""
+    if right < left:
+        return 0.0
+    return rows_below(right + 1, bounds, rows_per_bucket) - rows_below(
+        left, bounds, rows_per_bucket
+    )
+
+
+@entry
+def group_by_gap(keys, first, last, maxgap):
+    """MaxGap: neighbours p < q share a range if and only if q - p <= maxgap.
+
+    keys (U,) row keys, ascending; first, last (U,) the lowest and highest voxel key asked for under
+    each. Returns the ranges' lowest and highest row keys.
+    """
+    total = keys.shape[0]
+    lows = np.empty(total, dtype=np.int64)
+    highs = np.empty(total, dtype=np.int64)
+    count = 0
+    for n in range(total):
+        if n > 0 and first[n] - last[n - 1] <= maxgap:
+            highs[count - 1] = keys[n]
+            continue
+        lows[count] = keys[n]
+        highs[count] = keys[n]
+        count += 1
+    return lows[:count], highs[:count]
+
+
+@entry
+def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost):
+    """CBGroup: a gap is closed if and only if scanning it costs no more than another descent.
+
+    keys (U,) row keys, ascending; bounds (R + 1,) int64, the quantile vector; costs in one unit.
+
+    Returns
+    -------
+    lows, highs : (G,) int64
+        The ranges' lowest and highest row keys.
+    asked, scanned : float
+        Expected rows under the keys themselves, and in the gaps that were closed.
+    """
+    total = keys.shape[0]
+    lows = np.empty(total, dtype=np.int64)
+    highs = np.empty(total, dtype=np.int64)
+    count = 0
+    asked = 0.0
+    scanned = 0.0
+    above = 0.0
+    for n in range(total):
+        below = rows_below(keys[n], bounds, rows_per_bucket)
+        gap = below - above
+        if n > 0 and gap * row_cost <= descent_cost:
+            highs[count - 1] = keys[n]
+            scanned += gap
+        else:
+            lows[count] = keys[n]
+            highs[count] = keys[n]
+            count += 1
+        above = rows_below(keys[n] + 1, bounds, rows_per_bucket)
+        asked += above - below
+    return lows[:count], highs[:count], asked, scanned
+
+
+@leaf
+def add_range(ranges, count, low, high):
+    """Append a closed range, growing the array; returns both."""
+    if count == ranges.shape[0]:
+        larger = np.empty((2 * count, 2), dtype=np.int64)
+        larger[:count] = ranges
+        ranges = larger
+    ranges[count, 0] = low
+    ranges[count, 1] = high
+    return ranges, count + 1
+
+
+@entry
+def ranges_of_box(low, high, bits, curve, finest):
+    """Closed ranges of voxel keys (G, 2) that cover the voxels low .. high (3,), both inside.
+
+    On a hierarchical curve the box's cubes, split no finer than 2^finest voxels an edge, so that
+    their number stays in proportion to the box's surface in such cubes; in lexicographic order one
+    range a slab. Not yet sorted or merged.
+    """
+    ranges = np.empty((64, 2), dtype=np.int64)
+    count = 0
+    if curve == LEXICOGRAPHIC:
+        for i in range(low[0], high[0] + 1):
+            ranges, count = add_range(
+                ranges,
+                count,
+                key_of(i, low[1], low[2], bits, curve),
+                key_of(i, high[1], high[2], bits, curve),
+            )
+        return ranges[:count]
+    stack = np.empty((8 * (bits + 1), 4), dtype=np.int64)
+    stack[0, 0] = bits
+    stack[0, 1:] = 0
+    depth = 1
+    while depth > 0:
+        depth -= 1
+        level = stack[depth, 0]
+        i = stack[depth, 1]
+        j = stack[depth, 2]
+        k = stack[depth, 3]
+        edge = (1 << level) - 1
+        i0 = i << level
+        j0 = j << level
+        k0 = k << level
+        if i0 > high[0] or j0 > high[1] or k0 > high[2]:
+            continue
+        if i0 + edge < low[0] or j0 + edge < low[1] or k0 + edge < low[2]:
+            continue
+        is_inside = (
+            low[0] <= i0
+            and i0 + edge <= high[0]
+            and low[1] <= j0
+            and j0 + edge <= high[1]
+            and low[2] <= k0
+            and k0 + edge <= high[2]
+        )
+        if is_inside or level <= finest:
+            key = key_of(i, j, k, bits - level, curve) if level < bits else 0
+            ranges, count = add_range(
+                ranges, count, key << (3 * level), ((key + 1) << (3 * level)) - 1
+            )
+            continue
+        for child in range(8):
+            stack[depth, 0] = level - 1
+            stack[depth, 1] = 2 * i + (child >> 2)
+            stack[depth, 2] = 2 * j + ((child >> 1) & 1)
+            stack[depth, 3] = 2 * k + (child & 1)
+            depth += 1
+    return ranges[:count]

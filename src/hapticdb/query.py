@@ -1,0 +1,201 @@
+"""The haptic query: plan, fetch, refine (the paper, section 4.2)."""
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.force import TangentPlane
+from hapticdb.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
+from hapticdb.kernels import contact
+from hapticdb.store.base import Frame, Keys, Rows, Store, SupportsStatement, row_shift
+
+if TYPE_CHECKING:
+    from hapticdb.pointshell import PointShell
+    from hapticdb.statistics import CostModel, QuantileVector
+
+Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
+STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
+NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
+
+
+class Query(NamedTuple):
+    """How a frame asked the database.
+
+    strategy : what was used (`auto` names its choice); statements : SQL statements run; ranges :
+    index ranges they named, each key of a point query counting as one; rows : rows read, false hits
+    included; elapsed_us : the whole frame, microseconds.
+    """
+
+    strategy: str
+    statements: int
+    ranges: int
+    rows: int
+    elapsed_us: float
+
+
+class Located(NamedTuple):
+    """A shell placed in the grid: `hapticdb.kernels.contact.locate` describes the arrays."""
+
+    world: NDArray[np.float64]
+    normals: NDArray[np.float64]
+    address: Keys
+    slot: NDArray[np.int32]
+    keys: Keys
+    first: Keys
+    last: Keys
+    center: NDArray[np.float64]
+
+
+class Answer(NamedTuple):
+    """What a frame found, before it is given to a person.
+
+    wrench (6,) N and N m; hits (H,) indices, ascending; depths (H,) metres; ids : objects of all
+    hits, ascending; pairs : () -> (P, 2) int64, every (hit, object id), computed when asked for.
+    """
+
+    wrench: NDArray[np.float64]
+    hits: NDArray[np.int64]
+    depths: NDArray[np.float64]
+    ids: tuple[int, ...]
+    pairs: Callable[[], NDArray[np.int64]]
+    query: Query
+
+
+class HapticQuery:
+    """Frames against one store. Keeps what does not change between them.
+
+    Parameters
+    ----------
+    store : Store
+        The opened environment.
+    statistics : callable
+        Returns the quantile vector and the cost model; called when a strategy first needs them.
+    """
+
+    def __init__(
+        self, store: Store, statistics: "Callable[[], tuple[QuantileVector, CostModel]]"
+    ) -> None:
+        self._store = store
+        self._statistics = statistics
+        grid = store.grid
+        self._shift = row_shift(store.layout)
+        self._origin = np.array(grid.origin)
+        self._size = grid.voxel_size
+        self._curve = (grid.bits, grid.curve_code, self._shift)
+
+    def run(
+        self,
+        shell: "PointShell",
+        world_from_tool: ArrayLike,
+        strategy: Strategy = "auto",
+        gap: int = DEFAULT_MAXGAP,
+        exclude: Keys = NOTHING_EXCLUDED,
+        law: TangentPlane = TangentPlane(),  # noqa: B008 - frozen, and a frame counts microseconds
+    ) -> Answer:
+        """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
+        started = time.perf_counter_ns()
+        if strategy not in STRATEGIES:
+            raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
+        pose = np.ascontiguousarray(world_from_tool, dtype=np.float64)
+        located = self._locate(shell, pose)
+        if strategy == "statement":
+            return self._by_statement(located, exclude, law, started)
+        chosen, n_statements, n_ranges, rows = self._fetch(strategy, located, gap)
+        if chosen == "statement":
+            return self._by_statement(located, exclude, law, started)
+        wrench, hits, depths, touched = contact.refine(
+            *located[:5], *rows, exclude, self._origin, self._size, located.center, law.stiffness
+        )
+        ids = tuple(sorted(set(rows.ids[touched].tolist())))
+
+        def pairs() -> NDArray[np.int64]:
+            _, _, address, slot, keys = located[:5]
+            found: NDArray[np.int64] = contact.pairs_of_hits(
+                slot, address, keys, hits, *rows, exclude
+            )
+            return found
+
+        elapsed_us = (time.perf_counter_ns() - started) / 1000
+        query = Query(chosen, n_statements, n_ranges, len(rows), elapsed_us)
+        return Answer(wrench, hits, depths, ids, pairs, query)
+
+    def _locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> Located:
+        if pose.shape != (4, 4):
+            raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
+        status, *arrays = contact.locate(
+            shell.points,
+            shell.normals,
+            shell.center,
+            pose,
+            self._origin,
+            self._size,
+            *self._curve,
+        )
+        if status:
+            raise UsageError("a pose that is no rigid transform: give finite numbers, a rotation")
+        return Located(*arrays)
+
+    def _fetch(self, strategy: Strategy, located: Located, gap: int) -> tuple[str, int, int, Rows]:
+        """Rows of a frame: strategy used, statements, ranges, rows."""
+        keys = located.keys
+        if strategy == "array":
+            return strategy, 1, len(keys), self._store.lookup(keys)
+        if strategy == "points":
+            with self._store.snapshot():
+                return strategy, len(keys), len(keys), self._store.lookup_each(keys)
+        if strategy == "maxgap":
+            ranges = maxgap(keys, located.first, located.last, gap)
+            return strategy, 1, len(ranges.lows), self._store.scan(*ranges)
+        quantiles, costs = self._statistics()
+        grouping = cbgroup(keys, quantiles, costs)
+        lows, highs = grouping.ranges
+        if strategy == "cbgroup":
+            return strategy, 1, len(lows), self._store.scan(lows, highs)
+        asked, scanned = grouping.rows_asked, grouping.rows_asked + grouping.rows_in_gaps
+        expected: dict[Strategy, float] = {
+            "array": costs.of_keys(len(keys), asked),
+            "cbgroup": costs.of_ranges(len(lows), scanned),
+            "points": costs.of_points(len(keys)),
+            "statement": costs.of_statement(len(located.slot)),
+        }
+        chosen = min(expected, key=expected.__getitem__)
+        if chosen == "cbgroup":
+            return chosen, 1, len(lows), self._store.scan(lows, highs)
+        if chosen == "statement":
+            return chosen, 0, 0, Rows(NOTHING_EXCLUDED, NOTHING_EXCLUDED, np.empty(0, np.uint8))
+        return self._fetch(chosen, located, gap)
+
+    def _by_statement(
+        self,
+        located: Located,
+        exclude: Keys,
+        law: TangentPlane,
+        started: int,
+    ) -> Answer:
+        """Figure 3, and the second statement for what EXISTS drops, in one snapshot."""
+        store = self._store
+        if not isinstance(store, SupportsStatement):
+            raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
+        world, normals, address = located[:3]
+        frame = Frame(world, normals, address, located.center, law.stiffness, exclude)
+        with store.snapshot():
+            wrench = store.statement(frame)
+            ordinals, ids = store.statement_hits(frame)
+        pairs = np.stack([ordinals, ids], axis=1)
+        hits = np.unique(ordinals)
+        depths = contact.depths_of_hits(world, normals, hits, self._origin, self._size)
+        touched = tuple(np.unique(ids).tolist())
+        elapsed_us = (time.perf_counter_ns() - started) / 1000
+        query = Query("statement", 2, len(address), len(ids), elapsed_us)
+        order = np.lexsort((ids, ordinals))
+        return Answer(wrench, hits, depths, touched, lambda: pairs[order], query)
+
+
+def as_ids(exclude: Iterable[int]) -> NDArray[np.int64]:
+    """Ids of objects, ascending and distinct, as kernels take them."""
+    ids: Sequence[int] = sorted({int(i) for i in exclude})
+    return np.array(ids, dtype=np.int64)

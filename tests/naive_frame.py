@@ -1,0 +1,92 @@
+"""One frame in plain Python: slow, obviously right. The oracle of every strategy.
+
+Sums and products are written in the order that hapticdb promises, so the wrench is the same bit
+for bit; the hits come from a plain set.
+"""
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+
+Triple = tuple[float, float, float]
+Voxel = tuple[int, int, int]
+
+
+@dataclass
+class NaiveTouch:
+    """What a frame must find."""
+
+    force: Triple
+    torque: Triple
+    hits: list[int]
+    depths: list[float]
+    pairs: list[tuple[int, int]]
+
+    @property
+    def contacts(self) -> list[int]:
+        return [h for h, d in zip(self.hits, self.depths, strict=True) if d > 0]
+
+    @property
+    def ids(self) -> list[int]:
+        return sorted({i for _, i in self.pairs})
+
+
+def transform(pose: list[list[float]], v: Triple, *, shift: bool) -> Triple:
+    """Turn v by a pose, and shift it when it is a point."""
+    turned = [row[0] * v[0] + row[1] * v[1] + row[2] * v[2] for row in pose[:3]]
+    if shift:
+        turned = [t + row[3] for t, row in zip(turned, pose, strict=False)]
+    return turned[0], turned[1], turned[2]
+
+
+def voxel_of(p: Triple, origin: Triple, size: float) -> Voxel:
+    """The voxel [i s, (i + 1) s) that holds p."""
+    i, j, k = (math.floor((x - o) / size) for x, o in zip(p, origin, strict=True))
+    return i, j, k
+
+
+def touch(
+    ids_in: Mapping[Voxel, Collection[int]],
+    points: list[Triple],
+    normals: list[Triple],
+    center: Triple,
+    pose: list[list[float]],
+    origin: Triple,
+    size: float,
+    side: int,
+    stiffness: float = 1000.0,
+    exclude: Collection[int] = (),
+) -> NaiveTouch:
+    """Look every point up in a dictionary of voxels and sum the tangent-plane law."""
+    found = NaiveTouch((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), [], [], [])
+    total = [0.0] * 6
+    cm = transform(pose, center, shift=True)
+    for n, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        p = transform(pose, point, shift=True)
+        nrm = transform(pose, normal, shift=False)
+        voxel = voxel_of(p, origin, size)
+        if not all(0 <= v < side for v in voxel):
+            continue
+        ids = sorted(i for i in ids_in.get(voxel, ()) if i not in exclude)
+        if not ids:
+            continue
+        c = [o + size * (v + 0.5) for o, v in zip(origin, voxel, strict=True)]
+        depth = (c[0] - p[0]) * nrm[0] + (c[1] - p[1]) * nrm[1] + (c[2] - p[2]) * nrm[2]
+        found.hits.append(n)
+        found.depths.append(max(depth, 0.0))
+        found.pairs += [(n, i) for i in ids]
+        if depth <= 0:
+            continue
+        f = [stiffness * depth * x for x in nrm]
+        r = [a - b for a, b in zip(p, cm, strict=True)]
+        total[0] += f[0]
+        total[1] += f[1]
+        total[2] += f[2]
+        total[3] += r[1] * f[2] - r[2] * f[1]
+        total[4] += r[2] * f[0] - r[0] * f[2]
+        total[5] += r[0] * f[1] - r[1] * f[0]
+    if len(found.hits) >= 10:
+        total = [x / (len(found.hits) / 10.0) for x in total]
+    found.force = (total[0], total[1], total[2])
+    found.torque = (total[3], total[4], total[5])
+    return found

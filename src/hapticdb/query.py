@@ -40,14 +40,9 @@ class Query(NamedTuple):
 class Located(NamedTuple):
     """A shell placed in the grid: `hapticdb.kernels.contact.locate` describes the arrays."""
 
-    world: NDArray[np.float64]
-    normals: NDArray[np.float64]
-    address: Keys
-    slot: NDArray[np.int32]
-    keys: Keys
-    first: Keys
-    last: Keys
-    center: NDArray[np.float64]
+    placed: NDArray[np.float64]
+    asked: NDArray[np.int64]
+    keys: NDArray[np.int64]
 
 
 class Answer(NamedTuple):
@@ -108,15 +103,12 @@ class HapticQuery:
         if chosen == "statement":
             return self._by_statement(located, exclude, law, started)
         wrench, hits, depths, touched = contact.refine(
-            *located[:5], *rows, exclude, self._origin, self._size, located.center, law.stiffness
+            *located, *rows, exclude, self._origin, self._size, law.stiffness
         )
         ids = tuple(sorted(set(rows.ids[touched].tolist())))
 
         def pairs() -> NDArray[np.int64]:
-            _, _, address, slot, keys = located[:5]
-            found: NDArray[np.int64] = contact.pairs_of_hits(
-                slot, address, keys, hits, *rows, exclude
-            )
+            found: NDArray[np.int64] = contact.pairs_of_hits(*located[1:], *rows, exclude, hits)
             return found
 
         elapsed_us = (time.perf_counter_ns() - started) / 1000
@@ -141,14 +133,14 @@ class HapticQuery:
 
     def _fetch(self, strategy: Strategy, located: Located, gap: int) -> tuple[str, int, int, Rows]:
         """Rows of a frame: strategy used, statements, ranges, rows."""
-        keys = located.keys
+        keys, first, last = located.keys
         if strategy == "array":
             return strategy, 1, len(keys), self._store.lookup(keys)
         if strategy == "points":
             with self._store.snapshot():
                 return strategy, len(keys), len(keys), self._store.lookup_each(keys)
         if strategy == "maxgap":
-            ranges = maxgap(keys, located.first, located.last, gap)
+            ranges = maxgap(keys, first, last, gap)
             return strategy, 1, len(ranges.lows), self._store.scan(*ranges)
         quantiles, costs = self._statistics()
         grouping = cbgroup(keys, quantiles, costs)
@@ -160,7 +152,7 @@ class HapticQuery:
             "array": costs.of_keys(len(keys), asked),
             "cbgroup": costs.of_ranges(len(lows), scanned),
             "points": costs.of_points(len(keys)),
-            "statement": costs.of_statement(len(located.slot)),
+            "statement": costs.of_statement(located.asked.shape[1]),
         }
         chosen = min(expected, key=expected.__getitem__)
         if chosen == "cbgroup":
@@ -180,17 +172,17 @@ class HapticQuery:
         store = self._store
         if not isinstance(store, SupportsStatement):
             raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
-        world, normals, address = located[:3]
-        frame = Frame(world, normals, address, located.center, law.stiffness, exclude)
+        addresses = located.asked[0]
+        frame = Frame(located.placed, addresses, law.stiffness, exclude)
         with store.snapshot():
             wrench = store.statement(frame)
             ordinals, ids = store.statement_hits(frame)
         pairs = np.stack([ordinals, ids], axis=1)
         hits = np.unique(ordinals)
-        depths = contact.depths_of_hits(world, normals, hits, self._origin, self._size)
+        depths = contact.depths_of_hits(located.placed, hits, self._origin, self._size)
         touched = tuple(np.unique(ids).tolist())
         elapsed_us = (time.perf_counter_ns() - started) / 1000
-        query = Query("statement", 2, len(address), len(ids), elapsed_us)
+        query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
         order = np.lexsort((ids, ordinals))
         return Answer(wrench, hits, depths, touched, lambda: pairs[order], query)
 

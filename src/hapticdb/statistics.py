@@ -215,7 +215,9 @@ class _Trials:
         few = probe.keys[:: max(1, len(probe.keys) // 20)].copy()
         self._singles.append((len(few), self._time(lambda: store.lookup_each(few))))
         if isinstance(store, SupportsStatement):
-            self._statements.append((1, len(probe.frame.points), self._time(self._figure_3(probe))))
+            self._statements.append(
+                (1, len(probe.frame.addresses), self._time(self._figure_3(probe)))
+            )
 
     def _figure_3(self, probe: _Probe) -> Callable[[], object]:
         store = self._store
@@ -319,12 +321,12 @@ def _probes(store: Store, seed: int) -> list[_Probe]:
         points.flags.writeable = normals.flags.writeable = False
         pose = np.eye(4)
         pose[:3, 3] = center
-        _, world, turned, address, _, keys, first, last, placed = contact.locate(
+        _, placed, asked, (keys, first, last) = contact.locate(
             points, normals, middle, pose, origin, grid.voxel_size, *grid_codes, shift
         )
         if not len(keys):
             continue
-        frame = Frame(world, turned, address, placed, 1000.0, np.empty(0, dtype=np.int64))
+        frame = Frame(placed, asked[0], 1000.0, np.empty(0, dtype=np.int64))
         probes.append(_Probe(frame, keys, first, last))
     return probes
 

@@ -261,10 +261,11 @@ class StoreContract:
             places = both & 7
             order = Grid(1.0, (0, 0, 0), 3).encode(places)
             keys = (keys >> 9 << 9) | order
-        points = store.grid.centers(both) - np.array([0.0, 0.0, 0.002])
-        up = np.tile([0.0, 0.0, 1.0], (3, 1))
+        placed = np.zeros((4, 6))
+        placed[:3, :3] = store.grid.centers(both) - np.array([0.0, 0.0, 0.002])
+        placed[:3, 5] = 1.0
         none = np.empty(0, dtype=np.int64)
-        frame = Frame(points, up, keys, np.zeros(3), 1000.0, none)
+        frame = Frame(placed, keys, 1000.0, none)
         ordinals, ids = store.statement_hits(frame)
         assert sorted(zip(ordinals.tolist(), ids.tolist(), strict=True)) == [(0, 1), (0, 2), (1, 1)]
         np.testing.assert_allclose(store.statement(frame)[:3], [0, 0, 4.0])

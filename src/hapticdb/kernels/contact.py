@@ -21,33 +21,38 @@ def contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz):
 
 
 @leaf
-def add_contact(px, py, pz, nx, ny, nz, depth, center, stiffness, out):
-    """Add the force and torque of a contact of that depth to out (6,).
-
-    Tangent-plane law, McNeely et al. 1999: F = K d n, tau = (p - x_cm) x F. Points and normals
-    come as scalars: a row taken from an array costs a counted reference (4 times the frame).
-    """
-    fx = stiffness * depth * nx
-    fy = stiffness * depth * ny
-    fz = stiffness * depth * nz
-    rx = px - center[0]
-    ry = py - center[1]
-    rz = pz - center[2]
-    out[0] += fx
-    out[1] += fy
-    out[2] += fz
-    out[3] += ry * fz - rz * fy
-    out[4] += rz * fx - rx * fz
-    out[5] += rx * fy - ry * fx
+def center_of(x, origin, size):
+    """Centre, on one axis, of the voxel that holds coordinate x, metres."""
+    return origin + size * (np.floor((x - origin) / size) + 0.5)
 
 
 @leaf
-def average(n_hits, out):
-    """Divide the wrench (6,) by a tenth of the hits when there are ten or more."""
+def contact_force(nx, ny, nz, depth, stiffness):
+    """Force of a contact (McNeely et al. 1999): F = K d n."""
+    return stiffness * depth * nx, stiffness * depth * ny, stiffness * depth * nz
+
+
+@leaf
+def moment(rx, ry, rz, fx, fy, fz):
+    """Torque of a force at a lever: r x F."""
+    return ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx
+
+
+@leaf
+def averaged(n_hits, fx, fy, fz, tx, ty, tz):
+    """Wrench (6,): divided by a tenth of the hits when there are ten or more."""
+    wrench = np.empty(6)
+    wrench[0] = fx
+    wrench[1] = fy
+    wrench[2] = fz
+    wrench[3] = tx
+    wrench[4] = ty
+    wrench[5] = tz
     if n_hits >= AVERAGE_FROM:
         tenth = n_hits / 10.0
         for axis in range(6):
-            out[axis] /= tenth
+            wrench[axis] /= tenth
+    return wrench
 
 
 @leaf
@@ -76,9 +81,9 @@ def is_rigid(pose):
 
 
 @leaf
-def turn(pose, axis, x, y, z):
-    """One coordinate of (x, y, z) rotated by the upper left of pose (4, 4)."""
-    return pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z
+def turn(a, b, c, x, y, z):
+    """One coordinate of a turned vector: a row (a, b, c) of the rotation times (x, y, z)."""
+    return a * x + b * y + c * z
 
 
 @leaf
@@ -109,31 +114,33 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
     -------
     status : int
         0, or 1 when the pose is not rigid (then the rest is empty).
-    world : (N, 3), turned : (N, 3) float64
-        Points in metres and normals, world frame.
-    address : (N,) int64
-        Voxel rows: the key. Brick rows: the brick's key << 9 | bit number. -1 outside the grid.
-    slot : (N,) int32
-        Place of the point's row key in `keys`; -1 outside the grid.
-    keys : (U,) int64
-        Distinct row keys, ascending.
-    first, last : (U,) int64
-        Lowest and highest voxel key that the shell asks for under each row key.
-    placed : (3,) float64
-        The centre, world frame.
+    placed : (N + 1, 6) float64
+        Each point in metres and its normal, world frame; last the centre.
+    asked : (2, N) int64
+        Each point's address and slot. The address is the key on voxel rows, the brick's key << 9 |
+        bit number on brick rows; the slot its row key's place in `keys`; both -1 outside the grid.
+    keys : (3, U) int64
+        Distinct row keys, ascending; lowest and highest voxel key asked for under each.
+
+    Notes
+    -----
+    Few arrays go in and out: each costs a third of a microsecond to cross from and to Python.
     """
     total = points.shape[0]
-    world = np.empty((total, 3))
-    turned = np.empty((total, 3))
-    address = np.empty(total, dtype=np.int64)
-    slot = np.empty(total, dtype=np.int32)
-    none = np.empty(0, dtype=np.int64)
-    placed = np.empty(3)
+    placed = np.empty((total + 1, 6))
+    asked = np.empty((2, total), dtype=np.int64)
     if not is_rigid(pose):
-        return 1, world, turned, address, slot, none, none, none, placed
-    for axis in range(3):
-        placed[axis] = turn(pose, axis, center[0], center[1], center[2]) + pose[axis, 3]
-    side = 1 << bits
+        return 1, placed, asked, np.empty((3, 0), dtype=np.int64)
+    # scalars: an array handed to a leaf, or a row of one, costs a counted reference each time
+    a, b, c, u = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    d, e, f, v = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    g, h, m, w = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    placed[total, 0] = turn(a, b, c, center[0], center[1], center[2]) + u
+    placed[total, 1] = turn(d, e, f, center[0], center[1], center[2]) + v
+    placed[total, 2] = turn(g, h, m, center[0], center[1], center[2]) + w
+    placed[total, 3:] = 0.0
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    side = float(1 << bits)
     capacity = 16
     while capacity < 2 * total:
         capacity *= 2
@@ -145,17 +152,23 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
     memo_key = -1
     memo_slot = -1
     for n in range(total):
-        for axis in range(3):
-            world[n, axis] = (
-                turn(pose, axis, points[n, 0], points[n, 1], points[n, 2]) + pose[axis, 3]
-            )
-            turned[n, axis] = turn(pose, axis, normals[n, 0], normals[n, 1], normals[n, 2])
-        x = np.floor((world[n, 0] - origin[0]) / size)
-        y = np.floor((world[n, 1] - origin[1]) / size)
-        z = np.floor((world[n, 2] - origin[2]) / size)
-        if not (0 <= x < side and 0 <= y < side and 0 <= z < side):
-            address[n] = -1
-            slot[n] = -1
+        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+        nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
+        wx = turn(a, b, c, px, py, pz) + u
+        wy = turn(d, e, f, px, py, pz) + v
+        wz = turn(g, h, m, px, py, pz) + w
+        placed[n, 0] = wx
+        placed[n, 1] = wy
+        placed[n, 2] = wz
+        placed[n, 3] = turn(a, b, c, nx, ny, nz)
+        placed[n, 4] = turn(d, e, f, nx, ny, nz)
+        placed[n, 5] = turn(g, h, m, nx, ny, nz)
+        x = np.floor((wx - ox) / size)
+        y = np.floor((wy - oy) / size)
+        z = np.floor((wz - oz) / size)
+        if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
+            asked[0, n] = -1
+            asked[1, n] = -1
             continue
         i = np.int64(x)
         j = np.int64(y)
@@ -163,9 +176,9 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
         key = key_of(i, j, k, bits, curve)
         row_key = key >> shift
         if shift == 0 or curve == Z_ORDER:
-            address[n] = key  # a Z-order key ends in the bit number
+            asked[0, n] = key  # a Z-order key ends in the bit number
         else:
-            address[n] = (row_key << 9) | z_encode(i & 7, j & 7, k & 7)
+            asked[0, n] = (row_key << 9) | z_encode(i & 7, j & 7, k & 7)
         if row_key != memo_key:
             # Fibonacci hashing (Knuth, volume 3, section 6.4) into a table at most half full
             at = ((row_key * 0x9E3779B97F4A7C1) >> 20) & (capacity - 1)
@@ -179,64 +192,64 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
                 count += 1
             memo_key = row_key
             memo_slot = table[at]
-        slot[n] = memo_slot
+        asked[1, n] = memo_slot
         low[memo_slot] = min(low[memo_slot], key)
         high[memo_slot] = max(high[memo_slot], key)
     order = sort_small_or_large(found[:count])
     rank = np.empty(count, dtype=np.int32)
-    keys = np.empty(count, dtype=np.int64)
-    first = np.empty(count, dtype=np.int64)
-    last = np.empty(count, dtype=np.int64)
-    for u in range(count):
-        keys[u] = found[order[u]]
-        first[u] = low[order[u]]
-        last[u] = high[order[u]]
-        rank[order[u]] = u
+    keys = np.empty((3, count), dtype=np.int64)
+    for n in range(count):
+        at = order[n]
+        keys[0, n] = found[at]
+        keys[1, n] = low[at]
+        keys[2, n] = high[at]
+        rank[at] = n
     for n in range(total):
-        if slot[n] >= 0:
-            slot[n] = rank[slot[n]]
-    return 0, world, turned, address, slot, keys, first, last, placed
+        if asked[1, n] >= 0:
+            asked[1, n] = rank[asked[1, n]]
+    return 0, placed, asked, keys
 
 
 @leaf
-def holds(occupancy, row, bit):
-    """Whether a row covers a point: bit of its brick, or any row of a voxel (no occupancy)."""
-    if occupancy.shape[0] == 0:
-        return True
-    return (occupancy[64 * row + (bit >> 3)] >> (bit & 7)) & 1 == 1
+def rows_of_keys(keys, row_keys):
+    """Where the rows of each asked key begin and end, (U,) int64 each.
 
-
-@leaf
-def is_excluded(object_id, exclude):
-    """Whether the object is left out; exclude (E,) int64, a handful."""
-    for n in range(exclude.shape[0]):
-        if exclude[n] == object_id:
-            return True
-    return False
-
-
-@leaf
-def first_rows(keys, row_keys):
-    """Where the rows of each asked key begin, (U,) int64: one merge of two ascending lists."""
-    starts = np.empty(keys.shape[0], dtype=np.int64)
+    One merge of two ascending lists; rows of keys that nobody asked for are the false hits.
+    """
+    total = keys.shape[1]
+    starts = np.empty(total, dtype=np.int64)
+    ends = np.empty(total, dtype=np.int64)
+    n_rows = row_keys.shape[0]
     row = 0
-    for u in range(keys.shape[0]):
-        while row < row_keys.shape[0] and row_keys[row] < keys[u]:
+    for n in range(total):
+        key = keys[0, n]
+        while row < n_rows and row_keys[row] < key:
             row += 1
-        starts[u] = row
-    return starts
+        starts[n] = row
+        while row < n_rows and row_keys[row] == key:
+            row += 1
+        ends[n] = row
+    return starts, ends
+
+
+@leaf
+def felt_rows(row_ids, exclude):
+    """Which rows are felt, (R,) bool: those of objects that are not excluded."""
+    felt = np.ones(row_ids.shape[0], dtype=np.bool_)
+    if exclude.shape[0] > 0:
+        for row in range(row_ids.shape[0]):
+            for n in range(exclude.shape[0]):
+                if exclude[n] == row_ids[row]:
+                    felt[row] = False
+    return felt
 
 
 @entry
-def refine(
-    world, turned, address, slot, keys, row_keys, row_ids, occupancy, exclude,
-    origin, size, center, stiffness,
-):  # fmt: skip
+def refine(placed, asked, keys, row_keys, row_ids, occupancy, exclude, origin, size, stiffness):
     """Drop the false hits of a frame's rows and sum the wrench of the rest.
 
-    world, turned, address, slot, keys as `locate` returns them; row_keys (R,) int64 ascending,
-    row_ids (R,) int64, occupancy (64 R,) uint8 or empty for voxel rows; exclude (E,) int64;
-    center (3,) the tool's centre of mass, world frame; stiffness in N/m.
+    placed, asked, keys as `locate` returns them; row_keys (R,) int64 ascending, row_ids (R,) int64,
+    occupancy (64 R,) uint8 or empty for voxel rows; exclude (E,) int64; stiffness in N/m.
 
     Returns
     -------
@@ -249,64 +262,75 @@ def refine(
     touched : (R,) bool
         Rows that at least one hit lies in.
     """
-    wrench = np.zeros(6)
-    total = slot.shape[0]
+    total = asked.shape[1]
     hits = np.empty(total, dtype=np.int64)
     depths = np.empty(total)
     touched = np.zeros(row_keys.shape[0], dtype=np.bool_)
-    starts = first_rows(keys, row_keys)
+    starts, ends = rows_of_keys(keys, row_keys)
+    felt = felt_rows(row_ids, exclude)
+    has_bits = occupancy.shape[0] > 0
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    mx, my, mz = placed[total, 0], placed[total, 1], placed[total, 2]
+    fx = fy = fz = tx = ty = tz = 0.0
     count = 0
     for n in range(total):
-        u = slot[n]
-        if u < 0:
+        at = asked[1, n]
+        if at < 0:
             continue
-        bit = address[n] & 511
+        byte = (asked[0, n] & 511) >> 3
+        bit = asked[0, n] & 7
         is_hit = False
-        row = starts[u]
-        while row < row_keys.shape[0] and row_keys[row] == keys[u]:
-            if holds(occupancy, row, bit) and not is_excluded(row_ids[row], exclude):
+        for row in range(starts[at], ends[at]):
+            if has_bits and not (occupancy[64 * row + byte] >> bit) & 1:
+                continue
+            if felt[row]:
                 is_hit = True
                 touched[row] = True
-            row += 1
         if not is_hit:
             continue
-        px = world[n, 0]
-        py = world[n, 1]
-        pz = world[n, 2]
-        nx = turned[n, 0]
-        ny = turned[n, 1]
-        nz = turned[n, 2]
-        cx = origin[0] + size * (np.floor((px - origin[0]) / size) + 0.5)
-        cy = origin[1] + size * (np.floor((py - origin[1]) / size) + 0.5)
-        cz = origin[2] + size * (np.floor((pz - origin[2]) / size) + 0.5)
+        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
+        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
+        cx = center_of(px, ox, size)
+        cy = center_of(py, oy, size)
+        cz = center_of(pz, oz, size)
         depth = contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz)
-        if depth > 0.0:
-            add_contact(px, py, pz, nx, ny, nz, depth, center, stiffness, wrench)
         hits[count] = n
         depths[count] = max(depth, 0.0)
         count += 1
-    average(count, wrench)
-    return wrench, hits[:count], depths[:count], touched
+        if depth > 0.0:
+            x, y, z = contact_force(nx, ny, nz, depth, stiffness)
+            fx += x
+            fy += y
+            fz += z
+            x, y, z = moment(px - mx, py - my, pz - mz, x, y, z)
+            tx += x
+            ty += y
+            tz += z
+    return averaged(count, fx, fy, fz, tx, ty, tz), hits[:count], depths[:count], touched
 
 
 @entry
-def pairs_of_hits(slot, address, keys, hits, row_keys, row_ids, occupancy, exclude):
+def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
     """Every (shell point, object) pair of a frame's hits, (P, 2) int64, ordered by both."""
-    starts = first_rows(keys, row_keys)
-    pairs = np.empty((hits.shape[0] * 2 + 8, 2), dtype=np.int64)
+    starts, ends = rows_of_keys(keys, row_keys)
+    felt = felt_rows(row_ids, exclude)
+    has_bits = occupancy.shape[0] > 0
+    most = 0
+    for h in range(hits.shape[0]):
+        at = asked[1, hits[h]]
+        most += ends[at] - starts[at]
+    pairs = np.empty((most, 2), dtype=np.int64)
     count = 0
-    for n in hits:
-        row = starts[slot[n]]
-        while row < row_keys.shape[0] and row_keys[row] == keys[slot[n]]:
-            if holds(occupancy, row, address[n] & 511) and not is_excluded(row_ids[row], exclude):
-                if count == pairs.shape[0]:
-                    larger = np.empty((2 * count, 2), dtype=np.int64)
-                    larger[:count] = pairs
-                    pairs = larger
+    for h in range(hits.shape[0]):
+        n = hits[h]
+        at = asked[1, n]
+        byte = (asked[0, n] & 511) >> 3
+        bit = asked[0, n] & 7
+        for row in range(starts[at], ends[at]):
+            if felt[row] and not (has_bits and not (occupancy[64 * row + byte] >> bit) & 1):
                 pairs[count, 0] = n
                 pairs[count, 1] = row_ids[row]
                 count += 1
-            row += 1
     return pairs[:count]
 
 
@@ -321,43 +345,47 @@ def voxel_at(address, bits, curve, shift):
 
 
 @entry
-def wrench_of_addresses(
-    world, turned, ordinals, addresses, origin, size, bits, curve, shift, center, stiffness
-):
+def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, shift, stiffness):
     """Wrench (6,) of hits given as ordinals (H,), ascending, and addresses (H,) int64.
 
     The paper's ``force(point, z_val)``: the voxel's centre comes from the address alone.
     """
-    wrench = np.zeros(6)
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    last = placed.shape[0] - 1
+    mx, my, mz = placed[last, 0], placed[last, 1], placed[last, 2]
+    fx = fy = fz = tx = ty = tz = 0.0
     for h in range(ordinals.shape[0]):
         i, j, k = voxel_at(addresses[h], bits, curve, shift)
-        cx = origin[0] + size * (i + 0.5)
-        cy = origin[1] + size * (j + 0.5)
-        cz = origin[2] + size * (k + 0.5)
         n = ordinals[h]
-        px = world[n, 0]
-        py = world[n, 1]
-        pz = world[n, 2]
-        nx = turned[n, 0]
-        ny = turned[n, 1]
-        nz = turned[n, 2]
+        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
+        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
+        cx = ox + size * (i + 0.5)
+        cy = oy + size * (j + 0.5)
+        cz = oz + size * (k + 0.5)
         depth = contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz)
         if depth > 0.0:
-            add_contact(px, py, pz, nx, ny, nz, depth, center, stiffness, wrench)
-    average(ordinals.shape[0], wrench)
-    return wrench
+            x, y, z = contact_force(nx, ny, nz, depth, stiffness)
+            fx += x
+            fy += y
+            fz += z
+            x, y, z = moment(px - mx, py - my, pz - mz, x, y, z)
+            tx += x
+            ty += y
+            tz += z
+    return averaged(ordinals.shape[0], fx, fy, fz, tx, ty, tz)
 
 
 @entry
-def depths_of_hits(world, turned, hits, origin, size):
+def depths_of_hits(placed, hits, origin, size):
     """Depths (H,) in metres of hits (H,) int64, 0 where the point is above its tangent plane."""
     depths = np.empty(hits.shape[0])
+    ox, oy, oz = origin[0], origin[1], origin[2]
     for h in range(hits.shape[0]):
         n = hits[h]
-        depth = 0.0
-        for axis in range(3):
-            p = world[n, axis]
-            c = origin[axis] + size * (np.floor((p - origin[axis]) / size) + 0.5)
-            depth += (c - p) * turned[n, axis]
-        depths[h] = max(depth, 0.0)
+        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
+        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
+        cx = center_of(px, ox, size)
+        cy = center_of(py, oy, size)
+        cz = center_of(pz, oz, size)
+        depths[h] = max(contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz), 0.0)
     return depths

@@ -186,15 +186,13 @@ class Size(NamedTuple):
 class Frame(NamedTuple):
     """A located shell as `SupportsStatement` binds it: parallel arrays in the order of the points.
 
-    points, normals (N, 3) float64, world frame; addresses (N,) int64 as `kernels.contact.locate`
-    gives them, -1 outside the grid; center (3,) metres, world frame; stiffness N/m; exclude (E,)
-    int64, ids.
+    placed (N + 1, 6) float64: points in metres and normals, world frame, last the tool's centre;
+    addresses (N,) int64, -1 outside the grid, both as `kernels.contact.locate` gives them;
+    stiffness N/m; exclude (E,) int64, ids.
     """
 
-    points: NDArray[np.float64]
-    normals: NDArray[np.float64]
+    placed: NDArray[np.float64]
     addresses: Keys
-    center: NDArray[np.float64]
     stiffness: float
     exclude: Keys
 

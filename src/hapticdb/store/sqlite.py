@@ -177,12 +177,13 @@ class SQLiteStore:
             return Rows(pairs[:, 0].copy(), pairs[:, 1].copy(), NO_OCCUPANCY)
         keys, ids, bricks = zip(*found, strict=True)
         joined = b"".join(bricks)
-        if len(joined) != BRICK_BYTES * len(keys):
+        count = len(keys)
+        if len(joined) != BRICK_BYTES * count:
             raise sqlite_file.damaged(self.url, "a brick of the wrong length")
         return Rows(
-            np.array(keys, dtype=np.int64),
-            np.array(ids, dtype=np.int64),
-            np.frombuffer(joined, dtype=np.uint8),
+            np.fromiter(keys, np.int64, count),
+            np.fromiter(ids, np.int64, count),
+            np.frombuffer(joined, np.uint8),
         )
 
     def lookup(self, keys: Keys) -> Rows:

@@ -23,6 +23,8 @@ from hapticdb.store.schema import FORMAT_VERSION, MIGRATIONS, SQLITE_APPLICATION
 BUSY_TIMEOUT_MS = 10_000
 CACHE_KIB = 256 * 1024
 """Page cache of one connection: the bricks of a large car; memory is taken as it is filled."""
+PAGE_BYTES = 8192
+"""The paper's block."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
 
@@ -120,6 +122,7 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
         with named_errors(str(path)), contextlib.closing(apsw.Connection(str(unfinished))) as new:
+            new.execute(f"PRAGMA page_size = {PAGE_BYTES}")
             new.execute("PRAGMA journal_mode = OFF").fetchall()
             migrate(new, 0)
             fill(new)

@@ -87,8 +87,7 @@ class _Force:
             return bytes(48)
         hits = np.array(sorted(self._hits), dtype=np.int64)
         wrench: NDArray[np.float64] = wrench_of_addresses(
-            self._frame.points,
-            self._frame.normals,
+            self._frame.placed,
             hits[:, 0].copy(),
             hits[:, 1].copy(),
             np.array(self._grid.origin),
@@ -96,7 +95,6 @@ class _Force:
             self._grid.bits,
             self._grid.curve_code,
             row_shift(self._layout),
-            self._frame.center,
             self._frame.stiffness,
         )
         return wrench.tobytes()

@@ -32,6 +32,7 @@ from hapticdb.pointshell import PointShell
 from hapticdb.query import Query
 from hapticdb.statistics import CostModel, QuantileVector
 from hapticdb.store.base import Object
+from hapticdb.warm import warm_up
 
 __all__ = [
     "BusyError",
@@ -65,5 +66,6 @@ __all__ = [
     "create",
     "import_files",
     "open",
+    "warm_up",
 ]
 __version__ = "0.1.0"

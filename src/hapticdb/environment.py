@@ -89,7 +89,7 @@ class Touch:
         x, y, z = self.force
         return (
             f"Touch(force=({x:.4g}, {y:.4g}, {z:.4g}) N, {len(self.hits)} hits, "
-            f"{len(self.contacts)} contacts, objects {list(self._answer.ids)})"
+            f"{len(self.contacts)} contacts, objects {self._answer.ids})"
         )
 
 

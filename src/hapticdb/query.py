@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -18,6 +19,8 @@ if TYPE_CHECKING:
     from hapticdb.statistics import CostModel, QuantileVector
 
 Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
+Located = tuple[NDArray[np.float64], NDArray[np.int64], Keys]
+"""A shell placed in the grid: placed, asked and keys of `hapticdb.kernels.contact.locate`."""
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
@@ -37,14 +40,6 @@ class Query(NamedTuple):
     elapsed_us: float
 
 
-class Located(NamedTuple):
-    """A shell placed in the grid: `hapticdb.kernels.contact.locate` describes the arrays."""
-
-    placed: NDArray[np.float64]
-    asked: NDArray[np.int64]
-    keys: NDArray[np.int64]
-
-
 class Answer(NamedTuple):
     """What a frame found, before it is given to a person.
 
@@ -55,7 +50,7 @@ class Answer(NamedTuple):
     wrench: NDArray[np.float64]
     hits: NDArray[np.int64]
     depths: NDArray[np.float64]
-    ids: tuple[int, ...]
+    ids: list[int]
     pairs: Callable[[], NDArray[np.int64]]
     query: Query
 
@@ -100,46 +95,61 @@ class HapticQuery:
         if strategy == "statement":
             return self._by_statement(located, exclude, law, started)
         chosen, n_statements, n_ranges, rows = self._fetch(strategy, located, gap)
-        if chosen == "statement":
+        if rows is None:
             return self._by_statement(located, exclude, law, started)
-        wrench, hits, depths, touched = contact.refine(
-            *located, *rows, exclude, self._origin, self._size, law.stiffness
+        placed, asked, keys = located
+        row_keys, row_ids, occupancy = rows
+        n_hits, felt, met = contact.refine(
+            placed,
+            asked,
+            keys,
+            row_keys,
+            row_ids,
+            occupancy,
+            exclude,
+            self._origin,
+            self._size,
+            law.stiffness,
         )
-        ids = tuple(sorted(set(rows.ids[touched].tolist())))
-
-        def pairs() -> NDArray[np.int64]:
-            found: NDArray[np.int64] = contact.pairs_of_hits(*located[1:], *rows, exclude, hits)
-            return found
-
+        hits = met[:n_hits]
+        pairs = partial(
+            contact.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
+        )
         elapsed_us = (time.perf_counter_ns() - started) / 1000
-        query = Query(chosen, n_statements, n_ranges, len(rows), elapsed_us)
-        return Answer(wrench, hits, depths, ids, pairs, query)
+        query = Query(chosen, n_statements, n_ranges, len(row_keys), elapsed_us)
+        return Answer(felt[:6], hits, felt[6:], met[n_hits:].tolist(), pairs, query)
 
     def _locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> Located:
         if pose.shape != (4, 4):
             raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
-        status, *arrays = contact.locate(
+        bits, curve, shift = self._curve
+        status, placed, asked, keys = contact.locate(
             shell.points,
             shell.normals,
             shell.center,
             pose,
             self._origin,
             self._size,
-            *self._curve,
+            bits,
+            curve,
+            shift,
         )
         if status:
             raise UsageError("a pose that is no rigid transform: give finite numbers, a rotation")
-        return Located(*arrays)
+        return placed, asked, keys
 
-    def _fetch(self, strategy: Strategy, located: Located, gap: int) -> tuple[str, int, int, Rows]:
-        """Rows of a frame: strategy used, statements, ranges, rows."""
-        keys, first, last = located.keys
+    def _fetch(
+        self, strategy: Strategy, located: Located, gap: int
+    ) -> tuple[Strategy, int, int, Rows | None]:
+        """Rows of a frame: strategy used, statements, ranges, rows; none for `statement`."""
+        _, asked, keys = located
         if strategy == "array":
             return strategy, 1, len(keys), self._store.lookup(keys)
         if strategy == "points":
             with self._store.snapshot():
                 return strategy, len(keys), len(keys), self._store.lookup_each(keys)
         if strategy == "maxgap":
+            first, last = contact.spans_of_keys(asked, keys, *self._curve)
             ranges = maxgap(keys, first, last, gap)
             return strategy, 1, len(ranges.lows), self._store.scan(*ranges)
         quantiles, costs = self._statistics()
@@ -147,18 +157,18 @@ class HapticQuery:
         lows, highs = grouping.ranges
         if strategy == "cbgroup":
             return strategy, 1, len(lows), self._store.scan(lows, highs)
-        asked, scanned = grouping.rows_asked, grouping.rows_asked + grouping.rows_in_gaps
+        n_asked, n_scanned = grouping.rows_asked, grouping.rows_asked + grouping.rows_in_gaps
         expected: dict[Strategy, float] = {
-            "array": costs.of_keys(len(keys), asked),
-            "cbgroup": costs.of_ranges(len(lows), scanned),
+            "array": costs.of_keys(len(keys), n_asked),
+            "cbgroup": costs.of_ranges(len(lows), n_scanned),
             "points": costs.of_points(len(keys)),
-            "statement": costs.of_statement(located.asked.shape[1]),
+            "statement": costs.of_statement(asked.shape[1]),
         }
         chosen = min(expected, key=expected.__getitem__)
         if chosen == "cbgroup":
             return chosen, 1, len(lows), self._store.scan(lows, highs)
         if chosen == "statement":
-            return chosen, 0, 0, Rows(NOTHING_EXCLUDED, NOTHING_EXCLUDED, np.empty(0, np.uint8))
+            return chosen, 0, 0, None
         return self._fetch(chosen, located, gap)
 
     def _by_statement(
@@ -172,15 +182,15 @@ class HapticQuery:
         store = self._store
         if not isinstance(store, SupportsStatement):
             raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
-        addresses = located.asked[0]
-        frame = Frame(located.placed, addresses, law.stiffness, exclude)
+        placed, (addresses, _), _ = located
+        frame = Frame(placed, addresses, law.stiffness, exclude)
         with store.snapshot():
             wrench = store.statement(frame)
             ordinals, ids = store.statement_hits(frame)
         pairs = np.stack([ordinals, ids], axis=1)
         hits = np.unique(ordinals)
-        depths = contact.depths_of_hits(located.placed, hits, self._origin, self._size)
-        touched = tuple(np.unique(ids).tolist())
+        depths = contact.depths_of_hits(placed, hits, self._origin, self._size)
+        touched = np.unique(ids).tolist()
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
         order = np.lexsort((ids, ordinals))

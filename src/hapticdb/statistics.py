@@ -321,11 +321,12 @@ def _probes(store: Store, seed: int) -> list[_Probe]:
         points.flags.writeable = normals.flags.writeable = False
         pose = np.eye(4)
         pose[:3, 3] = center
-        _, placed, asked, (keys, first, last) = contact.locate(
+        _, placed, asked, keys = contact.locate(
             points, normals, middle, pose, origin, grid.voxel_size, *grid_codes, shift
         )
         if not len(keys):
             continue
+        first, last = contact.spans_of_keys(asked, keys, *grid_codes, shift)
         frame = Frame(placed, asked[0], 1000.0, np.empty(0, dtype=np.int64))
         probes.append(_Probe(frame, keys, first, last))
     return probes

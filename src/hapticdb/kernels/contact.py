@@ -119,8 +119,8 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
     asked : (2, N) int64
         Each point's address and slot. The address is the key on voxel rows, the brick's key << 9 |
         bit number on brick rows; the slot its row key's place in `keys`; both -1 outside the grid.
-    keys : (3, U) int64
-        Distinct row keys, ascending; lowest and highest voxel key asked for under each.
+    keys : (U,) int64
+        Distinct row keys, ascending.
 
     Notes
     -----
@@ -130,7 +130,7 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
     placed = np.empty((total + 1, 6))
     asked = np.empty((2, total), dtype=np.int64)
     if not is_rigid(pose):
-        return 1, placed, asked, np.empty((3, 0), dtype=np.int64)
+        return 1, placed, asked, np.empty(0, dtype=np.int64)
     # scalars: an array handed to a leaf, or a row of one, costs a counted reference each time
     a, b, c, u = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
     d, e, f, v = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
@@ -146,8 +146,6 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
         capacity *= 2
     table = np.full(capacity, -1, dtype=np.int32)
     found = np.empty(total, dtype=np.int64)
-    low = np.empty(total, dtype=np.int64)
-    high = np.empty(total, dtype=np.int64)
     count = 0
     memo_key = -1
     memo_slot = -1
@@ -187,22 +185,16 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
             if table[at] < 0:
                 table[at] = count
                 found[count] = row_key
-                low[count] = key
-                high[count] = key
                 count += 1
             memo_key = row_key
             memo_slot = table[at]
         asked[1, n] = memo_slot
-        low[memo_slot] = min(low[memo_slot], key)
-        high[memo_slot] = max(high[memo_slot], key)
     order = sort_small_or_large(found[:count])
     rank = np.empty(count, dtype=np.int32)
-    keys = np.empty((3, count), dtype=np.int64)
+    keys = np.empty(count, dtype=np.int64)
     for n in range(count):
         at = order[n]
-        keys[0, n] = found[at]
-        keys[1, n] = low[at]
-        keys[2, n] = high[at]
+        keys[n] = found[at]
         rank[at] = n
     for n in range(total):
         if asked[1, n] >= 0:
@@ -211,18 +203,50 @@ def locate(points, normals, center, pose, origin, size, bits, curve, shift):
 
 
 @leaf
+def voxel_at(address, bits, curve, shift):
+    """Voxel (i, j, k) of an address as `locate` gives it."""
+    if shift == 0:
+        return voxel_of(address, bits, curve)
+    i, j, k = voxel_of(address >> 9, max(bits - 3, 0), curve)
+    x, y, z = voxel_of(address & 511, 3, Z_ORDER)
+    return (i << 3) | x, (j << 3) | y, (k << 3) | z
+
+
+@entry
+def spans_of_keys(asked, keys, bits, curve, shift):
+    """Lowest and highest voxel key (2, U) that a shell asks for under each row key.
+
+    asked, keys as `locate` returns them.
+    """
+    spans = np.empty((2, keys.shape[0]), dtype=np.int64)
+    spans[0] = np.iinfo(np.int64).max
+    spans[1] = -1
+    for n in range(asked.shape[1]):
+        at = asked[1, n]
+        if at < 0:
+            continue
+        key = asked[0, n]
+        if shift > 0 and curve != Z_ORDER:
+            i, j, k = voxel_at(key, bits, curve, shift)
+            key = key_of(i, j, k, bits, curve)
+        spans[0, at] = min(spans[0, at], key)
+        spans[1, at] = max(spans[1, at], key)
+    return spans
+
+
+@leaf
 def rows_of_keys(keys, row_keys):
     """Where the rows of each asked key begin and end, (U,) int64 each.
 
     One merge of two ascending lists; rows of keys that nobody asked for are the false hits.
     """
-    total = keys.shape[1]
+    total = keys.shape[0]
     starts = np.empty(total, dtype=np.int64)
     ends = np.empty(total, dtype=np.int64)
     n_rows = row_keys.shape[0]
     row = 0
     for n in range(total):
-        key = keys[0, n]
+        key = keys[n]
         while row < n_rows and row_keys[row] < key:
             row += 1
         starts[n] = row
@@ -233,15 +257,32 @@ def rows_of_keys(keys, row_keys):
 
 
 @leaf
-def felt_rows(row_ids, exclude):
-    """Which rows are felt, (R,) bool: those of objects that are not excluded."""
-    felt = np.ones(row_ids.shape[0], dtype=np.bool_)
+def counting_rows(row_ids, exclude):
+    """Which rows count, (R,) bool: those of objects that are not excluded."""
+    counts = np.ones(row_ids.shape[0], dtype=np.bool_)
     if exclude.shape[0] > 0:
         for row in range(row_ids.shape[0]):
             for n in range(exclude.shape[0]):
                 if exclude[n] == row_ids[row]:
-                    felt[row] = False
-    return felt
+                    counts[row] = False
+    return counts
+
+
+@leaf
+def insert_distinct(values, start, count, value):
+    """Insert a value into values[start : start + count], ascending; returns the new count.
+
+    A frame touches a handful of objects, each by many rows: from the largest downwards is soon.
+    """
+    at = start + count
+    while at > start and values[at - 1] > value:
+        at -= 1
+    if at > start and values[at - 1] == value:
+        return count
+    for n in range(start + count, at, -1):
+        values[n] = values[n - 1]
+    values[at] = value
+    return count + 1
 
 
 @entry
@@ -253,21 +294,21 @@ def refine(placed, asked, keys, row_keys, row_ids, occupancy, exclude, origin, s
 
     Returns
     -------
-    wrench : (6,) float64
-        Force in N, torque in N m about the centre, world frame.
-    hits : (H,) int64
-        Indices of the shell's points inside a voxel, ascending.
-    depths : (H,) float64
-        Metres below the tangent plane, 0 where the point is above it.
-    touched : (R,) bool
-        Rows that at least one hit lies in.
+    n_hits : int
+        H.
+    felt : (6 + H,) float64
+        Force in N and torque in N m about the centre, world frame; then each hit's depth in metres
+        below its tangent plane, 0 above it.
+    met : (H + I,) int64
+        Indices of the shell's points inside a voxel, ascending; then the ids of the objects that
+        they are in, ascending.
     """
     total = asked.shape[1]
-    hits = np.empty(total, dtype=np.int64)
-    depths = np.empty(total)
-    touched = np.zeros(row_keys.shape[0], dtype=np.bool_)
+    felt = np.empty(6 + total)
+    met = np.empty(total + row_ids.shape[0], dtype=np.int64)
+    touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
     starts, ends = rows_of_keys(keys, row_keys)
-    felt = felt_rows(row_ids, exclude)
+    counts = counting_rows(row_ids, exclude)
     has_bits = occupancy.shape[0] > 0
     ox, oy, oz = origin[0], origin[1], origin[2]
     mx, my, mz = placed[total, 0], placed[total, 1], placed[total, 2]
@@ -283,7 +324,7 @@ def refine(placed, asked, keys, row_keys, row_ids, occupancy, exclude, origin, s
         for row in range(starts[at], ends[at]):
             if has_bits and not (occupancy[64 * row + byte] >> bit) & 1:
                 continue
-            if felt[row]:
+            if counts[row]:
                 is_hit = True
                 touched[row] = True
         if not is_hit:
@@ -294,8 +335,8 @@ def refine(placed, asked, keys, row_keys, row_ids, occupancy, exclude, origin, s
         cy = center_of(py, oy, size)
         cz = center_of(pz, oz, size)
         depth = contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz)
-        hits[count] = n
-        depths[count] = max(depth, 0.0)
+        met[count] = n
+        felt[6 + count] = max(depth, 0.0)
         count += 1
         if depth > 0.0:
             x, y, z = contact_force(nx, ny, nz, depth, stiffness)
@@ -306,14 +347,19 @@ def refine(placed, asked, keys, row_keys, row_ids, occupancy, exclude, origin, s
             tx += x
             ty += y
             tz += z
-    return averaged(count, fx, fy, fz, tx, ty, tz), hits[:count], depths[:count], touched
+    felt[:6] = averaged(count, fx, fy, fz, tx, ty, tz)
+    n_ids = 0
+    for row in range(row_ids.shape[0]):
+        if touched[row]:
+            n_ids = insert_distinct(met, count, n_ids, row_ids[row])
+    return count, felt[: 6 + count], met[: count + n_ids]
 
 
 @entry
 def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
     """Every (shell point, object) pair of a frame's hits, (P, 2) int64, ordered by both."""
     starts, ends = rows_of_keys(keys, row_keys)
-    felt = felt_rows(row_ids, exclude)
+    counts = counting_rows(row_ids, exclude)
     has_bits = occupancy.shape[0] > 0
     most = 0
     for h in range(hits.shape[0]):
@@ -327,21 +373,11 @@ def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
         byte = (asked[0, n] & 511) >> 3
         bit = asked[0, n] & 7
         for row in range(starts[at], ends[at]):
-            if felt[row] and not (has_bits and not (occupancy[64 * row + byte] >> bit) & 1):
+            if counts[row] and not (has_bits and not (occupancy[64 * row + byte] >> bit) & 1):
                 pairs[count, 0] = n
                 pairs[count, 1] = row_ids[row]
                 count += 1
     return pairs[:count]
-
-
-@leaf
-def voxel_at(address, bits, curve, shift):
-    """Voxel (i, j, k) of an address as `locate` gives it."""
-    if shift == 0:
-        return voxel_of(address, bits, curve)
-    i, j, k = voxel_of(address >> 9, max(bits - 3, 0), curve)
-    x, y, z = voxel_of(address & 511, 3, Z_ORDER)
-    return (i << 3) | x, (j << 3) | y, (k << 3) | z
 
 
 @entry

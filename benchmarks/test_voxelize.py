@@ -75,7 +75,7 @@ def subset(assembly: Assembly, benchmark: BenchmarkFixture, one_in: int = 1) -> 
 
 def measure(benchmark: BenchmarkFixture, run: Callable[[], list[T]], rounds: int) -> list[T]:
     """Time `run`, warmed up, and return what it returns."""
-    result: list[T] = benchmark.pedantic(run, rounds=rounds, warmup_rounds=1)  # type: ignore[no-untyped-call]
+    result: list[T] = benchmark.pedantic(run, rounds=rounds, warmup_rounds=1)
     return result
 
 

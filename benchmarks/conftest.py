@@ -1,0 +1,44 @@
+"""Scenes of the benchmarks: the paper's size when they measure, tiny when they run as tests."""
+
+from collections.abc import Iterator
+
+import pytest
+
+import hapticdb
+from hapticdb import Environment, PointShell
+from hapticdb.poses import read_poses
+from hapticdb.sample import write_sample
+from hapticdb.store.base import LAYOUTS, Layout
+from scene import Scene
+
+PAPER_BITS = 11
+TINY_BITS = 7
+
+
+def is_measuring(config: pytest.Config) -> bool:
+    """Whether times count; else the benchmarks run once, as tests."""
+    return not config.getoption("benchmark_disable")
+
+
+@pytest.fixture(scope="session")
+def bits(pytestconfig: pytest.Config) -> int:
+    return PAPER_BITS if is_measuring(pytestconfig) else TINY_BITS
+
+
+@pytest.fixture(scope="session")
+def scene(bits: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+    """Sample car, extent 1.6; 300 points of the wrench; poses spread over the sample's path."""
+    folder = tmp_path_factory.mktemp("bench")
+    files = write_sample(folder, count=400)
+    environments: dict[Layout, Environment] = {}
+    for layout in LAYOUTS:
+        options = hapticdb.ImportOptions(
+            grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout
+        )
+        (report,) = hapticdb.import_files(folder / f"{layout}.db", [files.car], options)
+        assert report.status == "imported"
+        environments[layout] = hapticdb.open(folder / f"{layout}.db", read_only=True)
+    shell = PointShell.from_file(files.wrench, points=300)
+    yield Scene(files, environments, shell, list(read_poses(files.path)))
+    for env in environments.values():
+        env.close()

@@ -1,0 +1,20 @@
+"""What the benchmarks of frames and imports share."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb import Environment, PointShell
+from hapticdb.sample import SampleFiles
+from hapticdb.store.base import Layout
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The sample car in both layouts, a tool, and where it goes."""
+
+    files: SampleFiles
+    environments: dict[Layout, Environment]
+    shell: PointShell
+    poses: list[NDArray[np.float64]]

@@ -1,0 +1,137 @@
+"""One frame: every strategy and layout, beside the limit and the start.
+
+The limit is a dense in-memory bitmap with the same kernels; the start is one warm statement a shell
+point through the standard library's ``sqlite3`` on the voxel layout, what a program without any of
+this would do. Each round is one pass over all poses, so that no pose stays in a processor's cache;
+`us_per_frame` in the extra info is the median round over their number.
+
+    make bench                      # the sample at 11 bits: about 13.5 million object voxels
+"""
+
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pytest_benchmark.fixture import BenchmarkFixture
+
+import hapticdb
+from hapticdb import Environment
+from hapticdb.kernels import contact
+from hapticdb.query import STRATEGIES, Strategy
+from hapticdb.store.base import BRICK_SHIFT, LAYOUTS, Layout
+from scene import Scene
+
+ROUNDS = 10
+CACHE_KIB = 256 * 1024
+Pose = NDArray[np.float64]
+
+
+def measure(
+    benchmark: BenchmarkFixture, scene: Scene, frame: Callable[[Pose], object], group: str
+) -> None:
+    """Time passes over all poses, after one that warms up."""
+
+    def all_poses() -> None:
+        for pose in scene.poses:
+            frame(pose)
+
+    benchmark.group = group
+    benchmark.pedantic(all_poses, rounds=ROUNDS, warmup_rounds=2)
+    if benchmark.stats is not None:
+        per_frame = benchmark.stats.stats.median / len(scene.poses) * 1e6
+        benchmark.extra_info["us_per_frame"] = round(per_frame, 1)
+    env = scene.environments["brick"]
+    benchmark.extra_info["object_voxels"] = sum(obj.voxels for obj in env.objects())
+
+
+class DenseBitmap:
+    """Every brick of the grid in memory, indexed by its key: 1 GiB at 11 bits an axis."""
+
+    def __init__(self, env: Environment) -> None:
+        self._env = env
+        self._origin = np.array(env.grid.origin)
+        self._bricks = np.zeros((1 << max(3 * env.grid.bits - BRICK_SHIFT, 0), 64), dtype=np.uint8)
+        ends = np.array([0], dtype=np.int64), np.array([len(self._bricks)], dtype=np.int64)
+        rows = env.store.scan(*ends)
+        np.bitwise_or.at(self._bricks, rows.keys, rows.occupancy.reshape(-1, 64))
+        self._nothing = np.empty(0, dtype=np.int64)
+
+    def touch(self, shell: hapticdb.PointShell, pose: Pose) -> tuple[int, NDArray[np.float64]]:
+        """Hits and wrench, by the kernels of every frame."""
+        grid = self._env.grid
+        size = grid.voxel_size
+        _, placed, asked, keys = contact.locate(
+            shell.points,
+            shell.normals,
+            shell.center,
+            pose,
+            self._origin,
+            size,
+            grid.bits,
+            grid.curve_code,
+            BRICK_SHIFT,
+        )
+        bits = np.frombuffer(self._bricks[keys].tobytes(), np.uint8)
+        ids = np.ones(len(keys), dtype=np.int64)
+        n_hits, felt, _ = contact.refine(
+            placed, asked, keys, keys, ids, bits, self._nothing, self._origin, size, 1000.0
+        )
+        return n_hits, felt[:6]
+
+
+@pytest.fixture(scope="module")
+def dense(scene: Scene) -> DenseBitmap:
+    return DenseBitmap(scene.environments["brick"])
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_touch(
+    benchmark: BenchmarkFixture, scene: Scene, strategy: Strategy, layout: Layout
+) -> None:
+    env = scene.environments[layout]
+    env.calibrate(keep=False)
+    measure(benchmark, scene, lambda pose: env.touch(scene.shell, pose, strategy), "frame")
+    queries = [env.touch(scene.shell, pose, strategy).query for pose in scene.poses]
+    for name in ("statements", "ranges", "rows"):
+        benchmark.extra_info[name] = float(np.mean([getattr(q, name) for q in queries]))
+
+
+def test_dense_bitmap(benchmark: BenchmarkFixture, scene: Scene, dense: DenseBitmap) -> None:
+    measure(benchmark, scene, lambda pose: dense.touch(scene.shell, pose), "frame")
+    for pose in scene.poses[::20]:
+        touch = scene.environments["brick"].touch(scene.shell, pose)
+        n_hits, wrench = dense.touch(scene.shell, pose)
+        assert n_hits == len(touch.hits)
+        assert wrench[:3].tobytes() == touch.force.tobytes()
+
+
+@pytest.mark.parametrize("cache_kib", [2000, CACHE_KIB], ids=["default cache", "all cached"])
+def test_one_statement_a_point_by_the_standard_library(
+    benchmark: BenchmarkFixture, scene: Scene, cache_kib: int
+) -> None:
+    env = scene.environments["voxel"]
+    connection = sqlite3.connect(f"{Path(env.url).resolve().as_uri()}?mode=ro", uri=True)
+    connection.execute(f"PRAGMA cache_size = -{cache_kib}")
+    cursor = connection.cursor()
+    grid = env.grid
+    asked: dict[bytes, list[int]] = {}
+    for pose in scene.poses:
+        voxels = grid.voxels_of(scene.shell.points @ pose[:3, :3].T + pose[:3, 3])
+        inside = voxels[grid.contains(voxels)]
+        asked[pose.tobytes()] = grid.encode(inside).tolist()
+
+    def look_up(pose: Pose) -> int:
+        found = 0
+        for key in asked[pose.tobytes()]:
+            row = cursor.execute("SELECT id FROM voxel WHERE z_val = ?", (key,)).fetchone()
+            found += row is not None
+        return found
+
+    measure(benchmark, scene, look_up, "frame")
+    for pose in scene.poses[::20]:
+        assert look_up(pose) == len(env.touch(scene.shell, pose).hits)
+    connection.close()

@@ -1,0 +1,43 @@
+"""Import of the sample car: from the file to a database that answers, in both layouts.
+
+`object_voxels_per_s` counts everything: the child that parses, voxelizing, writing, statistics.
+"""
+
+import shutil
+from pathlib import Path
+
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+import hapticdb
+from hapticdb.store.base import LAYOUTS, Layout
+from scene import Scene
+
+
+@pytest.mark.parametrize("jobs", [1, 2])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_import(
+    benchmark: BenchmarkFixture, scene: Scene, bits: int, tmp_path: Path, layout: Layout, jobs: int
+) -> None:
+    options = hapticdb.ImportOptions(
+        grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout, jobs=jobs
+    )
+    folder = tmp_path / "car"
+
+    def fresh() -> None:
+        shutil.rmtree(folder, ignore_errors=True)
+        folder.mkdir()
+
+    def run() -> None:
+        hapticdb.import_files(folder / "car.db", [scene.files.car], options)
+
+    benchmark.group = "import"
+    benchmark.pedantic(run, setup=fresh, rounds=3, warmup_rounds=1)
+    with hapticdb.open(folder / "car.db") as env:
+        voxels = sum(obj.voxels for obj in env.objects())
+        size = env.size()
+    benchmark.extra_info["object_voxels"] = voxels
+    benchmark.extra_info["bytes_per_voxel"] = round(size.bytes / voxels, 2)
+    if benchmark.stats is not None:
+        per_second = voxels / benchmark.stats.stats.median
+        benchmark.extra_info["object_voxels_per_s"] = round(per_second)

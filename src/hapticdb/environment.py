@@ -41,6 +41,8 @@ from hapticdb.statistics import (
 from hapticdb.store.base import Keys, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
 
+_NOBODY: tuple[int, ...] = ()
+
 
 class Touch:
     """What a tool felt in one frame.
@@ -102,7 +104,8 @@ class Environment:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._query = HapticQuery(store, self._statistics)
-        self._fitted: tuple[QuantileVector, CostModel] | None = None
+        self._quantiles: QuantileVector | None = None
+        self._costs: CostModel | None = None
         self._known: dict[int, Object] = {}
         self._known_at: int | None = None
 
@@ -203,8 +206,7 @@ class Environment:
     def remove(self, object_id: int) -> None:
         """Remove an object and its rows, in one transaction."""
         self._check_writable()
-        old = self._ranges_of(self.object(object_id))
-        self._store.remove(object_id, _pairs(old))
+        self._store.remove(object_id, self._covering)
         self._forget()
 
     def move(self, object_id: int, transform: ArrayLike) -> Object:
@@ -240,7 +242,7 @@ class Environment:
             bounds=bounds,
             attributes=old.attributes,
         )
-        self._store.replace(new, rows, _pairs(self._ranges_of(old)))
+        self._store.replace(new, rows, self._covering)
         self._forget()
         return self.object(object_id)
 
@@ -267,7 +269,7 @@ class Environment:
         pose: ArrayLike,
         strategy: Strategy = "auto",
         *,
-        exclude: Iterable[int] = (),
+        exclude: Iterable[int] = _NOBODY,
         maxgap: int = DEFAULT_MAXGAP,
         law: TangentPlane | None = None,
     ) -> Touch:
@@ -301,7 +303,7 @@ class Environment:
         -----
         Points outside the grid miss. All statements of a touch read one committed revision.
         """
-        ids = as_ids(exclude) if exclude else NOTHING_EXCLUDED
+        ids = NOTHING_EXCLUDED if exclude is _NOBODY else as_ids(exclude)
         force_law = law or _DEFAULT_LAW
         answer = self._query.run(shell, pose, strategy, maxgap, ids, force_law)
         if self._store.version() != self._known_at:
@@ -340,31 +342,32 @@ class Environment:
         costs = calibrate(self._store, seed=seed)
         if keep and not self._store.is_read_only:
             self._store.save_costs(machine_name(), costs.figures())
-        self._fitted = (self.quantiles(), costs)
+        self._costs = costs
         return costs
 
     def _statistics(self) -> tuple[QuantileVector, CostModel]:
         """What grouping by cost needs, fitted when first asked for: under a second."""
-        if self._fitted is None:
-            quantiles = self.quantiles()
+        if self._quantiles is None:
+            self._quantiles = self.quantiles()
+        if not self._quantiles.n_rows:
+            return self._quantiles, CostModel.of_equal_parts()
+        if self._costs is None:
             kept = self._store.costs(machine_name())
-            if not quantiles.n_rows:
-                costs = CostModel.of_equal_parts()
-            elif kept is not None:
-                costs = CostModel.from_figures(kept)
-            else:
-                costs = calibrate(self._store)
-            self._fitted = (quantiles, costs)
-        return self._fitted
+            self._costs = CostModel.from_figures(kept) if kept else calibrate(self._store)
+        return self._quantiles, self._costs
 
     def _forget(self) -> None:
         """Drop what an edit of our own has made stale."""
-        self._fitted = None
+        self._quantiles = None
         self._known_at = None
 
     def _check_writable(self) -> None:
         if self._store.is_read_only:
             raise ReadOnlyError(f"{self.url} was opened to read: open it without read_only")
+
+    def _covering(self, obj: Object) -> Iterable[tuple[int, int]]:
+        lows, highs = self._ranges_of(obj)
+        return zip(lows.tolist(), highs.tolist(), strict=True)
 
     def _ranges_of(self, obj: Object) -> Ranges:
         """Key ranges that cover an object's bounding box, a voxel wider on each side."""
@@ -404,10 +407,6 @@ def create(url: str | os.PathLike[str], grid: Grid, *, layout: Layout = "brick")
         When bricks are asked for in lexicographic order.
     """
     return Environment(create_store(url, grid, layout))
-
-
-def _pairs(ranges: Ranges) -> Iterable[tuple[int, int]]:
-    return zip(ranges.lows.tolist(), ranges.highs.tolist(), strict=True)
 
 
 def _as_transform(transform: ArrayLike) -> NDArray[np.float64]:

@@ -148,7 +148,7 @@ def import_files(
                 report = FileReport(os.fspath(file), "failed", error=error)
             n_written += len(report.added)
             reports.append(report)
-        if store is not None and n_written:
+        if store is not None and store.revision():
             store.analyze(DEFAULT_RESOLUTION)
     finally:
         if store is not None:

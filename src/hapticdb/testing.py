@@ -22,7 +22,16 @@ from hapticdb.errors import EnvironmentExistsError, ObjectNotFoundError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.grouping import box_ranges
 from hapticdb.ingest import rows_of_voxels
-from hapticdb.store.base import Frame, Keys, Layout, Object, Store, SupportsStatement, row_shift
+from hapticdb.store.base import (
+    Covering,
+    Frame,
+    Keys,
+    Layout,
+    Object,
+    Store,
+    SupportsStatement,
+    row_shift,
+)
 
 KINDS: list[tuple[Layout, CurveName]] = [
     ("voxel", "z"),
@@ -66,10 +75,13 @@ def _kind(store: Store) -> tuple[Grid, Layout]:
     return store.grid, store.layout
 
 
-def _ranges(store: Store, obj: Object) -> list[tuple[int, int]]:
-    low, high = store.grid.voxels_of(obj.bounds)
-    found = box_ranges(store.grid, store.layout, low - 1, high + 1)
-    return list(zip(found.lows.tolist(), found.highs.tolist(), strict=True))
+def _covering(store: Store) -> Covering:
+    def ranges(obj: Object) -> list[tuple[int, int]]:
+        low, high = store.grid.voxels_of(obj.bounds)
+        found = box_ranges(store.grid, store.layout, low - 1, high + 1)
+        return list(zip(found.lows.tolist(), found.highs.tolist(), strict=True))
+
+    return ranges
 
 
 class StoreContract:
@@ -169,25 +181,23 @@ class StoreContract:
 
     def test_remove_takes_one_object_and_leaves_the_others(self, store: Store) -> None:
         """Rows and record go, in one revision; the id is never used again."""
-        one, two = store.objects()
-        store.remove(1, _ranges(store, one))
+        store.remove(1, _covering(store))
         assert [obj.id for obj in store.objects()] == [2]
         rows = store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
         assert set(rows.ids.tolist()) == {2}
         assert len(rows) == len(rows_of_voxels(blob(2, (24, 20, 20)), *_kind(store)))
         assert write_voxels(store, blob(1, (20, 20, 20)), "one") == 3
-        store.remove(2, _ranges(store, two))
+        store.remove(2, _covering(store))
         with pytest.raises(ObjectNotFoundError):
-            store.remove(2, _ranges(store, two))
+            store.remove(2, _covering(store))
 
     def test_replace_moves_the_rows(self, store: Store) -> None:
         """Old rows go, new ones come, the id stays."""
-        old = store.objects()[0]
         ijk = blob(7, (44, 30, 10))
         new = voxel_object(store.grid, ijk, "one")
         moved = Object(**{**vars(new), "id": 1})
         rows = rows_of_voxels(ijk, *_kind(store))
-        store.replace(moved, rows, _ranges(store, old))
+        store.replace(moved, rows, _covering(store))
         found = store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
         np.testing.assert_array_equal(found.keys[found.ids == 1], rows.keys)
         np.testing.assert_array_equal(store.objects()[0].bounds, new.bounds)
@@ -201,7 +211,7 @@ class StoreContract:
         ranges = changes[1].ranges
         inside = (keys[:, None] >= ranges[:, 0]) & (keys[:, None] <= ranges[:, 1])
         assert inside.any(axis=1).all()
-        store.remove(1, _ranges(store, store.objects()[0]))
+        store.remove(1, _covering(store))
         assert [c.action for c in store.changes(since=2)] == ["remove"]
 
     def test_a_snapshot_sees_one_revision(self, store: Store) -> None:
@@ -210,7 +220,7 @@ class StoreContract:
         before = reader.size().rows
         with reader.snapshot():
             assert len(reader.objects()) == 2
-            store.remove(1, _ranges(store, store.objects()[0]))
+            store.remove(1, _covering(store))
             assert len(reader.objects()) == 2
             assert reader.size().rows == before
             version = reader.version()
@@ -233,7 +243,7 @@ class StoreContract:
         store.analyze(10)
         kept = store.quantiles(10)
         assert kept[0].tolist() == store.quantiles(10)[0].tolist()
-        store.remove(1, _ranges(store, store.objects()[0]))
+        store.remove(1, _covering(store))
         assert store.quantiles(10)[1] < kept[1]
 
     def test_costs_are_kept_by_machine(self, store: Store) -> None:

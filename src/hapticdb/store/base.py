@@ -1,6 +1,6 @@
 """What an engine does for an environment: the Store protocol and the rows that cross it."""
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
@@ -91,6 +91,10 @@ class Change:
     ranges: NDArray[np.int64]
 
 
+Covering = Callable[[Object], Iterable[tuple[int, int]]]
+"""Key ranges, closed, that hold all rows of an object as it stands when a write begins."""
+
+
 class Store(Protocol):
     """Where an environment lives. Methods take and return whole batches; one call, one round trip.
 
@@ -149,11 +153,11 @@ class Store(Protocol):
     def add(self, record: Object, rows: Rows) -> int:
         """Write an object and its rows (any ids in them) in one transaction; returns its id."""
 
-    def replace(self, record: Object, rows: Rows, old: Iterable[tuple[int, int]]) -> None:
-        """Exchange an object's rows, found in the key ranges `old`, in one transaction."""
+    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+        """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
 
-    def remove(self, object_id: int, old: Iterable[tuple[int, int]]) -> None:
-        """Remove an object and its rows, found in the key ranges `old`, in one transaction."""
+    def remove(self, object_id: int, covering: Covering) -> None:
+        """Remove an object and its rows in one transaction; `covering` says where they are."""
 
     def changes(self, since: int = 0) -> Iterator[Change]:
         """Committed writes after that revision, oldest first."""
@@ -166,7 +170,7 @@ class Store(Protocol):
         """Bounds (R + 1,) of the equi-count histogram of all row keys, and the rows behind it."""
 
     def analyze(self, resolution: int) -> None:
-        """Renew the statistics that `quantiles` answers from."""
+        """Renew the statistics that `quantiles` answers from, unless they are fresh."""
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""

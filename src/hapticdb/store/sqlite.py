@@ -8,7 +8,7 @@ as Python's own.
 
 import contextlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -23,6 +23,7 @@ from hapticdb.store.base import (
     BRICK_BYTES,
     LAYOUTS,
     Change,
+    Covering,
     Frame,
     Keys,
     Layout,
@@ -231,6 +232,9 @@ class SQLiteStore:
 
     def objects(self) -> list[Object]:
         """All objects, ordered by id."""
+        return self._objects("TRUE")
+
+    def _objects(self, condition: str, *bindings: int) -> list[Object]:
         return [
             Object(
                 id=row[0],
@@ -245,7 +249,8 @@ class SQLiteStore:
             )
             for row in self._fetch(
                 "SELECT id, name, link, digest, transform, voxels, bounds, attributes, revision "
-                "FROM object ORDER BY id"
+                f"FROM object WHERE {condition} ORDER BY id",
+                bindings,
             )
         ]
 
@@ -280,29 +285,25 @@ class SQLiteStore:
             self._log(revision, "add", object_id, rows.keys)
         return object_id
 
-    def replace(self, record: Object, rows: Rows, old: Iterable[tuple[int, int]]) -> None:
-        """Exchange an object's rows, found in the key ranges `old`, in one transaction."""
+    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+        """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
         with self._writing():
             revision = self.revision() + 1
-            gone = self._delete(record.id, old)
+            gone = self._delete(record.id, covering)
             self._connection.execute(
                 "UPDATE object SET digest = ?, transform = ?, voxels = ?, bounds = ?,"
                 " attributes = ?, revision = ? WHERE id = ?",
                 (*_contents(record), revision, record.id),
             )
-            if not self._connection.changes():
-                raise ObjectNotFoundError(f"no object {record.id} in {self.url}: see its objects")
             self._insert(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
-    def remove(self, object_id: int, old: Iterable[tuple[int, int]]) -> None:
-        """Remove an object and its rows, found in the key ranges `old`, in one transaction."""
+    def remove(self, object_id: int, covering: Covering) -> None:
+        """Remove an object and its rows in one transaction; `covering` says where they are."""
         with self._writing():
             revision = self.revision() + 1
+            gone = self._delete(object_id, covering)
             self._connection.execute("DELETE FROM object WHERE id = ?", (object_id,))
-            if not self._connection.changes():
-                raise ObjectNotFoundError(f"no object {object_id} in {self.url}: see its objects")
-            gone = self._delete(object_id, old)
             self._log(revision, "remove", object_id, gone)
 
     def _insert(self, rows: Rows, object_id: int) -> None:
@@ -315,11 +316,16 @@ class SQLiteStore:
                 part = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + CHUNK)]
                 self._connection.execute(INSERT["brick"], (keys, object_id, part.tobytes()))
 
-    def _delete(self, object_id: int, old: Iterable[tuple[int, int]]) -> Keys:
-        """Delete an object's rows inside key ranges; returns their keys."""
+    def _delete(self, object_id: int, covering: Covering) -> Keys:
+        """Delete the rows of an object as it stands now; returns their keys."""
+        known = self._objects("id = ?", object_id)
+        if not known:
+            raise ObjectNotFoundError(
+                f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
+            )
         sql = f"DELETE FROM {self.layout} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
         gone: list[int] = []
-        for low, high in old:
+        for low, high in covering(known[0]):
             gone += [row[0] for row in self._connection.execute(sql, (low, high, object_id))]
         return np.array(gone, dtype=np.int64)
 
@@ -363,17 +369,23 @@ class SQLiteStore:
         The kept vector while no object was written since, else a scan of the whole index.
         """
         with self.snapshot():
-            kept = self._fetch(
-                "SELECT bounds, n_rows FROM quantile WHERE resolution = ?"
-                " AND revision = (SELECT coalesce(max(revision), 0) FROM change)",
-                (resolution,),
-            )
+            kept = self._kept_quantiles(resolution)
             if kept:
                 return np.frombuffer(kept[0][0], dtype="<i8").astype(np.int64), int(kept[0][1])
             return exact_quantiles(self._connection, self.layout, resolution)
 
+    def _kept_quantiles(self, resolution: int) -> list[Any]:
+        """Bounds and rows of the vector that was kept at this revision, if any."""
+        return self._fetch(
+            "SELECT bounds, n_rows FROM quantile WHERE resolution = ?"
+            " AND revision = (SELECT coalesce(max(revision), 0) FROM change)",
+            (resolution,),
+        )
+
     def analyze(self, resolution: int) -> None:
-        """Compute and keep the quantile vector of that resolution."""
+        """Compute and keep the quantile vector of that resolution, unless a fresh one is kept."""
+        if self._kept_quantiles(resolution):
+            return
         bounds, n_rows = self.quantiles(resolution)
         with self._writing():
             # another process may have written since: then the vector carries the older revision's

@@ -46,6 +46,8 @@ def named_errors(path: str) -> Iterator[None]:
         raise DatabaseError(f"{path}: the disk is full; what was committed is safe") from error
     except apsw.IOError as error:
         raise DatabaseError(f"{path}: the disk does not answer ({error})") from error
+    except (apsw.ConnectionClosedError, apsw.CursorClosedError) as error:
+        raise DatabaseError(f"{path} has been closed: open it again") from error
     except apsw.CantOpenError as error:
         raise DatabaseError(f"{path} cannot be opened: check its folder's rights") from error
     except apsw.SQLError as error:

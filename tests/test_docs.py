@@ -1,0 +1,75 @@
+"""Every block of the README runs, and the SQL in the docs is the SQL that runs."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from hapticdb.cli import app
+from hapticdb.store import sqlite, sqlite_force
+
+ROOT = Path(__file__).parent.parent
+BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+SHOWN = re.compile(r"<!-- sql: (\w+)\.(\w+)\[\"(\w+)\"\] -->\n```sql\n(.*?)```", re.DOTALL)
+CODE = {"sqlite": sqlite, "sqlite_force": sqlite_force}
+
+
+def blocks(kind: str) -> list[str]:
+    return [text for name, text in BLOCK.findall((ROOT / "README.md").read_text()) if name == kind]
+
+
+def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
+    """Shell first, since Python needs the sample; then all Python in one session."""
+    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for block in blocks("sh"):
+        done = subprocess.run(
+            ["bash", "-euo", "pipefail", "-c", block],
+            cwd=tmp_path,
+            env=os.environ | {"PATH": tools},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert done.returncode == 0, done.stderr
+    (tmp_path / "car.db").unlink()
+    session = "\n".join(blocks("python"))
+    done = subprocess.run(
+        [sys.executable, "-c", session], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(done.stdout.splitlines()) >= 100
+
+
+def test_every_make_line_of_the_readme_is_run_by_ci() -> None:
+    ci = (ROOT / ".ci" / "run").read_text()
+    named = re.findall(r"^    (make \w+)", (ROOT / "README.md").read_text(), re.MULTILINE)
+    assert named == ["make demo", "make test"]
+    for line in named:
+        assert line in ci
+
+
+def test_the_docs_show_the_sql_that_runs() -> None:
+    shown = SHOWN.findall((ROOT / "docs" / "strategies.md").read_text())
+    assert len(shown) == 4
+    for module, constant, layout, text in shown:
+        runs = getattr(CODE[module], constant)[layout]
+        assert text.split() == runs.split()
+
+
+@pytest.mark.parametrize("page", ["README.md", "ARCHITECTURE.md", "docs/strategies.md"])
+def test_every_link_in_the_docs_leads_somewhere(page: str) -> None:
+    path = ROOT / page
+    for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
+        if "://" not in target:
+            assert (path.parent / target).exists(), target
+
+
+def test_the_readme_names_every_command() -> None:
+    readme = (ROOT / "README.md").read_text()
+    for command in app.registered_commands:
+        assert command.callback is not None
+        verb = (command.name or command.callback.__name__).replace("_", "-")
+        assert f"hapticdb {verb}" in readme or f"make {verb}" in readme, verb

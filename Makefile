@@ -21,6 +21,7 @@ lint: $(READY)
 
 types: $(READY)
 	$(BIN)/mypy
+	$(BIN)/mypy benchmarks
 
 # Open3D stands beside in the voxelizing benchmark when it is installed:
 #   pip install open3d   (needs the system's libusb-1.0)

@@ -117,9 +117,12 @@ class Grid:
         Raises
         ------
         GridError
-            When a voxel lies outside the grid.
+            When a voxel lies outside the grid, or is no integer.
         """
-        voxels = np.asarray(ijk, dtype=np.int64).reshape(-1, 3)
+        given = np.asarray(ijk)
+        if given.dtype.kind not in "iu" and given.size:
+            raise GridError(f"voxels of type {given.dtype}: give integers, as voxels_of returns")
+        voxels = given.astype(np.int64).reshape(-1, 3)
         inside = self.contains(voxels)
         if not inside.all():
             bad = voxels[~inside][0].tolist()
@@ -226,6 +229,8 @@ class GridOptions:
             differences.append(f"curve {self.curve} instead of {grid.curve}")
         if self.extent is not None and bounds is not None and not differences:
             fitted = self.fit(bounds)
+            if not np.allclose(fitted.origin, grid.origin, rtol=0, atol=1e-9 * grid.edge):
+                differences.append(f"origin {fitted.origin} instead of {grid.origin}")
             if not _is_close(fitted.edge, grid.edge):
                 differences.append(
                     f"extent {self.extent:g} (an edge of {fitted.edge:.6g} m) instead of an edge "

@@ -47,7 +47,7 @@ def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
     if gap < 0:
         raise UsageError(f"MAXGAP {gap}: give 0 or more")
     # a key has at most 63 bits, and so has every gap between two
-    return Ranges(*kernels.group_by_gap(keys, first, last, min(int(gap), 2**62)))
+    return Ranges(*kernels.group_by_gap(keys, first, last, min(int(gap), 2**63 - 1)))
 
 
 def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping:

@@ -242,6 +242,8 @@ class _Trials:
 
     def fit(self, rows_per_block: float) -> CostModel:
         """Least squares over all that was measured."""
+        if not self._scans:  # every range held more than a frame could wait for
+            return CostModel.of_equal_parts()
         (statement, descent, scanned), s_scan = _least_squares(self._scans)
         (_, _, counted), s_count = _least_squares(self._counts)
         counted = min(counted, scanned)
@@ -314,7 +316,7 @@ def _probes(store: Store, seed: int) -> list[_Probe]:
     probes = []
     for n, center in enumerate(centers):
         n_points = (300, 100, 30, 600)[n % 4]
-        radius = grid.voxel_size * (12, 8, 4, 24)[n % 4]
+        radius = min(grid.voxel_size * (12, 8, 4, 24)[n % 4], grid.edge / 4)
         normals = -_fibonacci_sphere(n_points)
         points = -normals * radius
         # one compiled signature: PointShell, too, hands its arrays out read-only

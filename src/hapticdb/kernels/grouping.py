@@ -29,14 +29,20 @@ def rows_below(x, bounds, rows_per_bucket):
     return (low - 1 + (x - left) / (bounds[low] - left)) * rows_per_bucket
 
 
+@leaf
+def rows_up_to(x, bounds, rows_per_bucket):
+    """Expected rows with a key <= x; x may be the last int64."""
+    if x >= bounds[bounds.shape[0] - 1]:
+        return (bounds.shape[0] - 1) * rows_per_bucket
+    return rows_below(x + 1, bounds, rows_per_bucket)
+
+
 @entry
 def gap_rows(left, right, bounds, rows_per_bucket):
     """Expected rows with a key in [left, right]. bounds (R + 1,) int64, ascending -> float."""
     if right < left:
         return 0.0
-    return rows_below(right + 1, bounds, rows_per_bucket) - rows_below(
-        left, bounds, rows_per_bucket
-    )
+    return rows_up_to(right, bounds, rows_per_bucket) - rows_below(left, bounds, rows_per_bucket)
 
 
 @entry
@@ -90,7 +96,7 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost):
             lows[count] = keys[n]
             highs[count] = keys[n]
             count += 1
-        above = rows_below(keys[n] + 1, bounds, rows_per_bucket)
+        above = rows_up_to(keys[n], bounds, rows_per_bucket)
         asked += above - below
     return lows[:count], highs[:count], asked, scanned
 
@@ -113,17 +119,19 @@ def ranges_of_box(low, high, bits, curve, finest):
 
     On a hierarchical curve the box's cubes, split no finer than 2^finest voxels an edge, so that
     their number stays in proportion to the box's surface in such cubes; in lexicographic order one
-    range a slab. Not yet sorted or merged.
+    range for each of at most 1024 runs of slabs. Not yet sorted or merged.
     """
     ranges = np.empty((64, 2), dtype=np.int64)
     count = 0
     if curve == LEXICOGRAPHIC:
-        for i in range(low[0], high[0] + 1):
+        step = (high[0] - low[0]) // 1024 + 1
+        for i in range(low[0], high[0] + 1, step):
+            last = min(i + step - 1, high[0])
             ranges, count = add_range(
                 ranges,
                 count,
                 key_of(i, low[1], low[2], bits, curve),
-                key_of(i, high[1], high[2], bits, curve),
+                key_of(last, high[1], high[2], bits, curve),
             )
         return ranges[:count]
     stack = np.empty((8 * (bits + 1), 4), dtype=np.int64)

@@ -1,0 +1,212 @@
+"""The three curves against definitions bit by bit in plain Python, and what makes them curves."""
+
+from collections.abc import Callable
+from itertools import pairwise, product
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb.kernels.curves import HILBERT, LEXICOGRAPHIC, Z_ORDER, decode, encode
+from naive import Voxel, z_order
+
+JIT = not numba.config.DISABLE_JIT
+few = settings(max_examples=300 if JIT else 60, deadline=None)
+CURVES = {"lexicographic": LEXICOGRAPHIC, "z": Z_ORDER, "hilbert": HILBERT}
+HIERARCHICAL = [Z_ORDER, HILBERT]
+LAST = (1 << 21) - 1
+
+# The Hilbert curve as eight copies of itself: the octant of each copy in the order of the path,
+# the axis that each of its own axes is taken from, and which of its axes run backwards.
+COPIES: list[tuple[Voxel, Voxel, Voxel]] = [
+    ((0, 0, 0), (1, 2, 0), (0, 0, 0)),
+    ((0, 0, 1), (1, 0, 2), (0, 0, 0)),
+    ((0, 1, 1), (0, 1, 2), (0, 0, 0)),
+    ((0, 1, 0), (2, 1, 0), (1, 0, 1)),
+    ((1, 1, 0), (2, 1, 0), (0, 0, 0)),
+    ((1, 1, 1), (0, 1, 2), (0, 0, 0)),
+    ((1, 0, 1), (1, 0, 2), (1, 1, 0)),
+    ((1, 0, 0), (1, 2, 0), (1, 0, 1)),
+]
+
+
+def lexicographic(key: int, bits: int) -> Voxel:
+    """Voxel of a key that counts k fastest and i slowest."""
+    rest, k = divmod(key, 2**bits)
+    i, j = divmod(rest, 2**bits)
+    return i, j, k
+
+
+def interleaved(key: int, bits: int) -> Voxel:
+    """Voxel of a key whose bits are ... i1 j1 k1 i0 j0 k0."""
+    places = range(bits)
+    i, j, k = (sum((key >> (3 * n + axis) & 1) << n for n in places) for axis in (2, 1, 0))
+    return i, j, k
+
+
+def hilbert(key: int, bits: int) -> Voxel:
+    """Voxel of a key on the path made of eight copies of the path of one bit less."""
+    if bits == 0:
+        return 0, 0, 0
+    half = 1 << (bits - 1)
+    octant, source, is_reversed = COPIES[key >> 3 * (bits - 1)]
+    inner = hilbert(key & (8 ** (bits - 1) - 1), bits - 1)
+    i, j, k = (
+        octant[axis] * half + (half - 1 - inner[at] if is_reversed[axis] else inner[at])
+        for axis, at in enumerate(source)
+    )
+    return i, j, k
+
+
+DEFINITIONS: dict[int, Callable[[int, int], Voxel]] = {
+    LEXICOGRAPHIC: lexicographic,
+    Z_ORDER: interleaved,
+    HILBERT: hilbert,
+}
+curves = pytest.mark.parametrize("curve", CURVES.values(), ids=CURVES.keys())
+hierarchical = pytest.mark.parametrize("curve", HIERARCHICAL, ids=["z", "hilbert"])
+
+
+def cube(bits: int) -> NDArray[np.int64]:
+    """Every voxel (8^bits, 3) in lexicographic order."""
+    return np.array(list(product(range(1 << bits), repeat=3)), dtype=np.int64)
+
+
+def voxels_and_bits() -> st.SearchStrategy[tuple[int, list[list[int]]]]:
+    """Bits an axis, 1 to 21, and some voxels of that grid."""
+    return st.integers(1, 21).flatmap(
+        lambda bits: st.tuples(
+            st.just(bits),
+            st.lists(
+                st.lists(st.integers(0, (1 << bits) - 1), min_size=3, max_size=3),
+                min_size=1,
+                max_size=8,
+            ),
+        )
+    )
+
+
+@curves
+@pytest.mark.parametrize("bits", [1, 2, 3, 4])
+def test_every_voxel_of_a_small_grid_has_the_defined_key(bits: int, curve: int) -> None:
+    path = [DEFINITIONS[curve](key, bits) for key in range(8**bits)]
+    assert encode(np.array(path), bits, curve).tolist() == list(range(8**bits))
+    assert [tuple(v) for v in decode(np.arange(8**bits), bits, curve).tolist()] == path
+
+
+@curves
+@pytest.mark.parametrize("bits", [1, 2, 3, 4, 5])
+def test_a_curve_visits_every_voxel_once(bits: int, curve: int) -> None:
+    voxels = cube(bits)
+    keys = encode(voxels, bits, curve)
+    assert np.sort(keys).tolist() == list(range(8**bits))
+    np.testing.assert_array_equal(decode(keys, bits, curve), voxels)
+
+
+@curves
+@few
+@given(chosen=voxels_and_bits())
+def test_any_voxel_returns_from_its_defined_key(
+    chosen: tuple[int, list[list[int]]], curve: int
+) -> None:
+    bits, voxels = chosen
+    keys = encode(np.array(voxels), bits, curve)
+    assert keys.dtype == np.int64
+    assert keys.min() >= 0
+    assert int(keys.max()) < 8**bits
+    assert decode(keys, bits, curve).tolist() == voxels
+    assert [list(DEFINITIONS[curve](key, bits)) for key in keys.tolist()] == voxels
+
+
+@few
+@given(chosen=voxels_and_bits())
+def test_the_z_order_agrees_with_the_oracle_of_the_voxelizer(
+    chosen: tuple[int, list[list[int]]],
+) -> None:
+    bits, voxels = chosen
+    assert encode(np.array(voxels), bits, Z_ORDER).tolist() == [z_order(*v) for v in voxels]
+
+
+@curves
+def test_the_corners_of_the_largest_grid_return(curve: int) -> None:
+    corners = np.array(list(product((0, 1, LAST - 1, LAST), repeat=3)), dtype=np.int64)
+    keys = encode(corners, 21, curve)
+    np.testing.assert_array_equal(decode(keys, 21, curve), corners)
+    assert [list(DEFINITIONS[curve](key, 21)) for key in keys.tolist()] == corners.tolist()
+    assert len(set(keys.tolist())) == len(corners)
+
+
+@curves
+def test_the_keys_of_the_largest_grid_fill_63_bits(curve: int) -> None:
+    ends = np.array([0, 2**63 - 1], dtype=np.int64)
+    voxels = decode(ends, 21, curve)
+    assert ((voxels >= 0) & (voxels <= LAST)).all()
+    np.testing.assert_array_equal(encode(voxels, 21, curve), ends)
+    assert voxels[0].tolist() == [0, 0, 0]
+    # the Hilbert curve ends beside its start, the others at the far corner
+    assert voxels[1].tolist() == ([LAST, 0, 0] if curve == HILBERT else [LAST] * 3)
+
+
+@curves
+@pytest.mark.parametrize("bits", [1, 7, 21])
+def test_i_is_the_most_significant_axis(bits: int, curve: int) -> None:
+    """The lower half of the keys is the lower half of i."""
+    half = 8**bits // 2
+    keys = np.array([0, half - 1, half, 2 * half - 1], dtype=np.int64)
+    voxels = decode(keys, bits, curve)
+    assert (voxels[:, 0] >> (bits - 1)).tolist() == [0, 0, 1, 1]
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3, 4, 5])
+def test_neighbours_on_the_hilbert_curve_share_a_face(bits: int) -> None:
+    path = decode(np.arange(8**bits), bits, HILBERT)
+    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
+
+
+@few
+@given(bits=st.integers(6, 21), at=st.floats(0, 1))
+def test_neighbours_on_a_long_hilbert_curve_share_a_face(bits: int, at: float) -> None:
+    start = min(int(at * 8**bits), 8**bits - 64)
+    path = decode(np.arange(64) + start, bits, HILBERT)
+    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
+
+
+@hierarchical
+@few
+@given(chosen=voxels_and_bits())
+def test_leading_bits_name_the_cube_that_holds_the_voxel(
+    chosen: tuple[int, list[list[int]]], curve: int
+) -> None:
+    """On the same curve of fewer bits: down to the whole grid, whose key is 0."""
+    bits, voxels = chosen
+    keys = encode(np.array(voxels), bits, curve)
+    for level in range(1, bits):
+        parents = encode(np.array(voxels) >> level, bits - level, curve)
+        np.testing.assert_array_equal(keys >> (3 * level), parents)
+
+
+@hierarchical
+def test_the_voxels_of_a_cube_have_neighbouring_keys(curve: int) -> None:
+    """What a brick's single key stands on."""
+    keys = encode(cube(3) + np.array([8, 24, 16]), 5, curve)
+    assert all(b - a == 1 for a, b in pairwise(sorted(keys.tolist())))
+
+
+@curves
+def test_arrays_of_any_type_and_order_of_memory_are_taken(curve: int) -> None:
+    voxels = cube(3)
+    keys = encode(voxels, 3, curve)
+    np.testing.assert_array_equal(encode(voxels.astype(np.int32), 3, curve), keys)
+    np.testing.assert_array_equal(encode(np.asfortranarray(voxels), 3, curve), keys)
+    np.testing.assert_array_equal(encode(voxels[::-2], 3, curve), keys[::-2])
+    np.testing.assert_array_equal(decode(keys[::-2], 3, curve), voxels[::-2])
+    np.testing.assert_array_equal(decode(keys.astype(np.uint16), 3, curve), voxels)
+
+
+@curves
+def test_no_voxels_have_no_keys(curve: int) -> None:
+    assert encode(np.empty((0, 3), dtype=np.int64), 4, curve).shape == (0,)
+    assert decode(np.empty(0, dtype=np.int64), 4, curve).shape == (0, 3)

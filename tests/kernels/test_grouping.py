@@ -1,0 +1,194 @@
+"""Expected rows and key ranges against plain definitions, on small grids by brute force."""
+
+from fractions import Fraction
+from itertools import pairwise, product
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb.kernels.curves import HILBERT, LEXICOGRAPHIC, Z_ORDER, encode
+from hapticdb.kernels.grouping import gap_rows, group_by_cost, group_by_gap, ranges_of_box
+
+JIT = not numba.config.DISABLE_JIT
+few = settings(max_examples=300 if JIT else 60, deadline=None)
+LAST_KEY = 2**63 - 1
+BITS = 4
+SIDE = 1 << BITS
+
+# a few values, so that bounds coincide and ends fall on them; and the whole width of a key
+small = st.integers(0, 40)
+large = st.integers(0, LAST_KEY)
+
+
+def bounds_of(values: st.SearchStrategy[int]) -> st.SearchStrategy[list[int]]:
+    return st.lists(values, min_size=2, max_size=12).map(sorted)
+
+
+def expected_rows(left: int, right: int, bounds: list[int], per_bucket: Fraction) -> Fraction:
+    """Sum over the buckets of overlap / width with [left, right + 1), exact.
+
+    A bucket of zero width counts whole if its value lies in the range.
+    """
+    total = Fraction(0)
+    for low, high in pairwise(bounds):
+        if low == high:
+            total += left <= low <= right
+        else:
+            overlap = min(high, right + 1) - max(low, left)
+            total += Fraction(max(overlap, 0), high - low)
+    return total * per_bucket
+
+
+def as_keys(values: list[int]) -> NDArray[np.int64]:
+    return np.array(values, dtype=np.int64)
+
+
+@few
+@given(
+    bounds=st.one_of(bounds_of(small), bounds_of(large)),
+    ends=st.one_of(st.tuples(small, small), st.tuples(large, large)),
+    eighths=st.integers(1, 80),
+)
+def test_expected_rows_are_the_overlaps_over_the_widths(
+    bounds: list[int], ends: tuple[int, int], eighths: int
+) -> None:
+    left, right = sorted(ends)
+    wanted = expected_rows(left, right, bounds, Fraction(eighths, 8))
+    found = gap_rows(left, right, as_keys(bounds), eighths / 8)
+    # a difference of two sums, each as large as all rows
+    assert found == pytest.approx(float(wanted), rel=1e-12, abs=1e-13 * eighths * len(bounds))
+
+
+@few
+@given(
+    bounds=bounds_of(small),
+    cuts=st.lists(small, min_size=3, max_size=8, unique=True).map(sorted),
+)
+def test_rows_of_neighbouring_ranges_add(bounds: list[int], cuts: list[int]) -> None:
+    """Ranges are half-open inside, so no key counts twice or never."""
+    keys = as_keys(bounds)
+    whole = gap_rows(cuts[0], cuts[-1] - 1, keys, 2.0)
+    parts = sum(gap_rows(low, high - 1, keys, 2.0) for low, high in pairwise(cuts))
+    assert parts == pytest.approx(whole, rel=1e-12, abs=1e-12)
+
+
+@few
+@given(bounds=bounds_of(small), ends=st.tuples(small, small))
+def test_an_empty_range_holds_no_rows(bounds: list[int], ends: tuple[int, int]) -> None:
+    low, high = sorted(ends)
+    assert gap_rows(high + 1, low, as_keys(bounds), 1.0) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "wanted"),
+    [
+        (5, 5, 2.2),  # two buckets of zero width, and a fifth of the one that begins there
+        (4, 5, 2.4),
+        (4, 4, 0.2),
+        (6, 9, 0.8),
+        (0, 0, 0.2),
+        (0, 20, 4.0),
+        (10, 10, 0.0),  # the last bound closes the last bucket
+        (11, 20, 0.0),
+    ],
+)
+def test_a_bucket_of_zero_width_counts_whole_where_its_value_lies_in_the_range(
+    left: int, right: int, wanted: float
+) -> None:
+    assert gap_rows(left, right, as_keys([0, 5, 5, 5, 10]), 1.0) == pytest.approx(wanted)
+
+
+def test_the_last_key_of_the_largest_grid_is_counted() -> None:
+    bounds = as_keys([0, LAST_KEY - 4, LAST_KEY])
+    assert gap_rows(LAST_KEY - 1, LAST_KEY, bounds, 8.0) == pytest.approx(2.0)
+    assert gap_rows(0, LAST_KEY, bounds, 8.0) == 16.0
+    ends = as_keys([LAST_KEY - 4, LAST_KEY])
+    _, _, asked, _ = group_by_cost(ends, bounds, 8.0, 1.0, 0.0)
+    assert asked == pytest.approx(2.0)
+
+
+def test_no_keys_have_no_ranges() -> None:
+    none = np.empty(0, dtype=np.int64)
+    lows, highs = group_by_gap(none, none, none, 500)
+    assert len(lows) == len(highs) == 0
+    lows, highs, asked, scanned = group_by_cost(none, as_keys([0, 9]), 1.0, 1.0, 1.0)
+    assert len(lows) == len(highs) == asked == scanned == 0
+
+
+# --- boxes --------------------------------------------------------------------------------------
+
+corners = st.lists(st.integers(0, SIDE - 1), min_size=3, max_size=3)
+
+
+def cubes_met(low: NDArray[np.int64], high: NDArray[np.int64], finest: int) -> int:
+    """How many aligned cubes of 2^finest voxels an edge a box meets."""
+    return int(np.prod((high >> finest) - (low >> finest) + 1))
+
+
+def voxels_between(low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[np.int64]:
+    axes = [range(a, b + 1) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+    return np.array(list(product(*axes)), dtype=np.int64)
+
+
+def covered(ranges: NDArray[np.int64]) -> list[int]:
+    """Every key in the ranges, ascending, as often as it is covered."""
+    return sorted(key for low, high in ranges.tolist() for key in range(low, high + 1))
+
+
+@pytest.mark.parametrize("curve", [Z_ORDER, HILBERT], ids=["z", "hilbert"])
+@few
+@given(a=corners, b=corners, finest=st.integers(0, BITS))
+def test_a_box_is_covered_by_the_cubes_that_it_meets(
+    curve: int, a: list[int], b: list[int], finest: int
+) -> None:
+    """Exactly so, each key once; whole where the cubes are single voxels."""
+    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
+    ranges = ranges_of_box(low, high, BITS, curve, finest)
+    keys = covered(ranges)
+    box = encode(voxels_between(low, high), BITS, curve).tolist()
+    assert len(set(keys)) == len(keys)
+    assert set(box) <= set(keys)
+    rounded = low >> finest << finest, ((high >> finest) + 1 << finest) - 1
+    assert set(keys) <= set(encode(voxels_between(*rounded), BITS, curve).tolist())
+    if finest == 0:
+        assert keys == sorted(box)
+    assert len(ranges) <= cubes_met(low, high, finest)
+
+
+@few
+@given(a=corners, b=corners)
+def test_a_box_is_covered_by_a_range_a_slab_in_lexicographic_order(
+    a: list[int], b: list[int]
+) -> None:
+    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
+    ranges = ranges_of_box(low, high, BITS, LEXICOGRAPHIC, 3)
+    keys = covered(ranges)
+    assert set(encode(voxels_between(low, high), BITS, LEXICOGRAPHIC).tolist()) <= set(keys)
+    assert len(set(keys)) == len(keys)
+    assert len(ranges) == high[0] - low[0] + 1
+
+
+@pytest.mark.parametrize(
+    ("curve", "bits"),
+    [(curve, bits) for curve in (LEXICOGRAPHIC, Z_ORDER, HILBERT) for bits in (1, 2, 3)]
+    + [(Z_ORDER, 21), (HILBERT, 21)],
+)
+def test_the_whole_grid_lies_in_its_ranges(curve: int, bits: int) -> None:
+    low = np.zeros(3, dtype=np.int64)
+    ranges = ranges_of_box(low, low + (1 << bits) - 1, bits, curve, min(3, bits))
+    assert ranges.min() == 0
+    assert int(ranges.max()) == 8**bits - 1
+    assert sum(high - low + 1 for low, high in ranges.tolist()) == 8**bits
+
+
+@pytest.mark.parametrize("curve", [Z_ORDER, HILBERT], ids=["z", "hilbert"])
+def test_ranges_grow_with_the_surface_of_a_box_and_not_with_its_volume(curve: int) -> None:
+    """A box of M cubes an edge: the outer two layers one by one, the rest in larger ones."""
+    low = np.array([1, 1, 1], dtype=np.int64)
+    for n_cubes in (16, 32, 64):
+        high = np.full(3, 8 * n_cubes - 2, dtype=np.int64)
+        assert len(ranges_of_box(low, high, 21, curve, 3)) <= 16 * n_cubes**2

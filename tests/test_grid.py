@@ -1,0 +1,307 @@
+"""Grids: metres <-> voxels <-> keys, what options make of a file's bounds, and what is refused."""
+
+import itertools
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb import Grid
+from hapticdb.errors import GridError, UsageError
+from hapticdb.grid import CURVE_NAMES, MAX_BITS, ROOM, CurveName, GridOptions
+
+few = settings(max_examples=200, deadline=None)
+BOUNDS = np.array([[-1.0, 0.5, 2.0], [3.0, 1.5, 4.0]])  # sides 4, 1 and 2 m
+LONGEST = 4.0
+CENTER = (1.0, 1.0, 3.0)
+
+
+def center_of(grid: Grid) -> NDArray[np.float64]:
+    middle: NDArray[np.float64] = grid.bounds.mean(axis=0)
+    return middle
+
+
+# --- the grid -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("curve", CURVE_NAMES)
+@few
+@given(
+    bits=st.integers(1, MAX_BITS),
+    unit=st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=1, max_size=9),
+)
+def test_voxels_return_from_their_keys(
+    curve: CurveName, bits: int, unit: list[tuple[float, float, float]]
+) -> None:
+    grid = Grid(0.005, (0, 0, 0), bits, curve)
+    voxels = np.minimum(np.array(unit) * grid.side, grid.side - 1).astype(np.int64)
+    np.testing.assert_array_equal(grid.decode(grid.encode(voxels)), voxels)
+
+
+@few
+@given(
+    ijk=st.lists(st.integers(0, 2**12 - 1), min_size=3, max_size=3),
+    corner=st.lists(st.integers(-(2**12), 2**12), min_size=3, max_size=3),
+    place=st.lists(st.integers(0, 255), min_size=3, max_size=3),
+)
+def test_voxels_are_half_open(ijk: list[int], corner: list[int], place: list[int]) -> None:
+    """A point on a border belongs to the upper voxel. Sizes are exact in binary here."""
+    size = 2.0**-8
+    x, y, z = (size * c for c in corner)
+    grid = Grid(size, (x, y, z), 12)
+    low = np.array([grid.origin]) + size * np.array([ijk])
+    assert grid.voxels_of(low).tolist() == [ijk]
+    assert grid.voxels_of(low + size * np.array([place]) / 256).tolist() == [ijk]
+    assert grid.voxels_of(low - size / 256).tolist() == [[v - 1 for v in ijk]]
+
+
+@few
+@given(
+    size=st.floats(1e-5, 10),
+    origin=st.tuples(*[st.floats(-100, 100)] * 3),
+    ijk=st.lists(st.integers(0, 2**10 - 1), min_size=3, max_size=3),
+)
+def test_the_center_of_a_voxel_lies_in_it(
+    size: float, origin: tuple[float, float, float], ijk: list[int]
+) -> None:
+    grid = Grid(size, origin, 10)
+    assert grid.voxels_of(grid.centers([ijk])).tolist() == [ijk]
+
+
+def test_points_outside_have_voxels_outside() -> None:
+    grid = Grid(0.5, (1.0, 1.0, 1.0), 3)
+    voxels = grid.voxels_of([[0.9, 1.0, 1.0], [5.0, 1.0, 1.0], [4.99, 4.99, 4.99]])
+    assert voxels.tolist() == [[-1, 0, 0], [8, 0, 0], [7, 7, 7]]
+    assert grid.contains(voxels).tolist() == [False, False, True]
+
+
+def test_a_grid_knows_its_size() -> None:
+    grid = Grid(0.25, (-1, 0, 1), 4)
+    assert (grid.side, grid.edge, grid.curve) == (16, 4.0, "z")
+    np.testing.assert_array_equal(grid.bounds, [[-1, 0, 1], [3, 4, 5]])
+    assert grid.describe().startswith("16^3 voxels of 250 mm, origin (-1, 0, 1) m")
+
+
+def test_only_lexicographic_order_is_not_hierarchical() -> None:
+    flags = {c: Grid(1, (0, 0, 0), 4, c).is_hierarchical for c in CURVE_NAMES}
+    assert flags == {"z": True, "hilbert": True, "lexicographic": False}
+
+
+@pytest.mark.parametrize("bits", [1, 21])
+@pytest.mark.parametrize("curve", CURVE_NAMES)
+def test_voxels_and_keys_outside_the_grid_are_refused(curve: CurveName, bits: int) -> None:
+    grid = Grid(1.0, (0, 0, 0), bits, curve)
+    for axis, value in itertools.product(range(3), (-1, grid.side)):
+        voxel = [0, 0, 0]
+        voxel[axis] = value
+        with pytest.raises(GridError, match="lies outside the grid"):
+            grid.encode([[0, 0, 0], voxel])
+    for key in (-1, 8**bits):
+        if key < 2**63:
+            with pytest.raises(GridError, match="outside the curve"):
+                grid.decode([0, key])
+    assert grid.encode(np.empty((0, 3))).shape == (0,)
+    assert grid.decode([]).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0.0, (0, 0, 0), 4), "voxel size 0.0 m"),
+        ((-1.0, (0, 0, 0), 4), "voxel size -1.0 m"),
+        ((math.nan, (0, 0, 0), 4), "voxel size nan"),
+        ((math.inf, (0, 0, 0), 4), "voxel size inf"),
+        ((1.0, (0, 0, 0), 0), "0 bits an axis: give 1 to 21"),
+        ((1.0, (0, 0, 0), 22), "22 bits an axis"),
+        ((1.0, (0, 0), 4), "three finite coordinates"),
+        ((1.0, (0, math.nan, 0), 4), "three finite coordinates"),
+        ((1.0, (0, 0, 0), 4, "peano"), "choose one of z, hilbert, lexicographic"),
+    ],
+)
+def test_a_grid_that_cannot_be_is_refused(arguments: tuple[Any, ...], message: str) -> None:
+    with pytest.raises(GridError, match=message) as caught:
+        Grid(*arguments)
+    assert isinstance(caught.value, UsageError)
+
+
+# --- options ------------------------------------------------------------------------------------
+
+EACH: dict[str, list[Any]] = {
+    "bits": [None, 1, 11, 21],
+    "voxel_size": [None, 0.01],
+    "extent": [None, 1.0, 3.0],
+    "origin": [None, (-5.0, -4.0, -3.0)],
+    "curve": [None, "hilbert"],
+}
+ALL_COMBINATIONS = [
+    dict(zip(EACH, values, strict=True)) for values in itertools.product(*EACH.values())
+]
+CONTRADICTORY = [
+    c for c in ALL_COMBINATIONS if None not in (c["bits"], c["voxel_size"], c["extent"])
+]
+COMBINATIONS = [c for c in ALL_COMBINATIONS if c not in CONTRADICTORY]
+
+
+@pytest.mark.parametrize("given_options", COMBINATIONS, ids=lambda c: str(list(c.values())))
+def test_every_combination_of_options_fits_as_it_says(given_options: dict[str, Any]) -> None:
+    grid = GridOptions(**given_options).fit(BOUNDS)
+    bits, size, extent = (given_options[name] for name in ("bits", "voxel_size", "extent"))
+    wanted = (extent or ROOM) * LONGEST
+    assert grid.curve == (given_options["curve"] or "z")
+    if given_options["origin"] is None:
+        np.testing.assert_allclose(center_of(grid), CENTER, atol=1e-12 * max(grid.edge, 1))
+    else:
+        assert grid.origin == given_options["origin"]
+    if size is not None:
+        assert grid.voxel_size == size
+    if size is None:
+        assert grid.bits == (bits or 10)
+        assert grid.edge == pytest.approx(wanted, rel=1e-15)
+    elif bits is not None:
+        assert grid.bits == bits
+    else:
+        assert grid.edge / 2 < wanted <= grid.edge * (1 + 1e-12)
+    GridOptions(**given_options).check_matches(grid, BOUNDS)
+
+
+@pytest.mark.parametrize("given_options", CONTRADICTORY[:4])
+def test_bits_voxel_size_and_extent_contradict_one_another(given_options: dict[str, Any]) -> None:
+    with pytest.raises(GridError, match="give two of them"):
+        GridOptions(**given_options)
+
+
+@few
+@given(
+    low=st.tuples(*[st.floats(-100, 100)] * 3),
+    sides=st.tuples(*[st.floats(0.001, 50)] * 3),
+    extent=st.floats(1.001, 5),
+    bits=st.integers(1, 21),
+)
+def test_an_extent_is_the_edge_in_longest_sides_about_the_middle(
+    low: tuple[float, float, float],
+    sides: tuple[float, float, float],
+    extent: float,
+    bits: int,
+) -> None:
+    bounds = np.array([low, np.add(low, sides)])
+    longest = float((bounds[1] - bounds[0]).max())
+    grid = GridOptions(bits=bits, extent=extent).fit(bounds)
+    assert grid.edge == pytest.approx(extent * longest, rel=1e-14)
+    np.testing.assert_allclose(center_of(grid), bounds.mean(axis=0), atol=1e-11)
+    assert grid.contains(grid.voxels_of(bounds)).all()
+
+
+def test_without_options_the_file_fits_with_room_around_it() -> None:
+    grid = GridOptions().fit(BOUNDS)
+    assert (grid.bits, grid.edge) == (10, ROOM * LONGEST)
+    room = np.stack([BOUNDS[0] - grid.bounds[0], grid.bounds[1] - BOUNDS[1]])
+    assert (room >= 0.29 * LONGEST).all()
+
+
+def test_a_voxel_size_too_small_for_the_scene_is_refused() -> None:
+    with pytest.raises(GridError, match=r"needs 23 bits an axis .* the most is 21"):
+        GridOptions(voxel_size=1e-6).fit(BOUNDS)
+    finest = ROOM * LONGEST / 2**21
+    assert GridOptions(voxel_size=finest * 1.0001).fit(BOUNDS).bits == 21
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"extent": 0.0}, "extent 0.0"),
+        ({"extent": -1.6}, "extent -1.6"),
+        ({"extent": math.nan}, "extent nan"),
+        ({"extent": math.inf}, "extent inf"),
+        ({"bits": 0}, "0 bits"),
+        ({"bits": 22}, "22 bits"),
+        ({"voxel_size": 0.0}, "voxel size 0.0"),
+        ({"voxel_size": math.nan}, "voxel size nan"),
+        ({"origin": (1.0, 2.0)}, "three coordinates"),
+        ({"origin": (1.0, 2.0, math.inf)}, "three finite coordinates"),
+        ({"curve": "peano"}, "choose one of"),
+    ],
+)
+def test_options_that_cannot_be_are_refused_before_a_file_is_read(
+    options: dict[str, Any], message: str
+) -> None:
+    with pytest.raises(GridError, match=message):
+        GridOptions(**options)
+
+
+def test_a_single_point_needs_a_voxel_size() -> None:
+    point = np.array([[1.0, 2.0, 3.0]] * 2)
+    for options in (GridOptions(), GridOptions(extent=1.6), GridOptions(bits=8)):
+        with pytest.raises(GridError, match="single point: give --voxel-size"):
+            options.fit(point)
+    for options in (GridOptions(voxel_size=0.5), GridOptions(voxel_size=0.5, bits=4)):
+        grid = options.fit(point)
+        np.testing.assert_allclose(center_of(grid), point[0])
+        assert grid.contains(grid.voxels_of(point)).all()
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_flat_or_thin_scene_takes_its_longest_side(axis: int) -> None:
+    bounds = np.zeros((2, 3))
+    bounds[1, axis] = 2.0
+    assert GridOptions(bits=4).fit(bounds).edge == pytest.approx(2.0 * ROOM)
+
+
+def test_bounds_that_overflow_are_refused() -> None:
+    with pytest.raises(GridError), np.errstate(all="ignore"):
+        GridOptions().fit(np.array([[-1e308] * 3, [1e308] * 3]))
+
+
+# --- options against an existing grid -----------------------------------------------------------
+
+KNOWN = Grid(0.01, (-1.0, 0.0, 2.0), 9, "hilbert")
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"bits": 9},
+        {"voxel_size": 0.01},
+        {"voxel_size": 0.1 * 0.1},  # another rounding of the same length
+        {"origin": (-1.0, 0.0, 2.0)},
+        {"origin": [-1.0 - 1e-15, 1e-15, 2.0]},
+        {"curve": "hilbert"},
+        {"bits": 9, "voxel_size": 0.01, "origin": (-1.0, 0.0, 2.0), "curve": "hilbert"},
+    ],
+)
+def test_equal_options_are_accepted(options: dict[str, Any]) -> None:
+    GridOptions(**options).check_matches(KNOWN)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bits": 10}, "bits 10 instead of 9"),
+        ({"voxel_size": 0.0100001}, "voxel size 0.0100001 instead of 0.01"),
+        ({"origin": (-1.0, 0.0, 2.001)}, r"origin \(-1.0, 0.0, 2.001\) instead of"),
+        ({"curve": "z"}, "curve z instead of hilbert"),
+        ({"bits": 10, "curve": "z"}, "bits 10 instead of 9; curve z instead of hilbert"),
+    ],
+)
+def test_differing_options_are_refused_by_name(options: dict[str, Any], message: str) -> None:
+    with pytest.raises(GridError, match=f"another grid: .*{message}.*leave these options out"):
+        GridOptions(**options).check_matches(KNOWN)
+
+
+def test_an_extent_is_compared_by_the_edge_that_it_gives() -> None:
+    grid = GridOptions(bits=11, extent=1.6).fit(BOUNDS)
+    GridOptions(bits=11, extent=1.6).check_matches(grid, BOUNDS)
+    with pytest.raises(GridError, match=r"extent 1\.7 .an edge of 6\.8 m. instead .* 6\.4 m"):
+        GridOptions(bits=11, extent=1.7).check_matches(grid, BOUNDS)
+    GridOptions(extent=1.7).check_matches(grid)  # nothing to measure it by
+
+
+@pytest.mark.parametrize("extent", [1.6, 3.0])
+def test_the_options_of_a_grid_match_it_again(extent: float) -> None:
+    """The same command run again finishes an import: extent and voxel size together, too."""
+    options = GridOptions(voxel_size=0.01, extent=extent)
+    options.check_matches(options.fit(BOUNDS), BOUNDS)

@@ -166,8 +166,11 @@ def test_a_moved_tool_has_a_moved_shell(seed: int, shift: int) -> None:
     offset = np.array([shift, -2.0 * shift, 0.5])
     here = PointShell.from_mesh(corners, faces, 60, seed=seed)
     there = PointShell.from_mesh(corners @ turn.T + offset, faces, 60, seed=seed)
-    assert np.allclose(there.points, here.points @ turn.T + offset, atol=1e-12)
-    assert np.allclose(there.normals, here.normals @ turn.T, atol=1e-12)
+    # The curve that orders the points follows the frame's axes: a turned tool has them in another.
+    twin = np.asarray(cKDTree(there.points).query(here.points @ turn.T + offset)[1])
+    assert len(np.unique(twin)) == 60
+    assert np.allclose(there.points[twin], here.points @ turn.T + offset, atol=1e-12)
+    assert np.allclose(there.normals[twin], here.normals @ turn.T, atol=1e-12)
     assert np.allclose(there.center, turn @ here.center + offset, atol=1e-12)
 
 
@@ -177,6 +180,46 @@ def test_equal_seeds_give_equal_shells_and_others_do_not() -> None:
     assert np.array_equal(first.normals, again.normals)
     assert not np.array_equal(first.points, other.points)
     assert first.seed == 5
+
+
+def mean_step(points: Floats) -> float:
+    """Mean distance from each point to the one after it."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).mean())
+
+
+@pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), (30.0, 1.0, 1.0), (1.0, 1.0, 0.01)])
+def test_points_next_to_each_other_by_index_are_close_in_space(
+    stretch: tuple[float, float, float],
+) -> None:
+    corners, faces = torus()
+    points = PointShell.from_mesh(corners * stretch, faces, 2000).points
+    shuffled = np.random.default_rng(0).permutation(points)
+    assert mean_step(points) < mean_step(shuffled) / 8.0
+    nearest = np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1]
+    assert mean_step(points) < 3.0 * nearest.mean()
+
+
+def test_a_frame_finds_the_same_brick_many_times_in_a_row() -> None:
+    points = PointShell.from_mesh(*torus(), 5000).points
+    bricks = np.floor(points / 0.8).astype(np.int64)
+    n_runs = 1 + int((np.diff(bricks, axis=0) != 0).any(axis=1).sum())
+    assert n_runs < 5000 / 5  # in random order, nearly one run a point
+
+
+def test_a_rounding_of_the_frame_leaves_the_order() -> None:
+    # A cube's points lie on the ends of their bounding box: where a step must not end.
+    here, there = (PointShell.from_mesh(*cube(at=(x, 0.0, 0.0)), 500) for x in (0.0, 0.1))
+    assert np.allclose(there.points, here.points + np.array([0.1, 0.0, 0.0]), atol=1e-12)
+
+
+def test_points_given_as_arrays_keep_their_order(tmp_path: Path) -> None:
+    sampled = PointShell.from_mesh(*torus(), 200)
+    order = np.random.default_rng(1).permutation(200)
+    shell = PointShell(sampled.points[order], sampled.normals[order], sampled.center)
+    shell.save(tmp_path / "tool.npz")
+    for kept in (shell, PointShell.from_file(tmp_path / "tool.npz")):
+        assert np.array_equal(kept.points, sampled.points[order])
+        assert np.array_equal(kept.normals, sampled.normals[order])
 
 
 @pytest.mark.parametrize("state", ["outward", "inside out", "tumbled", "mirrored", "doubled"])

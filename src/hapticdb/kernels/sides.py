@@ -1,0 +1,299 @@
+"""Which side of a surface is inside, and which body encloses which, asked of lines through them.
+
+A line that leaves a closed surface crosses it once more than it enters it (Jordan's theorem), so
+the parity of its crossings ahead of a face and behind it tells the face's inside, whatever the
+winding of the triangles. One line may meet an edge, a hole or a rounding, so several vote. A tree
+of boxes keeps a line from asking every triangle. Lengths are in metres, in one frame of the
+caller's choice.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels.curves import Z_ORDER, encode
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+LEAF_SIZE = 4  # triangles in a leaf of the tree
+STACK = 64  # more than the height of a tree over 2^31 leaves
+TOUCH = 2  # a crossing at the line's own start
+PATIENCE = 32  # lines asked for one group of faces, at most
+ENOUGH = 5  # a side that leads by this many lines is not asked further
+LABOUR = 2e8  # nodes visited for all votes, a few seconds: past it, patches fall silent
+
+
+class TriangleTree(NamedTuple):
+    """Boxes over triangles: a complete binary tree, node n above nodes 2 n + 1 and 2 n + 2.
+
+    Triangles are sorted by body, then by Z-order of their centroids, so that a line that asks about
+    one body enters only the nodes that hold some of it.
+    """
+
+    corners: Floats  # (T, 3, 3), sorted
+    faces: Ints  # (T,) number of each sorted triangle in the caller's order
+    bodies: Ints  # (T,) body of each sorted triangle, ascending
+    boxes: Floats  # (nodes, 2, 3) lower and upper corner
+    spans: Ints  # (nodes, 2) least and greatest body below
+    slack: float  # what counts as no distance, metres
+
+
+def triangle_tree(triangles: Floats, bodies: Ints) -> TriangleTree:
+    """Build the tree over triangles (T, 3, 3), T > 0, of the bodies (T,)."""
+    centroids = triangles.mean(axis=1)
+    low = centroids.min(axis=0)
+    extent = float((centroids.max(axis=0) - low).max()) or 1.0
+    cells = ((centroids - low) * ((2**21 - 1) / extent)).astype(np.int64)
+    order = np.lexsort((encode(cells, 21, Z_ORDER), bodies))
+    corners = np.ascontiguousarray(triangles[order])
+    n_leaves = 1
+    while n_leaves * LEAF_SIZE < len(triangles):
+        n_leaves *= 2
+    # A line in the plane of a flat box would miss it by a rounding: the boxes are grown by more.
+    slack = 1e-11 * float(np.abs(triangles).max())
+    boxes = np.empty((2 * n_leaves - 1, 2, 3))
+    spans = np.empty((2 * n_leaves - 1, 2), dtype=np.int64)
+    level = np.full((n_leaves * LEAF_SIZE, 2, 3), np.inf)
+    level[:, 1] = -np.inf
+    level[: len(corners), 0] = corners.min(axis=1) - slack
+    level[: len(corners), 1] = corners.max(axis=1) + slack
+    span = np.full((n_leaves * LEAF_SIZE, 2), np.iinfo(np.int64).max)
+    span[:, 1] = -1
+    span[: len(corners)] = bodies[order, None]
+    arity = LEAF_SIZE
+    width = n_leaves
+    while width > 0:
+        below = level.reshape(width, arity, 2, 3)
+        level = np.stack((below[:, :, 0].min(axis=1), below[:, :, 1].max(axis=1)), axis=1)
+        parts = span.reshape(width, arity, 2)
+        span = np.stack((parts[:, :, 0].min(axis=1), parts[:, :, 1].max(axis=1)), axis=1)
+        boxes[width - 1 : 2 * width - 1] = level
+        spans[width - 1 : 2 * width - 1] = span
+        width //= 2
+        arity = 2
+    return TriangleTree(corners, order.astype(np.int64), bodies[order], boxes, spans, slack)
+
+
+@leaf
+def line_meets_box(ox, oy, oz, ix, iy, iz, boxes, node):
+    """Whether the line through o, of inverse direction i, meets the node's box."""
+    a = (boxes[node, 0, 0] - ox) * ix
+    b = (boxes[node, 1, 0] - ox) * ix
+    near = min(a, b)
+    far = max(a, b)
+    a = (boxes[node, 0, 1] - oy) * iy
+    b = (boxes[node, 1, 1] - oy) * iy
+    near = max(near, min(a, b))
+    far = min(far, max(a, b))
+    a = (boxes[node, 0, 2] - oz) * iz
+    b = (boxes[node, 1, 2] - oz) * iz
+    near = max(near, min(a, b))
+    far = min(far, max(a, b))
+    return near <= far
+
+
+@leaf
+def crossing_side(ox, oy, oz, dx, dy, dz, corners, n, slack):
+    """Where the line through o along d crosses triangle n: 1 ahead, -1 behind, TOUCH at o, or 0.
+
+    Moeller and Trumbore, Journal of Graphics Tools 2(1), 1997.
+    """
+    x, y, z = corners[n, 0, 0], corners[n, 0, 1], corners[n, 0, 2]
+    ax, ay, az = corners[n, 1, 0] - x, corners[n, 1, 1] - y, corners[n, 1, 2] - z
+    bx, by, bz = corners[n, 2, 0] - x, corners[n, 2, 1] - y, corners[n, 2, 2] - z
+    sx, sy, sz = ox - x, oy - y, oz - z
+    px, py, pz = dy * bz - dz * by, dz * bx - dx * bz, dx * by - dy * bx
+    det = ax * px + ay * py + az * pz
+    if det == 0.0:
+        return 0
+    u = (sx * px + sy * py + sz * pz) / det
+    if u < 0.0 or u > 1.0:
+        return 0
+    qx, qy, qz = sy * az - sz * ay, sz * ax - sx * az, sx * ay - sy * ax
+    v = (dx * qx + dy * qy + dz * qz) / det
+    if v < 0.0 or u + v > 1.0:
+        return 0
+    distance = (bx * qx + by * qy + bz * qz) / det
+    if abs(distance) <= slack:
+        return TOUCH
+    return 1 if distance > 0.0 else -1
+
+
+@leaf
+def crossings(origin, direction, body, skip, tree, stack):
+    """Crossings of a line with one body, ahead of the origin and behind it, and nodes visited.
+
+    A line that starts on face `skip` leaves it out, and so needs no offset: walls may be as thin as
+    they like. Both counts are -1 where the start lies on yet another triangle.
+    """
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    dx, dy, dz = direction[0], direction[1], direction[2]
+    ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
+    first_leaf = tree.boxes.shape[0] // 2
+    n_triangles = tree.corners.shape[0]
+    ahead = 0
+    behind = 0
+    visits = 0
+    stack[0] = 0
+    top = 1
+    while top > 0:
+        visits += 1
+        top -= 1
+        node = stack[top]
+        if tree.spans[node, 0] > body or tree.spans[node, 1] < body:
+            continue
+        if not line_meets_box(ox, oy, oz, ix, iy, iz, tree.boxes, node):
+            continue
+        if node < first_leaf:
+            stack[top] = 2 * node + 2
+            stack[top + 1] = 2 * node + 1
+            top += 2
+            continue
+        start = (node - first_leaf) * LEAF_SIZE
+        for n in range(start, min(start + LEAF_SIZE, n_triangles)):
+            if tree.bodies[n] != body or tree.faces[n] == skip:
+                continue
+            side = crossing_side(ox, oy, oz, dx, dy, dz, tree.corners, n, tree.slack)
+            if side == TOUCH:
+                return -1, -1, visits
+            if side > 0:
+                ahead += 1
+            elif side < 0:
+                behind += 1
+    return ahead, behind, visits
+
+
+@entry
+def side_votes_kernel(tree, picks, directions, centroids, normals, body_of, out):
+    """For each patch, lines that see the inside where the normals point, less those that do not.
+
+    picks (P, L) int64 faces, -1 for none; directions (L, 3); centroids, normals (F, 3); body_of
+    (F,) int64; out (P,) int64. A line across a closed surface crosses it, the start not counted, an
+    odd number of times on one side of its start, and that side is inside, and an even number on the
+    other; anything else is a hole or a rounding and has no vote. A dense soup, where each line
+    crosses thousands, runs out of `LABOUR` evenly: some of its patches get fewer lines, or none.
+    """
+    stack = np.empty(STACK, dtype=np.int64)
+    spent = 0
+    for p in range(picks.shape[0]):
+        votes = 0
+        for line in range(picks.shape[1]):
+            face = picks[p, line]
+            if face < 0:
+                continue
+            if spent > LABOUR * (p + 1) / picks.shape[0]:
+                break
+            ahead, behind, visits = crossings(
+                centroids[face], directions[line], body_of[face], face, tree, stack
+            )
+            spent += visits
+            if ahead < 0 or ahead % 2 == behind % 2:
+                continue
+            along = 0.0
+            for axis in range(3):
+                along += directions[line, axis] * normals[face, axis]
+            votes += 1 if (along > 0.0) == (ahead % 2 == 1) else -1
+            if abs(votes) >= ENOUGH:
+                break
+        out[p] = votes
+
+
+@entry
+def nesting_kernel(tree, pairs, picks, directions, centroids, out):
+    """For each pair (inner, outer) of bodies, whether the outer one encloses the inner one whole.
+
+    pairs (Q, 2) int64; picks (B, L) int64 faces of each body, -1 for none; out (Q,) uint8.
+    """
+    stack = np.empty(STACK, dtype=np.int64)
+    for q in range(pairs.shape[0]):
+        n_inside = 0
+        n_outside = 0
+        for line in range(picks.shape[1]):
+            face = picks[pairs[q, 0], line]
+            if face < 0:
+                continue
+            ahead, behind, _ = crossings(
+                centroids[face], directions[line], pairs[q, 1], -1, tree, stack
+            )
+            if ahead < 0 or ahead % 2 != behind % 2:
+                continue
+            if ahead % 2 == 1:
+                n_inside += 1
+            else:
+                n_outside += 1
+                break
+        out[q] = 1 if n_inside > 0 and n_outside == 0 else 0
+
+
+def normals_of(triangles: Floats) -> tuple[Floats, Floats]:
+    """Find unit normals (F, 3) by the winding, and areas (F,); zero for needles and points."""
+    along = triangles[:, 1] - triangles[:, 0]
+    across = triangles[:, 2] - triangles[:, 0]
+    cross = np.cross(along, across)
+    double = np.linalg.norm(cross, axis=1)
+    longest = np.maximum((along**2).sum(axis=1), (across**2).sum(axis=1))
+    is_degenerate = ~(double > 1e-12 * longest)  # below, the normal is rounding
+    double[is_degenerate] = 0.0
+    normals = cross / np.where(is_degenerate, 1.0, double)[:, None]
+    normals[is_degenerate] = 0.0
+    return normals, double / 2.0
+
+
+def _pick_faces(group: Ints, areas: Floats, n_groups: int) -> Ints:
+    """For each group (F,) of faces some of them, in proportion to area; (n_groups, PATIENCE).
+
+    Small groups repeat their faces; a group without area has none: -1.
+    """
+    totals = np.bincount(group, areas, n_groups)
+    order = np.argsort(group, kind="stable")
+    order = order[areas[order] > 0.0]
+    filled = np.cumsum(areas[order] / totals[group[order]])  # a filled group takes up 1
+    starts = np.cumsum(totals > 0.0) - 1.0
+    # The golden ratio's multiples spread any number of first picks over the whole group.
+    wanted = starts[:, None] + (np.arange(PATIENCE) * 0.6180339887498949 + 0.5) % 1.0
+    picks = order[np.minimum(np.searchsorted(filled, wanted), len(order) - 1)]
+    is_own = group[picks] == np.arange(n_groups)[:, None]
+    return np.where(is_own, picks, -1).astype(np.int64)
+
+
+def _directions(n: int) -> Floats:
+    """`n` fixed directions, all over the sphere, none along an axis."""
+    directions = np.random.default_rng(2015).normal(size=(n, 3))
+    directions[np.abs(directions) < 1e-3] = 1e-3
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    return directions
+
+
+def side_votes(
+    tree: TriangleTree,
+    patch: Ints,
+    body: Ints,
+    areas: Floats,
+    centroids: Floats,
+    normals: Floats,
+) -> Ints:
+    """Let lines vote on each patch: positive (P,) where its normals point inside.
+
+    patch, body, areas (F,); centroids, normals (F, 3), the normals alike in each patch.
+    """
+    picks = _pick_faces(patch, areas, int(patch.max()) + 1)
+    votes = np.zeros(len(picks), dtype=np.int64)
+    side_votes_kernel(tree, picks, _directions(PATIENCE), centroids, normals, body, votes)
+    return votes
+
+
+def enclosures(
+    tree: TriangleTree,
+    pairs: Ints,
+    body: Ints,
+    areas: Floats,
+    centroids: Floats,
+) -> NDArray[np.bool_]:
+    """Tell for each pair (inner, outer) of bodies whether the outer one encloses the inner one."""
+    picks = _pick_faces(body, areas, int(body.max()) + 1)
+    out = np.zeros(len(pairs), dtype=np.uint8)
+    nesting_kernel(tree, pairs, picks, _directions(PATIENCE), centroids, out)
+    return out.astype(np.bool_)

@@ -311,6 +311,8 @@ class Environment:
                 self._known = {obj.id: obj for obj in self._store.objects()}
                 answer = self._query.run(shell, pose, strategy, maxgap, ids, force_law)
                 self._known_at = self._store.version()
+            if self._quantiles is not None and not self._quantiles.n_rows:
+                self._quantiles = None  # it was empty when it was opened
         if ids.size:
             self._check_known(ids)
         return Touch(answer, self._known)

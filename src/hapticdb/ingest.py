@@ -10,13 +10,14 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import (
+    EnvironmentExistsError,
     FileError,
     GeometryChangedError,
     HapticDBError,
@@ -24,7 +25,7 @@ from hapticdb.errors import (
     OutsideGridError,
     UsageError,
 )
-from hapticdb.grid import BRICK_BITS, CurveName, Grid, GridOptions
+from hapticdb.grid import BRICK_BITS, Grid, GridOptions
 from hapticdb.kernels import curves, voxelize
 from hapticdb.mesh import Defects, MeshFile, Part, read_file
 from hapticdb.statistics import DEFAULT_RESOLUTION
@@ -100,8 +101,8 @@ class ImportOptions:
     def __post_init__(self) -> None:
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"{self.jobs} jobs: give 1 or more")
-        curve: CurveName = self.grid.curve or "z"
-        check_curve(curve, self.layout or "brick")
+        if self.layout is not None and self.grid.curve is not None:
+            check_curve(self.grid.curve, self.layout)
 
 
 def import_files(
@@ -126,7 +127,9 @@ def import_files(
     if not files:
         raise UsageError("no files: name at least one to import")
     store = open_store(url) if exists(url) else None
-    if store is not None:
+    if store is None:
+        check_curve(chosen.grid.curve or "z", chosen.layout or "brick")
+    else:
         with _closing_on_error(store):
             _check_layout(store, chosen.layout)
             chosen.grid.check_matches(store.grid)
@@ -179,16 +182,21 @@ def ingest_file(
     for part in mesh_file.parts:
         if present.get(part.name, part.digest) != part.digest:
             raise GeometryChangedError(
-                f"{mesh_file.link}: part {part.name!r} has changed since it was imported; "
-                "remove that object, then import again"
+                f"{mesh_file.link}: part {part.name!r} has changed since it was imported, or was "
+                "read with another --unit; remove that object, then import again"
             )
     _check_inside(mesh_file, store.grid, missing)
-    added: list[Object] = []
+    added: set[int] = set()
     n_present = len(mesh_file.parts) - len(missing)
     voxels = 0
     jobs = options.jobs or os.cpu_count() or 1
     for obj, rows in _voxelized(missing, mesh_file.link, store, options.unit, jobs):
-        added.append(replace(obj, id=store.add(obj, rows)))
+        try:
+            added.add(store.add(obj, rows))
+        except EnvironmentExistsError:
+            if not _is_present(store, obj):
+                raise
+            n_present += 1  # another process imports the same file
         voxels += obj.voxels
         if progress is not None:
             done = n_present + len(added)
@@ -196,9 +204,17 @@ def ingest_file(
     return FileReport(
         mesh_file.link,
         "imported" if added else "complete",
-        tuple(added),
+        tuple(obj for obj in store.objects() if obj.id in added) if added else (),
         n_present,
         mesh_file.defects,
+    )
+
+
+def _is_present(store: Store, part: Object) -> bool:
+    """Whether the environment holds that part with that geometry."""
+    return any(
+        (obj.link, obj.name, obj.digest) == (part.link, part.name, part.digest)
+        for obj in store.objects()
     )
 
 
@@ -252,12 +268,18 @@ def rows_of_part(
         Placement in metres; the file's unless given.
     """
     if part.is_cloud:
-        points = grid.to_voxel_units(part.world_points(world_from_part))
+        points = _on_grid(part.world_points(world_from_part), grid)
         bricks, occupancy = voxelize.mark_points(points, grid.bits)
     else:
-        triangles = grid.to_voxel_units(part.triangles(world_from_part))
+        triangles = _on_grid(part.triangles(world_from_part), grid)
         bricks, occupancy = voxelize.voxelize(triangles, grid.bits)
     return _rows_of_bricks(bricks, occupancy, grid, layout)
+
+
+def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
+    """Points (..., 3) in voxels; what rounding carried over the border is set back onto it."""
+    scaled = grid.to_voxel_units(points)
+    return np.clip(scaled, 0.0, float(grid.side), out=scaled)
 
 
 def rows_of_voxels(ijk: NDArray[np.int64], grid: Grid, layout: Layout) -> Rows:

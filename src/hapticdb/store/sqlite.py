@@ -334,7 +334,7 @@ class SQLiteStore:
         shift = 15 if self.grid.is_hierarchical else 2 * self.grid.bits
         cubes = np.unique(row_keys >> (shift - self._shift))
         starts = np.flatnonzero(np.diff(cubes, prepend=-2) > 1)
-        ends = np.append(starts[1:], len(cubes)) - 1
+        ends = np.append(starts[1:], len(cubes))[: len(starts)] - 1
         ranges = np.stack([cubes[starts] << shift, ((cubes[ends] + 1) << shift) - 1], axis=1)
         self._connection.execute(
             "INSERT INTO change VALUES (?, ?, ?, ?)",

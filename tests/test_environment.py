@@ -1,0 +1,444 @@
+"""An opened environment: its objects, moving and removing them, and what others see of it."""
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import hapticdb
+from assemblies import (
+    Mesh,
+    assembly,
+    ball,
+    index_rows,
+    left_behind,
+    oracle_voxels,
+    placement,
+    rows_of,
+    small_grid,
+    small_options,
+    voxel_set,
+    write_obj,
+)
+from hapticdb import Environment, PointShell, environment, ingest
+from hapticdb.grid import CurveName
+from hapticdb.mesh import MeshFile, parse_in_process
+from hapticdb.query import STRATEGIES
+from hapticdb.statistics import machine_name
+from hapticdb.store.base import Layout
+from hapticdb.testing import KINDS, blob, write_voxels
+from mesh_files import gltf
+
+ELSEWHERE = placement(0.03, -0.05, 0.04, 0.7)
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return write_obj(tmp_path / "assembly.obj", assembly(4))
+
+
+@pytest.fixture
+def env(tmp_path: Path, file: Path) -> Environment:
+    """Four objects in a grid of 32^3."""
+    hapticdb.import_files(tmp_path / "e.db", [file], small_options())
+    return hapticdb.open(tmp_path / "e.db")
+
+
+def write_balls(path: Path, *placed: NDArray[np.float64]) -> Path:
+    """A glTF file: a ball of 40 mm for each placement."""
+    vertices, faces = ball((0, 0, 0), 0.04)
+    nodes = [
+        {"name": f"ball {n}", "mesh": 0, "matrix": p.T.ravel().tolist()}
+        for n, p in enumerate(placed)
+    ]
+    tree = {"nodes": nodes, "scenes": [{"nodes": list(range(len(nodes)))}]}
+    return gltf(tree, path, vertices.astype(np.float32), faces.ravel().tolist())
+
+
+@pytest.fixture
+def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Files are parsed in this process: the tests' own are sound, and a child takes longer."""
+    for module in (environment, ingest):
+        monkeypatch.setattr(module, "read_file", parse_in_process)
+
+
+# --- objects ------------------------------------------------------------------------------------
+
+
+def test_objects_are_ordered_by_id_and_say_what_they_are(env: Environment, file: Path) -> None:
+    objects = env.objects()
+    assert [o.id for o in objects] == [1, 2, 3, 4]
+    assert [o.name for o in objects] == ["ball 0", "box 1", "ball 2", "ball 3"]
+    for obj, part in zip(objects, parse_in_process(file).parts, strict=True):
+        assert obj.link == str(file.resolve())
+        assert (obj.digest, obj.revision) == (part.digest, obj.id)
+        assert obj.voxels == len(env.voxels(obj.id))
+        np.testing.assert_array_equal(obj.transform, np.eye(4))
+        np.testing.assert_array_equal(obj.bounds, part.bounds)
+        assert env.object(obj.id).name == obj.name
+
+
+def test_an_object_is_linked_by_its_absolute_path(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "alias.obj").symlink_to(file)
+    monkeypatch.chdir(tmp_path)
+    (first,) = hapticdb.import_files("e.db", ["alias.obj"], small_options())
+    assert {o.link for o in first.added} == {str(file.resolve())}
+    (again,) = hapticdb.import_files("sqlite:///e.db", ["./assembly.obj"])
+    assert again.status == "complete"
+
+
+@pytest.mark.parametrize("missing", [0, 5, -1])
+def test_what_is_not_there_is_told(env: Environment, missing: int) -> None:
+    before = env.store.revision()
+    for ask in (env.object, env.voxels, env.remove):
+        with pytest.raises(hapticdb.ObjectNotFoundError, match=f"no object {missing} in"):
+            ask(missing)
+    with pytest.raises(hapticdb.ObjectNotFoundError):
+        env.move(missing, np.eye(4))
+    assert env.store.revision() == before
+
+
+@pytest.mark.parametrize(("layout", "curve"), KINDS)
+def test_voxels_return_as_written(tmp_path: Path, layout: Layout, curve: CurveName) -> None:
+    """Also those at the grid's border."""
+    env = hapticdb.create(tmp_path / "e.db", small_grid(curve), layout=layout)
+    for n, center in enumerate([(16, 16, 16), (1, 2, 30), (31, 16, 16)]):
+        ijk = blob(n, center)
+        inside = ijk[env.grid.contains(ijk)]
+        i = write_voxels(env.store, inside, f"blob {n}")
+        found = env.voxels(i)
+        assert found.dtype == np.int64
+        assert voxel_set(found) == voxel_set(inside)
+        assert (np.diff(env.grid.encode(found)) > 0).all()
+
+
+# --- removing -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("layout", "curve"), KINDS)
+def test_removing_takes_the_rows_of_one_object(
+    tmp_path: Path, file: Path, layout: Layout, curve: CurveName
+) -> None:
+    hapticdb.import_files(tmp_path / "e.db", [file], small_options(curve, layout))
+    with hapticdb.open(tmp_path / "e.db") as env:
+        before = index_rows(env)
+        env.remove(2)
+        assert [o.id for o in env.objects()] == [1, 3, 4]
+        assert index_rows(env) == {row for row in before if row[1] != 2}
+        *_, change = env.store.changes()
+        assert (change.revision, change.action, change.id) == (5, "remove", 2)
+        for i in (1, 3, 4):
+            env.remove(i)
+        assert not index_rows(env)
+
+
+def test_a_removed_object_comes_back_under_a_new_id(env: Environment, file: Path) -> None:
+    before = index_rows(env)
+    env.remove(2)
+    report = env.add(file)
+    assert [(o.id, o.name) for o in report.added] == [(5, "box 1")]
+    assert {(k, 2 if i == 5 else i, bits) for k, i, bits in index_rows(env)} == before
+
+
+# --- moving -------------------------------------------------------------------------------------
+
+
+@pytest.mark.usefixtures("without_child")
+@pytest.mark.parametrize(("layout", "curve"), KINDS)
+def test_a_moved_object_is_as_if_imported_there(
+    tmp_path: Path, layout: Layout, curve: CurveName
+) -> None:
+    (tmp_path / "there").mkdir()
+    here = write_balls(tmp_path / "balls.gltf", placement(0, 0, 0), placement(0.02, 0, 0))
+    there = write_balls(tmp_path / "there" / "balls.gltf", ELSEWHERE, placement(0.02, 0, 0))
+    options = small_options(curve, layout)
+    hapticdb.import_files(tmp_path / "e.db", [here], options)
+    hapticdb.import_files(tmp_path / "there" / "e.db", [there], options)
+    with (
+        hapticdb.open(tmp_path / "e.db") as env,
+        hapticdb.open(tmp_path / "there" / "e.db", read_only=True) as fresh,
+    ):
+        before, old = index_rows(env), env.object(1)
+        moved = env.move(1, ELSEWHERE)
+        assert index_rows(env) == index_rows(fresh) != before
+        wanted = fresh.object(1)
+        assert (moved.id, moved.name, moved.digest) == (1, "ball 0", wanted.digest)
+        assert (moved.voxels, moved.revision, moved.link) == (wanted.voxels, 3, str(here))
+        np.testing.assert_array_equal(moved.transform, wanted.transform)
+        np.testing.assert_array_equal(moved.bounds, wanted.bounds)
+        np.testing.assert_array_equal(env.voxels(1), fresh.voxels(1))
+
+        *_, change = env.store.changes()
+        assert (change.revision, change.action, change.id) == (3, "move", 1)
+        shift = 9 if layout == "brick" else 0
+        keys = np.array([row[0] for row in before ^ index_rows(env)])[:, None] << shift
+        inside = (keys >= change.ranges[:, 0]) & (keys <= change.ranges[:, 1])
+        assert inside.any(axis=1).all()
+
+        env.move(1, old.transform)
+        assert index_rows(env) == before
+
+
+@pytest.mark.usefixtures("without_child")
+def test_any_series_of_moves_ends_as_a_fresh_import(tmp_path: Path) -> None:
+    """Nothing of a place on the way stays, the border included."""
+    rng = np.random.default_rng(11)
+    n_balls = 3
+    file = write_balls(tmp_path / "balls.gltf", *[placement(0, 0, 0)] * n_balls)
+    hapticdb.import_files(tmp_path / "e.db", [file], small_options("hilbert", "brick"))
+    last = [np.eye(4)] * n_balls
+    with hapticdb.open(tmp_path / "e.db") as env:
+        for _ in range(8):
+            n = int(rng.integers(n_balls))
+            x, y, z = rng.choice([-0.12, -0.1, 0.0, 0.0371, 0.12], 3)
+            last[n] = placement(x, y, z, rng.choice([0.0, np.pi / 4, 1.0]))
+            env.move(n + 1, last[n])
+        (tmp_path / "there").mkdir()
+        fresh = hapticdb.create(tmp_path / "there" / "e.db", env.grid, layout="brick")
+        fresh.add(write_balls(tmp_path / "there" / "balls.gltf", *last))
+        assert index_rows(env) == index_rows(fresh)
+
+
+def test_a_move_reads_the_file_in_the_unit_that_it_was_imported_in(tmp_path: Path) -> None:
+    block = write_obj(tmp_path / "block.obj", {"ball": ball((0, 0, 0), 40)})
+    with hapticdb.create(tmp_path / "e.db", small_grid()) as env:
+        env.add(block, unit="mm")
+        moved = env.move(1, placement(0.1, 0, 0))
+        np.testing.assert_allclose(moved.bounds.mean(axis=0), (0.1, 0, 0), atol=1e-12)
+        part = parse_in_process(block, unit="mm").parts[0]
+        part.world_from_part[:] = moved.transform
+        assert voxel_set(env.voxels(1)) == oracle_voxels(part, env.grid)
+
+
+def vanish(file: Path) -> None:
+    file.unlink()
+
+
+def become_another(file: Path) -> None:
+    write_obj(file, {**assembly(4), "box 1": ball((0, 0, 0), 0.03)})
+
+
+def lose_the_part(file: Path) -> None:
+    parts: dict[str, Mesh] = assembly(4)
+    del parts["box 1"]
+    write_obj(file, parts)
+
+
+def become_rubbish(file: Path) -> None:
+    file.write_text("v 1 2\n")
+
+
+@pytest.mark.parametrize("spoil", [vanish, become_another, lose_the_part, become_rubbish])
+def test_an_object_whose_file_is_gone_or_another_cannot_be_moved(
+    env: Environment, file: Path, spoil: Callable[[Path], None]
+) -> None:
+    before = rows_of(Path(env.url))
+    spoil(file)
+    with pytest.raises(hapticdb.GeometryChangedError) as raised:
+        env.move(2, ELSEWHERE)
+    for words in ("object 2 (box 1) cannot be moved", str(file)):
+        assert words in str(raised.value)
+    assert "\n" not in str(raised.value)
+    assert rows_of(Path(env.url)) == before
+    env.remove(2)  # needs no file
+    assert [o.id for o in env.objects()] == [1, 3, 4]
+
+
+def test_no_object_is_moved_out_of_the_grid(env: Environment) -> None:
+    before = rows_of(Path(env.url))
+    for far in (placement(0.3, 0, 0), placement(0, 0, -0.3), placement(1e300, 0, 0)):
+        with pytest.raises(hapticdb.OutsideGridError, match="part 'ball 0' spans"):
+            env.move(1, far)
+    assert rows_of(Path(env.url)) == before
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [np.eye(3), np.full((4, 4), np.nan), np.diag([1, 1, 1, 2.0]), np.eye(4)[:, ::-1]],
+)
+def test_what_is_no_placement_is_refused(env: Environment, transform: NDArray[np.float64]) -> None:
+    before = index_rows(env)
+    with pytest.raises(hapticdb.UsageError):
+        env.move(1, transform)
+    assert index_rows(env) == before
+
+
+@pytest.mark.parametrize("layout", ["voxel", "brick"])
+def test_a_move_by_another_while_the_file_is_read_leaves_no_stray_rows(
+    tmp_path: Path, layout: Layout, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two editors move one object at once: it ends at one place, the last writer's."""
+    file = write_balls(tmp_path / "balls.gltf", placement(-0.1, 0, 0))
+    hapticdb.import_files(tmp_path / "e.db", [file], small_options("z", layout))
+    env, other = hapticdb.open(tmp_path / "e.db"), hapticdb.open(tmp_path / "e.db")
+
+    def read_while_another_moves(link: str, *, unit: str | None = None) -> MeshFile:
+        monkeypatch.setattr(environment, "read_file", parse_in_process)
+        other.move(1, placement(0.1, 0, 0))
+        return parse_in_process(link, unit=unit)
+
+    monkeypatch.setattr(environment, "read_file", read_while_another_moves)
+    moved = env.move(1, placement(0, 0.1, 0))
+    np.testing.assert_array_equal(moved.transform, placement(0, 0.1, 0))
+    once = index_rows(env)
+    env.move(1, np.eye(4))
+    env.move(1, placement(0, 0.1, 0))
+    assert index_rows(env) == once
+    env.remove(1)
+    assert not index_rows(env)
+
+
+# --- opening and closing ------------------------------------------------------------------------
+
+
+def test_an_environment_opened_to_read_refuses_every_write(env: Environment, file: Path) -> None:
+    before = rows_of(Path(env.url))
+    reader = hapticdb.open(env.url, read_only=True)
+    for write in (
+        lambda: reader.add(file),
+        lambda: reader.remove(1),
+        lambda: reader.move(1, ELSEWHERE),
+    ):
+        with pytest.raises(hapticdb.ReadOnlyError, match="opened to read"):
+            write()
+    assert rows_of(Path(env.url)) == before
+
+
+def test_leaving_its_context_closes_an_environment(tmp_path: Path) -> None:
+    with hapticdb.create(tmp_path / "e.db", small_grid()) as env:
+        assert env.objects() == []
+    assert left_behind(tmp_path) == ["e.db"]
+    env.close()  # once more is harmless
+    with pytest.raises(ZeroDivisionError), hapticdb.open(tmp_path / "e.db") as again:
+        raise ZeroDivisionError
+    again.close()
+    assert left_behind(tmp_path) == ["e.db"]
+
+
+def test_a_closed_environment_says_so(env: Environment, sphere: PointShell) -> None:
+    env.close()
+    for ask in (env.objects, lambda: env.remove(1), lambda: env.touch(sphere, np.eye(4))):
+        with pytest.raises(hapticdb.HapticDBError):
+            ask()
+
+
+# --- what others see ----------------------------------------------------------------------------
+
+EDIT = """
+import sys
+import numpy as np
+import hapticdb
+
+with hapticdb.open(sys.argv[1]) as env:
+    for line in sys.stdin:
+        exec(line)
+        print("done", flush=True)
+"""
+
+
+def test_edits_of_another_process_are_felt_by_the_next_touch(
+    tmp_path: Path, sphere: PointShell
+) -> None:
+    balls = {"one": ball((0, 0, 0), 0.04), "two": ball((0.11, 0, 0), 0.04)}
+    file = write_obj(tmp_path / "balls.obj", balls)
+    hapticdb.import_files(tmp_path / "e.db", [file], small_options())
+    env = hapticdb.open(tmp_path / "e.db")
+    editor = subprocess.Popen(
+        [sys.executable, "-c", EDIT, env.url],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        bufsize=1,
+    )
+
+    def edit(line: str) -> None:
+        assert editor.stdin is not None
+        assert editor.stdout is not None
+        editor.stdin.write(line + "\n")
+        assert editor.stdout.readline() == "done\n"
+
+    def felt() -> list[tuple[int, float]]:
+        """Ids, and where the objects that are felt stand, by every strategy."""
+        found = [env.touch(sphere, pose, s).objects for s in ("auto", "statement", "cbgroup")]
+        places = [[(o.id, float(o.transform[0, 3])) for o in objects] for objects in found]
+        assert places[0] == places[1] == places[2]
+        return places[0]
+
+    pose = placement(0.04, 0, 0)
+    try:
+        assert felt() == [(1, 0.0)]
+        edit("env.move(1, np.eye(4) + np.eye(4)[0][:, None] * [[0, 0, 0, -0.1]])")
+        assert felt() == []
+        edit("env.move(2, np.eye(4) + np.eye(4)[0][:, None] * [[0, 0, 0, -0.1]])")
+        assert felt() == [(2, -0.1)]
+        edit("env.move(1, np.eye(4))")
+        assert felt() == [(1, 0.0), (2, -0.1)]
+        edit("env.remove(2)")
+        assert felt() == [(1, 0.0)]
+        assert [o.id for o in env.objects()] == [1]
+        with pytest.raises(hapticdb.ObjectNotFoundError):
+            env.touch(sphere, pose, exclude=[2])
+    finally:
+        editor.kill()
+        editor.communicate()
+
+
+def test_what_comes_into_an_environment_opened_empty_is_felt(
+    tmp_path: Path, file: Path, sphere: PointShell
+) -> None:
+    env = hapticdb.create(tmp_path / "e.db", small_grid())
+    for strategy in STRATEGIES:
+        assert not len(env.touch(sphere, np.eye(4), strategy).hits)
+    with hapticdb.open(tmp_path / "e.db") as other:
+        other.add(file)
+        pose = placement(*other.object(2).bounds[0])
+    found = [env.touch(sphere, pose, strategy) for strategy in STRATEGIES]
+    assert len(found[0].hits)
+    assert len({(t.hits.tobytes(), t.force.tobytes()) for t in found}) == 1
+
+
+# --- statistics ---------------------------------------------------------------------------------
+
+
+def test_quantiles_follow_the_edits(env: Environment) -> None:
+    for n_objects in (4, 3):
+        keys = np.sort(np.array([row[0] for row in index_rows(env)]))
+        vector = env.quantiles(7)
+        ranks = [max(-(-i * len(keys) // 7), 1) for i in range(8)]
+        assert vector.n_rows == len(keys)
+        assert vector.bounds.tolist() == [int(keys[rank - 1]) for rank in ranks]
+        assert len(env.objects()) == n_objects
+        env.remove(n_objects)
+
+
+def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointShell) -> None:
+    costs = env.calibrate()
+    assert env.store.costs(machine_name()) == costs.figures()
+    figures = [value for name, value in costs.figures().items() if "spread" not in name]
+    assert all(np.isfinite(figures))
+    assert costs.statement > 0
+    with hapticdb.open(env.url, read_only=True) as reader:
+        assert reader.touch(sphere, placement(0, 0, 0), "cbgroup").query.strategy == "cbgroup"
+        assert reader._statistics()[1] == costs
+        reader.calibrate()  # measured, and not kept
+    assert env.store.costs(machine_name()) == costs.figures()
+    env.calibrate(seed=1, keep=False)
+    assert env.store.costs(machine_name()) == costs.figures()
+
+
+def test_an_empty_environment_is_felt_and_not_calibrated(
+    tmp_path: Path, sphere: PointShell
+) -> None:
+    with hapticdb.create(tmp_path / "e.db", small_grid()) as env:
+        touch = env.touch(sphere, np.eye(4))
+        assert not touch.force.any()
+        assert touch.objects == []
+        assert env.quantiles(3).n_rows == 0
+        with pytest.raises(hapticdb.UsageError, match="import a file before"):
+            env.calibrate()

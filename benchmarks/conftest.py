@@ -17,7 +17,8 @@ TINY_BITS = 7
 
 def is_measuring(config: pytest.Config) -> bool:
     """Whether times count; else the benchmarks run once, as tests."""
-    return not config.getoption("benchmark_disable")
+    enabled = config.getoption("benchmark_enable") or not config.getoption("benchmark_disable")
+    return bool(enabled)
 
 
 @pytest.fixture(scope="session")

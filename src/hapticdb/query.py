@@ -12,6 +12,7 @@ from hapticdb.errors import UsageError
 from hapticdb.force import TangentPlane
 from hapticdb.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
 from hapticdb.kernels import contact
+from hapticdb.kernels.contact import Located
 from hapticdb.store.base import Frame, Keys, Rows, Store, SupportsStatement, row_shift
 
 if TYPE_CHECKING:
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
     from hapticdb.statistics import CostModel, QuantileVector
 
 Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
-Located = tuple[NDArray[np.float64], NDArray[np.int64], Keys]
-"""A shell placed in the grid: placed, asked and keys of `hapticdb.kernels.contact.locate`."""
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
@@ -99,7 +98,7 @@ class HapticQuery:
             return self._by_statement(located, exclude, law, started)
         placed, asked, keys = located
         row_keys, row_ids, occupancy = rows
-        n_hits, felt, met = contact.refine(
+        wrench, hits, depths, ids = contact.refine(
             placed,
             asked,
             keys,
@@ -111,32 +110,31 @@ class HapticQuery:
             self._size,
             law.stiffness,
         )
-        hits = met[:n_hits]
         pairs = partial(
             contact.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
         )
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         query = Query(chosen, n_statements, n_ranges, len(row_keys), elapsed_us)
-        return Answer(felt[:6], hits, felt[6:], met[n_hits:].tolist(), pairs, query)
+        return Answer(wrench, hits, depths, ids.tolist(), pairs, query)
 
     def _locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> Located:
         if pose.shape != (4, 4):
             raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
         bits, curve, shift = self._curve
-        status, placed, asked, keys = contact.locate(
-            shell.points,
-            shell.normals,
-            shell.center,
-            pose,
-            self._origin,
-            self._size,
-            bits,
-            curve,
-            shift,
-        )
-        if status:
-            raise UsageError("a pose that is no rigid transform: give finite numbers, a rotation")
-        return placed, asked, keys
+        try:
+            return contact.locate(
+                shell.points,
+                shell.normals,
+                shell.center,
+                pose,
+                self._origin,
+                self._size,
+                bits,
+                curve,
+                shift,
+            )
+        except ValueError as error:
+            raise UsageError(f"{error}: give finite numbers and a rotation") from error
 
     def _fetch(
         self, strategy: Strategy, located: Located, gap: int

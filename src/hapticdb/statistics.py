@@ -5,6 +5,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -35,12 +36,12 @@ class QuantileVector:
     bounds: Keys
     n_rows: int
 
-    @property
+    @cached_property
     def resolution(self) -> int:
         """R, the number of buckets."""
         return len(self.bounds) - 1
 
-    @property
+    @cached_property
     def rows_per_bucket(self) -> float:
         """Rows that each bucket stands for."""
         return self.n_rows / self.resolution
@@ -100,7 +101,7 @@ class CostModel:
     point: float
     spread: Mapping[str, float] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def row_scanned(self) -> float:
         """One row read in a range: its share of a leaf block, and its handling."""
         return self.block / self.rows_per_block + self.row
@@ -323,7 +324,7 @@ def _probes(store: Store, seed: int) -> list[_Probe]:
         points.flags.writeable = normals.flags.writeable = False
         pose = np.eye(4)
         pose[:3, 3] = center
-        _, placed, asked, keys = contact.locate(
+        placed, asked, keys = contact.locate(
             points, normals, middle, pose, origin, grid.voxel_size, *grid_codes, shift
         )
         if not len(keys):

@@ -7,20 +7,37 @@ from hapticdb.kernels.curves import LEXICOGRAPHIC, key_of
 
 
 @leaf
-def rows_below(x, bounds, rows_per_bucket):
-    """Expected rows with a key < x. bounds (R + 1,) int64, ascending -> float.
+def first_bound(x, bounds, start):
+    """Index of the first bound >= x, at `start` or above it; R + 1 when there is none.
 
-    A bucket [b[i-1], b[i]) counts in proportion to what lies below x; one of zero width counts
-    whole as soon as its value does.
+    Steps that double, then halves: keys of a frame lie close together, so that the next bound is
+    mostly the last one again.
     """
-    low = 0
-    high = bounds.shape[0]
+    total = bounds.shape[0]
+    step = 1
+    low = start
+    high = start
+    while high < total and bounds[high] < x:
+        low = high + 1
+        high += step
+        step *= 2
+    high = min(high, total)
     while low < high:
         middle = (low + high) >> 1
         if bounds[middle] < x:
             low = middle + 1
         else:
             high = middle
+    return low
+
+
+@leaf
+def rows_below_bound(x, low, bounds, rows_per_bucket):
+    """Expected rows with a key < x, given the first bound >= x.
+
+    A bucket [b[i-1], b[i]) counts in proportion to what lies below x; one of zero width counts
+    whole as soon as its value does.
+    """
     if low == 0:
         return 0.0
     if low == bounds.shape[0]:
@@ -30,11 +47,19 @@ def rows_below(x, bounds, rows_per_bucket):
 
 
 @leaf
-def rows_up_to(x, bounds, rows_per_bucket):
-    """Expected rows with a key <= x; x may be the last int64."""
+def bound_after(x, bounds, start):
+    """Index of the first bound > x, at `start` or above it: x may be the last int64."""
     if x >= bounds[bounds.shape[0] - 1]:
-        return (bounds.shape[0] - 1) * rows_per_bucket
-    return rows_below(x + 1, bounds, rows_per_bucket)
+        return bounds.shape[0]
+    return first_bound(x + 1, bounds, start)
+
+
+@leaf
+def rows_up_to(x, after, bounds, rows_per_bucket):
+    """Expected rows with a key <= x, given the first bound > x."""
+    if after == bounds.shape[0]:
+        return (after - 1) * rows_per_bucket
+    return rows_below_bound(x + 1, after, bounds, rows_per_bucket)
 
 
 @entry
@@ -42,7 +67,11 @@ def gap_rows(left, right, bounds, rows_per_bucket):
     """Expected rows with a key in [left, right]. bounds (R + 1,) int64, ascending -> float."""
     if right < left:
         return 0.0
-    return rows_up_to(right, bounds, rows_per_bucket) - rows_below(left, bounds, rows_per_bucket)
+    at = first_bound(left, bounds, 0)
+    after = bound_after(right, bounds, at)
+    return rows_up_to(right, after, bounds, rows_per_bucket) - rows_below_bound(
+        left, at, bounds, rows_per_bucket
+    )
 
 
 @entry
@@ -86,8 +115,10 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost):
     asked = 0.0
     scanned = 0.0
     above = 0.0
+    at = 0
     for n in range(total):
-        below = rows_below(keys[n], bounds, rows_per_bucket)
+        at = first_bound(keys[n], bounds, at)
+        below = rows_below_bound(keys[n], at, bounds, rows_per_bucket)
         gap = below - above
         if n > 0 and gap * row_cost <= descent_cost:
             highs[count - 1] = keys[n]
@@ -96,7 +127,8 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost):
             lows[count] = keys[n]
             highs[count] = keys[n]
             count += 1
-        above = rows_up_to(keys[n], bounds, rows_per_bucket)
+        at = bound_after(keys[n], bounds, at)
+        above = rows_up_to(keys[n], at, bounds, rows_per_bucket)
         asked += above - below
     return lows[:count], highs[:count], asked, scanned
 

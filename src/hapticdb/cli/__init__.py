@@ -1,0 +1,91 @@
+"""The command line: parse, call, print.
+
+Results go to standard output, progress and errors to standard error. A user's error is one line
+and exit code 2; anything unforeseen one line and exit code 1, its traceback behind ``--debug``.
+"""
+
+import contextlib
+import os
+import sys
+import traceback
+from collections.abc import Sequence
+from itertools import takewhile
+
+from hapticdb.cli.editing import move, remove
+from hapticdb.cli.importing import import_
+from hapticdb.cli.listing import calibrate, info, objects
+from hapticdb.cli.root import Interrupted, PipeClosedError, app
+from hapticdb.cli.sampling import demo, sample
+from hapticdb.cli.touching import touch
+from hapticdb.errors import HapticDBError
+
+__all__ = ["app", "main"]
+
+USER_ERROR = 2
+UNFORESEEN = 1
+INTERRUPTED = 130
+PIPE_CLOSED = 141
+
+app.command("import")(import_)
+for verb in (info, objects, touch, move, remove, calibrate, sample, demo):
+    app.command()(verb)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run a command line and return its exit code.
+
+    Parameters
+    ----------
+    argv : sequence of str, optional
+        Arguments after the program's name; those of the process unless given.
+    """
+    args = list(sys.argv[1:] if argv is None else argv)
+    is_debugging = "--debug" in takewhile(lambda arg: arg.startswith("-"), args)
+    _print_anything()
+    try:
+        code = app(args, standalone_mode=False, prog_name="hapticdb")
+        sys.stdout.flush()
+    except (BrokenPipeError, PipeClosedError):
+        _close_stdout()
+        return PIPE_CLOSED
+    except (KeyboardInterrupt, Interrupted) as error:
+        return _fail(str(error) or "interrupted", INTERRUPTED)
+    except HapticDBError as error:
+        return _fail(str(error), USER_ERROR, show_trace=is_debugging)
+    except Exception as error:  # noqa: BLE001 - whatever it is, a user sees one line
+        if hasattr(error, "format_message"):  # typer's own, under the name of each version
+            return _fail(_usage(error), USER_ERROR, show_trace=is_debugging)
+        cause = str(error).partition("\n")[0] or "no further word"
+        hint = "" if is_debugging else "; 'hapticdb --debug ...' shows where"
+        message = f"{type(error).__name__}: {cause}{hint}"
+        return _fail(message, UNFORESEEN, show_trace=is_debugging)
+    return code if isinstance(code, int) else 0
+
+
+def _fail(message: str, code: int, *, show_trace: bool = False) -> int:
+    if show_trace:
+        traceback.print_exc()
+    with contextlib.suppress(BrokenPipeError):
+        print(f"hapticdb: {' '.join(message.splitlines())}", file=sys.stderr)
+    return code
+
+
+def _usage(error: Exception) -> str:
+    """Typer's complaint as one line that says where to look."""
+    text = str(error.format_message()).replace("Value error, ", "").rstrip(".")  # type: ignore[attr-defined]
+    context = getattr(error, "ctx", None)
+    command = getattr(context, "command_path", "hapticdb")
+    return f"{text[:1].lower()}{text[1:]}; see '{command} --help'"
+
+
+def _print_anything() -> None:
+    """Let names of parts and files be printed that the terminal's encoding cannot express."""
+    for stream in (sys.stdout, sys.stderr):
+        if hasattr(stream, "reconfigure"):
+            stream.reconfigure(errors="backslashreplace")
+
+
+def _close_stdout() -> None:
+    """Whoever read the output is gone (``| head``): nothing more is to be written to it."""
+    with contextlib.suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,0 +1,114 @@
+"""The verbs that edit an environment: move, remove."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hapticdb.cli import render
+from hapticdb.cli.root import Json, Url, ids_of, numbers_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+
+def move(
+    url: Url,
+    object_id: Annotated[int, typer.Argument(metavar="ID", help="As 'hapticdb objects' lists it.")],
+    *,
+    translate: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Shift from where it is, metres, world frame."),
+    ] = None,
+    pose: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z,QW,QX,QY,QZ", help="New placement: metres, unit quaternion."),
+    ] = None,
+    matrix: Annotated[
+        str | None,
+        typer.Option(
+            metavar="FILE",
+            help="New placement: 16 numbers, row by row, in a text file or separated by commas.",
+        ),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Place an object anew; its geometry is read from its file again.
+
+    Example: hapticdb move car.db 17 --translate 0,0,0.25
+    """
+    import hapticdb
+    from hapticdb.cli.listing import record_of
+    from hapticdb.errors import UsageError
+
+    given = [option for option in (translate, pose, matrix) if option is not None]
+    if len(given) != 1:
+        raise UsageError("give one of --translate, --pose and --matrix")
+    placed = _placement(pose, matrix)
+    shift = translate and numbers_of(translate, [3], "--translate", "X,Y,Z in metres")
+    with hapticdb.open(url) as env:
+        if shift:
+            placed = env.object(object_id).transform.copy()
+            placed[:3, 3] += shift
+        moved = env.move(object_id, placed)
+    if json:
+        render.say_json(record_of(moved))
+    else:
+        low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in moved.bounds.tolist())
+        render.say(f"moved {moved.id} ({moved.name}): now from ({low}) to ({high}) m")
+
+
+def _placement(pose: str | None, matrix: str | None) -> "NDArray[np.float64]":
+    """world_from_part (4, 4) of the options; the identity without any."""
+    import numpy as np
+
+    from hapticdb.errors import UsageError
+    from hapticdb.poses import rotation_of
+
+    placed = np.eye(4)
+    if pose is not None:
+        numbers = np.array(numbers_of(pose, [7], "--pose", "X,Y,Z,QW,QX,QY,QZ"))
+        norm = float(np.linalg.norm(numbers[3:]))
+        if not norm > 1e-9:
+            raise UsageError(f"--pose {pose!r}: the quaternion is no rotation")
+        placed[:3, :3] = rotation_of(numbers[3:] / norm)[0]
+        placed[:3, 3] = numbers[:3]
+    elif matrix is not None:
+        text = _matrix_text(matrix)
+        placed = np.array(numbers_of(text, [16], "--matrix", "a file of 16 numbers")).reshape(4, 4)
+    return placed
+
+
+def _matrix_text(matrix: str) -> str:
+    """Return the option itself where it holds numbers, else what is in the file that it names."""
+    from hapticdb.errors import FileError
+
+    if len(matrix.replace(",", " ").split()) == 16:
+        return matrix
+    try:
+        return Path(matrix).read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise FileError(f"--matrix: no file at {matrix}; give one, or 16 numbers") from None
+    except (OSError, ValueError) as error:
+        raise FileError(f"--matrix: cannot read {matrix}: {error}") from None
+
+
+def remove(
+    url: Url,
+    ids: Annotated[
+        list[str], typer.Argument(metavar="ID...", help="As 'hapticdb objects' lists them.")
+    ],
+) -> None:
+    """Remove objects, each in a transaction of its own.
+
+    Example: hapticdb remove car.db 17 18
+    """
+    import hapticdb
+
+    wanted = list(dict.fromkeys(ids_of(ids, "ID")))
+    with hapticdb.open(url) as env:
+        found = [env.object(i) for i in wanted]  # all or an error before anything is removed
+        for obj in found:
+            env.remove(obj.id)
+            render.say(f"removed {obj.id} ({obj.name})")

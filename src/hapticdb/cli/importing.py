@@ -1,0 +1,149 @@
+"""The verb import."""
+
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hapticdb.cli import render
+from hapticdb.cli.root import (
+    CurveName,
+    Interrupted,
+    Json,
+    LayoutName,
+    UnitName,
+    Url,
+    numbers_of,
+)
+
+if TYPE_CHECKING:
+    from hapticdb.ingest import FileReport
+
+
+def import_(
+    url: Url,
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE...",
+            help="GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP, LAS and LAZ with their extras.",
+        ),
+    ],
+    *,
+    unit: Annotated[
+        UnitName | None, typer.Option(help="Unit of files that name none; metres otherwise.")
+    ] = None,
+    bits: Annotated[
+        int | None,
+        typer.Option(metavar="1..21", help="Bits an axis: 2^bits voxels.", show_default="10"),
+    ] = None,
+    voxel_size: Annotated[
+        float | None, typer.Option(metavar="METRES", help="Edge of a voxel.")
+    ] = None,
+    extent: Annotated[
+        float | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="Edge of the grid in longest sides of the first file's box.",
+            show_default="1.6",
+        ),
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z", help="Lower corner in metres; without it the first file is centred."
+        ),
+    ] = None,
+    layout: Annotated[
+        LayoutName | None,
+        typer.Option(help="Index table of a new environment.", show_default="brick"),
+    ] = None,
+    curve: Annotated[
+        CurveName | None, typer.Option(help="Order of the keys of a new one.", show_default="z")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(metavar="N", help="Threads.", show_default="one a processor")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Import files into an environment, which is made when it does not exist.
+
+    Every part becomes an object, in a transaction of its own: run the same
+    command again to go on with what was interrupted. A file that cannot be
+    used is named and skipped, and the others go in.
+
+    Example: hapticdb import car.db car.glb --bits 11 --extent 1.6
+    """
+    from hapticdb.grid import GridOptions
+    from hapticdb.ingest import ImportOptions, import_files
+
+    corner = None if origin is None else numbers_of(origin, [3], "--origin", "X,Y,Z in metres")
+    options = ImportOptions(
+        unit=unit,
+        grid=GridOptions(
+            bits=bits, voxel_size=voxel_size, extent=extent, origin=corner, curve=curve
+        ),
+        layout=layout,
+        jobs=jobs,
+    )
+    started = time.perf_counter()
+    try:
+        with render.import_bar() as progress:
+            reports = import_files(url, files, options, progress)
+    except KeyboardInterrupt:
+        raise Interrupted(
+            "interrupted; what went in is whole, and the same command goes on from there"
+        ) from None
+    elapsed = time.perf_counter() - started
+    for file, report in zip(files, reports, strict=True):
+        if json:
+            render.say_json(_record(report))
+        elif report.error is None:
+            _say(file, report)
+        if report.error is not None:
+            render.note(str(report.error))
+    if not json and any(report.added for report in reports):
+        _say_total(url, elapsed)
+    if any(report.error for report in reports):
+        raise typer.Exit(2)
+
+
+def _record(report: "FileReport") -> dict[str, object]:
+    return {
+        "file": report.link,
+        "status": report.status,
+        "objects": len(report.added),
+        "present": report.present,
+        "voxels": sum(obj.voxels for obj in report.added),
+        "defects": report.defects.as_dict(),
+        "error": None if report.error is None else str(report.error),
+    }
+
+
+def _say(file: str, report: "FileReport") -> None:
+    if report.status == "complete":
+        there = render.counted(report.present, "object")
+        render.say(f"{file}: complete already ({there}), nothing to do")
+    else:
+        voxels = sum(obj.voxels for obj in report.added)
+        line = (
+            f"{file}: {render.counted(len(report.added), 'object')} imported, "
+            f"{render.counted(voxels, 'voxel')}"
+        )
+        if report.present:
+            line += f"; {report.present} were there already"
+        render.say(line)
+    if report.defects:
+        render.say(f"  found in the file: {report.defects.describe()}")
+
+
+def _say_total(url: str, elapsed: float) -> None:
+    import hapticdb
+
+    with hapticdb.open(url, read_only=True) as env:
+        size = env.size()
+        objects = len(env.objects())
+        render.say(
+            f"{url}: {render.counted(objects, 'object')}, {render.counted(size.rows, 'row')}, "
+            f"{render.bytes_text(size.bytes)}; {env.grid.describe()}; {elapsed:.1f} s"
+        )

@@ -1,0 +1,157 @@
+"""The verbs that look at an environment: info, objects, calibrate."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hapticdb.cli import render
+from hapticdb.cli.root import Json, Url
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from hapticdb.statistics import CostModel
+    from hapticdb.store.base import Object
+
+MEANINGS = {
+    "statement": "a statement of ranges, whatever it reads",
+    "descent": "each range in it: a descent of the index",
+    "block": "each leaf block scanned in the engine",
+    "row": "each row handed to the client",
+    "lookup": "a statement of keys",
+    "probe": "each key in it",
+    "single": "a point query of the sequence",
+    "aggregate": "Figure 3, with the statement for ids",
+    "point": "each shell point in it",
+}
+
+
+def info(url: Url, *, json: Json = False) -> None:
+    """Show an environment's grid, layout and size.
+
+    Example: hapticdb info car.db --json
+    """
+    import hapticdb
+
+    with hapticdb.open(url, read_only=True) as env:
+        grid, size, objects = env.grid, env.size(), env.objects()
+        layout = env.layout
+    voxels = sum(obj.voxels for obj in objects)
+    if json:
+        render.say_json(
+            {
+                "voxel_size": grid.voxel_size,
+                "bits": grid.bits,
+                "origin": list(grid.origin),
+                "curve": grid.curve,
+                "layout": layout,
+                "objects": len(objects),
+                "voxels": voxels,
+                "rows": size.rows,
+                "bytes": size.bytes,
+            }
+        )
+        return
+    origin = ", ".join(f"{x:.6g}" for x in grid.origin)
+    a_voxel = f" ({size.bytes / voxels:.3g} a voxel)" if voxels else ""
+    render.show(
+        render.facts(
+            [
+                ("environment", url),
+                ("voxel size", render.metres(grid.voxel_size)),
+                ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
+                ("edge", render.metres(grid.edge)),
+                ("origin", f"({origin}) m"),
+                ("curve", grid.curve),
+                ("layout", layout),
+                ("objects", f"{len(objects):,}"),
+                ("voxels", f"{voxels:,}"),
+                ("rows", f"{size.rows:,}"),
+                ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
+            ]
+        )
+    )
+
+
+def objects(url: Url, *, json: Json = False) -> None:
+    """List the objects of an environment.
+
+    Example: hapticdb objects car.db
+    """
+    import hapticdb
+
+    with hapticdb.open(url, read_only=True) as env:
+        found = env.objects()
+    if json:
+        for obj in found:
+            render.say_json(record_of(obj))
+        return
+    if not found:
+        render.note(f"{url} is empty; 'hapticdb import {url} FILE' fills it")
+        return
+    rows = [(str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in found]
+    render.show(render.table(("id>", "name", "voxels>", "size, mm>", "file"), rows))
+
+
+def record_of(obj: "Object") -> dict[str, object]:
+    """One object as JSON knows it: metres, world frame."""
+    return {
+        "id": obj.id,
+        "name": obj.name,
+        "link": obj.link,
+        "voxels": obj.voxels,
+        "bounds": obj.bounds.tolist(),
+        "transform": obj.transform.tolist(),
+        "digest": obj.digest,
+        "attributes": dict(obj.attributes),
+        "revision": obj.revision,
+    }
+
+
+def size_text(obj: "Object") -> str:
+    """Sides of an object's bounding box in millimetres: ``1200 x 35 x 4``."""
+    return " x ".join(
+        f"{1000 * side:.3g}" if side < 1 else f"{1000 * side:.0f}"
+        for side in (obj.bounds[1] - obj.bounds[0]).tolist()
+    )
+
+
+def calibrate(url: Url, *, json: Json = False) -> None:
+    """Measure what statements, descents and rows cost on this database and machine.
+
+    The figures are kept in the environment; the strategies cbgroup and auto decide by them.
+
+    Example: hapticdb calibrate car.db
+    """
+    import hapticdb
+    from hapticdb.errors import ReadOnlyError
+
+    try:
+        env = hapticdb.open(url)
+        is_kept = True
+    except ReadOnlyError:
+        env = hapticdb.open(url, read_only=True)
+        is_kept = False
+    with env:
+        costs = env.calibrate()
+        rows = env.size().rows
+    if not is_kept:
+        render.note(f"{url} can only be read: the figures were measured, and not kept")
+    if json:
+        figures = {name: getattr(costs, name) for name in (*MEANINGS, "rows_per_block")}
+        render.say_json({"figures": figures, "spread": dict(costs.spread), "kept": is_kept})
+        return
+    render.show(_costs_table(costs))
+    render.say(
+        f"{render.counted(rows, 'row')}, {costs.rows_per_block:.0f} in a leaf block; "
+        f"a gap is scanned when it holds fewer than "
+        f"{costs.descent / max(costs.row_scanned, 1e-9):.1f} rows"
+    )
+
+
+def _costs_table(costs: "CostModel") -> "RenderableType":
+    rows = []
+    for name, meaning in MEANINGS.items():
+        spread = costs.spread.get(name)
+        known = "" if spread is None else f"± {100 * spread:.0f} %"
+        rows.append((name, f"{getattr(costs, name):.3f}", known, meaning))
+    return render.table(("figure", "µs>", "spread>", "what it is"), rows)

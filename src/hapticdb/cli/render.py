@@ -1,0 +1,171 @@
+"""What people see: tables and notes; bars on a terminal only."""
+
+import io
+import json
+import sys
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import RenderableType
+
+    from hapticdb.ingest import ProgressCallback
+
+PIPED_WIDTH = 10_000
+"""Columns where nobody looks: what reads a pipe wants whole lines."""
+
+
+def note(text: str) -> None:
+    """Say something on standard error, in a line."""
+    print(f"hapticdb: {' '.join(text.splitlines())}", file=sys.stderr)
+
+
+def say(text: str = "") -> None:
+    """Print a line of a result."""
+    print(text)
+
+
+def say_json(record: Mapping[str, Any]) -> None:
+    """Print one JSON object on a line; numbers round-trip and are finite."""
+    print(json.dumps(record, allow_nan=False))
+
+
+def show(renderable: "RenderableType") -> None:
+    """Print a table to standard output: as wide as the terminal, or whole into a pipe."""
+    from rich.console import Console
+
+    is_terminal = sys.stdout.isatty()
+    page = io.StringIO()
+    width = None if is_terminal else PIPED_WIDTH
+    screen = Console(file=sys.stdout)
+    console = Console(
+        file=page,
+        width=width or screen.width,
+        force_terminal=is_terminal,
+        no_color=screen.no_color,
+        highlight=False,
+        markup=False,
+        emoji=False,
+    )
+    console.print(renderable)
+    # by way of a string, so that a closed pipe is met where every other print meets it
+    lines = [line.rstrip() for line in page.getvalue().splitlines()]
+    sys.stdout.write("\n".join(lines).strip("\n") + "\n")
+
+
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> "RenderableType":
+    """Lay out rows under headings; a heading that ends in ``>`` is of a column of numbers."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    laid = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
+    for column in columns:
+        is_number = column.endswith(">")
+        laid.add_column(
+            Text(column.rstrip(">")),
+            justify="right" if is_number else "left",
+            no_wrap=is_number,
+            overflow="fold",
+        )
+    for row in rows:
+        laid.add_row(*(Text(cell) for cell in row))
+    return laid
+
+
+def facts(rows: Iterable[tuple[str, str]]) -> "RenderableType":
+    """Lay out names and values, a pair a line."""
+    from rich.table import Table
+    from rich.text import Text
+
+    laid = Table.grid(padding=(0, 2))
+    laid.add_column(no_wrap=True, style="dim")
+    laid.add_column(overflow="fold")
+    for name, value in rows:
+        laid.add_row(Text(name), Text(value))
+    return laid
+
+
+def counted(n: float, noun: str = "") -> str:
+    """Put a count in words: ``1 object``, ``3,412 rows``, ``14.8 million voxels``."""
+    for size, word in ((1e12, "million million"), (1e9, "billion"), (1e6, "million")):
+        if n >= size:
+            number = f"{n / size:.3g} {word}"
+            break
+    else:
+        number = f"{n:,.0f}"
+    plural = noun if n == 1 or not noun else f"{noun}s"
+    return f"{number} {plural}".rstrip()
+
+
+def bytes_text(n: float) -> str:
+    """Put bytes in words: ``13.5 MB``."""
+    for size, word in ((1e12, "TB"), (1e9, "GB"), (1e6, "MB"), (1e3, "kB")):
+        if n >= size:
+            return f"{n / size:.3g} {word}"
+    return f"{n:.0f} bytes"
+
+
+def metres(length: float) -> str:
+    """Put a length in the unit that reads best: ``3.3 mm``, ``4.21 m``."""
+    for size, word in ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")):
+        if length >= 0.1 * size or word == "µm":
+            return f"{length / size:.4g} {word}"
+    return f"{length:.4g} m"
+
+
+def shares(counts: Mapping[str, int]) -> str:
+    """Put counts in words, largest first: ``array 93 %, cbgroup 7 %``."""
+    total = sum(counts.values()) or 1
+    ranked = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    return ", ".join(f"{name} {100 * n / total:.3g} %" for name, n in ranked)
+
+
+@contextmanager
+def import_bar() -> "Iterator[ProgressCallback | None]":
+    """Show a bar with parts, voxels a second and time left; nothing where nobody looks."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from time import monotonic
+
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+
+    from hapticdb import ingest
+
+    bar = Progress(
+        SpinnerColumn(),
+        TextColumn("{task.fields[file]}", markup=False),
+        BarColumn(bar_width=14),
+        TextColumn("{task.fields[parts]}", markup=False),
+        TextColumn("{task.fields[rate]}", markup=False),
+        TimeRemainingColumn(compact=True),
+        console=Console(file=sys.stderr),
+        transient=True,
+    )
+    started: dict[str, tuple[float, int]] = {}
+    with bar:
+        task = bar.add_task("", total=None, file="reading", parts="", rate="")
+
+        def advance(now: ingest.Progress) -> None:
+            since, first = started.setdefault(now.link, (monotonic(), now.voxels))
+            elapsed = monotonic() - since
+            rate = (now.voxels - first) / elapsed if elapsed > 0.05 else 0.0
+            is_last = now.parts_done == now.parts_total
+            bar.update(
+                task,
+                total=None if is_last else now.parts_total,
+                completed=now.parts_done,
+                file="finishing" if is_last else _short(now.link),
+                parts=f"{now.parts_done}/{now.parts_total} parts",
+                rate=f"{counted(rate, 'voxel')}/s" if rate else "",
+            )
+
+        yield advance
+
+
+def _short(link: str, most: int = 18) -> str:
+    name = link.rsplit("/", 1)[-1]
+    return name if len(name) <= most else f"{name[: most - 1]}…"

@@ -1,0 +1,121 @@
+"""The typer application, its global options, and the options that several verbs share."""
+
+from collections.abc import Iterable
+from typing import Annotated, Any, Literal
+
+import typer
+import typer.core
+
+StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
+CurveName = Literal["z", "hilbert", "lexicographic"]
+LayoutName = Literal["brick", "voxel"]
+UnitName = Literal["mm", "cm", "m", "in"]
+
+Url = Annotated[
+    str, typer.Argument(metavar="URL", help="The environment: a path, or sqlite:///path.")
+]
+Json = Annotated[bool, typer.Option("--json", help="Print JSON, an object a line.")]
+
+
+class Interrupted(Exception):  # noqa: N818 - no error: the user pressed Ctrl-C
+    """Ctrl-C, with what the user should know about the state that is left."""
+
+
+class PipeClosedError(Exception):
+    """Whoever read the output is gone: ``| head``."""
+
+
+class Verbs(typer.core.TyperGroup):
+    """The verbs, in the order of a first visit; Ctrl-C and closed pipes pass through to `main`."""
+
+    def list_commands(self, ctx: Any) -> list[str]:  # noqa: ANN401, ARG002, D102 - typer's types move between versions
+        return list(self.commands)
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401, D102
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise Interrupted("interrupted") from None
+        except BrokenPipeError as error:  # typer would end the process
+            raise PipeClosedError from error
+
+
+app = typer.Typer(
+    cls=Verbs,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+def _show_version(*, wanted: bool) -> None:
+    if wanted:
+        from hapticdb import __version__
+
+        print(f"hapticdb {__version__}")
+        raise typer.Exit
+
+
+@app.callback(invoke_without_command=True)
+def root(
+    context: typer.Context,
+    *,
+    version: Annotated[
+        bool,
+        typer.Option(
+            "--version",
+            callback=lambda wanted: _show_version(wanted=wanted),
+            is_eager=True,
+            help="Print the version.",
+        ),
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks of errors.")] = False,
+) -> None:
+    """Feel a virtual environment too large for memory: haptic queries on an SQL database.
+
+    A first visit:
+
+      hapticdb demo
+      hapticdb import car.db car.glb --bits 11
+      hapticdb touch car.db --tool wrench.stl --poses path.csv
+
+    'hapticdb VERB --help' shows what a verb takes, with an example.
+    """
+    del version, debug  # seen by their callbacks and by `main`
+    if context.invoked_subcommand is None:
+        print(context.get_help())
+
+
+def numbers_of(text: str, counts: Iterable[int], option: str, example: str) -> list[float]:
+    """Finite numbers of an option, separated by commas or blanks.
+
+    Raises
+    ------
+    UsageError
+        When they are no numbers, or not as many as one of `counts`.
+    """
+    from math import isfinite
+
+    from hapticdb.errors import UsageError
+
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in counts or not all(map(isfinite, numbers)):
+        raise UsageError(f"{option} {text[:80]!r}: give {example}")
+    return numbers
+
+
+def ids_of(words: Iterable[str], option: str) -> list[int]:
+    """Ids of objects from words such as ``7`` and ``3,4``."""
+    from hapticdb.errors import UsageError
+
+    ids = []
+    for word in words:
+        for text in word.split(","):
+            if not text.strip().isdecimal():
+                raise UsageError(f"{option} {word!r}: give ids of objects, such as 3 or 3,4")
+            ids.append(int(text))
+    return ids

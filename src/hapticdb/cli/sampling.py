@@ -1,0 +1,124 @@
+"""The verbs that need no data of the user's: sample, demo."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hapticdb.cli import render
+
+if TYPE_CHECKING:
+    from hapticdb.demo import Imported, Measured, Scene
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
+Frames = Annotated[int, typer.Option(metavar="N", help="Poses of the path.")]
+
+
+def sample(
+    folder: Folder,
+    *,
+    along: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Slide over this environment instead of the sample."),
+    ] = None,
+    frames: Frames = 1000,
+) -> None:
+    """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
+
+    With --along, wrench.stl and a path over another environment.
+
+    Example: hapticdb sample sample
+    """
+    if along is None:
+        from hapticdb.sample import write_sample
+
+        written: tuple[Path, ...] = write_sample(folder, frames)
+    else:
+        from hapticdb.demo import write_along
+
+        written = write_along(folder, along, frames)
+    for path in written:
+        render.say(str(path))
+
+
+def demo(
+    folder: Folder = Path("demo"),
+    *,
+    bits: Annotated[int, typer.Option(metavar="1..21", help="Bits an axis of the grid.")] = 10,
+    frames: Frames = 1000,
+    points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
+) -> None:
+    """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
+
+    Example: hapticdb demo demo --bits 11
+    """
+    render.note(f"writing the sample into {folder}, compiling kernels on the first run ...")
+    import numpy as np
+
+    from hapticdb.demo import compare, prepare
+    from hapticdb.picture import draw
+
+    with render.import_bar() as progress:
+        scene = prepare(folder, bits=bits, frames=frames, points=points, progress=progress)
+    _show_scene(scene)
+    comparison = compare(scene)
+    for measured in comparison.layouts:
+        _show_layout(measured, scene, float(np.median(comparison.trace.hits)))
+    render.say(f"\n{comparison.against_paper()}")
+    render.say(comparison.verdict)
+    picture = folder / "demo.png"
+    draw(picture, scene, comparison)
+    render.say(f"picture: {picture}")
+    if comparison.disagreed:
+        raise typer.Exit(1)
+
+
+def _show_scene(scene: "Scene") -> None:
+    rows = [
+        ("sample", ", ".join(str(path) for path in scene.files)),
+        ("grid", scene.grid_text),
+        ("kernels", f"ready after {scene.compile_seconds:.1f} s"),
+    ]
+    rows += [(f"import, {one.layout}", _import_text(one)) for one in scene.imported]
+    rows.append(("tool", f"{len(scene.shell)} points, {len(scene.poses):,} poses"))
+    render.show(render.facts(rows))
+
+
+def _import_text(one: "Imported") -> str:
+    size = (
+        f"{render.counted(one.objects, 'object')}, {render.counted(one.voxels, 'voxel')}, "
+        f"{render.counted(one.rows, 'row')}, {render.bytes_text(one.bytes)}"
+    )
+    if not one.is_new:
+        return f"{one.path}: {size}; there already"
+    rate = render.counted(one.voxels / one.seconds, "voxel")
+    return f"{one.path}: {size}; {one.seconds:.1f} s, {rate} a second"
+
+
+def _show_layout(measured: "Measured", scene: "Scene", hits: float) -> None:
+    import numpy as np
+
+    from hapticdb.demo import YARDSTICK
+
+    base = measured.felt[YARDSTICK].median_us
+    rows = [
+        (
+            name,
+            f"{felt.median_us:.0f}",
+            f"{felt.p99_us:.0f}",
+            f"{np.mean(felt.statements):.0f}",
+            f"{np.mean(felt.ranges):.0f}",
+            f"{np.mean(felt.rows):.0f}",
+            f"{base / felt.median_us:.1f}",
+        )
+        for name, felt in measured.felt.items()
+    ]
+    keys = np.median(measured.felt[YARDSTICK].ranges)
+    one = measured.imported
+    render.say(
+        f"\n{one.layout} layout, {render.counted(one.rows, 'row')}; warm, strategies in turns\n"
+        f"a frame: {len(scene.shell)} points, {keys:.0f} distinct keys, {hits:.0f} hits (medians)\n"
+    )
+    columns = ("strategy", "median µs>", "p99 µs>", "statements>", "ranges>", "rows>", "x faster>")
+    render.show(render.table(columns, rows))
+    render.say(f"auto chose {render.shares(measured.felt['auto'].used)}")

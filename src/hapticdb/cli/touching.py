@@ -1,0 +1,179 @@
+"""The verb touch."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hapticdb.cli import render
+from hapticdb.cli.root import Json, StrategyName, UnitName, Url, ids_of
+
+if TYPE_CHECKING:
+    from hapticdb.environment import Touch
+    from hapticdb.pointshell import PointShell
+    from hapticdb.store.base import Object
+
+DEFAULT_POINTS = 300
+MOST_TOUCHED = 8
+
+
+def touch(
+    url: Url,
+    *,
+    tool: Annotated[
+        str, typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
+    ],
+    poses: Annotated[
+        str,
+        typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header, metres."),
+    ],
+    tool_unit: Annotated[
+        UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
+    ] = None,
+    points: Annotated[
+        int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(metavar="N", help="Seed of their places.", show_default="0")
+    ] = None,
+    strategy: Annotated[StrategyName, typer.Option(help="How the database is asked.")] = "auto",
+    maxgap: Annotated[
+        int, typer.Option(metavar="KEYS", help="Of the strategy maxgap, in voxel keys.")
+    ] = 500,
+    exclude: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="Objects that are not felt; again, or 3,4, for more."),
+    ] = None,
+    stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")] = 1000.0,
+    json: Json = False,
+) -> None:
+    """Touch an environment with a tool along a path: force, torque and objects of every pose.
+
+    Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
+    """
+    import hapticdb
+    from hapticdb.poses import read_poses
+
+    law = hapticdb.TangentPlane(stiffness)
+    excluded = ids_of(exclude or (), "--exclude")
+    path = read_poses(poses)
+    summary = _Summary()
+    with hapticdb.open(url, read_only=True) as env:
+        shell = _shell(tool, tool_unit, points, seed)
+
+        def felt(index: int) -> "Touch":
+            return env.touch(shell, path[index], strategy, exclude=excluded, maxgap=maxgap, law=law)
+
+        felt(0)  # compiles kernels and reads statistics, which belong to no frame's time
+        for index in range(len(path)):
+            touched = felt(index)
+            if json:
+                render.say_json(_record(index, touched))
+            else:
+                summary.add(touched)
+    if not json:
+        summary.show()
+
+
+def _shell(tool: str, unit: str | None, points: int | None, seed: int | None) -> "PointShell":
+    from hapticdb.errors import UsageError
+    from hapticdb.pointshell import PointShell
+
+    if tool.lower().endswith(".npz") and (points is not None or seed is not None):
+        raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
+    shell = PointShell.from_file(
+        tool,
+        DEFAULT_POINTS if points is None else points,
+        unit=unit,
+        seed=0 if seed is None else seed,
+    )
+    if not shell.is_closed:
+        render.note(f"{tool}: the tool's mesh is open, so its inside is a guess")
+    return shell
+
+
+def _record(index: int, touched: "Touch") -> dict[str, object]:
+    query = touched.query
+    return {
+        "pose": index,
+        "force": touched.force.tolist(),
+        "torque": touched.torque.tolist(),
+        "hits": len(touched.hits),
+        "contacts": len(touched.contacts),
+        "objects": [{"id": obj.id, "name": obj.name} for obj in touched.objects],
+        "query": {
+            "strategy": query.strategy,
+            "statements": query.statements,
+            "ranges": query.ranges,
+            "rows": query.rows,
+            "elapsed_us": query.elapsed_us,
+        },
+    }
+
+
+@dataclass
+class _Summary:
+    """What a path felt like, gathered frame by frame."""
+
+    forces: list[float] = field(default_factory=list)
+    torques: list[float] = field(default_factory=list)
+    hits: list[int] = field(default_factory=list)
+    contacts: list[int] = field(default_factory=list)
+    queries: list[tuple[int, int, int, float]] = field(default_factory=list)
+    strategies: Counter[str] = field(default_factory=Counter)
+    frames_of: Counter[int] = field(default_factory=Counter)
+    objects: dict[int, "Object"] = field(default_factory=dict)
+
+    def add(self, touched: "Touch") -> None:
+        """Count one frame in."""
+        import numpy as np
+
+        query = touched.query
+        self.forces.append(float(np.linalg.norm(touched.force)))
+        self.torques.append(float(np.linalg.norm(touched.torque)))
+        self.hits.append(len(touched.hits))
+        self.contacts.append(len(touched.contacts))
+        self.queries.append((query.statements, query.ranges, query.rows, query.elapsed_us))
+        self.strategies[query.strategy] += 1
+        for obj in touched.objects:
+            self.frames_of[obj.id] += 1
+            self.objects[obj.id] = obj
+
+    def show(self) -> None:
+        """Print it."""
+        import numpy as np
+
+        peak, twist = int(np.argmax(self.forces)), int(np.argmax(self.torques))
+        statements, ranges, rows, elapsed = np.array(self.queries, dtype=float).T
+        median, p99 = np.percentile(elapsed, [50, 99])
+        asked = (
+            f"{statements.mean():.3g} statements, {ranges.mean():.3g} ranges, "
+            f"reads {rows.mean():.3g} rows"
+        )
+        n_hit, n_contact = np.count_nonzero(self.hits), np.count_nonzero(self.contacts)
+        render.show(
+            render.facts(
+                [
+                    ("frames", f"{len(self.hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
+                    (
+                        "hits a frame",
+                        f"median {np.median(self.hits):.0f}, {max(self.hits)} at most",
+                    ),
+                    ("peak force", f"{self.forces[peak]:.4g} N at pose {peak}"),
+                    ("peak torque", f"{self.torques[twist]:.4g} N m at pose {twist}"),
+                    ("frame time", f"median {median:.0f} µs, p99 {p99:.0f} µs"),
+                    ("a frame asks", asked),
+                    ("strategy", render.shares(self.strategies)),
+                    ("objects", f"{len(self.objects)} touched"),
+                ]
+            )
+        )
+        if self.objects:
+            ranked = sorted(self.frames_of.items(), key=lambda item: (-item[1], item[0]))
+            render.show(
+                render.table(
+                    ("id>", "touched most", "frames>"),
+                    [(str(i), self.objects[i].name, str(n)) for i, n in ranked[:MOST_TOUCHED]],
+                )
+            )

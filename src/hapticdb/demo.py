@@ -1,0 +1,333 @@
+"""The demo: the sample imported in both layouts, touched by every strategy, measured and compared.
+
+What is compared is bit for bit: hits, ids and wrench of every pose, over strategies and layouts.
+What is timed is warm: each strategy has run before, and they take turns at going first.
+"""
+
+import os
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.environment import Environment, Touch
+from hapticdb.environment import open as open_environment
+from hapticdb.errors import FileError, GridError, UsageError
+from hapticdb.grid import GridOptions
+from hapticdb.ingest import FileReport, ImportOptions, ProgressCallback, import_files
+from hapticdb.pointshell import PointShell
+from hapticdb.poses import read_poses, write_poses
+from hapticdb.query import Strategy
+from hapticdb.sample import SampleFiles, slide_over_voxels, write_sample, write_wrench
+from hapticdb.store.base import Layout
+from hapticdb.warm import warm_up
+
+COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
+YARDSTICK: Strategy = "points"
+"""The paper's point query sequence: what the others are measured by."""
+WARM_POSES = 20
+MAP_CELLS = 4096
+"""Cells an axis of the map of heights that a path over an environment is made from."""
+ALONG_VOXELS = 10_000_000
+"""Voxels that such a path may read at most: a gigabyte."""
+
+
+class Imported(NamedTuple):
+    """One environment of the demo; how long its import took, nothing if it was there."""
+
+    layout: Layout
+    path: Path
+    seconds: float
+    objects: int
+    voxels: int
+    rows: int
+    bytes: int
+    is_new: bool
+
+
+@dataclass(frozen=True)
+class Scene:
+    """What the demo works on: the sample's files and the environments made from them."""
+
+    folder: Path
+    files: SampleFiles
+    imported: tuple[Imported, ...]
+    shell: PointShell
+    poses: NDArray[np.float64]
+    grid_text: str
+    compile_seconds: float
+
+
+@dataclass
+class Felt:
+    """What one strategy did and took, frame by frame."""
+
+    elapsed_us: list[float] = field(default_factory=list)
+    statements: list[int] = field(default_factory=list)
+    ranges: list[int] = field(default_factory=list)
+    rows: list[int] = field(default_factory=list)
+    used: Counter[str] = field(default_factory=Counter)
+
+    def add(self, touched: Touch) -> None:
+        """Count one frame in."""
+        query = touched.query
+        self.elapsed_us.append(query.elapsed_us)
+        self.statements.append(query.statements)
+        self.ranges.append(query.ranges)
+        self.rows.append(query.rows)
+        self.used[query.strategy] += 1
+
+    @property
+    def median_us(self) -> float:
+        """Median time of a frame, microseconds."""
+        return float(np.median(self.elapsed_us))
+
+    @property
+    def p99_us(self) -> float:
+        """Time that 99 frames of 100 keep, microseconds."""
+        return float(np.percentile(self.elapsed_us, 99))
+
+
+@dataclass(frozen=True)
+class Measured:
+    """All strategies on one layout."""
+
+    imported: Imported
+    felt: dict[Strategy, Felt]
+
+
+@dataclass
+class Trace:
+    """What the tool felt along the path, whatever the strategy: for the picture.
+
+    force (M,) newtons and hits (M,), a number a pose; points (H, 3) metres, world frame, of the
+    hits, ids (H,) of the object that each hit (the lowest where several share a voxel), and frames
+    (H,) the pose of each.
+    """
+
+    force: NDArray[np.float64]
+    hits: NDArray[np.int64]
+    points: NDArray[np.float64]
+    ids: NDArray[np.int64]
+    frames: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All strategies on all layouts, and whether they agreed."""
+
+    layouts: tuple[Measured, ...]
+    trace: Trace
+    compared: int
+    disagreed: tuple[str, ...]
+
+    @property
+    def verdict(self) -> str:
+        """One line: whether all found the same."""
+        if self.disagreed:
+            return f"DISAGREED: {self.disagreed[0]} ({len(self.disagreed)} frames in all)"
+        return (
+            f"all agreed: hits, ids and wrench bit for bit, {len(COMPARED)} strategies on "
+            f"{len(self.layouts)} layouts, {self.compared:,} frames compared"
+        )
+
+    def against_paper(self) -> str:
+        """One line: the default here beside the paper's point queries on its own layout."""
+        felt = {measured.imported.layout: measured.felt for measured in self.layouts}
+        ours, theirs = felt["brick"]["auto"].median_us, felt["voxel"][YARDSTICK].median_us
+        return (
+            f"auto on bricks against the paper's point queries on voxels: "
+            f"{ours:.0f} µs to {theirs:.0f} µs, {theirs / ours:.1f} times as fast"
+        )
+
+
+def prepare(
+    folder: str | os.PathLike[str],
+    *,
+    bits: int = 10,
+    frames: int = 1000,
+    points: int = 300,
+    progress: ProgressCallback | None = None,
+) -> Scene:
+    """Write the sample and import it in both layouts.
+
+    Parameters
+    ----------
+    folder : path
+        Where everything goes; made when it does not exist.
+    bits : int
+        Bits an axis of the grid.
+    frames : int
+        Poses of the path.
+    points : int
+        Points of the tool's shell.
+    progress : callable or None
+        As for `hapticdb.import_files`.
+    """
+    options = GridOptions(bits=bits)
+    home = Path(folder)
+    files = write_sample(home, frames)
+    started = time.perf_counter()
+    warm_up()
+    compile_seconds = time.perf_counter() - started
+    shell = PointShell.from_file(files.wrench, points)
+    imported = []
+    layouts: tuple[tuple[Layout, str], ...] = (("brick", "car.db"), ("voxel", "car_voxel.db"))
+    for layout, name in layouts:
+        imported.append(_import(home / name, files.car, layout, options, progress))
+    with open_environment(imported[0].path, read_only=True) as env:
+        grid_text = env.grid.describe()
+    poses = read_poses(files.path)
+    return Scene(home, files, tuple(imported), shell, poses, grid_text, compile_seconds)
+
+
+def _import(
+    path: Path, car: Path, layout: Layout, grid: GridOptions, progress: ProgressCallback | None
+) -> Imported:
+    started = time.perf_counter()
+    try:
+        report: FileReport = import_files(
+            path, [car], ImportOptions(grid=grid, layout=layout), progress
+        )[0]
+    except GridError as error:
+        raise UsageError(f"{path} is of another demo: give another folder ({error})") from error
+    seconds = time.perf_counter() - started
+    if report.error is not None:
+        raise report.error
+    with open_environment(path) as env:
+        if env.store.size().rows:
+            env.calibrate()
+        size, objects = env.size(), env.objects()
+    return Imported(
+        layout,
+        path,
+        seconds,
+        len(objects),
+        sum(obj.voxels for obj in objects),
+        size.rows,
+        size.bytes,
+        bool(report.added),
+    )
+
+
+def compare(scene: Scene) -> Comparison:
+    """Touch every pose by every strategy on every layout; time it, and compare what was found."""
+    disagreed: list[str] = []
+    layouts = []
+    reference: list[Any] = []
+    trace: Trace | None = None
+    for imported in scene.imported:
+        with open_environment(imported.path, read_only=True) as env:
+            layouts.append(Measured(imported, _race(env, scene, reference, disagreed)))
+            if trace is None:
+                trace = trace_of(env, scene.shell, scene.poses)
+    assert trace is not None  # noqa: S101 - the demo has two layouts
+    compared = len(scene.poses) * len(COMPARED) * len(layouts)
+    return Comparison(tuple(layouts), trace, compared, tuple(disagreed))
+
+
+def _race(
+    env: Environment, scene: Scene, reference: list[Any], disagreed: list[str]
+) -> dict[Strategy, Felt]:
+    """Time of every strategy; what each pose found is held against `reference`, filled first."""
+    for strategy in COMPARED:
+        for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
+            env.touch(scene.shell, pose, strategy)
+    felt: dict[Strategy, Felt] = {strategy: Felt() for strategy in COMPARED}
+    for index, pose in enumerate(scene.poses):
+        # whoever goes first at a pose brings its pages in for the others: they take turns
+        turn = index % len(COMPARED)
+        for strategy in COMPARED[turn:] + COMPARED[:turn]:
+            touched = env.touch(scene.shell, pose, strategy)
+            felt[strategy].add(touched)
+            found = _found(touched)
+            if len(reference) == index:
+                reference.append(found)
+            elif found != reference[index]:
+                disagreed.append(f"pose {index} by {strategy} on the {env.layout} layout")
+    return felt
+
+
+def _found(touched: Touch) -> tuple[bytes, bytes, bytes, tuple[int, ...]]:
+    """Everything that must be equal, bit for bit."""
+    return (
+        touched.force.tobytes(),
+        touched.torque.tobytes(),
+        touched.hits.tobytes(),
+        tuple(obj.id for obj in touched.objects),
+    )
+
+
+def trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) -> Trace:
+    """Feel a path once, and keep where the hits were."""
+    force, hits, points, ids, frames = [], [], [], [], []
+    for index, pose in enumerate(poses):
+        touched = env.touch(shell, pose)
+        force.append(float(np.linalg.norm(touched.force)))
+        hits.append(len(touched.hits))
+        pairs = touched.pairs
+        _, first = np.unique(pairs[:, 0], return_index=True)
+        points.append(shell.points[pairs[first, 0]] @ pose[:3, :3].T + pose[:3, 3])
+        ids.append(pairs[first, 1])
+        frames.append(np.full(len(first), index, dtype=np.int64))
+    return Trace(
+        np.array(force),
+        np.array(hits, dtype=np.int64),
+        np.concatenate(points),
+        np.concatenate(ids),
+        np.concatenate(frames),
+    )
+
+
+def write_along(
+    folder: str | os.PathLike[str], url: str | os.PathLike[str], frames: int
+) -> tuple[Path, Path]:
+    """Write wrench.stl, and path.csv that slides it over an environment."""
+    home = Path(folder)
+    with open_environment(url, read_only=True) as env:
+        try:
+            home.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise FileError(f"cannot make the folder {home}: {error.strerror}") from error
+        wrench = write_wrench(home)
+        # the points that will be looked up: where the mesh alone touches, none of them may
+        poses = slide_along(env, PointShell.from_file(wrench).points, frames)
+    write_poses(home / "path.csv", poses)
+    return wrench, home / "path.csv"
+
+
+def slide_along(
+    env: Environment, tool_points: NDArray[np.float64], frames: int
+) -> NDArray[np.float64]:
+    """Poses (frames, 4, 4) that slide a tool over the largest objects of an environment.
+
+    Their voxels are thinned to a map that fits in memory, whatever the grid.
+    """
+    chosen, total = [], 0
+    for obj in sorted(env.objects(), key=lambda obj: (-obj.voxels, obj.id)):
+        if total + obj.voxels <= ALONG_VOXELS:
+            chosen.append(obj)
+            total += obj.voxels
+    if not chosen:
+        raise UsageError(f"{env.url} has no objects small enough to slide over")
+    bounds = np.array([obj.bounds for obj in chosen])
+    span = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
+    size = env.grid.voxel_size
+    step = size * max(1, 2 ** int(np.ceil(np.log2(max(span / (size * MAP_CELLS), 1.0)))))
+    tops = [_tops(env.grid.centers(env.voxels(obj.id)), step) for obj in chosen]
+    centers = np.concatenate(tops)
+    centers[:, 2] -= 0.5 * (step - size)  # the map adds half a cell: the tops stay where they are
+    return slide_over_voxels(centers, step, tool_points, frames)
+
+
+def _tops(centers: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """Highest of the centres (V, 3) in each column of a map of that step, metres."""
+    columns = np.floor(centers[:, :2] / step).astype(np.int64)
+    order = np.lexsort((centers[:, 2], columns[:, 1], columns[:, 0]))
+    ranked = columns[order]
+    is_last = np.append((ranked[1:] != ranked[:-1]).any(axis=1), True)
+    return np.asarray(centers[order[is_last]])

@@ -1,0 +1,194 @@
+"""Voxels to pixels: a camera, a buffer of depths, and shading from the depths alone."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+Floats = NDArray[np.float64]
+Image = NDArray[np.float32]
+
+FAR = np.iinfo(np.int64).max
+NUMBER_BITS = 20
+"""Bits of a buffer's entry that name the object; the depth is above them."""
+DEPTH_STEPS = 1 << 40
+CHUNK = 1_000_000
+"""Voxels splatted at a time."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera.
+
+    eye (3,) metres, world frame; axes (3, 3), rows right, down, ahead; focal length and middle (2,)
+    in pixels; size (width, height); near and far, metres ahead of the eye.
+    """
+
+    eye: Floats
+    axes: Floats
+    focal: float
+    middle: Floats
+    size: tuple[int, int]
+    near: float
+    far: float
+
+    @classmethod
+    def looking_at(
+        cls, boxes: Floats, towards: Floats, size: tuple[int, int], window: Floats
+    ) -> "Camera":
+        """Camera that has boxes (B, 2, 3), metres, in view, from a direction (3,).
+
+        They fill the window (2, 2), corners in pixels, along one of its sides.
+        """
+        low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
+        center, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
+        ahead = -towards / np.linalg.norm(towards)
+        right = np.cross(ahead, np.array([0.0, 0.0, 1.0]))
+        right /= np.linalg.norm(right)
+        axes = np.stack([right, np.cross(ahead, right), ahead])
+        eye = center - 5.5 * radius * ahead
+        which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
+        corners = boxes[:, which, np.arange(3)].reshape(-1, 3)
+        seen = (corners - eye) @ axes.T
+        flat = seen[:, :2] / seen[:, 2:]
+        left, right_most = flat.min(axis=0), flat.max(axis=0)
+        focal = float(((window[1] - window[0]) / (right_most - left)).min())
+        middle = window.mean(axis=0) - focal * 0.5 * (left + right_most)
+        return cls(eye, axes, focal, middle, size, 4.0 * radius, 7.0 * radius)
+
+    def project(self, points: Floats) -> Floats:
+        """Pixels across and down, and metres ahead, of points (N, 3) in metres -> (N, 3)."""
+        seen = (points - self.eye) @ self.axes.T
+        seen[:, :2] = seen[:, :2] / seen[:, 2:] * self.focal + self.middle
+        return np.asarray(seen)
+
+
+class Depths(NamedTuple):
+    """Nearest voxel behind each pixel: depth and number, packed, (height, width)."""
+
+    nearest: NDArray[np.int64]
+
+    @classmethod
+    def empty(cls, camera: Camera) -> "Depths":
+        """Nothing anywhere."""
+        return cls(np.full(camera.size[::-1], FAR, dtype=np.int64))
+
+
+def splat(depths: Depths, camera: Camera, centers: Floats, size: float, number: int) -> None:
+    """Put voxels into the buffer as squares that face the eye.
+
+    Parameters
+    ----------
+    depths : Depths
+        Changed in place.
+    camera : Camera
+        What sees them.
+    centers : (V, 3) float64
+        Of the voxels, metres.
+    size : float
+        Edge of a voxel, metres.
+    number : int
+        What they are entered as, below 2^20.
+    """
+    width, height = camera.size
+    flat = depths.nearest.reshape(-1)
+    for start in range(0, len(centers), CHUNK):
+        seen = camera.project(centers[start : start + CHUNK])
+        scaled = (seen[:, 2] - camera.near) / (camera.far - camera.near)
+        entry = (np.clip(scaled, 0, 1) * DEPTH_STEPS).astype(np.int64) << NUMBER_BITS | number
+        edge = 1.25 * size * camera.focal / float(seen[:, 2].mean())
+        reach = max(1, int(np.ceil(edge)))
+        corner = np.floor(seen[:, :2] - 0.5 * (reach - 1)).astype(np.int64)
+        for dx in range(reach):
+            for dy in range(reach):
+                x, y = corner[:, 0] + dx, corner[:, 1] + dy
+                inside = (x >= 0) & (x < width) & (y >= 0) & (y < height)
+                np.minimum.at(flat, (y * width + x)[inside], entry[inside])
+
+
+def shade(depths: Depths, camera: Camera, tints: Floats, paper: Floats, size: float) -> Image:
+    """Light a buffer -> image (height, width, 3), 0 to 1.
+
+    Parameters
+    ----------
+    depths : Depths
+        What `splat` filled.
+    camera : Camera
+        What saw it.
+    tints : (K, 3) float64
+        Colours by the number that a voxel was entered as.
+    paper : (3,) float64
+        Colour behind the scene.
+    size : float
+        Edge of a voxel, metres.
+
+    Notes
+    -----
+    The staircase of the voxels is smoothed away, but for steps of more than a few voxels: those are
+    edges. What lies behind its surroundings is darkened (unsharp masking of the depths).
+    """
+    image = _backdrop(camera, paper)
+    rows, columns = np.nonzero(depths.nearest != FAR)
+    if len(rows) == 0:
+        return image
+    # twice the widest blur around what is seen: the rest is backdrop
+    seen = tuple(
+        slice(max(int(index.min()) - 80, 0), int(index.max()) + 80) for index in (rows, columns)
+    )
+    nearest = depths.nearest[seen]
+    is_hit = nearest != FAR
+    number = np.where(is_hit, nearest & ((1 << NUMBER_BITS) - 1), 0)
+    depth = (nearest >> NUMBER_BITS) * ((camera.far - camera.near) / DEPTH_STEPS)
+    metres = np.where(is_hit, depth, camera.far - camera.near).astype(np.float32)
+    pixel = (camera.near + camera.far) / 2 / camera.focal
+    smooth = _smoothed(metres, is_hit, reach=max(3, round(3.0 * size / pixel)), edge=2.5 * size)
+    down, across = np.gradient(smooth)
+    normals = np.stack([across, down, np.full_like(smooth, -pixel)], axis=-1)
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    world = normals @ camera.axes.astype(np.float32)
+    light = 0.26 + 0.70 * _lit(world, (0.30, 0.45, 0.84)) + 0.22 * _lit(world, (0.95, 0.1, 0.2))
+    light *= _unoccluded(metres, 40, 0.25) * _unoccluded(metres, 8, 0.06)
+    rim = 0.10 * (1.0 + normals[..., 2]) ** 3
+    lit = tints.astype(np.float32)[number] * light[..., None] + rim[..., None]
+    image[seen] = np.where(is_hit[..., None], lit, image[seen])
+    return image
+
+
+def _lit(normals: Image, towards: tuple[float, float, float]) -> Image:
+    direction = (np.array(towards) / np.linalg.norm(towards)).astype(np.float32)
+    return np.asarray(np.clip(normals @ direction, 0, 1))
+
+
+def _unoccluded(metres: Image, blur: float, depth: float) -> Image:
+    """Factor below 1 behind the surroundings; blur in pixels, depth in metres."""
+    behind = metres - gaussian_filter(metres, blur, truncate=2.5)
+    return np.asarray(1.0 - 0.55 * np.clip(behind / depth, 0, 1))
+
+
+def _backdrop(camera: Camera, paper: Floats) -> Image:
+    """Backdrop a little lighter behind the scene."""
+    width, height = camera.size
+    x = (np.arange(width) / width - 0.5)[None, :, None] / 0.62
+    y = (np.arange(height) / height - 0.52)[:, None, None] / 0.60
+    glow = 0.055 * np.exp(-2.2 * x**2) * np.exp(-2.2 * y**2)
+    return (paper + glow).astype(np.float32)
+
+
+def _smoothed(metres: Image, is_hit: NDArray[np.bool_], reach: int, edge: float) -> Image:
+    """Mean of the depths around each pixel, of those within `edge` metres of its own."""
+    result = metres
+    shifts = [shift for shift in range(-reach, reach + 1, max(1, reach // 5)) if shift]
+    for axis in (0, 1):
+        total, weight = result.copy(), np.ones_like(result)
+        for shift in shifts:
+            moved = np.roll(result, shift, axis=axis)
+            # falls off where the depth steps, and along the window
+            step = (moved - result) * np.float32(1 / edge)
+            step *= step  # a power of four by numpy takes longer than all the rest
+            near = np.float32(1.0 - 0.7 * (shift / reach) ** 2) / (1 + step * step)
+            total += near * moved
+            weight += near
+        result = np.where(is_hit, total / weight, metres)
+    return np.asarray(result)

@@ -1,0 +1,103 @@
+"""The command line as tests use it: run in an empty folder, on a small environment."""
+
+import shutil
+import sqlite3
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import hapticdb
+from hapticdb.cli import main
+
+PLACES = ((0.0, 0.0, 0.055), (0.0, 0.0, 0.3), (0.2, 0.0, -0.052))
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    """Runs a command line in an empty folder: exit code, standard output, standard error."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "80")
+
+    def call(*args: object) -> tuple[int, str, str]:
+        capfd.readouterr()
+        code = main([str(arg) for arg in args])
+        out, err = capfd.readouterr()
+        return code, out, err
+
+    return call
+
+
+def refused(result: tuple[int, str, str], *words: str) -> str:
+    """One line on standard error, exit code 2."""
+    code, _, err = result
+    assert code == 2, result
+    lines = err.splitlines()
+    assert len(lines) == 1, err
+    assert lines[0].startswith("hapticdb: ")
+    for word in words:
+        assert word in lines[0]
+    return lines[0]
+
+
+def boxes(path: Path, count: int = 3, side: float = 0.1, subdivisions: int = 0) -> Path:
+    """A file of boxes in a row along x, 0.2 m apart."""
+    scene = trimesh.Scene()
+    for n in range(count):
+        box = trimesh.creation.box((side, side, side))
+        for _ in range(subdivisions):
+            box = box.subdivide()
+        placed = trimesh.transformations.translation_matrix((0.2 * n, 0, 0))
+        scene.add_geometry(box, node_name=f"box{n}", geom_name=f"box{n}", transform=placed)
+    path.write_bytes(scene.export(file_type="glb"))
+    return path
+
+
+def tool(path: Path, *, is_open: bool = False) -> Path:
+    """A cube of 2 cm, with a side missing if open."""
+    cube = trimesh.creation.box((0.02, 0.02, 0.02))
+    if is_open:
+        cube.update_faces(np.arange(len(cube.faces)) > 1)
+    path.write_bytes(cube.export(file_type="stl"))
+    return path
+
+
+def poses(path: Path, *places: tuple[float, float, float]) -> Path:
+    lines = ["x,y,z,qw,qx,qy,qz", *(f"{x},{y},{z},1,0,0,0" for x, y, z in places)]
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+@pytest.fixture(scope="session")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with an environment of three boxes, a tool, and poses that touch two of them."""
+    folder = tmp_path_factory.mktemp("made")
+    file = boxes(folder / "boxes.glb")
+    assert main(["import", str(folder / "scene.db"), str(file), "--bits", "6"]) == 0
+    hapticdb.PointShell.from_file(tool(folder / "tool.stl")).save(folder / "tool.npz")
+    poses(folder / "path.csv", *PLACES)
+    return folder
+
+
+@pytest.fixture
+def scene(run: Run, made: Path, tmp_path: Path) -> Path:
+    """A copy of that environment, tool and path; the boxes' file stays where it was."""
+    assert callable(run)  # in the folder where it runs
+    for name in ("scene.db", "tool.stl", "tool.npz", "path.csv"):
+        shutil.copy(made / name, tmp_path)
+    return tmp_path / "scene.db"
+
+
+def rows_of(path: Path) -> list[tuple[Any, ...]]:
+    """Every row of the objects and of the index table, whichever it has."""
+    with sqlite3.connect(path) as connection:
+        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
+        found = list(connection.execute("SELECT id, name, digest, voxels FROM object ORDER BY id"))
+        for table in {"voxel", "brick"} & tables:
+            found += connection.execute(f"SELECT * FROM {table} ORDER BY 1, 2").fetchall()
+    connection.close()
+    return found

@@ -1,0 +1,284 @@
+"""The command line as a user meets it: what is offered, import, and the process around it."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import hapticdb
+from command_line import Run, boxes, made, poses, refused, rows_of, run, scene  # noqa: F401 - fixtures
+from hapticdb.cli import root
+from hapticdb.grid import CURVE_NAMES
+from hapticdb.mesh.reader import UNITS
+from hapticdb.query import STRATEGIES
+from hapticdb.store.base import LAYOUTS
+
+VERBS = ("import", "info", "objects", "touch", "move", "remove", "calibrate", "sample", "demo")
+
+
+# -- what is offered ------------------------------------------------------------------------------
+
+
+def test_alone_it_shows_the_verbs(run: Run) -> None:
+    code, out, err = run()
+    assert (code, err) == (0, "")
+    for verb in VERBS:
+        assert re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_with_an_example(run: Run, verb: str) -> None:
+    code, out, err = run(verb, "--help")
+    assert (code, err) == (0, "")
+    assert f"Example: hapticdb {verb}" in out
+
+
+def test_version(run: Run) -> None:
+    assert run("--version") == (0, f"hapticdb {hapticdb.__version__}\n", "")
+
+
+def test_choices_are_those_of_the_library() -> None:
+    assert get_args(root.StrategyName) == STRATEGIES
+    assert set(get_args(root.CurveName)) == set(CURVE_NAMES)
+    assert set(get_args(root.LayoutName)) == set(LAYOUTS)
+    assert set(get_args(root.UnitName)) == set(UNITS)
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (["nothing"], "nothing"),
+        (["import"], "missing argument"),
+        (["import", "a.db"], "missing argument"),
+        (["info"], "missing argument"),
+        (["info", "a.db", "--jsn"], "--jsn"),
+        (["touch", "a.db"], "missing option"),
+        (["import", "a.db", "b.glb", "--bits", "x"], "--bits"),
+        (["import", "a.db", "b.glb", "--unit", "yard"], "--unit"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_that_names_the_help(
+    run: Run, args: list[str], word: str
+) -> None:
+    refused(run(*args), word, "--help")
+
+
+def test_debug_shows_where_an_error_came_from(run: Run) -> None:
+    code, _, err = run("--debug", "info", "none.db")
+    assert code == 2
+    assert "Traceback" in err
+    assert err.splitlines()[-1].startswith("hapticdb: no environment at none.db")
+
+
+def test_an_unforeseen_error_is_one_line_too(
+    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise RuntimeError("first line\nsecond line")
+
+    monkeypatch.setattr(hapticdb, "open", fails)
+    code, out, err = run("info", scene)
+    assert (code, out) == (1, "")
+    assert err == "hapticdb: RuntimeError: first line; 'hapticdb --debug ...' shows where\n"
+
+
+def test_the_library_does_without_typer_and_rich() -> None:
+    program = (
+        "import sys, hapticdb, hapticdb.demo, hapticdb.picture\n"
+        "print([name for name in ('typer', 'rich') if name in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
+    assert found.stdout.strip() == b"[]"
+
+
+# -- import ---------------------------------------------------------------------------------------
+
+
+def test_an_import_says_what_went_in(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    code, out, err = run("import", "a.db", file, "--bits", 6)
+    assert (code, err) == (0, "")
+    assert "3 objects imported" in out
+    assert "64^3 voxels" in out
+
+
+def test_a_complete_import_is_told_to_be_one(run: Run, scene: Path, made: Path) -> None:
+    before = rows_of(scene)
+    code, out, err = run("import", scene, made / "boxes.glb", "--bits", 6, "--extent", 1.6)
+    assert (code, err) == (0, "")
+    assert "complete already (3 objects), nothing to do" in out
+    assert rows_of(scene) == before
+
+
+def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    code, out, err = run("import", "a.db", file, "none.stl", "--json", "--bits", 5)
+    assert code == 2
+    good, bad = map(json.loads, out.splitlines())
+    assert set(good) == {"file", "status", "objects", "present", "voxels", "defects", "error"}
+    assert (good["status"], good["objects"], good["error"]) == ("imported", 3, None)
+    assert bad["status"] == "failed"
+    assert "none.stl" in bad["error"]
+    assert "none.stl" in err
+
+
+def test_a_bad_file_is_named_and_the_others_go_in(run: Run, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.stl"
+    bad.write_bytes(b"no mesh at all")
+    result = run("import", "a.db", bad, boxes(tmp_path / "boxes.glb"), "--bits", 5)
+    refused(result, "bad.stl")
+    with hapticdb.open("a.db", read_only=True) as env:
+        assert [obj.name for obj in env.objects()] == ["box0", "box1", "box2"]
+
+
+def test_nothing_usable_leaves_no_database(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "empty.obj").write_bytes(b"")
+    refused(run("import", "a.db", "empty.obj"), "empty.obj")
+    assert [path.name for path in tmp_path.iterdir()] == ["empty.obj"]
+
+
+def test_defects_are_counted_in_the_summary(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nf 1 2 3\nf 1 2 4\n")
+    code, out, err = run("import", "a.db", "nan.obj", "--bits", 4)
+    assert (code, err) == (0, "")
+    assert "1 non-finite" in out
+
+
+@pytest.mark.parametrize("form", [["--origin", "-1,-2,-0.5"], ["--origin=-1,-2,-0.5"]])
+def test_a_negative_origin_is_read(run: Run, tmp_path: Path, form: list[str]) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    code, _, err = run("import", "a.db", file, *form, "--voxel-size", 0.05, "--bits", 7)
+    assert (code, err) == (0, "")
+    assert json.loads(run("info", "a.db", "--json")[1])["origin"] == [-1, -2, -0.5]
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--bits", "22"], "22 bits"),
+        (["--bits", "5", "--extent", "2", "--voxel-size", "0.1"], "contradict"),
+        (["--curve", "lexicographic"], "hierarchical"),
+        (["--origin", "1,2"], "--origin"),
+        (["--origin", "1,2,nan"], "--origin"),
+        (["--voxel-size", "-1"], "voxel size"),
+        (["--extent", "0"], "extent"),
+        (["--jobs", "0"], "jobs"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(
+    run: Run, tmp_path: Path, options: list[str], word: str
+) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    refused(run("import", "a.db", file, *options), word)
+    assert not (tmp_path / "a.db").exists()
+
+
+def test_another_grid_than_the_environments_is_refused(run: Run, scene: Path, made: Path) -> None:
+    file = made / "boxes.glb"
+    refused(run("import", scene, file, "--bits", 7), "bits 7 instead of 6")
+    refused(run("import", scene, file, "--layout", "voxel"), "layout")
+    refused(run("import", scene, file, "--curve", "hilbert"), "curve")
+
+
+def test_a_part_outside_the_grid_is_named(run: Run, scene: Path, tmp_path: Path) -> None:
+    large = boxes(tmp_path / "large.glb", count=1, side=5.0)
+    refused(run("import", scene, large), "large.glb", "box0", "outside the grid")
+    assert json.loads(run("info", scene, "--json")[1])["objects"] == 3
+
+
+def test_a_file_of_another_kind_is_no_environment(run: Run, tmp_path: Path) -> None:
+    note = tmp_path / "note.db"
+    note.write_text("Dear reader, " * 100)
+    for verb in ("info", "objects", "calibrate"):
+        refused(run(verb, note), "note.db")
+    refused(run("import", note, boxes(tmp_path / "boxes.glb")), "note.db")
+    assert note.read_text().startswith("Dear reader")
+
+
+@pytest.mark.parametrize("verb", ["info", "objects", "calibrate"])
+def test_a_missing_environment_is_named(run: Run, verb: str) -> None:
+    refused(run(verb, "none.db"), "no environment at none.db", "hapticdb import")
+
+
+# -- as a process ---------------------------------------------------------------------------------
+
+
+def command(*args: object) -> list[str]:
+    return [sys.executable, "-m", "hapticdb", *map(str, args)]
+
+
+def test_it_runs_as_a_module(scene: Path) -> None:
+    found = subprocess.run(command("info", scene, "--json"), capture_output=True, check=True)
+    assert json.loads(found.stdout)["objects"] == 3
+    assert found.stderr == b""
+
+
+def test_a_reader_that_stops_early_is_no_error(scene: Path, tmp_path: Path) -> None:
+    poses(tmp_path / "long.csv", *[(0.0, 0.0, 0.055)] * 2000)
+    args = command("touch", scene, "--tool", "tool.npz", "--poses", "long.csv", "--json")
+    with subprocess.Popen(
+        args, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline().startswith(b"{")
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
+def test_names_beyond_the_terminals_encoding_are_printed(tmp_path: Path) -> None:
+    (tmp_path / "ä.obj").write_text("o é\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", encoding="utf-8")
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    for args in (["import", "a.db", "ä.obj", "--bits", "4"], ["objects", "a.db"], ["info", "a.db"]):
+        done = subprocess.run(
+            command(*args), cwd=tmp_path, env=environment, capture_output=True, check=False
+        )
+        assert (done.returncode, done.stderr) == (0, b"")
+
+
+def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "many.glb", count=30, side=0.15)
+    options = ("--layout", "voxel", "--voxel-size", 0.002)
+    assert run("import", "whole.db", file, *options)[0] == 0
+    args = command("import", "cut.db", file, *options)
+    with subprocess.Popen(
+        args, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
+    ) as process:
+        cut = tmp_path / "cut.db"
+        wait_for_an_object(cut, process)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert err.decode().splitlines() == [
+        "hapticdb: interrupted; what went in is whole, and the same command goes on from there"
+    ]
+    with hapticdb.open(cut, read_only=True) as env:
+        n_objects = len(env.objects())
+        assert all(len(env.voxels(obj.id)) == obj.voxels for obj in env.objects())
+    assert 0 < n_objects < 30
+    code, out, err_text = run("import", "cut.db", file, *options)
+    assert (code, err_text) == (0, "")
+    assert f"{30 - n_objects} objects imported" in out
+    assert f"{n_objects} were there already" in out
+    assert rows_of(cut) == rows_of(tmp_path / "whole.db")
+
+
+def wait_for_an_object(path: Path, process: "subprocess.Popen[bytes]") -> None:
+    """Return when the import has committed something, long before it ends."""
+    deadline = time.monotonic() + 120
+    while time.monotonic() < deadline and process.poll() is None:
+        if path.exists():
+            with hapticdb.open(path, read_only=True) as env:
+                if env.objects():
+                    return
+        time.sleep(0.005)
+    pytest.fail("the import ended before it could be interrupted")

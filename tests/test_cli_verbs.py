@@ -1,0 +1,251 @@
+"""The verbs on a small environment, used rightly and wrongly: info to touch."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import hapticdb
+from command_line import PLACES, Run, boxes, made, refused, rows_of, run, scene, tool  # noqa: F401 - fixtures
+from hapticdb.query import STRATEGIES
+
+# -- info, objects, calibrate ---------------------------------------------------------------------
+
+
+def test_info_json_has_the_documented_keys(run: Run, scene: Path) -> None:
+    code, out, err = run("info", scene, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert list(found) == [
+        *("voxel_size", "bits", "origin", "curve", "layout"),
+        *("objects", "voxels", "rows", "bytes"),
+    ]
+    with hapticdb.open(scene, read_only=True) as env:
+        assert found["voxels"] == sum(len(env.voxels(obj.id)) for obj in env.objects())
+        assert (found["voxel_size"], found["bits"]) == (env.grid.voxel_size, 6)
+    assert (found["curve"], found["layout"], found["objects"]) == ("z", "brick", 3)
+    assert found["bytes"] >= scene.stat().st_size
+
+
+def test_info_speaks_to_people(run: Run, scene: Path) -> None:
+    code, out, err = run("info", scene)
+    assert (code, err) == (0, "")
+    assert "262,144 cells" in out
+    assert "a voxel)" in out
+
+
+def test_objects_are_listed_by_id(run: Run, scene: Path) -> None:
+    code, out, err = run("objects", scene, "--json")
+    assert (code, err) == (0, "")
+    found = [json.loads(line) for line in out.splitlines()]
+    assert [(obj["id"], obj["name"]) for obj in found] == [(1, "box0"), (2, "box1"), (3, "box2")]
+    assert np.allclose(np.diff(found[0]["bounds"], axis=0), 0.1)
+    table = run("objects", scene)[1]
+    assert re.search(r"2\s+box1\s+\d+\s+100 x 100 x 100\s+boxes.glb", table)
+
+
+def test_a_name_in_brackets_is_printed_as_it_is(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("o [bold]x[/bold]\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert run("import", "a.db", "a.obj", "--bits", 4)[0] == 0
+    with hapticdb.open("a.db", read_only=True) as env:
+        name = env.objects()[0].name
+    assert "[bold]" in name
+    assert name in run("objects", "a.db")[1]
+
+
+def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Path) -> None:
+    code, out, err = run("calibrate", scene, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert found["kept"] is True
+    assert found["figures"]["descent"] >= 0
+    assert set(found["spread"]) < set(found["figures"])
+    assert "±" in run("calibrate", scene)[1]
+
+
+# -- move, remove ---------------------------------------------------------------------------------
+
+
+def bounds_of(scene: Path, object_id: int) -> Any:  # noqa: ANN401 - an array
+    with hapticdb.open(scene, read_only=True) as env:
+        return env.object(object_id).bounds
+
+
+def test_a_translation_counts_from_where_the_object_is(run: Run, scene: Path) -> None:
+    before = bounds_of(scene, 2)
+    for n in (1, 2):
+        code, out, err = run("move", scene, 2, "--translate", "-0.01,0,0.02")
+        assert (code, err) == (0, "")
+        assert "box1" in out
+        assert np.allclose(bounds_of(scene, 2), before + n * np.array([-0.01, 0, 0.02]))
+
+
+def test_a_pose_and_a_matrix_replace_the_placement(run: Run, scene: Path, tmp_path: Path) -> None:
+    assert run("move", scene, 1, "--pose", "0.1,0,0,0,0,0,2")[0] == 0  # half a turn about z
+    assert np.allclose(bounds_of(scene, 1).mean(axis=0), (0.1, 0, 0))
+    matrix = tmp_path / "matrix.txt"
+    matrix.write_text("1 0 0 0.3\n0 1 0 0.05\n0 0 1 0\n0 0 0 1\n")
+    for given in (matrix, "1,0,0,.3,0,1,0,.05,0,0,1,0,0,0,0,1"):
+        code, out, _ = run("move", scene, 1, "--matrix", given, "--json")
+        assert code == 0
+        assert np.allclose(np.mean(json.loads(out)["bounds"], axis=0), (0.3, 0.05, 0))
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        ([1], "give one of"),
+        ([1, "--translate", "1,2,3", "--pose", "0,0,0,1,0,0,0"], "give one of"),
+        ([1, "--translate", "1,2"], "--translate"),
+        ([1, "--pose", "0,0,0,0,0,0,0"], "no rotation"),
+        ([1, "--matrix", "none.txt"], "none.txt"),
+        ([1, "--translate", "50,0,0"], "outside the grid"),
+        ([9, "--translate", "0,0,0"], "no object 9"),
+    ],
+)
+def test_a_move_that_cannot_be_changes_nothing(
+    run: Run, scene: Path, args: list[object], word: str
+) -> None:
+    before = rows_of(scene)
+    refused(run("move", scene, *args), word)
+    assert rows_of(scene) == before
+
+
+def test_a_move_says_when_the_file_is_gone(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "gone.glb")
+    assert run("import", "a.db", file, "--bits", 4)[0] == 0
+    file.unlink()
+    refused(run("move", "a.db", 1, "--translate", "0,0,0.01"), "gone.glb")
+
+
+def test_remove_takes_all_or_nothing(run: Run, scene: Path) -> None:
+    refused(run("remove", scene, 1, 9), "no object 9")
+    refused(run("remove", scene, "first"), "first")
+    code, out, err = run("remove", scene, 1, "3,1")
+    assert (code, err) == (0, "")
+    assert out == "removed 1 (box0)\nremoved 3 (box2)\n"
+    with hapticdb.open(scene, read_only=True) as env:
+        assert [obj.id for obj in env.objects()] == [2]
+
+
+# -- touch ----------------------------------------------------------------------------------------
+
+
+def touch(run: Run, scene: Path, *more: object) -> tuple[int, str, str]:
+    return run("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", *more)
+
+
+def test_touch_json_has_a_line_a_pose(run: Run, scene: Path) -> None:
+    code, out, err = touch(run, scene, "--json", "--strategy", "cbgroup")
+    assert (code, err) == (0, "")
+    found = [json.loads(line) for line in out.splitlines()]
+    assert [frame["pose"] for frame in found] == [0, 1, 2]
+    keys = ["pose", "force", "torque", "hits", "contacts", "objects", "query"]
+    assert all(list(frame) == keys for frame in found)
+    asked = ["strategy", "statements", "ranges", "rows", "elapsed_us"]
+    assert all(list(frame["query"]) == asked for frame in found)
+    assert found[0]["objects"] == [{"id": 1, "name": "box0"}]
+    assert found[2]["objects"] == [{"id": 2, "name": "box1"}]
+    assert found[1]["force"] == [0, 0, 0]
+    assert found[0]["hits"] >= found[0]["contacts"] > 0
+
+
+def test_touch_json_is_the_librarys_answer_to_the_bit(run: Run, scene: Path) -> None:
+    lines = touch(run, scene, "--json", "--tool", "tool.stl", "--points", 90)[1].splitlines()
+    shell = hapticdb.PointShell.from_file("tool.stl", 90)
+    with hapticdb.open(scene, read_only=True) as env:
+        for line, place in zip(lines, PLACES, strict=True):
+            pose = np.eye(4)
+            pose[:3, 3] = place
+            touched = env.touch(shell, pose)
+            frame = json.loads(line)
+            assert frame["force"] == touched.force.tolist()
+            assert frame["torque"] == touched.torque.tolist()
+            assert frame["hits"] == len(touched.hits)
+
+
+def test_every_strategy_prints_the_same_wrench(run: Run, scene: Path) -> None:
+    wrenches = set()
+    for strategy in STRATEGIES:
+        lines = touch(run, scene, "--json", "--strategy", strategy)[1].splitlines()
+        frames = [json.loads(line) for line in lines]
+        wrenches.add(str([(f["force"], f["torque"], f["hits"], f["objects"]) for f in frames]))
+    assert len(wrenches) == 1
+
+
+def test_an_excluded_object_is_not_felt(run: Run, scene: Path) -> None:
+    out = touch(run, scene, "--json", "--exclude", "1,3", "--exclude", 2)[1]
+    assert [json.loads(line)["hits"] for line in out.splitlines()] == [0, 0, 0]
+
+
+def test_stiffness_scales_the_force(run: Run, scene: Path) -> None:
+    one, two = (
+        json.loads(touch(run, scene, "--json", "--stiffness", k)[1].splitlines()[0])["force"]
+        for k in (1000, 2000)
+    )
+    assert np.allclose(2 * np.array(one), two)
+
+
+def test_a_saved_shell_is_a_tool(run: Run, scene: Path) -> None:
+    saved = touch(run, scene, "--json")[1].splitlines()
+    meshed = touch(run, scene, "--json", "--tool", "tool.stl")[1].splitlines()
+    for one, other in zip(saved, meshed, strict=True):
+        assert one.split('"query"')[0] == other.split('"query"')[0]
+    refused(touch(run, scene, "--points", 9), "saved shell")
+    refused(touch(run, scene, "--tool-unit", "mm"), "saved shell")
+
+
+def test_an_open_tool_is_told_to_be_a_guess(run: Run, scene: Path, tmp_path: Path) -> None:
+    tool(tmp_path / "open.stl", is_open=True)
+    code, out, err = run("touch", scene, "--tool", "open.stl", "--poses", "path.csv", "--json")
+    assert code == 0
+    assert len(out.splitlines()) == 3
+    assert "inside is a guess" in err
+
+
+def test_the_tools_unit_is_its_own(run: Run, scene: Path, tmp_path: Path) -> None:
+    cube = trimesh.creation.box((20.0, 20.0, 20.0))
+    (tmp_path / "mm.stl").write_bytes(cube.export(file_type="stl"))
+    args = ("touch", scene, "--tool", "mm.stl", "--poses", "path.csv", "--json")
+    assert json.loads(run(*args, "--tool-unit", "mm")[1].splitlines()[0])["hits"] > 0
+    assert json.loads(run(*args)[1].splitlines()[0])["hits"] == 0
+
+
+def test_a_summary_without_json(run: Run, scene: Path) -> None:
+    code, out, err = touch(run, scene)
+    assert (code, err) == (0, "")
+    assert re.search(r"frames\s+3: 2 hit, 2 in contact", out)
+    assert "N at pose" in out
+    assert "box1" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--exclude", "77"], "no object 77"),
+        (["--exclude", "x"], "--exclude"),
+        (["--strategy", "guess"], "--strategy"),
+        (["--maxgap", "-1", "--strategy", "maxgap"], "MAXGAP"),
+        (["--stiffness", "nan"], "stiffness"),
+        (["--points", "0", "--tool", "tool.stl"], "points"),
+        (["--seed", "-1", "--tool", "tool.stl"], "seed"),
+        (["--tool", "none.stl"], "none.stl"),
+        (["--poses", "none.csv"], "none.csv"),
+    ],
+)
+def test_a_touch_that_cannot_be_is_one_line(
+    run: Run, scene: Path, options: list[str], word: str
+) -> None:
+    refused(touch(run, scene, *options), word)
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3\n", "x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0\n", "x,y\n\0"])
+def test_bad_poses_are_named(run: Run, scene: Path, tmp_path: Path, text: str) -> None:
+    (tmp_path / "bad.csv").write_text(text)
+    refused(touch(run, scene, "--poses", "bad.csv"), "bad.csv")

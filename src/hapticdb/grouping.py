@@ -56,10 +56,17 @@ def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping
     The gap between keys p < q covers p+1 .. q-1. Costs of neighbouring gaps add, so deciding each
     by itself gives the least cost over all groupings.
     """
-    lows, highs, asked, scanned = kernels.group_by_cost(
-        keys, quantiles.bounds, quantiles.rows_per_bucket, costs.row_scanned, costs.descent
+    lows, highs = np.empty_like(keys), np.empty_like(keys)
+    count, asked, scanned = kernels.group_by_cost(
+        keys,
+        quantiles.bounds,
+        quantiles.rows_per_bucket,
+        costs.row_scanned,
+        costs.descent,
+        lows,
+        highs,
     )
-    return Grouping(Ranges(lows, highs), asked, scanned)
+    return Grouping(Ranges(lows[:count], highs[:count]), asked, scanned)
 
 
 def box_ranges(

@@ -155,14 +155,9 @@ class HapticQuery:
         lows, highs = grouping.ranges
         if strategy == "cbgroup":
             return strategy, 1, len(lows), self._store.scan(lows, highs)
-        n_asked, n_scanned = grouping.rows_asked, grouping.rows_asked + grouping.rows_in_gaps
-        expected: dict[Strategy, float] = {
-            "array": costs.of_keys(len(keys), n_asked),
-            "cbgroup": costs.of_ranges(len(lows), n_scanned),
-            "points": costs.of_points(len(keys)),
-            "statement": costs.of_statement(asked.shape[1]),
-        }
-        chosen = min(expected, key=expected.__getitem__)
+        chosen = costs.cheapest(
+            asked.shape[1], len(keys), len(lows), grouping.rows_asked, grouping.rows_in_gaps
+        )
         if chosen == "cbgroup":
             return chosen, 1, len(lows), self._store.scan(lows, highs)
         if chosen == "statement":

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -121,6 +121,21 @@ class CostModel:
     def of_statement(self, n_points: int) -> float:
         """Expected cost of Figure 3."""
         return self.aggregate + self.point * n_points
+
+    def cheapest(
+        self, n_points: int, n_keys: int, n_ranges: int, rows_asked: float, rows_in_gaps: float
+    ) -> Literal["array", "cbgroup", "points", "statement"]:
+        """Strategy of the least expected cost for a frame of so many points, keys and ranges."""
+        array = self.of_keys(n_keys, rows_asked)
+        ranges = self.of_ranges(n_ranges, rows_asked + rows_in_gaps)
+        points = self.of_points(n_keys)
+        statement = self.of_statement(n_points)
+        least = min(array, ranges, points, statement)
+        if array == least:
+            return "array"
+        if ranges == least:
+            return "cbgroup"
+        return "points" if points == least else "statement"
 
     def figures(self) -> dict[str, float]:
         """All figures by name, the spreads as ``name.spread``: what a store keeps."""

@@ -96,21 +96,20 @@ def group_by_gap(keys, first, last, maxgap):
 
 
 @entry
-def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost):
+def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, highs):
     """CBGroup: a gap is closed if and only if scanning it costs no more than another descent.
 
     keys (U,) row keys, ascending; bounds (R + 1,) int64, the quantile vector; costs in one unit.
+    The ranges' lowest and highest row keys go into lows and highs, (U,) int64.
 
     Returns
     -------
-    lows, highs : (G,) int64
-        The ranges' lowest and highest row keys.
+    count : int
+        G, how many ranges there are.
     asked, scanned : float
         Expected rows under the keys themselves, and in the gaps that were closed.
     """
     total = keys.shape[0]
-    lows = np.empty(total, dtype=np.int64)
-    highs = np.empty(total, dtype=np.int64)
     count = 0
     asked = 0.0
     scanned = 0.0
@@ -130,7 +129,7 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost):
         at = bound_after(keys[n], bounds, at)
         above = rows_up_to(keys[n], at, bounds, rows_per_bucket)
         asked += above - below
-    return lows[:count], highs[:count], asked, scanned
+    return count, asked, scanned
 
 
 @leaf

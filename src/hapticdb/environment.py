@@ -162,12 +162,7 @@ class Environment:
         ObjectNotFoundError
             When there is none of that id.
         """
-        for obj in self._store.objects():
-            if obj.id == object_id:
-                return obj
-        raise ObjectNotFoundError(
-            f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
-        )
+        return self._store.object(int(object_id))
 
     def add(
         self,

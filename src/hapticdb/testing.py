@@ -164,6 +164,9 @@ class StoreContract:
         """Records, ordered by id, revisions counted."""
         first, second = store.objects()
         assert (first.id, second.id) == (1, 2)
+        assert store.object(2).name == "two"
+        with pytest.raises(ObjectNotFoundError, match="no object 3"):
+            store.object(3)
         assert (first.name, first.link, first.attributes) == ("one", "made", {"made": True})
         assert (first.revision, second.revision, store.revision()) == (1, 2, 2)
         np.testing.assert_array_equal(first.transform, np.eye(4))

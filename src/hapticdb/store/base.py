@@ -150,6 +150,9 @@ class Store(Protocol):
     def objects(self) -> list[Object]:
         """All objects, ordered by id."""
 
+    def object(self, object_id: int) -> Object:
+        """One object; raises ObjectNotFoundError when there is none of that id."""
+
     def add(self, record: Object, rows: Rows) -> int:
         """Write an object and its rows (any ids in them) in one transaction; returns its id."""
 

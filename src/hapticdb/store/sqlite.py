@@ -234,6 +234,15 @@ class SQLiteStore:
         """All objects, ordered by id."""
         return self._objects("TRUE")
 
+    def object(self, object_id: int) -> Object:
+        """One object; raises ObjectNotFoundError when there is none of that id."""
+        found = self._objects("id = ?", object_id)
+        if not found:
+            raise ObjectNotFoundError(
+                f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
+            )
+        return found[0]
+
     def _objects(self, condition: str, *bindings: int) -> list[Object]:
         return [
             Object(
@@ -318,14 +327,10 @@ class SQLiteStore:
 
     def _delete(self, object_id: int, covering: Covering) -> Keys:
         """Delete the rows of an object as it stands now; returns their keys."""
-        known = self._objects("id = ?", object_id)
-        if not known:
-            raise ObjectNotFoundError(
-                f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
-            )
+        known = self.object(object_id)
         sql = f"DELETE FROM {self.layout} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
         gone: list[int] = []
-        for low, high in covering(known[0]):
+        for low, high in covering(known):
             gone += [row[0] for row in self._connection.execute(sql, (low, high, object_id))]
         return np.array(gone, dtype=np.int64)
 

@@ -32,6 +32,8 @@ YARDSTICK: Strategy = "points"
 WARM_POSES = 20
 MAP_CELLS = 4096
 """Cells an axis of the map of heights that a path over an environment is made from."""
+SAMPLE_LENGTH = 4.28
+"""Of the sample car, metres."""
 ALONG_VOXELS = 10_000_000
 """Voxels that such a path may read at most: a gigabyte."""
 
@@ -286,14 +288,17 @@ def trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) ->
 def write_along(
     folder: str | os.PathLike[str], url: str | os.PathLike[str], frames: int
 ) -> tuple[Path, Path]:
-    """Write wrench.stl, and path.csv that slides it over an environment."""
+    """Write wrench.stl, scaled to an environment, and path.csv that slides it over that."""
     home = Path(folder)
     with open_environment(url, read_only=True) as env:
         try:
             home.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise FileError(f"cannot make the folder {home}: {error.strerror}") from error
-        wrench = write_wrench(home)
+        # as large beside the scene as the wrench is beside the sample car
+        bounds = np.array([obj.bounds for obj in env.objects()] or [np.zeros((2, 3))])
+        longest = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
+        wrench = write_wrench(home, longest / SAMPLE_LENGTH or 1.0)
         # the points that will be looked up: where the mesh alone touches, none of them may
         poses = slide_along(env, PointShell.from_file(wrench).points, frames)
     write_poses(home / "path.csv", poses)

@@ -25,7 +25,7 @@ def sample(
 ) -> None:
     """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
 
-    With --along, wrench.stl and a path over another environment.
+    With --along, a path over another environment, and wrench.stl scaled to its size.
 
     Example: hapticdb sample sample
     """

@@ -80,10 +80,11 @@ def _write(path: Path, content: bytes) -> None:
         partial.unlink(missing_ok=True)
 
 
-def write_wrench(folder: Path) -> Path:
-    """Write wrench.stl, metres, into a folder."""
+def write_wrench(folder: Path, scale: float = 1.0) -> Path:
+    """Write wrench.stl, metres, into a folder; 0.25 m long at scale 1."""
     mesh: Mesh = build_wrench()
-    content: bytes = trimesh.Trimesh(*mesh, process=False).export(file_type="stl")
+    scaled = trimesh.Trimesh(mesh.vertices * scale, mesh.faces, process=False)
+    content: bytes = scaled.export(file_type="stl")
     _write(folder / "wrench.stl", content)
     return folder / "wrench.stl"
 

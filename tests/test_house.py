@@ -84,7 +84,9 @@ PUBLIC = [
     "create",
     "import_files",
     "open",
+    "read_poses",
     "warm_up",
+    "write_poses",
 ]
 
 

@@ -29,6 +29,7 @@ from hapticdb.force import TangentPlane
 from hapticdb.grid import Grid, GridOptions
 from hapticdb.ingest import FileReport, ImportOptions, import_files
 from hapticdb.pointshell import PointShell
+from hapticdb.poses import read_poses, write_poses
 from hapticdb.query import Query
 from hapticdb.statistics import CostModel, QuantileVector
 from hapticdb.store.base import Object
@@ -66,6 +67,8 @@ __all__ = [
     "create",
     "import_files",
     "open",
+    "read_poses",
     "warm_up",
+    "write_poses",
 ]
 __version__ = "0.1.0"

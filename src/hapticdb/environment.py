@@ -30,7 +30,7 @@ from hapticdb.kernels import curves
 from hapticdb.kernels.voxelize import brick_voxels
 from hapticdb.mesh import Part, read_file
 from hapticdb.pointshell import PointShell
-from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Query, Strategy, as_ids
+from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Query, Strategy, as_id, as_ids
 from hapticdb.statistics import (
     DEFAULT_RESOLUTION,
     CostModel,
@@ -109,6 +109,9 @@ class Environment:
         self._known: dict[int, Object] = {}
         self._known_at: int | None = None
 
+    def __repr__(self) -> str:
+        return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
+
     def __enter__(self) -> Self:
         return self
 
@@ -162,7 +165,7 @@ class Environment:
         ObjectNotFoundError
             When there is none of that id.
         """
-        return self._store.object(int(object_id))
+        return self._store.object(as_id(object_id))
 
     def add(
         self,
@@ -201,7 +204,7 @@ class Environment:
     def remove(self, object_id: int) -> None:
         """Remove an object and its rows, in one transaction."""
         self._check_writable()
-        self._store.remove(object_id, self._covering)
+        self._store.remove(as_id(object_id), self._covering)
         self._forget()
 
     def move(self, object_id: int, transform: ArrayLike) -> Object:
@@ -212,7 +215,7 @@ class Environment:
         object_id : int
             Which object.
         transform : (4, 4) array
-            world_from_part, metres; replaces the present one.
+            world_from_part, metres; replaces the present one, scale and all.
 
         Raises
         ------
@@ -244,8 +247,9 @@ class Environment:
     def voxels(self, object_id: int) -> NDArray[np.int64]:
         """Voxels (n, 3) that an object's surface touches, in the order of their keys."""
         with self._store.snapshot():
-            rows = self._store.scan(*self._ranges_of(self.object(object_id)))
-        mine = rows.ids == object_id
+            obj = self.object(object_id)
+            rows = self._store.scan(*self._ranges_of(obj))
+        mine = rows.ids == obj.id
         keys = rows.keys[mine]
         if self.layout == "voxel":
             return self.grid.decode(keys)
@@ -410,6 +414,8 @@ def _as_transform(transform: ArrayLike) -> NDArray[np.float64]:
     placed = np.array(transform, dtype=np.float64)
     if placed.shape != (4, 4) or not np.isfinite(placed).all() or (placed[3] != (0, 0, 0, 1)).any():
         raise UsageError("a transform that is no placement: give a finite 4 x 4 matrix in metres")
+    if np.linalg.matrix_rank(placed[:3, :3]) < 3:
+        raise UsageError("a transform that flattens the object: give one that can be undone")
     return placed
 
 

@@ -116,6 +116,23 @@ def import_files(
     A file that cannot be used is reported and skipped; the others go in. A new environment into
     which nothing went is not left behind.
 
+    Parameters
+    ----------
+    url : str or path
+        The environment: a path, or ``sqlite:///path``.
+    files : sequence of paths
+        The first usable one decides on the grid of a new environment.
+    options : ImportOptions or None
+        Units, grid, layout, jobs.
+    progress : callable or None
+        Called after each part with a `Progress`.
+
+    Returns
+    -------
+    list of FileReport
+        One a file, in order; look at each one's `status`, and at its `error` where that is
+        ``failed``.
+
     Raises
     ------
     GridError, UsageError
@@ -124,6 +141,8 @@ def import_files(
         When the environment cannot be opened or written.
     """
     chosen = options or ImportOptions()
+    if isinstance(files, (str, bytes, os.PathLike)):
+        raise UsageError(f"files {files!r}: give a list of files")
     if not files:
         raise UsageError("no files: name at least one to import")
     store = open_store(url) if exists(url) else None
@@ -143,7 +162,7 @@ def import_files(
                 if store is None:
                     grid = chosen.grid.fit(mesh_file.bounds)
                     _check_inside(mesh_file, grid)
-                    store = create_store(url, grid, chosen.layout or "brick")
+                    store = _created_or_joined(url, grid, chosen)
                 elif n == 0 and not is_new:
                     chosen.grid.check_matches(store.grid, _first_bounds(store, mesh_file))
                 report = ingest_file(store, mesh_file, chosen, progress)
@@ -160,6 +179,20 @@ def import_files(
             else:
                 store.close()
     return reports
+
+
+def _created_or_joined(url: str | os.PathLike[str], grid: Grid, options: ImportOptions) -> Store:
+    """Make the environment, or join one that another process has made in the meantime."""
+    try:
+        return create_store(url, grid, options.layout or "brick")
+    except EnvironmentExistsError:
+        store = open_store(url)
+        with _closing_on_error(store):
+            _check_layout(store, options.layout or "brick")
+            GridOptions(
+                bits=grid.bits, voxel_size=grid.voxel_size, origin=grid.origin, curve=grid.curve
+            ).check_matches(store.grid)
+        return store
 
 
 def ingest_file(

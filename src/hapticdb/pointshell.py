@@ -7,7 +7,7 @@ a frame that takes the points in turn finds the same brick many times in a row, 
 holds many points.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from os import PathLike
 from pathlib import Path
 
@@ -52,6 +52,8 @@ class PointShell:
         The file that it was made from, absolute; empty if from none.
     seed : int
         The seed of the points' places.
+    defects : str
+        What was wrong in that file, in words; not saved.
 
     Raises
     ------
@@ -65,6 +67,7 @@ class PointShell:
     is_closed: bool = True
     link: str = ""
     seed: int = 0
+    defects: str = ""
 
     def __post_init__(self) -> None:
         for name, shape in (("points", (-1, 3)), ("normals", (-1, 3)), ("center", (3,))):
@@ -83,6 +86,11 @@ class PointShell:
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def __repr__(self) -> str:
+        size = ", ".join(f"{x:.4g}" for x in np.ptp(self.points, axis=0))
+        kind = "closed" if self.is_closed else "open"
+        return f"PointShell({len(self)} points, {size} m, {kind}, {self.link or 'from no file'})"
 
     @classmethod
     def from_file(
@@ -126,9 +134,10 @@ class PointShell:
             raise FileError(f"{path}: no triangles, only points or nothing; a tool needs a surface")
         triangles = np.concatenate([part.triangles() for part in parts])
         try:
-            return cls._from_triangles(triangles, points, seed, file.link)
+            shell = cls._from_triangles(triangles, points, seed, file.link)
         except UsageError as error:
             raise FileError(f"{path}: {error}") from None
+        return replace(shell, defects=file.defects.describe())
 
     @classmethod
     def from_mesh(

@@ -1,14 +1,15 @@
 """The haptic query: plan, fetch, refine (the paper, section 4.2)."""
 
+import operator
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.errors import UsageError
+from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.force import TangentPlane
 from hapticdb.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
 from hapticdb.kernels import contact
@@ -89,6 +90,8 @@ class HapticQuery:
         started = time.perf_counter_ns()
         if strategy not in STRATEGIES:
             raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
+        if gap < 0:
+            raise UsageError(f"MAXGAP {gap}: give 0 or more")
         pose = np.ascontiguousarray(world_from_tool, dtype=np.float64)
         located = self._locate(shell, pose)
         if strategy == "statement":
@@ -190,7 +193,21 @@ class HapticQuery:
         return Answer(wrench, hits, depths, touched, lambda: pairs[order], query)
 
 
+def as_id(object_id: int) -> int:
+    """An object's id as a plain int; refuses what is none."""
+    try:
+        plain = operator.index(object_id)
+    except TypeError as error:
+        raise UsageError(
+            f"object id {object_id!r}: give an int, as objects() lists them"
+        ) from error
+    if not -(1 << 63) <= plain < 1 << 63:
+        raise ObjectNotFoundError(f"no object {plain}: objects() lists those that are there")
+    return plain
+
+
 def as_ids(exclude: Iterable[int]) -> NDArray[np.int64]:
     """Ids of objects, ascending and distinct, as kernels take them."""
-    ids: Sequence[int] = sorted({int(i) for i in exclude})
-    return np.array(ids, dtype=np.int64)
+    if not isinstance(exclude, Iterable):
+        raise UsageError(f"exclude {exclude!r}: give ids in a list")
+    return np.array(sorted({as_id(i) for i in exclude}), dtype=np.int64)

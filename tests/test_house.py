@@ -53,7 +53,10 @@ NARROW: dict[str, set[str]] = {
     "splat": set(),
 }
 PUBLIC = [
+    "AccessError",
     "BusyError",
+    "ConflictError",
+    "ConnectionLostError",
     "CostModel",
     "DamagedError",
     "DatabaseError",
@@ -78,6 +81,7 @@ PUBLIC = [
     "QuantileVector",
     "Query",
     "ReadOnlyError",
+    "StuckError",
     "TangentPlane",
     "Touch",
     "UsageError",

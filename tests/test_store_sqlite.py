@@ -25,10 +25,10 @@ GRID = Grid(0.005, (0, 0, 0), 6)
 class TestSQLiteStore(StoreContract):
     @pytest.fixture(autouse=True)
     def _folder(self, tmp_path: Path) -> None:
-        self.path = tmp_path / "environment.db"
+        self.folder = tmp_path
 
-    def make(self, grid: Grid, layout: Layout) -> Store:
-        return SQLiteStore.create(self.path, grid, layout)
+    def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
+        return SQLiteStore.create(self.folder / f"{name}.db", grid, layout)
 
     def reopen(self, store: Store) -> Store:
         return SQLiteStore.open(store.url, read_only=True)

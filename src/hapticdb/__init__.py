@@ -8,7 +8,10 @@
 
 from hapticdb.environment import Environment, Touch, create, open  # noqa: A004 - as in tarfile.open
 from hapticdb.errors import (
+    AccessError,
     BusyError,
+    ConflictError,
+    ConnectionLostError,
     DamagedError,
     DatabaseError,
     EnvironmentExistsError,
@@ -23,6 +26,7 @@ from hapticdb.errors import (
     ObjectNotFoundError,
     OutsideGridError,
     ReadOnlyError,
+    StuckError,
     UsageError,
 )
 from hapticdb.force import TangentPlane
@@ -36,7 +40,10 @@ from hapticdb.store.base import Object
 from hapticdb.warm import warm_up
 
 __all__ = [
+    "AccessError",
     "BusyError",
+    "ConflictError",
+    "ConnectionLostError",
     "CostModel",
     "DamagedError",
     "DatabaseError",
@@ -61,6 +68,7 @@ __all__ = [
     "QuantileVector",
     "Query",
     "ReadOnlyError",
+    "StuckError",
     "TangentPlane",
     "Touch",
     "UsageError",

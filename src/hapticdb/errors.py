@@ -17,7 +17,11 @@
         ├── NewerVersionError                 written by a newer hapticdb
         ├── DamagedError                      an environment whose pages are broken
         ├── ReadOnlyError (PermissionError)   a write where only reading is possible
-        └── BusyError (TimeoutError)          another writer held the database too long
+        ├── AccessError (PermissionError)     the server does not let this user in
+        ├── ConflictError                     another has written the object meanwhile
+        ├── ConnectionLostError (ConnectionError)  the server went away
+        ├── BusyError (TimeoutError)          another writer held the database too long
+        └── StuckError (TimeoutError)         the database took longer than a frame may
 
 Every message is one line: what, where, and what next. Where a builtin fits, the error is one of
 that kind, too.
@@ -86,3 +90,19 @@ class ReadOnlyError(DatabaseError, PermissionError):
 
 class BusyError(DatabaseError, TimeoutError):
     """Another writer held the database for longer than the time allowed."""
+
+
+class AccessError(DatabaseError, PermissionError):
+    """The server does not let this user in, or not into this environment."""
+
+
+class ConflictError(DatabaseError):
+    """Another has written the object since it was read."""
+
+
+class ConnectionLostError(DatabaseError, ConnectionError):
+    """The server went away, or was never there."""
+
+
+class StuckError(DatabaseError, TimeoutError):
+    """The database did not answer within the time allowed for a statement."""

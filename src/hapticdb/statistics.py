@@ -31,10 +31,14 @@ class QuantileVector:
         Ascending; bound i is the key of the row of rank ceil(i N / R), bound 0 the lowest key.
     n_rows : int
         N, rows of the index table.
+    source : str
+        Where the bounds come from: ``computed``, ``kept`` since the last write, or the engine's own
+        ``server statistics``.
     """
 
     bounds: Keys
     n_rows: int
+    source: str = "computed"
 
     @cached_property
     def resolution(self) -> int:
@@ -322,7 +326,7 @@ def _probes(store: Store, seed: int) -> list[_Probe]:
     rng = np.random.default_rng(seed)
     grid = store.grid
     shift = row_shift(store.layout)
-    bounds, _ = store.quantiles(min(1000, max(store.size().rows, 1)))
+    bounds = store.quantiles(min(1000, max(store.size().rows, 1))).bounds
     places = rng.choice(bounds, size=64)
     centers = grid.centers(grid.decode(places << shift))
     origin = np.array(grid.origin)

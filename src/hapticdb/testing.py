@@ -3,7 +3,7 @@
 An engine's tests subclass `StoreContract` and say how a store is made and opened again::
 
     class TestMyStore(StoreContract):
-        def make(self, grid, layout):
+        def make(self, grid, layout, name="environment"):
             return MyStore.create(..., grid, layout)
 
         def reopen(self, store):
@@ -12,13 +12,15 @@ An engine's tests subclass `StoreContract` and say how a store is made and opene
 Needs pytest.
 """
 
+import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hapticdb.errors import EnvironmentExistsError, ObjectNotFoundError
+from hapticdb.errors import ConflictError, EnvironmentExistsError, ObjectNotFoundError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.grouping import box_ranges
 from hapticdb.ingest import rows_of_voxels
@@ -87,8 +89,8 @@ def _covering(store: Store) -> Covering:
 class StoreContract:
     """Tests of one engine, over every layout and curve. Subclass and override two methods."""
 
-    def make(self, grid: Grid, layout: Layout) -> Store:
-        """Make a new store."""
+    def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
+        """Make a new store; another name, another one beside it."""
         raise NotImplementedError
 
     def reopen(self, store: Store) -> Store:
@@ -182,6 +184,49 @@ class StoreContract:
         assert store.size().rows == before
         assert store.revision() == 2
 
+    def test_rows_of_leaves_the_others_out(self, store: Store) -> None:
+        """Of two objects that overlap."""
+        everywhere = [np.array([b], dtype=np.int64) for b in (0, 2**62)]
+        written = rows_of_voxels(blob(2, (24, 20, 20)), *_kind(store))
+        rows = store.rows_of(2, *everywhere)
+        np.testing.assert_array_equal(rows.keys, written.keys)
+        np.testing.assert_array_equal(rows.occupancy, written.occupancy)
+        assert set(rows.ids.tolist()) == {2}
+        assert not len(store.rows_of(3, *everywhere))
+
+    def test_loading_ends_as_single_writes_do(self, store: Store) -> None:
+        """Rows, ids and revisions; also when it is left by an error."""
+        fresh = self.make(store.grid, store.layout, "loaded")
+        with contextlib.suppress(ZeroDivisionError), fresh.loading(), fresh.loading():
+            write_voxels(fresh, blob(1, (20, 20, 20)), "one")
+            write_voxels(fresh, blob(2, (24, 20, 20)), "two")
+            raise ZeroDivisionError
+        everywhere = [np.array([b], dtype=np.int64) for b in (0, 2**62)]
+        for found, expected in zip(fresh.scan(*everywhere), store.scan(*everywhere), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        assert [obj.id for obj in fresh.objects()] == [1, 2]
+        assert fresh.revision() == 2
+
+    def test_an_id_is_kept_where_it_is_free(self, store: Store) -> None:
+        """What moves house keeps its ids."""
+        ijk = blob(5, (40, 40, 40))
+        rows = rows_of_voxels(ijk, *_kind(store))
+        nine = replace(voxel_object(store.grid, ijk, "nine"), id=9)
+        assert store.add(nine, rows) == 9
+        assert store.add(replace(nine, name="again"), rows) == 10
+        assert write_voxels(store, ijk, "next") == 11
+
+    def test_an_object_written_meanwhile_is_not_replaced(self, store: Store) -> None:
+        """Whoever read it before is told, and nothing is changed."""
+        rows = rows_of_voxels(blob(7, (44, 30, 10)), *_kind(store))
+        seen = store.object(1)
+        store.replace(seen, rows, _covering(store))
+        with pytest.raises(ConflictError, match="written by another meanwhile"):
+            store.replace(seen, rows, _covering(store))
+        assert store.revision() == 3
+        with pytest.raises(ObjectNotFoundError):
+            store.replace(replace(seen, id=7), rows, _covering(store))
+
     def test_remove_takes_one_object_and_leaves_the_others(self, store: Store) -> None:
         """Rows and record go, in one revision; the id is never used again."""
         store.remove(1, _covering(store))
@@ -236,7 +281,7 @@ class StoreContract:
         """Bound i is the key of rank ceil(i N / v) among all rows, ties counted one by one."""
         rows = store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
         keys = np.sort(rows.keys)
-        bounds, n_rows = store.quantiles(resolution)
+        bounds, n_rows, _ = store.quantiles(resolution)
         ranks = [max(-(-i * len(keys) // resolution), 1) for i in range(resolution + 1)]
         assert n_rows == len(keys)
         assert bounds.tolist() == [int(keys[rank - 1]) for rank in ranks]
@@ -245,9 +290,21 @@ class StoreContract:
         """After a write they are computed anew."""
         store.analyze(10)
         kept = store.quantiles(10)
-        assert kept[0].tolist() == store.quantiles(10)[0].tolist()
+        assert kept.source == "kept"
         store.remove(1, _covering(store))
-        assert store.quantiles(10)[1] < kept[1]
+        anew = store.quantiles(10)
+        assert anew.source == "computed"
+        assert anew.n_rows < kept.n_rows
+
+    def test_freshness_counts_the_writes_since(self, store: Store) -> None:
+        """Unknown before, none right after, one after a removal."""
+        assert store.freshness(10).revision is None
+        store.analyze(10)
+        assert store.freshness(10) == (2, 0, 0)
+        store.remove(1, _covering(store))
+        assert store.freshness(10)[:2] == (2, 1)
+        store.analyze(10)
+        assert store.freshness(10)[:2] == (3, 0)
 
     def test_costs_are_kept_by_machine(self, store: Store) -> None:
         """Figures return as saved."""

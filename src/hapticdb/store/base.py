@@ -8,12 +8,15 @@ from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.errors import ConflictError
 from hapticdb.grid import BRICK_BITS, Grid
 
 Layout = Literal["voxel", "brick"]
 LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 BRICK_SHIFT = 3 * BRICK_BITS
 """Bits of a voxel's key below its brick's."""
+CELL_SHIFT = 15
+"""Bits of a voxel's key below its cell's."""
 BRICK_BYTES = 64
 
 Keys = NDArray[np.int64]
@@ -39,6 +42,18 @@ class Rows(NamedTuple):
 def row_shift(layout: Layout) -> int:
     """Bits of a voxel's key below the key of its row."""
     return BRICK_SHIFT if layout == "brick" else 0
+
+
+def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int64]:
+    """Voxel keys (C, 2) that a write of these rows touched, as `Change` holds them.
+
+    Rounded to cells; in lexicographic order, which has none, to slabs of one i.
+    """
+    shift = CELL_SHIFT if grid.is_hierarchical else 2 * grid.bits
+    cubes = np.unique(row_keys >> (shift - row_shift(layout)))
+    starts = np.flatnonzero(np.diff(cubes, prepend=-2) > 1)
+    ends = np.append(starts[1:], len(cubes))[: len(starts)] - 1
+    return np.stack([cubes[starts] << shift, ((cubes[ends] + 1) << shift) - 1], axis=1)
 
 
 @dataclass(frozen=True)
@@ -78,6 +93,15 @@ class Object:
     revision: int = 0
 
 
+def check_unwritten(record: Object, known: Object, url: str) -> None:
+    """Refuse to replace an object that another has written since `record` was derived from it."""
+    if record.revision and record.revision != known.revision:
+        raise ConflictError(
+            f"object {known.id} ({known.name}) of {url} was written by another meanwhile "
+            f"(revision {known.revision}, not {record.revision}): read it again, then decide"
+        )
+
+
 @dataclass(frozen=True)
 class Change:
     """One committed write: what readers refresh from.
@@ -93,6 +117,30 @@ class Change:
 
 Covering = Callable[[Object], Iterable[tuple[int, int]]]
 """Key ranges, closed, that hold all rows of an object as it stands when a write begins."""
+
+
+class Histogram(NamedTuple):
+    """Equi-count histogram of all row keys.
+
+    bounds (R + 1,) int64, ascending; n_rows : rows of the index table; source : ``computed`` now,
+    ``kept`` since the last write, or ``server statistics``, the engine's own.
+    """
+
+    bounds: Keys
+    n_rows: int
+    source: str
+
+
+class Freshness(NamedTuple):
+    """How old the statistics are that cost-based grouping stands on.
+
+    revision : of the environment when they were made, None without any; changes : writes committed
+    since; rows : rows that those wrote, as far as the engine counts them.
+    """
+
+    revision: int | None
+    changes: int
+    rows: int
 
 
 class Store(Protocol):
@@ -153,11 +201,27 @@ class Store(Protocol):
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""
 
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
+        """Rows of one object with a key in any closed range, ascending and disjoint."""
+
+    def loading(self) -> AbstractContextManager[None]:
+        """Many objects come: inside, an engine may put off what only readers need. May be nested.
+
+        However it is left, what was committed inside is safe and readers have what they need.
+        """
+
     def add(self, record: Object, rows: Rows) -> int:
-        """Write an object and its rows (any ids in them) in one transaction; returns its id."""
+        """Write an object and its rows (any ids in them) in one transaction; returns its id.
+
+        The record's own id is kept when it is above 0 and no object has it.
+        """
 
     def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
-        """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
+        """Exchange an object's rows in one transaction; `covering` says where the old ones are.
+
+        A record with a revision above 0 was derived from the object as it stood then: raises
+        ConflictError when another has written it since.
+        """
 
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""
@@ -169,11 +233,14 @@ class Store(Protocol):
     def size(self) -> "Size":
         """Rows, bytes and leaf blocks."""
 
-    def quantiles(self, resolution: int) -> tuple[Keys, int]:
-        """Bounds (R + 1,) of the equi-count histogram of all row keys, and the rows behind it."""
+    def quantiles(self, resolution: int) -> Histogram:
+        """Equi-count histogram of all row keys, of R buckets."""
 
-    def analyze(self, resolution: int) -> None:
-        """Renew the statistics that `quantiles` answers from, unless they are fresh."""
+    def freshness(self, resolution: int) -> Freshness:
+        """How old the statistics are that `quantiles` answers from at that resolution."""
+
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
+        """Renew the statistics that `quantiles` answers from; when they are fresh, only if anew."""
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""

@@ -26,12 +26,16 @@ from hapticdb.store.base import (
     Change,
     Covering,
     Frame,
+    Freshness,
+    Histogram,
     Keys,
     Layout,
     Object,
     Rows,
     Size,
+    check_unwritten,
     row_shift,
+    touched_ranges,
 )
 from hapticdb.store.quantiles import exact_quantiles
 
@@ -65,6 +69,10 @@ INSERT = {
                    FROM carray(?1)""",
 }
 CHUNK = 1 << 22
+INSERT_OBJECT = """
+INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
+SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN ?9 END,
+       ?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8"""
 COUNT = {
     layout: f"""SELECT count(*) FROM carray(?1) AS low CROSS JOIN {layout}
                  WHERE z_val BETWEEN low.value AND nth(?2, low.rowid)"""
@@ -219,6 +227,14 @@ class SQLiteStore:
         ends = apsw.pyobject(highs.tolist())
         return self._rows(self._fetch(SCAN[self.layout], (apsw.carray(lows), ends)))
 
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
+        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
+        if not lows.size:
+            return NO_ROWS
+        ends = apsw.pyobject(highs.tolist())
+        sql = f"{SCAN[self.layout]} AND id = ?3"
+        return self._rows(self._fetch(sql, (apsw.carray(lows), ends, object_id)))
+
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""
         if not lows.size:
@@ -288,15 +304,18 @@ class SQLiteStore:
                 raise
             self._connection.execute("COMMIT")
 
+    def loading(self) -> contextlib.AbstractContextManager[None]:
+        """Nothing is put off here: rows go into the tree in which they stay."""
+        return contextlib.nullcontext()
+
     def add(self, record: Object, rows: Rows) -> int:
         """Write an object and its rows in one transaction; returns its id."""
         with self._writing():
             revision = self.revision() + 1
             try:
                 self._connection.execute(
-                    "INSERT INTO object (name, link, digest, transform, voxels, bounds, attributes,"
-                    " revision) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                    (record.name, record.link, *_contents(record), revision),
+                    INSERT_OBJECT,
+                    (record.name, record.link, *_contents(record), revision, record.id),
                 )
             except apsw.ConstraintError as error:
                 raise EnvironmentExistsError(
@@ -311,6 +330,7 @@ class SQLiteStore:
         """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
         with self._writing():
             revision = self.revision() + 1
+            check_unwritten(record, self.object(record.id), self.url)
             gone = self._delete(record.id, covering)
             self._connection.execute(
                 "UPDATE object SET digest = ?, transform = ?, voxels = ?, bounds = ?,"
@@ -348,12 +368,8 @@ class SQLiteStore:
         return np.array(gone, dtype=np.int64)
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
-        """Record which keys a write touched, rounded to cells (to slabs in lexicographic order)."""
-        shift = 15 if self.grid.is_hierarchical else 2 * self.grid.bits
-        cubes = np.unique(row_keys >> (shift - self._shift))
-        starts = np.flatnonzero(np.diff(cubes, prepend=-2) > 1)
-        ends = np.append(starts[1:], len(cubes))[: len(starts)] - 1
-        ranges = np.stack([cubes[starts] << shift, ((cubes[ends] + 1) << shift) - 1], axis=1)
+        """Record which keys a write touched."""
+        ranges = touched_ranges(self.grid, self.layout, row_keys)
         self._connection.execute(
             "INSERT INTO change VALUES (?, ?, ?, ?)",
             (revision, action, object_id, ranges.astype("<i8").tobytes()),
@@ -381,16 +397,29 @@ class SQLiteStore:
         total = self.path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
         return Size(int(rows), total, int(blocks[0][0]) if blocks else 1)
 
-    def quantiles(self, resolution: int) -> tuple[Keys, int]:
-        """Bounds (R + 1,) of the equi-count histogram of all row keys, and the rows behind it.
+    def quantiles(self, resolution: int) -> Histogram:
+        """Equi-count histogram of all row keys, of R buckets.
 
-        The kept vector while no object was written since, else a scan of the whole index.
+        The kept one while no object was written since, else by a scan of the whole index.
         """
         with self.snapshot():
             kept = self._kept_quantiles(resolution)
             if kept:
-                return np.frombuffer(kept[0][0], dtype="<i8").astype(np.int64), int(kept[0][1])
-            return exact_quantiles(self._connection, self.layout, resolution)
+                bounds = np.frombuffer(kept[0][0], dtype="<i8").astype(np.int64)
+                return Histogram(bounds, int(kept[0][1]), "kept")
+            bounds, n_rows = exact_quantiles(self._connection, self.layout, resolution)
+            return Histogram(bounds, n_rows, "computed")
+
+    def freshness(self, resolution: int) -> Freshness:
+        """How old the kept histogram of that resolution is; rows are those of later writes' ids."""
+        with self.snapshot():
+            revision = self.revision()
+            kept = self._fetch("SELECT revision FROM quantile WHERE resolution = ?", (resolution,))
+            since = int(kept[0][0]) if kept else 0
+            rows = self._fetch(
+                "SELECT coalesce(sum(voxels), 0) FROM object WHERE revision > ?", (since,)
+            )
+        return Freshness(since if kept else None, revision - since, int(rows[0][0]))
 
     def _kept_quantiles(self, resolution: int) -> list[Any]:
         """Bounds and rows of the vector that was kept at this revision, if any."""
@@ -400,11 +429,11 @@ class SQLiteStore:
             (resolution,),
         )
 
-    def analyze(self, resolution: int) -> None:
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
         """Compute and keep the quantile vector of that resolution, unless a fresh one is kept."""
-        if self._kept_quantiles(resolution):
+        if self._kept_quantiles(resolution) and not anew:
             return
-        bounds, n_rows = self.quantiles(resolution)
+        bounds, n_rows = exact_quantiles(self._connection, self.layout, resolution)
         with self._writing():
             # another process may have written since: then the vector carries the older revision's
             # rows under the newer number, off by that one write, as statistics are allowed to be

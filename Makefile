@@ -37,7 +37,7 @@ pins:
 	rm -rf .venv-pins
 	$(PYTHON) -m venv .venv-pins
 	.venv-pins/bin/pip install --upgrade "pip>=25.1"
-	.venv-pins/bin/pip install ".[step,pointcloud]" --group dev
+	.venv-pins/bin/pip install ".[step,pointcloud,postgres]" --group dev
 	echo "# Everything that make test, make demo and .ci/run install; renewed by 'make pins'." > requirements/dev.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb >> requirements/dev.txt
 	rm -rf .venv-pins

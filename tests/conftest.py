@@ -10,6 +10,7 @@ import pytest
 
 from hapticdb import PointShell
 from hapticdb.statistics import _fibonacci_sphere
+from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 
 
 def real_folder() -> Path | None:
@@ -24,7 +25,8 @@ def pytest_report_header() -> list[str]:
         pytest.exit(f"HAPTICDB_TEST_DATA={folder} holds no SOURCES.md: give the right folder")
     where = f"real CAD from {folder}" if folder else "the sample stands in for real CAD"
     jit = "off" if numba.config.DISABLE_JIT else "on"
-    return [f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, JIT {jit}"]
+    servers = ", ".join(map(named, FOUND))
+    return [f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, {servers}, JIT {jit}"]
 
 
 @pytest.fixture(scope="session")

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import (
+    ConnectionLostError,
     FileError,
     GeometryChangedError,
     ObjectNotFoundError,
@@ -26,8 +27,7 @@ from hapticdb.ingest import (
     ingest_file,
     rows_of_part,
 )
-from hapticdb.kernels import curves
-from hapticdb.kernels.voxelize import brick_voxels
+from hapticdb.layout import voxels_of_rows
 from hapticdb.mesh import Part, read_file
 from hapticdb.pointshell import PointShell
 from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Query, Strategy, as_id, as_ids
@@ -195,7 +195,9 @@ class Environment:
         """
         self._check_writable()
         options = ImportOptions(unit=unit, jobs=jobs, layout=self.layout)
-        report = ingest_file(self._store, read_file(file, unit=unit), options, progress)
+        mesh_file = read_file(file, unit=unit)
+        with self._store.loading():
+            report = ingest_file(self._store, mesh_file, options, progress)
         if report.added:
             self._store.analyze(DEFAULT_RESOLUTION)
             self._forget()
@@ -207,7 +209,7 @@ class Environment:
         self._store.remove(as_id(object_id), self._covering)
         self._forget()
 
-    def move(self, object_id: int, transform: ArrayLike) -> Object:
+    def move(self, object_id: int, transform: ArrayLike, *, revision: int | None = None) -> Object:
         """Place an object anew, in one transaction; its geometry is read from its file again.
 
         Parameters
@@ -216,9 +218,13 @@ class Environment:
             Which object.
         transform : (4, 4) array
             world_from_part, metres; replaces the present one, scale and all.
+        revision : int or None
+            Of the object that the placement was derived from, as `Object.revision` gave it.
 
         Raises
         ------
+        ConflictError
+            When `revision` is given and another has written the object since.
         GeometryChangedError
             When the object's file is gone or holds another geometry.
         OutsideGridError
@@ -239,6 +245,7 @@ class Environment:
             voxels=n_voxels,
             bounds=bounds,
             attributes=old.attributes,
+            revision=revision or 0,
         )
         self._store.replace(new, rows, self._covering)
         self._forget()
@@ -248,17 +255,8 @@ class Environment:
         """Voxels (n, 3) that an object's surface touches, in the order of their keys."""
         with self._store.snapshot():
             obj = self.object(object_id)
-            rows = self._store.scan(*self._ranges_of(obj))
-        mine = rows.ids == obj.id
-        keys = rows.keys[mine]
-        if self.layout == "voxel":
-            return self.grid.decode(keys)
-        bits = max(self.grid.bits - 3, 0)
-        bricks = curves.encode(
-            curves.decode(keys, bits, self.grid.curve_code), bits, curves.Z_ORDER
-        )
-        ijk = brick_voxels(bricks, rows.occupancy.reshape(-1, 64)[mine])
-        return ijk[np.argsort(self.grid.encode(ijk))]
+            rows = self._store.rows_of(obj.id, *self._ranges_of(obj))
+        return voxels_of_rows(rows, self.grid, self.layout)
 
     # -- the haptic query --------------------------------------------------------------------
 
@@ -304,17 +302,33 @@ class Environment:
         """
         ids = NOTHING_EXCLUDED if exclude is _NOBODY else as_ids(exclude)
         force_law = law or _DEFAULT_LAW
-        answer = self._query.run(shell, pose, strategy, maxgap, ids, force_law)
-        if self._store.version() != self._known_at:
-            with self._store.snapshot():
-                self._known = {obj.id: obj for obj in self._store.objects()}
-                answer = self._query.run(shell, pose, strategy, maxgap, ids, force_law)
-                self._known_at = self._store.version()
-            if self._quantiles is not None and not self._quantiles.n_rows:
-                self._quantiles = None  # it was empty when it was opened
+        try:
+            answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
+        except ConnectionLostError:  # in the middle of a snapshot: once more, from its start
+            answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
         if ids.size:
             self._check_known(ids)
         return Touch(answer, self._known)
+
+    def _felt(
+        self,
+        shell: PointShell,
+        pose: ArrayLike,
+        strategy: Strategy,
+        maxgap: int,
+        ids: Keys,
+        law: TangentPlane,
+    ) -> Answer:
+        """Answer of a frame, and the objects of the revision that it has seen."""
+        answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
+        if self._store.version() != self._known_at:
+            with self._store.snapshot():
+                self._known = {obj.id: obj for obj in self._store.objects()}
+                answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
+                self._known_at = self._store.version()
+            if self._quantiles is not None and not self._quantiles.n_rows:
+                self._quantiles = None  # it was empty when it was opened
+        return answer
 
     def _check_known(self, ids: Keys) -> None:
         for i in ids.tolist():
@@ -385,7 +399,7 @@ def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment
     Parameters
     ----------
     url : str or path
-        A path, or ``sqlite:///path``.
+        A path, ``sqlite:///path``, or ``postgresql://user@host/database?environment=NAME``.
     read_only : bool
         Refuse every write; works on files and folders that cannot be written.
 

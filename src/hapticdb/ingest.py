@@ -25,14 +25,14 @@ from hapticdb.errors import (
     OutsideGridError,
     UsageError,
 )
-from hapticdb.grid import BRICK_BITS, Grid, GridOptions
-from hapticdb.kernels import curves, voxelize
+from hapticdb.grid import Grid, GridOptions
+from hapticdb.kernels import voxelize
+from hapticdb.layout import Bricks, rows_of_bricks
 from hapticdb.mesh import Defects, MeshFile, Part, read_file
 from hapticdb.statistics import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Rows, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
 
-NO_OCCUPANCY = np.empty(0, dtype=np.uint8)
 AT_BORDER = 1e-6
 """Voxels by which rounding may carry a part across the grid's border without an error."""
 
@@ -119,7 +119,7 @@ def import_files(
     Parameters
     ----------
     url : str or path
-        The environment: a path, or ``sqlite:///path``.
+        The environment: a path, ``sqlite:///path``, or ``postgresql://host/database``.
     files : sequence of paths
         The first usable one decides on the grid of a new environment.
     options : ImportOptions or None
@@ -156,20 +156,25 @@ def import_files(
     reports: list[FileReport] = []
     n_written = 0
     try:
-        for n, file in enumerate(files):
-            try:
-                mesh_file = read_file(file, unit=chosen.unit)
-                if store is None:
-                    grid = chosen.grid.fit(mesh_file.bounds)
-                    _check_inside(mesh_file, grid)
-                    store = _created_or_joined(url, grid, chosen)
-                elif n == 0 and not is_new:
-                    chosen.grid.check_matches(store.grid, _first_bounds(store, mesh_file))
-                report = ingest_file(store, mesh_file, chosen, progress)
-            except (FileError, MissingExtraError) as error:
-                report = FileReport(os.fspath(file), "failed", error=error)
-            n_written += len(report.added)
-            reports.append(report)
+        is_loading = False
+        with contextlib.ExitStack() as loading:
+            for n, file in enumerate(files):
+                try:
+                    mesh_file = read_file(file, unit=chosen.unit)
+                    if store is None:
+                        grid = chosen.grid.fit(mesh_file.bounds)
+                        _check_inside(mesh_file, grid)
+                        store = _created_or_joined(url, grid, chosen)
+                    elif n == 0 and not is_new:
+                        chosen.grid.check_matches(store.grid, _first_bounds(store, mesh_file))
+                    if not is_loading:
+                        loading.enter_context(store.loading())
+                        is_loading = True
+                    report = ingest_file(store, mesh_file, chosen, progress)
+                except (FileError, MissingExtraError) as error:
+                    report = FileReport(os.fspath(file), "failed", error=error)
+                n_written += len(report.added)
+                reports.append(report)
         if store is not None and store.revision():
             store.analyze(DEFAULT_RESOLUTION)
     finally:
@@ -302,40 +307,17 @@ def rows_of_part(
     """
     if part.is_cloud:
         points = _on_grid(part.world_points(world_from_part), grid)
-        bricks, occupancy = voxelize.mark_points(points, grid.bits)
+        bricks = Bricks(*voxelize.mark_points(points, grid.bits))
     else:
         triangles = _on_grid(part.triangles(world_from_part), grid)
-        bricks, occupancy = voxelize.voxelize(triangles, grid.bits)
-    return _rows_of_bricks(bricks, occupancy, grid, layout)
+        bricks = Bricks(*voxelize.voxelize(triangles, grid.bits))
+    return rows_of_bricks(bricks, grid, layout)
 
 
 def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
     """Points (..., 3) in voxels; what rounding carried over the border is set back onto it."""
     scaled = grid.to_voxel_units(points)
     return np.clip(scaled, 0.0, float(grid.side), out=scaled)
-
-
-def rows_of_voxels(ijk: NDArray[np.int64], grid: Grid, layout: Layout) -> Rows:
-    """Rows of voxels (n, 3) that were made and not imported: analytic scenes."""
-    bricks, occupancy = voxelize.mark_points(ijk.astype(np.float64) + 0.5, grid.bits)
-    return _rows_of_bricks(bricks, occupancy, grid, layout)[0]
-
-
-def _rows_of_bricks(
-    bricks: NDArray[np.int64], occupancy: NDArray[np.uint8], grid: Grid, layout: Layout
-) -> tuple[Rows, int]:
-    """Rows in the environment's layout and order of bricks (B,) in Z-order and their bits."""
-    n_voxels = voxelize.count_voxels(occupancy)
-    if layout == "voxel":
-        keys = np.sort(grid.encode(voxelize.brick_voxels(bricks, occupancy)))
-        return Rows(keys, np.zeros(len(keys), dtype=np.int64), NO_OCCUPANCY), n_voxels
-    if grid.curve != "z":
-        bits = max(grid.bits - BRICK_BITS, 0)
-        places = curves.decode(bricks, bits, curves.Z_ORDER)
-        bricks = curves.encode(places, bits, grid.curve_code)
-        order = np.argsort(bricks)
-        bricks, occupancy = bricks[order], occupancy[order]
-    return Rows(bricks, np.zeros(len(bricks), dtype=np.int64), occupancy.reshape(-1)), n_voxels
 
 
 def check_placed_inside(

@@ -326,7 +326,7 @@ def _probes(store: Store, seed: int) -> list[_Probe]:
     rng = np.random.default_rng(seed)
     grid = store.grid
     shift = row_shift(store.layout)
-    bounds = store.quantiles(min(1000, max(store.size().rows, 1))).bounds
+    bounds = store.quantiles(DEFAULT_RESOLUTION).bounds
     places = rng.choice(bounds, size=64)
     centers = grid.centers(grid.decode(places << shift))
     origin = np.array(grid.origin)

@@ -1,5 +1,6 @@
 """The verbs that edit an environment: move, remove."""
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,6 +12,9 @@ from hapticdb.cli.root import Json, Url, ids_of, numbers_of
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
+
+    from hapticdb.environment import Environment
+    from hapticdb.store.base import Object
 
 
 def move(
@@ -49,16 +53,28 @@ def move(
     shift = translate and numbers_of(translate, [3], "--translate", "X,Y,Z in metres")
     with hapticdb.open(url) as env:
         if shift:
-            placed = env.object(object_id).transform.copy()
-            placed[:3, 3] += shift
-        elif pose is not None:
-            _check_unscaled(env.object(object_id).transform)
-        moved = env.move(object_id, placed)
+            moved = _shifted(env, object_id, shift)
+        else:
+            if pose is not None:
+                _check_unscaled(env.object(object_id).transform)
+            moved = env.move(object_id, placed)
     if json:
         render.say_json(record_of(moved))
     else:
         low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in moved.bounds.tolist())
         render.say(f"moved {moved.id} ({moved.name}): now from ({low}) to ({high}) m")
+
+
+def _shifted(env: "Environment", object_id: int, shift: list[float]) -> "Object":
+    """Shift an object from where it is, wherever another puts it meanwhile."""
+    from hapticdb.errors import ConflictError
+
+    while True:
+        old = env.object(object_id)
+        placed = old.transform.copy()
+        placed[:3, 3] += shift
+        with contextlib.suppress(ConflictError):
+            return env.move(object_id, placed, revision=old.revision)
 
 
 def _check_unscaled(transform: "NDArray[np.float64]") -> None:

@@ -1,0 +1,111 @@
+"""URLs of environments on PostgreSQL: which server, which database, which environment in it.
+
+``postgresql://user@host:port/database?environment=NAME`` and everything else that libpq takes in a
+URL, its TLS parameters among them. An environment is a schema of its own, `hapticdb` unless named;
+libpq's own way, ``?options=-csearch_path=NAME``, names it, too. ``?data=FOLDER`` asks for a private
+server in a folder (see `hapticdb.store.private_server`).
+"""
+
+import re
+from typing import NamedTuple
+from urllib.parse import quote, unquote, urlsplit, urlunsplit
+
+from hapticdb.errors import UsageError
+
+SCHEMES = ("postgresql", "postgres")
+DEFAULT_ENVIRONMENT = "hapticdb"
+SECRET = re.compile(r"password|secret|passphrase|token", re.IGNORECASE)
+SEARCH_PATH = re.compile(r"(?:-c\s*|--)search_path=(?:\"([^\"]+)\"|([^\s,]+))")
+LONGEST_NAME = 63
+
+
+class Address(NamedTuple):
+    """A URL taken apart.
+
+    conninfo : for libpq, without what is ours; environment : the schema; data : folder of the
+    private server, if one is meant; shown : the whole URL as messages may show it.
+    """
+
+    conninfo: str
+    environment: str
+    data: str | None
+    shown: str
+
+
+def is_postgres(url: str) -> bool:
+    """Whether a URL names a PostgreSQL server."""
+    return url.split("://", 1)[0].lower() in SCHEMES and "://" in url
+
+
+def parse(url: str) -> Address:
+    """Take a URL apart.
+
+    Raises
+    ------
+    UsageError
+        When the environment's name cannot be a schema's, or is given twice.
+    """
+    parts = urlsplit(url)
+    named: list[str] = []
+    data: list[str] = []
+    others: list[str] = []
+    found: str | None = None
+    for pair in parts.query.split("&") if parts.query else []:
+        key, _, value = pair.partition("=")
+        if key == "environment":
+            named.append(unquote(value))
+        elif key == "data":
+            data.append(unquote(value))
+        else:
+            others.append(pair)
+            if key == "options" and (match := SEARCH_PATH.search(unquote(value))):
+                found = match[1] or match[2]
+    if found is not None:
+        named.append(found)
+    if len(set(named)) > 1 or len(data) > 1:
+        raise UsageError(f"{redact(url)}: name one environment, and one folder at most")
+    environment = named[0] if named else DEFAULT_ENVIRONMENT
+    _check_name(environment, url)
+    if data and not data[0]:
+        raise UsageError(f"{redact(url)}: data= names no folder")
+    conninfo = urlunsplit(parts._replace(query="&".join(others), fragment=""))
+    if not parts.netloc:  # urlunsplit drops the empty host's slashes
+        conninfo = f"{parts.scheme}://{parts.path}{'?' + '&'.join(others) if others else ''}"
+    return Address(conninfo, environment, data[0] if data else None, redact(url))
+
+
+def with_environment(url: str, name: str) -> str:
+    """Rewrite a URL so that it names another environment of the same database."""
+    head, _, query = url.partition("?")
+    kept = [pair for pair in query.split("&") if pair and not pair.startswith("environment=")]
+    named = f"environment={quote(name, safe='')}"
+    return f"{head}?{'&'.join([*kept, named])}"
+
+
+def redact(url: str) -> str:
+    """Leave out of a URL what nobody may read over a shoulder: passwords, wherever they stand."""
+    head, mark, query = url.partition("?")
+    scheme, separator, rest = head.partition("://")
+    if separator:
+        authority, slash, path = rest.partition("/")
+        user, at, host = authority.rpartition("@")
+        head = f"{scheme}://{user.partition(':')[0]}{at}{host}{slash}{path}"
+    pairs = [
+        f"{key}=***" if SECRET.search(key) and equals else f"{key}{equals}{value}"
+        for key, equals, value in (pair.partition("=") for pair in query.split("&"))
+    ]
+    return head + mark + "&".join(pairs)
+
+
+def _check_name(name: str, url: str) -> None:
+    if (
+        not name
+        or "\0" in name
+        or len(name.encode("utf-8", "surrogateescape")) > LONGEST_NAME
+        or name.startswith("pg_")
+        or name in {"public", "information_schema"}
+    ):
+        raise UsageError(
+            f"{redact(url)}: {name!r} cannot be an environment's name; give one of 1 to "
+            f"{LONGEST_NAME} bytes that is not the server's own"
+        )

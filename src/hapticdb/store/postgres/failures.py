@@ -1,0 +1,114 @@
+"""What psycopg raises, as errors of ours: what, where, what next."""
+
+import contextlib
+import re
+from collections.abc import Iterator
+
+import psycopg
+from psycopg import errors
+
+from hapticdb.errors import (
+    AccessError,
+    BusyError,
+    ConnectionLostError,
+    DamagedError,
+    DatabaseError,
+    EnvironmentNotFoundError,
+    HapticDBError,
+    ReadOnlyError,
+    StuckError,
+)
+
+
+@contextlib.contextmanager
+def named_errors(shown: str) -> Iterator[None]:
+    """Turn the engine's errors into ours. `shown` is the URL as messages may show it."""
+    try:
+        yield
+    except psycopg.Error as error:
+        raise named(error, shown) from error
+
+
+def named(error: psycopg.Error, shown: str) -> HapticDBError:
+    """One of our errors for one of the engine's."""
+    cause = _line(error)
+    if isinstance(error, errors.QueryCanceled):
+        return StuckError(
+            f"{shown} did not answer in time ({cause}); raise the limit with "
+            "?options=-cstatement_timeout=MS, or look for what holds the server up"
+        )
+    if isinstance(error, (errors.LockNotAvailable, errors.DeadlockDetected)):
+        return BusyError(f"{shown} is being written by another: try again later ({cause})")
+    if isinstance(error, errors.SerializationFailure):
+        return BusyError(f"{shown} was changed by another meanwhile: try again ({cause})")
+    if isinstance(error, (errors.InsufficientPrivilege, errors.ReadOnlySqlTransaction)):
+        return ReadOnlyError(
+            f"{shown}: this user may not do that ({cause}); its owner can allow it with "
+            "'hapticdb grant URL ROLE --as editor'"
+        )
+    if isinstance(error, (errors.UndefinedTable, errors.UndefinedColumn, errors.UndefinedFunction)):
+        return damaged(shown, cause)
+    if isinstance(error, (errors.DataCorrupted, errors.IndexCorrupted)):
+        return damaged(shown, cause)
+    if isinstance(error, (errors.DiskFull, errors.OutOfMemory)):
+        return DatabaseError(
+            f"{shown}: the server has no room left ({cause}); nothing is half done"
+        )
+    if is_lost(error):
+        return ConnectionLostError(
+            f"{shown}: the server went away ({cause}); what was committed is safe, "
+            "so run the same again when it is back"
+        )
+    return DatabaseError(f"{shown}: {cause}")
+
+
+def is_lost(error: BaseException) -> bool:
+    """Whether the connection, and not the statement, is what failed."""
+    return isinstance(
+        error,
+        (
+            errors.AdminShutdown,
+            errors.CrashShutdown,
+            errors.CannotConnectNow,
+            errors.ConnectionException,
+            errors.IdleSessionTimeout,
+            errors.IdleInTransactionSessionTimeout,
+        ),
+    ) or (isinstance(error, psycopg.OperationalError) and error.sqlstate is None)
+
+
+def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
+    """One of our errors for a connection that never came to be.
+
+    libpq passes on no code here, only words: the usual ones are told apart, all are shown.
+    """
+    cause = _line(error)
+    if re.search(r'database ".*" does not exist', cause):
+        return EnvironmentNotFoundError(f"{shown}: {cause}; make it first with 'createdb'")
+    if re.search(
+        r"authentication failed|no password|role .* does not exist|pg_hba|not permitted to log in"
+        r"|permission denied for database",
+        cause,
+    ):
+        return AccessError(f"{shown}: {cause}; check the user, ~/.pgpass and pg_hba.conf")
+    return ConnectionLostError(f"{shown} cannot be reached: {cause}")
+
+
+def denied(shown: str, name: str) -> AccessError:
+    """Build the error for an environment that this user may not even read."""
+    return AccessError(
+        f"{shown}: this user may not read the environment {name!r}; its owner can allow it with "
+        "'hapticdb grant URL ROLE --as viewer'"
+    )
+
+
+def damaged(shown: str, cause: str) -> DamagedError:
+    """Build the error for an environment whose contents are broken."""
+    return DamagedError(f"{shown} is damaged ({cause}): restore a copy or import the files again")
+
+
+def _line(error: psycopg.Error) -> str:
+    """Words of an error on one line, without the server's position marks."""
+    primary = error.diag.message_primary
+    text = primary or str(error) or type(error).__name__
+    return " ".join(text.split())

@@ -1,0 +1,128 @@
+"""Quantiles of the index: from the server's own statistics, or computed where they do not reach."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.store.base import Keys, Layout
+from hapticdb.store.postgres import wire
+from hapticdb.store.postgres.session import Session
+
+SERVER_RESOLUTION = 10_000
+"""The largest statistics target, at which both index tables are analysed, and the paper's best."""
+ENOUGH_ROWS = 10 * SERVER_RESOLUTION
+"""Below, an exact histogram is computed sooner than it takes to think about it."""
+
+STATISTICS = """
+SELECT histogram_bounds::text::bigint[], most_common_vals::text::bigint[],
+       most_common_freqs::float8[],
+       (SELECT reltuples::bigint FROM pg_class
+         WHERE oid = format('%I.%I', schemaname, tablename)::regclass)
+  FROM pg_stats
+ WHERE schemaname = $1::text::name AND tablename = $2::text::name AND attname = 'z_val'"""
+# a fraction aims at the middle of its rank: at the rank itself, floating point lands one off
+EXACT = {
+    layout: f"""
+SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
+                          FROM unnest($1) WITH ORDINALITY AS rank(r, n)))
+         WITHIN GROUP (ORDER BY z_val)
+  FROM {layout}"""
+    for layout in ("voxel", "brick")
+}
+
+
+def server_histogram(session: Session, layout: Layout) -> tuple[Keys, int] | None:
+    """Bounds (10,001,) from `pg_stats` and the rows behind them; None before the first ANALYZE."""
+    found = session.again(
+        lambda: session.execute(
+            "SELECT 1 FROM pg_stats WHERE schemaname = %s AND tablename = %s AND attname = 'z_val'",
+            (session.address.environment, layout),
+        ).fetchone()
+    )
+    if found is None:
+        return None
+    bounds, common, frequencies, n_rows = session.fetch(
+        STATISTICS,
+        wire.text(session.address.environment),
+        wire.text(layout),
+    )
+    rows = wire.read_int8(n_rows) if n_rows is not None else 0
+    if rows <= 0:
+        return None
+    shares = wire.read_float8s(frequencies) if frequencies else np.empty(0)
+    return (
+        with_common_values(
+            wire.read_int8s(bounds), wire.read_int8s(common), shares, SERVER_RESOLUTION
+        ),
+        rows,
+    )
+
+
+def with_common_values(
+    bounds: Keys, common: Keys, shares: NDArray[np.float64], resolution: int
+) -> Keys:
+    """Equi-count bounds (R + 1,) of all rows, from a histogram that leaves the most common out.
+
+    Parameters
+    ----------
+    bounds : (B + 1,) int64
+        Equi-count bounds of the rows whose keys are not among the common ones; may be empty.
+    common, shares : (C,) int64 and float64
+        Most common keys, and the share of all rows that each has.
+    resolution : int
+        R, buckets of the result.
+
+    Notes
+    -----
+    The share of rows with a key <= x grows along each bucket of the histogram, in proportion, and
+    jumps at each common key; the bounds of the result are where it reaches i / R.
+    """
+    order = np.argsort(common)
+    common, shares = common[order], shares[order]
+    rest = max(1.0 - float(shares.sum()), 0.0)
+    if len(bounds) < 2:
+        bounds, rest = np.concatenate([bounds, bounds])[:2], 0.0
+    places = np.unique(np.concatenate([bounds, common]))
+    if not len(places):
+        return np.zeros(resolution + 1, dtype=np.int64)
+    smooth = np.zeros(len(places))
+    if len(bounds):
+        # of several equal bounds the last counts: all of their buckets lie at or below that key
+        last = np.append(bounds[1:] != bounds[:-1], True)
+        known = np.flatnonzero(last)
+        smooth = rest * np.interp(
+            places.astype(np.float64), bounds[known].astype(np.float64), known / (len(bounds) - 1)
+        )
+        smooth[places < bounds[0]] = 0.0
+    jumps = np.concatenate([[0.0], np.cumsum(shares)])
+    below = smooth + jumps[np.searchsorted(common, places, "left")]
+    up_to = smooth + jumps[np.searchsorted(common, places, "right")]
+    # two corners a place: where the share stands before its jump, and after
+    heights = np.stack([below, up_to], axis=1).reshape(-1)
+    corners = np.repeat(places, 2)
+    targets = np.arange(resolution + 1) / resolution * heights[-1]
+    at = np.clip(np.searchsorted(heights, targets, "left"), 1, len(heights) - 1)
+    low, high = heights[at - 1], heights[at]
+    part = np.where(high > low, (targets - low) / np.where(high > low, high - low, 1.0), 1.0)
+    width = (corners[at] - corners[at - 1]).astype(np.float64)
+    # from the lower corner, in whole keys: a float64 of a key itself would lose its last bits
+    found = corners[at - 1] + np.round(np.clip(part, 0.0, 1.0) * width).astype(np.int64)
+    found[0] = places[0]
+    found[-1] = places[-1]
+    return np.asarray(np.maximum.accumulate(found))
+
+
+def exact_histogram(session: Session, layout: Layout, resolution: int) -> tuple[Keys, int]:
+    """Bounds (R + 1,) by Definition 2 of the paper, over all rows, and their number N.
+
+    Bound i is the key of the row of rank ceil(i N / R), bound 0 the lowest key.
+    """
+    with session.snapshot(), session.without_limit():
+        counted = session.execute(f"SELECT count(*) FROM {layout}").fetchone()
+        n_rows = int(counted[0]) if counted else 0
+        if n_rows == 0:
+            return np.zeros(2, dtype=np.int64), 0
+        ranks = -(-np.arange(resolution + 1, dtype=np.int64) * n_rows // resolution)
+        (bounds,) = session.fetch(
+            EXACT[layout], wire.int8s(np.maximum(ranks, 1)), wire.float8(float(n_rows))
+        )
+    return wire.read_int8s(bounds), n_rows

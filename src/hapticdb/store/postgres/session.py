@@ -1,0 +1,371 @@
+"""A connection with the settings that decide, prepared statements, and a way back after a loss.
+
+The hot path goes to libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
+statement. It waits by polling the socket, so that Ctrl-C is heard and a server that has stopped
+answering ends in an error instead of a hang.
+"""
+
+import contextlib
+import select
+import time
+from collections.abc import Callable, Iterator, Sequence
+from threading import get_ident
+from typing import Any, LiteralString, Self, TypeVar, cast
+
+import psycopg
+from psycopg import pq, sql
+from psycopg.errors import error_from_result
+
+from hapticdb.errors import ConnectionLostError, DatabaseError, StuckError, UsageError
+from hapticdb.store.postgres import failures
+from hapticdb.store.postgres.address import Address
+from hapticdb.store.postgres.wire import Parameter
+
+Result = TypeVar("Result")
+
+SETTINGS = {
+    # compiling a frame's plan takes longer than running it: 1.8 ms with, 0.3 without
+    "jit": "off",
+    # a custom plan reads 10,000 histogram bounds each time: 288 us instead of 84 for one range
+    "plan_cache_mode": "force_generic_plan",
+    # a frame reads a few dozen rows: starting a worker takes longer
+    "max_parallel_workers_per_gather": "0",
+    # a bitmap scan reads the heap and forgets the order of the keys; planned for ranges of which
+    # the planner cannot know how short they are
+    "enable_bitmapscan": "off",
+    # a plan made while the table was small is kept, and must not be a scan of all of it
+    "enable_seqscan": "off",
+    # readers never wait for locks; a writer that does so is told after this
+    "lock_timeout": "10s",
+    # a frame that takes longer is stuck; writes, indexes and statistics lift it for themselves
+    "statement_timeout": "10s",
+    "client_min_messages": "warning",
+}
+RECONNECT_SECONDS = 15.0
+FIRST_PAUSE_SECONDS = 0.05
+CONNECT_SECONDS = 10
+WRITE_TRIES = 3
+GRACE_MS = 3000
+"""What the network and a busy server may add to the server's own time limit."""
+
+
+class Session:
+    """One connection to one environment's schema; belongs to the thread that opened it."""
+
+    def __init__(self, address: Address, conninfo: str, *, read_only: bool = False) -> None:
+        self.address = address
+        self.shown = address.shown
+        self.is_read_only = read_only
+        self._conninfo = conninfo
+        self._thread = get_ident()
+        self._depth = 0
+        self._is_closed = False
+        self.connect()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- the connection ----------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Connect once, with our settings; what the URL's own `options` set stays."""
+        try:
+            self.connection = psycopg.connect(
+                self._conninfo,
+                autocommit=True,
+                fallback_application_name="hapticdb",
+                connect_timeout=CONNECT_SECONDS,
+            )
+        except psycopg.OperationalError as error:
+            raise failures.refused(error, self.shown) from error
+        except psycopg.Error as error:
+            raise UsageError(f"{self.shown}: {' '.join(str(error).split())}") from error
+        self.connection.prepare_threshold = None
+        self._prepared: dict[str, bytes] = {}
+        self._pgconn = self.connection.pgconn
+        self._poller = select.poll()
+        with failures.named_errors(self.shown):
+            self._settle()
+        self._poller.register(self._pgconn.socket, select.POLLIN | select.POLLERR | select.POLLHUP)
+
+    def _settle(self) -> None:
+        wanted = {
+            **SETTINGS,
+            "search_path": f"{_quoted(self.address.environment)}, pg_temp",
+            "default_transaction_read_only": "on" if self.is_read_only else "off",
+        }
+        options = self.connection.info.options
+        ours = {name: value for name, value in wanted.items() if f"{name}=" not in options}
+        ours["search_path"] = wanted["search_path"]
+        known = self.connection.execute(
+            "SELECT set_config(s.name, s.value, false)"
+            "  FROM unnest(%s::text[], %s::text[]) AS s(name, value)",
+            (list(ours), list(ours.values())),
+        )
+        known.fetchall()
+        row = self.connection.execute(
+            "SELECT setting::int FROM pg_settings WHERE name = 'statement_timeout'"
+        ).fetchone()
+        assert row is not None  # noqa: S101 - the server has this setting
+        self._patience_ms = row[0] + GRACE_MS if row[0] else None
+
+    @property
+    def server_version(self) -> int:
+        """As libpq counts: 150018 is 15.18."""
+        return self._pgconn.server_version
+
+    def close(self) -> None:
+        """Give the connection back."""
+        self._is_closed = True
+        self.connection.close()
+
+    def _reconnect(self) -> None:
+        """Connect again, waiting longer each time; raises when the server stays away."""
+        self.connection.close()
+        deadline = time.monotonic() + RECONNECT_SECONDS
+        pause = FIRST_PAUSE_SECONDS
+        while True:
+            try:
+                self.connect()
+            except ConnectionLostError:
+                if time.monotonic() + pause > deadline:
+                    raise
+                time.sleep(pause)
+                pause = min(2 * pause, 2.0)
+            else:
+                return
+
+    def check_thread(self) -> None:
+        """Refuse a call from another thread than the one that opened this."""
+        if get_ident() != self._thread:
+            raise UsageError(
+                f"{self.shown} belongs to the thread that opened it: open it here, too"
+            )
+
+    def again(self, read: Callable[[], Result]) -> Result:
+        """Run a read; when the connection is lost, connect again and run it once more.
+
+        Inside a snapshot there is no second run: what came before was read from the lost one.
+        """
+        self.check_thread()
+        if self._is_closed:
+            raise DatabaseError(f"{self.shown} has been closed: open it again")
+        try:
+            if self.connection.closed and not self._depth:
+                self._reconnect()
+            with failures.named_errors(self.shown):
+                return read()
+        except ConnectionLostError:
+            if self._depth:
+                raise
+        self._reconnect()
+        with failures.named_errors(self.shown):
+            return read()
+
+    # -- statements --------------------------------------------------------------------------
+
+    def fetch(self, text: str, *parameters: Parameter) -> list[bytes | None]:
+        """First row of a prepared statement, every value in its binary form."""
+
+        def read() -> list[bytes | None]:
+            result = self._run(text, parameters)
+            return [result.get_value(0, column) for column in range(result.nfields)]
+
+        return self.again(read)
+
+    def rows(self, text: LiteralString, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """All rows of a statement, as Python's own values: for what no frame waits on."""
+        return self.again(lambda: self.execute(text, parameters).fetchall())
+
+    def execute(
+        self, text: LiteralString | sql.Composed, parameters: Sequence[Any] = ()
+    ) -> psycopg.Cursor[tuple[Any, ...]]:
+        """One statement through psycopg, without a second try."""
+        return self.connection.execute(text, parameters or None)
+
+    def command(self, text: str) -> None:
+        """One statement without parameters or rows, through libpq."""
+        self._pgconn.send_query(text.encode())
+        self._result()
+
+    def _run(self, text: str, parameters: Sequence[Parameter]) -> pq.abc.PGresult:
+        name = self._prepared.get(text)
+        if name is None:
+            name = f"hapticdb_{len(self._prepared)}".encode()
+            oids = [parameter.oid for parameter in parameters]
+            self._pgconn.send_prepare(name, text.encode(), oids)
+            self._result()
+            self._prepared[text] = name
+        values = [parameter.value for parameter in parameters]
+        self._pgconn.send_query_prepared(name, values, [1] * len(values), 1)
+        return self._result()
+
+    def _result(self) -> pq.abc.PGresult:
+        """Result of what was sent; the connection is given up when it does not come."""
+        try:
+            return self._receive()
+        except psycopg.Error as error:
+            if failures.is_lost(error):
+                self.connection.close()
+            raise
+        except BaseException:  # Ctrl-C, or out of patience: what comes now belongs to nobody
+            self.connection.close()
+            raise
+
+    def _receive(self) -> pq.abc.PGresult:
+        pgconn = self._pgconn
+        while pgconn.flush():  # a shell of many points does not fit into the socket at once
+            self._poller.modify(pgconn.socket, select.POLLIN | select.POLLOUT)
+            self._wait()
+            pgconn.consume_input()
+        self._poller.modify(pgconn.socket, select.POLLIN)
+        found: pq.abc.PGresult | None = None
+        while True:
+            while pgconn.is_busy():
+                self._wait()
+                pgconn.consume_input()
+            result = pgconn.get_result()
+            if result is None:
+                break
+            found = result
+        if found is None:
+            raise psycopg.OperationalError("the server closed the connection")
+        if found.status not in _FINE:
+            raise error_from_result(found, encoding="utf-8")
+        return found
+
+    def _wait(self) -> None:
+        if not self._poller.poll(self._patience_ms):
+            raise StuckError(
+                f"{self.shown} did not answer within {self._patience_ms} ms: "
+                "the server, or the way to it, hangs"
+            )
+
+    # -- transactions ------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All reads inside see one committed revision: REPEATABLE READ. May be nested."""
+        if self._depth == 0:
+            self.again(lambda: self.command(_SNAPSHOT))
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            if self._depth == 0 and not self.connection.closed:
+                with failures.named_errors(self.shown):
+                    self.command("COMMIT")
+
+    def write(
+        self, work: Callable[[], Result], is_committed: Callable[[], bool] | None = None
+    ) -> Result:
+        """Run `work` in one transaction, without a frame's time limit.
+
+        When the connection is lost before the commit was sent, the whole is done again; when it is
+        lost during the commit, `is_committed` looks, on the new connection, whether it counts.
+        """
+        self.check_thread()
+        for _ in range(WRITE_TRIES - 1):
+            try:
+                return self._write_once(work, is_committed)
+            except ConnectionLostError:
+                self._reconnect()
+        return self._write_once(work, is_committed)
+
+    def _write_once(
+        self, work: Callable[[], Result], is_committed: Callable[[], bool] | None
+    ) -> Result:
+        if self._is_closed:
+            raise DatabaseError(f"{self.shown} has been closed: open it again")
+        if self.connection.closed:
+            self._reconnect()
+        with failures.named_errors(self.shown), self._unhurried():
+            self.command("BEGIN ISOLATION LEVEL READ COMMITTED")
+            self._depth += 1
+            try:
+                self.command("SET LOCAL statement_timeout = 0")
+                result = work()
+            except BaseException:
+                self._roll_back()
+                raise
+            finally:
+                self._depth -= 1
+            try:
+                self.command("COMMIT")
+            except psycopg.Error as error:
+                if is_committed is None or not failures.is_lost(error):
+                    raise
+            else:
+                return result
+        self._reconnect()
+        if is_committed():
+            return result
+        raise ConnectionLostError(f"{self.shown}: the server went away; nothing was written")
+
+    def _roll_back(self) -> None:
+        with contextlib.suppress(psycopg.Error):
+            if not self.connection.closed:
+                self.command("ROLLBACK")
+
+    @contextlib.contextmanager
+    def _unhurried(self) -> Iterator[None]:
+        """Wait without limit inside: for what is allowed to take its time."""
+        patience, self._patience_ms = self._patience_ms, None
+        try:
+            yield
+        finally:
+            self._patience_ms = patience
+
+    @contextlib.contextmanager
+    def without_limit(self, *limits: str) -> Iterator[None]:
+        """Lift time limits inside, the statement's unless named: for indexes and statistics."""
+        names = limits or ("statement_timeout",)
+        with failures.named_errors(self.shown), self._unhurried():
+            before = [self._shown_setting(name) for name in names]
+            for name in names:
+                self.command(f"SET {name} = 0")
+            try:
+                yield
+            finally:
+                if self._is_usable():
+                    for name, value in zip(names, before, strict=True):
+                        self.command(f"SET {name} = '{value}'")
+
+    def _shown_setting(self, name: str) -> str:
+        row = self.connection.execute(text_of(f"SHOW {name}")).fetchone()
+        return row[0] if row else "0"
+
+    def _is_usable(self) -> bool:
+        """Whether a statement can be sent: neither closed nor in a failed transaction."""
+        state = self._pgconn.transaction_status
+        return not self.connection.closed and state != pq.TransactionStatus.INERROR
+
+    def is_owner(self) -> bool:
+        """Whether this user owns the environment's tables: who may make indexes and grant."""
+        found = self.rows(
+            "SELECT pg_has_role(relowner, 'USAGE') FROM pg_class"
+            " WHERE oid = 'environment'::regclass"
+        )
+        return bool(found[0][0])
+
+
+_SNAPSHOT = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY"
+_FINE = (pq.ExecStatus.TUPLES_OK, pq.ExecStatus.COMMAND_OK, pq.ExecStatus.EMPTY_QUERY)
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'
+
+
+def identifier(name: str) -> sql.Identifier:
+    """Quote a name for a statement's text."""
+    return sql.Identifier(name)
+
+
+def text_of(statement: str) -> LiteralString:
+    """Statements built from constants of ours, which psycopg asks to be literal."""
+    return cast("LiteralString", statement)

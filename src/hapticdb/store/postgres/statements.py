@@ -1,0 +1,80 @@
+"""The SQL of the haptic query on PostgreSQL: a frame is one statement and one row of packed arrays.
+
+Every statement also returns the revision that it has seen, so that knowing whether the environment
+has changed costs no round trip. Rows come in the order of the index, which `PostgresStore` checks.
+"""
+
+from hapticdb.store.base import LAYOUTS, Layout
+
+PACKED: dict[Layout, str] = {
+    "voxel": "array_agg(z_val), array_agg(id)",
+    "brick": "array_agg(z_val), array_agg(id), string_agg(occupancy, '')",
+}
+SEEN = "(SELECT revision FROM environment WHERE environment.id = 1)"
+
+# 17 and later read each leaf page once for all of the sorted keys on it
+LOOKUP = {
+    layout: f"""
+SELECT {PACKED[layout]}, {SEEN}
+  FROM {layout}
+ WHERE z_val = ANY ($1)"""
+    for layout in LAYOUTS
+}
+LOOKUP_ONE = {
+    layout: f"""
+SELECT {PACKED[layout]}, {SEEN}
+  FROM {layout}
+ WHERE z_val = $1"""
+    for layout in LAYOUTS
+}
+SCAN = {
+    layout: f"""
+SELECT {PACKED[layout]}, {SEEN}
+  FROM unnest($1, $2) AS range(low, high) JOIN {layout}
+    ON z_val BETWEEN range.low AND range.high"""
+    for layout in LAYOUTS
+}
+ROWS_OF = {layout: f"{SCAN[layout]} AND id = $3" for layout in LAYOUTS}
+COUNT = {
+    layout: f"""
+SELECT count(*)
+  FROM unnest($1, $2) AS range(low, high) JOIN {layout}
+    ON z_val BETWEEN range.low AND range.high"""
+    for layout in LAYOUTS
+}
+
+# The paper's Figure 3. Only hits fetch their point: a shell unnested whole, seven arrays wide,
+# takes half as long again.
+WRENCH: dict[Layout, str] = {
+    "voxel": """
+SELECT force(ROW(($2)[n], ($3)[n], ($4)[n], ($5)[n], ($6)[n], ($7)[n],
+                 $8, $9, $10, $11, shell.key)::hit ORDER BY n)
+  FROM unnest($1) WITH ORDINALITY AS shell(key, n)
+ WHERE EXISTS (SELECT 1 FROM voxel
+                WHERE z_val = shell.key)""",
+    "brick": """
+SELECT force(ROW(($2)[n], ($3)[n], ($4)[n], ($5)[n], ($6)[n], ($7)[n],
+                 $8, $9, $10, $11, shell.key)::hit ORDER BY n)
+  FROM unnest($1) WITH ORDINALITY AS shell(key, n)
+ WHERE EXISTS (SELECT 1 FROM brick
+                WHERE z_val = shell.key >> 9
+                  AND get_bit(occupancy, shell.key & 511) = 1)""",
+}
+HITS: dict[Layout, str] = {
+    "voxel": f"""
+SELECT array_agg(n), array_agg(id), {SEEN}
+  FROM unnest($1) WITH ORDINALITY AS shell(key, n) JOIN voxel
+    ON z_val = shell.key""",
+    "brick": f"""
+SELECT array_agg(n), array_agg(id), {SEEN}
+  FROM unnest($1) WITH ORDINALITY AS shell(key, n) JOIN brick
+    ON z_val = shell.key >> 9
+   AND get_bit(occupancy, shell.key & 511) = 1""",
+}
+KEY_TEST: dict[Layout, str] = {"voxel": "z_val = shell.key", "brick": "z_val = shell.key >> 9"}
+
+
+def without_excluded(sql: str, layout: Layout, number: int) -> str:
+    """Leave objects out of a statement: their ids are its parameter of that number."""
+    test = KEY_TEST[layout]
+    return sql.replace(test, f"{test} AND id <> ALL (${number})")

@@ -1,0 +1,494 @@
+"""An environment in a schema of a PostgreSQL database."""
+
+import contextlib
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+from psycopg import errors, sql
+
+from hapticdb.errors import EnvironmentExistsError, ObjectNotFoundError
+from hapticdb.grid import Grid
+from hapticdb.store.base import (
+    Change,
+    Covering,
+    Frame,
+    Freshness,
+    Histogram,
+    Keys,
+    Layout,
+    Object,
+    Rows,
+    Size,
+    check_unwritten,
+    row_shift,
+    touched_ranges,
+)
+from hapticdb.store.postgres import schema_of, statements, wire
+from hapticdb.store.postgres.histogram import (
+    ENOUGH_ROWS,
+    SERVER_RESOLUTION,
+    exact_histogram,
+    server_histogram,
+)
+from hapticdb.store.postgres.loading import Loading
+from hapticdb.store.postgres.session import Session, text_of
+
+Result = TypeVar("Result")
+
+NO_KEYS = np.empty(0, dtype=np.int64)
+NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
+NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
+COPY_CHUNK = 1 << 17
+
+OBJECTS = (
+    "SELECT id, name, link, digest, transform, voxels, bounds, attributes::text, revision"
+    " FROM object"
+)
+INSERT_OBJECT = """
+INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
+VALUES (CASE WHEN %(id)s > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = %(id)s)
+             THEN %(id)s ELSE nextval(pg_get_serial_sequence('object', 'id')) END,
+        %(name)s, %(link)s, %(digest)s, %(transform)s, %(voxels)s, %(bounds)s, %(attributes)s,
+        %(revision)s)
+RETURNING id"""
+# an id that was brought along is never given again
+KEEP_IDS_NEW = """
+SELECT setval(pg_get_serial_sequence('object', 'id'), %s)
+ WHERE %s > (SELECT last_value FROM pg_sequences
+              WHERE schemaname = current_schema() AND sequencename = 'object_id_seq')"""
+UPDATE_OBJECT = """
+UPDATE object SET digest = %(digest)s, transform = %(transform)s, voxels = %(voxels)s,
+       bounds = %(bounds)s, attributes = %(attributes)s, revision = %(revision)s
+ WHERE id = %(id)s"""
+# the write lock: revisions follow one another, and no reader waits for it
+NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
+DELETE_ROWS = {
+    layout: f"""
+WITH gone AS (
+  DELETE FROM {layout} USING unnest($1, $2) AS range(low, high)
+   WHERE z_val BETWEEN range.low AND range.high AND id = $3
+  RETURNING z_val)
+SELECT array_agg(z_val) FROM gone"""
+    for layout in ("voxel", "brick")
+}
+
+
+class PostgresStore:
+    """An environment on a PostgreSQL server. Open with `open`, make with `create`."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self.url = session.shown
+        self.is_read_only = session.is_read_only
+        try:
+            self.grid, self.layout = schema_of.read_environment(session)
+        except BaseException:
+            session.close()
+            raise
+        self._shift = row_shift(self.layout)
+        self._seen = -1
+        self._written: tuple[int, str, int] = (0, "", 0)
+        self._loading = Loading(session, self.layout)
+        if not self.is_read_only:
+            self._loading.mend()
+
+    @classmethod
+    def open(cls, url: str, *, read_only: bool = False) -> "PostgresStore":
+        """Open an existing environment."""
+        return cls(schema_of.opened(url, read_only=read_only))
+
+    @classmethod
+    def create(cls, url: str, grid: Grid, layout: Layout = "brick") -> "PostgresStore":
+        """Make a new environment with its grid: a schema that appears whole or not at all."""
+        schema_of.created(url, grid, layout)
+        return cls.open(url)
+
+    @property
+    def session(self) -> Session:
+        """The connection below: for what only this engine has."""
+        return self._session
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._session.close()
+
+    def discard(self) -> None:
+        """Close and delete an environment that nothing went into."""
+        schema_of.drop(self._session)
+        self.close()
+
+    def snapshot(self) -> contextlib.AbstractContextManager[None]:
+        """All reads inside see one committed revision. May be nested."""
+        return self._session.snapshot()
+
+    def version(self) -> int:
+        """The revision that the last read has seen."""
+        return self._seen
+
+    def revision(self) -> int:
+        """Number of the last committed write; 0 for an empty environment."""
+        rows = self._session.rows("SELECT revision FROM environment WHERE id = 1")
+        self._seen = int(rows[0][0])
+        return self._seen
+
+    # -- the haptic query --------------------------------------------------------------------
+
+    def _rows(self, found: list[bytes | None]) -> Rows:
+        """Rows of one packed row; its last value is the revision that it has seen."""
+        seen = found[-1]
+        self._seen = wire.read_int8(seen) if seen is not None else -1
+        if found[0] is None:
+            return NO_ROWS
+        keys, ids = wire.read_int8s(found[0]), wire.read_int8s(found[1])
+        occupancy = np.frombuffer(found[2] or b"", np.uint8) if self._shift else NO_OCCUPANCY
+        rows = Rows(keys, ids, occupancy)
+        return rows if _is_in_order(rows) else _in_order(rows)
+
+    def lookup(self, keys: Keys) -> Rows:
+        """Rows of distinct ascending keys (U,), in one statement."""
+        if not keys.size:
+            return NO_ROWS
+        return self._rows(self._session.fetch(statements.LOOKUP[self.layout], wire.int8s(keys)))
+
+    def lookup_each(self, keys: Keys) -> Rows:
+        """Rows of distinct ascending keys (U,), one statement a key."""
+        text = statements.LOOKUP_ONE[self.layout]
+        parts = [
+            rows
+            for key in keys.tolist()
+            if len(rows := self._rows(self._session.fetch(text, wire.int8(key))))
+        ]
+        if not parts:
+            return NO_ROWS
+        bits = b"".join(part.occupancy.tobytes() for part in parts)
+        return Rows(
+            np.concatenate([part.keys for part in parts]),
+            np.concatenate([part.ids for part in parts]),
+            np.frombuffer(bits, np.uint8),
+        )
+
+    def scan(self, lows: Keys, highs: Keys) -> Rows:
+        """Rows with a key in any of the closed ranges, ascending and disjoint."""
+        if not lows.size:
+            return NO_ROWS
+        text = statements.SCAN[self.layout]
+        return self._rows(self._session.fetch(text, wire.int8s(lows), wire.int8s(highs)))
+
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
+        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
+        if not lows.size:
+            return NO_ROWS
+        ends = wire.int8s(lows), wire.int8s(highs)
+        text = statements.ROWS_OF[self.layout]
+        return self._rows(self._session.fetch(text, *ends, wire.int8(object_id)))
+
+    def count(self, lows: Keys, highs: Keys) -> int:
+        """How many rows `scan` would return, counted inside the engine."""
+        if not lows.size:
+            return 0
+        text = statements.COUNT[self.layout]
+        (found,) = self._session.fetch(text, wire.int8s(lows), wire.int8s(highs))
+        return wire.read_int8(found or b"")
+
+    # -- the paper's Figure 3 ----------------------------------------------------------------
+
+    def statement(self, frame: Frame) -> NDArray[np.float64]:
+        """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
+        text = statements.WRENCH[self.layout]
+        placed = np.ascontiguousarray(frame.placed.T)
+        count = len(frame.addresses)
+        parameters = [
+            wire.int8s(frame.addresses),
+            *(wire.float8s(column[:count]) for column in placed),
+            *(wire.float8(float(x)) for x in frame.placed[count, :3]),
+            wire.float8(frame.stiffness),
+        ]
+        if frame.exclude.size:
+            text = statements.without_excluded(text, self.layout, len(parameters) + 1)
+            parameters.append(wire.int8s(frame.exclude))
+        (found,) = self._session.fetch(text, *parameters)
+        return np.zeros(6) if found is None else wire.read_float8s(found)
+
+    def statement_hits(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
+        text = statements.HITS[self.layout]
+        parameters = [wire.int8s(frame.addresses)]
+        if frame.exclude.size:
+            text = statements.without_excluded(text, self.layout, 2)
+            parameters.append(wire.int8s(frame.exclude))
+        ordinals, ids, seen = self._session.fetch(text, *parameters)
+        self._seen = wire.read_int8(seen or b"")
+        return wire.read_int8s(ordinals) - 1, wire.read_int8s(ids)
+
+    # -- objects -----------------------------------------------------------------------------
+
+    def objects(self) -> list[Object]:
+        """All objects, ordered by id."""
+        self.revision()  # before: what is written in between is then noticed later, not never
+        return [_object(row) for row in self._session.rows(text_of(f"{OBJECTS} ORDER BY id"))]
+
+    def object(self, object_id: int) -> Object:
+        """One object; raises ObjectNotFoundError when there is none of that id."""
+        rows = self._session.rows(text_of(f"{OBJECTS} WHERE id = %s"), (object_id,))
+        if not rows:
+            raise ObjectNotFoundError(
+                f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
+            )
+        return _object(rows[0])
+
+    def loading(self) -> contextlib.AbstractContextManager[None]:
+        """Inside, an empty table has no index, and commits do not wait for the disk."""
+        return self._loading
+
+    def add(self, record: Object, rows: Rows) -> int:
+        """Write an object and its rows in one transaction; returns its id."""
+
+        def work() -> int:
+            revision = self._next_revision()
+            try:
+                object_id = self._execute(INSERT_OBJECT, _contents(record, revision))[0][0]
+            except errors.UniqueViolation as error:
+                raise EnvironmentExistsError(
+                    f"{record.name} of {record.link} is in {self.url} already; remove it first"
+                ) from error
+            if record.id:
+                self._execute(KEEP_IDS_NEW, (object_id, object_id))
+            self._copy(rows, object_id)
+            self._log(revision, "add", object_id, rows.keys)
+            return int(object_id)
+
+        return self._commit(work)
+
+    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+        """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
+
+        def work() -> None:
+            revision = self._next_revision()
+            known = self.object(record.id)
+            check_unwritten(record, known, self.url)
+            gone = self._delete(known, covering)
+            self._execute(UPDATE_OBJECT, _contents(record, revision))
+            self._copy(rows, record.id)
+            self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
+
+        self._commit(work)
+
+    def remove(self, object_id: int, covering: Covering) -> None:
+        """Remove an object and its rows in one transaction; `covering` says where they are."""
+
+        def work() -> None:
+            revision = self._next_revision()
+            gone = self._delete(self.object(object_id), covering)
+            self._execute("DELETE FROM object WHERE id = %s", (object_id,))
+            self._log(revision, "remove", object_id, gone)
+
+        self._commit(work)
+
+    def _next_revision(self) -> int:
+        """Take the write lock, and the number of the revision to come."""
+        revision = int(self._execute(NEXT_REVISION)[0][0])
+        self._loading.check(revision)
+        return revision
+
+    def _commit(self, work: Callable[[], Result]) -> Result:
+        result = self._session.write(work, self._is_written)
+        self._loading.note(self._written[0])
+        return result
+
+    def _execute(self, text: str, parameters: Any = ()) -> list[tuple[Any, ...]]:  # noqa: ANN401 - a sequence or a mapping, as psycopg takes them
+        """One statement of a write; its rows, when it returns some."""
+        cursor = self._session.execute(text_of(text), parameters)
+        return cursor.fetchall() if cursor.description else []
+
+    def _copy(self, rows: Rows, object_id: int) -> None:
+        columns = "z_val, id, occupancy" if self._shift else "z_val, id"
+        text = f"COPY {self.layout} ({columns}) FROM STDIN (FORMAT binary)"
+        cursor = self._session.connection.cursor()
+        with cursor.copy(text_of(text)) as copy:
+            copy.write(wire.COPY_HEADER)
+            for at in range(0, len(rows), COPY_CHUNK):
+                part = slice(at, at + COPY_CHUNK)
+                bits = rows.occupancy[64 * at : 64 * (at + COPY_CHUNK)]
+                copy.write(wire.copy_rows(Rows(rows.keys[part], rows.ids[part], bits), object_id))
+            copy.write(wire.COPY_TRAILER)
+
+    def _delete(self, known: Object, covering: Covering) -> Keys:
+        """Delete the rows of an object as it stands now; returns their keys."""
+        ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
+        (found,) = self._session.fetch(
+            DELETE_ROWS[self.layout],
+            wire.int8s(ends[:, 0]),
+            wire.int8s(ends[:, 1]),
+            wire.int8(known.id),
+        )
+        return wire.read_int8s(found)
+
+    def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
+        """Record which keys a write touched."""
+        ranges = touched_ranges(self.grid, self.layout, row_keys)
+        self._execute(
+            "INSERT INTO change VALUES (%s, %s, %s, %s)",
+            (revision, action, object_id, ranges.reshape(-1).tolist()),
+        )
+        self._written = (revision, action, object_id)
+
+    def _is_written(self) -> bool:
+        """Whether the write whose commit was under way when the connection was lost counts."""
+        return bool(
+            self._session.rows(
+                "SELECT 1 FROM change WHERE (revision, action, id) = (%s, %s, %s)", self._written
+            )
+        )
+
+    def changes(self, since: int = 0) -> Iterator[Change]:
+        """Committed writes after that revision, oldest first."""
+        for revision, action, object_id, ranges in self._session.rows(
+            "SELECT revision, action, id, ranges FROM change WHERE revision > %s ORDER BY revision",
+            (since,),
+        ):
+            pairs = np.array(ranges, dtype=np.int64).reshape(-1, 2)
+            yield Change(revision, action, object_id, pairs)
+
+    # -- statistics --------------------------------------------------------------------------
+
+    def size(self) -> Size:
+        """Rows, bytes of all tables and indexes, leaf blocks of the index."""
+        with self._session.snapshot(), self._session.without_limit():
+            self.revision()
+            counted = (
+                "SELECT count(*) FROM brick"
+                if self._shift
+                else "SELECT coalesce(sum(voxels), 0) FROM object"  # a row for each voxel
+            )
+            ((rows,),) = self._session.execute(text_of(counted)).fetchall()
+            ((total, index),) = self._session.execute(
+                "SELECT (SELECT sum(pg_total_relation_size(c.oid)) FROM pg_class c"
+                "         WHERE c.relnamespace = to_regnamespace(%s) AND c.relkind = 'r'),"
+                "       coalesce(pg_relation_size(to_regclass(%s)), 0)"
+                "         / current_setting('block_size')::int",
+                (_quoted(self._session), f"{_quoted(self._session)}.{self.layout}_key"),
+            ).fetchall()
+        return Size(int(rows), int(total), max(int(index), 1))
+
+    def quantiles(self, resolution: int) -> Histogram:
+        """Equi-count histogram of all row keys, of R buckets.
+
+        At 10,000 from the server's statistics once there are enough rows; else the kept one while
+        no object was written since, else computed exactly.
+        """
+        if resolution == SERVER_RESOLUTION:
+            found = server_histogram(self._session, self.layout)
+            if found is not None and found[1] >= ENOUGH_ROWS:
+                return Histogram(*found, "server statistics")
+        kept = self._session.rows(
+            "SELECT bounds, n_rows FROM quantile WHERE resolution = %s AND bounds IS NOT NULL"
+            " AND revision = (SELECT revision FROM environment)",
+            (resolution,),
+        )
+        if kept:
+            return Histogram(np.array(kept[0][0], dtype=np.int64), int(kept[0][1]), "kept")
+        return Histogram(*exact_histogram(self._session, self.layout, resolution), "computed")
+
+    def freshness(self, resolution: int) -> Freshness:
+        """How old the histogram of that resolution is, by its own revision."""
+        ((revision, made, changed, unseen),) = self._session.rows(
+            "SELECT e.revision, q.revision,"
+            "       (SELECT coalesce(sum(voxels), 0) FROM object WHERE object.revision > "
+            "               coalesce(q.revision, 0)),"
+            "       CASE WHEN q.bounds IS NULL THEN (SELECT n_mod_since_analyze"
+            "         FROM pg_stat_user_tables WHERE schemaname = %s AND relname = %s) END"
+            "  FROM environment e LEFT JOIN quantile q ON q.resolution = %s",
+            (self._session.address.environment, self.layout, resolution),
+        )
+        since = 0 if made is None else int(made)
+        rows = int(changed if made is None or unseen is None else unseen)
+        changes = int(revision) - since
+        # the server counts a moment late: what it adds after its own ANALYZE was there before
+        return Freshness(None if made is None else since, changes, rows if changes else 0)
+
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
+        """Renew the server's statistics, or compute and keep a histogram, unless it is fresh."""
+        if not anew and self.freshness(resolution)[:2] == (self.revision(), 0):
+            return
+        bounds: list[int] | None = None
+        n_rows = self.size().rows
+        if resolution == SERVER_RESOLUTION and n_rows >= ENOUGH_ROWS:
+            with self._session.without_limit():
+                self._session.execute("SELECT refresh_statistics()")
+        else:
+            keys, n_rows = exact_histogram(self._session, self.layout, resolution)
+            bounds = keys.tolist()
+        self._save(
+            "INSERT INTO quantile SELECT %s, revision, %s, %s FROM environment"
+            " ON CONFLICT (resolution) DO UPDATE SET revision = EXCLUDED.revision,"
+            " n_rows = EXCLUDED.n_rows, bounds = EXCLUDED.bounds",
+            (resolution, n_rows, bounds),
+        )
+
+    def costs(self, machine: str) -> Mapping[str, float] | None:
+        """Figures that `save_costs` kept for that machine."""
+        kept = self._session.rows("SELECT figures::text FROM cost WHERE machine = %s", (machine,))
+        return cast("Mapping[str, float]", json.loads(kept[0][0])) if kept else None
+
+    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
+        """Keep the fitted cost figures of a machine."""
+        self._save(
+            "INSERT INTO cost VALUES (%s, %s)"
+            " ON CONFLICT (machine) DO UPDATE SET figures = EXCLUDED.figures",
+            (machine, json.dumps(dict(figures))),
+        )
+
+    def _save(self, text: str, parameters: Sequence[Any]) -> None:
+        self._session.write(lambda: self._execute(text, parameters))
+
+
+def _quoted(session: Session) -> str:
+    return sql.Identifier(session.address.environment).as_string(session.connection)
+
+
+def _is_in_order(rows: Rows) -> bool:
+    keys, ids = rows.keys, rows.ids
+    if len(keys) < 2:
+        return True
+    return bool(((keys[1:] > keys[:-1]) | ((keys[1:] == keys[:-1]) & (ids[1:] > ids[:-1]))).all())
+
+
+def _in_order(rows: Rows) -> Rows:
+    """Rows that came without the index, sorted: while a first import has none yet."""
+    order = np.lexsort((rows.ids, rows.keys))
+    bits = rows.occupancy
+    if bits.size:
+        bits = np.frombuffer(bits.reshape(-1, 64)[order].tobytes(), np.uint8)
+    return Rows(rows.keys[order], rows.ids[order], bits)
+
+
+def _object(row: tuple[Any, ...]) -> Object:
+    return Object(
+        id=row[0],
+        name=row[1],
+        link=row[2],
+        digest=row[3],
+        transform=np.array(row[4], dtype=np.float64).reshape(4, 4),
+        voxels=row[5],
+        bounds=np.array(row[6], dtype=np.float64).reshape(2, 3),
+        attributes=json.loads(row[7]),
+        revision=row[8],
+    )
+
+
+def _contents(record: Object, revision: int) -> dict[str, Any]:
+    """Bindings of an object's columns."""
+    return {
+        "id": record.id,
+        "name": record.name,
+        "link": record.link,
+        "digest": record.digest,
+        "transform": np.asarray(record.transform, dtype=np.float64).reshape(-1).tolist(),
+        "voxels": int(record.voxels),
+        "bounds": np.asarray(record.bounds, dtype=np.float64).reshape(-1).tolist(),
+        "attributes": json.dumps(dict(record.attributes), sort_keys=True),
+        "revision": revision,
+    }

@@ -12,7 +12,7 @@ import psycopg
 
 from hapticdb.errors import ConnectionLostError
 from hapticdb.store.base import Layout
-from hapticdb.store.postgres.session import Session, text_of
+from hapticdb.store.postgres.session import Session
 
 # one key for all environments of a database: a loader elsewhere only puts the mending off
 LOADERS = 0x4841505449434442
@@ -103,7 +103,7 @@ class Loading:
         return bool(found[0][0])
 
     def _is_empty(self) -> bool:
-        return bool(self._session.rows(text_of(IS_EMPTY[self._layout]))[0][0])
+        return bool(self._session.rows(IS_EMPTY[self._layout])[0][0])
 
     def _drop_index(self) -> None:
         """Leave the index out, if nobody is reading; nobody is made to wait."""

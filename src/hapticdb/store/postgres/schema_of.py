@@ -18,7 +18,7 @@ from hapticdb.grid import CurveName, Grid
 from hapticdb.store.base import LAYOUTS, Layout
 from hapticdb.store.postgres import failures
 from hapticdb.store.postgres.address import Address, parse
-from hapticdb.store.postgres.session import Session, identifier, text_of
+from hapticdb.store.postgres.session import Session, identifier
 from hapticdb.store.private_server import PrivateServer
 from hapticdb.store.schema import FORMAT_VERSION, MIGRATIONS
 
@@ -166,7 +166,7 @@ def _migrate(session: Session, version: int) -> None:
     schema = identifier(session.address.environment)
     for migration in MIGRATIONS[version:]:
         for statement in migration.postgres:
-            session.execute(sql.SQL(text_of(statement)).format(schema=schema))
+            session.execute(sql.SQL(statement).format(schema=schema))
     if version:
         session.execute("UPDATE environment SET format = %s", (FORMAT_VERSION,))
 

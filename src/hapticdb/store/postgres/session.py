@@ -10,7 +10,7 @@ import select
 import time
 from collections.abc import Callable, Iterator, Sequence
 from threading import get_ident
-from typing import Any, LiteralString, Self, TypeVar, cast
+from typing import Any, Self, TypeVar
 
 import psycopg
 from psycopg import pq, sql
@@ -176,12 +176,12 @@ class Session:
 
         return self.again(read)
 
-    def rows(self, text: LiteralString, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+    def rows(self, text: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """All rows of a statement, as Python's own values: for what no frame waits on."""
         return self.again(lambda: self.execute(text, parameters).fetchall())
 
     def execute(
-        self, text: LiteralString | sql.Composed, parameters: Sequence[Any] = ()
+        self, text: str | sql.Composed, parameters: Sequence[Any] = ()
     ) -> psycopg.Cursor[tuple[Any, ...]]:
         """One statement through psycopg, without a second try."""
         return self.connection.execute(text, parameters or None)
@@ -336,7 +336,7 @@ class Session:
                         self.command(f"SET {name} = '{value}'")
 
     def _shown_setting(self, name: str) -> str:
-        row = self.connection.execute(text_of(f"SHOW {name}")).fetchone()
+        row = self.connection.execute(f"SHOW {name}").fetchone()
         return row[0] if row else "0"
 
     def _is_usable(self) -> bool:
@@ -364,8 +364,3 @@ def _quoted(name: str) -> str:
 def identifier(name: str) -> sql.Identifier:
     """Quote a name for a statement's text."""
     return sql.Identifier(name)
-
-
-def text_of(statement: str) -> LiteralString:
-    """Statements built from constants of ours, which psycopg asks to be literal."""
-    return cast("LiteralString", statement)

@@ -34,7 +34,7 @@ from hapticdb.store.postgres.histogram import (
     server_histogram,
 )
 from hapticdb.store.postgres.loading import Loading
-from hapticdb.store.postgres.session import Session, text_of
+from hapticdb.store.postgres.session import Session
 
 Result = TypeVar("Result")
 
@@ -228,11 +228,11 @@ class PostgresStore:
     def objects(self) -> list[Object]:
         """All objects, ordered by id."""
         self.revision()  # before: what is written in between is then noticed later, not never
-        return [_object(row) for row in self._session.rows(text_of(f"{OBJECTS} ORDER BY id"))]
+        return [_object(row) for row in self._session.rows(f"{OBJECTS} ORDER BY id")]
 
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""
-        rows = self._session.rows(text_of(f"{OBJECTS} WHERE id = %s"), (object_id,))
+        rows = self._session.rows(f"{OBJECTS} WHERE id = %s", (object_id,))
         if not rows:
             raise ObjectNotFoundError(
                 f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
@@ -300,14 +300,14 @@ class PostgresStore:
 
     def _execute(self, text: str, parameters: Any = ()) -> list[tuple[Any, ...]]:  # noqa: ANN401 - a sequence or a mapping, as psycopg takes them
         """One statement of a write; its rows, when it returns some."""
-        cursor = self._session.execute(text_of(text), parameters)
+        cursor = self._session.execute(text, parameters)
         return cursor.fetchall() if cursor.description else []
 
     def _copy(self, rows: Rows, object_id: int) -> None:
         columns = "z_val, id, occupancy" if self._shift else "z_val, id"
         text = f"COPY {self.layout} ({columns}) FROM STDIN (FORMAT binary)"
         cursor = self._session.connection.cursor()
-        with cursor.copy(text_of(text)) as copy:
+        with cursor.copy(text) as copy:
             copy.write(wire.COPY_HEADER)
             for at in range(0, len(rows), COPY_CHUNK):
                 part = slice(at, at + COPY_CHUNK)
@@ -363,7 +363,7 @@ class PostgresStore:
                 if self._shift
                 else "SELECT coalesce(sum(voxels), 0) FROM object"  # a row for each voxel
             )
-            ((rows,),) = self._session.execute(text_of(counted)).fetchall()
+            ((rows,),) = self._session.execute(counted).fetchall()
             ((total, index),) = self._session.execute(
                 "SELECT (SELECT sum(pg_total_relation_size(c.oid)) FROM pg_class c"
                 "         WHERE c.relnamespace = to_regnamespace(%s) AND c.relkind = 'r'),"

@@ -1,5 +1,7 @@
-"""Case 9: every strategy, layout and curve finds what a plain set finds, bit for bit."""
+"""Case 9: every strategy, layout, curve and engine finds what a plain set finds, bit for bit."""
 
+import os
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,9 +16,12 @@ from hapticdb import Environment, Grid, PointShell, TangentPlane
 from hapticdb.grid import CurveName
 from hapticdb.query import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
+from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.private_server import Binaries
 from hapticdb.testing import KINDS, blob, write_voxels
 from naive_frame import NaiveTouch
 from naive_frame import touch as naive_touch
+from servers import FOUND, base_url, named
 
 ORIGIN = (-0.31, 0.17, -0.05)
 SIZE = 0.013
@@ -39,14 +44,34 @@ def plain() -> dict[tuple[int, int, int], set[int]]:
     return found
 
 
+ENGINES: list[Binaries | str | None] = [None, *FOUND]
+"""SQLite, and every PostgreSQL server."""
+
+
 @pytest.fixture(scope="module", params=KINDS, ids="-".join)
-def env(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Environment:
+def kind(request: pytest.FixtureRequest) -> tuple[Layout, CurveName]:
     layout, curve = request.param
-    return make_scene(tmp_path_factory.mktemp("scene") / "e.db", layout, curve)
+    return layout, curve
 
 
-def make_scene(path: Path, layout: Layout, curve: CurveName) -> Environment:
-    env = hapticdb.create(path, Grid(SIZE, ORIGIN, BITS, curve), layout=layout)
+@pytest.fixture(
+    scope="module", params=ENGINES, ids=lambda found: "sqlite" if found is None else named(found)
+)
+def env(
+    request: pytest.FixtureRequest,
+    kind: tuple[Layout, CurveName],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Environment]:
+    if request.param is None:
+        yield make_scene(tmp_path_factory.mktemp("scene") / "e.db", *kind)
+        return
+    env = make_scene(with_environment(base_url(request.param), f"scene_{os.getpid()}"), *kind)
+    yield env
+    env.store.discard()
+
+
+def make_scene(url: Path | str, layout: Layout, curve: CurveName) -> Environment:
+    env = hapticdb.create(url, Grid(SIZE, ORIGIN, BITS, curve), layout=layout)
     for n, voxels in enumerate(scene_voxels()):
         write_voxels(env.store, voxels, f"blob {n}")
     return env

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import UsageError
+from hapticdb.grouping import cbgroup
 from hapticdb.query import Strategy
 from hapticdb.statistics import (
     DEFAULT_RESOLUTION,
@@ -122,7 +123,7 @@ MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0, 7.0, 0.25, 11.0, 13.0, 0.125)
 
 
 @few
-@given(values=st.lists(figures, min_size=10, max_size=10), spread=figures)
+@given(values=st.lists(figures, min_size=12, max_size=12), spread=figures)
 def test_a_cost_model_returns_from_its_figures(values: list[float], spread: float) -> None:
     """Also through text, as a store keeps them."""
     names = [name for name in vars(MODEL) if name != "spread"]
@@ -130,6 +131,18 @@ def test_a_cost_model_returns_from_its_figures(values: list[float], spread: floa
     model = replace(model, spread={"row": spread, "descent": 0.0})
     assert CostModel.from_figures(model.figures()) == model
     assert CostModel.from_figures(json.loads(json.dumps(model.figures()))) == model
+
+
+def test_figures_kept_before_crowding_was_measured_still_serve() -> None:
+    older = {k: v for k, v in MODEL.figures().items() if k not in {"crowding", "presence"}}
+    assert CostModel.from_figures(older) == MODEL
+
+
+def test_crowded_gaps_are_closed_less_often() -> None:
+    keys = np.arange(0, 4000, 40, dtype=np.int64)
+    quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 40 * 4)  # 1.56 rows a gap
+    assert len(cbgroup(keys, quantiles, replace(MODEL, crowding=1.0)).ranges.lows) == 1
+    assert len(cbgroup(keys, quantiles, replace(MODEL, crowding=3.0)).ranges.lows) == len(keys)
 
 
 def test_the_cost_of_a_frame_is_the_sum_of_its_parts() -> None:
@@ -172,7 +185,9 @@ def test_calibrated_figures_are_finite_and_not_negative(scene: Environment) -> N
 
 
 def test_the_places_measured_depend_on_the_seed_alone(scene: Environment) -> None:
-    first, again, other = (list(_probes(scene.store, seed)) for seed in (0, 0, 1))
+    first, again, other = (
+        list(_probes(scene.store, scene.quantiles(), seed)) for seed in (0, 0, 1)
+    )
     assert len(first) >= 12
     assert [p.keys.tolist() for p in first] == [p.keys.tolist() for p in again]
     assert [p.keys.tolist() for p in first] != [p.keys.tolist() for p in other]
@@ -183,7 +198,7 @@ def test_the_places_measured_lie_at_occupied_voxels(scene: Environment) -> None:
     rows = scene.store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
     occupied = scene.grid.decode(np.unique(rows.keys) << shift)
     edge = 1 << (shift // 3)
-    for probe in _probes(scene.store, 3):
+    for probe in _probes(scene.store, scene.quantiles(), 3):
         center = scene.grid.voxels_of(probe.frame.placed[-1:, :3])
         nearest = np.abs(occupied // edge - center // edge).max(axis=1).min()
         assert nearest == 0

@@ -61,7 +61,7 @@ def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping
         keys,
         quantiles.bounds,
         quantiles.rows_per_bucket,
-        costs.row_scanned,
+        costs.row_in_gap,
         costs.descent,
         lows,
         highs,

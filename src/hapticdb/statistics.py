@@ -19,6 +19,8 @@ from hapticdb.store.base import Frame, Keys, Store, SupportsStatement, row_shift
 DEFAULT_RESOLUTION = 10_000
 """Buckets of the quantile vector: the paper's best."""
 MAX_RESOLUTION = 1_000_000
+SMALL_GAP = 1 << 13
+"""Voxel keys; among the gaps that a frame's shell leaves, those of up to sixteen bricks."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,9 @@ class CostModel:
         One point query of the sequence (strategy `points`).
     aggregate, point : float
         The statement of Figure 3 with its second one, and each shell point in it.
+    crowding, presence : float
+        Rows found in the gaps of real frames, and under their keys, over those that the quantile
+        vector expects there: rows crowd where a tool touches, which no histogram knows.
     spread : mapping
         Relative standard error of each fitted figure.
     """
@@ -103,12 +108,19 @@ class CostModel:
     single: float
     aggregate: float
     point: float
+    crowding: float = 1.0
+    presence: float = 1.0
     spread: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
     def row_scanned(self) -> float:
         """One row read in a range: its share of a leaf block, and its handling."""
         return self.block / self.rows_per_block + self.row
+
+    @cached_property
+    def row_in_gap(self) -> float:
+        """One row that the quantile vector expects in a gap."""
+        return self.row_scanned * self.crowding
 
     def of_ranges(self, n_ranges: int, rows: float) -> float:
         """Expected cost of one statement of ranges."""
@@ -130,8 +142,9 @@ class CostModel:
         self, n_points: int, n_keys: int, n_ranges: int, rows_asked: float, rows_in_gaps: float
     ) -> Literal["array", "cbgroup", "points", "statement"]:
         """Strategy of the least expected cost for a frame of so many points, keys and ranges."""
-        array = self.of_keys(n_keys, rows_asked)
-        ranges = self.of_ranges(n_ranges, rows_asked + rows_in_gaps)
+        rows = rows_asked * self.presence
+        array = self.of_keys(n_keys, rows)
+        ranges = self.of_ranges(n_ranges, rows + rows_in_gaps * self.crowding)
         points = self.of_points(n_keys)
         statement = self.of_statement(n_points)
         least = min(array, ranges, points, statement)
@@ -196,9 +209,10 @@ def calibrate(store: Store, *, seed: int = 0, repeats: int = 5, budget: float = 
     if size.rows == 0:
         raise UsageError(f"{store.url} is empty: import a file before calibrating")
     rows_per_block = size.rows / max(size.leaf_blocks, 1)
-    trials = _Trials(store, repeats)
+    quantiles = QuantileVector.of(store)
+    trials = _Trials(store, quantiles, repeats)
     started = time.perf_counter()
-    for n, probe in enumerate(_probes(store, seed)):
+    for n, probe in enumerate(_probes(store, quantiles, seed)):
         trials.measure(probe)
         if n >= 11 and time.perf_counter() - started > budget:
             break
@@ -208,14 +222,17 @@ def calibrate(store: Store, *, seed: int = 0, repeats: int = 5, budget: float = 
 class _Trials:
     """Timings of every form at several places, and their fit."""
 
-    def __init__(self, store: Store, repeats: int) -> None:
+    def __init__(self, store: Store, quantiles: QuantileVector, repeats: int) -> None:
         self._store = store
+        self._quantiles = quantiles
         self._repeats = repeats
         self._scans: list[tuple[float, ...]] = []
         self._counts: list[tuple[float, ...]] = []
         self._lookups: list[tuple[float, ...]] = []
         self._singles: list[tuple[float, ...]] = []
         self._statements: list[tuple[float, ...]] = []
+        self._in_gaps = np.zeros(2)
+        self._under_keys = np.zeros(2)
 
     def measure(self, probe: _Probe) -> None:
         """Ask for one shell in every form."""
@@ -229,6 +246,7 @@ class _Trials:
             count = self._time(lambda lo=lows, hi=highs: store.count(lo, hi))  # type: ignore[misc]
             self._scans.append((1, len(lows), rows, scan))
             self._counts.append((1, len(lows), rows, count))
+        self._compare(probe)
         rows = len(store.lookup(probe.keys))
         lookup = self._time(lambda: store.lookup(probe.keys))
         self._lookups.append((1, len(probe.keys), rows, lookup))
@@ -238,6 +256,18 @@ class _Trials:
             self._statements.append(
                 (1, len(probe.frame.addresses), self._time(self._figure_3(probe)))
             )
+
+    def _compare(self, probe: _Probe) -> None:
+        """Add up what is found in a frame's small gaps and under its keys, and what is expected."""
+        keys = probe.keys
+        lows, highs = group_by_gap(keys, probe.first, probe.last, SMALL_GAP)
+        found = self._store.scan(lows, highs).keys
+        is_asked = np.isin(found, keys)
+        between = self._quantiles.rows_between
+        asked = sum(between(key, key) for key in keys.tolist())
+        scanned = sum(between(*ends) for ends in zip(lows.tolist(), highs.tolist(), strict=True))
+        self._in_gaps += np.array([np.count_nonzero(~is_asked), scanned - asked])
+        self._under_keys += np.array([np.count_nonzero(is_asked), asked])
 
     def _figure_3(self, probe: _Probe) -> Callable[[], object]:
         store = self._store
@@ -287,6 +317,8 @@ class _Trials:
             single=single,
             aggregate=aggregate,
             point=point,
+            crowding=_ratio(self._in_gaps),
+            presence=_ratio(self._under_keys),
             spread={
                 "statement": s_scan[0],
                 "descent": s_scan[1],
@@ -299,6 +331,12 @@ class _Trials:
                 "point": s_statement[1],
             },
         )
+
+
+def _ratio(found_and_expected: NDArray[np.float64]) -> float:
+    """Rows found over rows expected; one where nothing can be said."""
+    found, expected = found_and_expected.tolist()
+    return float(found / expected) if found > 0 and expected > 0 else 1.0
 
 
 def _least_squares(
@@ -321,13 +359,12 @@ def _least_squares(
     return tuple(map(float, figures)), tuple(map(float, errors))
 
 
-def _probes(store: Store, seed: int) -> list[_Probe]:
+def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
     """Spheres of shell points on occupied voxels, small and large ones in turn."""
     rng = np.random.default_rng(seed)
     grid = store.grid
     shift = row_shift(store.layout)
-    bounds = store.quantiles(DEFAULT_RESOLUTION).bounds
-    places = rng.choice(bounds, size=64)
+    places = rng.choice(quantiles.bounds, size=64)
     centers = grid.centers(grid.decode(places << shift))
     origin = np.array(grid.origin)
     grid_codes = (grid.bits, grid.curve_code)

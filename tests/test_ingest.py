@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import laspy
@@ -30,7 +31,7 @@ from hapticdb import FileReport, GridOptions, ImportOptions, ingest
 from hapticdb.grid import ROOM, CurveName
 from hapticdb.ingest import Progress
 from hapticdb.kernels.voxelize import brick_voxels, voxelize
-from hapticdb.mesh import Part, parse_in_process
+from hapticdb.mesh import MeshFile, Part, parse_in_process, read_file
 from hapticdb.store.base import Layout
 from hapticdb.testing import KINDS
 from mesh_files import gltf
@@ -434,3 +435,20 @@ def test_options_that_cannot_be_are_refused_before_anything_is_made(
     with pytest.raises(hapticdb.UsageError, match="name at least one"):
         hapticdb.import_files(tmp_path / "e.db", [])
     assert left_behind(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", ["car\udcff", "car\0"])
+def test_a_name_that_is_no_text_is_refused(
+    name: str, file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = read_file
+
+    def named(path: str, *, unit: str | None = None) -> MeshFile:
+        return replace(read(path, unit=unit), link=name)
+
+    monkeypatch.setattr(ingest, "read_file", named)
+    (report,) = hapticdb.import_files(tmp_path / "e.db", [str(file)])
+    assert report.status == "failed"
+    assert "is no text" in str(report.error)
+    str(report.error).encode()  # the message itself can be printed
+    assert not (tmp_path / "e.db").exists()

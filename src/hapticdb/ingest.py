@@ -215,6 +215,7 @@ def ingest_file(
     GeometryChangedError
         When the environment holds a part of that name with another geometry.
     """
+    _check_names(mesh_file)
     present = {obj.name: obj.digest for obj in store.objects() if obj.link == mesh_file.link}
     missing = [part for part in mesh_file.parts if part.name not in present]
     for part in mesh_file.parts:
@@ -335,6 +336,19 @@ def check_placed_inside(
             f"{_box(grid.bounds)} m; move it, or make an environment with a larger --extent"
         )
     return bounds
+
+
+def _check_names(mesh_file: MeshFile) -> None:
+    """Refuse names that not every engine can hold as text."""
+    for name in (mesh_file.link, *(part.name for part in mesh_file.parts)):
+        try:
+            name.encode()
+        except UnicodeEncodeError:
+            is_text = False
+        else:
+            is_text = "\0" not in name
+        if not is_text:
+            raise FileError(f"{mesh_file.link!a}: the name {name!a} is no text: rename it")
 
 
 def _check_inside(mesh_file: MeshFile, grid: Grid, parts: Sequence[Part] | None = None) -> None:

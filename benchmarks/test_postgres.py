@@ -30,6 +30,7 @@ from hapticdb.query import STRATEGIES, Strategy
 from hapticdb.store.base import LAYOUTS, Frame, Layout, row_shift
 from hapticdb.store.postgres import statements, wire
 from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.session import Session
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.private_server import Binaries, PrivateServer
@@ -107,11 +108,10 @@ class Served:
         return store.session
 
     def end(self) -> None:
-        for env in self.environments.values():
+        for layout, env in self.environments.items():
             if self._server is None:
-                env.store.discard()
-            else:
-                env.close()
+                drop(self.session(layout))
+            env.close()
         if self._server is not None:
             self._server.stop()
             subprocess.run(["rm", "-rf", str(self._server.folder)], check=True)
@@ -303,7 +303,9 @@ def test_import_beside_sqlite(
             start = time.perf_counter()
             hapticdb.import_files(url, [scene.files.car], options)
             times[name].append(time.perf_counter() - start)
-        hapticdb.open(there).store.discard()
+        with hapticdb.open(there) as env:
+            assert isinstance(env.store, PostgresStore)
+            drop(env.store.session)
 
     benchmark.group = f"{layout} import"
     benchmark.pedantic(both, rounds=3, warmup_rounds=1)

@@ -1,7 +1,6 @@
 """The command line as tests use it: run in an empty folder, on a small environment."""
 
 import shutil
-import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -92,12 +91,9 @@ def scene(run: Run, made: Path, tmp_path: Path) -> Path:
     return tmp_path / "scene.db"
 
 
-def rows_of(path: Path) -> list[tuple[Any, ...]]:
+def rows_of(url: Path | str) -> list[tuple[Any, ...]]:
     """Every row of the objects and of the index table, whichever it has."""
-    with sqlite3.connect(path) as connection:
-        tables = {name for (name,) in connection.execute("SELECT name FROM sqlite_master")}
-        found = list(connection.execute("SELECT id, name, digest, voxels FROM object ORDER BY id"))
-        for table in {"voxel", "brick"} & tables:
-            found += connection.execute(f"SELECT * FROM {table} ORDER BY 1, 2").fetchall()
-    connection.close()
-    return found
+    with hapticdb.open(url, read_only=True) as env:
+        found = [(obj.id, obj.name, obj.digest, obj.voxels) for obj in env.objects()]
+        keys, ids, bits = env.store.scan(np.zeros(1, np.int64), np.array([2**62]))
+    return [*found, *zip(keys.tolist(), ids.tolist(), strict=True), (bits.tobytes(),)]

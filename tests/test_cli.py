@@ -22,7 +22,20 @@ from hapticdb.mesh.reader import UNITS
 from hapticdb.query import STRATEGIES
 from hapticdb.store.base import LAYOUTS
 
-VERBS = ("import", "info", "objects", "touch", "move", "remove", "calibrate", "sample", "demo")
+VERBS = (
+    "import",
+    "info",
+    "objects",
+    "touch",
+    "move",
+    "remove",
+    "calibrate",
+    "analyze",
+    "copy",
+    "diff",
+    "sample",
+    "demo",
+)
 
 
 # -- what is offered ------------------------------------------------------------------------------

@@ -15,32 +15,55 @@ import hapticdb
 from command_line import PLACES, Run, boxes, made, refused, rows_of, run, scene, tool  # noqa: F401 - fixtures
 from hapticdb.query import STRATEGIES
 
-# -- info, objects, calibrate ---------------------------------------------------------------------
+Scene = Path | str
+"""A file here; the same tests run on servers in test_cli_postgres.py."""
+
+# -- info, objects, calibrate, analyze -----------------------------------------------------------
 
 
-def test_info_json_has_the_documented_keys(run: Run, scene: Path) -> None:
+def test_info_json_has_the_documented_keys(run: Run, scene: Scene) -> None:
     code, out, err = run("info", scene, "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
     assert list(found) == [
-        *("voxel_size", "bits", "origin", "curve", "layout"),
-        *("objects", "voxels", "rows", "bytes"),
+        *("name", "engine", "voxel_size", "bits", "origin", "curve", "layout"),
+        *("objects", "voxels", "rows", "bytes", "statistics"),
     ]
     with hapticdb.open(scene, read_only=True) as env:
         assert found["voxels"] == sum(len(env.voxels(obj.id)) for obj in env.objects())
         assert (found["voxel_size"], found["bits"]) == (env.grid.voxel_size, 6)
+        assert (found["name"], found["engine"]) == (env.name, env.engine)
+        assert found["bytes"] == env.size().bytes > 0
+    assert found["statistics"] == {"source": "kept", "revision": 3, "changes": 0, "rows": 0}
     assert (found["curve"], found["layout"], found["objects"]) == ("z", "brick", 3)
-    assert found["bytes"] >= scene.stat().st_size
 
 
-def test_info_speaks_to_people(run: Run, scene: Path) -> None:
+def test_info_speaks_to_people(run: Run, scene: Scene) -> None:
     code, out, err = run("info", scene)
     assert (code, err) == (0, "")
     assert "262,144 cells" in out
     assert "a voxel)" in out
+    assert re.search(r"^engine +(SQLite|PostgreSQL) \d+\.\d+", out, re.MULTILINE)
+    assert re.search(r"^statistics +computed and kept; fresh$", out, re.MULTILINE)
 
 
-def test_objects_are_listed_by_id(run: Run, scene: Path) -> None:
+def test_analyze_renews_what_an_edit_made_stale(run: Run, scene: Scene) -> None:
+    assert run("remove", scene, 2)[0] == 0
+    assert "1 write behind" in run("info", scene)[1]
+    code, out, err = run("analyze", scene)
+    assert (code, err) == (0, "")
+    assert "10,000 buckets over" in out
+    assert "before: 1 write behind" in out
+    code, out, err = run("analyze", scene, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert list(found) == ["source", "buckets", "rows", "before"]
+    assert found["before"] == {"revision": 4, "changes": 0, "rows": 0}
+    assert (found["source"], found["buckets"]) == ("kept", 10_000)
+    assert found["rows"] == json.loads(run("info", scene, "--json")[1])["rows"]
+
+
+def test_objects_are_listed_by_id(run: Run, scene: Scene) -> None:
     code, out, err = run("objects", scene, "--json")
     assert (code, err) == (0, "")
     found = [json.loads(line) for line in out.splitlines()]
@@ -59,7 +82,7 @@ def test_a_name_in_brackets_is_printed_as_it_is(run: Run, tmp_path: Path) -> Non
     assert name in run("objects", "a.db")[1]
 
 
-def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Path) -> None:
+def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> None:
     code, out, err = run("calibrate", scene, "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
@@ -72,12 +95,12 @@ def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Path) -> No
 # -- move, remove ---------------------------------------------------------------------------------
 
 
-def bounds_of(scene: Path, object_id: int) -> Any:  # noqa: ANN401 - an array
+def bounds_of(scene: Scene, object_id: int) -> Any:  # noqa: ANN401 - an array
     with hapticdb.open(scene, read_only=True) as env:
         return env.object(object_id).bounds
 
 
-def test_a_translation_counts_from_where_the_object_is(run: Run, scene: Path) -> None:
+def test_a_translation_counts_from_where_the_object_is(run: Run, scene: Scene) -> None:
     before = bounds_of(scene, 2)
     for n in (1, 2):
         code, out, err = run("move", scene, 2, "--translate", "-0.01,0,0.02")
@@ -86,7 +109,7 @@ def test_a_translation_counts_from_where_the_object_is(run: Run, scene: Path) ->
         assert np.allclose(bounds_of(scene, 2), before + n * np.array([-0.01, 0, 0.02]))
 
 
-def test_a_pose_and_a_matrix_replace_the_placement(run: Run, scene: Path, tmp_path: Path) -> None:
+def test_a_pose_and_a_matrix_replace_the_placement(run: Run, scene: Scene, tmp_path: Path) -> None:
     assert run("move", scene, 1, "--pose", "0.1,0,0,0,0,0,2")[0] == 0  # half a turn about z
     assert np.allclose(bounds_of(scene, 1).mean(axis=0), (0.1, 0, 0))
     matrix = tmp_path / "matrix.txt"
@@ -110,7 +133,7 @@ def test_a_pose_and_a_matrix_replace_the_placement(run: Run, scene: Path, tmp_pa
     ],
 )
 def test_a_move_that_cannot_be_changes_nothing(
-    run: Run, scene: Path, args: list[object], word: str
+    run: Run, scene: Scene, args: list[object], word: str
 ) -> None:
     before = rows_of(scene)
     refused(run("move", scene, *args), word)
@@ -124,7 +147,7 @@ def test_a_move_says_when_the_file_is_gone(run: Run, tmp_path: Path) -> None:
     refused(run("move", "a.db", 1, "--translate", "0,0,0.01"), "gone.glb")
 
 
-def test_remove_takes_all_or_nothing(run: Run, scene: Path) -> None:
+def test_remove_takes_all_or_nothing(run: Run, scene: Scene) -> None:
     refused(run("remove", scene, 1, 9), "no object 9")
     refused(run("remove", scene, "first"), "first")
     code, out, err = run("remove", scene, 1, "3,1")
@@ -137,11 +160,11 @@ def test_remove_takes_all_or_nothing(run: Run, scene: Path) -> None:
 # -- touch ----------------------------------------------------------------------------------------
 
 
-def touch(run: Run, scene: Path, *more: object) -> tuple[int, str, str]:
+def touch(run: Run, scene: Scene, *more: object) -> tuple[int, str, str]:
     return run("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", *more)
 
 
-def test_touch_json_has_a_line_a_pose(run: Run, scene: Path) -> None:
+def test_touch_json_has_a_line_a_pose(run: Run, scene: Scene) -> None:
     code, out, err = touch(run, scene, "--json", "--strategy", "cbgroup")
     assert (code, err) == (0, "")
     found = [json.loads(line) for line in out.splitlines()]
@@ -156,7 +179,7 @@ def test_touch_json_has_a_line_a_pose(run: Run, scene: Path) -> None:
     assert found[0]["hits"] >= found[0]["contacts"] > 0
 
 
-def test_touch_json_is_the_librarys_answer_to_the_bit(run: Run, scene: Path) -> None:
+def test_touch_json_is_the_librarys_answer_to_the_bit(run: Run, scene: Scene) -> None:
     lines = touch(run, scene, "--json", "--tool", "tool.stl", "--points", 90)[1].splitlines()
     shell = hapticdb.PointShell.from_file("tool.stl", 90)
     with hapticdb.open(scene, read_only=True) as env:
@@ -170,7 +193,7 @@ def test_touch_json_is_the_librarys_answer_to_the_bit(run: Run, scene: Path) -> 
             assert frame["hits"] == len(touched.hits)
 
 
-def test_every_strategy_prints_the_same_wrench(run: Run, scene: Path) -> None:
+def test_every_strategy_prints_the_same_wrench(run: Run, scene: Scene) -> None:
     wrenches = set()
     for strategy in STRATEGIES:
         lines = touch(run, scene, "--json", "--strategy", strategy)[1].splitlines()
@@ -179,12 +202,12 @@ def test_every_strategy_prints_the_same_wrench(run: Run, scene: Path) -> None:
     assert len(wrenches) == 1
 
 
-def test_an_excluded_object_is_not_felt(run: Run, scene: Path) -> None:
+def test_an_excluded_object_is_not_felt(run: Run, scene: Scene) -> None:
     out = touch(run, scene, "--json", "--exclude", "1,3", "--exclude", 2)[1]
     assert [json.loads(line)["hits"] for line in out.splitlines()] == [0, 0, 0]
 
 
-def test_stiffness_scales_the_force(run: Run, scene: Path) -> None:
+def test_stiffness_scales_the_force(run: Run, scene: Scene) -> None:
     one, two = (
         json.loads(touch(run, scene, "--json", "--stiffness", k)[1].splitlines()[0])["force"]
         for k in (1000, 2000)
@@ -192,7 +215,7 @@ def test_stiffness_scales_the_force(run: Run, scene: Path) -> None:
     assert np.allclose(2 * np.array(one), two)
 
 
-def test_a_saved_shell_is_a_tool(run: Run, scene: Path) -> None:
+def test_a_saved_shell_is_a_tool(run: Run, scene: Scene) -> None:
     saved = touch(run, scene, "--json")[1].splitlines()
     meshed = touch(run, scene, "--json", "--tool", "tool.stl")[1].splitlines()
     for one, other in zip(saved, meshed, strict=True):
@@ -201,7 +224,7 @@ def test_a_saved_shell_is_a_tool(run: Run, scene: Path) -> None:
     refused(touch(run, scene, "--tool-unit", "mm"), "saved shell")
 
 
-def test_an_open_tool_is_told_to_be_a_guess(run: Run, scene: Path, tmp_path: Path) -> None:
+def test_an_open_tool_is_told_to_be_a_guess(run: Run, scene: Scene, tmp_path: Path) -> None:
     tool(tmp_path / "open.stl", is_open=True)
     code, out, err = run("touch", scene, "--tool", "open.stl", "--poses", "path.csv", "--json")
     assert code == 0
@@ -209,7 +232,7 @@ def test_an_open_tool_is_told_to_be_a_guess(run: Run, scene: Path, tmp_path: Pat
     assert "inside is a guess" in err
 
 
-def test_the_tools_unit_is_its_own(run: Run, scene: Path, tmp_path: Path) -> None:
+def test_the_tools_unit_is_its_own(run: Run, scene: Scene, tmp_path: Path) -> None:
     cube = trimesh.creation.box((20.0, 20.0, 20.0))
     (tmp_path / "mm.stl").write_bytes(cube.export(file_type="stl"))
     args = ("touch", scene, "--tool", "mm.stl", "--poses", "path.csv", "--json")
@@ -217,7 +240,7 @@ def test_the_tools_unit_is_its_own(run: Run, scene: Path, tmp_path: Path) -> Non
     assert json.loads(run(*args)[1].splitlines()[0])["hits"] == 0
 
 
-def test_a_summary_without_json(run: Run, scene: Path) -> None:
+def test_a_summary_without_json(run: Run, scene: Scene) -> None:
     code, out, err = touch(run, scene)
     assert (code, err) == (0, "")
     assert re.search(r"frames\s+3: 2 hit, 2 in contact", out)
@@ -240,12 +263,12 @@ def test_a_summary_without_json(run: Run, scene: Path) -> None:
     ],
 )
 def test_a_touch_that_cannot_be_is_one_line(
-    run: Run, scene: Path, options: list[str], word: str
+    run: Run, scene: Scene, options: list[str], word: str
 ) -> None:
     refused(touch(run, scene, *options), word)
 
 
 @pytest.mark.parametrize("text", ["", "1,2,3\n", "x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0\n", "x,y\n\0"])
-def test_bad_poses_are_named(run: Run, scene: Path, tmp_path: Path, text: str) -> None:
+def test_bad_poses_are_named(run: Run, scene: Scene, tmp_path: Path, text: str) -> None:
     (tmp_path / "bad.csv").write_text(text)
     refused(touch(run, scene, "--poses", "bad.csv"), "bad.csv")

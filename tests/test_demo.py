@@ -71,7 +71,7 @@ def test_hits_of_the_trace_lie_in_voxels_of_their_objects(
     scene: demo.Scene, comparison: demo.Comparison
 ) -> None:
     trace = comparison.trace
-    with hapticdb.open(scene.imported[0].path, read_only=True) as env:
+    with hapticdb.open(scene.imported[0].url, read_only=True) as env:
         for object_id in np.unique(trace.ids).tolist():
             mine = env.grid.encode(env.voxels(object_id))
             hit = env.grid.encode(env.grid.voxels_of(trace.points[trace.ids == object_id]))

@@ -5,20 +5,24 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
 from hapticdb.cli import app
 from hapticdb.store import sqlite, sqlite_force
+from hapticdb.store.postgres import session, statements
+from hapticdb.store.private_server import Binaries, PrivateServer
+from servers import FOUND, SETTINGS, named
 
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SHOWN = re.compile(r"<!-- sql: (\w+)\.(\w+)\[\"(\w+)\"\] -->\n```sql\n(.*?)```", re.DOTALL)
-CODE = {"sqlite": sqlite, "sqlite_force": sqlite_force}
+CODE = {"sqlite": sqlite, "sqlite_force": sqlite_force, "statements": statements}
 
 
-def blocks(kind: str) -> list[str]:
-    return [text for name, text in BLOCK.findall((ROOT / "README.md").read_text()) if name == kind]
+def blocks(kind: str, page: str = "README.md") -> list[str]:
+    return [text for name, text in BLOCK.findall((ROOT / page).read_text()) if name == kind]
 
 
 def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
@@ -43,6 +47,42 @@ def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
     assert len(done.stdout.splitlines()) >= 100
 
 
+@pytest.mark.parametrize("binaries", [b for b in FOUND if not isinstance(b, str)], ids=named)
+def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
+    """On a private server that libpq's environment variables lead to, by its own pg_dump."""
+    server = PrivateServer.at(tmp_path / "plant", binaries, SETTINGS)
+    server.start()
+    server.create_database("plant")
+    options = parse_qs(urlsplit(server.conninfo("plant")).query)
+    tools = f"{Path(sys.executable).parent}{os.pathsep}{binaries.bindir}{os.pathsep}"
+    variables = {
+        "PATH": tools + os.environ["PATH"],
+        **{f"PG{name.upper()}": value for name, (value,) in options.items()},
+    }
+    try:
+        found = ""
+        for block in blocks("sh", "docs/postgresql.md"):
+            done = subprocess.run(
+                ["bash", "-euo", "pipefail", "-c", block],
+                cwd=tmp_path,
+                env=os.environ | variables,
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            assert done.returncode == 0, done.stderr
+            found = done.stdout
+    finally:
+        server.stop()
+    assert "postgresql:///plant and postgresql:///restored hold the same" in found
+
+
+def test_the_postgresql_page_gives_the_settings_that_are_set() -> None:
+    page = (ROOT / "docs" / "postgresql.md").read_text()
+    shown = re.findall(r"^\| `(\w+)` \| `(\w+)` \|", page, re.MULTILINE)
+    assert dict(shown) == session.SETTINGS
+
+
 def test_every_make_line_of_the_readme_is_run_by_ci() -> None:
     ci = (ROOT / ".ci" / "run").read_text()
     named = re.findall(r"^    (make \w+)", (ROOT / "README.md").read_text(), re.MULTILINE)
@@ -53,13 +93,15 @@ def test_every_make_line_of_the_readme_is_run_by_ci() -> None:
 
 def test_the_docs_show_the_sql_that_runs() -> None:
     shown = SHOWN.findall((ROOT / "docs" / "strategies.md").read_text())
-    assert len(shown) == 4
+    assert len(shown) == 9
     for module, constant, layout, text in shown:
         runs = getattr(CODE[module], constant)[layout]
         assert text.split() == runs.split()
 
 
-@pytest.mark.parametrize("page", ["README.md", "ARCHITECTURE.md", "docs/strategies.md"])
+@pytest.mark.parametrize(
+    "page", ["README.md", "ARCHITECTURE.md", "docs/strategies.md", "docs/postgresql.md"]
+)
 def test_every_link_in_the_docs_leads_somewhere(page: str) -> None:
     path = ROOT / page
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):

@@ -17,6 +17,8 @@ from hapticdb.grid import CurveName
 from hapticdb.query import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.postgres.schema_of import drop
+from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.private_server import Binaries
 from hapticdb.testing import KINDS, blob, write_voxels
 from naive_frame import NaiveTouch
@@ -67,7 +69,9 @@ def env(
         return
     env = make_scene(with_environment(base_url(request.param), f"scene_{os.getpid()}"), *kind)
     yield env
-    env.store.discard()
+    assert isinstance(env.store, PostgresStore)
+    drop(env.store.session)
+    env.close()
 
 
 def make_scene(url: Path | str, layout: Layout, curve: CurveName) -> Environment:

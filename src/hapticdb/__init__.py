@@ -6,6 +6,7 @@
 >>> env.touch(shell, pose).force                              # doctest: +SKIP
 """
 
+from hapticdb.difference import Difference, diff_environments
 from hapticdb.environment import Environment, Touch, create, open  # noqa: A004 - as in tarfile.open
 from hapticdb.errors import (
     AccessError,
@@ -33,10 +34,12 @@ from hapticdb.force import TangentPlane
 from hapticdb.grid import Grid, GridOptions
 from hapticdb.ingest import FileReport, ImportOptions, import_files
 from hapticdb.pointshell import PointShell
+from hapticdb.pool import Pool
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.query import Query
 from hapticdb.statistics import CostModel, QuantileVector
 from hapticdb.store.base import Object
+from hapticdb.transfer import CopyReport, copy_environment
 from hapticdb.warm import warm_up
 
 __all__ = [
@@ -44,9 +47,11 @@ __all__ = [
     "BusyError",
     "ConflictError",
     "ConnectionLostError",
+    "CopyReport",
     "CostModel",
     "DamagedError",
     "DatabaseError",
+    "Difference",
     "Environment",
     "EnvironmentExistsError",
     "EnvironmentNotFoundError",
@@ -65,6 +70,7 @@ __all__ = [
     "ObjectNotFoundError",
     "OutsideGridError",
     "PointShell",
+    "Pool",
     "QuantileVector",
     "Query",
     "ReadOnlyError",
@@ -72,7 +78,9 @@ __all__ = [
     "TangentPlane",
     "Touch",
     "UsageError",
+    "copy_environment",
     "create",
+    "diff_environments",
     "import_files",
     "open",
     "read_poses",

@@ -24,6 +24,7 @@ from hapticdb.poses import read_poses, write_poses
 from hapticdb.query import Strategy
 from hapticdb.sample import SampleFiles, slide_over_voxels, write_sample, write_wrench
 from hapticdb.store.base import Layout
+from hapticdb.store.connect import beside, name_of, redact
 from hapticdb.warm import warm_up
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
@@ -42,7 +43,8 @@ class Imported(NamedTuple):
     """One environment of the demo; how long its import took, nothing if it was there."""
 
     layout: Layout
-    path: Path
+    url: str
+    engine: str
     seconds: float
     objects: int
     voxels: int
@@ -150,6 +152,7 @@ class Comparison:
 def prepare(
     folder: str | os.PathLike[str],
     *,
+    url: str | None = None,
     bits: int = 10,
     frames: int = 1000,
     points: int = 300,
@@ -161,6 +164,8 @@ def prepare(
     ----------
     folder : path
         Where everything goes; made when it does not exist.
+    url : str or None
+        Where the environments go instead: beside the one that it names, which is left alone.
     bits : int
         Bits an axis of the grid.
     frames : int
@@ -178,35 +183,42 @@ def prepare(
     compile_seconds = time.perf_counter() - started
     shell = PointShell.from_file(files.wrench, points)
     imported = []
-    layouts: tuple[tuple[Layout, str], ...] = (("brick", "car.db"), ("voxel", "car_voxel.db"))
-    for layout, name in layouts:
-        imported.append(_import(home / name, files.car, layout, options, progress))
-    with open_environment(imported[0].path, read_only=True) as env:
+    first = beside(home / "demo", "car") if url is None else beside(url, f"{name_of(url)}_demo_car")
+    layouts: tuple[tuple[Layout, str], ...] = (
+        ("brick", first),
+        ("voxel", beside(first, f"{name_of(first)}_voxel")),
+    )
+    for layout, place in layouts:
+        imported.append(_import(place, files.car, layout, options, progress))
+    with open_environment(imported[0].url, read_only=True) as env:
         grid_text = env.grid.describe()
     poses = read_poses(files.path)
     return Scene(home, files, tuple(imported), shell, poses, grid_text, compile_seconds)
 
 
 def _import(
-    path: Path, car: Path, layout: Layout, grid: GridOptions, progress: ProgressCallback | None
+    url: str, car: Path, layout: Layout, grid: GridOptions, progress: ProgressCallback | None
 ) -> Imported:
     started = time.perf_counter()
     try:
         report: FileReport = import_files(
-            path, [car], ImportOptions(grid=grid, layout=layout), progress
+            url, [car], ImportOptions(grid=grid, layout=layout), progress
         )[0]
     except GridError as error:
-        raise UsageError(f"{path} is of another demo: give another folder ({error})") from error
+        raise UsageError(
+            f"{redact(url)} is of another demo: give another folder or --url ({error})"
+        ) from error
     seconds = time.perf_counter() - started
     if report.error is not None:
         raise report.error
-    with open_environment(path) as env:
+    with open_environment(url) as env:
         if env.store.size().rows:
             env.calibrate()
         size, objects = env.size(), env.objects()
     return Imported(
         layout,
-        path,
+        url,
+        env.engine,
         seconds,
         len(objects),
         sum(obj.voxels for obj in objects),
@@ -223,7 +235,7 @@ def compare(scene: Scene) -> Comparison:
     reference: list[Any] = []
     trace: Trace | None = None
     for imported in scene.imported:
-        with open_environment(imported.path, read_only=True) as env:
+        with open_environment(imported.url, read_only=True) as env:
             layouts.append(Measured(imported, _race(env, scene, reference, disagreed)))
             if trace is None:
                 trace = trace_of(env, scene.shell, scene.poses)

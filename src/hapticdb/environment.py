@@ -38,7 +38,7 @@ from hapticdb.statistics import (
     calibrate,
     machine_name,
 )
-from hapticdb.store.base import Keys, Layout, Object, Size, Store
+from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
 
 _NOBODY: tuple[int, ...] = ()
@@ -131,6 +131,16 @@ class Environment:
     def url(self) -> str:
         """Where the environment is."""
         return self._store.url
+
+    @property
+    def name(self) -> str:
+        """What it is called among others at the same place."""
+        return self._store.name
+
+    @property
+    def engine(self) -> str:
+        """Engine and version: ``SQLite 3.51.0``, ``PostgreSQL 18.6``."""
+        return self._store.engine
 
     @property
     def grid(self) -> Grid:
@@ -331,6 +341,8 @@ class Environment:
         return answer
 
     def _check_known(self, ids: Keys) -> None:
+        if not set(ids.tolist()) <= set(self._known):  # a frame that asked nothing saw nothing new
+            self._known = {obj.id: obj for obj in self._store.objects()}
         for i in ids.tolist():
             if i not in self._known:
                 raise ObjectNotFoundError(
@@ -343,6 +355,17 @@ class Environment:
     def quantiles(self, resolution: int = DEFAULT_RESOLUTION) -> QuantileVector:
         """Quantile vector of the index's keys (the paper's Definition 2)."""
         return QuantileVector.of(self._store, resolution)
+
+    def freshness(self) -> Freshness:
+        """How old the statistics are that grouping by cost stands on."""
+        return self._store.freshness(DEFAULT_RESOLUTION)
+
+    def analyze(self) -> QuantileVector:
+        """Renew those statistics, however fresh they are."""
+        self._check_writable()
+        self._store.analyze(DEFAULT_RESOLUTION, anew=True)
+        self._quantiles = self.quantiles()
+        return self._quantiles
 
     def calibrate(self, *, seed: int = 0, keep: bool = True) -> CostModel:
         """Measure what queries cost here; used from now on, and kept for this machine.

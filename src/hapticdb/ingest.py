@@ -152,7 +152,7 @@ def import_files(
         with _closing_on_error(store):
             _check_layout(store, chosen.layout)
             chosen.grid.check_matches(store.grid)
-    is_new = store is None
+    is_new = False
     reports: list[FileReport] = []
     n_written = 0
     try:
@@ -164,7 +164,7 @@ def import_files(
                     if store is None:
                         grid = chosen.grid.fit(mesh_file.bounds)
                         _check_inside(mesh_file, grid)
-                        store = _created_or_joined(url, grid, chosen)
+                        store, is_new = _created_or_joined(url, grid, chosen)
                     elif n == 0 and not is_new:
                         chosen.grid.check_matches(store.grid, _first_bounds(store, mesh_file))
                     if not is_loading:
@@ -186,10 +186,12 @@ def import_files(
     return reports
 
 
-def _created_or_joined(url: str | os.PathLike[str], grid: Grid, options: ImportOptions) -> Store:
-    """Make the environment, or join one that another process has made in the meantime."""
+def _created_or_joined(
+    url: str | os.PathLike[str], grid: Grid, options: ImportOptions
+) -> tuple[Store, bool]:
+    """Make the environment, or join one that another has made meanwhile; whether it was made."""
     try:
-        return create_store(url, grid, options.layout or "brick")
+        return create_store(url, grid, options.layout or "brick"), True
     except EnvironmentExistsError:
         store = open_store(url)
         with _closing_on_error(store):
@@ -197,7 +199,7 @@ def _created_or_joined(url: str | os.PathLike[str], grid: Grid, options: ImportO
             GridOptions(
                 bits=grid.bits, voxel_size=grid.voxel_size, origin=grid.origin, curve=grid.curve
             ).check_matches(store.grid)
-        return store
+        return store, False
 
 
 def ingest_file(

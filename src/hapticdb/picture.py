@@ -56,7 +56,7 @@ class Palette:
 
 def draw(path: Path, scene: "Scene", comparison: "Comparison") -> None:
     """Draw the first environment of a demo, what its tool felt, and write it as a PNG."""
-    with open_environment(scene.imported[0].path, read_only=True) as env:
+    with open_environment(scene.imported[0].url, read_only=True) as env:
         figure = compose(env, scene, comparison)
     try:
         figure.savefig(path, dpi=100, facecolor=PAPER)
@@ -171,7 +171,7 @@ def _draw_words(figure: Figure, scene: "Scene", comparison: "Comparison") -> Non
     lines = (
         (
             f"{one.objects} parts, {one.voxels / 1e6:.1f} million voxels, "
-            f"{one.bytes / 1e6:.1f} MB of SQLite"
+            f"{one.bytes / 1e6:.1f} MB of {one.engine.split()[0]}"
         ),
         (
             f"{len(scene.shell)} points of a spanner looked up {len(scene.poses):,} times, "

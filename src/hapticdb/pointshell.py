@@ -29,6 +29,10 @@ FORMAT = "hapticdb.pointshell 1"
 Floats = NDArray[np.float64]
 
 
+LEAST_COMPONENT = 1e-100
+"""Of a normal: below, it is 0. PostgreSQL takes a product that underflows for an error."""
+
+
 @dataclass(frozen=True, eq=False)
 class PointShell:
     """The tool: points on its surface and unit normals that point into it.
@@ -74,6 +78,8 @@ class PointShell:
             array = _as_floats(getattr(self, name), name)
             if array.ndim != len(shape) or array.shape[-1] != 3:
                 raise UsageError(f"a shell's {name} have the shape {array.shape}, not {shape}")
+            if name == "normals":  # too small to turn anything, and their products to be numbers
+                array = np.where(np.abs(array) < LEAST_COMPONENT, 0.0, array)
             array.flags.writeable = False
             object.__setattr__(self, name, array)
         if len(self.points) == 0 or len(self.points) != len(self.normals):

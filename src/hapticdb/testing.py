@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import ConflictError, EnvironmentExistsError, ObjectNotFoundError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.grouping import box_ranges
-from hapticdb.ingest import rows_of_voxels
+from hapticdb.layout import rows_of_voxels
 from hapticdb.store.base import (
     Covering,
     Frame,

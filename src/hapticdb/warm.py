@@ -7,7 +7,8 @@ import numpy as np
 
 from hapticdb.environment import create
 from hapticdb.grid import Grid
-from hapticdb.ingest import rows_of_part, rows_of_voxels
+from hapticdb.ingest import rows_of_part
+from hapticdb.layout import rows_of_voxels
 from hapticdb.mesh import Part
 from hapticdb.pointshell import PointShell
 from hapticdb.query import STRATEGIES

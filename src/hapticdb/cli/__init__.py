@@ -12,8 +12,10 @@ from collections.abc import Sequence
 from itertools import takewhile
 
 from hapticdb.cli.editing import move, remove
+from hapticdb.cli.granting import grant
 from hapticdb.cli.importing import import_
-from hapticdb.cli.listing import calibrate, info, objects
+from hapticdb.cli.listing import analyze, calibrate, info, objects
+from hapticdb.cli.moving import copy, diff
 from hapticdb.cli.root import Interrupted, PipeClosedError, app
 from hapticdb.cli.sampling import demo, sample
 from hapticdb.cli.touching import touch
@@ -27,7 +29,20 @@ INTERRUPTED = 130
 PIPE_CLOSED = 141
 
 app.command("import")(import_)
-for verb in (info, objects, touch, move, remove, calibrate, sample, demo):
+for verb in (
+    info,
+    objects,
+    touch,
+    move,
+    remove,
+    copy,
+    diff,
+    calibrate,
+    analyze,
+    grant,
+    sample,
+    demo,
+):
     app.command()(verb)
 
 

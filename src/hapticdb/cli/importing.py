@@ -73,6 +73,8 @@ def import_(
     used is named and skipped, and the others go in.
 
     Example: hapticdb import car.db car.glb --bits 11 --extent 1.6
+
+    Example: hapticdb import 'postgresql://me@host/plant?environment=hall' plant.glb
     """
     from hapticdb.grid import GridOptions
     from hapticdb.ingest import ImportOptions, import_files
@@ -144,6 +146,6 @@ def _say_total(url: str, elapsed: float) -> None:
         size = env.size()
         objects = len(env.objects())
         render.say(
-            f"{url}: {render.counted(objects, 'object')}, {render.counted(size.rows, 'row')}, "
+            f"{env.url}: {render.counted(objects, 'object')}, {render.counted(size.rows, 'row')}, "
             f"{render.bytes_text(size.bytes)}; {env.grid.describe()}; {elapsed:.1f} s"
         )

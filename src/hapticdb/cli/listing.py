@@ -1,4 +1,4 @@
-"""The verbs that look at an environment: info, objects, calibrate."""
+"""The verbs that look at an environment: info, objects, calibrate, analyze."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
     from hapticdb.statistics import CostModel
-    from hapticdb.store.base import Object
+    from hapticdb.store.base import Freshness, Object
 
 MEANINGS = {
     "statement": "a statement of ranges, whatever it reads",
@@ -23,22 +23,29 @@ MEANINGS = {
     "aggregate": "Figure 3, with the statement for ids",
     "point": "each shell point in it",
 }
+SOURCES = {
+    "server statistics": "the server's own statistics",
+    "kept": "computed and kept",
+    "computed": "computed when needed",
+}
 
 
 def info(url: Url, *, json: Json = False) -> None:
-    """Show an environment's grid, layout and size.
+    """Show an environment's engine, grid, layout, size and statistics.
 
     Example: hapticdb info car.db --json
     """
     import hapticdb
 
     with hapticdb.open(url, read_only=True) as env:
-        grid, size, objects = env.grid, env.size(), env.objects()
-        layout = env.layout
+        grid, size, objects, layout = env.grid, env.size(), env.objects(), env.layout
+        freshness, quantiles = env.freshness(), env.quantiles()
     voxels = sum(obj.voxels for obj in objects)
     if json:
         render.say_json(
             {
+                "name": env.name,
+                "engine": env.engine,
                 "voxel_size": grid.voxel_size,
                 "bits": grid.bits,
                 "origin": list(grid.origin),
@@ -48,6 +55,7 @@ def info(url: Url, *, json: Json = False) -> None:
                 "voxels": voxels,
                 "rows": size.rows,
                 "bytes": size.bytes,
+                "statistics": {"source": quantiles.source, **freshness._asdict()},
             }
         )
         return
@@ -56,7 +64,9 @@ def info(url: Url, *, json: Json = False) -> None:
     render.show(
         render.facts(
             [
-                ("environment", url),
+                ("environment", env.url),
+                ("name", env.name),
+                ("engine", env.engine),
                 ("voxel size", render.metres(grid.voxel_size)),
                 ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
                 ("edge", render.metres(grid.edge)),
@@ -67,6 +77,7 @@ def info(url: Url, *, json: Json = False) -> None:
                 ("voxels", f"{voxels:,}"),
                 ("rows", f"{size.rows:,}"),
                 ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
+                ("statistics", f"{SOURCES[quantiles.source]}; {_age(freshness)}"),
             ]
         )
     )
@@ -80,13 +91,13 @@ def objects(url: Url, *, json: Json = False) -> None:
     import hapticdb
 
     with hapticdb.open(url, read_only=True) as env:
-        found = env.objects()
+        found, shown = env.objects(), env.url
     if json:
         for obj in found:
             render.say_json(record_of(obj))
         return
     if not found:
-        render.note(f"{url} is empty; 'hapticdb import {url} FILE' fills it")
+        render.note(f"{shown} is empty; 'hapticdb import URL FILE' fills it")
         return
     rows = [(str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in found]
     render.show(render.table(("id>", "name", "voxels>", "size, mm>", "file"), rows))
@@ -135,7 +146,7 @@ def calibrate(url: Url, *, json: Json = False) -> None:
         costs = env.calibrate()
         rows = env.size().rows
     if not is_kept:
-        render.note(f"{url} can only be read: the figures were measured, and not kept")
+        render.note(f"{env.url} can only be read: the figures were measured, and not kept")
     if json:
         figures = {name: getattr(costs, name) for name in (*MEANINGS, "rows_per_block")}
         render.say_json({"figures": figures, "spread": dict(costs.spread), "kept": is_kept})
@@ -146,6 +157,44 @@ def calibrate(url: Url, *, json: Json = False) -> None:
         f"a gap is scanned when it holds fewer than "
         f"{costs.descent / max(costs.row_scanned, 1e-9):.1f} rows"
     )
+
+
+def analyze(url: Url, *, json: Json = False) -> None:
+    """Renew the statistics of the keys, by which cbgroup and auto expect how many rows a gap holds.
+
+    An import does so at its end, PostgreSQL's autovacuum now and then: this
+    is for after many edits.
+
+    Example: hapticdb analyze car.db
+    """
+    import hapticdb
+
+    with hapticdb.open(url) as env:
+        before = env.freshness()
+        found = env.analyze()
+    if json:
+        render.say_json(
+            {
+                "source": found.source,
+                "buckets": found.resolution,
+                "rows": found.n_rows,
+                "before": before._asdict(),
+            }
+        )
+        return
+    render.say(
+        f"{env.url}: {SOURCES[found.source]}, {render.counted(found.resolution, 'bucket')} over "
+        f"{render.counted(found.n_rows, 'row')}; before: {_age(before)}"
+    )
+
+
+def _age(freshness: "Freshness") -> str:
+    """Put the age of statistics in words."""
+    if freshness.revision is None:
+        return "none made yet"
+    if not freshness.changes:
+        return "fresh"
+    return f"{render.counted(freshness.changes, 'write')} behind"
 
 
 def _costs_table(costs: "CostModel") -> "RenderableType":

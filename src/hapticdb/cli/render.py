@@ -3,13 +3,14 @@
 import io
 import json
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
+    from hapticdb import transfer
     from hapticdb.ingest import ProgressCallback
 
 PIPED_WIDTH = 10_000
@@ -128,18 +129,33 @@ def import_bar() -> "Iterator[ProgressCallback | None]":
     if not sys.stderr.isatty():
         yield None
         return
+    with _bar("reading", "parts") as advance:
+        yield lambda now: advance(now.link, now.parts_done, now.parts_total, now.voxels)
+
+
+@contextmanager
+def copy_bar(doing: str) -> "Iterator[transfer.ProgressCallback | None]":
+    """Show a bar with objects, voxels a second and time left; nothing where nobody looks."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    with _bar(doing, "objects") as advance:
+        yield lambda now: advance(doing, now.objects_done, now.objects_total, now.voxels)
+
+
+@contextmanager
+def _bar(first: str, noun: str) -> Iterator[Callable[[str, int, int, int], None]]:
+    """Show a bar; yields what advances it: what is being done, how much of it, voxels so far."""
     from time import monotonic
 
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-    from hapticdb import ingest
-
     bar = Progress(
         SpinnerColumn(),
-        TextColumn("{task.fields[file]}", markup=False),
+        TextColumn("{task.fields[doing]}", markup=False),
         BarColumn(bar_width=14),
-        TextColumn("{task.fields[parts]}", markup=False),
+        TextColumn("{task.fields[count]}", markup=False),
         TextColumn("{task.fields[rate]}", markup=False),
         TimeRemainingColumn(compact=True),
         console=Console(file=sys.stderr),
@@ -147,19 +163,19 @@ def import_bar() -> "Iterator[ProgressCallback | None]":
     )
     started: dict[str, tuple[float, int]] = {}
     with bar:
-        task = bar.add_task("", total=None, file="reading", parts="", rate="")
+        task = bar.add_task("", total=None, doing=first, count="", rate="")
 
-        def advance(now: ingest.Progress) -> None:
-            since, first = started.setdefault(now.link, (monotonic(), now.voxels))
+        def advance(doing: str, done: int, total: int, voxels: int) -> None:
+            since, before = started.setdefault(doing, (monotonic(), voxels))
             elapsed = monotonic() - since
-            rate = (now.voxels - first) / elapsed if elapsed > 0.05 else 0.0
-            is_last = now.parts_done == now.parts_total
+            rate = (voxels - before) / elapsed if elapsed > 0.05 else 0.0
+            is_last = done == total
             bar.update(
                 task,
-                total=None if is_last else now.parts_total,
-                completed=now.parts_done,
-                file="finishing" if is_last else _short(now.link),
-                parts=f"{now.parts_done}/{now.parts_total} parts",
+                total=None if is_last else total,
+                completed=done,
+                doing="finishing" if is_last else _short(doing),
+                count=f"{done}/{total} {noun}",
                 rate=f"{counted(rate, 'voxel')}/s" if rate else "",
             )
 

@@ -12,7 +12,10 @@ LayoutName = Literal["brick", "voxel"]
 UnitName = Literal["mm", "cm", "m", "in"]
 
 Url = Annotated[
-    str, typer.Argument(metavar="URL", help="The environment: a path, or sqlite:///path.")
+    str,
+    typer.Argument(
+        metavar="URL", help="The environment: a path, sqlite:///path, postgresql://host/database."
+    ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, an object a line.")]
 
@@ -79,6 +82,10 @@ def root(
       hapticdb demo
       hapticdb import car.db car.glb --bits 11
       hapticdb touch car.db --tool wrench.stl --poses path.csv
+
+    Instead of a file's path, a URL names an environment on PostgreSQL:
+    'postgresql://user@host/database?environment=NAME', or
+    'postgresql:///local?data=DIR', a private server in a folder.
 
     'hapticdb VERB --help' shows what a verb takes, with an example.
     """

@@ -44,6 +44,13 @@ def sample(
 def demo(
     folder: Folder = Path("demo"),
     *,
+    url: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Import beside this environment, instead of into DIR: postgresql://host/database.",
+        ),
+    ] = None,
     bits: Annotated[int, typer.Option(metavar="1..21", help="Bits an axis of the grid.")] = 10,
     frames: Frames = 1000,
     points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
@@ -51,6 +58,8 @@ def demo(
     """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
 
     Example: hapticdb demo demo --bits 11
+
+    Example: hapticdb demo --url 'postgresql:///local?data=DIR'
     """
     render.note(f"writing the sample into {folder}, compiling kernels on the first run ...")
     import numpy as np
@@ -59,7 +68,7 @@ def demo(
     from hapticdb.picture import draw
 
     with render.import_bar() as progress:
-        scene = prepare(folder, bits=bits, frames=frames, points=points, progress=progress)
+        scene = prepare(folder, url=url, bits=bits, frames=frames, points=points, progress=progress)
     _show_scene(scene)
     comparison = compare(scene)
     for measured in comparison.layouts:
@@ -85,14 +94,17 @@ def _show_scene(scene: "Scene") -> None:
 
 
 def _import_text(one: "Imported") -> str:
+    from hapticdb.store.connect import redact
+
+    where = redact(one.url)
     size = (
         f"{render.counted(one.objects, 'object')}, {render.counted(one.voxels, 'voxel')}, "
         f"{render.counted(one.rows, 'row')}, {render.bytes_text(one.bytes)}"
     )
     if not one.is_new:
-        return f"{one.path}: {size}; there already"
+        return f"{where}: {size}; there already"
     rate = render.counted(one.voxels / one.seconds, "voxel")
-    return f"{one.path}: {size}; {one.seconds:.1f} s, {rate} a second"
+    return f"{where}: {size}; {one.seconds:.1f} s, {rate} a second"
 
 
 def _show_layout(measured: "Measured", scene: "Scene", hits: float) -> None:
@@ -116,7 +128,8 @@ def _show_layout(measured: "Measured", scene: "Scene", hits: float) -> None:
     keys = np.median(measured.felt[YARDSTICK].ranges)
     one = measured.imported
     render.say(
-        f"\n{one.layout} layout, {render.counted(one.rows, 'row')}; warm, strategies in turns\n"
+        f"\n{one.engine}, {one.layout} layout, {render.counted(one.rows, 'row')}; "
+        "warm, strategies in turns\n"
         f"a frame: {len(scene.shell)} points, {keys:.0f} distinct keys, {hits:.0f} hits (medians)\n"
     )
     columns = ("strategy", "median µs>", "p99 µs>", "statements>", "ranges>", "rows>", "x faster>")

@@ -155,6 +155,14 @@ class Store(Protocol):
         """Where it is, as messages name it: without a password."""
 
     @property
+    def name(self) -> str:
+        """What it is called among others at the same place."""
+
+    @property
+    def engine(self) -> str:
+        """Engine and version: ``SQLite 3.51.0``, ``PostgreSQL 18.6``."""
+
+    @property
     def grid(self) -> Grid:
         """The environment's grid, fixed when it was made."""
 

@@ -1,8 +1,9 @@
 """A URL picks the engine: nothing else in the code knows which one it is."""
 
 import os
-from importlib.util import find_spec
+import re
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from hapticdb.errors import MissingExtraError, UsageError
 from hapticdb.grid import Grid
@@ -11,9 +12,23 @@ from hapticdb.store.postgres import address
 from hapticdb.store.postgres.address import redact
 from hapticdb.store.sqlite import SQLiteStore
 
-__all__ = ["beside", "check_curve", "create_store", "exists", "open_store", "redact"]
+if TYPE_CHECKING:
+    from hapticdb.store.postgres.rights import Right
+
+__all__ = [
+    "beside",
+    "check_curve",
+    "create_store",
+    "exists",
+    "grant",
+    "name_of",
+    "open_store",
+    "redact",
+]
 
 SQLITE_SCHEME = "sqlite:///"
+# what libpq takes beside URLs, and a URL without its slashes
+KEYWORDS = re.compile(r"^postgres(ql)?:|(^|\s)\w*password\s*=", re.IGNORECASE)
 
 
 def open_store(url: str | os.PathLike[str], *, read_only: bool = False) -> Store:
@@ -53,6 +68,32 @@ def beside(url: str | os.PathLike[str], name: str) -> str:
     return str(_path_of(url).with_name(f"{name}.db"))
 
 
+def grant(url: str | os.PathLike[str], role: str, right: "Right") -> None:
+    """Give a role of the server one right on an environment; see `hapticdb.store.postgres.rights`.
+
+    Raises
+    ------
+    AccessError
+        When the URL's user does not own the environment.
+    UsageError
+        When there is no such role, or none that could be held back; for a file.
+    """
+    if not _is_postgres(url):
+        raise UsageError(f"{_path_of(url)}: a file has no roles: use the file system's rights")
+    from hapticdb.store.postgres import rights, schema_of  # noqa: PLC0415 - an extra
+
+    with schema_of.connected(os.fspath(url)) as session:
+        schema_of.check(session)
+        rights.grant(session, role, right)
+
+
+def name_of(url: str | os.PathLike[str]) -> str:
+    """Name of the environment that a URL means: a schema, or a file without its ending."""
+    if _is_postgres(url):
+        return address.parse(os.fspath(url)).environment
+    return _path_of(url).stem
+
+
 def check_curve(curve: str, layout: Layout) -> None:
     """Refuse bricks in an order whose leading bits name no cube."""
     if layout == "brick" and curve == "lexicographic":
@@ -65,10 +106,12 @@ def _is_postgres(url: str | os.PathLike[str]) -> bool:
     """Whether a URL means PostgreSQL; refuses it when the driver is not installed."""
     if not isinstance(url, str) or not address.is_postgres(url):
         return False
-    if find_spec("psycopg") is None:
+    try:
+        import psycopg  # noqa: F401, PLC0415 - an extra
+    except ImportError as error:  # it is not there, or finds no libpq
         raise MissingExtraError(
             f"{redact(url)} needs psycopg: install it with pip install 'hapticdb[postgres]'"
-        )
+        ) from error
     return True
 
 
@@ -81,6 +124,8 @@ def _path_of(url: str | os.PathLike[str]) -> Path:
         raise UsageError(
             f"scheme {scheme!r}: give a path, sqlite:///path, or postgresql://host/database"
         )
+    if KEYWORDS.search(text):  # not shown: it holds a password
+        raise UsageError("libpq's keywords are not read here: give postgresql://user@host/database")
     if not text:
         raise UsageError("an empty path: name the environment's file")
     if text.startswith((":memory:", "file:")):

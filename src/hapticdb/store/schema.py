@@ -107,9 +107,10 @@ CREATE TABLE object (
   voxels     bigint NOT NULL,
   bounds     double precision[] NOT NULL CHECK (cardinality(bounds) = 6),
   attributes json NOT NULL,
-  revision   bigint NOT NULL,
-  UNIQUE (link, name)
+  revision   bigint NOT NULL
 )"""
+# digests: an index holds no names of thousands of characters
+POSTGRES_PART = "CREATE UNIQUE INDEX object_part ON object (md5(link), md5(name))"
 
 # statistics: the paper's best resolution, and the server's largest. Autovacuum: rows are read from
 # the index alone only where the visibility map says so
@@ -156,8 +157,9 @@ CREATE TABLE cost (
   figures json NOT NULL
 )"""
 
-# ANALYZE is the table owner's; editors may ask for it through this
-POSTGRES_REFRESH = """
+# ANALYZE is the table owner's; editors may ask for it through this, and nobody else
+POSTGRES_REFRESH = (
+    """
 CREATE FUNCTION refresh_statistics() RETURNS void
 LANGUAGE plpgsql SECURITY DEFINER SET search_path = {schema}, pg_temp AS $$
 BEGIN
@@ -166,7 +168,9 @@ BEGIN
   ELSE
     ANALYZE {schema}.voxel;
   END IF;
-END $$"""
+END $$""",
+    "REVOKE ALL ON FUNCTION refresh_statistics() FROM PUBLIC",
+)
 
 # The paper's force(point, z_val). A hit carries what the tangent-plane law needs, so that one
 # statement serves any shell, pose and stiffness; the aggregate collects hits and computes at the
@@ -231,12 +235,13 @@ MIGRATIONS = (
         (
             POSTGRES_ENVIRONMENT,
             POSTGRES_OBJECT,
+            POSTGRES_PART,
             *POSTGRES_VOXEL,
             *POSTGRES_BRICK,
             POSTGRES_CHANGE,
             POSTGRES_QUANTILE,
             POSTGRES_COST,
-            POSTGRES_REFRESH,
+            *POSTGRES_REFRESH,
             *POSTGRES_FORCE,
         ),
     ),

@@ -92,12 +92,15 @@ class SQLiteStore:
         self._cursor = connection.cursor()
         self.path = path
         self.url = str(path)
+        self.name = path.name
+        self.engine = f"SQLite {apsw.sqlite_lib_version()}"
         self.is_read_only = read_only
         self._stamp = (
             sqlite_file.stamp(path) if read_only and sqlite_file.needs_immutable(path) else None
         )
         self._depth = 0
         self._thread = get_ident()
+        self.is_closed = False
         self.grid, self.layout = self._read_environment()
         self._shift = row_shift(self.layout)
         connection.create_scalar_function("nth", cast("Any", _nth), 2, deterministic=True)
@@ -128,7 +131,12 @@ class SQLiteStore:
 
     def close(self) -> None:
         """Close the connection; the last one folds the write-ahead log into the file."""
+        self.is_closed = True
         self._connection.close()
+
+    def give_to(self, thread: int) -> None:
+        """Belong to another thread from now on, or to none (0); only while nobody uses it."""
+        self._thread = thread
 
     def discard(self) -> None:
         """Close and delete an environment that nothing went into."""

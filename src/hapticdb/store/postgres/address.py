@@ -8,14 +8,18 @@ server in a folder (see `hapticdb.store.private_server`).
 
 import re
 from typing import NamedTuple
-from urllib.parse import quote, unquote, urlsplit, urlunsplit
+from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
 
 from hapticdb.errors import UsageError
 
 SCHEMES = ("postgresql", "postgres")
 DEFAULT_ENVIRONMENT = "hapticdb"
-SECRET = re.compile(r"password|secret|passphrase|token", re.IGNORECASE)
+SECRET = re.compile(r"password|secret|passphrase|token|scram", re.IGNORECASE)
 SEARCH_PATH = re.compile(r"(?:-c\s*|--)search_path=(?:\"([^\"]+)\"|([^\s,]+))")
+LONE_PERCENT = re.compile(r"%(?![0-9a-fA-F]{2})|%00")
+PASSWORD = re.compile(r"(?P<user>\w+://[^:/?@\[]*):(?P<password>.*)@", re.DOTALL)
+PORTS = re.compile(r"\d*(?:,[^@/?]*)?(?:/[^@?]*)?\?(?:.*&)?[a-z_]+=")
+"""Not a password's begin, but a port's: host:5432/database?user=me@there."""
 LONGEST_NAME = 63
 
 
@@ -43,9 +47,9 @@ def parse(url: str) -> Address:
     Raises
     ------
     UsageError
-        When the environment's name cannot be a schema's, or is given twice.
+        When the environment's name cannot be a schema's, or is given twice; when the URL is none.
     """
-    parts = urlsplit(url)
+    parts = _split(url)
     named: list[str] = []
     data: list[str] = []
     others: list[str] = []
@@ -57,7 +61,8 @@ def parse(url: str) -> Address:
         elif key == "data":
             data.append(unquote(value))
         else:
-            others.append(pair)
+            # libpq takes no second = in a pair, and people write ?options=-cstatement_timeout=50
+            others.append(f"{key}={value.replace('=', '%3D')}")
             if key == "options" and (match := SEARCH_PATH.search(unquote(value))):
                 found = match[1] or match[2]
     if found is not None:
@@ -74,25 +79,56 @@ def parse(url: str) -> Address:
     return Address(conninfo, environment, data[0] if data else None, redact(url))
 
 
+def _split(url: str) -> SplitResult:
+    """Split a URL; refuses what libpq would read otherwise than it was meant, and then quote.
+
+    An @ in a password, not escaped, makes a part of the password a host, and part of its message.
+    """
+    try:
+        parts = urlsplit(url)
+    except ValueError:  # its words may hold the password
+        raise UsageError(f"{redact(url)} is no URL: check the host and its brackets") from None
+    pairs = [pair.partition("=") for pair in parts.query.split("&") if pair]
+    if (
+        parts.netloc.count("@") > 1
+        or "@" in parts.path
+        or "#" in url
+        or any(not equals or "@" in key for key, equals, _ in pairs)
+        or LONE_PERCENT.search(url)
+    ):
+        raise UsageError(
+            f"{redact(url)} is no URL: write @ : / ? # % in a password or name as "
+            "%40 %3A %2F %3F %23 %25"
+        )
+    return parts
+
+
 def with_environment(url: str, name: str) -> str:
     """Rewrite a URL so that it names another environment of the same database."""
     head, _, query = url.partition("?")
     kept = [pair for pair in query.split("&") if pair and not pair.startswith("environment=")]
+    for n, pair in enumerate(kept):
+        if pair.startswith("options="):
+            rest = SEARCH_PATH.sub("", unquote(pair.removeprefix("options="))).strip()
+            kept[n] = f"options={quote(rest, safe='')}"
     named = f"environment={quote(name, safe='')}"
     return f"{head}?{'&'.join([*kept, named])}"
 
 
 def redact(url: str) -> str:
-    """Leave out of a URL what nobody may read over a shoulder: passwords, wherever they stand."""
+    """Leave out of a URL what nobody may read over a shoulder: passwords, wherever they stand.
+
+    Those that should have been escaped, too: up to the last @ that may end them.
+    """
+    if "://" not in url:
+        return url
+    secret = PASSWORD.match(url)
+    if secret and not PORTS.match(secret["password"]):
+        url = secret["user"] + url[secret.end() - 1 :]
     head, mark, query = url.partition("?")
-    scheme, separator, rest = head.partition("://")
-    if separator:
-        authority, slash, path = rest.partition("/")
-        user, at, host = authority.rpartition("@")
-        head = f"{scheme}://{user.partition(':')[0]}{at}{host}{slash}{path}"
     pairs = [
-        f"{key}=***" if SECRET.search(key) and equals else f"{key}{equals}{value}"
-        for key, equals, value in (pair.partition("=") for pair in query.split("&"))
+        f"{key}=***" if SECRET.search(unquote(key)) else f"{key}={value}" if equals else "***"
+        for key, equals, value in (pair.partition("=") for pair in query.split("&") if pair)
     ]
     return head + mark + "&".join(pairs)
 
@@ -100,7 +136,8 @@ def redact(url: str) -> str:
 def _check_name(name: str, url: str) -> None:
     if (
         not name
-        or "\0" in name
+        or not name.isprintable()  # nor half a character, which no server takes
+        or "$$" in name  # would end the text of a function
         or len(name.encode("utf-8", "surrogateescape")) > LONGEST_NAME
         or name.startswith("pg_")
         or name in {"public", "information_schema"}

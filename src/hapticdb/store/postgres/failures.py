@@ -17,6 +17,7 @@ from hapticdb.errors import (
     HapticDBError,
     ReadOnlyError,
     StuckError,
+    UsageError,
 )
 
 
@@ -47,7 +48,10 @@ def named(error: psycopg.Error, shown: str) -> HapticDBError:
             "'hapticdb grant URL ROLE --as editor'"
         )
     if isinstance(error, (errors.UndefinedTable, errors.UndefinedColumn, errors.UndefinedFunction)):
-        return damaged(shown, cause)
+        return DamagedError(  # what may not be used at all is passed over as if it were not there
+            f"{shown} is damaged ({cause}), or this user may no longer use it: ask its owner, "
+            "restore a copy, or import the files again"
+        )
     if isinstance(error, (errors.DataCorrupted, errors.IndexCorrupted)):
         return damaged(shown, cause)
     if isinstance(error, (errors.DiskFull, errors.OutOfMemory)):
@@ -83,6 +87,8 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
     libpq passes on no code here, only words: the usual ones are told apart, all are shown.
     """
     cause = _line(error)
+    if cause.startswith("connection is bad: invalid"):  # a parameter that libpq does not take
+        return unusable(error, shown)
     if re.search(r'database ".*" does not exist', cause):
         return EnvironmentNotFoundError(f"{shown}: {cause}; make it first with 'createdb'")
     if re.search(
@@ -94,11 +100,33 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
     return ConnectionLostError(f"{shown} cannot be reached: {cause}")
 
 
+def unusable(error: psycopg.Error, shown: str) -> UsageError:
+    """One of our errors for a URL that libpq does not take.
+
+    It quotes what it stumbles over, which may be a piece of a password: shown only where the URL
+    as messages may show it has it, too.
+    """
+    cause = _line(error).removeprefix("connection is bad: ")
+    if any(words not in shown for words in re.findall(r'"([^"]*)"', cause)):
+        cause = "libpq knows no such parameters"
+    return UsageError(
+        f"{shown}: {cause}; write NAME=VALUE for each parameter, and % & = in values as %25 %26 %3D"
+    )
+
+
 def denied(shown: str, name: str) -> AccessError:
     """Build the error for an environment that this user may not even read."""
     return AccessError(
         f"{shown}: this user may not read the environment {name!r}; its owner can allow it with "
         "'hapticdb grant URL ROLE --as viewer'"
+    )
+
+
+def no_editor(shown: str) -> ReadOnlyError:
+    """Build the error for a user who may open the environment to write, but not its objects."""
+    return ReadOnlyError(
+        f"{shown}: this user may not change objects; its owner can allow it with "
+        "'hapticdb grant URL ROLE --as editor'"
     )
 
 

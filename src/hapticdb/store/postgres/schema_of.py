@@ -1,18 +1,21 @@
 """The schema of an environment: made, opened, checked, brought up to date, dropped."""
 
 import atexit
+import re
+from pathlib import Path
 from typing import cast
 from urllib.parse import unquote, urlsplit
 
 from psycopg import errors, sql
 
 from hapticdb.errors import (
-    DatabaseError,
+    AccessError,
     EnvironmentExistsError,
     EnvironmentNotFoundError,
     NewerVersionError,
     NotAnEnvironmentError,
     ReadOnlyError,
+    UsageError,
 )
 from hapticdb.grid import CurveName, Grid
 from hapticdb.store.base import LAYOUTS, Layout
@@ -23,39 +26,62 @@ from hapticdb.store.private_server import PrivateServer
 from hapticdb.store.schema import FORMAT_VERSION, MIGRATIONS
 
 DEFAULT_DATABASE = "hapticdb"
-_servers: dict[str, PrivateServer] = {}
+SERVER_IS_OURS = re.compile(r"(?:^|&)(?:host|hostaddr|port|user|service)=")
+_servers: dict[Path, PrivateServer] = {}
 
 
-def connected(url: str, *, read_only: bool = False) -> Session:
-    """Connect to an environment's database, whether the environment is there or not."""
+def connected(url: str, *, read_only: bool = False, making: bool = False) -> Session:
+    """Connect to an environment's database, whether the environment is there or not.
+
+    `making` one sets up a private server and its database where they are missing.
+    """
     address = parse(url)
-    return Session(address, _conninfo(address), read_only=read_only)
+    try:
+        return Session(address, _conninfo(address, making=making), read_only=read_only)
+    except EnvironmentNotFoundError as error:
+        raise error if address.data is None else _not_found(address) from None
 
 
-def _conninfo(address: Address) -> str:
+def _conninfo(address: Address, *, making: bool) -> str:
     """Where libpq is to go: with ``data=`` to a private server, started when it does not run."""
     if address.data is None:
         return address.conninfo
     parts = urlsplit(address.conninfo)
-    if parts.netloc or parts.query:
-        raise DatabaseError(
-            f"{address.shown}: data= starts a server of its own: leave host and options out"
+    if parts.netloc or SERVER_IS_OURS.search(parts.query):
+        raise UsageError(
+            f"{address.shown}: data= starts a server of its own: leave host, port and user out"
         )
-    database = unquote(parts.path.strip("/")) or DEFAULT_DATABASE
-    server = _servers.get(address.data)
+    folder = Path(address.data).expanduser().absolute()
+    if not making and not folder.exists():
+        raise _not_found(address)
+    server = _servers.get(folder)
     if server is None:
-        server = PrivateServer.at(address.data)
-        _servers[address.data] = server
+        server = PrivateServer.at(folder)
+        _servers[folder] = server
         atexit.register(server.release)
     server.start()
-    server.create_database(database)
-    return server.conninfo(database)
+    database = unquote(parts.path.strip("/")) or DEFAULT_DATABASE
+    if making:
+        server.create_database(database)
+    return "&".join(filter(None, (server.conninfo(database), parts.query)))
+
+
+def _not_found(address: Address) -> EnvironmentNotFoundError:
+    return EnvironmentNotFoundError(
+        f"no environment {address.environment!r} at {address.shown}; make one with "
+        "'hapticdb import URL FILE'"
+    )
 
 
 def exists(url: str) -> bool:
     """Whether a schema of that name is there, an environment or not."""
-    with connected(url, read_only=True) as session:
-        return _has_schema(session)
+    try:
+        with connected(url, read_only=True) as session:
+            return _has_schema(session)
+    except EnvironmentNotFoundError:
+        if parse(url).data is None:
+            raise
+        return False
 
 
 def _has_schema(session: Session) -> bool:
@@ -70,31 +96,34 @@ def opened(url: str, *, read_only: bool) -> Session:
     """Connect to an existing environment; migrate it when it is older and may be written."""
     session = connected(url, read_only=read_only)
     try:
-        _check(session)
+        check(session)
+        if not read_only:
+            _check_writable(session)
     except BaseException:
         session.close()
         raise
     return session
 
 
-def _check(session: Session) -> None:
+def check(session: Session) -> None:
+    """Refuse what is no environment of ours or may not be read; migrate an older one."""
     shown, name = session.shown, session.address.environment
     if not _has_schema(session):
-        raise EnvironmentNotFoundError(
-            f"no environment {name!r} at {shown}; make one with 'hapticdb import {shown} FILE'"
-        )
-    if not session.rows(
-        "SELECT 1 FROM pg_class WHERE relnamespace = to_regnamespace(%s) AND relname = %s",
-        (identifier(name).as_string(session.connection), "environment"),
-    ):
+        raise _not_found(session.address)
+    readable = session.rows(
+        "SELECT has_schema_privilege(n.oid, 'USAGE') AND has_table_privilege(c.oid, 'SELECT')"
+        "  FROM pg_class c JOIN pg_namespace n ON n.oid = c.relnamespace"
+        " WHERE n.nspname = %s AND c.relname = 'environment'",
+        (name,),
+    )
+    if not readable:
         raise NotAnEnvironmentError(
             f"schema {name!r} at {shown} is no hapticdb environment; name another one with "
             "?environment=NAME"
         )
-    try:
-        found = session.rows("SELECT format FROM environment")
-    except ReadOnlyError as error:  # reading, too, is a right
-        raise failures.denied(shown, name) from error
+    if readable != [(True,)]:  # without the right, the schema is passed over in silence
+        raise failures.denied(shown, name)
+    found = session.rows("SELECT format FROM environment")
     version = int(found[0][0]) if found else 0
     if not version >= 1:
         raise failures.damaged(shown, f"format {version}")
@@ -104,18 +133,19 @@ def _check(session: Session) -> None:
             "install a newer hapticdb"
         )
     if version < FORMAT_VERSION:
-        if session.is_read_only:
+        if session.is_read_only or not session.is_owner():
             raise ReadOnlyError(
-                f"{shown} has the older format {version}: open it once to write, "
-                "and it is brought up to date"
+                f"{shown} has the older format {version}: its owner has to open it once to "
+                "write, and it is brought up to date"
             )
-        session.write(lambda: _migrate(session, version))
-    if not session.is_read_only:
-        _check_writable(session)
+        session.write(lambda: _migrate_once(session))
 
 
 def _check_writable(session: Session) -> None:
-    """Tell at once, and not after a minute's work, that nothing may be written."""
+    """Tell at once, and not after a minute's work, that nothing may be written.
+
+    A toucher writes cost figures, no more; `Loading` tells at once that objects are not for it.
+    """
     ((may_write, is_standby),) = session.rows(
         "SELECT has_table_privilege('cost', 'INSERT'), pg_is_in_recovery()"
     )
@@ -141,7 +171,7 @@ def read_environment(session: Session) -> tuple[Grid, Layout]:
 
 def created(url: str, grid: Grid, layout: Layout) -> None:
     """Make the schema with all tables and the grid, in one transaction."""
-    with connected(url) as session:
+    with connected(url, making=True) as session:
         name = session.address.environment
 
         def work() -> None:
@@ -152,13 +182,26 @@ def created(url: str, grid: Grid, layout: Layout) -> None:
                     f"{session.shown}: schema {name!r} exists already; open it, or name another "
                     "environment with ?environment=NAME"
                 ) from error
+            except errors.InsufficientPrivilege as error:
+                raise AccessError(
+                    f"{session.shown}: there is no environment {name!r}, and this user may not "
+                    "make one; the database's owner can allow it with "
+                    "'GRANT CREATE ON DATABASE ... TO ...'"
+                ) from error
             _migrate(session, 0)
             session.execute(
                 "INSERT INTO environment VALUES (1, %s, %s, %s, %s, %s, %s, %s, %s, 0)",
                 (FORMAT_VERSION, grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout),
             )
 
-        session.write(work)
+        session.write(work, lambda: _has_schema(session))
+
+
+def _migrate_once(session: Session) -> None:
+    """Migrate from the version that is there once nobody else migrates."""
+    row = session.execute("SELECT format FROM environment FOR UPDATE").fetchone()
+    assert row is not None  # noqa: S101 - it was there before
+    _migrate(session, int(row[0]))
 
 
 def _migrate(session: Session, version: int) -> None:
@@ -172,6 +215,9 @@ def _migrate(session: Session, version: int) -> None:
 
 
 def drop(session: Session) -> None:
-    """Delete an environment that nothing went into."""
+    """Delete an environment, whatever is in it."""
     schema = identifier(session.address.environment)
-    session.write(lambda: session.execute(sql.SQL("DROP SCHEMA {} CASCADE").format(schema)))
+    session.write(
+        lambda: session.execute(sql.SQL("DROP SCHEMA {} CASCADE").format(schema)),
+        lambda: not _has_schema(session),
+    )

@@ -6,11 +6,12 @@ answering ends in an error instead of a hang.
 """
 
 import contextlib
+import re
 import select
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from threading import get_ident
-from typing import Any, Self, TypeVar
+from typing import Any, Self, TypeVar, cast
 
 import psycopg
 from psycopg import pq, sql
@@ -47,6 +48,22 @@ CONNECT_SECONDS = 10
 WRITE_TRIES = 3
 GRACE_MS = 3000
 """What the network and a busy server may add to the server's own time limit."""
+NOBODY = 0
+"""No thread has this number."""
+
+
+class _Connection(psycopg.Connection[tuple[Any, ...]]):
+    """psycopg's connection, which by itself waits for ever, with its session's patience."""
+
+    session: "Session"
+
+    def wait(self, gen: Generator[Any, Any, Result], *args: Any, **options: Any) -> Result:  # noqa: ANN401 - psycopg's own
+        """Let a statement run to its end; the connection is given up when that does not come."""
+        try:
+            return super().wait(self.session.until_out_of_patience(gen), *args, **options)
+        except StuckError:
+            self.close()
+            raise
 
 
 class Session:
@@ -59,6 +76,8 @@ class Session:
         self._conninfo = conninfo
         self._thread = get_ident()
         self._depth = 0
+        self._leisure = 0
+        self.is_loading = False
         self._is_closed = False
         self.connect()
 
@@ -73,23 +92,31 @@ class Session:
     def connect(self) -> None:
         """Connect once, with our settings; what the URL's own `options` set stays."""
         try:
-            self.connection = psycopg.connect(
+            self.connection = _Connection.connect(
                 self._conninfo,
                 autocommit=True,
+                client_encoding="utf8",
                 fallback_application_name="hapticdb",
-                connect_timeout=CONNECT_SECONDS,
+                connect_timeout=None if "connect_timeout=" in self._conninfo else CONNECT_SECONDS,
             )
+        # the engine's own words, in a traceback, too, may hold the password: from None
         except psycopg.OperationalError as error:
-            raise failures.refused(error, self.shown) from error
+            raise failures.refused(error, self.shown) from None
         except psycopg.Error as error:
-            raise UsageError(f"{self.shown}: {' '.join(str(error).split())}") from error
+            raise failures.unusable(error, self.shown) from None
+        self.connection.session = self
         self.connection.prepare_threshold = None
         self._prepared: dict[str, bytes] = {}
         self._pgconn = self.connection.pgconn
+        self._limit_ms: int | None = 1000 * CONNECT_SECONDS
         self._poller = select.poll()
-        with failures.named_errors(self.shown):
-            self._settle()
         self._poller.register(self._pgconn.socket, select.POLLIN | select.POLLERR | select.POLLHUP)
+        try:
+            with failures.named_errors(self.shown):
+                self._settle()
+        except BaseException:  # half settled is worse than none
+            self.connection.close()
+            raise
 
     def _settle(self) -> None:
         wanted = {
@@ -97,8 +124,9 @@ class Session:
             "search_path": f"{_quoted(self.address.environment)}, pg_temp",
             "default_transaction_read_only": "on" if self.is_read_only else "off",
         }
-        options = self.connection.info.options
-        ours = {name: value for name, value in wanted.items() if f"{name}=" not in options}
+        options = self.connection.info.options.lower().replace("-", "_")
+        theirs = re.findall(r"(?:_c\s*|__)(\w+)=", options)
+        ours = {name: value for name, value in wanted.items() if name not in theirs}
         ours["search_path"] = wanted["search_path"]
         known = self.connection.execute(
             "SELECT set_config(s.name, s.value, false)"
@@ -110,7 +138,12 @@ class Session:
             "SELECT setting::int FROM pg_settings WHERE name = 'statement_timeout'"
         ).fetchone()
         assert row is not None  # noqa: S101 - the server has this setting
-        self._patience_ms = row[0] + GRACE_MS if row[0] else None
+        self._limit_ms = row[0] + GRACE_MS if row[0] else None
+
+    @property
+    def _patience_ms(self) -> int | None:
+        """How long to wait for an answer; None while something is allowed to take its time."""
+        return None if self._leisure else self._limit_ms
 
     @property
     def server_version(self) -> int:
@@ -138,8 +171,17 @@ class Session:
             else:
                 return
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called; a lost connection comes back by itself."""
+        return self._is_closed
+
+    def give_to(self, thread: int) -> None:
+        """Belong to another thread from now on, or to NOBODY; only while nobody uses it."""
+        self._thread = thread
+
     def check_thread(self) -> None:
-        """Refuse a call from another thread than the one that opened this."""
+        """Refuse a call from another thread than the one that this belongs to."""
         if get_ident() != self._thread:
             raise UsageError(
                 f"{self.shown} belongs to the thread that opened it: open it here, too"
@@ -239,10 +281,29 @@ class Session:
 
     def _wait(self) -> None:
         if not self._poller.poll(self._patience_ms):
-            raise StuckError(
-                f"{self.shown} did not answer within {self._patience_ms} ms: "
-                "the server, or the way to it, hangs"
-            )
+            raise self._stuck()
+
+    def until_out_of_patience(
+        self, waiting: Generator[Any, Any, Result]
+    ) -> Generator[Any, Any, Result]:
+        """Pass on what one of psycopg's statements waits for, as long as there is time."""
+        started = time.monotonic()
+        try:
+            wanted = next(waiting)
+            while True:
+                ready = yield wanted
+                waited_ms = 1000 * (time.monotonic() - started)
+                if not ready and self._patience_ms is not None and waited_ms > self._patience_ms:
+                    raise self._stuck()
+                wanted = waiting.send(ready)
+        except StopIteration as end:
+            return cast("Result", end.value)
+
+    def _stuck(self) -> StuckError:
+        return StuckError(
+            f"{self.shown} did not answer within {self._patience_ms} ms: "
+            "the server, or the way to it, hangs"
+        )
 
     # -- transactions ------------------------------------------------------------------------
 
@@ -257,8 +318,7 @@ class Session:
         finally:
             self._depth -= 1
             if self._depth == 0 and not self.connection.closed:
-                with failures.named_errors(self.shown):
-                    self.command("COMMIT")
+                self._end_snapshot()
 
     def write(
         self, work: Callable[[], Result], is_committed: Callable[[], bool] | None = None
@@ -267,18 +327,37 @@ class Session:
 
         When the connection is lost before the commit was sent, the whole is done again; when it is
         lost during the commit, `is_committed` looks, on the new connection, whether it counts.
+        Without `is_committed`, work is what may be done twice.
         """
         self.check_thread()
-        for _ in range(WRITE_TRIES - 1):
+        for tries_left in reversed(range(WRITE_TRIES)):
             try:
-                return self._write_once(work, is_committed)
+                result, is_certain = self._write_once(work)
             except ConnectionLostError:
+                if not tries_left:
+                    raise
                 self._reconnect()
-        return self._write_once(work, is_committed)
+            else:
+                if is_certain or (is_committed is not None and self._finds(is_committed)):
+                    return result
+        raise ConnectionLostError(
+            f"{self.shown}: the server went away during each of {WRITE_TRIES} commits; nothing "
+            "was written, so run the same again when it is back"
+        )
 
-    def _write_once(
-        self, work: Callable[[], Result], is_committed: Callable[[], bool] | None
-    ) -> Result:
+    def _finds(self, is_committed: Callable[[], bool]) -> bool:
+        """Whether a write counts whose commit was sent and not answered; never guesses."""
+        try:
+            self._reconnect()
+            return is_committed()
+        except DatabaseError as error:
+            raise ConnectionLostError(
+                f"{self.shown}: the server went away during a commit, and whether that counts is "
+                f"not known yet: look, then decide ({error})"
+            ) from error
+
+    def _write_once(self, work: Callable[[], Result]) -> tuple[Result, bool]:
+        """Result of `work`, and whether the commit was answered."""
         if self._is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
         if self.connection.closed:
@@ -288,6 +367,8 @@ class Session:
             self._depth += 1
             try:
                 self.command("SET LOCAL statement_timeout = 0")
+                if self.is_loading:  # another loader may be making its index
+                    self.command("SET LOCAL lock_timeout = 0")
                 result = work()
             except BaseException:
                 self._roll_back()
@@ -297,14 +378,18 @@ class Session:
             try:
                 self.command("COMMIT")
             except psycopg.Error as error:
-                if is_committed is None or not failures.is_lost(error):
+                if not failures.is_lost(error):
                     raise
-            else:
-                return result
-        self._reconnect()
-        if is_committed():
-            return result
-        raise ConnectionLostError(f"{self.shown}: the server went away; nothing was written")
+                return result, False
+        return result, True
+
+    def _end_snapshot(self) -> None:
+        """Nothing is left to lose: all was read from one revision, though the server be gone."""
+        try:
+            with failures.named_errors(self.shown):
+                self.command("COMMIT")
+        except ConnectionLostError:
+            self.connection.close()
 
     def _roll_back(self) -> None:
         with contextlib.suppress(psycopg.Error):
@@ -314,18 +399,19 @@ class Session:
     @contextlib.contextmanager
     def _unhurried(self) -> Iterator[None]:
         """Wait without limit inside: for what is allowed to take its time."""
-        patience, self._patience_ms = self._patience_ms, None
+        self._leisure += 1
         try:
             yield
         finally:
-            self._patience_ms = patience
+            self._leisure -= 1
 
     @contextlib.contextmanager
     def without_limit(self, *limits: str) -> Iterator[None]:
         """Lift time limits inside, the statement's unless named: for indexes and statistics."""
         names = limits or ("statement_timeout",)
         with failures.named_errors(self.shown), self._unhurried():
-            before = [self._shown_setting(name) for name in names]
+            # the connection may have been lost since it was last used
+            before = self.again(lambda: [self._shown_setting(name) for name in names])
             for name in names:
                 self.command(f"SET {name} = 0")
             try:

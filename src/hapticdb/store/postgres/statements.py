@@ -34,7 +34,32 @@ SELECT {PACKED[layout]}, {SEEN}
     ON z_val BETWEEN range.low AND range.high"""
     for layout in LAYOUTS
 }
-ROWS_OF = {layout: f"{SCAN[layout]} AND id = $3" for layout in LAYOUTS}
+# the planner takes ranges for wide, and would read the whole index by id: range by range instead
+ROWS_OF = {
+    layout: f"""
+SELECT {PACKED[layout]}, {SEEN}
+  FROM unnest($1, $2) AS range(low, high),
+       LATERAL (SELECT *
+                  FROM {layout}
+                 WHERE z_val BETWEEN range.low AND range.high AND id = $3
+                 ORDER BY z_val OFFSET 0) AS found"""
+    for layout in LAYOUTS
+}
+DELETE_ROWS = {
+    layout: f"""
+WITH gone AS (
+  DELETE FROM {layout}
+   WHERE ctid = ANY (ARRAY(
+           SELECT place
+             FROM unnest($1, $2) AS range(low, high),
+                  LATERAL (SELECT ctid AS place
+                             FROM {layout}
+                            WHERE z_val BETWEEN range.low AND range.high AND id = $3
+                           OFFSET 0) AS found))
+  RETURNING z_val)
+SELECT array_agg(z_val) FROM gone"""
+    for layout in LAYOUTS
+}
 COUNT = {
     layout: f"""
 SELECT count(*)

@@ -26,7 +26,7 @@ from hapticdb.store.base import (
     row_shift,
     touched_ranges,
 )
-from hapticdb.store.postgres import schema_of, statements, wire
+from hapticdb.store.postgres import records, schema_of, statements, wire
 from hapticdb.store.postgres.histogram import (
     ENOUGH_ROWS,
     SERVER_RESOLUTION,
@@ -43,37 +43,10 @@ NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
 NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
 COPY_CHUNK = 1 << 17
 
-OBJECTS = (
-    "SELECT id, name, link, digest, transform, voxels, bounds, attributes::text, revision"
-    " FROM object"
-)
-INSERT_OBJECT = """
-INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
-VALUES (CASE WHEN %(id)s > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = %(id)s)
-             THEN %(id)s ELSE nextval(pg_get_serial_sequence('object', 'id')) END,
-        %(name)s, %(link)s, %(digest)s, %(transform)s, %(voxels)s, %(bounds)s, %(attributes)s,
-        %(revision)s)
-RETURNING id"""
-# an id that was brought along is never given again
-KEEP_IDS_NEW = """
-SELECT setval(pg_get_serial_sequence('object', 'id'), %s)
- WHERE %s > (SELECT last_value FROM pg_sequences
-              WHERE schemaname = current_schema() AND sequencename = 'object_id_seq')"""
-UPDATE_OBJECT = """
-UPDATE object SET digest = %(digest)s, transform = %(transform)s, voxels = %(voxels)s,
-       bounds = %(bounds)s, attributes = %(attributes)s, revision = %(revision)s
- WHERE id = %(id)s"""
+# no sequence: it would count what was rolled back, and an import run again end with other ids
+HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
 # the write lock: revisions follow one another, and no reader waits for it
 NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
-DELETE_ROWS = {
-    layout: f"""
-WITH gone AS (
-  DELETE FROM {layout} USING unnest($1, $2) AS range(low, high)
-   WHERE z_val BETWEEN range.low AND range.high AND id = $3
-  RETURNING z_val)
-SELECT array_agg(z_val) FROM gone"""
-    for layout in ("voxel", "brick")
-}
 
 
 class PostgresStore:
@@ -82,6 +55,8 @@ class PostgresStore:
     def __init__(self, session: Session) -> None:
         self._session = session
         self.url = session.shown
+        self.name = session.address.environment
+        self.engine = "PostgreSQL {}.{}".format(*divmod(session.server_version, 10_000))
         self.is_read_only = session.is_read_only
         try:
             self.grid, self.layout = schema_of.read_environment(session)
@@ -90,7 +65,8 @@ class PostgresStore:
             raise
         self._shift = row_shift(self.layout)
         self._seen = -1
-        self._written: tuple[int, str, int] = (0, "", 0)
+        self._written: tuple[int, str, int, str] = (0, "", 0, "")
+        self._highest_id = (0, 0)  # at which revision
         self._loading = Loading(session, self.layout)
         if not self.is_read_only:
             self._loading.mend()
@@ -115,9 +91,18 @@ class PostgresStore:
         """Close the connection."""
         self._session.close()
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._session.is_closed
+
+    def give_to(self, thread: int) -> None:
+        """Belong to another thread from now on, or to none (0); only while nobody uses it."""
+        self._session.give_to(thread)
+
     def discard(self) -> None:
-        """Close and delete an environment that nothing went into."""
-        schema_of.drop(self._session)
+        """Close and delete an environment that nothing went into, unless another writes to it."""
+        self._loading.drop_unused()
         self.close()
 
     def snapshot(self) -> contextlib.AbstractContextManager[None]:
@@ -228,19 +213,21 @@ class PostgresStore:
     def objects(self) -> list[Object]:
         """All objects, ordered by id."""
         self.revision()  # before: what is written in between is then noticed later, not never
-        return [_object(row) for row in self._session.rows(f"{OBJECTS} ORDER BY id")]
+        return [
+            records.object_of(row) for row in self._session.rows(f"{records.OBJECTS} ORDER BY id")
+        ]
 
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""
-        rows = self._session.rows(f"{OBJECTS} WHERE id = %s", (object_id,))
+        rows = self._session.rows(f"{records.OBJECTS} WHERE id = %s", (object_id,))
         if not rows:
             raise ObjectNotFoundError(
                 f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
             )
-        return _object(rows[0])
+        return records.object_of(rows[0])
 
     def loading(self) -> contextlib.AbstractContextManager[None]:
-        """Inside, an empty table has no index, and commits do not wait for the disk."""
+        """Inside, an empty table has no index."""
         return self._loading
 
     def add(self, record: Object, rows: Rows) -> int:
@@ -249,13 +236,12 @@ class PostgresStore:
         def work() -> int:
             revision = self._next_revision()
             try:
-                object_id = self._execute(INSERT_OBJECT, _contents(record, revision))[0][0]
+                new = {"new_id": self._new_id(revision), **records.contents(record, revision)}
+                object_id = self._execute(records.INSERT_OBJECT, new)[0][0]
             except errors.UniqueViolation as error:
                 raise EnvironmentExistsError(
                     f"{record.name} of {record.link} is in {self.url} already; remove it first"
                 ) from error
-            if record.id:
-                self._execute(KEEP_IDS_NEW, (object_id, object_id))
             self._copy(rows, object_id)
             self._log(revision, "add", object_id, rows.keys)
             return int(object_id)
@@ -270,7 +256,7 @@ class PostgresStore:
             known = self.object(record.id)
             check_unwritten(record, known, self.url)
             gone = self._delete(known, covering)
-            self._execute(UPDATE_OBJECT, _contents(record, revision))
+            self._execute(records.UPDATE_OBJECT, records.contents(record, revision))
             self._copy(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
@@ -289,13 +275,18 @@ class PostgresStore:
 
     def _next_revision(self) -> int:
         """Take the write lock, and the number of the revision to come."""
-        revision = int(self._execute(NEXT_REVISION)[0][0])
-        self._loading.check(revision)
-        return revision
+        return int(self._execute(NEXT_REVISION)[0][0])
+
+    def _new_id(self, revision: int) -> int:
+        """One above all that were ever given. The write lock is held: nobody adds meanwhile."""
+        since, highest = self._highest_id
+        found = self._execute(HIGHEST_ID, (since,))
+        self._highest_id = revision - 1, max(highest, int(found[0][0]))
+        return self._highest_id[1] + 1
 
     def _commit(self, work: Callable[[], Result]) -> Result:
         result = self._session.write(work, self._is_written)
-        self._loading.note(self._written[0])
+        self._loading.note()
         return result
 
     def _execute(self, text: str, parameters: Any = ()) -> list[tuple[Any, ...]]:  # noqa: ANN401 - a sequence or a mapping, as psycopg takes them
@@ -319,7 +310,7 @@ class PostgresStore:
         """Delete the rows of an object as it stands now; returns their keys."""
         ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
         (found,) = self._session.fetch(
-            DELETE_ROWS[self.layout],
+            statements.DELETE_ROWS[self.layout],
             wire.int8s(ends[:, 0]),
             wire.int8s(ends[:, 1]),
             wire.int8(known.id),
@@ -329,19 +320,18 @@ class PostgresStore:
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
         """Record which keys a write touched."""
         ranges = touched_ranges(self.grid, self.layout, row_keys)
-        self._execute(
-            "INSERT INTO change VALUES (%s, %s, %s, %s)",
+        ((transaction,),) = self._execute(
+            "INSERT INTO change VALUES (%s, %s, %s, %s) RETURNING xmin::text",
             (revision, action, object_id, ranges.reshape(-1).tolist()),
         )
-        self._written = (revision, action, object_id)
+        self._written = (revision, action, object_id, transaction)
 
     def _is_written(self) -> bool:
         """Whether the write whose commit was under way when the connection was lost counts."""
-        return bool(
-            self._session.rows(
-                "SELECT 1 FROM change WHERE (revision, action, id) = (%s, %s, %s)", self._written
-            )
-        )
+        # the commit may still be under way: wait for its lock, and only then look
+        self._session.rows("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")
+        found = "SELECT 1 FROM change WHERE (revision, action, id, xmin::text) = (%s, %s, %s, %s)"
+        return bool(self._session.rows(found, self._written))
 
     def changes(self, since: int = 0) -> Iterator[Change]:
         """Committed writes after that revision, oldest first."""
@@ -414,18 +404,22 @@ class PostgresStore:
         if not anew and self.freshness(resolution)[:2] == (self.revision(), 0):
             return
         bounds: list[int] | None = None
-        n_rows = self.size().rows
-        if resolution == SERVER_RESOLUTION and n_rows >= ENOUGH_ROWS:
-            with self._session.without_limit():
+        with self.snapshot():
+            revision = self.revision()
+            n_rows = self.size().rows
+            is_computed = resolution != SERVER_RESOLUTION or n_rows < ENOUGH_ROWS
+            if is_computed:
+                keys, n_rows = exact_histogram(self._session, self.layout, resolution)
+                bounds = keys.tolist()
+        if not is_computed:
+            with self._session.without_limit("statement_timeout", "lock_timeout"):
                 self._session.execute("SELECT refresh_statistics()")
-        else:
-            keys, n_rows = exact_histogram(self._session, self.layout, resolution)
-            bounds = keys.tolist()
         self._save(
-            "INSERT INTO quantile SELECT %s, revision, %s, %s FROM environment"
+            "INSERT INTO quantile VALUES (%s, %s, %s, %s)"
             " ON CONFLICT (resolution) DO UPDATE SET revision = EXCLUDED.revision,"
-            " n_rows = EXCLUDED.n_rows, bounds = EXCLUDED.bounds",
-            (resolution, n_rows, bounds),
+            " n_rows = EXCLUDED.n_rows, bounds = EXCLUDED.bounds"
+            " WHERE quantile.revision <= EXCLUDED.revision",
+            (resolution, revision, n_rows, bounds),
         )
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
@@ -463,32 +457,3 @@ def _in_order(rows: Rows) -> Rows:
     if bits.size:
         bits = np.frombuffer(bits.reshape(-1, 64)[order].tobytes(), np.uint8)
     return Rows(rows.keys[order], rows.ids[order], bits)
-
-
-def _object(row: tuple[Any, ...]) -> Object:
-    return Object(
-        id=row[0],
-        name=row[1],
-        link=row[2],
-        digest=row[3],
-        transform=np.array(row[4], dtype=np.float64).reshape(4, 4),
-        voxels=row[5],
-        bounds=np.array(row[6], dtype=np.float64).reshape(2, 3),
-        attributes=json.loads(row[7]),
-        revision=row[8],
-    )
-
-
-def _contents(record: Object, revision: int) -> dict[str, Any]:
-    """Bindings of an object's columns."""
-    return {
-        "id": record.id,
-        "name": record.name,
-        "link": record.link,
-        "digest": record.digest,
-        "transform": np.asarray(record.transform, dtype=np.float64).reshape(-1).tolist(),
-        "voxels": int(record.voxels),
-        "bounds": np.asarray(record.bounds, dtype=np.float64).reshape(-1).tolist(),
-        "attributes": json.dumps(dict(record.attributes), sort_keys=True),
-        "revision": revision,
-    }

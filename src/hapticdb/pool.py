@@ -1,0 +1,192 @@
+"""Environments ready for use by many threads, such as those of a web service."""
+
+import contextlib
+import os
+import time
+from collections.abc import Iterator
+from threading import Condition, get_ident
+from types import TracebackType
+from typing import Protocol, Self, cast
+
+from hapticdb.environment import Environment
+from hapticdb.environment import open as open_environment
+from hapticdb.errors import BusyError, ConnectionLostError, DatabaseError, UsageError
+
+NOBODY = 0
+"""No thread has this number."""
+
+
+class SupportsHandOver(Protocol):
+    """An engine whose opened store may belong to one thread after the other."""
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called."""
+
+    def give_to(self, thread: int) -> None:
+        """Belong to another thread from now on, or to nobody (0); only while nobody uses it."""
+
+
+class Pool:
+    """At most so many opened environments of one database, lent to threads one at a time.
+
+    Opening costs a connection, the statistics and the cost model: here they are paid once a member.
+    Who borrows gets the one that was given back last, with the warmest caches.
+
+    Parameters
+    ----------
+    url : str or path
+        As for `hapticdb.open`.
+    size : int
+        Members at most; opened when first needed, the first at once.
+    read_only : bool
+        Refuse every write.
+    timeout : float
+        Seconds that a borrower waits when all members are out.
+
+    Raises
+    ------
+    UsageError
+        When the size or the timeout cannot be.
+    DatabaseError
+        When the environment cannot be opened.
+
+    Examples
+    --------
+    >>> pool = hapticdb.Pool("postgresql:///plant", size=4)       # doctest: +SKIP
+    >>> with pool.environment() as env:                           # doctest: +SKIP
+    ...     env.touch(shell, pose)
+    """
+
+    def __init__(
+        self,
+        url: str | os.PathLike[str],
+        size: int = 8,
+        *,
+        read_only: bool = True,
+        timeout: float = 30.0,
+    ) -> None:
+        if size < 1:
+            raise UsageError(f"a pool of size {size}: give 1 or more")
+        if not timeout >= 0:
+            raise UsageError(f"timeout {timeout}: give seconds, 0 or more")
+        self._url = url
+        self._size = size
+        self._is_read_only = read_only
+        self._timeout = timeout
+        self._changed = Condition()
+        self._free: list[Environment] = []
+        self._n_members = 1
+        self._is_closed = False
+        first = self._opened()
+        self._shown = first.url
+        self._give(first, NOBODY)
+        self._free.append(first)
+
+    def __repr__(self) -> str:
+        return f"Pool({self._shown!r}, size={self._size})"
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close all members: those that are out as soon as they are given back."""
+        with self._changed:
+            self._is_closed = True
+            left, self._free = self._free, []
+            self._n_members -= len(left)
+            self._changed.notify_all()
+        for env in left:
+            _close(env)
+
+    @contextlib.contextmanager
+    def environment(self, timeout: float | None = None) -> Iterator[Environment]:
+        """Lend an environment to this thread, inside a ``with``; not to be used after it.
+
+        Parameters
+        ----------
+        timeout : float or None
+            Seconds to wait when all are out; the pool's unless given.
+
+        Raises
+        ------
+        BusyError
+            When none was given back in that time.
+        DatabaseError
+            When the pool is closed, or a new member cannot be opened.
+        """
+        env = self._taken(self._timeout if timeout is None else timeout)
+        is_sound = True
+        try:
+            yield env
+        except ConnectionLostError:
+            raise  # it connects anew by itself, and keeps its statistics
+        except DatabaseError:
+            is_sound = False
+            raise
+        finally:
+            self._take_back(env, is_sound=is_sound)
+
+    def _taken(self, timeout: float) -> Environment:
+        """Take a member that is free, or a new one; waits for one of the two."""
+        deadline = time.monotonic() + timeout
+        with self._changed:
+            while not self._is_closed:
+                if self._free:
+                    env = self._free.pop()
+                    self._give(env, get_ident())
+                    return env
+                if self._n_members < self._size:
+                    self._n_members += 1
+                    break
+                if not self._changed.wait(deadline - time.monotonic()):
+                    raise BusyError(
+                        f"all {self._size} environments of the pool of {self._shown} were in use "
+                        f"for {timeout:g} s: give them back sooner, or make the pool larger"
+                    )
+            else:
+                raise DatabaseError(f"the pool of {self._shown} has been closed: make a new one")
+        try:
+            return self._opened()  # outside the lock: others go on meanwhile
+        except BaseException:
+            self._forget_one()
+            raise
+
+    def _take_back(self, env: Environment, *, is_sound: bool) -> None:
+        """Make a member free again; one that is broken or closed is replaced when needed."""
+        with self._changed:
+            if is_sound and not _store_of(env).is_closed and not self._is_closed:
+                self._give(env, NOBODY)  # whoever still holds it is refused
+                self._free.append(env)
+                self._changed.notify()
+                return
+        _close(env)
+        self._forget_one()
+
+    def _forget_one(self) -> None:
+        with self._changed:
+            self._n_members -= 1
+            self._changed.notify()
+
+    def _opened(self) -> Environment:
+        return open_environment(self._url, read_only=self._is_read_only)
+
+    def _give(self, env: Environment, thread: int) -> None:
+        _store_of(env).give_to(thread)
+
+
+def _store_of(env: Environment) -> SupportsHandOver:
+    return cast("SupportsHandOver", env.store)
+
+
+def _close(env: Environment) -> None:
+    _store_of(env).give_to(get_ident())
+    env.close()

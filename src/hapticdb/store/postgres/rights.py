@@ -1,0 +1,106 @@
+"""Who may do what with an environment: rights of roles, kept and enforced by the server itself.
+
+A viewer reads and touches; a toucher also keeps fitted cost figures; an editor also adds, moves and
+removes objects. The grid, the tables and the rights are the owner's, who made the environment.
+"""
+
+from typing import Literal
+
+from psycopg import sql
+
+from hapticdb.errors import AccessError, UsageError
+from hapticdb.store.postgres.session import Session, identifier
+
+Right = Literal["viewer", "toucher", "editor", "nobody"]
+
+WITHDRAWN = (
+    "REVOKE ALL ON SCHEMA {schema} FROM {role}",
+    "REVOKE ALL ON ALL TABLES IN SCHEMA {schema} FROM {role}",  # of their columns, too
+    "REVOKE ALL ON ALL SEQUENCES IN SCHEMA {schema} FROM {role}",
+    "REVOKE ALL ON ALL FUNCTIONS IN SCHEMA {schema} FROM {role}",
+    "REVOKE ALL ON TYPE {schema}.hit FROM {role}",
+)
+VIEWER = (
+    "GRANT USAGE ON SCHEMA {schema} TO {role}",
+    "GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {role}",
+    # everybody's, unless the owner has said otherwise
+    "GRANT USAGE ON TYPE {schema}.hit TO {role}",
+    (
+        "GRANT EXECUTE ON FUNCTION {schema}.add_up(double precision),"
+        " {schema}.wrench_of_hits({schema}.hit[]), {schema}.force({schema}.hit) TO {role}"
+    ),
+)
+TOUCHER = (*VIEWER, "GRANT INSERT, UPDATE ON {schema}.cost TO {role}")
+EDITOR = (
+    *TOUCHER,
+    "GRANT INSERT, UPDATE, DELETE ON {schema}.object, {schema}.voxel, {schema}.brick TO {role}",
+    "GRANT INSERT ON {schema}.change TO {role}",  # what was written stays written
+    "GRANT INSERT, UPDATE ON {schema}.quantile TO {role}",
+    "GRANT UPDATE (revision) ON {schema}.environment TO {role}",
+    # UPDATE: a copy brings ids along, and the sequence has to follow
+    "GRANT USAGE, SELECT, UPDATE ON SEQUENCE {schema}.object_id_seq TO {role}",
+    "GRANT EXECUTE ON FUNCTION {schema}.refresh_statistics() TO {role}",
+)
+GRANTED: dict[Right, tuple[str, ...]] = {
+    "viewer": VIEWER,
+    "toucher": TOUCHER,
+    "editor": EDITOR,
+    "nobody": (),
+}
+# two that change the same rights at once would meet in the server's catalog
+GRANTERS = 0x4841505447524E54
+KNOWN_ROLE = """
+SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')
+  FROM pg_roles AS role, pg_class AS kept
+ WHERE role.rolname = %s AND kept.oid = 'environment'::regclass"""
+
+
+def grant(session: Session, role: str, right: Right) -> None:
+    """Give a role that right on an environment, and no more; one transaction.
+
+    Parameters
+    ----------
+    session : Session
+        Of the environment's owner.
+    role : str
+        Name of a role of the server, a person's or a group's, written as it is.
+    right : {"viewer", "toucher", "editor", "nobody"}
+        Replaces what was granted to that role on this environment before. What the role has
+        through a group that it belongs to stays.
+
+    Raises
+    ------
+    AccessError
+        When the session's user does not own the environment.
+    UsageError
+        When there is no such role, or none that the server would hold back.
+    """
+    if right not in GRANTED:
+        raise UsageError(f"right {right!r}: choose one of {', '.join(GRANTED)}")
+    if not session.is_owner():
+        raise AccessError(
+            f"{session.shown}: only the owner of the environment "
+            f"{session.address.environment!r} may grant rights; connect as the owner"
+        )
+    names = {"schema": identifier(session.address.environment), "role": identifier(role)}
+
+    def work() -> None:
+        session.execute("SELECT pg_advisory_xact_lock(%s)", (GRANTERS,))
+        _check_role(session, role)
+        for statement in (*WITHDRAWN, *GRANTED[right]):
+            session.execute(sql.SQL(statement).format(**names))
+
+    session.write(work)
+
+
+def _check_role(session: Session, role: str) -> None:
+    found = session.execute(KNOWN_ROLE, (role,)).fetchone()
+    if found is None:
+        raise UsageError(
+            f"{session.shown}: no role {role!r} on this server; create it first with 'createuser'"
+        )
+    if found[0]:
+        raise UsageError(
+            f"{session.shown}: {role!r} is the owner, a member of the owner or a superuser, and "
+            "may do everything whatever is granted; give the right to another role"
+        )

@@ -1,0 +1,267 @@
+"""Moving house: environments copied between engines, layouts and curves."""
+
+import os
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticdb.errors import (
+    ConflictError,
+    DamagedError,
+    EnvironmentExistsError,
+    GridError,
+    UsageError,
+)
+from hapticdb.grid import CurveName, Grid
+from hapticdb.grouping import Ranges, box_ranges
+from hapticdb.kernels.voxelize import count_voxels
+from hapticdb.layout import bricks_of_rows, merged, rows_of_bricks
+from hapticdb.statistics import DEFAULT_RESOLUTION, QuantileVector
+from hapticdb.store.base import Layout, Object, Rows, Store
+from hapticdb.store.connect import create_store, exists, open_store
+
+MOST_ROWS = 1 << 19
+"""Rows, of whatever object, that one statement is expected to pass over: far below a second."""
+
+Url = str | os.PathLike[str]
+
+
+class Progress(NamedTuple):
+    """How far a copy or a comparison is: sent after each object.
+
+    voxels : of the objects that were copied or compared until now.
+    """
+
+    objects_done: int
+    objects_total: int
+    voxels: int
+
+
+ProgressCallback = Callable[[Progress], None]
+
+
+@dataclass(frozen=True)
+class CopyReport:
+    """What a copy did.
+
+    Attributes
+    ----------
+    source, target : str
+        The environments, as messages name them: without a password.
+    copied, voxels : int
+        Objects written now, and their voxels.
+    present : int
+        Objects that were there already.
+    renumbered : int
+        Objects written under another id, since their own was taken.
+    """
+
+    source: str
+    target: str
+    copied: int
+    voxels: int
+    present: int
+    renumbered: int
+
+
+def copy_environment(
+    source_url: Url,
+    target_url: Url,
+    *,
+    layout: Layout | None = None,
+    curve: CurveName | None = None,
+    progress: ProgressCallback | None = None,
+) -> CopyReport:
+    """Copy an environment's objects into another, which is made when it does not exist.
+
+    Each object goes over whole, in one transaction, with its id where that is free. What is there
+    already is left alone, so that an interrupted copy goes on when it is started again. Everything
+    is read at one revision of the source: edits made meanwhile are not copied. Memory is in
+    proportion to the largest object.
+
+    Parameters
+    ----------
+    source_url, target_url : str or path
+        The environments; engines, layouts and curves may differ.
+    layout : {"voxel", "brick"} or None
+        Of a new target, the source's unless given; must agree with an existing one.
+    curve : curve name or None
+        Likewise.
+    progress : callable or None
+        Called after each object that was written.
+
+    Raises
+    ------
+    UsageError, GridError
+        When both are one, when bricks are asked for in lexicographic order, or when the target
+        exists with another grid, layout or curve.
+    ConflictError
+        When the target holds a part of the source with another geometry or in another place; then
+        nothing is written.
+    DamagedError
+        When an object of the source has not the voxels that it should.
+    """
+    with closing(open_store(source_url, read_only=True)) as source:
+        target, is_new = _target(target_url, source, layout, curve)
+        is_copied = False
+        try:
+            report = _copy_objects(source, target, progress)
+            is_copied = True
+            if target.revision():
+                target.analyze(DEFAULT_RESOLUTION)
+        finally:
+            if is_new and not is_copied and not target.revision():
+                target.discard()
+            else:
+                target.close()
+    return report
+
+
+def _target(
+    url: Url, source: Store, layout: Layout | None, curve: CurveName | None
+) -> tuple[Store, bool]:
+    """Open the target, or make it; and whether it was made."""
+    if not exists(url):
+        grid = source.grid if curve is None else replace(source.grid, curve=curve)
+        with suppress(EnvironmentExistsError):  # another process may be faster
+            return create_store(url, grid, layout or source.layout), True
+    store = open_store(url)
+    with ExitStack() as on_error:
+        on_error.callback(store.close)
+        if _is_same_place(source, store):
+            raise UsageError(f"{source.url} and {store.url} are one: copy to another place")
+        if not is_same_grid(source.grid, store.grid):
+            raise GridError(
+                f"{store.url} has another grid ({store.grid.describe()}) than {source.url} "
+                f"({source.grid.describe()}): copy into a new environment"
+            )
+        there = (("layout", layout, store.layout), ("curve", curve, store.grid.curve))
+        for word, wanted, found in there:
+            if wanted not in {None, found}:
+                raise UsageError(
+                    f"{store.url} has the {word} {found}, not {wanted}; leave --{word} out, or "
+                    "copy into a new environment"
+                )
+        on_error.pop_all()
+    return store, False
+
+
+def _is_same_place(a: Store, b: Store) -> bool:
+    """Whether two URLs lead to one environment, also through links of the file system."""
+    with suppress(OSError, ValueError):
+        return Path(a.url).samefile(b.url)
+    return a.url == b.url
+
+
+def is_same_grid(a: Grid, b: Grid) -> bool:
+    """Whether a voxel of one is the same voxel of the other."""
+    return (a.voxel_size, a.origin, a.bits) == (b.voxel_size, b.origin, b.bits)
+
+
+def is_same_kind(a: Store, b: Store) -> bool:
+    """Whether rows of one are rows of the other."""
+    return (a.layout, a.grid.curve) == (b.layout, b.grid.curve)
+
+
+def _copy_objects(source: Store, target: Store, progress: ProgressCallback | None) -> CopyReport:
+    copied = voxels = renumbered = 0
+    # left after the source's snapshot: an engine cannot tidy up behind the back of a reader
+    with ExitStack() as loading, source.snapshot():
+        objects = source.objects()
+        missing = _missing(objects, source, target)
+        quantiles = QuantileVector.of(source)
+        if missing:
+            loading.enter_context(target.loading())
+        for done, obj in enumerate(missing, start=len(objects) - len(missing) + 1):
+            rows = _rows_for(target, source, obj, quantiles)
+            try:
+                renumbered += target.add(obj, rows) != obj.id
+            except EnvironmentExistsError:
+                if _missing([obj], source, target):
+                    raise
+                continue  # another process copies the same
+            copied += 1
+            voxels += obj.voxels
+            if progress is not None:
+                progress(Progress(done, len(objects), voxels))
+    present = len(objects) - copied
+    return CopyReport(source.url, target.url, copied, voxels, present, renumbered)
+
+
+def _missing(objects: Iterable[Object], source: Store, target: Store) -> list[Object]:
+    """Objects that the target has not; refuses those that it has otherwise."""
+    known = {part_of(obj): obj for obj in target.objects()}
+    taken = {obj.id for obj in known.values()}
+    missing = []
+    for obj in objects:
+        there = known.get(part_of(obj))
+        if there is None:
+            missing.append(obj)
+            continue
+        if obj.digest != there.digest:
+            word = "with another geometry"
+        elif not np.array_equal(obj.transform, there.transform):
+            word = "in another place"
+        elif obj.voxels != there.voxels:
+            word = f"with {there.voxels} voxels instead of {obj.voxels}"
+        else:
+            continue
+        raise ConflictError(
+            f"object {obj.id} ({obj.name}) of {source.url} is in {target.url} {word}: remove "
+            f"object {there.id} there, or copy into a new environment"
+        )
+    # those that will get another id come last, or they would get one that is still to come
+    return sorted(missing, key=lambda obj: (obj.id in taken, obj.id))
+
+
+def part_of(obj: Object) -> tuple[str, str]:
+    """What makes an object the same part in another environment."""
+    return obj.link, obj.name
+
+
+def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVector) -> Rows:
+    """All rows of an object of the source, as the target has them."""
+    low, high = source.grid.voxels_of(obj.bounds)
+    ranges = box_ranges(source.grid, source.layout, low - 1, high + 1)
+    batches = _batches(source, obj, ranges, quantiles)
+    if is_same_kind(source, target):
+        rows = Rows(*(np.concatenate(column) for column in zip(*batches, strict=True)))
+        n_voxels = len(rows) if source.layout == "voxel" else count_voxels(rows.occupancy)
+    else:
+        parts = [bricks_of_rows(batch, source.grid, source.layout) for batch in batches]
+        rows, n_voxels = rows_of_bricks(merged(parts), target.grid, target.layout)
+    if n_voxels != obj.voxels:
+        raise DamagedError(
+            f"{source.url} is damaged (object {obj.id}, {obj.name}, has {n_voxels} voxels instead "
+            f"of {obj.voxels}): remove that object and import its file again, or restore a copy"
+        )
+    return rows
+
+
+def are_few_rows(ranges: Ranges, quantiles: QuantileVector) -> bool:
+    """Whether one statement may pass over these ranges."""
+    pairs = zip(*(bounds.tolist() for bounds in ranges), strict=True)
+    return sum(quantiles.rows_between(low, high) for low, high in pairs) <= MOST_ROWS
+
+
+def _batches(
+    store: Store, obj: Object, ranges: Ranges, quantiles: QuantileVector
+) -> Iterator[Rows]:
+    """Rows of an object, ascending by key, a statement each."""
+    lows, highs = ranges
+    is_one_key = len(lows) == 1 and lows[0] == highs[0]
+    if is_one_key or are_few_rows(ranges, quantiles):
+        yield store.rows_of(obj.id, lows, highs)
+        return
+    half = len(lows) // 2
+    if half:
+        halves = (lows[:half], highs[:half]), (lows[half:], highs[half:])
+    else:
+        middle = (lows + highs) // 2
+        halves = (lows, middle), (middle + 1, highs)
+    for part in halves:
+        yield from _batches(store, obj, Ranges(*part), quantiles)

@@ -1,0 +1,134 @@
+"""What differs between two environments is told, and nothing else."""
+
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from assemblies import placement, voxel_set
+from hapticdb import Environment, Grid, diff_environments, transfer
+from hapticdb.grid import CurveName
+from hapticdb.layout import rows_of_voxels
+from hapticdb.store.base import Layout
+from hapticdb.testing import KINDS, blob, voxel_object
+
+Kind = tuple[Layout, CurveName]
+PLACE = (12, 12, 12)
+
+
+def make(path: Path, kind: Kind = ("brick", "z"), bits: int = 5) -> Environment:
+    layout, curve = kind
+    return hapticdb.create(path, Grid(0.01, (-0.1, 0.2, -0.3), bits, curve), layout=layout)
+
+
+def write(env: Environment, ijk: NDArray[np.int64], name: str, **fields: object) -> int:
+    """An object that claims the same geometry, whatever its voxels are."""
+    record = replace(voxel_object(env.grid, ijk, name), digest="same")
+    rows = rows_of_voxels(ijk, env.grid, env.layout)
+    return env.store.add(replace(record, **fields), rows)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("most_rows", [1, 1 << 19])
+@pytest.mark.parametrize(("kind", "other"), [(a, b) for a in KINDS for b in KINDS], ids=str)
+def test_every_voxel_that_differs_is_counted(
+    monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, most_rows: int
+) -> None:
+    """Against plain sets; in one batch and in many, beside an object that shares voxels."""
+    monkeypatch.setattr(transfer, "MOST_ROWS", most_rows)
+
+    @settings(max_examples=3, deadline=None)
+    @given(bits=st.integers(1, 7), seed=st.integers(0, 2**32 - 1), share=st.floats(0, 1))
+    def counted(bits: int, seed: int, share: float) -> None:
+        rng = np.random.default_rng(seed)
+        every = np.unique(rng.integers(0, 1 << bits, (80, 3)), axis=0)
+        chosen = [every[:1], every[:1]]
+        for n in range(2):
+            chosen[n] = np.concatenate([every[:1], every[1:][rng.random(len(every) - 1) < share]])
+        with TemporaryDirectory() as folder:
+            urls = Path(folder) / "a.db", Path(folder) / "b.db"
+            for url, ijk, of_kind in zip(urls, chosen, (kind, other), strict=True):
+                with make(url, of_kind, bits) as env:
+                    write(env, every, "beside")
+                    write(env, ijk, "one")
+            found = diff_environments(*urls)
+        in_a, in_b = map(voxel_set, chosen)
+        assert found.is_equal == (in_a == in_b)
+        assert [(v.a.id, v.only_in_a, v.only_in_b) for v in found.voxels] == (
+            [] if in_a == in_b else [(2, len(in_a - in_b), len(in_b - in_a))]
+        )
+        assert found.compared == 2
+
+    counted()
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_a_large_object_is_compared_in_batches(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Kind
+) -> None:
+    """One voxel of 70,000 differs, and no statement brings many of them."""
+    span = np.arange(20, 220)
+    sheet = np.stack(np.meshgrid(span, span, [99, 100], indexing="ij"), axis=-1).reshape(-1, 3)
+    for name, ijk in (("a", sheet), ("b", np.delete(sheet, 33_333, axis=0))):
+        with make(tmp_path / f"{name}.db", kind, bits=8) as env:
+            write(env, ijk, "sheet")
+    monkeypatch.setattr(transfer, "MOST_ROWS", 4000)
+    brought: list[int] = []
+    store = type(hapticdb.open(tmp_path / "a.db").store)
+    rows_of_object = store.rows_of
+
+    def counting(*asked: object) -> object:
+        rows = rows_of_object(*asked)  # type: ignore[arg-type]
+        brought.append(len(rows))
+        return rows
+
+    monkeypatch.setattr(store, "rows_of", counting)
+    found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
+    assert [(v.only_in_a, v.only_in_b) for v in found.voxels] == [(1, 0)]
+    assert max(brought) <= 1.25 * 4000  # what a histogram expects is not what is there
+    assert kind[0] == "brick" or len(brought) >= 2 * len(sheet) // 4000
+
+
+def test_parts_are_told_apart_by_what_differs(tmp_path: Path) -> None:
+    ijk = blob(1, PLACE)
+    with make(tmp_path / "a.db") as env:
+        for name in ("same", "gone", "changed", "moved", "described", "renumbered"):
+            write(env, ijk, name)
+    with make(tmp_path / "b.db", ("voxel", "hilbert")) as env:
+        write(env, ijk, "same", id=1)
+        write(env, ijk, "changed", id=3, digest="other", transform=placement(1, 0, 0))
+        write(env, ijk, "moved", id=4, transform=placement(1, 0, 0))
+        write(env, ijk, "described", id=5, attributes={"paint": "green"})
+        write(env, ijk, "renumbered", id=60)
+        write(env, ijk, "new", id=61)
+        write(env, ijk, "same", id=62, link="of another file")
+    found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
+    assert [obj.name for obj in found.only_in_a] == ["gone"]
+    assert [obj.name for obj in found.only_in_b] == ["new", "same"]
+    for word in ("changed", "moved", "described", "renumbered"):
+        assert [pair[0].name for pair in getattr(found, word)] == [word]
+    assert (found.voxels, found.compared) == ((), 3)
+    assert not found.is_equal
+    assert found.n_voxels == 3 * len(ijk)
+
+
+def test_ids_and_attributes_are_felt_by_nobody(tmp_path: Path) -> None:
+    """They are told, and the environments are equal."""
+    ijk = blob(1, PLACE)
+    for n, name in enumerate(("a", "b"), start=1):
+        with make(tmp_path / f"{name}.db") as env:
+            write(env, ijk, "part", id=n, attributes={"n": n})
+    found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
+    assert found.is_equal
+    assert len(found.renumbered) == len(found.described) == 1
+
+
+def test_an_environment_equals_itself(tmp_path: Path) -> None:
+    with make(tmp_path / "a.db") as env:
+        write(env, blob(1, PLACE), "part")
+    assert diff_environments(tmp_path / "a.db", tmp_path / "a.db").is_equal

@@ -1,0 +1,430 @@
+"""Moving house: a copy holds the same whatever its layout and curve, and goes on when cut off."""
+
+import signal
+import subprocess
+import sys
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import apsw
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from assemblies import index_rows, left_behind, placement, rows_of, voxel_set
+from hapticdb import Environment, Grid, PointShell, copy_environment, diff_environments, transfer
+from hapticdb.grid import CurveName
+from hapticdb.layout import rows_of_voxels
+from hapticdb.statistics import DEFAULT_RESOLUTION
+from hapticdb.store.base import Layout
+from hapticdb.store.sqlite import SQLiteStore
+from hapticdb.testing import KINDS, blob, voxel_object, write_voxels
+from hapticdb.transfer import CopyReport, Progress
+
+Kind = tuple[Layout, CurveName]
+PAIRS = [(a, b) for a in KINDS for b in KINDS]
+PLACES = ((10, 10, 10), (13, 10, 10), (11, 14, 9), (22, 22, 22))
+
+
+def make(path: Path, kind: Kind = ("brick", "z"), bits: int = 5) -> Environment:
+    layout, curve = kind
+    return hapticdb.create(path, Grid(0.01, (-0.1, 0.2, -0.3), bits, curve), layout=layout)
+
+
+def make_blobs(path: Path, kind: Kind = ("brick", "z")) -> Path:
+    """Four objects of ids 2, 3, 5 and 9, three of which share voxels."""
+    with make(path, kind) as env:
+        for n, object_id in enumerate((2, 3, 5, 9)):
+            add(env, blob(n, PLACES[n]), f"blob {n}", id=object_id)
+    return path
+
+
+def add(env: Environment, ijk: NDArray[np.int64], name: str, **fields: Any) -> int:  # noqa: ANN401
+    record = replace(voxel_object(env.grid, ijk, name), **fields)
+    return env.store.add(record, rows_of_voxels(ijk, env.grid, env.layout))
+
+
+def change(path: Path, *statements: str) -> None:
+    """Write past the library."""
+    with closing(apsw.Connection(str(path))) as connection:
+        for sql in statements:
+            connection.execute(sql)
+
+
+@st.composite
+def scattered(draw: st.DrawFn, bits: int) -> NDArray[np.int64]:
+    """Distinct voxels, at least one."""
+    coordinate = st.integers(0, 2**bits - 1)
+    found = draw(st.sets(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=60))
+    return np.array(sorted(found), dtype=np.int64)
+
+
+# --- what a copy holds --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("most_rows", [1, 1 << 19])
+@pytest.mark.parametrize(("kind", "other"), PAIRS, ids=str)
+def test_voxels_come_back_from_every_layout_and_curve(
+    monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, most_rows: int
+) -> None:
+    """There and back again, in one batch and in many, down to grids smaller than a brick."""
+    monkeypatch.setattr(transfer, "MOST_ROWS", most_rows)
+
+    @settings(max_examples=3, deadline=None)
+    @given(drawn=st.integers(1, 7).flatmap(lambda b: st.tuples(st.just(b), scattered(b))))
+    def there_and_back(drawn: tuple[int, NDArray[np.int64]]) -> None:
+        bits, ijk = drawn
+        with TemporaryDirectory() as folder:
+            here, there, back = (Path(folder) / f"{n}.db" for n in range(3))
+            with make(here, kind, bits) as env:
+                write_voxels(env.store, ijk, "one")
+                write_voxels(env.store, ijk[::2], "two")
+            copy_environment(here, there, layout=other[0], curve=other[1])
+            copy_environment(there, back, layout=kind[0], curve=kind[1])
+            with hapticdb.open(there, read_only=True) as env:
+                assert (env.layout, env.grid.curve) == other
+                assert voxel_set(env.voxels(1)) == voxel_set(ijk)
+                assert voxel_set(env.voxels(2)) == voxel_set(ijk[::2])
+            tables = ("object", kind[0])
+            assert rows_of(back, *tables) == rows_of(here, *tables)
+
+    there_and_back()
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_rows_of_the_same_kind_go_over_as_they_are(tmp_path: Path, kind: Kind) -> None:
+    source = make_blobs(tmp_path / "a.db", kind)
+    copy_environment(source, tmp_path / "b.db")
+    with hapticdb.open(source) as a, hapticdb.open(tmp_path / "b.db") as b:
+        assert index_rows(a) == index_rows(b)
+        assert (a.grid, a.layout) == (b.grid, b.layout)
+
+
+def test_an_object_keeps_everything_but_its_revision(tmp_path: Path) -> None:
+    source = tmp_path / "a.db"
+    with make(source) as env:
+        ijk = blob(1, PLACES[0])
+        placed = placement(0.1, 1 / 3, -2e-9, 0.3)
+        attributes = {"unit": "mm", "paint": {"colour": "grün"}}
+        add(env, ijk, "ä/b", id=7, transform=placed, attributes=attributes, link="/over/there.obj")
+    report = copy_environment(source, tmp_path / "b.db", layout="voxel", curve="lexicographic")
+    assert report == CopyReport(str(source), str(tmp_path / "b.db"), 1, len(ijk), 0, 0)
+    with hapticdb.open(source) as a, hapticdb.open(tmp_path / "b.db") as b:
+        (left,), (right,) = a.objects(), b.objects()
+    for name, value in vars(left).items():
+        np.testing.assert_array_equal(getattr(right, name), value)
+    assert right.id == 7
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_a_copy_feels_the_same_bit_for_bit(tmp_path: Path, kind: Kind, sphere: PointShell) -> None:
+    source = make_blobs(tmp_path / "a.db")
+    copy_environment(source, tmp_path / "b.db", layout=kind[0], curve=kind[1])
+    with hapticdb.open(source) as a, hapticdb.open(tmp_path / "b.db") as b:
+        pose = np.eye(4)
+        pose[:3, 3] = a.grid.centers([PLACES[1]])[0] + (0, 0, 0.06)
+        felt, felt_too = a.touch(sphere, pose), b.touch(sphere, pose)
+        assert len(felt.contacts)
+        assert felt.force.tobytes() == felt_too.force.tobytes()
+        assert felt.torque.tobytes() == felt_too.torque.tobytes()
+        assert [o.id for o in felt.objects] == [o.id for o in felt_too.objects]
+
+
+def test_statistics_are_kept_with_a_copy(tmp_path: Path) -> None:
+    copy_environment(make_blobs(tmp_path / "a.db"), tmp_path / "b.db")
+    with hapticdb.open(tmp_path / "b.db", read_only=True) as env:
+        assert env.store.quantiles(DEFAULT_RESOLUTION).source == "kept"
+
+
+def test_a_copy_of_an_empty_environment_is_one(tmp_path: Path) -> None:
+    make(tmp_path / "a.db", ("voxel", "hilbert")).close()
+    copy_environment(tmp_path / "a.db", tmp_path / "b.db")
+    assert diff_environments(tmp_path / "a.db", tmp_path / "b.db").is_equal
+
+
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_no_statement_brings_more_than_a_batch(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Kind
+) -> None:
+    """However large an object is."""
+    source = make_blobs(tmp_path / "a.db", kind)
+    monkeypatch.setattr(transfer, "MOST_ROWS", 8)
+    brought: list[int] = []
+    rows_of_object = SQLiteStore.rows_of
+
+    def counting(store: SQLiteStore, *asked: Any) -> Any:  # noqa: ANN401
+        rows = rows_of_object(store, *asked)
+        brought.append(len(rows))
+        return rows
+
+    monkeypatch.setattr(SQLiteStore, "rows_of", counting)
+    copy_environment(source, tmp_path / "b.db")
+    assert max(brought) <= 8
+    assert len(brought) > 12
+    assert diff_environments(source, tmp_path / "b.db").is_equal
+
+
+# --- what is there already ----------------------------------------------------------------------
+
+
+def test_a_second_copy_writes_nothing(tmp_path: Path) -> None:
+    source = make_blobs(tmp_path / "a.db")
+    copy_environment(source, tmp_path / "b.db")
+    before = rows_of(tmp_path / "b.db")
+    report = copy_environment(source, tmp_path / "b.db")
+    assert (report.copied, report.present, report.voxels) == (0, 4, 0)
+    assert rows_of(tmp_path / "b.db") == before
+
+
+def test_an_id_that_is_taken_is_exchanged(tmp_path: Path) -> None:
+    source = make_blobs(tmp_path / "a.db")
+    with make(tmp_path / "b.db", ("voxel", "hilbert")) as env:
+        for n in range(3):
+            write_voxels(env.store, blob(9, PLACES[0]), f"other {n}")
+    report = copy_environment(source, tmp_path / "b.db")
+    assert (report.copied, report.renumbered) == (4, 2)
+    with hapticdb.open(tmp_path / "b.db") as env:
+        ids = {obj.name: obj.id for obj in env.objects()}
+        assert (ids["blob 2"], ids["blob 3"], ids["other 1"], ids["other 2"]) == (5, 9, 2, 3)
+        assert voxel_set(env.voxels(ids["blob 0"])) == voxel_set(blob(0, PLACES[0]))
+    found = diff_environments(source, tmp_path / "b.db")
+    assert [obj.name for obj in found.only_in_b] == ["other 0", "other 1", "other 2"]
+    assert [pair[0].id for pair in found.renumbered] == [2, 3]
+    assert (found.compared, found.voxels) == (4, ())
+
+
+@pytest.mark.parametrize(
+    ("sql", "word"),
+    [
+        ("UPDATE object SET digest = 'else' WHERE id = 5", "with another geometry"),
+        ("UPDATE object SET transform = zeroblob(128) WHERE id = 5", "in another place"),
+        ("UPDATE object SET voxels = 7 WHERE id = 5", "with 7 voxels instead of"),
+    ],
+)
+def test_the_same_part_otherwise_is_a_conflict_before_anything_is_written(
+    tmp_path: Path, sql: str, word: str
+) -> None:
+    source = make_blobs(tmp_path / "a.db")
+    copy_environment(source, tmp_path / "b.db")
+    change(
+        tmp_path / "b.db", sql, "DELETE FROM brick WHERE id = 2", "DELETE FROM object WHERE id=2"
+    )
+    before = rows_of(tmp_path / "b.db")
+    with pytest.raises(hapticdb.ConflictError, match=rf"object 5 \(blob 2\) of .* {word}"):
+        copy_environment(source, tmp_path / "b.db")
+    assert rows_of(tmp_path / "b.db") == before
+
+
+# --- what cannot be -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("spelling", ["{0}", "sqlite:///{0}", "{1}/x/../a.db", "{1}/link.db"])
+def test_an_environment_is_not_copied_onto_itself(tmp_path: Path, spelling: str) -> None:
+    source = make_blobs(tmp_path / "a.db")
+    (tmp_path / "x").mkdir()
+    (tmp_path / "link.db").symlink_to(source)
+    before = rows_of(source)
+    with pytest.raises(hapticdb.UsageError, match="are one"):
+        copy_environment(source, spelling.format(source, tmp_path))
+    assert rows_of(source) == before
+
+
+@pytest.mark.parametrize(
+    ("grid", "word"),
+    [
+        (Grid(0.01, (-0.1, 0.2, -0.3), 6), "another grid"),
+        (Grid(0.010001, (-0.1, 0.2, -0.3), 5), "another grid"),
+        (Grid(0.01, (-0.1, 0.2, 0.3), 5), "another grid"),
+    ],
+)
+def test_a_target_of_another_grid_is_refused(tmp_path: Path, grid: Grid, word: str) -> None:
+    source = make_blobs(tmp_path / "a.db")
+    hapticdb.create(tmp_path / "b.db", grid).close()
+    with pytest.raises(hapticdb.GridError, match=word):
+        copy_environment(source, tmp_path / "b.db")
+    found = diff_environments(source, tmp_path / "b.db")
+    assert not found.is_same_grid
+    assert not found.is_equal
+
+
+@pytest.mark.parametrize(
+    ("asked", "word"),
+    [({"layout": "voxel"}, "has the layout brick"), ({"curve": "hilbert"}, "has the curve z")],
+)
+def test_a_target_of_another_kind_than_asked_is_refused(
+    tmp_path: Path, asked: dict[str, Any], word: str
+) -> None:
+    source = make_blobs(tmp_path / "a.db", ("voxel", "hilbert"))
+    make(tmp_path / "b.db").close()
+    with pytest.raises(hapticdb.UsageError, match=word):
+        copy_environment(source, tmp_path / "b.db", **asked)
+    assert copy_environment(source, tmp_path / "b.db").copied == 4
+
+
+@pytest.mark.parametrize(
+    ("kind", "asked", "word"),
+    [
+        (("brick", "z"), {"curve": "lexicographic"}, "hierarchical"),
+        (("voxel", "lexicographic"), {"layout": "brick"}, "hierarchical"),
+        (("brick", "z"), {"curve": "peano"}, "peano"),
+        (("brick", "z"), {"layout": "heap"}, "heap"),
+    ],
+)
+def test_what_cannot_be_made_is_refused_before_anything_is_made(
+    tmp_path: Path, kind: Kind, asked: dict[str, Any], word: str
+) -> None:
+    source = make_blobs(tmp_path / "a.db", kind)
+    before = left_behind(tmp_path)
+    with pytest.raises(hapticdb.UsageError, match=word):
+        copy_environment(source, tmp_path / "b.db", **asked)
+    assert set(left_behind(tmp_path)) - {"a.db-wal", "a.db-shm"} == set(before)
+
+
+@pytest.mark.parametrize("other", KINDS, ids=str)
+def test_a_damaged_object_is_told_and_an_empty_target_discarded(
+    tmp_path: Path, other: Kind
+) -> None:
+    source = make_blobs(tmp_path / "a.db", ("voxel", "z"))
+    change(source, "DELETE FROM voxel WHERE z_val = (SELECT min(z_val) FROM voxel WHERE id = 2)")
+    with pytest.raises(hapticdb.DamagedError, match=r"object 2, blob 0, has \d+ voxels instead"):
+        copy_environment(source, tmp_path / "b.db", layout=other[0], curve=other[1])
+    assert not (tmp_path / "b.db").exists()
+
+
+def test_a_source_that_is_not_there_makes_no_target(tmp_path: Path) -> None:
+    with pytest.raises(hapticdb.EnvironmentNotFoundError):
+        copy_environment(tmp_path / "a.db", tmp_path / "b.db")
+    assert left_behind(tmp_path) == []
+
+
+# --- while others work --------------------------------------------------------------------------
+
+
+def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
+    """The copy is of the revision at which it began; started again, it tells of the conflict."""
+    source = make_blobs(tmp_path / "a.db")
+    copy_environment(source, tmp_path / "before.db")
+
+    def edit(progress: Progress) -> None:
+        if progress.objects_done == 1:
+            with hapticdb.open(source) as env:
+                env.remove(9)
+                moved = blob(2, (20, 20, 20))
+                turned = replace(
+                    voxel_object(env.grid, moved, "blob 2"), id=5, transform=placement(1, 0, 0)
+                )
+                rows = rows_of_voxels(moved, env.grid, env.layout)
+                env.store.replace(turned, rows, env._covering)
+
+    report = copy_environment(source, tmp_path / "b.db", curve="hilbert", progress=edit)
+    assert report.copied == 4
+    assert diff_environments(tmp_path / "before.db", tmp_path / "b.db").is_equal
+    found = diff_environments(source, tmp_path / "b.db")
+    assert [obj.id for obj in found.only_in_b] == [9]
+    assert [pair[0].id for pair in found.moved] == [5]
+    with pytest.raises(hapticdb.ConflictError, match="object 5"):
+        copy_environment(source, tmp_path / "b.db")
+
+
+def test_two_copies_at_once_make_one(tmp_path: Path) -> None:
+    """The slower one finds what the faster one has written."""
+    source = make_blobs(tmp_path / "a.db")
+
+    def overtake(progress: Progress) -> None:
+        if progress.objects_done == 1:
+            assert copy_environment(source, tmp_path / "b.db").copied == 3
+
+    report = copy_environment(source, tmp_path / "b.db", progress=overtake)
+    assert (report.copied, report.present) == (1, 3)
+    assert diff_environments(source, tmp_path / "b.db").is_equal
+
+
+def test_progress_counts_objects_and_voxels(tmp_path: Path) -> None:
+    source = make_blobs(tmp_path / "a.db")
+    with hapticdb.open(source) as env:
+        voxels = np.cumsum([obj.voxels for obj in env.objects()]).tolist()
+    expected = [Progress(n + 1, 4, voxels[n]) for n in range(4)]
+    seen: list[Progress] = []
+    copy_environment(source, tmp_path / "b.db", progress=seen.append)
+    assert seen == expected
+    seen.clear()
+    diff_environments(source, tmp_path / "b.db", progress=seen.append)
+    assert seen == expected
+
+
+# --- interrupted --------------------------------------------------------------------------------
+
+COPY = """
+import sys
+import hapticdb
+
+source, target, layout = sys.argv[1:]
+print(0, flush=True)
+hapticdb.copy_environment(
+    source, target, layout=layout, progress=lambda now: print(now.objects_done, flush=True)
+)
+"""
+N_OBJECTS = 40
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment of forty objects, each of some thousand voxels."""
+    path = tmp_path_factory.mktemp("many") / "a.db"
+    rng = np.random.default_rng(5)
+    with make(path, bits=8) as env:
+        for n in range(N_OBJECTS):
+            write_voxels(env.store, blob(n, tuple(rng.integers(30, 220, 3)), 16), f"blob {n}")
+    return path
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=str)
+@pytest.mark.parametrize(("n_objects", "layout"), [(1, "voxel"), (17, "brick"), (33, "voxel")])
+def test_an_interrupted_copy_started_again_ends_as_an_undisturbed_one(
+    many: Path, tmp_path: Path, how: signal.Signals, n_objects: int, layout: Layout
+) -> None:
+    target = tmp_path / "b.db"
+    child = subprocess.Popen(
+        [sys.executable, "-c", COPY, str(many), str(target), layout],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    with child:
+        assert child.stdout is not None
+        assert any(int(line) >= n_objects for line in child.stdout)
+        child.send_signal(how)
+    assert child.returncode == -how
+    with hapticdb.open(target, read_only=True) as env:
+        left = env.objects()
+        assert all(len(env.voxels(obj.id)) == obj.voxels for obj in left)
+    assert [obj.id for obj in left] == list(range(1, len(left) + 1))
+    assert len(left) >= n_objects
+    report = copy_environment(many, target, layout=layout)
+    assert (report.present, report.copied) == (len(left), N_OBJECTS - len(left))
+    found = diff_environments(many, target)
+    assert found.is_equal
+    assert (found.compared, found.renumbered) == (N_OBJECTS, ())
+    copy_environment(many, tmp_path / "whole.db", layout=layout)
+    assert rows_of(target) == rows_of(tmp_path / "whole.db")
+
+
+def test_an_error_before_the_first_object_leaves_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = make_blobs(tmp_path / "a.db")
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SQLiteStore, "add", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            copy_environment(source, tmp_path / "b.db")
+    assert not (tmp_path / "b.db").exists()

@@ -183,15 +183,6 @@ def frames_of(scene: Scene, env: Environment) -> list[Frame]:
     return found
 
 
-def parameters_of(frame: Frame) -> list[wire.Parameter]:
-    count = len(frame.addresses)
-    return [
-        wire.int8s(frame.addresses),
-        *(wire.float8s(frame.placed[:count, column]) for column in range(6)),
-        *(wire.float8(float(x)) for x in (*frame.placed[count, :3], frame.stiffness)),
-    ]
-
-
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("form", ["exists alone", "built-in sums", "force()"])
 def test_figure_3(
@@ -206,7 +197,7 @@ def test_figure_3(
         "built-in sums": SUMS.format(exists=exists),
         "force()": force,
     }[form]
-    asked = [parameters_of(frame) for frame in frames_of(scene, served.environments[layout])]
+    asked = [wire.shell(frame) for frame in frames_of(scene, served.environments[layout])]
     n_parameters = 1 if form == "exists alone" else None
     measure(
         benchmark,

@@ -18,7 +18,7 @@ from hapticdb.errors import (
 )
 from hapticdb.force import TangentPlane
 from hapticdb.grid import Grid
-from hapticdb.grouping import DEFAULT_MAXGAP, Ranges, box_ranges
+from hapticdb.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
 from hapticdb.ingest import (
     FileReport,
     ImportOptions,
@@ -408,9 +408,7 @@ class Environment:
         return zip(lows.tolist(), highs.tolist(), strict=True)
 
     def _ranges_of(self, obj: Object) -> Ranges:
-        """Key ranges that cover an object's bounding box, a voxel wider on each side."""
-        low, high = self.grid.voxels_of(obj.bounds)
-        return box_ranges(self.grid, self.layout, low - 1, high + 1)
+        return object_ranges(self.grid, self.layout, obj.bounds)
 
 
 _DEFAULT_LAW = TangentPlane()

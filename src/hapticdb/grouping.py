@@ -69,6 +69,12 @@ def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping
     return Grouping(Ranges(lows[:count], highs[:count]), asked, scanned)
 
 
+def object_ranges(grid: Grid, layout: Layout, bounds: NDArray[np.float64]) -> Ranges:
+    """Ranges of row keys that hold an object of those bounds (2, 3), a voxel wider on each side."""
+    low, high = grid.voxels_of(bounds)
+    return box_ranges(grid, layout, low - 1, high + 1)
+
+
 def box_ranges(
     grid: Grid, layout: Layout, low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> Ranges:

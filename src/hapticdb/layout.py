@@ -12,9 +12,7 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.kernels import curves, voxelize
-from hapticdb.store.base import BRICK_BYTES, Keys, Layout, Rows
-
-NO_OCCUPANCY = np.empty(0, dtype=np.uint8)
+from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, Keys, Layout, Rows
 
 
 class Bricks(NamedTuple):

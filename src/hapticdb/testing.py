@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import ConflictError, EnvironmentExistsError, ObjectNotFoundError
 from hapticdb.grid import CurveName, Grid
-from hapticdb.grouping import box_ranges
+from hapticdb.grouping import object_ranges
 from hapticdb.layout import rows_of_voxels
 from hapticdb.store.base import (
     Covering,
@@ -79,8 +79,7 @@ def _kind(store: Store) -> tuple[Grid, Layout]:
 
 def _covering(store: Store) -> Covering:
     def ranges(obj: Object) -> list[tuple[int, int]]:
-        low, high = store.grid.voxels_of(obj.bounds)
-        found = box_ranges(store.grid, store.layout, low - 1, high + 1)
+        found = object_ranges(store.grid, store.layout, obj.bounds)
         return list(zip(found.lows.tolist(), found.highs.tolist(), strict=True))
 
     return ranges

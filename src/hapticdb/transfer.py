@@ -17,7 +17,7 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.grid import CurveName, Grid
-from hapticdb.grouping import Ranges, box_ranges
+from hapticdb.grouping import Ranges, object_ranges
 from hapticdb.kernels.voxelize import count_voxels
 from hapticdb.layout import bricks_of_rows, merged, rows_of_bricks
 from hapticdb.statistics import DEFAULT_RESOLUTION, QuantileVector
@@ -225,8 +225,7 @@ def part_of(obj: Object) -> tuple[str, str]:
 
 def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVector) -> Rows:
     """All rows of an object of the source, as the target has them."""
-    low, high = source.grid.voxels_of(obj.bounds)
-    ranges = box_ranges(source.grid, source.layout, low - 1, high + 1)
+    ranges = object_ranges(source.grid, source.layout, obj.bounds)
     batches = _batches(source, obj, ranges, quantiles)
     if is_same_kind(source, target):
         rows = Rows(*(np.concatenate(column) for column in zip(*batches, strict=True)))

@@ -3,12 +3,18 @@
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
+from threading import get_ident
 from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import ConflictError
+from hapticdb.errors import (
+    ConflictError,
+    EnvironmentExistsError,
+    ObjectNotFoundError,
+    UsageError,
+)
 from hapticdb.grid import BRICK_BITS, Grid
 
 Layout = Literal["voxel", "brick"]
@@ -37,6 +43,12 @@ class Rows(NamedTuple):
     def __len__(self) -> int:
         """Count the rows (a tuple of three would say three)."""
         return len(self.keys)
+
+
+NO_KEYS = np.empty(0, dtype=np.int64)
+# bytes and not an array of numpy's own: kernels see one type, read-only, on every path
+NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
+NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
 
 
 def row_shift(layout: Layout) -> int:
@@ -91,6 +103,26 @@ class Object:
     attributes: Mapping[str, object] = field(default_factory=dict)
     id: int = 0
     revision: int = 0
+
+
+def no_object(object_id: int, url: str) -> ObjectNotFoundError:
+    """Build the error for an id that no object has."""
+    return ObjectNotFoundError(
+        f"no object {object_id} in {url}; 'hapticdb objects {url}' lists them"
+    )
+
+
+def present_already(record: Object, url: str) -> EnvironmentExistsError:
+    """Build the error for a part that the environment holds."""
+    return EnvironmentExistsError(
+        f"{record.name} of {record.link} is in {url} already; remove it first"
+    )
+
+
+def check_thread(owner: int, url: str) -> None:
+    """Refuse a call from another thread than the one that a store belongs to."""
+    if get_ident() != owner:
+        raise UsageError(f"{url} belongs to the thread that opened it: open it here, too")
 
 
 def check_unwritten(record: Object, known: Object, url: str) -> None:

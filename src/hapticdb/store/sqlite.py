@@ -17,12 +17,14 @@ import apsw
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import BusyError, EnvironmentExistsError, ObjectNotFoundError, UsageError
+from hapticdb.errors import BusyError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.store import sqlite_file, sqlite_force
 from hapticdb.store.base import (
     BRICK_BYTES,
     LAYOUTS,
+    NO_OCCUPANCY,
+    NO_ROWS,
     Change,
     Covering,
     Frame,
@@ -33,16 +35,14 @@ from hapticdb.store.base import (
     Object,
     Rows,
     Size,
+    check_thread,
     check_unwritten,
+    no_object,
+    present_already,
     row_shift,
     touched_ranges,
 )
 from hapticdb.store.quantiles import exact_quantiles
-
-NO_KEYS = np.empty(0, dtype=np.int64)
-# bytes and not an array of numpy's own: kernels see one type, read-only, on every path
-NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
-NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
 
 LOOKUP = {
     "voxel": "SELECT z_val, id FROM carray(?1) AS asked CROSS JOIN voxel ON z_val = asked.value",
@@ -147,8 +147,7 @@ class SQLiteStore:
 
     def _fetch(self, sql: str, bindings: Sequence[Any] = ()) -> list[Any]:
         """Run one statement to its end."""
-        if get_ident() != self._thread:
-            raise self._in_another_thread()
+        check_thread(self._thread, self.url)
         try:
             if self._stamp is not None:
                 self._check_unchanged()
@@ -156,9 +155,6 @@ class SQLiteStore:
         except apsw.Error:
             with sqlite_file.named_errors(self.url):
                 raise
-
-    def _in_another_thread(self) -> UsageError:
-        return UsageError(f"{self.url} belongs to the thread that opened it: open it here, too")
 
     def _check_unchanged(self) -> None:
         """Refuse to answer once somebody else has written: an immutable opening takes no locks."""
@@ -273,9 +269,7 @@ class SQLiteStore:
         """One object; raises ObjectNotFoundError when there is none of that id."""
         found = self._objects("id = ?", object_id)
         if not found:
-            raise ObjectNotFoundError(
-                f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
-            )
+            raise no_object(object_id, self.url)
         return found[0]
 
     def _objects(self, condition: str, *bindings: int) -> list[Object]:
@@ -301,8 +295,7 @@ class SQLiteStore:
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
         """One transaction that begins by taking the write lock."""
-        if get_ident() != self._thread:
-            raise self._in_another_thread()
+        check_thread(self._thread, self.url)
         with sqlite_file.named_errors(self.url):
             self._connection.execute("BEGIN IMMEDIATE")
             try:
@@ -326,9 +319,7 @@ class SQLiteStore:
                     (record.name, record.link, *_contents(record), revision, record.id),
                 )
             except apsw.ConstraintError as error:
-                raise EnvironmentExistsError(
-                    f"{record.name} of {record.link} is in {self.url} already; remove it first"
-                ) from error
+                raise present_already(record, self.url) from error
             object_id = self._connection.last_insert_rowid()
             self._insert(rows, object_id)
             self._log(revision, "add", object_id, rows.keys)

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.store.base import Keys, Layout
+from hapticdb.store.base import LAYOUTS, Keys, Layout
 from hapticdb.store.postgres import wire
 from hapticdb.store.postgres.session import Session
 
@@ -12,13 +12,14 @@ SERVER_RESOLUTION = 10_000
 ENOUGH_ROWS = 10 * SERVER_RESOLUTION
 """Below, an exact histogram is computed sooner than it takes to think about it."""
 
+# one row, of NULLs before the first ANALYZE
 STATISTICS = """
 SELECT histogram_bounds::text::bigint[], most_common_vals::text::bigint[],
        most_common_freqs::float8[],
        (SELECT reltuples::bigint FROM pg_class
-         WHERE oid = format('%I.%I', schemaname, tablename)::regclass)
-  FROM pg_stats
- WHERE schemaname = $1::text::name AND tablename = $2::text::name AND attname = 'z_val'"""
+         WHERE oid = to_regclass(quote_ident(schemaname) || '.' || quote_ident(tablename)))
+  FROM (SELECT) AS one LEFT JOIN pg_stats
+    ON schemaname = $1::text::name AND tablename = $2::text::name AND attname = 'z_val'"""
 # a fraction aims at the middle of its rank: at the rank itself, floating point lands one off
 EXACT = {
     layout: f"""
@@ -26,20 +27,12 @@ SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
                           FROM unnest($1) WITH ORDINALITY AS rank(r, n)))
          WITHIN GROUP (ORDER BY z_val)
   FROM {layout}"""
-    for layout in ("voxel", "brick")
+    for layout in LAYOUTS
 }
 
 
 def server_histogram(session: Session, layout: Layout) -> tuple[Keys, int] | None:
     """Bounds (10,001,) from `pg_stats` and the rows behind them; None before the first ANALYZE."""
-    found = session.again(
-        lambda: session.execute(
-            "SELECT 1 FROM pg_stats WHERE schemaname = %s AND tablename = %s AND attname = 'z_val'",
-            (session.address.environment, layout),
-        ).fetchone()
-    )
-    if found is None:
-        return None
     bounds, common, frequencies, n_rows = session.fetch(
         STATISTICS,
         wire.text(session.address.environment),

@@ -13,11 +13,11 @@ from types import TracebackType
 import psycopg
 
 from hapticdb.errors import ConnectionLostError
-from hapticdb.store.base import Layout
+from hapticdb.store.base import LAYOUTS, Layout
 from hapticdb.store.postgres import failures, schema_of
 from hapticdb.store.postgres.session import Session
 
-IS_EMPTY = {layout: f"SELECT NOT EXISTS (SELECT 1 FROM {layout})" for layout in ("voxel", "brick")}
+IS_EMPTY = {layout: f"SELECT NOT EXISTS (SELECT 1 FROM {layout})" for layout in LAYOUTS}
 # advisory locks of an environment, by the number of one of its tables: who loads, and who makes the
 # index. An oid has 32 bits without a sign, the key of a lock 32 bits with one
 LOADERS, MAKERS = 0x48415054, 0x48415055

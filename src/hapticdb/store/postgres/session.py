@@ -17,7 +17,8 @@ import psycopg
 from psycopg import pq, sql
 from psycopg.errors import error_from_result
 
-from hapticdb.errors import ConnectionLostError, DatabaseError, StuckError, UsageError
+from hapticdb.errors import ConnectionLostError, DatabaseError, StuckError
+from hapticdb.store.base import check_thread
 from hapticdb.store.postgres import failures
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.wire import Parameter
@@ -182,10 +183,7 @@ class Session:
 
     def check_thread(self) -> None:
         """Refuse a call from another thread than the one that this belongs to."""
-        if get_ident() != self._thread:
-            raise UsageError(
-                f"{self.shown} belongs to the thread that opened it: open it here, too"
-            )
+        check_thread(self._thread, self.shown)
 
     def again(self, read: Callable[[], Result]) -> Result:
         """Run a read; when the connection is lost, connect again and run it once more.

@@ -9,9 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from psycopg import errors, sql
 
-from hapticdb.errors import EnvironmentExistsError, ObjectNotFoundError
 from hapticdb.grid import Grid
 from hapticdb.store.base import (
+    NO_OCCUPANCY,
+    NO_ROWS,
     Change,
     Covering,
     Frame,
@@ -23,6 +24,8 @@ from hapticdb.store.base import (
     Rows,
     Size,
     check_unwritten,
+    no_object,
+    present_already,
     row_shift,
     touched_ranges,
 )
@@ -38,9 +41,6 @@ from hapticdb.store.postgres.session import Session
 
 Result = TypeVar("Result")
 
-NO_KEYS = np.empty(0, dtype=np.int64)
-NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
-NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
 COPY_CHUNK = 1 << 17
 
 # no sequence: it would count what was rolled back, and an import run again end with other ids
@@ -183,14 +183,7 @@ class PostgresStore:
     def statement(self, frame: Frame) -> NDArray[np.float64]:
         """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
         text = statements.WRENCH[self.layout]
-        placed = np.ascontiguousarray(frame.placed.T)
-        count = len(frame.addresses)
-        parameters = [
-            wire.int8s(frame.addresses),
-            *(wire.float8s(column[:count]) for column in placed),
-            *(wire.float8(float(x)) for x in frame.placed[count, :3]),
-            wire.float8(frame.stiffness),
-        ]
+        parameters = wire.shell(frame)
         if frame.exclude.size:
             text = statements.without_excluded(text, self.layout, len(parameters) + 1)
             parameters.append(wire.int8s(frame.exclude))
@@ -221,9 +214,7 @@ class PostgresStore:
         """One object; raises ObjectNotFoundError when there is none of that id."""
         rows = self._session.rows(f"{records.OBJECTS} WHERE id = %s", (object_id,))
         if not rows:
-            raise ObjectNotFoundError(
-                f"no object {object_id} in {self.url}; 'hapticdb objects {self.url}' lists them"
-            )
+            raise no_object(object_id, self.url)
         return records.object_of(rows[0])
 
     def loading(self) -> contextlib.AbstractContextManager[None]:
@@ -239,9 +230,7 @@ class PostgresStore:
                 new = {"new_id": self._new_id(revision), **records.contents(record, revision)}
                 object_id = self._execute(records.INSERT_OBJECT, new)[0][0]
             except errors.UniqueViolation as error:
-                raise EnvironmentExistsError(
-                    f"{record.name} of {record.link} is in {self.url} already; remove it first"
-                ) from error
+                raise present_already(record, self.url) from error
             self._copy(rows, object_id)
             self._log(revision, "add", object_id, rows.keys)
             return int(object_id)

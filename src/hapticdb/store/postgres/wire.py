@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.store.base import BRICK_BYTES, Rows
+from hapticdb.store.base import BRICK_BYTES, Frame, Rows
 
 BYTEA, INT8, INT4, TEXT, FLOAT8 = 17, 20, 23, 25, 701
 INT8_ARRAY, FLOAT8_ARRAY = 1016, 1022
@@ -69,6 +69,16 @@ def float8s(values: NDArray[np.float64]) -> Parameter:
     packed["length"] = 8
     packed["value"] = values
     return Parameter(FLOAT8_ARRAY, _header(FLOAT8, len(values)) + packed.tobytes())
+
+
+def shell(frame: Frame) -> list[Parameter]:
+    """Pack a located shell: keys, then six arrays of points and normals, centre, stiffness."""
+    count = len(frame.addresses)
+    return [
+        int8s(frame.addresses),
+        *(float8s(frame.placed[:count, column]) for column in range(6)),
+        *(float8(float(x)) for x in (*frame.placed[count, :3], frame.stiffness)),
+    ]
 
 
 def _header(oid: int, length: int) -> bytes:

@@ -10,7 +10,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from hapticdb.cli import app
-from hapticdb.store import sqlite, sqlite_force
+from hapticdb.store import sqlite_force, sqlite_ranges
 from hapticdb.store.postgres import session, statements
 from hapticdb.store.private_server import Binaries, PrivateServer
 from servers import FOUND, SETTINGS, named
@@ -18,7 +18,7 @@ from servers import FOUND, SETTINGS, named
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SHOWN = re.compile(r"<!-- sql: (\w+)\.(\w+)\[\"(\w+)\"\] -->\n```sql\n(.*?)```", re.DOTALL)
-CODE = {"sqlite": sqlite, "sqlite_force": sqlite_force, "statements": statements}
+CODE = {"sqlite_ranges": sqlite_ranges, "sqlite_force": sqlite_force, "statements": statements}
 
 
 def blocks(kind: str, page: str = "README.md") -> list[str]:

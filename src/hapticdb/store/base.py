@@ -320,3 +320,14 @@ class SupportsStatement(Protocol):
 
     def statement_hits(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
+
+
+@runtime_checkable
+class SupportsCaches(Protocol):
+    """An engine whose caches this process owns: how large, and emptied when asked."""
+
+    def limit_cache(self, size_bytes: int) -> None:
+        """Pages that the connection may keep in memory, from now on."""
+
+    def drop_caches(self) -> None:
+        """Forget all pages: the connection's, and the file's in the operating system's cache."""

@@ -43,6 +43,7 @@ from hapticdb.store.base import (
     touched_ranges,
 )
 from hapticdb.store.quantiles import exact_quantiles
+from hapticdb.store.sqlite_ranges import RangeStatements
 
 LOOKUP = {
     "voxel": "SELECT z_val, id FROM carray(?1) AS asked CROSS JOIN voxel ON z_val = asked.value",
@@ -52,14 +53,6 @@ LOOKUP = {
 LOOKUP_ONE = {
     "voxel": "SELECT z_val, id FROM voxel WHERE z_val = ?1",
     "brick": "SELECT z_val, id, occupancy FROM brick WHERE z_val = ?1",
-}
-# one prepared statement for any number of ranges: 20 us where a VALUES list of the same 20 ranges
-# takes 28 (benchmarks/test_frame.py), since no text is built or parsed
-SCAN = {
-    "voxel": """SELECT z_val, id FROM carray(?1) AS low CROSS JOIN voxel
-                 WHERE z_val BETWEEN low.value AND nth(?2, low.rowid)""",
-    "brick": """SELECT z_val, id, occupancy FROM carray(?1) AS low CROSS JOIN brick
-                 WHERE z_val BETWEEN low.value AND nth(?2, low.rowid)""",
 }
 # whole arrays cross at once: 8 times faster than executemany, and without the interpreter lock
 INSERT = {
@@ -73,11 +66,6 @@ INSERT_OBJECT = """
 INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
 SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN ?9 END,
        ?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8"""
-COUNT = {
-    layout: f"""SELECT count(*) FROM carray(?1) AS low CROSS JOIN {layout}
-                 WHERE z_val BETWEEN low.value AND nth(?2, low.rowid)"""
-    for layout in LAYOUTS
-}
 
 
 class SQLiteStore:
@@ -103,7 +91,7 @@ class SQLiteStore:
         self.is_closed = False
         self.grid, self.layout = self._read_environment()
         self._shift = row_shift(self.layout)
-        connection.create_scalar_function("nth", cast("Any", _nth), 2, deterministic=True)
+        self._ranges = RangeStatements(connection, self.layout, self.grid.bits)
         sqlite_force.register(connection, self.grid, self.layout)
 
     @classmethod
@@ -228,23 +216,20 @@ class SQLiteStore:
         """Rows with a key in any of the closed ranges, ascending and disjoint."""
         if not lows.size:
             return NO_ROWS
-        ends = apsw.pyobject(highs.tolist())
-        return self._rows(self._fetch(SCAN[self.layout], (apsw.carray(lows), ends)))
+        return self._rows(self._fetch(*self._ranges.scan(lows, highs)))
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
         """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
         if not lows.size:
             return NO_ROWS
-        ends = apsw.pyobject(highs.tolist())
-        sql = f"{SCAN[self.layout]} AND id = ?3"
-        return self._rows(self._fetch(sql, (apsw.carray(lows), ends, object_id)))
+        sql, bindings = self._ranges.scan(lows, highs)
+        return self._rows(self._fetch(f"{sql} AND id = ?4", (*bindings, object_id)))
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""
         if not lows.size:
             return 0
-        ends = apsw.pyobject(highs.tolist())
-        return int(self._fetch(COUNT[self.layout], (apsw.carray(lows), ends))[0][0])
+        return int(self._fetch(*self._ranges.count(lows, highs))[0][0])
 
     # -- the paper's Figure 3 ----------------------------------------------------------------
 
@@ -383,6 +368,18 @@ class SQLiteStore:
             pairs = np.frombuffer(ranges, dtype="<i8").reshape(-1, 2)
             yield Change(revision, action, object_id, pairs.astype(np.int64))
 
+    # -- caches ------------------------------------------------------------------------------
+
+    def limit_cache(self, size_bytes: int) -> None:
+        """Pages that the connection may keep in memory, from now on."""
+        self._fetch(f"PRAGMA cache_size = -{max(int(size_bytes) // 1024, 1)}")
+
+    def drop_caches(self) -> None:
+        """Forget all pages: the connection's, and the file's in the operating system's cache."""
+        check_thread(self._thread, self.url)
+        self._connection.release_memory()
+        sqlite_file.forget_pages(self.path)
+
     # -- statistics --------------------------------------------------------------------------
 
     def size(self) -> Size:
@@ -453,11 +450,6 @@ class SQLiteStore:
             self._connection.execute(
                 "INSERT OR REPLACE INTO cost VALUES (?, ?)", (machine, json.dumps(dict(figures)))
             )
-
-
-def _nth(values: list[int], ordinal: int) -> int:
-    """Value of a bound list by ordinal, from 1: the other end of a range."""
-    return values[ordinal - 1]
 
 
 def _contents(record: Object) -> tuple[Any, ...]:

@@ -150,6 +150,13 @@ def remove_file(path: Path) -> None:
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
 
+def forget_pages(path: Path) -> None:
+    """Ask the operating system to drop what it caches of a file; what is not yet on disk stays."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+
+
 def _sweep_unfinished(path: Path) -> None:
     """Remove what a process that was killed while making this file left behind."""
     for left in path.parent.glob(f".{path.name}.*.new"):

@@ -1,0 +1,74 @@
+"""How ranges of keys reach SQLite: one prepared statement for any number of them.
+
+Both ends cross as one integer where that has room for the lower end and the width, as in every
+frame on a grid of 11 bits; else the lower ends cross, and a function of ours returns the upper ones
+(docs/decisions/0004).
+"""
+
+from typing import Any, cast
+
+import apsw
+import numpy as np
+
+from hapticdb.store.base import Keys, Layout, row_shift
+
+KEY_BITS = 63
+"""Of a signed integer that is not negative."""
+
+NARROW: dict[Layout, str] = {
+    "voxel": """
+SELECT z_val, id
+  FROM carray(?1) AS range CROSS JOIN voxel
+ WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
+    "brick": """
+SELECT z_val, id, occupancy
+  FROM carray(?1) AS range CROSS JOIN brick
+ WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
+}
+WIDE: dict[Layout, str] = {
+    "voxel": """
+SELECT z_val, id
+  FROM carray(?1) AS low CROSS JOIN voxel
+ WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
+    "brick": """
+SELECT z_val, id, occupancy
+  FROM carray(?1) AS low CROSS JOIN brick
+ WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
+}
+
+
+class RangeStatements:
+    """Statements of ranges on one environment, with what binds to their first three parameters."""
+
+    def __init__(self, connection: apsw.Connection, layout: Layout, bits: int) -> None:
+        # a key of that many bits leaves so many for a range's width
+        self._width_bits = KEY_BITS - max(3 * bits - row_shift(layout), 1)
+        self._mask = (1 << self._width_bits) - 1
+        self._key_end = 1 << (KEY_BITS - self._width_bits)
+        self._narrow, self._wide = NARROW[layout], WIDE[layout]
+        connection.create_scalar_function("nth", cast("Any", _nth), 3, deterministic=True)
+
+    def scan(self, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
+        """Rows with a key in closed ranges, ascending and disjoint, at least one."""
+        widths = highs - lows
+        is_narrow = (
+            int(widths.max()) <= self._mask and int(lows[-1]) < self._key_end and int(lows[0]) >= 0
+        )
+        if is_narrow:
+            packed = apsw.carray((lows << self._width_bits) | widths)
+            return self._narrow, (packed, self._width_bits, self._mask)
+        return self._wide, (apsw.carray(np.ascontiguousarray(lows)), _ends(highs), 0)
+
+    def count(self, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
+        """How many rows that are."""
+        sql, bindings = self.scan(lows, highs)
+        return f"SELECT count(*) FROM ({sql})", bindings
+
+
+def _ends(highs: Keys) -> object:
+    return apsw.pyobject(highs.tolist())
+
+
+def _nth(values: list[int], ordinal: int, _: int) -> int:
+    """Value of a bound list by ordinal, from 1: the other end of a range."""
+    return values[ordinal - 1]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hapticdb import PointShell
-from hapticdb.statistics import _fibonacci_sphere
+from hapticdb.pointshell import fibonacci_sphere
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 
 
@@ -37,5 +37,5 @@ def test_data() -> Path | None:
 @pytest.fixture(scope="session")
 def sphere() -> PointShell:
     """300 points on a sphere of 12 mm about the tool's origin, normals inward."""
-    out = _fibonacci_sphere(300)
+    out = fibonacci_sphere(300)
     return PointShell(points=out * 0.012, normals=-out, center=np.zeros(3), is_closed=True)

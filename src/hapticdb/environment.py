@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.calibration import calibrate
 from hapticdb.errors import (
     ConnectionLostError,
     FileError,
@@ -31,13 +32,7 @@ from hapticdb.layout import voxels_of_rows
 from hapticdb.mesh import Part, read_file
 from hapticdb.pointshell import PointShell
 from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Query, Strategy, as_id, as_ids
-from hapticdb.statistics import (
-    DEFAULT_RESOLUTION,
-    CostModel,
-    QuantileVector,
-    calibrate,
-    machine_name,
-)
+from hapticdb.statistics import DEFAULT_RESOLUTION, CostModel, QuantileVector, machine_name
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
 
@@ -367,7 +362,7 @@ class Environment:
         self._quantiles = self.quantiles()
         return self._quantiles
 
-    def calibrate(self, *, seed: int = 0, keep: bool = True) -> CostModel:
+    def calibrate(self, *, seed: int = 0, keep: bool = True, cold: bool = False) -> CostModel:
         """Measure what queries cost here; used from now on, and kept for this machine.
 
         Parameters
@@ -376,8 +371,11 @@ class Environment:
             Of the places that are measured.
         keep : bool
             Write the figures into the database, when it can be written.
+        cold : bool
+            Measure with empty caches, where this process can empty them: for environments much
+            larger than memory, that nobody goes over twice.
         """
-        costs = calibrate(self._store, seed=seed)
+        costs = calibrate(self._store, seed=seed, cold=cold)
         if keep and not self._store.is_read_only:
             self._store.save_costs(machine_name(), costs.figures())
         self._costs = costs

@@ -177,6 +177,29 @@ class PointShell:
         return cls._from_triangles(corners[indices], points, seed, "")
 
     @classmethod
+    def sphere(cls, radius: float, points: int = 300) -> "PointShell":
+        """Make the shell of a sphere about the origin, its points spread evenly.
+
+        Parameters
+        ----------
+        radius : float
+            Metres.
+        points : int
+            Number of points, 1 to 10^7.
+
+        Raises
+        ------
+        UsageError
+            Numbers out of range.
+        """
+        _check_request(points, 0)
+        if not (np.isfinite(radius) and radius > 0):
+            raise UsageError(f"a sphere of radius {radius}: give metres above 0")
+        outward = fibonacci_sphere(points)
+        outward = outward[_curve_order(outward)]
+        return cls(outward * radius, -outward, np.zeros(3))
+
+    @classmethod
     def _from_triangles(cls, triangles: Floats, points: int, seed: int, link: str) -> "PointShell":
         surface = orient(triangles)
         places, face_of = sample_surface(
@@ -272,3 +295,11 @@ def _curve_order(points: Floats) -> NDArray[np.intp]:
     # border of steps would leave the order of their points to roundings.
     steps = ((points - low) * ((2**ORDER_BITS - 0.5) / extent)).astype(np.int64)
     return np.argsort(encode(steps, ORDER_BITS, Z_ORDER), kind="stable")
+
+
+def fibonacci_sphere(n_points: int) -> Floats:
+    """Points (N, 3) spread over the unit sphere along a spiral of the golden angle."""
+    heights = 1 - (2 * np.arange(n_points) + 1) / n_points
+    angles = np.pi * (1 + 5**0.5) * np.arange(n_points)
+    radii = np.sqrt(1 - heights**2)
+    return np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1)

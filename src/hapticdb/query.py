@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.choice import Choice, Chooser, Chosen
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.force import TangentPlane
 from hapticdb.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
@@ -71,6 +72,7 @@ class HapticQuery:
     ) -> None:
         self._store = store
         self._statistics = statistics
+        self._chooser: Chooser | None = None
         grid = store.grid
         self._shift = row_shift(store.layout)
         self._origin = np.array(grid.origin)
@@ -93,12 +95,56 @@ class HapticQuery:
         if gap < 0:
             raise UsageError(f"MAXGAP {gap}: give 0 or more")
         pose = np.ascontiguousarray(world_from_tool, dtype=np.float64)
-        located = self._locate(shell, pose)
+        located = self.locate(shell, pose)
+        if strategy == "auto":
+            chooser = self._chooser
+            kept = chooser.kept(len(located.keys)) if chooser is not None else None
+            if chooser is None or kept is None:
+                return self._choosing(located, exclude, law, started)
+            if chooser.is_listening:
+                return self._heard(chooser, kept, located, exclude, law, started)
+            strategy = kept
+        return self._answer(strategy, located, exclude, law, started, gap)
+
+    def _choosing(self, located: Located, exclude: Keys, law: TangentPlane, started: int) -> Answer:
+        """The first frame of a turn: its strategy is chosen, and the rows that it reads told."""
+        chooser = self._present_chooser()
+        choice = chooser.choose(located.asked.shape[1], located.keys)
+        answer = self._answer(choice.strategy, located, exclude, law, started)
+        chooser.find(choice, answer.query.rows)
+        return answer
+
+    def _heard(
+        self,
+        chooser: Chooser,
+        strategy: Chosen,
+        located: Located,
+        exclude: Keys,
+        law: TangentPlane,
+        started: int,
+    ) -> Answer:
+        """The last frame of a turn: it is timed."""
+        asking = time.perf_counter_ns()
+        answer = self._answer(strategy, located, exclude, law, started)
+        took_us = (time.perf_counter_ns() - asking) / 1000
+        query = answer.query
+        n_points, n_keys = located.asked.shape[1], len(located.keys)
+        chooser.hear(Choice(strategy, n_points, n_keys, query.ranges, query.rows), took_us)
+        return answer
+
+    def _answer(
+        self,
+        strategy: Strategy,
+        located: Located,
+        exclude: Keys,
+        law: TangentPlane,
+        started: int,
+        gap: int = DEFAULT_MAXGAP,
+    ) -> Answer:
+        """Rows fetched, false hits dropped, the wrench summed."""
         if strategy == "statement":
             return self._by_statement(located, exclude, law, started)
-        chosen, n_statements, n_ranges, rows = self._fetch(strategy, located, gap)
-        if rows is None:
-            return self._by_statement(located, exclude, law, started)
+        n_statements, n_ranges, rows = self._fetch(strategy, located, gap)
         placed, asked, keys = located
         row_keys, row_ids, occupancy = rows
         wrench, hits, depths, ids = contact.refine(
@@ -117,10 +163,11 @@ class HapticQuery:
             contact.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
         )
         elapsed_us = (time.perf_counter_ns() - started) / 1000
-        query = Query(chosen, n_statements, n_ranges, len(row_keys), elapsed_us)
+        query = Query(strategy, n_statements, n_ranges, len(row_keys), elapsed_us)
         return Answer(wrench, hits, depths, ids.tolist(), pairs, query)
 
-    def _locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> Located:
+    def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> Located:
+        """Place a shell (N points) at a pose (4, 4), and find the row keys that it asks for."""
         if pose.shape != (4, 4):
             raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
         bits, curve, shift = self._curve
@@ -139,33 +186,28 @@ class HapticQuery:
         except ValueError as error:
             raise UsageError(f"{error}: give finite numbers and a rotation") from error
 
-    def _fetch(
-        self, strategy: Strategy, located: Located, gap: int
-    ) -> tuple[Strategy, int, int, Rows | None]:
-        """Rows of a frame: strategy used, statements, ranges, rows; none for `statement`."""
+    def _fetch(self, strategy: Strategy, located: Located, gap: int) -> tuple[int, int, Rows]:
+        """Statements, ranges and rows of a frame."""
         _, asked, keys = located
         if strategy == "array":
-            return strategy, 1, len(keys), self._store.lookup(keys)
+            return 1, len(keys), self._store.lookup(keys)
         if strategy == "points":
             with self._store.snapshot():
-                return strategy, len(keys), len(keys), self._store.lookup_each(keys)
+                return len(keys), len(keys), self._store.lookup_each(keys)
         if strategy == "maxgap":
             first, last = contact.spans_of_keys(asked, keys, *self._curve)
             ranges = maxgap(keys, first, last, gap)
-            return strategy, 1, len(ranges.lows), self._store.scan(*ranges)
+        else:
+            ranges = cbgroup(keys, *self._statistics()).ranges
+        return 1, len(ranges.lows), self._store.scan(*ranges)
+
+    def _present_chooser(self) -> Chooser:
+        """The one that stands on the present statistics; a new one has learned nothing yet."""
         quantiles, costs = self._statistics()
-        grouping = cbgroup(keys, quantiles, costs)
-        lows, highs = grouping.ranges
-        if strategy == "cbgroup":
-            return strategy, 1, len(lows), self._store.scan(lows, highs)
-        chosen = costs.cheapest(
-            asked.shape[1], len(keys), len(lows), grouping.rows_asked, grouping.rows_in_gaps
-        )
-        if chosen == "cbgroup":
-            return chosen, 1, len(lows), self._store.scan(lows, highs)
-        if chosen == "statement":
-            return chosen, 0, 0, None
-        return self._fetch(chosen, located, gap)
+        chooser = self._chooser
+        if chooser is None or chooser.quantiles is not quantiles or chooser.costs is not costs:
+            self._chooser = chooser = Chooser(quantiles, costs)
+        return chooser
 
     def _by_statement(
         self,

@@ -1,7 +1,9 @@
 """The verbs that look at an environment: info, objects, calibrate, analyze."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
+
+import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.root import Json, Url
@@ -22,7 +24,11 @@ MEANINGS = {
     "single": "a point query of the sequence",
     "aggregate": "Figure 3, with the statement for ids",
     "point": "each shell point in it",
+    "group": "grouping by cost, a frame",
+    "group_key": "and each key in it",
 }
+RATIOS = ("rows_per_block", "crowding", "presence", "caution")
+"""Of the figures, those that are no times."""
 SOURCES = {
     "server statistics": "the server's own statistics",
     "kept": "computed and kept",
@@ -126,7 +132,14 @@ def size_text(obj: "Object") -> str:
     )
 
 
-def calibrate(url: Url, *, json: Json = False) -> None:
+def calibrate(
+    url: Url,
+    *,
+    cold: Annotated[
+        bool, typer.Option("--cold", help="With empty caches; on SQLite, and in some seconds.")
+    ] = False,
+    json: Json = False,
+) -> None:
     """Measure what statements, descents and rows cost on this database and machine.
 
     The figures are kept in the environment; the strategies cbgroup and auto decide by them.
@@ -143,19 +156,19 @@ def calibrate(url: Url, *, json: Json = False) -> None:
         env = hapticdb.open(url, read_only=True)
         is_kept = False
     with env:
-        costs = env.calibrate()
+        costs = env.calibrate(cold=cold)
         rows = env.size().rows
     if not is_kept:
         render.note(f"{env.url} can only be read: the figures were measured, and not kept")
     if json:
-        figures = {name: getattr(costs, name) for name in (*MEANINGS, "rows_per_block")}
+        figures = {name: getattr(costs, name) for name in (*MEANINGS, *RATIOS)}
         render.say_json({"figures": figures, "spread": dict(costs.spread), "kept": is_kept})
         return
     render.show(_costs_table(costs))
     render.say(
         f"{render.counted(rows, 'row')}, {costs.rows_per_block:.0f} in a leaf block; "
-        f"a gap is scanned when it holds fewer than "
-        f"{costs.descent / max(costs.row_scanned, 1e-9):.1f} rows"
+        f"a gap is scanned when it should hold fewer than "
+        f"{costs.descent / max(costs.row_in_gap, 1e-9):.1f} rows"
     )
 
 

@@ -5,6 +5,8 @@ strategy, layout, curve and engine gives the same wrench bit for bit (numba cont
 multiplication and addition without fastmath, which this package never sets).
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,8 +15,15 @@ from hapticdb.kernels.curves import Z_ORDER, key_of, voxel_of, z_encode
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-Located = tuple[Floats, Ints, Ints]
-"""A shell placed in the grid: placed, asked and keys, as `locate` returns them."""
+
+
+class Located(NamedTuple):
+    """A shell placed in the grid, as `locate` returns it."""
+
+    placed: Floats
+    asked: Ints
+    keys: Ints
+
 
 AVERAGE_FROM = 10
 """Hits from which force and torque are averaged (McNeely et al. 1999, section 4.3)."""
@@ -232,7 +241,7 @@ def locate(
     )
     if count < 0:
         raise ValueError("a pose that is no rigid transform")
-    return placed, asked, keys[:count]
+    return Located(placed, asked, keys[:count])
 
 
 @leaf

@@ -388,14 +388,14 @@ def lines(url: str) -> dict[str, list[str]]:
     felt = ["--tool", "tool.stl", "--poses", "path.csv"]
     return {
         "import": [url, "boxes.glb", "--bits", "6"],
-        "info": [url],
-        "objects": [url],
+        **{verb: [url] for verb in ("info", "objects")},
         "touch": [url, *felt],
         "calibrate": [url],
         "analyze": [url],
         "move": [url, "1", "--translate", "0,0,0.01"],
         "copy": [url, "copy.db"],
         "diff": [url, "copy.db"],
+        "bench": [url, "--quick"],
         "grant": [url, "pg_monitor", "--as", "viewer"],
         "remove": [url, "1"],
         "demo": ["shown", "--url", url],

@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Sequence
 from itertools import takewhile
 
+from hapticdb.cli.benching import bench
 from hapticdb.cli.editing import move, remove
 from hapticdb.cli.granting import grant
 from hapticdb.cli.importing import import_
@@ -39,6 +40,7 @@ for verb in (
     diff,
     calibrate,
     analyze,
+    bench,
     grant,
     sample,
     demo,

@@ -1,0 +1,201 @@
+"""The evaluation's chapters on what the paper leaves out: strategies, caches, curves, tails."""
+
+from collections import Counter
+from collections.abc import Sequence
+
+from hapticdb.bench.cells import (
+    WHERE,
+    Cell,
+    Results,
+    distinct,
+    frame_us,
+    grouped,
+    least,
+    named,
+    with_strategy,
+    word,
+)
+from hapticdb.bench.evaluation.findings import AUTO_CLOSE, CHOOSABLE, Choice, choices
+from hapticdb.bench.evaluation.prose import (
+    bullets,
+    count_text,
+    listed,
+    paragraphs,
+    place_of,
+    ratio_text,
+    table,
+    time_text,
+    us_text,
+)
+
+FRAME = 1000.0
+WORST_SHOWN = 12
+
+
+def by_strategy(cells: Sequence[Cell]) -> str:
+    """Typical time and p99 of every strategy, and which is fastest how often."""
+    known = [cell for cell in cells if frame_us(cell) is not None and word(cell, "strategy")]
+    strategies = distinct(known, "strategy")
+    rows, fastest = [], Counter[str]()
+    for group in grouped(known, WHERE).values():
+        by = {strategy: least(with_strategy(group, strategy), frame_us) for strategy in strategies}
+        rows.append([place_of(group[0], known), *(_typical_and_p99(by[s]) for s in strategies)])
+        best = least(group, frame_us)
+        if best is not None and len(group) > 1:
+            fastest[named(best["strategy"])] += 1
+    counts = listed(f"{name} in {n}" for name, n in fastest.most_common())
+    said = "Microseconds a frame: typical, and in brackets p99."
+    told = f"Fastest by the typical frame: {counts} of {fastest.total()} rows." if fastest else ""
+    return paragraphs(said, table(["", *map(named, strategies)], rows), told) if rows else ""
+
+
+def _typical_and_p99(cell: Cell | None) -> str:
+    if cell is None:
+        return "-"
+    slow = frame_us(cell, "p99")
+    return time_text(cell) + (f" ({us_text(slow)})" if slow is not None else "")
+
+
+def conditions(cells: Sequence[Cell]) -> str:
+    """All strategies by cache, and what the caches are worth."""
+    cold, cached = (
+        "With the file out of the operating system's cache",
+        "With everything in the database's cache instead of 4 MB",
+    )
+    sentences = [
+        _compared(cells, "file", "cold", "cached", cold),
+        _compared(cells, "cache", "all cached", "4 MB", cached),
+    ]
+    return paragraphs(by_strategy(cells), bullets(filter(None, sentences)))
+
+
+def layouts(cells: Sequence[Cell]) -> str:
+    """All strategies by layout and curve, and what bricks and other curves are worth."""
+    sentences = [
+        _compared(cells, "layout", "brick", "voxel", "On bricks instead of voxels"),
+        _compared(cells, "curve", "hilbert", "z-order", "On the Hilbert curve instead of Z-order"),
+        _compared(cells, "curve", "lexicographic", "z-order", "In lexicographic order instead"),
+    ]
+    return paragraphs(by_strategy(cells), bullets(filter(None, sentences)))
+
+
+def _compared(cells: Sequence[Cell], key: str, one: str, other: str, words: str) -> str:
+    """Times under one value of a condition over those under another, all else equal."""
+    rest = [name for name in (*WHERE, "strategy", "maxgap") if name != key]
+    ratios = []
+    for group in grouped(cells, rest).values():
+        first = least([c for c in group if c.get(key) == one], frame_us)
+        second = least([c for c in group if c.get(key) == other], frame_us)
+        if first is not None and second is not None:
+            ratios.append((frame_us(first) or 0.0) / (frame_us(second) or 1.0))
+    if not ratios:
+        return ""
+    low, high = ratio_text(min(ratios)), ratio_text(max(ratios))
+    span = low if low == high else f"{low} to {high} times"
+    return f"{words} a frame takes {span} the time ({len(ratios)} pairs, all else equal)."
+
+
+def points(cells: Sequence[Cell]) -> str:
+    """All strategies by the number of points, and how many fit into a millisecond."""
+    sentences = []
+    rest = [name for name in WHERE if name != "points"]
+    known = [{k: v for k, v in cell.items() if k != "points"} for cell in cells]
+    for group in grouped(cells, rest).values():
+        quick = [c for c in group if (frame_us(c) or FRAME) < FRAME and c.get("points") is not None]
+        place = place_of({k: v for k, v in group[0].items() if k != "points"}, known)
+        if quick:
+            most = max(quick, key=lambda cell: (cell["points"], -(frame_us(cell) or 0.0)))
+            sentences.append(
+                f"{place}: up to {most['points']:,} points were measured to take less than 1 ms "
+                f"({named(word(most, 'strategy'))}, {time_text(most)} us)."
+            )
+        else:
+            sentences.append(f"{place}: no typical frame took less than 1 ms.")
+    return paragraphs(by_strategy(cells), bullets(sentences))
+
+
+def tail(cells: Sequence[Cell]) -> str:
+    """Percentiles and the worst frame, and the frames a second that follow from p99."""
+    known = [cell for cell in cells if frame_us(cell, "p50") is not None]
+    rows = []
+    for group in grouped(known, (*WHERE, "strategy")).values():
+        for cell in group:
+            slow = frame_us(cell, "p99")
+            times = [time_text(cell, m) for m in ("p50", "p99", "p99.9", "max")]
+            second = count_text(1e6 / slow if slow is not None else None)
+            frames = count_text(cell.get("frames"))
+            strategy = named(word(cell, "strategy"))
+            rows.append([place_of(cell, known), strategy, *times, second, frames])
+    head = ["", "strategy", "p50", "p99", "p99.9", "worst", "frames a second by p99", "frames"]
+    slows = [slow for cell in known if (slow := frame_us(cell, "p99")) is not None]
+    quick = sum(slow <= FRAME for slow in slows)
+    told = f"99 in 100 frames take 1 ms or less in {quick} of {len(slows)} rows." if slows else ""
+    return paragraphs(table(head, rows), told)
+
+
+# --- auto ---------------------------------------------------------------------------------------
+
+
+def auto(results: Results) -> str:
+    """`auto` beside the fastest strategy of every group of cells measured together."""
+    found = choices(results)
+    if not found:
+        return ""
+    return paragraphs(_auto_sentences(found), _auto_summary(found), _auto_worst(found))
+
+
+def _auto_sentences(found: Sequence[Choice]) -> str:
+    close = sum(choice.ratio <= AUTO_CLOSE for choice in found)
+    own = [r for choice in found if (r := choice.choosable_ratio) is not None]
+    told = f"`auto` is within 10 % of the fastest strategy, or faster, in {close} of {len(found)}"
+    said = [f"{told} groups of cells that differ in nothing but the strategy."]
+    if own:
+        close = sum(r <= AUTO_CLOSE for r in own)
+        told = f"Beside the fastest of {listed(CHOOSABLE)}, which it chooses among, it is so in"
+        said.append(f"{told} {close} of {len(own)}.")
+    return bullets(said)
+
+
+def _auto_summary(found: Sequence[Choice]) -> str:
+    rows = []
+    for (engine, layout), places in grouped([c.where for c in found], ("engine", "layout")).items():
+        own = [choice for choice in found if any(choice.where is place for place in places)]
+        ratios = sorted(choice.ratio for choice in own)
+        rows.append(
+            [
+                str(engine or "-"),
+                named(layout or "-"),
+                str(len(own)),
+                str(sum(r <= AUTO_CLOSE for r in ratios)),
+                ratio_text(ratios[len(ratios) // 2]),
+                ratio_text(ratios[-1]),
+            ]
+        )
+    return table(["engine", "layout", "groups", "within 10 %", "middle ratio", "worst"], rows)
+
+
+def _auto_worst(found: Sequence[Choice]) -> str:
+    off = sorted((c for c in found if c.ratio > AUTO_CLOSE), key=lambda c: -c.ratio)
+    if not off:
+        return ""
+    where = [choice.where for choice in found]
+    rows = [
+        [
+            choice.experiment,
+            place_of(choice.where, where),
+            time_text(choice.auto),
+            choice.chosen or "-",
+            f"{named(word(choice.best, 'strategy'))}{_maxgap_of(choice.best)}",
+            time_text(choice.best),
+            ratio_text(choice.ratio),
+        ]
+        for choice in off[:WORST_SHOWN]
+    ]
+    told = f"The worst of the {len(off)} others:" if len(off) > WORST_SHOWN else "The others:"
+    head = ["experiment", "", "`auto`, us", "chose", "fastest", "its us", "ratio"]
+    return paragraphs(told, table(head, rows))
+
+
+def _maxgap_of(cell: Cell) -> str:
+    gap = cell.get("maxgap")
+    return f" {gap:,}" if isinstance(gap, int) and not isinstance(gap, bool) else ""

@@ -1,0 +1,153 @@
+"""Timing alternatives side by side: in turns, so that a machine's drift falls on all alike."""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.query import Query
+
+FRAMES_FOR_P999 = 10_000
+"""Fewer frames say nothing of the slowest in a thousand."""
+CHUNK = 20
+"""Poses that an alternative runs before the next one's turn."""
+WARM_FRAMES = 20
+SEED = 0
+"""Of the order in which alternatives take turns."""
+
+Cell = dict[str, Any]
+"""One measured combination, as it is written to JSON: conditions, counts, percentiles."""
+Pose = NDArray[np.float64]
+
+
+@dataclass
+class Alternative:
+    """One way to answer a frame, and what its frames took.
+
+    cell : what is known of it beforehand; frame : pose -> Query; before : run, untimed, before each
+    frame, when given.
+    """
+
+    cell: Mapping[str, Any]
+    frame: Callable[[Pose], Query]
+    before: Callable[[], None] | None = None
+    times_us: list[float] = field(default_factory=list)
+    queries: list[Query] = field(default_factory=list)
+    poses: list[int] = field(default_factory=list)
+    spent_s: float = 0.0
+
+    def run(self, poses: NDArray[np.float64], indices: Sequence[int], limit_s: float) -> None:
+        """Measure some poses, until the time is spent.
+
+        The pose before them goes first, untimed: its frame finds the processor's caches full of
+        the others' work.
+        """
+        if self.before is None and self.spent_s <= limit_s:
+            self.frame(poses[indices[0] - 1])
+        for index in indices:
+            if self.spent_s > limit_s:
+                return
+            if self.before is not None:
+                self.before()
+            start = time.perf_counter_ns()
+            query = self.frame(poses[index])
+            elapsed_us = (time.perf_counter_ns() - start) / 1000
+            self.times_us.append(elapsed_us)
+            self.queries.append(query)
+            self.poses.append(index)
+            self.spent_s += elapsed_us / 1e6
+
+    def record(self, asked_rows: Sequence[int] | None = None) -> Cell:
+        """Everything measured; false rows beside the rows that were asked for, a number a pose."""
+        queries = self.queries
+        found: Cell = {
+            **self.cell,
+            "frames": len(queries),
+            "us": summary(self.times_us),
+            "ranges": float(np.mean([query.ranges for query in queries])),
+            "rows": float(np.mean([query.rows for query in queries])),
+        }
+        if asked_rows is not None:
+            asked = float(np.mean([asked_rows[index] for index in self.poses]))
+            found["false_rows"] = found["rows"] - asked
+        if found.get("strategy") == "auto":
+            found["chosen"] = dict(Counter(query.strategy for query in queries))
+        return found
+
+
+def in_turns(
+    alternatives: Sequence[Alternative],
+    poses: NDArray[np.float64],
+    *,
+    limit_s: float,
+    warm: int = WARM_FRAMES,
+    asked_rows: Sequence[int] | None = None,
+) -> list[Cell]:
+    """Measure all alternatives over all poses and return a cell for each.
+
+    Parameters
+    ----------
+    alternatives : sequence
+        What is compared.
+    poses : (M, 4, 4)
+        world_from_tool.
+    limit_s : float
+        Seconds of frames that each may take; who is stopped by it is marked `cut_short`.
+    warm : int
+        Untimed frames of each before.
+    asked_rows : (M,) ints, optional
+        Rows under each pose's own keys: what is read beyond them is a false hit.
+
+    Notes
+    -----
+    Poses are cut into chunks, and every alternative runs each chunk once, another one than its
+    neighbours run at that time, in an order drawn anew for each chunk: so a page that one has
+    brought into the cache is not at once used by the next, and what disturbs the machine for a
+    while falls on all alike.
+    """
+    for alternative in alternatives:
+        started = time.perf_counter()
+        for pose in poses[:: max(1, len(poses) // max(warm, 1))][:warm]:
+            alternative.frame(pose)
+            if time.perf_counter() - started > limit_s / 4:
+                break
+    chunks = [range(at, min(at + CHUNK, len(poses))) for at in range(0, len(poses), CHUNK)]
+    stride = max(1, len(chunks) // max(len(alternatives), 1))
+    rng = np.random.default_rng(SEED)
+    for turn in range(len(chunks)):
+        for n in rng.permutation(len(alternatives)).tolist():
+            chunk = chunks[(turn + n * stride) % len(chunks)]
+            alternatives[n].run(poses, chunk, limit_s)
+    cells = []
+    for alternative in alternatives:
+        cell = alternative.record(asked_rows)
+        cell["cut_short"] = len(alternative.queries) < len(poses)
+        cells.append(cell)
+    return cells
+
+
+def summary(times_us: ArrayLike) -> dict[str, float | None]:
+    """Mean, percentiles and worst of frame times (N,), microseconds.
+
+    `typical` is the mean of what lies between the 5th and the 95th percentile: as steady as a
+    median, and, like a mean, it counts every kind of pose by its share. `p99.9` is None below
+    10,000 frames.
+    """
+    times = np.sort(np.asarray(times_us, dtype=np.float64))
+    if not times.size:
+        return dict.fromkeys(("mean", "typical", "p10", "p50", "p90", "p99", "p99.9", "max"))
+    cut = len(times) // 20
+    found: dict[str, float | None] = {
+        "mean": float(times.mean()),
+        "typical": float(times[cut : len(times) - cut].mean()),
+    }
+    for share in (10, 50, 90, 99):
+        found[f"p{share}"] = float(np.percentile(times, share))
+    is_enough = len(times) >= FRAMES_FOR_P999
+    found["p99.9"] = float(np.percentile(times, 99.9)) if is_enough else None
+    found["max"] = float(times[-1])
+    return found

@@ -1,0 +1,198 @@
+"""All experiments on one environment, one after another."""
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from hapticdb.bench import experiments, records
+from hapticdb.bench.evaluation.plots import draw
+from hapticdb.bench.evaluation.report import write_report
+from hapticdb.bench.experiments import QUICK, Budget
+from hapticdb.bench.measure import Cell
+from hapticdb.bench.subject import PAPER_CACHE, Subject, limited
+from hapticdb.bench.workload import (
+    Poses,
+    Region,
+    Task,
+    random_poses,
+    regions,
+    slide_poses,
+    sphere_shell,
+)
+from hapticdb.environment import Environment
+from hapticdb.environment import open as open_environment
+from hapticdb.errors import UsageError
+from hapticdb.pointshell import PointShell
+from hapticdb.statistics import QuantileVector
+from hapticdb.store.base import SupportsCaches
+from hapticdb.warm import warm_up
+
+ALL_BYTES = 2 << 30
+"""A cache that holds every page of most environments; memory is taken as it is filled."""
+REPORT = "evaluation.md"
+
+Say = Callable[[str], None]
+"""Told, in a line, what comes next."""
+
+
+@dataclass(frozen=True)
+class Workload:
+    """What is asked of every subject of one environment."""
+
+    slide: Task
+    random: Task
+    recorded: Task | None
+    regions: tuple[Region, ...]
+    finest: QuantileVector
+
+    @property
+    def tasks(self) -> tuple[Task, ...]:
+        """Those over the whole environment."""
+        return tuple(task for task in (self.slide, self.random, self.recorded) if task)
+
+
+def workload_of(env: Environment, budget: Budget, recorded: Task | None = None) -> Workload:
+    """Shells, poses and regions for an environment; the same for all that have its grid."""
+    shell = sphere_shell(env.grid.voxel_size)
+    slide = Task("slide", "sphere", shell, slide_poses(env, shell, budget.frames))
+    near = Task("random", "sphere", shell, random_poses(env, budget.frames))
+    found = regions(env, max(budget.frames // 4, 10), windows=budget.windows)
+    finest = env.quantiles(max(budget.resolutions))
+    return Workload(slide, near, recorded, tuple(found), finest)
+
+
+def paper_figures(subject: Subject, work: Workload, budget: Budget) -> dict[str, list[Cell]]:
+    """Figures 8 to 10 and what the paper leaves out, under one subject's conditions."""
+    return {
+        "costs": [cost_row(subject, work.slide)],
+        "figure8": experiments.figure_8(subject, work.slide, work.finest, budget),
+        "figure9": experiments.figure_9(subject, work.slide, budget),
+        "figure10": experiments.figure_10(subject, work.slide, work.regions, budget),
+        "strategies": experiments.strategies(subject, work.tasks, budget),
+        "points": experiments.points(subject, budget),
+        "tail": experiments.tail(subject, work.slide, budget),
+    }
+
+
+def under_conditions(subject: Subject, work: Workload, budget: Budget) -> list[Cell]:
+    """A few strategies, for the comparison of caches: as they are, and empty."""
+    return [
+        *experiments.cached(subject, work.slide, budget),
+        *experiments.cold(subject, work.slide, budget),
+    ]
+
+
+def bench(
+    url: str,
+    folder: Path,
+    *,
+    quick: bool = False,
+    shell: PointShell | None = None,
+    poses: Poses | None = None,
+    say: Say = lambda _: None,
+) -> Path:
+    """Run the experiments on an environment, and write JSON, plots and a report.
+
+    Parameters
+    ----------
+    url : str
+        The environment; it is only read.
+    folder : Path
+        For `NAME.json`, `NAME.svg` and `evaluation.md`; made where it is missing.
+    quick : bool
+        A few seconds for each experiment: for a first look.
+    shell, poses : PointShell and (M, 4, 4), optional
+        A tool of one's own along a recorded path, measured beside the sphere.
+    say : callable, optional
+        Told what comes next.
+
+    Returns
+    -------
+    Path
+        The report.
+    """
+    budget = QUICK if quick else Budget()
+    warm_up()
+    with open_environment(url, read_only=is_file(url)) as env:
+        if not env.size().rows:
+            raise UsageError(f"{env.url} is empty: import a file before measuring")
+        records.make_folder(folder)
+        say("inputs: shells, poses, regions")
+        recorded = None
+        if shell is not None and poses is not None:
+            recorded = Task("recorded", "tool", shell, poses[: budget.frames])
+        work = workload_of(env, budget, recorded)
+        found: dict[str, list[Cell]] = {"table1": [table_1_row(env)]}
+        for cache, is_paper in caches_of(env):
+            subject = Subject(env, env.name, cache, drop_of(env))
+            say(f"database cache {cache}")
+            cells = (
+                paper_figures(subject, work, budget)
+                if is_paper
+                else {"figure9": experiments.figure_9(subject, work.slide, budget)}
+            )
+            cells["conditions"] = under_conditions(subject, work, budget)
+            for name, more in cells.items():
+                found.setdefault(name, []).extend(more)
+    results = {name: records.result(name, cells) for name, cells in found.items()}
+    records.write(folder, results)
+    say("plots and report")
+    draw(results, folder)
+    write_report(results, folder / REPORT, ".")
+    return folder / REPORT
+
+
+def caches_of(env: Environment) -> Iterator[tuple[str, bool]]:
+    """Give the connection each size of cache in turn: its name, and whether it is the paper's.
+
+    A server has the cache that it has, and a small environment is all cached from the start.
+    """
+    first = limited(env, PAPER_CACHE)
+    yield first, True
+    if isinstance(env.store, SupportsCaches) and (second := limited(env, ALL_BYTES)) != first:
+        yield second, False
+
+
+def drop_of(env: Environment) -> Callable[[], None] | None:
+    """What empties all caches of an environment, where this process can."""
+    return env.store.drop_caches if isinstance(env.store, SupportsCaches) else None
+
+
+def cost_row(subject: Subject, task: Task) -> Cell:
+    """What the cost model was fitted to under these conditions, microseconds and ratios."""
+    costs = subject.costs
+    kept = ("environment", "engine", "layout", "curve", "cache", "file", "resolution")
+    conditions = subject.conditions(task)
+    return {
+        **{name: conditions[name] for name in kept},
+        **{name: value for name, value in costs.figures().items() if "." not in name},
+        "row_scanned": costs.row_scanned,
+        "gap_rows": costs.descent / max(costs.row_in_gap, 1e-9),
+    }
+
+
+def table_1_row(env: Environment, **more: object) -> Cell:
+    """Voxels, objects, cells of the data space, as in the paper's Table 1."""
+    size, objects = env.size(), env.objects()
+    return {
+        "environment": env.name,
+        "engine": env.engine,
+        "layout": env.layout,
+        "objects": len(objects),
+        "object_voxels": sum(obj.voxels for obj in objects),
+        "bits": env.grid.bits,
+        "cells_of_space": 8**env.grid.bits,
+        "edge": env.grid.edge,
+        "voxel_size": env.grid.voxel_size,
+        f"rows_{env.layout}": size.rows,
+        f"bytes_{env.layout}": size.bytes,
+        **more,
+    }
+
+
+def is_file(url: str) -> bool:
+    """Whether an environment is a file, which is then opened to read.
+
+    On a server a loop of the paper's kind is a temporary function, which no reader may make.
+    """
+    return "://" not in url or url.startswith("sqlite:")

@@ -1,0 +1,134 @@
+"""What is measured: an opened environment under stated conditions, and ways to ask it a frame."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from hapticdb.bench.cells import ONE_STATEMENT
+from hapticdb.bench.measure import Alternative, Cell, Pose
+from hapticdb.bench.workload import Task
+from hapticdb.calibration import calibrate
+from hapticdb.environment import Environment
+from hapticdb.errors import DatabaseError
+from hapticdb.pointshell import PointShell
+from hapticdb.query import HapticQuery, Query, Strategy
+from hapticdb.statistics import CostModel, QuantileVector
+from hapticdb.store.base import Store, SupportsCaches
+
+PAPER_CACHE = 4 << 20
+"""500 blocks of 8 KB."""
+ALL_CACHED = "all cached"
+CURVES = {"z": "z-order", "hilbert": "hilbert", "lexicographic": "lexicographic"}
+
+
+@dataclass
+class Subject:
+    """An opened environment under stated conditions.
+
+    name : of the environment; cache : of the database, as plots say it; drop : empties all caches,
+    where that can be done.
+    """
+
+    env: Environment
+    name: str
+    cache: str
+    drop: Callable[[], None] | None = None
+
+    @cached_property
+    def costs(self) -> CostModel:
+        """Fitted under these conditions; not kept, since the conditions are not."""
+        return calibrate(self.env.store)
+
+    @cached_property
+    def quantiles(self) -> QuantileVector:
+        """As `cbgroup` and `auto` use them."""
+        return self.env.quantiles()
+
+    @cached_property
+    def looping(self) -> Store | None:
+        """The same store, its ranges scanned by a loop inside the server; None without one."""
+        if not self.env.engine.startswith("PostgreSQL"):
+            return None
+        from hapticdb.bench.in_server import LoopInServer  # noqa: PLC0415 - its driver is an extra
+
+        try:
+            return LoopInServer(self.env.store)
+        except DatabaseError:  # a user who may not make temporary functions
+            return None
+
+    def conditions(self, task: Task) -> Cell:
+        """What every cell of this subject and task says."""
+        return {
+            "environment": self.name,
+            "engine": self.env.engine,
+            "layout": self.env.layout,
+            "curve": CURVES[self.env.grid.curve],
+            "cache": self.cache,
+            "file": "cached",
+            "poses": task.name,
+            "shell": task.tool,
+            "points": len(task.shell),
+            "resolution": self.quantiles.resolution,
+            **({"region": task.region, "density": task.density} if task.region else {}),
+        }
+
+    def query(self, quantiles: QuantileVector | None = None) -> HapticQuery:
+        """Frames on this environment, with its quantiles unless others are given."""
+        statistics = (quantiles or self.quantiles, self.costs)
+        return HapticQuery(self.env.store, lambda: statistics)
+
+    @cached_property
+    def looping_query(self) -> HapticQuery | None:
+        """Frames whose ranges are scanned by a loop inside the server, by costs fitted to that."""
+        if self.looping is None:
+            return None
+        statistics = (self.quantiles, calibrate(self.looping))
+        return HapticQuery(self.looping, lambda: statistics)
+
+    def alternative(
+        self,
+        task: Task,
+        strategy: Strategy,
+        *,
+        gap: int | None = None,
+        query: HapticQuery | None = None,
+        **more: Any,  # noqa: ANN401 - what a cell says is JSON's
+    ) -> Alternative:
+        """A strategy over a task; `gap` is the strategy maxgap's."""
+        cell = {
+            **self.conditions(task),
+            "strategy": strategy,
+            "form": ONE_STATEMENT,
+            **({"maxgap": gap} if gap is not None else {}),
+            **more,
+        }
+        return Alternative(cell, asking(query or self.query(), task.shell, strategy, gap))
+
+    def asked_rows(self, task: Task) -> list[int]:
+        """Rows under each pose's own keys."""
+        query = self.query()
+        return [query.run(task.shell, pose, "array").query.rows for pose in task.poses]
+
+
+def asking(
+    query: HapticQuery, shell: PointShell, strategy: Strategy, gap: int | None = None
+) -> Callable[[Pose], Query]:
+    """Frames of one shell by one strategy."""
+    if gap is None:
+        return lambda pose: query.run(shell, pose, strategy).query
+    return lambda pose: query.run(shell, pose, strategy, gap).query
+
+
+def limited(env: Environment, size_bytes: int) -> str:
+    """Leave a connection so much cache, where it has its own; what plots call that.
+
+    A server's cache is its own: what it is set to is told.
+    """
+    if isinstance(env.store, SupportsCaches):
+        env.store.limit_cache(size_bytes)
+    else:
+        from hapticdb.bench.in_server import server_cache  # noqa: PLC0415 - its driver is an extra
+
+        size_bytes = server_cache(env.store)
+    return ALL_CACHED if size_bytes >= env.size().bytes else f"{size_bytes / (1 << 20):.0f} MB"

@@ -1,0 +1,113 @@
+"""Timing in turns: every pose once for each, side by side, and the summary of the times."""
+
+import itertools
+import math
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticdb.bench.measure import CHUNK, Alternative, Pose, in_turns, summary
+from hapticdb.query import Query
+
+POSES = np.tile(np.eye(4), (5 * CHUNK + 3, 1, 1))
+POSES[:, 0, 3] = np.arange(len(POSES))
+
+
+def counting(log: list[tuple[str, int]], name: str) -> Callable[[Pose], Query]:
+    """A frame that only notes which pose it was asked for."""
+
+    def frame(pose: Pose) -> Query:
+        log.append((name, int(pose[0, 3])))
+        return Query("array", 1, 2, 7, 0.0)
+
+    return frame
+
+
+@given(st.integers(1, 9))
+def test_every_alternative_measures_every_pose_once(count: int) -> None:
+    log: list[tuple[str, int]] = []
+    alternatives = [Alternative({"n": n}, counting(log, str(n))) for n in range(count)]
+    cells = in_turns(alternatives, POSES, limit_s=60.0, warm=0)
+    for n, (alternative, cell) in enumerate(zip(alternatives, cells, strict=True)):
+        assert sorted(alternative.poses) == list(range(len(POSES)))
+        assert {pose for name, pose in log if name == str(n)} == set(range(len(POSES)))
+        assert (cell["n"], cell["frames"], cell["cut_short"]) == (n, len(POSES), False)
+        assert (cell["ranges"], cell["rows"]) == (2.0, 7.0)
+
+
+def test_no_alternative_follows_another_over_the_same_poses() -> None:
+    """Or the second would find in the cache what the first has brought."""
+    log: list[tuple[str, int]] = []
+    alternatives = [Alternative({}, counting(log, name)) for name in "abc"]
+    in_turns(alternatives, POSES, limit_s=60.0, warm=0)
+    runs = [
+        {pose for _, pose in frames} for _, frames in itertools.groupby(log, lambda one: one[0])
+    ]
+    for before, after in itertools.pairwise(runs):
+        assert len(before & after) <= 1 or len(before) > CHUNK + 1
+
+
+def test_the_frame_before_a_turn_is_not_timed() -> None:
+    log: list[tuple[str, int]] = []
+    (cell,) = in_turns([Alternative({}, counting(log, "a"))], POSES, limit_s=60.0, warm=0)
+    n_turns = -(-len(POSES) // CHUNK)
+    assert len(log) == len(POSES) + n_turns
+    assert cell["frames"] == len(POSES)
+
+
+def test_a_slow_alternative_is_stopped_and_says_so() -> None:
+    def slow(_: Pose) -> Query:
+        time.sleep(0.005)
+        return Query("array", 1, 1, 1, 0.0)
+
+    quick = counting([], "quick")
+    cells = in_turns([Alternative({}, slow), Alternative({}, quick)], POSES, limit_s=0.02, warm=0)
+    assert cells[0]["cut_short"]
+    assert 0 < cells[0]["frames"] < len(POSES)
+    assert not cells[1]["cut_short"]
+
+
+def test_false_rows_are_those_beyond_what_the_same_poses_ask_for() -> None:
+    asked = [n % 5 for n in range(len(POSES))]
+    (cell,) = in_turns([Alternative({}, counting([], "a"))], POSES, limit_s=60.0, asked_rows=asked)
+    assert cell["false_rows"] == pytest.approx(7 - np.mean(asked))
+
+
+def test_what_comes_before_a_frame_is_not_part_of_its_time() -> None:
+    alternative = Alternative({}, counting([], "a"), before=lambda: time.sleep(0.01))
+    in_turns([alternative], POSES[:5], limit_s=60.0, warm=0)
+    assert max(alternative.times_us) < 9000
+
+
+def test_what_auto_chose_is_counted() -> None:
+    (cell,) = in_turns([Alternative({"strategy": "auto"}, counting([], "a"))], POSES, limit_s=60.0)
+    assert cell["chosen"] == {"array": len(POSES)}
+
+
+@given(st.lists(st.floats(1, 1e6), min_size=1, max_size=300))
+def test_the_summary_is_ordered_and_its_typical_frame_lies_within(times: list[float]) -> None:
+    found = summary(times)
+    shares = [found[name] for name in ("p10", "p50", "p90", "p99", "max")]
+    numbers = [us for us in shares if us is not None]
+    assert len(numbers) == 5
+    assert numbers == sorted(numbers)
+    assert found["max"] == max(times)
+    assert found["mean"] == pytest.approx(math.fsum(times) / len(times))
+    assert found["typical"] is not None
+    assert min(times) <= found["typical"] * (1 + 1e-12)
+    assert found["typical"] <= max(times) * (1 + 1e-12)
+
+
+def test_typical_leaves_out_a_twentieth_at_either_end() -> None:
+    times = [1e9, 1e9, *[10.0] * 36, 0.0, 0.0]
+    assert summary(times)["typical"] == 10.0
+
+
+def test_the_slowest_in_a_thousand_needs_ten_thousand_frames() -> None:
+    assert summary(np.arange(9999))["p99.9"] is None
+    assert summary(np.arange(10_000))["p99.9"] == pytest.approx(np.percentile(range(10_000), 99.9))
+    assert summary([])["p50"] is None

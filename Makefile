@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: demo test test-plain lint types bench wheel pins clean
+.PHONY: demo test test-plain lint types bench figures peers scale wheel pins clean
 
 demo: $(READY)
 	$(BIN)/hapticdb demo demo
@@ -23,10 +23,24 @@ types: $(READY)
 	$(BIN)/mypy
 	$(BIN)/mypy benchmarks
 
-# Open3D stands beside in the voxelizing benchmark when it is installed:
-#   pip install open3d   (needs the system's libusb-1.0)
+# Open3D stands beside in the voxelizing benchmark where 'make figures' or 'make peers' has run.
 bench: $(READY)
 	$(BIN)/pytest benchmarks --benchmark-enable --benchmark-only --benchmark-columns=median,min,iqr,rounds
+
+# The evaluation in docs/evaluation.md: half an hour; 'make figures ARGS=--quick' three minutes.
+# PostgreSQL 15 and PostGIS or pgpointcloud, where they are installed, take part (README.md).
+figures: $(READY) .venv/figures
+	$(BIN)/python benchmarks/figures.py $(ARGS)
+
+# Frames and bytes at 1.4 million to 1.4 billion voxels: 20 minutes, 10 GB of disk.
+scale: $(READY)
+	$(BIN)/python benchmarks/scale.py --report docs/evaluation.md $(ARGS)
+
+peers: .venv/figures
+
+.venv/figures: requirements/figures.txt $(READY)
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --requirement requirements/figures.txt
+	touch $@
 
 wheel: $(READY)
 	rm -rf dist

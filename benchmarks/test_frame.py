@@ -10,24 +10,21 @@ this would do. Each round is one pass over all poses, so that no pose stays in a
 
 import sqlite3
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 
-import hapticdb
-from hapticdb import Environment
-from hapticdb.kernels import contact
 from hapticdb.query import STRATEGIES, Strategy
-from hapticdb.store.base import BRICK_SHIFT, LAYOUTS, Layout
+from hapticdb.store.base import LAYOUTS, Layout
+from peers import PeerWork, Pose
+from peers.memory import DenseBitmap
 from scene import Scene, is_measuring
 
 ROUNDS = 10
 CACHE_KIB = 256 * 1024
-Pose = NDArray[np.float64]
 
 
 def measure(
@@ -48,44 +45,13 @@ def measure(
     benchmark.extra_info["object_voxels"] = sum(obj.voxels for obj in env.objects())
 
 
-class DenseBitmap:
-    """Every brick of the grid in memory, indexed by its key: 1 GiB at 11 bits an axis."""
-
-    def __init__(self, env: Environment) -> None:
-        self._env = env
-        self._origin = np.array(env.grid.origin)
-        self._bricks = np.zeros((1 << max(3 * env.grid.bits - BRICK_SHIFT, 0), 64), dtype=np.uint8)
-        ends = np.array([0], dtype=np.int64), np.array([len(self._bricks)], dtype=np.int64)
-        rows = env.store.scan(*ends)
-        np.bitwise_or.at(self._bricks, rows.keys, rows.occupancy.reshape(-1, 64))
-        self._nothing = np.empty(0, dtype=np.int64)
-
-    def touch(self, shell: hapticdb.PointShell, pose: Pose) -> tuple[int, NDArray[np.float64]]:
-        """Hits and wrench, by the kernels of every frame."""
-        grid = self._env.grid
-        size = grid.voxel_size
-        placed, asked, keys = contact.locate(
-            shell.points,
-            shell.normals,
-            shell.center,
-            pose,
-            self._origin,
-            size,
-            grid.bits,
-            grid.curve_code,
-            BRICK_SHIFT,
-        )
-        bits = np.frombuffer(self._bricks[keys].tobytes(), np.uint8)
-        ids = np.ones(len(keys), dtype=np.int64)
-        wrench, hits, _, _ = contact.refine(
-            placed, asked, keys, keys, ids, bits, self._nothing, self._origin, size, 1000.0
-        )
-        return len(hits), wrench
-
-
 @pytest.fixture(scope="module")
-def dense(scene: Scene) -> DenseBitmap:
-    return DenseBitmap(scene.environments["brick"])
+def dense(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Iterator[DenseBitmap]:
+    env, folder = scene.environments["brick"], tmp_path_factory.mktemp("dense")
+    bitmap = DenseBitmap()
+    bitmap.build(PeerWork.of_sample(env, scene.shell, scene.files, folder))
+    yield bitmap
+    bitmap.close()
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -102,10 +68,10 @@ def test_touch(
 
 
 def test_dense_bitmap(benchmark: BenchmarkFixture, scene: Scene, dense: DenseBitmap) -> None:
-    measure(benchmark, scene, lambda pose: dense.touch(scene.shell, pose), "frame")
+    measure(benchmark, scene, dense.felt, "frame")
     for pose in scene.poses[::20]:
         touch = scene.environments["brick"].touch(scene.shell, pose)
-        n_hits, wrench = dense.touch(scene.shell, pose)
+        n_hits, wrench = dense.felt(pose)
         assert n_hits == len(touch.hits)
         assert wrench[:3].tobytes() == touch.force.tobytes()
 

@@ -8,10 +8,9 @@ priority keeps each processor awake; without, times double and scatter.
     make bench                      # beside the frames on SQLite, over the same scene and poses
 """
 
+import contextlib
 import itertools
-import os
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -24,6 +23,7 @@ from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 
 import hapticdb
+from awake import awake
 from hapticdb import Environment
 from hapticdb.kernels import contact
 from hapticdb.query import STRATEGIES, Strategy
@@ -39,7 +39,6 @@ from servers import FOUND, named
 
 ROUNDS = 5
 SETTINGS = {"shared_buffers": "1GB", "max_wal_size": "4GB"}
-AWAKE = "import os; os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))\nwhile True: pass"
 # the same wrench by built-in sums, without an aggregate of ours: what that costs
 SUMS = """
 SELECT sum(fx), sum(fy), sum(fz),
@@ -65,18 +64,10 @@ SELECT {statements.PACKED[layout]}, {statements.SEEN}
 
 
 @pytest.fixture(scope="module", autouse=True)
-def awake(pytestconfig: pytest.Config) -> Iterator[None]:
+def _awake(pytestconfig: pytest.Config) -> Iterator[None]:
     """No processor sleeps while times count."""
-    started = []
-    if is_measuring(pytestconfig):
-        for cpu in os.sched_getaffinity(0):
-            process = subprocess.Popen([sys.executable, "-c", AWAKE])
-            os.sched_setaffinity(process.pid, {cpu})
-            started.append(process)
-    yield
-    for process in started:
-        process.kill()
-        process.wait()
+    with awake() if is_measuring(pytestconfig) else contextlib.nullcontext():
+        yield
 
 
 class Served:

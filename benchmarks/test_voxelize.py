@@ -12,7 +12,7 @@ part of them only, since it is slow; its count differs, as its boxes are not clo
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numba
 import numpy as np
@@ -22,19 +22,11 @@ from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from hapticdb.kernels.voxelize import count_voxels, voxelize
+from peers import PeerMissingError
+from peers.voxelizers import BITS, EDGE, Assembly, Triangles, by_open3d, read_assembly, tight
 
 T = TypeVar("T")
-BITS = 10
-EDGE = 2.0**BITS
-Triangles = NDArray[np.float64]
 Bricks = tuple[NDArray[np.int64], NDArray[np.uint8]]
-
-
-class Assembly(NamedTuple):
-    """Parts (T, 3, 3) in voxels of the tight cube, and the name of the model that they make."""
-
-    name: str
-    parts: list[Triangles]
 
 
 def tori() -> trimesh.Scene:
@@ -51,19 +43,16 @@ def tori() -> trimesh.Scene:
 @pytest.fixture(scope="module")
 def assembly() -> Assembly:
     folder = os.environ.get("HAPTICDB_TEST_DATA")
-    path = Path(folder or "") / "assembly_vw_t1" / "vw_t1.glb"
-    scene = trimesh.load_scene(path, process=False) if folder else tori()
+    if folder:
+        return read_assembly(Path(folder) / "assembly_vw_t1" / "vw_t1.glb")
+    scene = tori()
     parts = []
     for node in scene.graph.nodes_geometry:
         world_from_node, name = scene.graph[node]
         mesh = scene.geometry[name]
         points = trimesh.transform_points(mesh.vertices, world_from_node)
         parts.append(np.asarray(points[mesh.faces], dtype=np.float64))
-    low = np.min([part.min(axis=(0, 1)) for part in parts], axis=0)
-    high = np.max([part.max(axis=(0, 1)) for part in parts], axis=0)
-    scale = EDGE * (1 - 1e-9) / float((high - low).max())
-    placed = [(part - low) * scale for part in parts]
-    return Assembly(path.name if folder else "a ring of 60 tori", placed)
+    return tight("a ring of 60 tori", parts)
 
 
 def subset(assembly: Assembly, benchmark: BenchmarkFixture, one_in: int = 1) -> list[Triangles]:
@@ -178,27 +167,15 @@ def test_plain_separating_axes(benchmark: BenchmarkFixture, assembly: Assembly) 
     report(benchmark, assembly, parts, sum(counts))
 
 
-def open3d_grids(parts: list[Triangles]) -> Callable[[], list[Any]]:
-    """Make what voxelizes the parts with Open3D; says so and skips where it cannot be had."""
-    try:
-        import open3d  # noqa: PLC0415 - a guarded yardstick
-    except ImportError as error:
-        pytest.skip(f"nothing to compare with, open3d does not load: {error}")
-    meshes = []
-    for part in parts:
-        points = open3d.utility.Vector3dVector(part.reshape(-1, 3))
-        faces = np.arange(3 * len(part), dtype=np.int32).reshape(-1, 3)
-        meshes.append(open3d.geometry.TriangleMesh(points, open3d.utility.Vector3iVector(faces)))
-    make = open3d.geometry.VoxelGrid.create_from_triangle_mesh_within_bounds
-    corner, far = np.zeros(3), np.full(3, EDGE)
-    return lambda: [make(mesh, 1.0, corner, far) for mesh in meshes]
-
-
 def test_open3d(benchmark: BenchmarkFixture, assembly: Assembly) -> None:
+    try:
+        tool = by_open3d()
+    except PeerMissingError as error:
+        pytest.skip(f"nothing to compare with, Open3D does not load: {error}")
     parts = subset(assembly, benchmark, one_in=20)
-    run = open3d_grids(parts)
-    grids = measure(benchmark, run, rounds=5)
-    voxels = sum(len(grid.get_voxels()) for grid in grids)
+    meshes = [tool.take(part) for part in parts]
+    grids = measure(benchmark, lambda: [tool.make(mesh) for mesh in meshes], rounds=5)
+    voxels = sum(tool.count(grid) for grid in grids)
     own = sum(count_voxels(voxelize(part, BITS)[1]) for part in parts)
     assert 0.9 < voxels / own < 1.1
     report(benchmark, assembly, parts, voxels)

@@ -1,0 +1,37 @@
+"""Processors that do not sleep while times count.
+
+A frame on a server goes to and fro between two processes that each sleep while the other works, and
+a virtual processor that sleeps can take longer to wake than a frame lasts: times double and
+scatter. A process of idle priority on each keeps them awake, and yields to whatever else runs.
+"""
+
+import contextlib
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+
+AWAKE = """
+import os
+parent = os.getppid()
+os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
+while os.getppid() == parent:  # not longer than who asked for it, however that ended
+    for _ in range(1_000_000):
+        pass
+"""
+
+
+@contextlib.contextmanager
+def awake() -> Iterator[None]:
+    """Keep each processor of this process awake inside."""
+    started = []
+    try:
+        for cpu in os.sched_getaffinity(0):
+            process = subprocess.Popen([sys.executable, "-c", AWAKE])
+            os.sched_setaffinity(process.pid, {cpu})
+            started.append(process)
+        yield
+    finally:
+        for process in started:
+            process.kill()
+            process.wait()

@@ -1,0 +1,130 @@
+"""An environment many times as large: an object's rows repeated under other keys.
+
+In Z-order the leading bits of a key name the cube that holds the voxel. So a copy that stands
+2^bits voxels further along has the same keys but for those leading bits, and the same bricks: no
+triangle is voxelized again. Copies stand side by side on a plane, like parked cars.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb import Environment
+from hapticdb.errors import UsageError
+from hapticdb.grid import Grid
+from hapticdb.grouping import object_ranges
+from hapticdb.statistics import DEFAULT_RESOLUTION
+from hapticdb.store.base import Layout, Object, Rows, Store, row_shift
+
+MAX_BITS = 15
+"""Of the larger grid."""
+
+
+@dataclass(frozen=True)
+class Source:
+    """What is repeated: objects with their rows, on a grid that the copies share the voxels of."""
+
+    grid: Grid
+    layout: Layout
+    parts: tuple[tuple[Object, Rows], ...]
+
+    @property
+    def voxels(self) -> int:
+        """Object voxels of one copy."""
+        return sum(obj.voxels for obj, _ in self.parts)
+
+    @classmethod
+    def of(cls, env: Environment) -> "Source":
+        """All objects of an environment that fits into memory; Z-order only."""
+        if env.grid.curve != "z":
+            raise UsageError(f"{env.url} is in {env.grid.curve} order: copies need z order")
+        parts = []
+        for obj in env.objects():
+            ranges = object_ranges(env.grid, env.layout, obj.bounds)
+            parts.append((obj, env.store.rows_of(obj.id, *ranges)))
+        return cls(env.grid, env.layout, tuple(parts))
+
+    def within(self, voxels: float) -> "Source":
+        """Those objects nearest to the middle that together stay within so many voxels."""
+        middles = np.array([obj.bounds.mean(axis=0) for obj, _ in self.parts])
+        distances = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
+        room = voxels
+        chosen = []
+        for n in np.argsort(distances, kind="stable"):
+            if self.parts[n][0].voxels <= room:
+                room -= self.parts[n][0].voxels
+                chosen.append(int(n))
+        if not chosen:
+            raise UsageError(f"{voxels:g} voxels hold no object of the sample: give a larger size")
+        return replace(self, parts=tuple(self.parts[n] for n in sorted(chosen)))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """Where copies stand: `tiles` (C, 3), in edges of the source's grid, and the grid of all."""
+
+    source: Source
+    grid: Grid
+    tiles: NDArray[np.int64]
+
+    @classmethod
+    def of(cls, source: Source, copies: int) -> "Plan":
+        """As near to a square as can be, in the order of their keys: rows come ascending."""
+        side = math.isqrt(copies - 1) + 1
+        bits = source.grid.bits + (side - 1).bit_length()
+        if bits > MAX_BITS:
+            raise UsageError(f"{copies} copies need {bits} bits an axis, at most {MAX_BITS}")
+        grid = replace(source.grid, bits=bits)
+        numbers = np.arange(copies)
+        tiles = np.stack([numbers % side, numbers // side, np.zeros_like(numbers)], axis=1)
+        order = np.argsort(grid.encode(tiles * source.grid.side))
+        return cls(source, grid, tiles[order])
+
+    @property
+    def voxels(self) -> int:
+        """Object voxels of all copies."""
+        return len(self.tiles) * self.source.voxels
+
+    @property
+    def middle(self) -> int:
+        """Number of the copy nearest to the middle of all."""
+        return int(np.argmin(np.linalg.norm(self.tiles - self.tiles.mean(axis=0), axis=1)))
+
+    def offsets(self) -> NDArray[np.float64]:
+        """How far each copy stands from the source, (C, 3) metres."""
+        return self.tiles.astype(np.float64) * self.source.grid.edge
+
+    def parts_of(self, copy: int) -> list[tuple[Object, Rows]]:
+        """Objects and rows of one copy."""
+        corner = self.tiles[copy] * self.source.grid.side
+        key = self.grid.encode([corner]) >> row_shift(self.source.layout)
+        offset = self.offsets()[copy]
+        shift = np.eye(4)
+        shift[:3, 3] = offset
+        return [
+            (
+                replace(
+                    obj,
+                    id=0,
+                    revision=0,
+                    name=f"copy {copy}/{obj.name}",
+                    transform=shift @ obj.transform,
+                    bounds=obj.bounds + offset,
+                ),
+                Rows(rows.keys + key, rows.ids, rows.occupancy),
+            )
+            for obj, rows in self.source.parts
+        ]
+
+
+def write_copies(store: Store, plan: Plan, progress: Callable[[int], None]) -> None:
+    """Write all copies into an empty environment on the plan's grid; told how many are there."""
+    with store.loading():
+        for copy in range(len(plan.tiles)):
+            for obj, rows in plan.parts_of(copy):
+                store.add(obj, rows)
+            progress(copy + 1)
+    store.analyze(DEFAULT_RESOLUTION)

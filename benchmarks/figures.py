@@ -1,0 +1,333 @@
+"""The evaluation: every figure on every engine, the peers, plots and the written report.
+
+    make figures                    # the sample at 11 bits: half an hour on two processors
+    make figures ARGS=--quick       # a coarse sample and few frames: whether all of it runs
+
+Everything is made in a temporary folder: the sample, its environments on SQLite and on a private
+server of every PostgreSQL that is found, with 4 MB of cache as in the paper, then with a large one.
+"""
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+
+import hapticdb
+from awake import awake
+from hapticdb import Environment, GridOptions, ImportOptions, PointShell
+from hapticdb.bench import experiments, records, run
+from hapticdb.bench.evaluation.plots import draw
+from hapticdb.bench.evaluation.report import write_report
+from hapticdb.bench.experiments import QUICK, Budget
+from hapticdb.bench.measure import Cell
+from hapticdb.bench.run import Workload
+from hapticdb.bench.subject import PAPER_CACHE, Subject, limited
+from hapticdb.bench.workload import RADIUS_VOXELS, Task
+from hapticdb.grid import CurveName
+from hapticdb.poses import read_poses
+from hapticdb.sample import SampleFiles, write_sample
+from hapticdb.store.base import BRICK_BYTES, LAYOUTS, Layout
+from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.private_server import Binaries, PrivateServer, find_binaries
+from peers import Peer, PeerWork
+from peers.run import Measured, measure_peers
+from peers.voxelizers import measure_voxelizers, read_assembly
+from servers_cold import Cold
+
+EXTENT = 1.6
+CAD = (
+    ("demo_vintage_car", "*.glb", 1.6),
+    ("assembly_vw_t1", "vw_t1.glb", 2.4),
+)
+"""Real assemblies of Table 1: folder and file under HAPTICDB_TEST_DATA, extent of the grid."""
+VOXELIZED = Path("assembly_vw_t1/vw_t1.glb")
+POINTCLOUD_MAJOR = 15
+"""PostgreSQL that Debian's package of pgpointcloud is for."""
+CACHES = {"4 MB": "4MB", "all cached": "2GB"}
+SETTINGS = {"max_wal_size": "4GB", "fsync": "off"}
+
+
+@dataclass
+class Evaluation:
+    """What one run of the script knows and has found."""
+
+    folder: Path
+    files: SampleFiles
+    bits: int
+    budget: Budget
+    data: Path | None
+    with_peers: bool
+    seconds: float = field(default_factory=time.perf_counter)
+    found: dict[str, list[Cell]] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+    work: dict[Layout, Workload] = field(default_factory=dict)
+
+    def say(self, line: str) -> None:
+        """Tell what comes next, and how long it has been going on."""
+        print(f"{time.perf_counter() - self.seconds:6.0f} s  {line}", file=sys.stderr, flush=True)
+
+    def keep(self, name: str, measured: Measured) -> None:
+        """Keep what was measured, and what was not."""
+        self.add(name, [cell | {"environment": "sample"} for cell in measured.cells])
+        self.notes += measured.notes
+
+    def add(self, name: str, cells: list[Cell]) -> None:
+        """Keep what was measured."""
+        self.found.setdefault(name, []).extend(cells)
+
+    def make(self, url: str, layout: Layout, curve: CurveName = "z") -> str:
+        """Import the sample; the same grid everywhere, curve and layout aside."""
+        options = ImportOptions(
+            grid=GridOptions(bits=self.bits, extent=EXTENT, curve=curve), layout=layout
+        )
+        (report,) = hapticdb.import_files(url, [self.files.car], options)
+        if report.error is not None:
+            raise report.error
+        return url
+
+
+def table_1(evaluation: Evaluation) -> None:
+    """Voxels, objects and cells of real assemblies, beside the sample's."""
+    if evaluation.data is None:
+        evaluation.notes.append("real CAD assemblies: HAPTICDB_TEST_DATA names no folder")
+        return
+    for folder, pattern, extent in CAD:
+        (file,) = sorted((evaluation.data / folder).glob(pattern))
+        evaluation.say(f"table 1: {folder}")
+        url = str(evaluation.folder / f"{folder}.db")
+        options = ImportOptions(grid=GridOptions(bits=evaluation.bits, extent=extent))
+        started = time.perf_counter()
+        (report,) = hapticdb.import_files(url, [file], options)
+        if report.error is not None:
+            raise report.error
+        seconds = time.perf_counter() - started
+        with hapticdb.open(url) as env:
+            distinct = distinct_voxels(env)
+            row = run.table_1_row(env, extent=extent, import_s=seconds, distinct_voxels=distinct)
+        evaluation.add("table1", [row | {"environment": folder}])
+
+
+def distinct_voxels(env: Environment) -> int:
+    """Voxels that any object touches, each once; all bricks are read at once."""
+    ends = np.array([0], dtype=np.int64), np.array([8**env.grid.bits], dtype=np.int64)
+    rows = env.store.scan(*ends)
+    starts = np.flatnonzero(np.diff(rows.keys, prepend=-1))
+    occupancy = np.bitwise_or.reduceat(rows.occupancy.reshape(-1, BRICK_BYTES), starts, axis=0)
+    return int(np.bitwise_count(occupancy).sum())
+
+
+def on_sqlite(evaluation: Evaluation) -> None:
+    """The inputs, then all experiments on SQLite, in both layouts."""
+    budget = evaluation.budget
+    for layout in LAYOUTS:
+        evaluation.say(f"SQLite, {layout}: import")
+        started = time.perf_counter()
+        url = evaluation.make(str(evaluation.folder / f"{layout}.db"), layout)
+        seconds = time.perf_counter() - started
+        with hapticdb.open(url, read_only=True) as env:
+            if layout == "brick":
+                distinct = distinct_voxels(env)
+                row = run.table_1_row(
+                    env, extent=EXTENT, import_s=seconds, distinct_voxels=distinct
+                )
+                evaluation.add("table1", [row | {"environment": "sample"}])
+    evaluation.say("inputs: shells, poses, regions")
+    shell = PointShell.from_file(evaluation.files.wrench, 300)
+    recorded = Task("recorded", "wrench", shell, read_poses(evaluation.files.path))
+    with hapticdb.open(evaluation.folder / "brick.db", read_only=True) as env:
+        work = run.workload_of(env, budget, recorded)
+    for layout in LAYOUTS:
+        with hapticdb.open(evaluation.folder / f"{layout}.db", read_only=True) as env:
+            # the same rows on every engine, so the same vector
+            evaluation.work[layout] = replace(work, finest=env.quantiles(max(budget.resolutions)))
+            for cache, is_paper in run.caches_of(env):
+                subject = Subject(env, "sample", cache, run.drop_of(env))
+                measure(evaluation, subject, is_paper=is_paper)
+
+
+def measure(evaluation: Evaluation, subject: Subject, *, is_paper: bool) -> None:
+    """All experiments at the paper's point; with a large cache those that it changes."""
+    work, budget = evaluation.work[subject.env.layout], evaluation.budget
+    evaluation.say(f"{subject.env.engine}, {subject.env.layout}: cache {subject.cache}")
+    cells = (
+        run.paper_figures(subject, work, budget)
+        if is_paper
+        else {"figure9": experiments.figure_9(subject, work.slide, budget)}
+    )
+    cells["conditions"] = run.under_conditions(subject, work, budget)
+    for name, more in cells.items():
+        evaluation.add(name, more)
+
+
+@contextlib.contextmanager
+def serving(folder: Path, binaries: Binaries, shared_buffers: str) -> Iterator[PrivateServer]:
+    """A server in a folder, with that cache, while inside."""
+    settings = SETTINGS | {"shared_buffers": shared_buffers}
+    server = PrivateServer.at(folder, binaries, settings)
+    server.start()
+    try:
+        yield server
+    finally:
+        server.stop()
+
+
+def on_postgres(evaluation: Evaluation, binaries: Binaries) -> None:
+    """All experiments on one PostgreSQL, started anew for each size of its cache."""
+    folder = evaluation.folder / f"postgres{binaries.major}"
+    with serving(folder, binaries, CACHES["all cached"]) as server:
+        for layout in LAYOUTS:
+            evaluation.say(f"PostgreSQL {binaries.major}, {layout}: import")
+            evaluation.make(with_environment(server.conninfo(), layout), layout)
+    measured: set[tuple[Layout, str]] = set()
+    for cache, shared_buffers in CACHES.items():
+        with serving(folder, binaries, shared_buffers) as server, contextlib.ExitStack() as opened:
+            drop = None
+            if cache == "4 MB":
+                drop = Cold(server.conninfo(), folder / "data")
+                opened.callback(drop.close)
+            for layout in LAYOUTS:
+                url = with_environment(server.conninfo(), layout)
+                env = opened.enter_context(hapticdb.open(url))
+                subject = Subject(env, "sample", limited(env, 0), drop)
+                if (layout, subject.cache) in measured:
+                    continue  # a small environment was all cached from the start
+                measured.add((layout, subject.cache))
+                measure(evaluation, subject, is_paper=cache == "4 MB")
+                if evaluation.with_peers and layout == "brick" and cache == "4 MB":
+                    compare(evaluation, env, ())
+
+
+def curves(evaluation: Evaluation) -> None:
+    """The three curves on SQLite, bricks and voxels; lexicographic order has no bricks."""
+    made: list[tuple[Layout, CurveName, str]] = [
+        ("brick", "z", str(evaluation.folder / "brick.db")),
+        ("voxel", "z", str(evaluation.folder / "voxel.db")),
+    ]
+    others: tuple[tuple[Layout, CurveName], ...] = (
+        ("brick", "hilbert"),
+        ("voxel", "hilbert"),
+        ("voxel", "lexicographic"),
+    )
+    for layout, curve in others:
+        evaluation.say(f"SQLite, {layout}, {curve}: import")
+        place = str(evaluation.folder / f"{layout}-{curve}.db")
+        made.append((layout, curve, evaluation.make(place, layout, curve)))
+    for layout, curve, url in made:
+        evaluation.say(f"SQLite, {layout}, {curve}")
+        with hapticdb.open(url, read_only=True) as env:
+            cache = limited(env, PAPER_CACHE)
+            subject = Subject(env, "sample", cache)
+            task = evaluation.work[layout].slide
+            evaluation.add("layouts", experiments.cached(subject, task, evaluation.budget))
+
+
+def peers(evaluation: Evaluation) -> None:
+    """What a user would take instead, on the same poses; and other voxelizers."""
+    evaluation.say("peers")
+    with hapticdb.open(evaluation.folder / "brick.db", read_only=True) as env:
+        compare(evaluation, env, None)
+    evaluation.say("voxelizing")
+    path = evaluation.data / VOXELIZED if evaluation.data else evaluation.files.car
+    evaluation.keep(
+        "voxelizing", measure_voxelizers(read_assembly(path), 10 * evaluation.budget.cell_s)
+    )
+
+
+def compare(evaluation: Evaluation, env: Environment, among: Sequence[Peer] | None) -> None:
+    """Frames of an environment in bricks and of its peers: all of them unless given."""
+    task = evaluation.work["brick"].slide
+    radius = RADIUS_VOXELS * env.grid.voxel_size
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
+    folder = evaluation.folder / "peers"
+    folder.mkdir(exist_ok=True)
+    fifteen = [binaries for binaries in find_binaries() if binaries.major == POINTCLOUD_MAJOR]
+    work = PeerWork(
+        env,
+        task.shell,
+        evaluation.files.car,
+        (np.asarray(ball.vertices), np.asarray(ball.faces)),
+        folder,
+        fifteen[0] if fifteen else None,
+    )
+    evaluation.keep("peers", measure_peers(work, task.poses, 2 * evaluation.budget.cell_s, among))
+
+
+PARTS: dict[str, Callable[[Evaluation], None]] = {"curves": curves, "peers": peers}
+ENGINES = "engines"
+
+
+def evaluate(
+    folder: Path, bits: int, budget: Budget, data: Path | None, parts: tuple[str, ...]
+) -> dict[str, dict[str, Any]]:
+    """Run the parts named, and return results by name."""
+    files = write_sample(folder / "sample", budget.frames)
+    evaluation = Evaluation(folder, files, bits, budget, data, with_peers=peers.__name__ in parts)
+    hapticdb.warm_up()
+    on_sqlite(evaluation)
+    table_1(evaluation)
+    for name, part in PARTS.items():
+        if name in parts:
+            part(evaluation)
+    if ENGINES in parts:
+        for binaries in find_binaries():
+            on_postgres(evaluation, binaries)
+    inputs = dict(records.INPUTS) | {
+        "sample": f"the sample car, {bits} bits, extent {EXTENT}",
+        "PostgreSQL": "private server, Unix socket; fsync off while importing",
+        "processors": "kept awake by processes of idle priority",
+    }
+    evaluation.say("done")
+    return {
+        name: records.result(name, cells, inputs=inputs, notes=evaluation.notes)
+        for name, cells in evaluation.found.items()
+    }
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Read the command line, measure, write JSON, plots and the report."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="a coarse sample, few frames")
+    parser.add_argument("--bits", type=int, help="of the grid; 11 unless given, 9 when quick")
+    parser.add_argument("--out", type=Path, help="for JSON and plots; results unless quick")
+    parser.add_argument("--report", type=Path, help="docs/evaluation.md unless quick")
+    parser.add_argument(
+        "--parts", default=",".join([*PARTS, ENGINES]), help="some of these, and SQLite always"
+    )
+    chosen = parser.parse_args(arguments)
+    out = chosen.out or Path("results-quick" if chosen.quick else "results")
+    report = chosen.report or (out / run.REPORT if chosen.quick else Path("docs/evaluation.md"))
+    data = os.environ.get("HAPTICDB_TEST_DATA")
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that servers and files go, too
+    with awake(), tempfile.TemporaryDirectory(prefix="hapticdb-figures-") as folder:
+        found = evaluate(
+            Path(folder),
+            chosen.bits or (9 if chosen.quick else 11),
+            QUICK if chosen.quick else Budget(),
+            Path(data) if data else None,
+            tuple(chosen.parts.split(",")),
+        )
+    records.write(out, found)
+    redraw(out, report)
+    print(report)
+
+
+def redraw(out: Path, report: Path) -> None:
+    """Plots and report from the JSON that is there, that of `make scale` included."""
+    results = records.read(out)
+    draw(results, out)
+    report.parent.mkdir(parents=True, exist_ok=True)
+    write_report(results, report, os.path.relpath(out, report.parent))
+
+
+if __name__ == "__main__":
+    main()

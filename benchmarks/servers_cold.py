@@ -1,0 +1,44 @@
+"""Emptying the caches of a private server: its own, and the operating system's."""
+
+import os
+from pathlib import Path
+
+import psycopg
+
+BLOCKS = 2000
+"""Of 8 KB, read to push all others out of a cache of 4 MB."""
+FILL = f"""
+CREATE TABLE IF NOT EXISTS public.filler (n int PRIMARY KEY, pad text);
+ALTER TABLE public.filler ALTER COLUMN pad SET STORAGE PLAIN;
+INSERT INTO public.filler SELECT n, repeat('x', 7000) FROM generate_series(1, {BLOCKS}) AS s(n)
+    ON CONFLICT DO NOTHING;
+CHECKPOINT"""
+# by the index: a scan of the whole table would pass through a small ring of blocks instead
+PUSH_OUT = f"SELECT sum(length(pad)) FROM public.filler WHERE n BETWEEN 1 AND {BLOCKS}"
+
+
+class Cold:
+    """Empties the caches of a server whose folder is ours; its cache must be small."""
+
+    def __init__(self, conninfo: str, data: Path) -> None:
+        self._connection = psycopg.connect(conninfo, autocommit=True)
+        for statement in FILL.split(";"):
+            self._connection.execute(statement)
+        self._connection.execute("SET enable_seqscan = off")
+        self._connection.execute("SET enable_bitmapscan = off")
+        self._files = [path for path in (data / "base").rglob("*") if path.is_file()]
+
+    def __call__(self) -> None:
+        """Forget all pages."""
+        self._connection.execute(PUSH_OUT)
+        for path in self._files:
+            try:
+                descriptor = os.open(path, os.O_RDONLY)
+            except FileNotFoundError:
+                continue
+            os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+            os.close(descriptor)
+
+    def close(self) -> None:
+        """Give the connection back."""
+        self._connection.close()

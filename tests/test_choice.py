@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hapticdb.choice import FEW, MOST_KEPT, TRY_EVERY, Choice, Chooser
+from hapticdb.choice import FEW, LONG, MOST_KEPT, TRY_EVERY, Choice, Chooser
 from hapticdb.statistics import CostModel, QuantileVector
 
 KEYS = np.arange(0, 4000, 40, dtype=np.int64)
@@ -122,3 +122,17 @@ def test_only_the_last_frame_of_a_turn_is_timed() -> None:
         listening.append(chooser.is_listening)
     assert listening[-1]
     assert not any(listening[:-1])
+
+
+def test_a_strategy_that_was_disturbed_when_it_was_tried_gets_another_chance() -> None:
+    """Each of its first frames, or all of them: then it takes longer to come back."""
+    took = {"array": 80.0, "cbgroup": 160.0}
+    chooser = Chooser(QUANTILES, MODEL)
+    for spike in (1e4, 80.0, 1e4, 80.0):
+        chooser.hear(Choice("array", 300, len(KEYS), len(KEYS), 10), spike)
+    assert run(chooser, took, 500)["array"] > 400
+    chooser = Chooser(QUANTILES, MODEL)
+    for _ in range(FEW):
+        chooser.hear(Choice("array", 300, len(KEYS), len(KEYS), 10), 400.0)
+    run(chooser, took, 4 * LONG)
+    assert run(chooser, took, 500)["array"] > 400

@@ -259,7 +259,7 @@ def test_names_beyond_the_terminals_encoding_are_printed(tmp_path: Path) -> None
 
 
 def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) -> None:
-    file = boxes(tmp_path / "many.glb", count=30, side=0.15)
+    file = boxes(tmp_path / "many.glb", count=60, side=0.15)
     options = ("--layout", "voxel", "--voxel-size", 0.002)
     assert run("import", "whole.db", file, *options)[0] == 0
     args = command("import", "cut.db", file, *options)

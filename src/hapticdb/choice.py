@@ -20,6 +20,10 @@ WORTH_TRYING = 2.0
 """Times the least cost up to which a strategy is tried: no model is wrong by more."""
 STILL_WORTH_TRYING = 1.75
 """The same for one whose cost is known from frames of its own."""
+LONG = 2048
+"""Frames after which what is known of a strategy is doubted."""
+DOUBTED = 4.0
+"""Times the least cost up to which it is then as if it had never been heard of."""
 FEW = 4
 """Frames heard of after which a strategy's cost is known."""
 PACE = 0.2
@@ -110,11 +114,12 @@ class Chooser:
         modelled = self._model(choice)
         if modelled > 0.0:
             slowness = took_us / modelled
-            before = self._slowness.get(name, slowness)
-            if heard:  # one frame that waited for something else is not believed
-                slowness = min(max(slowness, before / 2), before * 2)
-            pace = max(PACE, 1 / (heard + 1))
-            self._slowness[name] = before + pace * (slowness - before)
+            before = self._slowness[name] if heard else slowness
+            if heard < FEW:  # whatever disturbs a frame makes it longer
+                slowness = min(slowness, before)
+            else:  # one that waited for something else is not believed
+                slowness = before + PACE * (min(max(slowness, before / 2), before * 2) - before)
+            self._slowness[name] = slowness
         self._heard[name] = heard + 1
 
     def _choices(self, n_points: int, n_keys: int, grouping: Grouping) -> dict[Chosen, Choice]:
@@ -143,8 +148,10 @@ class Chooser:
         """What a choice should take here and now."""
         name = choice.strategy
         rows = (choice.rows + 1) * self._crowding.get(name, 1.0) - 1
-        # of one never tried it is believed that it suffers from the same as the present one
-        slowness = self._slowness.get(name, self._slowness.get(self._turn, 1.0))
+        # of one hardly tried it is believed that it suffers from the same as the present one
+        slowness = self._slowness.get(self._turn, 1.0)
+        if self._heard.get(name, 0) >= FEW:
+            slowness = self._slowness[name]
         return self._model(choice._replace(rows=max(rows, 0.0))) * slowness
 
     def _worth_trying(self, best: Chosen, cost: dict[Chosen, float]) -> Chosen | None:
@@ -152,11 +159,14 @@ class Chooser:
         if best not in self._heard:
             return None
         for name, us in cost.items():
+            if name == best:
+                continue
+            since = self._frame - self._tried.get(name, 0)
+            if since >= LONG and us <= DOUBTED * cost[best]:
+                self._heard[name] = 0
             is_known = self._heard.get(name, 0) >= FEW
             worth = STILL_WORTH_TRYING if is_known else WORTH_TRYING
-            if name == best or us > worth * cost[best]:
-                continue
-            if not is_known or self._frame - self._tried.get(name, 0) >= TRY_EVERY:
+            if us <= worth * cost[best] and (not is_known or since >= TRY_EVERY):
                 self._tried[name] = self._frame
                 return name
         return None

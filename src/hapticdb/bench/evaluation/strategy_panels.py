@@ -74,7 +74,10 @@ def draw_conditions(sheet: Sheet) -> Figure:
             for number, strategy in enumerate(strategies):
                 x = place + dodged(number, len(strategies))
                 _mark(panel.axes, own, strategy, x)
-        names = [f"{cache or ''}\n{file or ''}" for cache, file in caches]
+        # side by side there is room for one word
+        names = [
+            f"{str(cache or '').removesuffix(' cached')}\n{file or ''}" for cache, file in caches
+        ]
         fix_ticks(panel.axes.xaxis, range(len(caches)), names if panel.is_lowest else [])
         panel.axes.set_xlim(-0.6, len(caches) - 0.4)
         for between in range(1, len(caches)):

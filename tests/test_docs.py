@@ -100,7 +100,14 @@ def test_the_docs_show_the_sql_that_runs() -> None:
 
 
 @pytest.mark.parametrize(
-    "page", ["README.md", "ARCHITECTURE.md", "docs/strategies.md", "docs/postgresql.md"]
+    "page",
+    [
+        "README.md",
+        "ARCHITECTURE.md",
+        "docs/strategies.md",
+        "docs/postgresql.md",
+        "docs/evaluation.md",
+    ],
 )
 def test_every_link_in_the_docs_leads_somewhere(page: str) -> None:
     path = ROOT / page

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hapticdb.bench.evaluation.findings import choices, contests
+from hapticdb.bench.evaluation.findings import choices, contests, repeats
 from hapticdb.bench.evaluation.plots import draw
 from hapticdb.bench.evaluation.prose import (
     bytes_text,
@@ -349,6 +349,18 @@ def test_a_table_escapes_what_would_break_it() -> None:
     assert [listed(words) for words in ([], ["a"], ["a", "b"], ["a", "b", "c"])] == [
         "", "a", "a and b", "a, b and c",
     ]  # fmt: skip
+
+
+def test_what_was_measured_twice_tells_how_far_to_trust_the_rest() -> None:
+    alike = cell(100.0, engine=SQLITE, layout="brick", strategy="array")
+    again = cell(125.0, engine=SQLITE, layout="brick", strategy="array")
+    other = cell(900.0, engine=SQLITE, layout="voxel", strategy="array")
+    results = {
+        name: {"name": name, "cells": cells}
+        for name, cells in (("figure9", [alike, other]), ("conditions", [again]))
+    }
+    assert repeats(results) == [1.25]
+    assert repeats({"figure9": results["figure9"]}) == []
 
 
 def test_the_fitted_costs_are_told_beside_what_a_range_is_worth(page: str) -> None:

@@ -167,6 +167,20 @@ def choices(results: Results) -> list[Choice]:
     return found
 
 
+def repeats(results: Results) -> list[float]:
+    """Longest over shortest typical time of what several experiments of the run measured alike."""
+    times: dict[tuple[Any, ...], list[float]] = {}
+    keys = (*WHERE, "strategy", "form", "maxgap", "resolution")
+    for experiment in results:
+        if experiment in {"peers", "scale"}:
+            continue
+        for values, group in grouped(cells_of(results, experiment), keys).items():
+            cell = least(group, frame_us)
+            if cell is not None and word(cell, "strategy") and len(group) == 1:
+                times.setdefault(values, []).append(frame_us(cell) or 0.0)
+    return sorted(max(own) / min(own) for own in times.values() if len(own) > 1 and min(own) > 0)
+
+
 def is_ours(cell: Cell) -> bool:
     """Whether a cell of the peers is hapticdb's own."""
     return word(cell, "peer").startswith(OURS)

@@ -12,10 +12,17 @@ from hapticdb.bench.cells import (
     grouped,
     least,
     named,
+    number,
     with_strategy,
     word,
 )
-from hapticdb.bench.evaluation.findings import AUTO_CLOSE, CHOOSABLE, Choice, choices
+from hapticdb.bench.evaluation.findings import (
+    AUTO_CLOSE,
+    CHOOSABLE,
+    Choice,
+    choices,
+    repeats,
+)
 from hapticdb.bench.evaluation.prose import (
     bullets,
     count_text,
@@ -141,7 +148,12 @@ def auto(results: Results) -> str:
     found = choices(results)
     if not found:
         return ""
-    return paragraphs(_auto_sentences(found), _auto_summary(found), _auto_worst(found))
+    return paragraphs(
+        _auto_sentences(found),
+        _auto_summary(found),
+        _auto_worst(found),
+        _auto_noise(results, found),
+    )
 
 
 def _auto_sentences(found: Sequence[Choice]) -> str:
@@ -194,6 +206,32 @@ def _auto_worst(found: Sequence[Choice]) -> str:
     told = f"The worst of the {len(off)} others:" if len(off) > WORST_SHOWN else "The others:"
     head = ["experiment", "", "`auto`, us", "chose", "fastest", "its us", "ratio"]
     return paragraphs(told, table(head, rows))
+
+
+def _auto_noise(results: Results, found: Sequence[Choice]) -> str:
+    """How far the numbers themselves can be trusted, as the run shows it."""
+    said = []
+    apart = repeats(results)
+    if apart:
+        said.append(
+            f"{len(apart)} combinations were measured by several experiments of the run. Minutes "
+            f"later they took {ratio_text(apart[len(apart) // 2])} times as long in the middle and "
+            f"{ratio_text(apart[-1])} at most: the machine's speed drifts by as much. What one "
+            "figure compares ran in turns; the fastest of several cells is still the one that luck "
+            "favoured most."
+        )
+    frames = [
+        n
+        for choice in found
+        if choice.ratio > AUTO_CLOSE and word(choice.where, "file") == "cold"
+        if (n := number(choice.auto, "frames")) is not None
+    ]
+    if frames:
+        said.append(
+            f"Cold cells have {count_text(min(frames))} frames, and `auto` spends its first ones "
+            "on hearing what each strategy takes."
+        )
+    return bullets(said)
 
 
 def _maxgap_of(cell: Cell) -> str:

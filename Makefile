@@ -27,12 +27,12 @@ types: $(READY)
 bench: $(READY)
 	$(BIN)/pytest benchmarks --benchmark-enable --benchmark-only --benchmark-columns=median,min,iqr,rounds
 
-# The evaluation in docs/evaluation.md: half an hour; 'make figures ARGS=--quick' three minutes.
+# The evaluation in docs/evaluation.md: a quarter of an hour; ARGS=--quick for two minutes.
 # PostgreSQL 15 and PostGIS or pgpointcloud, where they are installed, take part (README.md).
 figures: $(READY) .venv/figures
 	$(BIN)/python benchmarks/figures.py $(ARGS)
 
-# Frames and bytes at 1.4 million to 1.4 billion voxels: 20 minutes, 10 GB of disk.
+# Frames and bytes at 1.4 million to 1.4 billion voxels: five minutes, 10 GB of disk.
 scale: $(READY)
 	$(BIN)/python benchmarks/scale.py --report docs/evaluation.md $(ARGS)
 

@@ -1,6 +1,6 @@
 """The evaluation: every figure on every engine, the peers, plots and the written report.
 
-    make figures                    # the sample at 11 bits: half an hour on two processors
+    make figures                    # the sample at 11 bits: a quarter of an hour on two processors
     make figures ARGS=--quick       # a coarse sample and few frames: whether all of it runs
 
 Everything is made in a temporary folder: the sample, its environments on SQLite and on a private

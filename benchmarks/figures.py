@@ -283,7 +283,7 @@ def evaluate(
             on_postgres(evaluation, binaries)
     inputs = dict(records.INPUTS) | {
         "sample": f"the sample car, {bits} bits, extent {EXTENT}",
-        "PostgreSQL": "private server, Unix socket; fsync off while importing",
+        "PostgreSQL": "private server, Unix socket, fsync off",
         "processors": "kept awake by processes of idle priority",
     }
     evaluation.say("done")

@@ -48,7 +48,7 @@ def table1(cells: Sequence[Cell]) -> str:
     """Voxels, objects and cells of the data space."""
     head = (
         "environment", "objects", "object voxels", "distinct voxels", "cells of the data space",
-        "extent, m", "rows (bricks)", "size (bricks)",
+        "extent, longest sides", "rows (bricks)", "size (bricks)",
     )  # fmt: skip
     rows = [
         (

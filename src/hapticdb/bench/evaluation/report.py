@@ -240,7 +240,11 @@ def _facts(results: Results, key: str) -> str:
             said.setdefault(_fact_table(found), []).append(chapter.title)
     if len(said) == 1:
         return next(iter(said))
-    return paragraphs(*(f"{listed(titles)}:\n\n{facts}" for facts, titles in said.items()))
+    most = max(said, key=lambda facts: len(said[facts]), default="")
+    others = [title for facts, titles in said.items() if facts != most for title in titles]
+    labels = {facts: listed(titles) for facts, titles in said.items()}
+    labels[most] = f"All but {listed(others)}"
+    return paragraphs(*(f"{labels[facts]}:\n\n{facts}" for facts in said))
 
 
 def _fact_table(facts: Mapping[str, object]) -> str:

@@ -29,6 +29,8 @@ bench: $(READY)
 
 # The evaluation in docs/evaluation.md: a quarter of an hour; ARGS=--quick for two minutes.
 # PostgreSQL 15 and PostGIS or pgpointcloud, where they are installed, take part (README.md).
+# Real assemblies for Table 1 and voxelizing are read from the folder that HAPTICDB_TEST_DATA names.
+figures: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
 figures: $(READY) .venv/figures
 	$(BIN)/python benchmarks/figures.py $(ARGS)
 
@@ -63,4 +65,4 @@ $(READY): requirements/dev.txt pyproject.toml
 	touch $(READY)
 
 clean:
-	rm -rf .venv dist demo .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf .venv dist demo results-quick .pytest_cache .mypy_cache .ruff_cache .hypothesis

@@ -12,8 +12,8 @@ import sys
 from collections.abc import Iterator
 
 AWAKE = """
-import os
-parent = os.getppid()
+import os, sys
+parent = int(sys.argv[1])
 os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
 while os.getppid() == parent:  # not longer than who asked for it, however that ended
     for _ in range(1_000_000):
@@ -27,9 +27,8 @@ def awake() -> Iterator[None]:
     started = []
     try:
         for cpu in os.sched_getaffinity(0):
-            process = subprocess.Popen([sys.executable, "-c", AWAKE])
-            os.sched_setaffinity(process.pid, {cpu})
-            started.append(process)
+            started.append(subprocess.Popen([sys.executable, "-c", AWAKE, str(os.getpid())]))
+            os.sched_setaffinity(started[-1].pid, {cpu})
         yield
     finally:
         for process in started:

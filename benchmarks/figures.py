@@ -78,7 +78,10 @@ class Evaluation:
 
     def keep(self, name: str, measured: Measured) -> None:
         """Keep what was measured, and what was not."""
-        self.add(name, [cell | {"environment": "sample"} for cell in measured.cells])
+        conditions = {"environment": "sample"}
+        if name == "peers":
+            conditions |= {"poses": "slide", "shell": "sphere"}
+        self.add(name, [cell | conditions for cell in measured.cells])
         self.notes += measured.notes
 
     def add(self, name: str, cells: list[Cell]) -> None:
@@ -164,7 +167,7 @@ def measure(evaluation: Evaluation, subject: Subject, *, is_paper: bool) -> None
         if is_paper
         else {"figure9": experiments.figure_9(subject, work.slide, budget)}
     )
-    cells["conditions"] = run.under_conditions(subject, work, budget)
+    cells["conditions"] = run.under_conditions(subject, work, budget, is_first=is_paper)
     for name, more in cells.items():
         evaluation.add(name, more)
 
@@ -259,6 +262,8 @@ def compare(evaluation: Evaluation, env: Environment, among: Sequence[Peer] | No
         folder,
         fifteen[0] if fifteen else None,
     )
+    note = f"{env.engine}: with a database cache of {limited(env, PAPER_CACHE)}"
+    evaluation.notes += [note] if note not in evaluation.notes else []
     evaluation.keep("peers", measure_peers(work, task.poses, 2 * evaluation.budget.cell_s, among))
 
 

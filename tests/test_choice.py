@@ -136,3 +136,18 @@ def test_a_strategy_that_was_disturbed_when_it_was_tried_gets_another_chance() -
         chooser.hear(Choice("array", 300, len(KEYS), len(KEYS), 10), 400.0)
     run(chooser, took, 4 * LONG)
     assert run(chooser, took, 500)["array"] > 400
+
+
+def test_frames_that_ask_nothing_teach_nothing() -> None:
+    """A tool beside the grid has no keys; back on the part, all goes on."""
+    chooser = Chooser(QUANTILES, replace(MODEL, single=1e4))
+    took = {"array": 110.0, "cbgroup": 150.0}
+    run(chooser, took, 50)
+    none = KEYS[:0]
+    for _ in range(5 * FEW):
+        kept = chooser.kept(0)
+        if kept is None:
+            chooser.find(chooser.choose(300, none), 0)
+        elif chooser.is_listening:
+            chooser.hear(Choice(kept, 300, 0, 0, 0), 5.0)
+    assert run(chooser, took, 400)["array"] > 200

@@ -51,16 +51,20 @@ class PointcloudPatches(RowPeer):
         # a short path that the server's account may enter
         folder = Path(tempfile.mkdtemp(prefix="hapticdb-peer-"))
         self._server = PrivateServer.at(folder, work.binaries, SETTINGS)
-        self._server.start()
-        self._connection = psycopg.connect(self._server.conninfo(), autocommit=True)
-        found = self._connection.execute("SELECT name FROM pg_available_extensions").fetchall()
-        if not set(EXTENSIONS) <= {name for (name,) in found}:
-            self.close()
-            raise PeerMissingError(INSTALL)
-        self._fill(work)
+        try:
+            self._server.start()
+            self._connection = psycopg.connect(self._server.conninfo(), autocommit=True)
+            self._fill(work)
+        except BaseException:  # Ctrl-C, too: no server and no folder is left behind
+            self._server.stop()
+            shutil.rmtree(folder)
+            raise
 
     def _fill(self, work: PeerWork) -> None:
         execute = self._connection.execute
+        found = execute("SELECT name FROM pg_available_extensions").fetchall()
+        if not set(EXTENSIONS) <= {name for (name,) in found}:
+            raise PeerMissingError(INSTALL)
         for name in EXTENSIONS:
             execute(f"CREATE EXTENSION {name}")
         execute("INSERT INTO pointcloud_formats (pcid, srid, schema) VALUES (1, 0, %s)", [FORMAT])

@@ -47,7 +47,7 @@ class Choice(NamedTuple):
 
 
 class Chooser:
-    """Chooses for one opened environment, and learns.
+    """Chooses for one opened environment and one size of shell, and learns.
 
     The model's figures hold for pages that are cached, and rows are expected by a histogram, which
     knows nothing of the place: a tool that lifts off finds none where it found a hundred. So frames
@@ -112,14 +112,15 @@ class Chooser:
         name = choice.strategy
         heard = self._heard.get(name, 0)
         modelled = self._model(choice)
-        if modelled > 0.0:
-            slowness = took_us / modelled
-            before = self._slowness[name] if heard else slowness
-            if heard < FEW:  # whatever disturbs a frame makes it longer
-                slowness = min(slowness, before)
-            else:  # one that waited for something else is not believed
-                slowness = before + PACE * (min(max(slowness, before / 2), before * 2) - before)
-            self._slowness[name] = slowness
+        if modelled <= 0.0:  # nothing was asked, or nothing is known of what that costs
+            return
+        slowness = took_us / modelled
+        before = self._slowness[name] if heard else slowness
+        if heard < FEW:  # whatever disturbs a frame makes it longer
+            slowness = min(slowness, before)
+        else:  # one that waited for something else is not believed
+            slowness = before + PACE * (min(max(slowness, before / 2), before * 2) - before)
+        self._slowness[name] = slowness
         self._heard[name] = heard + 1
 
     def _choices(self, n_points: int, n_keys: int, grouping: Grouping) -> dict[Chosen, Choice]:

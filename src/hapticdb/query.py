@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
+MOST_SHELLS = 64
+"""Sizes of shells for which `auto` remembers what it has learned."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
 
@@ -72,7 +74,7 @@ class HapticQuery:
     ) -> None:
         self._store = store
         self._statistics = statistics
-        self._chooser: Chooser | None = None
+        self._choosers: dict[int, Chooser] = {}
         grid = store.grid
         self._shift = row_shift(store.layout)
         self._origin = np.array(grid.origin)
@@ -96,8 +98,10 @@ class HapticQuery:
             raise UsageError(f"MAXGAP {gap}: give 0 or more")
         pose = np.ascontiguousarray(world_from_tool, dtype=np.float64)
         located = self.locate(shell, pose)
+        if strategy == "auto" and not located.keys.size:
+            strategy = "array"  # nothing to ask: the tool is beside the grid
         if strategy == "auto":
-            chooser = self._chooser
+            chooser = self._choosers.get(located.asked.shape[1])
             kept = chooser.kept(len(located.keys)) if chooser is not None else None
             if chooser is None or kept is None:
                 return self._choosing(located, exclude, law, started)
@@ -108,8 +112,9 @@ class HapticQuery:
 
     def _choosing(self, located: Located, exclude: Keys, law: TangentPlane, started: int) -> Answer:
         """The first frame of a turn: its strategy is chosen, and the rows that it reads told."""
-        chooser = self._present_chooser()
-        choice = chooser.choose(located.asked.shape[1], located.keys)
+        n_points = located.asked.shape[1]
+        chooser = self._present_chooser(n_points)
+        choice = chooser.choose(n_points, located.keys)
         answer = self._answer(choice.strategy, located, exclude, law, started)
         chooser.find(choice, answer.query.rows)
         return answer
@@ -201,12 +206,17 @@ class HapticQuery:
             ranges = cbgroup(keys, *self._statistics()).ranges
         return 1, len(ranges.lows), self._store.scan(*ranges)
 
-    def _present_chooser(self) -> Chooser:
-        """The one that stands on the present statistics; a new one has learned nothing yet."""
+    def _present_chooser(self, n_points: int) -> Chooser:
+        """The one for such a shell that stands on the present statistics.
+
+        One for each size of shell: two tools in turns would never be alike.
+        """
         quantiles, costs = self._statistics()
-        chooser = self._chooser
+        chooser = self._choosers.get(n_points)
         if chooser is None or chooser.quantiles is not quantiles or chooser.costs is not costs:
-            self._chooser = chooser = Chooser(quantiles, costs)
+            if len(self._choosers) >= MOST_SHELLS:
+                self._choosers.clear()
+            self._choosers[n_points] = chooser = Chooser(quantiles, costs)
         return chooser
 
     def _by_statement(

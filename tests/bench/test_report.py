@@ -365,6 +365,19 @@ def test_what_was_measured_twice_tells_how_far_to_trust_the_rest() -> None:
     assert repeats({"figure9": results["figure9"]}) == []
 
 
+def test_a_ratio_is_told_beside_what_the_choices_alone_explain() -> None:
+    base: Cell = {"engine": SQLITE, "layout": "brick"}
+    cells = [
+        cell(150.0, strategy="auto", chosen={"array": 750, "cbgroup": 250}, **base),
+        cell(100.0, strategy="array", **base),
+        cell(140.0, strategy="cbgroup", **base),
+    ]
+    (found,) = choices({"strategies": {"name": "strategies", "cells": cells}})
+    assert (found.ratio, found.explained) == (1.5, pytest.approx(1.1))
+    cells[0]["cut_short"] = True
+    assert choices({"strategies": {"name": "strategies", "cells": cells}}) == []
+
+
 def test_the_fitted_costs_are_told_beside_what_a_range_is_worth(page: str) -> None:
     told = chapter(page, "What the grouping stands on")
     assert "| SQLite 3.51.0, bricks | 40 | 0.6 | 0.4 | 38 | 0.3 | 2 | 0.75 |" in told

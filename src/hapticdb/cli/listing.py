@@ -136,7 +136,10 @@ def calibrate(
     url: Url,
     *,
     cold: Annotated[
-        bool, typer.Option("--cold", help="With empty caches; on SQLite, and in some seconds.")
+        bool,
+        typer.Option(
+            "--cold", help="With empty caches, on SQLite; these figures are then the ones kept."
+        ),
     ] = False,
     json: Json = False,
 ) -> None:
@@ -165,10 +168,11 @@ def calibrate(
         render.say_json({"figures": figures, "spread": dict(costs.spread), "kept": is_kept})
         return
     render.show(_costs_table(costs))
+    worth = costs.descent / costs.row_in_gap if costs.row_in_gap else None
+    when = "always" if worth is None else f"when it should hold fewer than {worth:.1f} rows"
     render.say(
         f"{render.counted(rows, 'row')}, {costs.rows_per_block:.0f} in a leaf block; "
-        f"a gap is scanned when it should hold fewer than "
-        f"{costs.descent / max(costs.row_in_gap, 1e-9):.1f} rows"
+        f"a gap is scanned {when}"
     )
 
 

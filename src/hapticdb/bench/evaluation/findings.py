@@ -14,6 +14,7 @@ from hapticdb.bench.cells import (
     form_of,
     frame_us,
     grouped,
+    is_cut_short,
     least,
     number,
     ratio,
@@ -111,7 +112,8 @@ class Choice:
     """`auto` beside every other strategy under the same conditions, in the same run.
 
     experiment : its name; where : conditions by name; auto, best : cells; best_choosable : the
-    fastest of those that `auto` chooses among, if one was measured.
+    fastest of those that `auto` chooses among, if one was measured; own_us : times of the
+    strategies by name.
     """
 
     experiment: str
@@ -119,6 +121,17 @@ class Choice:
     auto: Cell
     best: Cell
     best_choosable: Cell | None
+    own_us: Mapping[str, float]
+
+    @property
+    def explained(self) -> float | None:
+        """What its choices alone make of the ratio: the strategies' own times, by their shares."""
+        counts = self.auto.get("chosen") or {}
+        known = {str(name): n for name in counts if (n := number(counts, name)) and n > 0}
+        if not known or not set(known) <= set(self.own_us):
+            return None
+        mean = sum(n * self.own_us[name] for name, n in known.items()) / sum(known.values())
+        return ratio(mean, frame_us(self.best))
 
     @property
     def ratio(self) -> float:
@@ -143,7 +156,10 @@ class Choice:
 
 
 def choices(results: Results) -> list[Choice]:
-    """Every set of conditions in which `auto` and another strategy have a time."""
+    """Every set of conditions in which `auto` and another strategy have a time.
+
+    Cells that the time limit cut short are left out: they hold other poses than their neighbours.
+    """
     found = []
     for experiment in results:
         if experiment in {"peers", "scale"}:
@@ -153,7 +169,7 @@ def choices(results: Results) -> list[Choice]:
         cells = [
             cell
             for cell in cells_of(results, experiment)
-            if word(cell, "strategy") and form_of(cell) == ONE_STATEMENT
+            if word(cell, "strategy") and form_of(cell) == ONE_STATEMENT and not is_cut_short(cell)
         ]
         for values, group in grouped(cells, keys).items():
             auto = least(with_strategy(group, "auto"), frame_us)
@@ -163,7 +179,12 @@ def choices(results: Results) -> list[Choice]:
                 continue
             choosable = least([c for c in others if c.get("strategy") in CHOOSABLE], frame_us)
             where = dict(zip(keys, values, strict=True))
-            found.append(Choice(experiment, where, auto, best, choosable))
+            own_us = {
+                word(c, "strategy"): us
+                for c in others
+                if number(c, "maxgap") is None and (us := frame_us(c)) is not None
+            }
+            found.append(Choice(experiment, where, auto, best, choosable, own_us))
     return found
 
 

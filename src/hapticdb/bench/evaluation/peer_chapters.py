@@ -1,5 +1,6 @@
 """The evaluation's chapters on peers, voxelizing and scale."""
 
+import math
 from collections.abc import Iterable, Sequence
 
 from hapticdb.bench.cells import Cell, distinct, frame_us, grouped, named, number, ratio, word
@@ -16,6 +17,9 @@ from hapticdb.bench.evaluation.prose import (
     table,
     time_text,
 )
+
+ALIKE = 1.1
+"""Peers run one after another, and a machine drifts by as much meanwhile."""
 
 
 def peers(cells: Sequence[Cell]) -> str:
@@ -63,15 +67,21 @@ def _peer_sentences(known: Sequence[Cell]) -> Iterable[str]:
     own = next((cell for cell in known if is_ours(cell)), None)
     rivals = [cell for cell in known if asks_the_same(cell) and not is_ours(cell)]
     if own is not None and rivals:
-        mine = frame_us(own, "p50")
-        faster = [c for c in rivals if (frame_us(c, "p50") or 0.0) < (mine or 0.0)]
-        slower = [c for c in rivals if c not in faster]
+        factors = {
+            word(c, "peer"): factor
+            for c in rivals
+            if (factor := ratio(frame_us(c, "p50"), frame_us(own, "p50"))) is not None
+        }
         name = word(own, "peer")
-        for group, kind in ((faster, "Faster"), (slower, "Slower")):
-            times = [f"{word(c, 'peer')} ({_factor(c, own)})" for c in group]
+        for kind, low, high in (
+            ("Faster than", 0.0, 1 / ALIKE),
+            ("As fast, within 10 %, as", 1 / ALIKE, ALIKE),
+            ("Slower than", ALIKE, math.inf),
+        ):
+            times = [f"{n} ({ratio_text(f)})" for n, f in factors.items() if low < f <= high]
             if times:
                 yield (
-                    f"{kind} than {name} at the same question (time as a multiple of its p50): "
+                    f"{kind} {name} at the same question (time as a multiple of its p50): "
                     f"{listed(times)}."
                 )
     apart = [
@@ -83,10 +93,6 @@ def _peer_sentences(known: Sequence[Cell]) -> Iterable[str]:
     ]
     if apart:
         yield f"Hits differ at some poses, though the question is the same: {listed(apart)}."
-
-
-def _factor(cell: Cell, own: Cell) -> str:
-    return ratio_text(ratio(frame_us(cell, "p50"), frame_us(own, "p50")))
 
 
 def voxelizing(cells: Sequence[Cell]) -> str:
@@ -139,8 +145,17 @@ def _scale_times(cells: Sequence[Cell]) -> str:
 
 
 def _growth(cells: Sequence[Cell]) -> Iterable[str]:
-    """The largest environment's time over the smallest's, for each engine and kind of poses."""
-    timed = [cell for cell in cells if frame_us(cell) and number(cell, "object_voxels")]
+    """The largest environment's time over the smallest's, for each engine and kind of poses.
+
+    Of whole copies: a part of one has other surfaces, and fewer of them.
+    """
+    timed = [
+        cell
+        for cell in cells
+        if frame_us(cell)
+        and number(cell, "object_voxels")
+        and (number(cell, "copies") or 1.0) >= 1.0
+    ]
     for (engine, poses), group in grouped(timed, ("engine", "poses")).items():
         found = []
         for own in grouped(group, ("layout", "strategy")).values():

@@ -122,7 +122,7 @@ CHAPTERS = (
 AUTO = "auto"
 """Chapter of all experiments together; evidence may be given for it, too."""
 OPENING = (
-    "Written by the benchmarks from the JSON of one run; edits are lost in the next. A time is one "
+    "Written by the benchmarks from the JSON beside the plots; edits are lost. A time is one "
     "frame: the tool's points placed, keys found, grouped, fetched from the database, false hits "
     "dropped, the wrench summed."
 )
@@ -130,10 +130,11 @@ READING = """\
 - **Typical** is the mean of the frames between the 5th and the 95th percentile: as steady as a
   median, and every kind of pose counts by its share. p99 is the time that 99 in 100 frames keep;
   p99.9 is given from 10,000 frames on.
-- **Ratios** count more than times: machines differ and are noisy, and what a figure compares was
-  measured in one run.
+- **Ratios** count more than times: machines differ and are noisy. Strategies on one environment ran
+  in turns.
 - **Database cache** is the engine's own: 4 MB, as in the paper, or large enough for all. **File**
-  cached or cold: whether the operating system holds the database's pages.
+  cached: the operating system holds the database's pages; cold: before each frame that cache and
+  the database's own were emptied.
 - **Ranges, rows, false rows** are means a frame; false rows were read, but no point asked for them.
   One session measures alone.
 - **Hollow marks** in plots, stars in tables: the time limit ended the cell early."""

@@ -200,12 +200,17 @@ def _auto_worst(found: Sequence[Choice]) -> str:
             f"{named(word(choice.best, 'strategy'))}{_maxgap_of(choice.best)}",
             time_text(choice.best),
             ratio_text(choice.ratio),
+            ratio_text(choice.explained),
         ]
         for choice in off[:WORST_SHOWN]
     ]
     told = f"The worst of the {len(off)} others:" if len(off) > WORST_SHOWN else "The others:"
-    head = ["experiment", "", "`auto`, us", "chose", "fastest", "its us", "ratio"]
-    return paragraphs(told, table(head, rows))
+    head = ["experiment", "", "`auto`, us", "chose", "fastest", "its us", "ratio", "by its choices"]
+    meant = (
+        "By its choices: what the strategies that it chose took in cells of their own, by their "
+        "shares; what the ratio exceeds that by is choosing, and noise."
+    )
+    return paragraphs(told, table(head, rows), meant)
 
 
 def _auto_noise(results: Results, found: Sequence[Choice]) -> str:
@@ -216,9 +221,9 @@ def _auto_noise(results: Results, found: Sequence[Choice]) -> str:
         said.append(
             f"{len(apart)} combinations were measured by several experiments of the run. Minutes "
             f"later they took {ratio_text(apart[len(apart) // 2])} times as long in the middle and "
-            f"{ratio_text(apart[-1])} at most: the machine's speed drifts by as much. What one "
-            "figure compares ran in turns; the fastest of several cells is still the one that luck "
-            "favoured most."
+            f"{ratio_text(apart[-1])} at most: the machine's speed drifts by as much. "
+            "Strategies on one environment ran in turns, and luck still favours the fastest of "
+            "several; engines, curves, sizes of the cache and peers ran one after another."
         )
     frames = [
         n
@@ -228,8 +233,8 @@ def _auto_noise(results: Results, found: Sequence[Choice]) -> str:
     ]
     if frames:
         said.append(
-            f"Cold cells have {count_text(min(frames))} frames, and `auto` spends its first ones "
-            "on hearing what each strategy takes."
+            f"Cold cells have {count_text(min(frames))} frames, each from the disk, whose speed "
+            "differs from frame to frame."
         )
     return bullets(said)
 

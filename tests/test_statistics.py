@@ -328,3 +328,17 @@ def test_dear_descents_make_few_ranges_and_dear_rows_many(
     assert rows == sorted(rows)
     assert ranges[0] > ranges[-1] == 1
     assert all(q.statements == 1 for q in found)
+
+
+def test_auto_goes_on_after_the_tool_has_been_beside_the_grid(
+    scene: Environment, sphere: PointShell
+) -> None:
+    far = np.eye(4)
+    far[:3, 3] = 1e3
+    with opened_with(scene, replace(DEAR, lookup=1.0, probe=1.0, row=0.0)) as env:
+        before = env.touch(sphere, resting(), "auto")
+        beside = [env.touch(sphere, far, "auto") for _ in range(20)]
+        after = [env.touch(sphere, resting(), "auto") for _ in range(100)]
+    assert all(len(touch.hits) == 0 for touch in beside)
+    assert {touch.force.tobytes() for touch in after} == {before.force.tobytes()}
+    assert np.linalg.norm(before.force) > 0

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-import time
 from collections.abc import Callable
 
 import numpy as np
@@ -10,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hapticdb.bench import measure
 from hapticdb.bench.measure import CHUNK, Alternative, Pose, in_turns, summary
 from hapticdb.query import Query
 
@@ -59,15 +59,38 @@ def test_the_frame_before_a_turn_is_not_timed() -> None:
     assert cell["frames"] == len(POSES)
 
 
-def test_a_slow_alternative_is_stopped_and_says_so() -> None:
+class Clock:
+    """Time that passes only when it is told to."""
+
+    def __init__(self) -> None:
+        self.now_ns = 0
+
+    def perf_counter_ns(self) -> int:
+        return self.now_ns
+
+    def perf_counter(self) -> float:
+        return self.now_ns / 1e9
+
+    def passes(self, ms: int) -> None:
+        self.now_ns += ms * 1_000_000
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    found = Clock()
+    monkeypatch.setattr(measure, "time", found)
+    return found
+
+
+def test_a_slow_alternative_is_stopped_and_says_so(clock: Clock) -> None:
     def slow(_: Pose) -> Query:
-        time.sleep(0.005)
+        clock.passes(5)
         return Query("array", 1, 1, 1, 0.0)
 
     quick = counting([], "quick")
     cells = in_turns([Alternative({}, slow), Alternative({}, quick)], POSES, limit_s=0.02, warm=0)
     assert cells[0]["cut_short"]
-    assert 0 < cells[0]["frames"] < len(POSES)
+    assert cells[0]["frames"] == 5  # the fifth is over the limit
     assert not cells[1]["cut_short"]
 
 
@@ -77,10 +100,14 @@ def test_false_rows_are_those_beyond_what_the_same_poses_ask_for() -> None:
     assert cell["false_rows"] == pytest.approx(7 - np.mean(asked))
 
 
-def test_what_comes_before_a_frame_is_not_part_of_its_time() -> None:
-    alternative = Alternative({}, counting([], "a"), before=lambda: time.sleep(0.01))
+def test_what_comes_before_a_frame_is_not_part_of_its_time(clock: Clock) -> None:
+    def frame(_: Pose) -> Query:
+        clock.passes(1)
+        return Query("array", 1, 1, 1, 0.0)
+
+    alternative = Alternative({}, frame, before=lambda: clock.passes(10))
     in_turns([alternative], POSES[:5], limit_s=60.0, warm=0)
-    assert max(alternative.times_us) < 9000
+    assert alternative.times_us == [1000.0] * 5
 
 
 def test_what_auto_chose_is_counted() -> None:

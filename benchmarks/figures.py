@@ -14,7 +14,7 @@ import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -34,14 +34,16 @@ from hapticdb.bench.run import Workload
 from hapticdb.bench.subject import PAPER_CACHE, Subject, limited
 from hapticdb.bench.workload import RADIUS_VOXELS, Task
 from hapticdb.grid import CurveName
+from hapticdb.kernels.voxelize import count_voxels
 from hapticdb.poses import read_poses
 from hapticdb.sample import SampleFiles, write_sample
-from hapticdb.store.base import BRICK_BYTES, LAYOUTS, Layout
+from hapticdb.store.base import LAYOUTS, Layout
 from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.private_server import Binaries, PrivateServer, find_binaries
-from peers import Peer, PeerWork
+from hapticdb.store.private_server import Binaries, find_binaries
+from peers import Peer, PeerWork, all_bricks
 from peers.run import Measured, measure_peers
 from peers.voxelizers import measure_voxelizers, read_assembly
+from places import serving
 from servers_cold import Cold
 
 EXTENT = 1.6
@@ -90,13 +92,27 @@ class Evaluation:
 
     def make(self, url: str, layout: Layout, curve: CurveName = "z") -> str:
         """Import the sample; the same grid everywhere, curve and layout aside."""
-        options = ImportOptions(
-            grid=GridOptions(bits=self.bits, extent=EXTENT, curve=curve), layout=layout
-        )
-        (report,) = hapticdb.import_files(url, [self.files.car], options)
-        if report.error is not None:
-            raise report.error
+        grid = GridOptions(bits=self.bits, extent=EXTENT, curve=curve)
+        import_file(url, self.files.car, ImportOptions(grid=grid, layout=layout))
         return url
+
+    def describe(self, name: str, url: str, extent: float, import_s: float) -> None:
+        """Add an environment in bricks to Table 1."""
+        with hapticdb.open(url, read_only=True) as env:
+            row = run.table_1_row(
+                env,
+                extent=extent,
+                import_s=import_s,
+                distinct_voxels=count_voxels(all_bricks(env).occupancy),
+            )
+        self.add("table1", [row | {"environment": name}])
+
+
+def import_file(url: str, file: Path, options: ImportOptions) -> None:
+    """Import one file, or raise what was wrong with it."""
+    (report,) = hapticdb.import_files(url, [file], options)
+    if report.error is not None:
+        raise report.error
 
 
 def table_1(evaluation: Evaluation) -> None:
@@ -110,23 +126,8 @@ def table_1(evaluation: Evaluation) -> None:
         url = str(evaluation.folder / f"{folder}.db")
         options = ImportOptions(grid=GridOptions(bits=evaluation.bits, extent=extent))
         started = time.perf_counter()
-        (report,) = hapticdb.import_files(url, [file], options)
-        if report.error is not None:
-            raise report.error
-        seconds = time.perf_counter() - started
-        with hapticdb.open(url) as env:
-            distinct = distinct_voxels(env)
-            row = run.table_1_row(env, extent=extent, import_s=seconds, distinct_voxels=distinct)
-        evaluation.add("table1", [row | {"environment": folder}])
-
-
-def distinct_voxels(env: Environment) -> int:
-    """Voxels that any object touches, each once; all bricks are read at once."""
-    ends = np.array([0], dtype=np.int64), np.array([8**env.grid.bits], dtype=np.int64)
-    rows = env.store.scan(*ends)
-    starts = np.flatnonzero(np.diff(rows.keys, prepend=-1))
-    occupancy = np.bitwise_or.reduceat(rows.occupancy.reshape(-1, BRICK_BYTES), starts, axis=0)
-    return int(np.bitwise_count(occupancy).sum())
+        import_file(url, file, options)
+        evaluation.describe(folder, url, extent, time.perf_counter() - started)
 
 
 def on_sqlite(evaluation: Evaluation) -> None:
@@ -137,13 +138,8 @@ def on_sqlite(evaluation: Evaluation) -> None:
         started = time.perf_counter()
         url = evaluation.make(str(evaluation.folder / f"{layout}.db"), layout)
         seconds = time.perf_counter() - started
-        with hapticdb.open(url, read_only=True) as env:
-            if layout == "brick":
-                distinct = distinct_voxels(env)
-                row = run.table_1_row(
-                    env, extent=EXTENT, import_s=seconds, distinct_voxels=distinct
-                )
-                evaluation.add("table1", [row | {"environment": "sample"}])
+        if layout == "brick":
+            evaluation.describe("sample", url, EXTENT, seconds)
     evaluation.say("inputs: shells, poses, regions")
     shell = PointShell.from_file(evaluation.files.wrench, 300)
     recorded = Task("recorded", "wrench", shell, read_poses(evaluation.files.path))
@@ -162,38 +158,22 @@ def measure(evaluation: Evaluation, subject: Subject, *, is_paper: bool) -> None
     """All experiments at the paper's point; with a large cache those that it changes."""
     work, budget = evaluation.work[subject.env.layout], evaluation.budget
     evaluation.say(f"{subject.env.engine}, {subject.env.layout}: cache {subject.cache}")
-    cells = (
-        run.paper_figures(subject, work, budget)
-        if is_paper
-        else {"figure9": experiments.figure_9(subject, work.slide, budget)}
-    )
-    cells["conditions"] = run.under_conditions(subject, work, budget, is_first=is_paper)
-    for name, more in cells.items():
+    for name, more in run.measured(subject, work, budget, is_paper=is_paper).items():
         evaluation.add(name, more)
-
-
-@contextlib.contextmanager
-def serving(folder: Path, binaries: Binaries, shared_buffers: str) -> Iterator[PrivateServer]:
-    """A server in a folder, with that cache, while inside."""
-    settings = SETTINGS | {"shared_buffers": shared_buffers}
-    server = PrivateServer.at(folder, binaries, settings)
-    server.start()
-    try:
-        yield server
-    finally:
-        server.stop()
 
 
 def on_postgres(evaluation: Evaluation, binaries: Binaries) -> None:
     """All experiments on one PostgreSQL, started anew for each size of its cache."""
     folder = evaluation.folder / f"postgres{binaries.major}"
-    with serving(folder, binaries, CACHES["all cached"]) as server:
+    large = SETTINGS | {"shared_buffers": CACHES["all cached"]}
+    with serving(folder, binaries, large) as server:
         for layout in LAYOUTS:
             evaluation.say(f"PostgreSQL {binaries.major}, {layout}: import")
             evaluation.make(with_environment(server.conninfo(), layout), layout)
     measured: set[tuple[Layout, str]] = set()
     for cache, shared_buffers in CACHES.items():
-        with serving(folder, binaries, shared_buffers) as server, contextlib.ExitStack() as opened:
+        settings = SETTINGS | {"shared_buffers": shared_buffers}
+        with serving(folder, binaries, settings) as server, contextlib.ExitStack() as opened:
             drop = None
             if cache == "4 MB":
                 drop = Cold(server.conninfo(), folder / "data")

@@ -1,7 +1,7 @@
 """Where the environments of all sizes are, on each engine, with 4 MB of page cache."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Protocol
 
@@ -67,10 +67,19 @@ def place_of(engine: str, folder: Path) -> Iterator[Place]:
     if engine == "sqlite":
         yield Files(folder)
         return
-    server = PrivateServer.at(folder / f"postgres{engine}", _binaries(engine), SETTINGS)
+    with serving(folder / f"postgres{engine}", _binaries(engine), SETTINGS) as server:
+        yield Server(server.conninfo())
+
+
+@contextlib.contextmanager
+def serving(
+    folder: Path, binaries: Binaries, settings: Mapping[str, str]
+) -> Iterator[PrivateServer]:
+    """A server in a folder, with those settings, while inside."""
+    server = PrivateServer.at(folder, binaries, settings)
     server.start()
     try:
-        yield Server(server.conninfo())
+        yield server
     finally:
         server.stop()
 

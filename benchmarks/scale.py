@@ -31,7 +31,7 @@ from figures import redraw
 from hapticdb import Environment, PointShell
 from hapticdb.bench import records
 from hapticdb.bench.measure import Alternative, Cell, in_turns
-from hapticdb.bench.subject import PAPER_CACHE
+from hapticdb.bench.subject import CURVES, PAPER_CACHE
 from hapticdb.bench.workload import POSES, SEED, random_poses, slide_poses, sphere_shell
 from hapticdb.errors import DatabaseError, HapticDBError, UsageError
 from hapticdb.query import Strategy
@@ -96,7 +96,7 @@ class Size:
         return {
             "environment": "sample",
             "layout": self.plan.source.layout,
-            "curve": {"z": "z-order"}.get(self.plan.grid.curve, self.plan.grid.curve),
+            "curve": CURVES[self.plan.grid.curve],
             "bits": self.plan.grid.bits,
             "copies": self.copies,
             "object_voxels": self.plan.voxels,

@@ -44,6 +44,15 @@ class PeerMissingError(Exception):
     """A peer cannot be had here; the message is what a result's notes say of it."""
 
 
+def all_bricks(env: Environment) -> Bricks:
+    """All bricks of an environment in that layout, each once, of whatever objects; in memory."""
+    whole = np.array([0], dtype=np.int64), np.array([8**env.grid.bits], dtype=np.int64)
+    rows = env.store.scan(*whole)
+    starts = np.flatnonzero(np.diff(rows.keys, prepend=-1))
+    occupancy = rows.occupancy.reshape(-1, BRICK_BYTES)
+    return Bricks(rows.keys[starts], np.bitwise_or.reduceat(occupancy, starts, axis=0))
+
+
 @dataclass(frozen=True)
 class PeerWork:
     """What peers are built from.
@@ -88,11 +97,7 @@ class PeerWork:
     @cached_property
     def bricks(self) -> Bricks:
         """All bricks, each once, of whatever objects; keys ascending."""
-        whole = np.array([0], dtype=np.int64), np.array([8**self.env.grid.bits], dtype=np.int64)
-        rows = self.env.store.scan(*whole)
-        starts = np.flatnonzero(np.diff(rows.keys, prepend=-1))
-        occupancy = rows.occupancy.reshape(-1, BRICK_BYTES)
-        return Bricks(rows.keys[starts], np.bitwise_or.reduceat(occupancy, starts, axis=0))
+        return all_bricks(self.env)
 
     @cached_property
     def voxels(self) -> Keys:

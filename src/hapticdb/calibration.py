@@ -69,11 +69,13 @@ def calibrate(
     size = store.size()
     if size.rows == 0:
         raise UsageError(f"{store.url} is empty: import a file before calibrating")
-    if cold and not isinstance(store, SupportsCaches):
-        raise UsageError(
-            f"{store.url}: a server's caches cannot be emptied from here; leave out cold"
-        )
-    before = store.drop_caches if cold and isinstance(store, SupportsCaches) else None
+    before: Callable[[], None] | None = None
+    if cold:
+        if not isinstance(store, SupportsCaches):
+            raise UsageError(
+                f"{store.url}: a server's caches cannot be emptied from here; leave out cold"
+            )
+        before = store.drop_caches
     rows_per_block = size.rows / max(size.leaf_blocks, 1)
     quantiles = QuantileVector.of(store)
     trials = _Trials(store, quantiles, 1 if cold else repeats, before)

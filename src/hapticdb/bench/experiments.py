@@ -99,8 +99,7 @@ def _grouping_us(subject: Subject, vector: QuantileVector, task: Task) -> float:
 
 def figure_9(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
     """MaxGap over MAXGAP, CBGroup, and `array`; on a server also by its own loop."""
-    alternatives = [subject.alternative(task, "maxgap", gap=gap) for gap in budget.gaps]
-    alternatives += [subject.alternative(task, name) for name in ("cbgroup", "array", "auto")]
+    alternatives = _maxgap_and_others(subject, task, budget)
     query = subject.looping_query
     if query is not None:
         alternatives += [
@@ -120,21 +119,21 @@ def figure_10(
         task = Task(
             "random", shell_task.tool, shell_task.shell, region.poses, region.name, region.density
         )
-        alternatives = [subject.alternative(task, "maxgap", gap=gap) for gap in budget.gaps]
-        alternatives += [subject.alternative(task, name) for name in ("cbgroup", "array", "auto")]
-        cells += _measure(subject, task, alternatives, budget)
+        cells += _measure(subject, task, _maxgap_and_others(subject, task, budget), budget)
     return cells
+
+
+def _maxgap_and_others(subject: Subject, task: Task, budget: Budget) -> list[Alternative]:
+    """MaxGap over MAXGAP, and what it stands beside."""
+    gaps = [subject.alternative(task, "maxgap", gap=gap) for gap in budget.gaps]
+    return gaps + [subject.alternative(task, name) for name in ("cbgroup", "array", "auto")]
 
 
 def strategies(subject: Subject, tasks: Sequence[Task], budget: Budget) -> list[Cell]:
     """Every strategy over every task."""
     cells = []
     for task in tasks:
-        alternatives = [
-            subject.alternative(task, name, gap=PAPERS_GAP if name == "maxgap" else None)
-            for name in STRATEGIES
-        ]
-        cells += _measure(subject, task, alternatives, budget)
+        cells += _measure(subject, task, _each(subject, task, STRATEGIES), budget)
     return cells
 
 
@@ -176,10 +175,7 @@ COMPARED: tuple[Strategy, ...] = ("array", "maxgap", "cbgroup", "auto")
 
 def cached(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
     """A few strategies with the file in the operating system's cache."""
-    alternatives = [
-        subject.alternative(task, name, gap=PAPERS_GAP if name == "maxgap" else None)
-        for name in COMPARED
-    ]
+    alternatives = _each(subject, task, COMPARED)
     return in_turns(alternatives, task.poses, limit_s=budget.cell_s)
 
 
@@ -189,13 +185,20 @@ def cold(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
         return []
     step = max(1, len(task.poses) // budget.cold)
     few = Task(task.name, task.tool, task.shell, task.poses[::step][: budget.cold])
-    alternatives = [
-        subject.alternative(few, name, gap=PAPERS_GAP if name == "maxgap" else None, file="cold")
-        for name in COMPARED
-    ]
+    alternatives = _each(subject, few, COMPARED, file="cold")
     for alternative in alternatives:
         alternative.before = subject.drop
     return in_turns(alternatives, few.poses, limit_s=4 * budget.cell_s, warm=2)
+
+
+def _each(
+    subject: Subject, task: Task, names: Sequence[Strategy], file: str = "cached"
+) -> list[Alternative]:
+    """Strategies by name, MaxGap with the paper's MAXGAP."""
+    return [
+        subject.alternative(task, name, gap=PAPERS_GAP if name == "maxgap" else None, file=file)
+        for name in names
+    ]
 
 
 def _measure(

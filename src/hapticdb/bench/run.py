@@ -74,6 +74,19 @@ def paper_figures(subject: Subject, work: Workload, budget: Budget) -> dict[str,
     }
 
 
+def measured(
+    subject: Subject, work: Workload, budget: Budget, *, is_paper: bool
+) -> dict[str, list[Cell]]:
+    """All experiments at the paper's point; with another cache those that it changes."""
+    cells = (
+        paper_figures(subject, work, budget)
+        if is_paper
+        else {"figure9": experiments.figure_9(subject, work.slide, budget)}
+    )
+    cells["conditions"] = under_conditions(subject, work, budget, is_first=is_paper)
+    return cells
+
+
 def under_conditions(
     subject: Subject, work: Workload, budget: Budget, *, is_first: bool
 ) -> list[Cell]:
@@ -126,13 +139,7 @@ def bench(
         for cache, is_paper in caches_of(env):
             subject = Subject(env, env.name, cache, drop_of(env))
             say(f"database cache {cache}")
-            cells = (
-                paper_figures(subject, work, budget)
-                if is_paper
-                else {"figure9": experiments.figure_9(subject, work.slide, budget)}
-            )
-            cells["conditions"] = under_conditions(subject, work, budget, is_first=is_paper)
-            for name, more in cells.items():
+            for name, more in measured(subject, work, budget, is_paper=is_paper).items():
                 found.setdefault(name, []).extend(more)
     results = {name: records.result(name, cells) for name, cells in found.items()}
     records.write(folder, results)

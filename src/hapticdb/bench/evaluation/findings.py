@@ -126,11 +126,10 @@ class Choice:
     @property
     def explained(self) -> float | None:
         """What its choices alone make of the ratio: the strategies' own times, by their shares."""
-        counts = self.auto.get("chosen") or {}
-        known = {str(name): n for name in counts if (n := number(counts, name)) and n > 0}
-        if not known or not set(known) <= set(self.own_us):
+        shares = self._shares
+        if not shares or not set(shares) <= set(self.own_us):
             return None
-        mean = sum(n * self.own_us[name] for name, n in known.items()) / sum(known.values())
+        mean = sum(share * self.own_us[name] for name, share in shares.items())
         return ratio(mean, frame_us(self.best))
 
     @property
@@ -148,11 +147,16 @@ class Choice:
     @property
     def chosen(self) -> str:
         """What it chose, in per cent of the frames, most first."""
+        most = sorted(self._shares.items(), key=lambda pair: -pair[1])
+        return ", ".join(f"{name} {100 * share:.0f} %" for name, share in most)
+
+    @property
+    def _shares(self) -> dict[str, float]:
+        """Share of the frames for which each strategy was chosen."""
         counts = self.auto.get("chosen") or {}
         known = {str(name): n for name in counts if (n := number(counts, name)) and n > 0}
         total = sum(known.values())
-        most = sorted(known.items(), key=lambda pair: -pair[1])
-        return ", ".join(f"{name} {100 * n / total:.0f} %" for name, n in most)
+        return {name: n / total for name, n in known.items()}
 
 
 def choices(results: Results) -> list[Choice]:

@@ -80,10 +80,7 @@ class Evaluation:
 
     def keep(self, name: str, measured: Measured) -> None:
         """Keep what was measured, and what was not."""
-        conditions = {"environment": "sample"}
-        if name == "peers":
-            conditions |= {"poses": "slide", "shell": "sphere"}
-        self.add(name, [cell | conditions for cell in measured.cells])
+        self.add(name, measured.cells)
         self.notes += measured.notes
 
     def add(self, name: str, cells: list[Cell]) -> None:
@@ -244,7 +241,10 @@ def compare(evaluation: Evaluation, env: Environment, among: Sequence[Peer] | No
     )
     note = f"{env.engine}: with a database cache of {limited(env, PAPER_CACHE)}"
     evaluation.notes += [note] if note not in evaluation.notes else []
-    evaluation.keep("peers", measure_peers(work, task.poses, 2 * evaluation.budget.cell_s, among))
+    measured = measure_peers(work, task.poses, 2 * evaluation.budget.cell_s, among)
+    conditions = {"environment": "sample", "poses": "slide", "shell": "sphere"}
+    cells = [cell | conditions for cell in measured.cells]
+    evaluation.keep("peers", Measured(cells, measured.notes))
 
 
 PARTS: dict[str, Callable[[Evaluation], None]] = {"curves": curves, "peers": peers}

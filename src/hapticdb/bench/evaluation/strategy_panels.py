@@ -50,8 +50,8 @@ from hapticdb.bench.evaluation.sheets import Sheet
 
 POINTS_SHOWN = ("points", "array", "cbgroup", "auto")
 CACHES = (
-    "Below the panels: the database's own cache; whether the file is in the operating system's "
-    "cache or not (cold)."
+    "Below the panels: the database's own cache; whether the operating system's cache holds the "
+    "file, or both were emptied before each frame (cold)."
 )
 TAIL = (("p50", INK, "o"), ("p99", STRATEGY_COLORS["array"], "s"), ("p99.9", SKY, "D"))
 

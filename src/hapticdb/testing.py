@@ -13,6 +13,7 @@ Needs pytest.
 """
 
 import contextlib
+import time
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -20,7 +21,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hapticdb.errors import ConflictError, EnvironmentExistsError, ObjectNotFoundError
+from hapticdb.errors import (
+    ConflictError,
+    EnvironmentExistsError,
+    ObjectNotFoundError,
+    UsageError,
+)
 from hapticdb.grid import CurveName, Grid
 from hapticdb.grouping import object_ranges
 from hapticdb.layout import rows_of_voxels
@@ -32,6 +38,7 @@ from hapticdb.store.base import (
     Object,
     Store,
     SupportsStatement,
+    SupportsWatch,
     row_shift,
 )
 
@@ -43,6 +50,8 @@ KINDS: list[tuple[Layout, CurveName]] = [
     ("brick", "hilbert"),
 ]
 """Every layout with every curve that it can have."""
+NOTICED_S = 10.0
+"""Patience with a notification, on a machine that does much else."""
 
 
 def write_voxels(store: Store, ijk: NDArray[np.int64], name: str = "voxels") -> int:
@@ -71,6 +80,16 @@ def floor_voxels(grid: Grid, depth: int = 8, width: int = 32) -> NDArray[np.int6
     across = np.arange(middle - half, middle + half)
     down = np.arange(max(middle - depth, 0), middle)
     return np.stack(np.meshgrid(across, across, down, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def is_noticed(watcher: SupportsWatch) -> bool:
+    """Whether a commit comes to be noticed: on a server, as soon as its notification is here."""
+    deadline = time.monotonic() + NOTICED_S
+    while not watcher.has_changed():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.0005)
+    return True
 
 
 def _kind(store: Store) -> tuple[Grid, Layout]:
@@ -273,6 +292,76 @@ class StoreContract:
             version = reader.version()
         assert len(reader.objects()) == 1
         assert reader.version() != version
+        reader.close()
+
+    def test_a_commit_of_another_is_noticed_once(self, store: Store) -> None:
+        """Of every kind of write; a rolled-back one hides none that comes after it."""
+        reader = self.reopen(store)
+        if not isinstance(reader, SupportsWatch):
+            return
+        reader.watch()
+        assert not reader.has_changed()
+        rows = rows_of_voxels(blob(7, (44, 30, 10)), *_kind(store))
+        with pytest.raises(EnvironmentExistsError):
+            write_voxels(store, blob(3, (20, 20, 20)), "one")
+        writes: list[Callable[[], object]] = [
+            lambda: write_voxels(store, blob(3, (20, 20, 20)), "three"),
+            lambda: store.replace(store.object(1), rows, _covering(store)),
+            lambda: store.remove(2, _covering(store)),
+        ]
+        for write in writes:
+            write()
+            assert is_noticed(reader)
+            assert not reader.has_changed()
+        reader.close()
+
+    def test_none_of_many_commits_is_missed(self, store: Store) -> None:
+        """Each after it was committed; and those of one moment together."""
+        reader = self.reopen(store)
+        if not isinstance(reader, SupportsWatch):
+            return
+        voxel = np.array([[1, 2, 3]])
+        for n in range(100):
+            if n % 10 == 0:
+                reader.watch()
+            write_voxels(store, voxel, f"{n}")
+            assert is_noticed(reader)
+            assert reader.revision() == n + 3
+        for n in range(5):
+            write_voxels(store, voxel, f"again {n}")
+        assert is_noticed(reader)
+        reader.close()
+
+    def test_reading_neither_hides_a_commit_nor_invents_one(self, store: Store) -> None:
+        """Though what was read holds the commit already."""
+        reader = self.reopen(store)
+        if not isinstance(reader, SupportsWatch):
+            return
+        reader.watch()
+        everywhere = [np.array([b], dtype=np.int64) for b in (0, 2**62)]
+        for _ in range(3):
+            reader.scan(*everywhere)
+            reader.objects()
+            assert not reader.has_changed()
+        store.remove(1, _covering(store))
+        assert set(reader.scan(*everywhere).ids.tolist()) == {2}
+        assert len(reader.objects()) == 1
+        assert is_noticed(reader)
+        reader.close()
+
+    def test_a_commit_during_a_snapshot_is_noticed_after_it(self, store: Store) -> None:
+        """Inside, asking is refused: nothing changes there."""
+        reader = self.reopen(store)
+        if not isinstance(reader, SupportsWatch):
+            return
+        reader.watch()
+        with reader.snapshot():
+            assert len(reader.objects()) == 2
+            store.remove(1, _covering(store))
+            with pytest.raises(UsageError, match="inside a snapshot nothing changes"):
+                reader.has_changed()
+            assert len(reader.objects()) == 2
+        assert is_noticed(reader)
         reader.close()
 
     @pytest.mark.parametrize("resolution", [1, 3, 7, 100, 5000])

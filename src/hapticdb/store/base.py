@@ -125,6 +125,12 @@ def check_thread(owner: int, url: str) -> None:
         raise UsageError(f"{url} belongs to the thread that opened it: open it here, too")
 
 
+def check_outside(depth: int, url: str) -> None:
+    """Refuse to look for the commits of others inside a snapshot, which shows none."""
+    if depth:
+        raise UsageError(f"{url}: inside a snapshot nothing changes: ask before or after it")
+
+
 def check_unwritten(record: Object, known: Object, url: str) -> None:
     """Refuse to replace an object that another has written since `record` was derived from it."""
     if record.revision and record.revision != known.revision:
@@ -331,3 +337,19 @@ class SupportsCaches(Protocol):
 
     def drop_caches(self) -> None:
         """Forget all pages: the connection's, and the file's in the operating system's cache."""
+
+
+@runtime_checkable
+class SupportsWatch(Protocol):
+    """An engine that tells cheaply whether others have committed."""
+
+    def watch(self) -> None:
+        """Begin to notice commits from now on; may be called again."""
+
+    def has_changed(self) -> bool:
+        """Whether something was committed since `watch` or the last call; never waits for a commit.
+
+        Meant to be called hundreds of times a second. May be true without need, as the first time
+        without a `watch`; never false when a commit was made before the call, on a server by as
+        long as its notification takes. Raises UsageError inside a snapshot.
+        """

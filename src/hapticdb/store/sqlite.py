@@ -35,6 +35,7 @@ from hapticdb.store.base import (
     Object,
     Rows,
     Size,
+    check_outside,
     check_thread,
     check_unwritten,
     no_object,
@@ -87,6 +88,7 @@ class SQLiteStore:
             sqlite_file.stamp(path) if read_only and sqlite_file.needs_immutable(path) else None
         )
         self._depth = 0
+        self._noticed = -1
         self._thread = get_ident()
         self.is_closed = False
         self.grid, self.layout = self._read_environment()
@@ -367,6 +369,24 @@ class SQLiteStore:
         ):
             pairs = np.frombuffer(ranges, dtype="<i8").reshape(-1, 2)
             yield Change(revision, action, object_id, pairs.astype(np.int64))
+
+    def watch(self) -> None:
+        """Begin to notice commits from now on; may be called again."""
+        self.has_changed()
+
+    def has_changed(self) -> bool:
+        """Whether another connection has committed since `watch` or the last call.
+
+        By the pragma, which looks at the file's log: the binding's own `data_version` says what the
+        last read has seen. Of an immutable opening by its stamp, and then for good.
+        """
+        check_outside(self._depth, self.url)
+        if self._stamp is not None:
+            check_thread(self._thread, self.url)
+            return sqlite_file.stamp(self.path) != self._stamp
+        before = self._noticed
+        self._noticed = self._fetch("PRAGMA data_version")[0][0]
+        return self._noticed != before
 
     # -- caches ------------------------------------------------------------------------------
 

@@ -182,8 +182,11 @@ def migrate(connection: apsw.Connection, version: int) -> None:
 
 
 def stamp(path: Path) -> tuple[int, int, bool]:
-    """What changes when somebody writes a file that was opened as immutable."""
-    status = path.stat()
+    """What changes when somebody writes or removes a file that was opened as immutable."""
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return 0, 0, False
     return status.st_mtime_ns, status.st_size, Path(f"{path}-wal").exists()
 
 

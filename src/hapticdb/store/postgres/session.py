@@ -18,7 +18,7 @@ from psycopg import pq, sql
 from psycopg.errors import error_from_result
 
 from hapticdb.errors import ConnectionLostError, DatabaseError, StuckError
-from hapticdb.store.base import check_thread
+from hapticdb.store.base import check_outside, check_thread
 from hapticdb.store.postgres import failures
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.wire import Parameter
@@ -185,6 +185,10 @@ class Session:
         """Refuse a call from another thread than the one that this belongs to."""
         check_thread(self._thread, self.shown)
 
+    def check_outside(self) -> None:
+        """Refuse to look for the commits of others inside a transaction."""
+        check_outside(self._depth, self.shown)
+
     def again(self, read: Callable[[], Result]) -> Result:
         """Run a read; when the connection is lost, connect again and run it once more.
 
@@ -230,6 +234,15 @@ class Session:
         """One statement without parameters or rows, through libpq."""
         self._pgconn.send_query(text.encode())
         self._result()
+
+    def hear(self) -> None:
+        """Hand what has come between statements to the connection's notify handlers; never waits.
+
+        What came during one waits in libpq until then, or went there through psycopg.
+        """
+        self._pgconn.consume_input()
+        while (notify := self._pgconn.notifies()) and self._pgconn.notify_handler:
+            self._pgconn.notify_handler(notify)
 
     def _run(self, text: str, parameters: Sequence[Parameter]) -> pq.abc.PGresult:
         name = self._prepared.get(text)

@@ -38,6 +38,7 @@ from hapticdb.store.postgres.histogram import (
 )
 from hapticdb.store.postgres.loading import Loading
 from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres.watching import Watch, channel_of
 
 Result = TypeVar("Result")
 
@@ -68,6 +69,7 @@ class PostgresStore:
         self._written: tuple[int, str, int, str] = (0, "", 0, "")
         self._highest_id = (0, 0)  # at which revision
         self._loading = Loading(session, self.layout)
+        self._watch = Watch(session)
         if not self.is_read_only:
             self._loading.mend()
 
@@ -307,11 +309,12 @@ class PostgresStore:
         return wire.read_int8s(found)
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
-        """Record which keys a write touched."""
-        ranges = touched_ranges(self.grid, self.layout, row_keys)
-        ((transaction,),) = self._execute(
-            "INSERT INTO change VALUES (%s, %s, %s, %s) RETURNING xmin::text",
-            (revision, action, object_id, ranges.reshape(-1).tolist()),
+        """Record which keys a write touched; who watches is told when it is committed."""
+        ranges = touched_ranges(self.grid, self.layout, row_keys).reshape(-1).tolist()
+        ((transaction, _),) = self._execute(
+            "INSERT INTO change VALUES (%s, %s, %s, %s)"
+            " RETURNING xmin::text, pg_notify(%s, revision::text)",
+            (revision, action, object_id, ranges, channel_of(self.name)),
         )
         self._written = (revision, action, object_id, transaction)
 
@@ -330,6 +333,14 @@ class PostgresStore:
         ):
             pairs = np.array(ranges, dtype=np.int64).reshape(-1, 2)
             yield Change(revision, action, object_id, pairs)
+
+    def watch(self) -> None:
+        """Begin to notice commits from now on; may be called again."""
+        self._watch.begin()
+
+    def has_changed(self) -> bool:
+        """Whether something was committed since `watch` or the last call; see `watching`."""
+        return self._watch.has_changed()
 
     # -- statistics --------------------------------------------------------------------------
 

@@ -1,0 +1,97 @@
+"""How a reader learns that others have committed: LISTEN, and the revision as a net under it.
+
+Each write notifies the environment's channel, with its revision as payload, in its transaction
+(PostgreSQL's manual: NOTIFY). The server sends that to whoever listens, once it is committed; to
+look whether it has come costs no round trip. A server that refuses LISTEN, as a standby does, and
+writers that do not notify are found out by asking for the revision now and then.
+"""
+
+import contextlib
+import hashlib
+import time
+
+import psycopg
+
+from hapticdb.store.postgres import failures, wire
+from hapticdb.store.postgres.address import LONGEST_NAME
+from hapticdb.store.postgres.session import Session, identifier
+
+REVISION = "SELECT revision FROM environment WHERE id = 1"
+DIGEST_DIGITS = 32
+HEARING_S = 1.0
+"""How long a writer that does not notify may go unnoticed where LISTEN works."""
+DEAF_S = 0.02
+"""How long any writer may, where it does not."""
+
+
+def channel_of(environment: str) -> str:
+    """Name of an environment's channel, of 63 bytes at most; all share the database's channels."""
+    channel = f"hapticdb_{environment}"
+    if len(channel.encode()) <= LONGEST_NAME:
+        return channel
+    # a dot, where the others have their underscore: no other environment has the same
+    return f"hapticdb.{hashlib.sha256(environment.encode()).hexdigest()[:DIGEST_DIGITS]}"
+
+
+class Watch:
+    """What one session has heard of the commits of others."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._connection: psycopg.Connection[tuple[object, ...]] | None = None
+        self._revision = -1
+        self._heard = -1
+        self._is_deaf = True
+        self._due = 0.0
+
+    def begin(self) -> None:
+        """Notice commits from now on."""
+        self._session.check_outside()
+        self._session.again(self._listen)
+        self._ask()
+
+    def has_changed(self) -> bool:
+        """Whether something was committed since `begin` or the last call.
+
+        A round trip only when the revision has to be asked for, and after a lost connection: then
+        the answer is yes, since what came meanwhile was not heard.
+        """
+        self._session.check_outside()
+        if self._session.again(self._listen):
+            self._ask()
+            return True
+        if self._heard > self._revision:
+            self._revision = self._heard
+            return True
+        return time.monotonic() >= self._due and self._ask()
+
+    def _listen(self) -> bool:
+        """Take in what has come; on a connection that does not listen yet, begin, and say so."""
+        connection = self._session.connection
+        if connection is self._connection:
+            self._session.hear()
+            return False
+        connection.add_notify_handler(self._hear)
+        channel = identifier(channel_of(self._session.address.environment))
+        try:
+            self._session.command(f"LISTEN {channel.as_string(connection)}")
+            self._is_deaf = False
+        except psycopg.Error as error:
+            if failures.is_lost(error):
+                raise
+            self._is_deaf = True
+        self._connection = connection
+        self._due = 0.0  # should asking right after this fail, the next call asks
+        return True
+
+    def _hear(self, notify: psycopg.Notify) -> None:
+        with contextlib.suppress(ValueError):  # anybody may notify anything
+            self._heard = max(self._heard, int(notify.payload))
+
+    def _ask(self) -> bool:
+        """Whether the revision is another than the one known."""
+        before = self._revision
+        (found,) = self._session.fetch(REVISION)
+        self._revision = self._heard = wire.read_int8(found or b"")
+        self._due = time.monotonic() + (DEAF_S if self._is_deaf else HEARING_S)
+        return self._revision != before

@@ -71,6 +71,7 @@ PUBLIC = [
     "CostModel",
     "DamagedError",
     "DatabaseError",
+    "DeviceError",
     "Difference",
     "Environment",
     "EnvironmentExistsError",

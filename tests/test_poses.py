@@ -10,7 +10,13 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, UsageError
-from hapticdb.poses import quaternion_of, read_poses, rotation_of, write_poses
+from hapticdb.poses import (
+    quaternion_of,
+    read_poses,
+    read_timed_poses,
+    rotation_of,
+    write_poses,
+)
 
 HEADER = "x,y,z,qw,qx,qy,qz\n"
 
@@ -139,3 +145,42 @@ def test_what_is_no_list_of_poses_is_not_written(tmp_path: Path) -> None:
     with pytest.raises(FileError):
         write_poses(tmp_path / "none" / "p.csv", np.eye(4)[None])
     assert not list(tmp_path.iterdir())
+
+
+def test_times_come_with_the_poses_where_the_file_has_them(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text("T,qw,qx,qy,qz,x,y,z\n-1,2,0,0,0,1,2,3\n0.5,1,0,0,0,4,5,6\n")
+    times, poses = read_timed_poses(path)
+    assert times is not None
+    assert times.tolist() == [-1.0, 0.5]
+    assert np.array_equal(poses, read_poses(path))
+    assert np.array_equal(poses[:, :3, 3], [[1, 2, 3], [4, 5, 6]])
+
+
+def test_a_file_without_times_gives_none(tmp_path: Path) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text(HEADER + "1,2,3,1,0,0,0\n")
+    times, poses = read_timed_poses(path)
+    assert times is None
+    assert poses.shape == (1, 4, 4)
+
+
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("0,0,0,1,0,0,0,1\n0,0,0,1,0,0,0,1\n", "t must increase, but 1 follows 1"),
+        ("0,0,0,1,0,0,0,2\n0,0,0,1,0,0,0,1\n", "t must increase, but 1 follows 2"),
+        ("0,0,0,1,0,0,0,soon\n", "line 2: t is 'soon'"),
+        ("0,0,0,1,0,0,0,nan\n", "line 2: t is nan"),
+        ("0,0,0,1,0,0,0\n", "line 2: no value for t"),
+    ],
+)
+def test_times_that_cannot_be_are_told_only_where_times_are_asked_for(
+    tmp_path: Path, rows: str, says: str
+) -> None:
+    path = tmp_path / "p.csv"
+    path.write_text("x,y,z,qw,qx,qy,qz,t\n" + rows)
+    with pytest.raises(FileError, match=says) as caught:
+        read_timed_poses(path)
+    assert "\n" not in str(caught.value)
+    assert np.isfinite(read_poses(path)).all()

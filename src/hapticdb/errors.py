@@ -8,8 +8,9 @@
     ├── FileError (ValueError)                an input file that cannot be used
     │   ├── OutsideGridError                  a part that does not fit the grid
     │   └── GeometryChangedError              an object's file is gone or another
-    ├── MissingExtraError (ImportError)       a format needs an extra that is not installed
+    ├── MissingExtraError (ImportError)       a format or device needs an extra
     ├── ObjectNotFoundError (LookupError)     no object of that id
+    ├── DeviceError (OSError)                 a haptic device that is not there, or went away
     └── DatabaseError                         the database, not the question
         ├── EnvironmentNotFoundError (FileNotFoundError)
         ├── EnvironmentExistsError (FileExistsError)
@@ -53,11 +54,15 @@ class GeometryChangedError(FileError):
 
 
 class MissingExtraError(HapticDBError, ImportError):
-    """A file format needs an extra that is not installed."""
+    """A file format or a device needs an extra that is not installed."""
 
 
 class ObjectNotFoundError(HapticDBError, LookupError):
     """No object of that id in the environment."""
+
+
+class DeviceError(HapticDBError, OSError):
+    """A haptic device that is not there, does not answer or was unplugged."""
 
 
 class DatabaseError(HapticDBError):

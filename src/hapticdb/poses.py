@@ -1,7 +1,8 @@
 """Files of poses: a line a pose, position in metres and unit quaternion, the scalar first.
 
-The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order; further columns are ignored.
-Quaternions are normalised; ``q`` and ``-q`` are the same pose.
+The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order; further columns are ignored, but
+for a column ``t``, seconds, where it is asked for. Quaternions are normalised; ``q`` and ``-q`` are
+the same pose.
 """
 
 import csv
@@ -85,9 +86,34 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
 
 def read_poses(path: str | os.PathLike[str]) -> NDArray[np.float64]:
     """Poses (M, 4, 4) `world_from_tool` of a file, in its order."""
-    rows = _read_rows(Path(path))
+    return _poses_of(_read_rows(Path(path)))
+
+
+def read_timed_poses(
+    path: str | os.PathLike[str],
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
+    """Times (M,) in seconds, or None, and poses (M, 4, 4) `world_from_tool` of a file.
+
+    Raises
+    ------
+    FileError
+        If the file has a column ``t`` whose numbers do not increase, or cannot be read.
+    """
+    rows = _read_rows(Path(path), optional="t")
+    if rows.shape[1] == len(COLUMNS):
+        return None, _poses_of(rows)
+    times = rows[:, -1]
+    late = np.flatnonzero(np.diff(times) <= 0.0)
+    if len(late):
+        first, second = times[late[0]], times[late[0] + 1]
+        raise FileError(f"{path}: t must increase, but {second:.9g} follows {first:.9g}; {_HINT}")
+    return times.copy(), _poses_of(rows)
+
+
+def _poses_of(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (M, 4, 4) of rows whose first columns are `COLUMNS`."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = rotation_of(rows[:, 3:])
+    poses[:, :3, :3] = rotation_of(rows[:, 3:7])
     poses[:, :3, 3] = rows[:, :3]
     return poses
 
@@ -110,10 +136,13 @@ def _read_text(path: Path) -> str:
     return text
 
 
-def _read_rows(path: Path) -> NDArray[np.float64]:
-    """Numbers (M, 7) in the order of `COLUMNS`, the quaternions normalised."""
+def _read_rows(path: Path, optional: str | None = None) -> NDArray[np.float64]:
+    """Numbers (M, 7) in the order of `COLUMNS`, the quaternions normalised.
+
+    With an eighth column, if the header names the `optional` one.
+    """
     reader = csv.reader(io.StringIO(_read_text(path), newline=""), strict=True)
-    places: list[int] = []
+    places: dict[str, int] = {}
     rows: list[list[float]] = []
     try:
         for fields in reader:
@@ -123,7 +152,7 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
             if places:
                 rows.append(_pose(fields, places, where))
             else:
-                places = _columns(fields, where)
+                places = _columns(fields, where, optional)
     except csv.Error as error:
         raise FileError(f"{path}, line {reader.line_num}: {error}; {_HINT}") from error
     if not rows:
@@ -131,24 +160,25 @@ def _read_rows(path: Path) -> NDArray[np.float64]:
     return np.array(rows)
 
 
-def _columns(fields: list[str], where: str) -> list[int]:
-    """Where the header has each of `COLUMNS`."""
+def _columns(fields: list[str], where: str, optional: str | None) -> dict[str, int]:
+    """Where the header has each of `COLUMNS`, and the optional one if it has it."""
     names = [field.strip().lower() for field in fields]
     missing = [name for name in COLUMNS if name not in names]
     if len(missing) == len(COLUMNS):
         raise FileError(f"{where}: no header; {_HINT}")
     if missing:
         raise FileError(f"{where}: the header lacks {', '.join(missing)}; {_HINT}")
-    doubled = [name for name in COLUMNS if names.count(name) > 1]
+    wanted = [*COLUMNS, optional] if optional in names else COLUMNS
+    doubled = [name for name in wanted if names.count(name) > 1]
     if doubled:
         raise FileError(f"{where}: the header names {', '.join(doubled)} twice; {_HINT}")
-    return [names.index(name) for name in COLUMNS]
+    return {name: names.index(name) for name in wanted}
 
 
-def _pose(fields: list[str], places: list[int], where: str) -> list[float]:
-    """Seven finite numbers of one line, the quaternion normalised."""
+def _pose(fields: list[str], places: dict[str, int], where: str) -> list[float]:
+    """Finite numbers of one line, the quaternion normalised."""
     values: list[float] = []
-    for name, place in zip(COLUMNS, places, strict=True):
+    for name, place in places.items():
         if place >= len(fields):
             raise FileError(f"{where}: no value for {name}")
         try:
@@ -158,7 +188,7 @@ def _pose(fields: list[str], places: list[int], where: str) -> list[float]:
         if not math.isfinite(value):
             raise FileError(f"{where}: {name} is {value}, not a finite number")
         values.append(value)
-    norm = math.hypot(*values[3:])
+    norm = math.hypot(*values[3:7])
     if not (norm > 1e-9 and math.isfinite(norm)):
-        raise FileError(f"{where}: the quaternion {values[3:]} is no rotation")
-    return [*values[:3], *(value / norm for value in values[3:])]
+        raise FileError(f"{where}: the quaternion {values[3:7]} is no rotation")
+    return [*values[:3], *(value / norm for value in values[3:7]), *values[7:]]

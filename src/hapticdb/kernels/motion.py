@@ -1,0 +1,273 @@
+"""How hands move: timed poses, smooth random motion, and a mass that a hand pulls along.
+
+Quaternions have the scalar first. A turn is a rotation vector: its axis times its angle. Velocities
+(6,) are m/s of the origin, then rad/s, both in the frame that the poses are given in.
+"""
+
+import math
+
+from hapticdb.kernels._jit import entry, leaf
+
+
+@leaf
+def product(aw, ax, ay, az, bw, bx, by, bz):
+    """Quaternion of turning by b, then by a."""
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+@leaf
+def turn_of(w, x, y, z):
+    """Shortest turn that a unit quaternion stands for."""
+    sine = math.sqrt(x * x + y * y + z * z)
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    # the quotient's limit: w is 1 there
+    scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
+    return scale * x, scale * y, scale * z
+
+
+@leaf
+def quaternion_by(x, y, z):
+    """Unit quaternion of a turn."""
+    angle = math.sqrt(x * x + y * y + z * z)
+    scale = 0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle
+    return math.cos(0.5 * angle), scale * x, scale * y, scale * z
+
+
+@leaf
+def quaternion_in(pose):
+    """Unit quaternion of a pose's rotation, from its longest component (Shepperd 1978)."""
+    xx, yy, zz = pose[0, 0], pose[1, 1], pose[2, 2]
+    w, x, y, z = 1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz
+    longest = max(w, x, y, z)
+    if longest == w:
+        x, y, z = pose[2, 1] - pose[1, 2], pose[0, 2] - pose[2, 0], pose[1, 0] - pose[0, 1]
+    elif longest == x:
+        w, y, z = pose[2, 1] - pose[1, 2], pose[0, 1] + pose[1, 0], pose[0, 2] + pose[2, 0]
+    elif longest == y:
+        w, x, z = pose[0, 2] - pose[2, 0], pose[0, 1] + pose[1, 0], pose[1, 2] + pose[2, 1]
+    else:
+        w, x, y = pose[1, 0] - pose[0, 1], pose[0, 2] + pose[2, 0], pose[1, 2] + pose[2, 1]
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return w * scale, x * scale, y * scale, z * scale
+
+
+@leaf
+def place(px, py, pz, w, x, y, z, pose):
+    """Write position and unit quaternion into pose (4, 4), whose last row stays."""
+    pose[0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    pose[0, 1] = 2.0 * (x * y - w * z)
+    pose[0, 2] = 2.0 * (x * z + w * y)
+    pose[0, 3] = px
+    pose[1, 0] = 2.0 * (x * y + w * z)
+    pose[1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    pose[1, 2] = 2.0 * (y * z - w * x)
+    pose[1, 3] = py
+    pose[2, 0] = 2.0 * (x * z - w * y)
+    pose[2, 1] = 2.0 * (y * z + w * x)
+    pose[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    pose[2, 3] = pz
+
+
+@leaf
+def pose_of_quaternion(px, py, pz, w, x, y, z, out):
+    """Write the whole matrix, out (4, 4), of a position and a unit quaternion, not normalised here.
+
+    A session and its replay both come this way, so that the bits are the same.
+    """
+    place(px, py, pz, w, x, y, z, out)
+    out[3, 0] = 0.0
+    out[3, 1] = 0.0
+    out[3, 2] = 0.0
+    out[3, 3] = 1.0
+
+
+@entry
+def poses_of(states, out):
+    """Matrices, out (M, 4, 4), of states (M, 7): m, unit quaternion."""
+    for m in range(states.shape[0]):
+        pose_of_quaternion(
+            states[m, 0],
+            states[m, 1],
+            states[m, 2],
+            states[m, 3],
+            states[m, 4],
+            states[m, 5],
+            states[m, 6],
+            out[m],
+        )
+
+
+@entry
+def play(time, knots, pose, velocity):
+    """Pose and velocity at a time: linear between knots, turning about one axis (slerp).
+
+    knots (M, 8) in order of time, M > 1: s, m, unit quaternion. Before the first and from the last
+    on the hand rests. Writes pose (4, 4) and velocity (6,).
+    """
+    left, right = 0, len(knots) - 1
+    rests = time < knots[0, 0] or time >= knots[right, 0]
+    time = min(max(time, knots[0, 0]), knots[right, 0])
+    while right - left > 1:
+        middle = (left + right) // 2
+        if knots[middle, 0] <= time:
+            left = middle
+        else:
+            right = middle
+    span = knots[right, 0] - knots[left, 0]
+    share = (time - knots[left, 0]) / span
+    w, x, y, z = knots[left, 4], knots[left, 5], knots[left, 6], knots[left, 7]
+    turn_x, turn_y, turn_z = turn_of(
+        *product(knots[right, 4], knots[right, 5], knots[right, 6], knots[right, 7], w, -x, -y, -z)
+    )
+    w, x, y, z = product(*quaternion_by(share * turn_x, share * turn_y, share * turn_z), w, x, y, z)
+    px = knots[left, 1] + share * (knots[right, 1] - knots[left, 1])
+    py = knots[left, 2] + share * (knots[right, 2] - knots[left, 2])
+    pz = knots[left, 3] + share * (knots[right, 3] - knots[left, 3])
+    place(px, py, pz, w, x, y, z, pose)
+    rate = 0.0 if rests else 1.0 / span
+    for axis in range(3):
+        velocity[axis] = rate * (knots[right, 1 + axis] - knots[left, 1 + axis])
+    velocity[3] = rate * turn_x
+    velocity[4] = rate * turn_y
+    velocity[5] = rate * turn_z
+
+
+@leaf
+def wave(time, waves, axis):
+    """Value and rate of change of one axis's sum of sines, zero at time zero."""
+    value = 0.0
+    rate = 0.0
+    for n in range(waves.shape[1]):
+        amplitude, speed, phase = waves[axis, n, 0], waves[axis, n, 1], waves[axis, n, 2]
+        angle = speed * time + phase
+        value += amplitude * (math.sin(angle) - waves[axis, n, 3])
+        rate += amplitude * speed * math.cos(angle)
+    return value, rate
+
+
+@leaf
+def angular_velocity(x, y, z, dx, dy, dz):
+    """Angular velocity of the rotation exp(turn) as the turn changes by (dx, dy, dz) a second.
+
+    The left Jacobian of the rotation group: w = d + a (t x d) + b t x (t x d) with
+    a = (1 - cos r) / r^2, b = (r - sin r) / r^3, r the turn's angle.
+    """
+    square = x * x + y * y + z * z
+    if square < 1e-6:  # where the differences lose their digits; the next terms are below 1e-14
+        a = 0.5 - square / 24.0
+        b = 1.0 / 6.0 - square / 120.0
+    else:
+        r = math.sqrt(square)
+        a = (1.0 - math.cos(r)) / square
+        b = (r - math.sin(r)) / (square * r)
+    cx, cy, cz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
+    return (
+        dx + a * cx + b * (y * cz - z * cy),
+        dy + a * cy + b * (z * cx - x * cz),
+        dz + a * cz + b * (x * cy - y * cx),
+    )
+
+
+@entry
+def sway(time, waves, center, pose, velocity):
+    """Pose and velocity at a time of a hand that sways about a pose by sums of sines.
+
+    waves (6, K, 4): amplitude (m; rad for the last three axes, which are a turn), rad/s, phase, the
+    phase's sine. center (4, 4). Writes pose (4, 4) and velocity (6,), exact derivatives.
+    """
+    px, velocity[0] = wave(time, waves, 0)
+    py, velocity[1] = wave(time, waves, 1)
+    pz, velocity[2] = wave(time, waves, 2)
+    x, dx = wave(time, waves, 3)
+    y, dy = wave(time, waves, 4)
+    z, dz = wave(time, waves, 5)
+    velocity[3], velocity[4], velocity[5] = angular_velocity(x, y, z, dx, dy, dz)
+    w, x, y, z = product(*quaternion_by(x, y, z), *quaternion_in(center))
+    place(px + center[0, 3], py + center[1, 3], pz + center[2, 3], w, x, y, z, pose)
+
+
+@entry
+def survey(waves, cycle, n_samples):
+    """Farthest distance, fastest speed and fastest turning over a cycle -> m, m/s, rad/s.
+
+    waves as in `sway`; cycle in seconds, looked at n_samples times.
+    """
+    reach = 0.0
+    speed = 0.0
+    turning = 0.0
+    for n in range(n_samples):
+        time = n * cycle / n_samples
+        px, vx = wave(time, waves, 0)
+        py, vy = wave(time, waves, 1)
+        pz, vz = wave(time, waves, 2)
+        x, dx = wave(time, waves, 3)
+        y, dy = wave(time, waves, 4)
+        z, dz = wave(time, waves, 5)
+        wx, wy, wz = angular_velocity(x, y, z, dx, dy, dz)
+        reach = max(reach, px * px + py * py + pz * pz)
+        speed = max(speed, vx * vx + vy * vy + vz * vz)
+        turning = max(turning, wx * wx + wy * wy + wz * wz)
+    return math.sqrt(reach), math.sqrt(speed), math.sqrt(turning)
+
+
+@entry
+def pull(
+    n_steps, step, ahead, rest, hand, hand_velocity, wrench, inertias, grips, body, pose, velocity
+):
+    """Let a hand pull a body along by a critically damped spring, against a wrench.
+
+    n_steps of step seconds, semi-implicit. ahead: seconds from the first step's start to the
+    instant of hand (4, 4) and hand_velocity (6,); before it the hand moved at that velocity.
+    inertias (kg, kg m^2) and grips (N/m, N m/rad) are pairs. body (13,): position, unit quaternion,
+    velocity; moved on. Writes pose (4, 4) and velocity (6,) as they are rest seconds later.
+    """
+    mass, inertia = inertias
+    grip, turn_grip = grips
+    damping = 2.0 * math.sqrt(grip * mass)
+    turn_damping = 2.0 * math.sqrt(turn_grip * inertia)
+    hw, hx, hy, hz = quaternion_in(hand)
+    w, x, y, z = body[3], body[4], body[5], body[6]
+    for n in range(n_steps):
+        late = n * step - ahead
+        for axis in range(3):
+            target = hand[axis, 3] + late * hand_velocity[axis]
+            force = grip * (target - body[axis]) + wrench[axis]
+            force += damping * (hand_velocity[axis] - body[7 + axis])
+            body[7 + axis] += step * force / mass
+            body[axis] += step * body[7 + axis]
+        tw, tx, ty, tz = quaternion_by(
+            late * hand_velocity[3], late * hand_velocity[4], late * hand_velocity[5]
+        )
+        tw, tx, ty, tz = product(tw, tx, ty, tz, hw, hx, hy, hz)
+        turns = turn_of(*product(tw, tx, ty, tz, w, -x, -y, -z))
+        for axis in range(3):
+            torque = turn_grip * turns[axis] + wrench[3 + axis]
+            torque += turn_damping * (hand_velocity[3 + axis] - body[10 + axis])
+            body[10 + axis] += step * torque / inertia
+        w, x, y, z = product(
+            *quaternion_by(step * body[10], step * body[11], step * body[12]), w, x, y, z
+        )
+        scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+        w, x, y, z = w * scale, x * scale, y * scale, z * scale
+    body[3], body[4], body[5], body[6] = w, x, y, z
+    w, x, y, z = product(
+        *quaternion_by(rest * body[10], rest * body[11], rest * body[12]), w, x, y, z
+    )
+    place(
+        body[0] + rest * body[7],
+        body[1] + rest * body[8],
+        body[2] + rest * body[9],
+        w,
+        x,
+        y,
+        z,
+        pose,
+    )
+    for axis in range(6):
+        velocity[axis] = body[7 + axis]

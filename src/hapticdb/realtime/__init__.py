@@ -1,0 +1,1 @@
+"""The real-time engine: frames that never wait on the database."""

@@ -1,0 +1,65 @@
+"""Devices that one can buy, each behind the package or service of its maker.
+
+Nothing is imported and no hardware is touched before `open`, so that a device can be pickled into
+the process that uses it.
+"""
+
+import importlib
+import math
+from collections import deque
+from types import ModuleType
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import DeviceError, MissingExtraError
+
+WINDOW = 0.02
+"""Seconds over which a velocity is measured where the device gives none."""
+
+
+def load(module: str, extra: str) -> ModuleType:
+    """A module that speaks to a device.
+
+    Raises
+    ------
+    MissingExtraError
+        If its package is not installed.
+    DeviceError
+        If the package is there, but the maker's own library, which it calls, is not.
+    """
+    try:
+        return importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(
+            f"this device needs the package {error.name}; pip install 'hapticdb[{extra}]'"
+        ) from error
+    except (ImportError, OSError) as error:
+        reason = str(error).partition("\n")[0]
+        raise DeviceError(f"{module}: {reason}; install the SDK of the device's maker") from error
+
+
+class VelocityWindow:
+    """Velocity of a hand as the difference between its poses over 20 ms."""
+
+    def __init__(self) -> None:
+        self._seen: deque[tuple[float, NDArray[np.float64]]] = deque()
+
+    def measure(self, now: float, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Velocity (6,), m/s and rad/s, from the poses (4, 4) seen so far and this one."""
+        seen = self._seen
+        while len(seen) > 1 and seen[1][0] <= now - WINDOW:
+            seen.popleft()
+        velocity = np.zeros(6)
+        if seen and now > seen[0][0]:
+            before, last = seen[0]
+            turn = pose[:3, :3] @ last[:3, :3].T
+            x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
+            sine, cosine = math.sqrt(x * x + y * y + z * z), float(np.trace(turn)) - 1.0
+            # both are doubled; the quotient tends to one half where the hand hardly turns
+            scale = math.atan2(sine, cosine) / sine if sine > 1e-12 else 0.5
+            velocity[:3] = pose[:3, 3] - last[:3, 3]
+            velocity[3:] = scale * x, scale * y, scale * z
+            velocity /= now - before
+        seen.append((now, pose))
+        return velocity

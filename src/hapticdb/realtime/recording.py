@@ -1,0 +1,353 @@
+"""Sessions on disk: one file (.hdbrec), a header and chunks of frames, bit for bit.
+
+docs/format.md describes the bytes. A file that was cut off anywhere is read up to its last whole
+chunk, and a recorder that goes on with it removes the rest first.
+"""
+
+import contextlib
+import fcntl
+import io
+import os
+import zlib
+from collections.abc import Iterator
+from functools import cached_property
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import FileError, UsageError
+from hapticdb.kernels.motion import poses_of
+from hapticdb.realtime.chunks import MOST_FRAMES, Chunk, Scan, read_bytes, scan
+from hapticdb.realtime.packing import pack, unpack
+from hapticdb.realtime.recorded import FRAME, Frames, State
+from hapticdb.realtime.recording_header import Header
+
+__all__ = ["FRAME", "MOST_FRAMES", "Frames", "Header", "Recorder", "Recording", "State"]
+
+CHUNK = 4096
+"""Frames that a recorder packs together: 1.3 MB in memory."""
+
+
+class Recording:
+    """A recorded session, opened. Holds no file open between calls.
+
+    Parameters
+    ----------
+    path : path
+        The file. Frames that are added to it later are not seen.
+
+    Raises
+    ------
+    FileError
+        When it is missing, no recording, or cut off within its header.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    header : Header
+        What was felt, and how.
+    """
+
+    def __init__(self, path: str | os.PathLike[str]) -> None:
+        self.path = Path(path)
+        with self._file() as file:
+            self.header, self._start = Header.read(file, str(self.path))
+
+    def __repr__(self) -> str:
+        return f"Recording({str(self.path)!r}, started {self.header.started})"
+
+    def __len__(self) -> int:
+        return self._scan.n_frames
+
+    @property
+    def damaged_at(self) -> int | None:
+        """Index of the first frame that cannot be read although others follow, None if none."""
+        return None if self._scan.damaged < 0 else self._scan.damaged
+
+    @property
+    def n_torn(self) -> int:
+        """Bytes behind the last whole chunk: more than 0 where the recorder was killed."""
+        return 0 if self._scan.damaged >= 0 else self._size - self._scan.end
+
+    def frames(self, *, until_damage: bool = False) -> Iterator[Frames]:
+        """Frames in their order, chunk by chunk.
+
+        Parameters
+        ----------
+        until_damage : bool
+            End at a damaged chunk as if the file ended there.
+
+        Yields
+        ------
+        (n,) structured array
+            Of `FRAME`, n at most `MOST_FRAMES`.
+
+        Raises
+        ------
+        FileError
+            At a damaged chunk, after all frames before it.
+        """
+        for columns in self._chunks(FRAME.names or (), until_damage=until_damage):
+            frames = np.empty(len(columns[0]), dtype=FRAME)
+            for name, column in zip(FRAME.names or (), columns, strict=True):
+                frames[name] = column
+            yield frames
+
+    def columns(self, *names: str, until_damage: bool = False) -> tuple[NDArray[np.generic], ...]:
+        """Whole columns, in the order of their names, (M,) or (M, k) each; see `FRAME`.
+
+        Raises
+        ------
+        UsageError
+            When there is no such column.
+        FileError
+            When a chunk is damaged, unless `until_damage`.
+        """
+        unknown = [name for name in names if name not in (FRAME.names or ())]
+        if unknown or not names:
+            known = ", ".join(FRAME.names or ())
+            raise UsageError(f"columns {', '.join(unknown) or 'of no name'}: choose of {known}")
+        pieces = [[np.empty((0, *FRAME[name].shape), FRAME[name].base)] for name in names]
+        for columns in self._chunks(names, until_damage=until_damage):
+            for parts, column in zip(pieces, columns, strict=True):
+                parts.append(column)
+        return tuple(np.concatenate(parts) for parts in pieces)
+
+    def poses(
+        self, *, until_damage: bool = False
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Times (M,), s, and poses (M, 4, 4) world_from_hand of the handle: to be played again."""
+        times, hands = self.columns("time", "hand", until_damage=until_damage)
+        poses = np.empty((len(hands), 4, 4))
+        poses_of(np.ascontiguousarray(hands, dtype=np.float64), poses)
+        return times.astype(np.float64), poses
+
+    def _chunks(
+        self, names: tuple[str, ...], *, until_damage: bool
+    ) -> Iterator[list[NDArray[np.generic]]]:
+        """Columns of each chunk."""
+        with self._file() as file:
+            for place, chunk in self._scan.chunks:
+                file.seek(place)
+                content = read_bytes(file, chunk.n_bytes)
+                try:  # the file may have changed since it was scanned
+                    if zlib.crc32(content) != chunk.crc:
+                        raise ValueError("another checksum")  # noqa: TRY301 - as one that unpack finds
+                    columns = list(unpack(content, chunk.n_frames, FRAME, names))
+                except ValueError as error:
+                    if until_damage:
+                        return
+                    raise self._damage(chunk.first) from error
+                yield columns
+        if self._scan.damaged >= 0 and not until_damage:
+            raise self._damage(self._scan.damaged)
+
+    def _damage(self, frame: int) -> FileError:
+        return FileError(
+            f"{self.path}: damaged at frame {frame}; the frames before it are whole: "
+            "read them with until_damage"
+        )
+
+    def _file(self) -> io.FileIO:
+        try:
+            if self.path.exists() and not self.path.is_file():  # a pipe would wait for ever
+                raise FileError(f"{self.path} is no file; give a recording")
+            return io.FileIO(self.path, "rb")
+        except FileNotFoundError:
+            raise FileError(f"no recording at {self.path}") from None
+        except OSError as error:
+            raise FileError(f"cannot read {self.path}: {error.strerror}") from error
+
+    @cached_property
+    def _size(self) -> int:
+        return self.path.stat().st_size
+
+    @cached_property
+    def _scan(self) -> Scan:
+        with self._file() as file:
+            return scan(file, self._start, self._size)
+
+
+class Recorder:
+    """Writes frames to a recording; a context manager, which closes it.
+
+    What `flush` or a full chunk has written survives the process; `close` has it on the disk.
+
+    Parameters
+    ----------
+    path : path
+        The file, `.hdbrec` by custom.
+    header : Header
+        What is felt, and how.
+    append : bool
+        Go on with a recording that is there: under the same header, but for the revision, the
+        version and the start. Its frames stay; a torn end goes. Times are the caller's: `header`
+        has the start that they count from.
+    replace : bool
+        Begin anew in a file that is there.
+
+    Raises
+    ------
+    UsageError
+        When a file is there and neither is asked for, another header is given to append, or
+        another recorder is at it.
+    FileError
+        When it cannot be written, or cannot be gone on with.
+
+    Attributes
+    ----------
+    path : Path
+        The file.
+    header : Header
+        As it stands in the file.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        header: Header,
+        *,
+        append: bool = False,
+        replace: bool = False,
+    ) -> None:
+        if append and replace:
+            raise UsageError("a recording is either appended to or replaced: choose one")
+        self.path = Path(path)
+        self.header = header
+        self._buffer: Frames = np.empty(CHUNK, dtype=FRAME)
+        self._n_waiting = self._n_written = self._end = 0
+        self._file = self._open(may_exist=append or replace)
+        try:
+            self._begin(append=append)
+        except BaseException:
+            self._file.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def __len__(self) -> int:
+        """Frames in the file, and those that wait for their chunk."""
+        return self._n_written + self._n_waiting
+
+    def append(self, frames: Frames) -> None:
+        """Add frames (n,) of `FRAME`; each full chunk is written.
+
+        Raises
+        ------
+        UsageError
+            When they are no frames, or the recorder is closed.
+        FileError
+            When the disk is full, or fails; the recorder is closed then, and what was written
+            before stays whole.
+        """
+        self._check_open()
+        if frames.dtype != FRAME or frames.ndim != 1:
+            raise UsageError(f"frames of {frames.dtype} {frames.shape}: give (n,) of FRAME")
+        at = 0
+        while at < len(frames):
+            n = min(len(frames) - at, CHUNK - self._n_waiting)
+            self._buffer[self._n_waiting : self._n_waiting + n] = frames[at : at + n]
+            self._n_waiting += n
+            at += n
+            if self._n_waiting == CHUNK:
+                self.flush()
+
+    def flush(self) -> None:
+        """Write the frames that wait, in a chunk of their own."""
+        self._check_open()
+        if self._n_waiting:
+            payload = pack(self._buffer[: self._n_waiting])
+            chunk = Chunk(self._n_written, self._n_waiting, len(payload), zlib.crc32(payload))
+            self._write(chunk.packed() + payload)
+            self._n_written += self._n_waiting
+            self._n_waiting = 0
+
+    def close(self) -> None:
+        """Write what waits and the mark of the end, and have all of it on the disk."""
+        if self._file.closed:
+            return
+        try:
+            self.flush()
+            self._write(Chunk(self._n_written, 0, 0, 0).packed())
+            with self._told():
+                os.fsync(self._file.fileno())
+        finally:
+            self._file.close()
+
+    def _open(self, *, may_exist: bool) -> io.FileIO:
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | (0 if may_exist else os.O_EXCL)
+        try:
+            file = io.FileIO(os.open(self.path, flags, 0o666), "r+b")
+        except FileExistsError:
+            raise UsageError(
+                f"{self.path} is there already: append to it, replace it, or give another name"
+            ) from None
+        except OSError as error:
+            raise FileError(f"cannot write {self.path}: {error.strerror}") from error
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            file.close()
+            raise UsageError(f"{self.path} is being recorded: give another name") from error
+        return file
+
+    def _begin(self, *, append: bool) -> None:
+        """Write the header, or stand at the end of what is to be gone on with."""
+        size = os.fstat(self._file.fileno()).st_size
+        if not (append and size):
+            with self._told():
+                self._file.truncate(0)
+            self._write(self.header.packed())
+            return
+        given, (self.header, start) = self.header, Header.read(self._file, str(self.path))
+        if differing := self.header.differing(given):
+            raise UsageError(
+                f"{self.path} was recorded with another {', '.join(differing)}: give another name"
+            )
+        found = scan(self._file, start, size)
+        if found.damaged >= 0:
+            raise FileError(f"{self.path}: damaged at frame {found.damaged}; give another name")
+        with self._told():
+            self._file.truncate(found.end)
+            self._file.seek(found.end)
+        self._n_written, self._end = found.n_frames, found.end
+
+    def _write(self, content: bytes) -> None:
+        """Write all of it, or none and close."""
+        try:
+            rest = memoryview(content)
+            while rest:
+                rest = rest[self._file.write(rest) :]
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                self._file.truncate(self._end)
+            self._file.close()
+            raise FileError(
+                f"cannot write {self.path}: {error.strerror}; its first {self._n_written} frames "
+                "are whole"
+            ) from error
+        self._end += len(content)
+
+    @contextlib.contextmanager
+    def _told(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise FileError(f"cannot write {self.path}: {error.strerror}") from error
+
+    def _check_open(self) -> None:
+        if self._file.closed:
+            raise UsageError(f"{self.path}: the recorder is closed")

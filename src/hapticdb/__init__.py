@@ -38,6 +38,15 @@ from hapticdb.pointshell import PointShell
 from hapticdb.pool import Pool
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.query import Query
+from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.handle import Handle
+from hapticdb.realtime.recording import Recording
+from hapticdb.realtime.replay import Replayed, replay
+from hapticdb.realtime.report import Report
+from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.session import Session
+from hapticdb.realtime.sweep import sweep
+from hapticdb.realtime.swept import Swept
 from hapticdb.statistics import CostModel, QuantileVector
 from hapticdb.store.base import Object
 from hapticdb.transfer import CopyReport, copy_environment
@@ -50,6 +59,7 @@ __all__ = [
     "ConnectionLostError",
     "CopyReport",
     "CostModel",
+    "Coupling",
     "DamagedError",
     "DatabaseError",
     "DeviceError",
@@ -63,6 +73,7 @@ __all__ = [
     "Grid",
     "GridError",
     "GridOptions",
+    "Handle",
     "HapticDBError",
     "ImportOptions",
     "MissingExtraError",
@@ -76,7 +87,13 @@ __all__ = [
     "QuantileVector",
     "Query",
     "ReadOnlyError",
+    "Recording",
+    "Replayed",
+    "Report",
+    "ResidentCells",
+    "Session",
     "StuckError",
+    "Swept",
     "TangentPlane",
     "Touch",
     "UsageError",
@@ -86,6 +103,8 @@ __all__ = [
     "import_files",
     "open",
     "read_poses",
+    "replay",
+    "sweep",
     "warm_up",
     "write_poses",
 ]

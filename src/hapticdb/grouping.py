@@ -69,6 +69,18 @@ def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping
     return Grouping(Ranges(lows[:count], highs[:count]), asked, scanned)
 
 
+def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostModel) -> Ranges:
+    """CBGroup over closed spans of row keys (U,), ascending and disjoint, such as cells'.
+
+    The gap between two spans is closed on the same condition as between two keys.
+    """
+    lows, highs = lows.copy(), highs.copy()
+    count = kernels.group_spans_by_cost(
+        lows, highs, quantiles.bounds, quantiles.rows_per_bucket, costs.row_in_gap, costs.descent
+    )
+    return Ranges(lows[:count].copy(), highs[:count].copy())
+
+
 def object_ranges(grid: Grid, layout: Layout, bounds: NDArray[np.float64]) -> Ranges:
     """Ranges of row keys that hold an object of those bounds (2, 3), a voxel wider on each side."""
     low, high = grid.voxels_of(bounds)

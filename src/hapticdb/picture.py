@@ -102,7 +102,7 @@ def _draw_scene(axes: Axes, env: Environment, camera: Camera, palette: Palette) 
     for number, obj in enumerate(env.objects()):
         centers = env.grid.centers(env.voxels(obj.id))
         splat(depths, camera, centers, env.grid.voxel_size, number)
-        tints.append(_mixed(BODY, palette.of(obj.id), 0.24 if obj.id in palette.colors else 0.0))
+        tints.append(mixed(BODY, palette.of(obj.id), 0.24 if obj.id in palette.colors else 0.0))
     image = shade(depths, camera, np.array(tints), np.array(to_rgb(PAPER)), env.grid.voxel_size)
     small = image.reshape(SCENE[1], SAMPLES, SCENE[0], SAMPLES, 3).mean(axis=(1, 3))
     axes.imshow(np.clip(small, 0, 1), extent=(0, SCENE[0], SCENE[1], 0), interpolation="nearest")
@@ -112,7 +112,8 @@ def _draw_scene(axes: Axes, env: Environment, camera: Camera, palette: Palette) 
     axes.axis("off")
 
 
-def _mixed(one: str, other: str, share: float) -> tuple[float, float, float]:
+def mixed(one: str, other: str, share: float) -> tuple[float, float, float]:
+    """Red, green and blue, 0 to 1, of one colour with a share of another."""
     r, g, b = (1 - share) * np.array(to_rgb(one)) + share * np.array(to_rgb(other))
     return float(r), float(g), float(b)
 

@@ -1,17 +1,29 @@
 """Compiles every kernel with the types that it meets in production, so that no frame waits."""
 
+import os
 import tempfile
 from pathlib import Path
 
 import numpy as np
 
-from hapticdb.environment import create
+from hapticdb.environment import Environment, create
 from hapticdb.grid import Grid
 from hapticdb.ingest import rows_of_part
 from hapticdb.layout import rows_of_voxels
 from hapticdb.mesh import Part
 from hapticdb.pointshell import PointShell
-from hapticdb.query import STRATEGIES
+from hapticdb.query import NOTHING_EXCLUDED, STRATEGIES
+from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.deadlines import Timing
+from hapticdb.realtime.devices import Line, RandomHand
+from hapticdb.realtime.frames import Frames
+from hapticdb.realtime.handle import Handle
+from hapticdb.realtime.loop import Loop, LoopRequest, ring_bytes
+from hapticdb.realtime.residency import Residency
+from hapticdb.realtime.simulated import SimulatedDevice
+from hapticdb.realtime.sweep import sweep
+from hapticdb.realtime.table import LEAST_BUDGET, CellTable, anonymous_memory
+from hapticdb.realtime.touched import ids_of_voxels
 from hapticdb.store.base import Layout, Object
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float64)
@@ -51,3 +63,39 @@ def warm_up() -> None:
                     assert env.touch(shell, np.eye(4), strategy).pairs.shape[1] == 2  # noqa: S101
                 env.quantiles(4).rows_between(0, 10)
                 grid.decode(grid.encode(grid.voxels_of(CORNERS)))
+                _feel(env, shell)
+
+
+def _feel(env: Environment, shell: PointShell) -> None:
+    """Run frames, a path and a session's loop against resident cells."""
+    with CellTable.create(LEAST_BUDGET) as table:
+        residency = Residency(env.store, table)
+        frames = Frames(residency, shell, run=4)
+        frames.feel(np.eye(4)[None])
+        frames.close()
+        ids_of_voxels(env.store, np.zeros(1, dtype=np.int64), NOTHING_EXCLUDED)
+        memory = anonymous_memory("hapticdb-frames", ring_bytes(4))
+        with table.reading() as row:
+            request = LoopRequest(
+                descriptor=table.descriptor,
+                n_slots=table.n_slots,
+                row=row,
+                ring=memory,
+                n_ring=4,
+                grid=env.grid,
+                shell=shell,
+                device=SimulatedDevice(RandomHand((0.0, 0.0, 0.0))),
+                stiffness=1000.0,
+                coupling=Coupling(),
+                handle=Handle(start=(0.0, 0.0, 0.0)),
+                timing=Timing(),
+                seconds=1.0,
+                staleness=1.0,
+                is_waiting=False,
+            )
+            Loop(request).warm_up()
+        os.close(memory)
+        sweep(env, shell, [np.eye(4), np.eye(4)], profile=True)
+        sweep(env, shell, [np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4)])
+        Line((0.0, 0.0, 0.0), (0.1, 0.0, 0.0)).read()
+

@@ -13,12 +13,14 @@ from itertools import takewhile
 
 from hapticdb.cli.benching import bench
 from hapticdb.cli.editing import move, remove
+from hapticdb.cli.feeling import feel, replay
 from hapticdb.cli.granting import grant
 from hapticdb.cli.importing import import_
 from hapticdb.cli.listing import analyze, calibrate, info, objects
 from hapticdb.cli.moving import copy, diff
 from hapticdb.cli.root import Interrupted, PipeClosedError, app
 from hapticdb.cli.sampling import demo, sample
+from hapticdb.cli.sweeping import sweep
 from hapticdb.cli.touching import touch
 from hapticdb.errors import HapticDBError
 
@@ -34,6 +36,9 @@ for verb in (
     info,
     objects,
     touch,
+    feel,
+    replay,
+    sweep,
     move,
     remove,
     copy,

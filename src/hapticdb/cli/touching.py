@@ -60,7 +60,7 @@ def touch(
     path = read_poses(poses)
     summary = _Summary()
     with hapticdb.open(url, read_only=True) as env:
-        shell = _shell(tool, tool_unit, points, seed)
+        shell = shell_of(tool, tool_unit, points, seed)
 
         def felt(index: int) -> "Touch":
             return env.touch(shell, path[index], strategy, exclude=excluded, maxgap=maxgap, law=law)
@@ -76,7 +76,8 @@ def touch(
         summary.show()
 
 
-def _shell(tool: str, unit: str | None, points: int | None, seed: int | None) -> "PointShell":
+def shell_of(tool: str, unit: str | None, points: int | None, seed: int | None) -> "PointShell":
+    """Shell of a tool's file, its defects told; --points and --seed as they were given."""
     from hapticdb.errors import UsageError
     from hapticdb.pointshell import PointShell
 

@@ -64,3 +64,9 @@ def entry(function: Callable[..., Any]) -> Callable[..., Any]:
 def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a scalar function that only kernels call; LLVM inlines it."""
     return numba.njit(nogil=True, error_model="numpy")(function)  # type: ignore[no-any-return]
+
+
+def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a leaf that takes arrays: numba puts it into its caller, with no counted reference."""
+    decorate = numba.njit(nogil=True, error_model="numpy", inline="always")
+    return decorate(function)  # type: ignore[no-any-return]

@@ -132,6 +132,32 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, h
     return count, asked, scanned
 
 
+@entry
+def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
+    """CBGroup over closed spans (U,) of row keys, ascending and disjoint: merged in place.
+
+    Returns how many ranges there are.
+    """
+    count = 0
+    for n in range(lows.shape[0]):
+        if count > 0:
+            left, right = highs[count - 1] + 1, lows[n] - 1
+            expected = 0.0
+            if left <= right:
+                at = first_bound(left, bounds, 0)
+                after = bound_after(right, bounds, at)
+                expected = rows_up_to(right, after, bounds, rows_per_bucket) - rows_below_bound(
+                    left, at, bounds, rows_per_bucket
+                )
+            if expected * row_cost <= descent_cost:
+                highs[count - 1] = highs[n]
+                continue
+        lows[count] = lows[n]
+        highs[count] = highs[n]
+        count += 1
+    return count
+
+
 @leaf
 def add_range(ranges, count, low, high):
     """Append a closed range, growing the array; returns both."""

@@ -1,0 +1,366 @@
+"""The verbs feel and replay."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from typing import TYPE_CHECKING, Annotated, Literal
+
+import typer
+
+from hapticdb.cli import render
+from hapticdb.cli.root import Interrupted, Json, UnitName, Url, ids_of, numbers_of
+from hapticdb.cli.touching import shell_of
+
+if TYPE_CHECKING:
+    from hapticdb.realtime.devices import Device
+    from hapticdb.realtime.report import Report, Spread
+    from hapticdb.realtime.resident import ResidentCells
+    from hapticdb.realtime.session import Session
+
+PolicyName = Literal["hold", "wait"]
+MOST_NAMED = 8
+DEFAULT_SPEED = 0.3
+VENDORS = {
+    "force-dimension": ("hapticdb.realtime.vendors.force_dimension", "ForceDimensionDevice"),
+    "openhaptics": ("hapticdb.realtime.vendors.openhaptics", "OpenHapticsDevice"),
+    "haply": ("hapticdb.realtime.vendors.haply", "HaplyDevice"),
+}
+
+
+def feel(
+    url: Url,
+    *,
+    tool: Annotated[
+        str, typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
+    ],
+    device: Annotated[
+        str,
+        typer.Option(
+            metavar="DEVICE",
+            help="The hand: poses in a .csv (column t: seconds), a recording .hdbrec, random, "
+            "tumble, force-dimension, openhaptics or haply.",
+        ),
+    ],
+    rate: Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")] = 1000.0,
+    seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="Until the device ends, or Ctrl-C, without.")
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(metavar="M/S", help="Of a path, and the fastest of a random hand."),
+    ] = None,
+    at: Annotated[
+        str | None, typer.Option(metavar="X,Y,Z", help="Where random and tumble are, metres.")
+    ] = None,
+    simulate: Annotated[
+        bool, typer.Option("--simulate", help="Let the force push back a simulated device.")
+    ] = False,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin a path anew at its end.")] = False,
+    scale: Annotated[
+        float, typer.Option(metavar="N", help="Scene metres a metre of the hand.")
+    ] = 1.0,
+    clutch: Annotated[
+        int | None,
+        typer.Option(metavar="BUTTON", help="While it is down, 0 the first, only the hand moves."),
+    ] = None,
+    exclude: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID", help="Objects that are not felt; again, or 3,4, for more."),
+    ] = None,
+    record: Annotated[
+        str | None, typer.Option(metavar="FILE", help="Record the session: a new .hdbrec.")
+    ] = None,
+    budget: Annotated[
+        float, typer.Option(metavar="MIB", help="Memory for resident cells.")
+    ] = 256.0,
+    policy: Annotated[
+        PolicyName,
+        typer.Option(
+            help="Where cells are not there yet: hold the force for 20 ms and let it fall, or wait."
+        ),
+    ] = "hold",
+    staleness: Annotated[
+        float, typer.Option(metavar="S", help="Silence of the database after which force falls.")
+    ] = 1.0,
+    stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")] = 1000.0,
+    tool_unit: Annotated[
+        UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
+    ] = None,
+    points: Annotated[
+        int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
+    ] = None,
+    seed: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Of the points, and of a random hand.", show_default="0"),
+    ] = None,
+    fifo: Annotated[bool, typer.Option("--fifo", help="Ask the system for SCHED_FIFO.")] = False,
+    processor: Annotated[
+        int | None, typer.Option(metavar="N", help="Bind the loop to that processor.")
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Feel an environment in real time with a device; report how well frames kept their time.
+
+    Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
+    """
+    import hapticdb
+    from hapticdb.errors import UsageError
+    from hapticdb.realtime.handle import Handle
+    from hapticdb.realtime.resident import ResidentCells
+    from hapticdb.realtime.session import Session
+
+    law = hapticdb.TangentPlane(stiffness)
+    if not 1.0 <= budget <= 1e6:
+        raise UsageError(f"--budget {budget}: give MiB, 1 to a million")
+    excluded = ids_of(exclude or (), "--exclude")
+    if device in VENDORS and policy == "wait":
+        raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
+    hand = _device(device, speed=speed, at=at, seed=seed or 0, loops=loop, is_simulated=simulate)
+    handle = Handle(scale=scale, clutch=clutch)
+    shell = shell_of(tool, tool_unit, points, seed)
+    with ResidentCells(url, budget_bytes=int(budget * (1 << 20)), exclude=excluded) as cells:
+        with (
+            Session(
+                cells,
+                shell,
+                hand,
+                rate=rate,
+                seconds=seconds,
+                law=law,
+                handle=handle,
+                policy=policy,
+                staleness=staleness,
+                record=record,
+                is_fifo=fifo,
+                processor=processor,
+            ) as session,
+            _ended_by_ctrl_c(session) as presses,
+        ):
+            report = session.wait()
+        assert report is not None  # noqa: S101 - waited for without a limit
+        if json:
+            render.say_json(report.figures())
+        else:
+            _show(report, cells, record)
+    if presses:
+        raise Interrupted(f"ended by Ctrl-C after {report.loop.seconds:.3g} s")
+
+
+@contextmanager
+def _ended_by_ctrl_c(session: "Session") -> Iterator[list[int]]:
+    """Let Ctrl-C end the session, with its report, and a second one the program; yields presses."""
+    presses: list[int] = []
+    before = signal.getsignal(signal.SIGINT)
+
+    def end(number: int, _: object) -> None:
+        presses.append(number)
+        session.ask_to_end()
+        signal.signal(signal.SIGINT, before)
+
+    if before is signal.default_int_handler:  # otherwise somebody wants it ignored
+        signal.signal(signal.SIGINT, end)
+    try:
+        yield presses
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def replay(
+    recording: Annotated[str, typer.Argument(metavar="FILE", help="A session's .hdbrec.")],
+    url: Annotated[
+        str | None,
+        typer.Argument(metavar="URL", help="The environment; the recorded one without."),
+    ] = None,
+    *,
+    json: Json = False,
+) -> None:
+    """Compute a recorded session's contact wrenches again, and say where they part.
+
+    Ends with exit code 0 when all are equal bit for bit, 1 when some differ.
+
+    Example: hapticdb replay session.hdbrec car.db
+    """
+    import hapticdb
+    from hapticdb.realtime.frames import Frames
+    from hapticdb.realtime.recording import Recording
+    from hapticdb.realtime.replay import replay as compare
+    from hapticdb.realtime.residency import Residency
+    from hapticdb.realtime.table import CellTable
+
+    session = Recording(recording)
+    header = session.header
+    with hapticdb.open(url or header.environment, read_only=True) as env:
+        felt = None
+        if header.grid == env.grid:
+            present = {obj.id for obj in env.objects()}
+            residency = Residency(
+                env.store, CellTable.create(), [i for i in header.exclude if i in present]
+            )
+            felt = Frames(residency, header.shell, header.law).wrenches
+        replayed = compare(session, env, felt)
+    if json:
+        parting = replayed.parting
+        render.say_json(
+            {
+                "compared": replayed.n_compared,
+                "skipped": replayed.n_skipped,
+                "differing": replayed.n_differing,
+                "revision": replayed.revision,
+                "is_same_revision": replayed.is_same_revision,
+                "parts_at": None if parting is None else parting.frame,
+            }
+        )
+    else:
+        render.say(replayed.describe())
+    if not replayed.is_equal:
+        raise typer.Exit(1)
+
+
+def _device(
+    word: str,
+    *,
+    speed: float | None,
+    at: str | None,
+    seed: int,
+    loops: bool,
+    is_simulated: bool,
+) -> "Device":
+    """The hand that a word names."""
+    from importlib import import_module
+
+    from hapticdb.errors import UsageError
+    from hapticdb.realtime import devices
+    from hapticdb.realtime.recording import Recording
+    from hapticdb.realtime.simulated import SimulatedDevice
+
+    place = numbers_of(at, [3], "--at", "metres, such as 0.5,0,1.2") if at is not None else None
+    if word in {"random", "tumble"} and place is None:
+        raise UsageError(f"--device {word}: give --at, where the hand is")
+    if word not in {"random", "tumble"} and place is not None:
+        raise UsageError(f"--at belongs to random and tumble, not to {word}")
+    hand: Device
+    if word in VENDORS:
+        if is_simulated or loops or speed is not None:
+            raise UsageError(
+                f"--device {word} is a real hand: leave out --simulate, --loop, --speed"
+            )
+        module, name = VENDORS[word]
+        hand = getattr(import_module(module), name)()
+        return hand
+    if word == "random":
+        hand = devices.RandomHand(place or (), seed, DEFAULT_SPEED if speed is None else speed)
+    elif word == "tumble":
+        hand = devices.Tumble(place or ())
+    elif word.lower().endswith(".hdbrec"):
+        times, poses = Recording(word).poses()
+        hand = devices.Player(times, poses, loops=loops)
+    elif word.lower().endswith(".csv"):
+        hand = devices.Path(word, speed=speed, loops=loops)
+    else:
+        raise UsageError(
+            f"--device {word!r}: give poses in a .csv, a .hdbrec, random, tumble, "
+            f"{', '.join(VENDORS)}"
+        )
+    return SimulatedDevice(hand) if is_simulated else hand
+
+
+def _show(report: "Report", cells: "ResidentCells", record: str | None) -> None:
+    """Print what a session was like, the empty loop beside it."""
+    columns = ("", "session>", "empty loop>")
+    loops = (report.loop, report.empty)
+    rows = [
+        ("frames", *(f"{loop.frames:,}" for loop in loops)),
+        ("rate, Hz", *(f"{loop.rate:,.1f}" for loop in loops)),
+        ("missed deadlines", *(f"{loop.missed:,}" for loop in loops)),
+        *_times("late", [loop.lateness for loop in loops]),
+        *_times("computing", [loop.elapsed for loop in loops]),
+    ]
+    render.show(render.table(columns, rows))
+    cache = report.cache
+    facts = [
+        (
+            "touching",
+            (
+                f"{render.counted(report.hit_frames, 'frame')} with a hit, "
+                f"{report.contact_frames:,} in contact"
+            ),
+        ),
+        (
+            "not known",
+            (
+                f"{render.counted(report.unknown_frames, 'frame')}, of {report.points:,} points "
+                f"{100 * (1 - report.hit_rate):.3g} %"
+            ),
+        ),
+        (
+            "force held",
+            (
+                f"{render.counted(report.held_frames, 'frame')}, "
+                f"{report.stale_frames:,} while the database was silent"
+            ),
+        ),
+        (
+            "resident",
+            (
+                f"{render.counted(cache.resident, 'cell')}, and {cache.empty:,} known to be empty, "
+                f"in {cache.budget_bytes / 2**20:.4g} MiB"
+            ),
+        ),
+        (
+            "fetched",
+            (
+                f"{render.counted(cache.loaded, 'cell')} in "
+                f"{render.counted(cache.statements, 'statement')}, "
+                f"{1e3 * cache.latency:.3g} ms each, {1e3 * cache.worst:.3g} ms at worst; "
+                f"{cache.evicted:,} evicted"
+            ),
+        ),
+        ("warm start", f"{1e3 * report.warm_up:.3g} ms"),
+        (
+            "peak",
+            (
+                f"{report.peak_force:.4g} N, {report.peak_torque:.4g} N m, "
+                f"{render.metres(report.deepest)} deep"
+            ),
+        ),
+        ("objects", _named(report, cells)),
+    ]
+    if cache.losses or cache.restarts:
+        facts.append(
+            (
+                "outages",
+                (
+                    f"{cache.losses:,} of the database, {cache.restarts:,} of the process that "
+                    "fetches"
+                ),
+            )
+        )
+    if record is not None:
+        lost = f", {report.lost_records:,} lost" if report.lost_records else ""
+        facts.append(("recorded", f"{report.recorded_frames:,} frames in {record}{lost}"))
+    facts += sorted(report.conditions.items())
+    render.show(render.facts(facts))
+
+
+def _times(what: str, spreads: "list[Spread]") -> list[tuple[str, ...]]:
+    """Rows of percentiles, microseconds."""
+    return [
+        (f"{what} {name}, µs", *(f"{1e6 * getattr(spread, field):,.1f}" for spread in spreads))
+        for name, field in (("p50", "p50"), ("p99", "p99"), ("p99.9", "p999"), ("worst", "worst"))
+    ]
+
+
+def _named(report: "Report", cells: "ResidentCells") -> str:
+    """Names of objects that were touched; ids where the database is away."""
+    import hapticdb
+    from hapticdb.errors import DatabaseError
+
+    names: dict[int, str] = {}
+    with suppress(DatabaseError):
+        if not cells.is_away:
+            with hapticdb.open(cells.url, read_only=True) as env:
+                names = {obj.id: obj.name for obj in env.objects()}
+    touched = [names.get(i, f"object {i}") for i in report.objects]
+    shown = ", ".join(touched[:MOST_NAMED])
+    more = f" and {len(touched) - MOST_NAMED} more" if len(touched) > MOST_NAMED else ""
+    return f"{len(touched)} touched" + (f": {shown}{more}" if shown else "")

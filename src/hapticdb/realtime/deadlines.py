@@ -1,0 +1,194 @@
+"""Deadlines: a loop on time, and what a process does to be left alone while it runs."""
+
+import contextlib
+import ctypes
+import gc
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+from hapticdb.realtime.report import LoopFigures, Times
+
+SPIN = 60e-6
+"""Seconds before a deadline at which the loop stops sleeping."""
+SWITCH_INTERVAL = 1e-4
+_PR_SET_TIMERSLACK = 29
+_PR_GET_TIMERSLACK = 30
+DEFAULT_SLACK_NS = 50_000
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How a loop is scheduled.
+
+    Attributes
+    ----------
+    rate : float
+        Frames a second.
+    is_fifo : bool
+        Ask for `SCHED_FIFO`, where the system allows it.
+    processor : int or None
+        Number of the processor that the loop is bound to.
+    """
+
+    rate: float = 1000.0
+    is_fifo: bool = False
+    processor: int | None = None
+
+
+class Deadlines:
+    """A fixed grid of deadlines, and how well they are kept.
+
+    `wait` sleeps until shortly before the next one, spins until it, and returns when the frame
+    begins, ns; a frame that took too long misses the deadlines that it ran over, and the loop goes
+    on with the next one on the grid.
+
+    Parameters
+    ----------
+    period_ns : int
+        Between two deadlines.
+    lateness, elapsed : Times
+        Are given every frame's.
+    clock, sleep : callable
+        Nanoseconds that never go back, and what lets seconds pass.
+    """
+
+    def __init__(
+        self,
+        period_ns: int,
+        lateness: Times,
+        elapsed: Times,
+        *,
+        clock: Callable[[], int] = time.perf_counter_ns,
+        sleep: Callable[[float], object] = time.sleep,
+    ) -> None:
+        self.period = period_ns
+        self.frames = self.missed = 0
+        self.dt = period_ns * 1e-9
+        self._lateness, self._elapsed = lateness, elapsed
+        self._clock, self._sleep = clock, sleep
+        self._spin = round(SPIN * 1e9)
+        self.started = self.due = self._before = self._begun = clock()
+        self.due += period_ns
+
+    @property
+    def passed(self) -> int:
+        """Deadlines that are over: kept, or missed."""
+        return self.frames + self.missed
+
+    def wait(self) -> int:
+        """Wait for the deadline; returns now, ns of `time.perf_counter_ns`."""
+        clock = self._clock
+        left = self.due - clock() - self._spin
+        if left > 0:
+            self._sleep(left * 1e-9)  # clock_nanosleep with an absolute deadline
+        now = clock()
+        while now < self.due:
+            now = clock()
+        if self.frames:
+            self.dt = (now - self._begun) * 1e-9
+        self._begun = now
+        self.frames += 1
+        self._lateness.add((now - self.due) * 1e-9)
+        return now
+
+    def done(self) -> None:
+        """End a frame: the next deadline is the first on the grid that is still to come."""
+        now = self._clock()
+        self._elapsed.add((now - self._begun) * 1e-9)
+        self.due += self.period
+        if now > self.due:
+            behind = -(-(now - self.due) // self.period)
+            self.missed += behind
+            self.due += behind * self.period
+        self._before = now
+
+    def figures(self) -> LoopFigures:
+        """How the loop kept its time."""
+        return LoopFigures(
+            frames=self.frames,
+            seconds=(self._before - self.started) * 1e-9,
+            missed=self.missed,
+            lateness=self._lateness.spread(),
+            elapsed=self._elapsed.spread(),
+        )
+
+
+def empty_loop(timing: Timing, seconds: float) -> LoopFigures:
+    """A loop of that rate that does nothing: how late this machine is by itself."""
+    deadlines = Deadlines(round(1e9 / timing.rate), Times(), Times())
+    while deadlines.passed < seconds * timing.rate:
+        deadlines.wait()
+        deadlines.done()
+    return deadlines.figures()
+
+
+@contextlib.contextmanager
+def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
+    """No garbage collection, quick thread switches, exact sleeps, and what `timing` asks for.
+
+    Yields what was granted, in words. All is as before afterwards.
+    """
+    granted: dict[str, str] = {}
+    switch, was_enabled = sys.getswitchinterval(), gc.isenabled()
+    gc.collect()
+    gc.freeze()
+    gc.disable()
+    sys.setswitchinterval(SWITCH_INTERVAL)
+    slack = _set_slack(1)
+    processors = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+    policy = None
+    try:
+        if timing.processor is not None:
+            granted["processor"] = _bind(timing.processor)
+        if timing.is_fifo:
+            policy = _ask_for_fifo(granted)
+        yield granted
+    finally:
+        if policy is not None:
+            os.sched_setscheduler(0, *policy)
+        if processors is not None and timing.processor is not None:
+            os.sched_setaffinity(0, processors)
+        if slack is not None:
+            _set_slack(slack)
+        sys.setswitchinterval(switch)
+        gc.unfreeze()
+        if was_enabled:
+            gc.enable()
+
+
+def _bind(processor: int) -> str:
+    if not hasattr(os, "sched_setaffinity"):
+        return "not on this system"
+    try:
+        os.sched_setaffinity(0, {processor})
+    except OSError as error:
+        return f"processor {processor} not granted: {error.strerror}"
+    return f"bound to processor {processor}"
+
+
+def _ask_for_fifo(granted: dict[str, str]) -> tuple[int, os.sched_param] | None:
+    """The policy that was there before, when another was granted."""
+    if not hasattr(os, "sched_setscheduler"):
+        granted["scheduling"] = "SCHED_FIFO not on this system"
+        return None
+    before = os.sched_getscheduler(0), os.sched_getparam(0)
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    except OSError as error:
+        granted["scheduling"] = f"SCHED_FIFO not granted: {error.strerror}"
+        return None
+    granted["scheduling"] = "SCHED_FIFO 10"
+    return before
+
+
+def _set_slack(nanoseconds: int) -> int | None:
+    """Set how late the system may wake this thread; returns what it was, None off Linux."""
+    if sys.platform != "linux":
+        return None
+    libc = ctypes.CDLL(None, use_errno=True)
+    before = libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
+    libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0)
+    return int(before)

@@ -1,0 +1,75 @@
+"""Handle: where the hand is in the scene, after scale and clutch."""
+
+import math
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.contact import is_rigid
+from hapticdb.kernels.coupling import HAND_VELOCITY
+from hapticdb.kernels.handle import carry, grip
+from hapticdb.poses import quaternion_of
+from hapticdb.realtime.devices import Reading, pose_at
+
+Floats = NDArray[np.float64]
+
+
+class Handle:
+    """Where the hand is in the scene: the handle, which the tool is pulled to.
+
+    While the clutch is open the hand moves and the handle stays; when it closes the handle goes on
+    from there. A handle holds the state of one session.
+
+    Parameters
+    ----------
+    scale : float
+        Metres of the scene for one metre of the device; turns are not scaled, nor are wrenches.
+    start : array_like or None
+        Pose (4, 4) or point (3,) of the handle at the start, scene metres. Unless given, the handle
+        is where the hand is, its position scaled.
+    clutch : int or None
+        Number of the button that opens the clutch while it is held down; none unless given.
+
+    Raises
+    ------
+    UsageError
+        When a number is out of its range or the start is no rigid transform.
+    """
+
+    def __init__(
+        self, *, scale: float = 1.0, start: ArrayLike | None = None, clutch: int | None = None
+    ) -> None:
+        if not (math.isfinite(scale) and scale > 0.0):
+            raise UsageError(f"a scale of {scale}: give a number above 0")
+        if clutch is not None and not 0 <= clutch < 31:
+            raise UsageError(f"button {clutch} for the clutch: give 0 to 30")
+        self.scale = float(scale)
+        self._bit = 0 if clutch is None else 1 << clutch
+        self._start = None if start is None else pose_at(start)
+        if self._start is not None and not is_rigid(self._start):
+            raise UsageError("a handle starts at a pose that is a rigid transform")
+        self.is_open = False
+        self._offset = np.zeros(7)  # of the handle beyond the hand: position and turn
+
+    def start(self, reading: Reading, hand: Floats) -> None:
+        """Place the handle for a reading, at rest: into hand (HAND,), its last number left."""
+        self.is_open = False
+        self._offset[:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+        if self._start is not None:
+            hand[:3] = self._start[:3, 3]
+            hand[3:7] = quaternion_of(self._start[:3, :3])[0]
+            grip(reading.pose, self.scale, self._offset, hand)
+        carry(reading.pose, reading.velocity, self.scale, self._offset, hand)
+        hand[HAND_VELOCITY : HAND_VELOCITY + 6] = 0.0
+
+    def follow(self, reading: Reading, hand: Floats) -> None:
+        """Move the handle on to where a reading carries it: into hand (HAND,)."""
+        if reading.buttons & self._bit:
+            self.is_open = True
+            hand[HAND_VELOCITY : HAND_VELOCITY + 6] = 0.0
+            return
+        if self.is_open:
+            self.is_open = False
+            grip(reading.pose, self.scale, self._offset, hand)
+        carry(reading.pose, reading.velocity, self.scale, self._offset, hand)

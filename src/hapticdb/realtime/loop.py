@@ -1,0 +1,351 @@
+"""The servo loop, in a process of its own: every frame on time, none of them asks the database.
+
+Absolute deadlines: the loop sleeps until shortly before each, and spins the rest. Nothing is
+compiled or collected once it runs.
+"""
+
+import contextlib
+import math
+import mmap
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import HapticDBError
+from hapticdb.grid import Grid
+from hapticdb.kernels import coupling as kernels
+from hapticdb.kernels import servo
+from hapticdb.kernels._jit import ENTRIES
+from hapticdb.kernels.cells import (
+    CONTACTS,
+    DEEPEST,
+    HITS,
+    MOST_MISSED,
+    RESULTS,
+    UNKNOWNS,
+    Place,
+)
+from hapticdb.kernels.motion import poses_of
+from hapticdb.pointshell import PointShell
+from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
+from hapticdb.realtime.devices import (
+    Device,
+    SupportsClose,
+    SupportsEnd,
+    SupportsOpen,
+    SupportsRewind,
+)
+from hapticdb.realtime.frames import clusters_of
+from hapticdb.realtime.handle import Handle
+from hapticdb.realtime.prefetch import (
+    ACTIVE,
+    ASKED_TO_END,
+    DONE,
+    HANDLE,
+    HEARD,
+    MISSING,
+    RADIUS,
+    TOOL,
+    VELOCITY,
+)
+from hapticdb.realtime.process import Voice, parent_is_gone
+from hapticdb.realtime.recorded import State
+from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
+from hapticdb.realtime.table import HEARTBEAT, STOP, CellTable
+
+EMPTY_SECONDS = 2.0
+"""Length of the empty loop, at most: shorter sessions have shorter ones."""
+TELL_EVERY = 1e-3
+ASK_EVERY = 1e-2
+LOOK_EVERY = 0.25
+"""Seconds between what the fetching process is told, between names asked for, and between looks
+whether the process that started the loop is still there."""
+WARM_PATIENCE = 30.0
+"""Seconds that the loop waits for its first cells."""
+
+
+@dataclass(frozen=True)
+class LoopRequest:
+    """What a loop's process is to do: see `hapticdb.realtime.session.Session`."""
+
+    descriptor: int
+    n_slots: int
+    row: int
+    ring: int
+    n_ring: int
+    grid: Grid
+    shell: PointShell
+    device: Device
+    stiffness: float
+    coupling: Coupling
+    handle: Handle
+    timing: Timing
+    seconds: float
+    staleness: float
+    is_waiting: bool
+
+
+class Loop:
+    """A session's loop in this process: made, warmed up, run once.
+
+    Parameters
+    ----------
+    request : LoopRequest
+        The table's reader row is taken already.
+    """
+
+    def __init__(self, request: LoopRequest) -> None:
+        self.request = request
+        self.device = request.device
+        self.table = CellTable(request.descriptor, request.n_slots)
+        self.cells = self.table.cells
+        grid, row, desk = request.grid, request.row, self.table.desk
+        self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
+        self.clusters = clusters_of(request.shell, grid.voxel_size)
+        self.body = request.coupling.body(request.shell, self.place, request.stiffness)
+        self.state = np.zeros(kernels.STATE)
+        self.hand = np.zeros(kernels.HAND)
+        self.met = np.empty((kernels.MET_ROWS, len(request.shell)), dtype=np.int64)
+        self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        self.frame = np.zeros(RESULTS)
+        self.out = np.zeros(kernels.OUT)
+        self.told = np.zeros(servo.TOLD)
+        self.pose = np.eye(4)
+        self.ring = ring_of(request.ring, request.n_ring)
+        self.signal = servo.Signal(
+            desk.sequence[row : row + 1], desk.state[row], desk.missed[row], desk.voxels[row]
+        )
+        self.counts = Counts()
+        self.lateness, self.elapsed = Times(), Times()
+
+    # -- before the first frame --------------------------------------------------------------
+
+    def prepare(self) -> float:
+        """Place the tool at the hand, wait for its cells; returns the seconds that took."""
+        started = time.monotonic()
+        state = self.signal.state
+        asked = 0
+        self._place()
+        while time.monotonic() - started < WARM_PATIENCE and not self._is_left():
+            if asked and state[HEARD] >= asked:
+                if state[MISSING] == 0:
+                    break
+                asked = 0
+            if not asked:  # a hand of flesh does not wait: where it is by now is what counts
+                self._place()
+                self._tell()
+                asked = int(self.signal.sequence[0])
+            time.sleep(1e-3)
+        self._place()
+        self._tell()
+        return time.monotonic() - started
+
+    def _place(self) -> None:
+        """Put the tool where the hand is, at rest."""
+        if isinstance(self.device, SupportsRewind):
+            self.device.rewind()
+        self.request.handle.start(self.device.read(), self.hand)
+        self.state[:] = 0.0
+        self.state[:7] = self.hand[:7]
+
+    def warm_up(self) -> None:
+        """Run every kernel of a frame, on the spot, until no more of them is compiled."""
+        if isinstance(self.device, SupportsOpen):
+            self.device.open()
+        self._place()
+        for at in range(3):
+            reading = self.device.read()
+            for buttons in (-1, 0):  # a clutch that opens, and closes
+                self.request.handle.follow(reading._replace(buttons=buttons), self.hand)
+            self._step(1e-3, is_stale=False)
+            self._ask(0)
+            self._note(at, 0.0, 0.0, 0.0, 0.0, 0, 0)
+            self._tell()
+        self.signal.state[ACTIVE] = 0.0
+        self.device.apply(np.zeros(6))
+
+    # -- one frame ---------------------------------------------------------------------------
+
+    def _step(self, dt: float, *, is_stale: bool) -> None:
+        """Advance the tool by a period; `out` has what is sent to the device."""
+        self.hand[kernels.IS_STALE] = is_stale
+        kernels.advance(
+            self.cells, self.request.row, self.clusters, self.place, self.body, self.state,
+            self.hand, dt, self.met, self.missed, self.frame, self.out,
+        )  # fmt: skip
+
+    def _step_exactly(self, dt: float) -> None:
+        """Advance once all cells that it needs are there, however long that takes."""
+        before, met = self.state.copy(), self.met.copy()
+        self._step(dt, is_stale=False)
+        while self.out[UNKNOWNS] and not self._is_left():
+            self.state[:] = before
+            self.met[:] = met
+            self._tell()
+            time.sleep(2e-4)
+            self._step(dt, is_stale=False)
+
+    def _tell(self) -> None:
+        """Say where tool and hand are, and which cells the last frame missed."""
+        told, center = self.told, self.request.shell.center
+        poses_of(self.state[None, :7], self.pose[None])
+        told[ACTIVE] = 1.0
+        told[TOOL : TOOL + 3] = self.pose[:3, :3] @ center + self.pose[:3, 3]
+        told[HANDLE : HANDLE + 3] = self.hand[:3] + self.pose[:3, :3] @ center
+        told[VELOCITY : VELOCITY + 3] = self.hand[7:10]
+        told[RADIUS] = self.body.radius
+        servo.tell(self.signal, told, self.missed)
+
+    def _ask(self, n_hits: int) -> None:
+        """Have the objects named that the last frame's hits are in."""
+        grid = self.request.grid
+        poses_of(self.state[None, :7], self.pose[None])
+        servo.name_voxels(
+            self.signal, self.clusters, self.pose, self.place, grid.bits, grid.curve_code,
+            self.met[0], n_hits,
+        )  # fmt: skip
+
+    def _note(
+        self,
+        at: int,
+        begun: float,
+        dt: float,
+        lateness: float,
+        elapsed: float,
+        buttons: int,
+        state: int,
+    ) -> None:
+        servo.note(
+            self.ring, at, begun, dt, lateness, elapsed, self.hand, self.state, self.frame,
+            self.out, self.out[kernels.OUT_REVISION], buttons, state,
+        )  # fmt: skip
+
+    def _is_stopped(self) -> bool:
+        return bool(self.cells.control[STOP]) or self.signal.state[ASKED_TO_END] != 0.0
+
+    def _is_left(self) -> bool:
+        return self._is_stopped() or parent_is_gone()
+
+    # -- the loop ----------------------------------------------------------------------------
+
+    def run(self) -> LoopFigures:
+        """Frames on time, for as long as was asked, or until the device ends or all shall stop."""
+        request, control = self.request, self.cells.control
+        clock, device = time.perf_counter_ns, self.device
+        rate = request.timing.rate
+        n_deadlines = max(round(request.seconds * rate), 1)
+        tell_every, ask_every, look_every = (
+            max(round(every * rate), 1) for every in (TELL_EVERY, ASK_EVERY, LOOK_EVERY)
+        )
+        staleness = round(min(request.staleness, 1e9) * 1e9)
+        ends = device if isinstance(device, SupportsEnd) else None
+        deadlines = Deadlines(round(1e9 / rate), self.lateness, self.elapsed)
+        while deadlines.passed < n_deadlines:
+            at = deadlines.frames
+            begun = deadlines.wait()
+            reading = device.read()
+            request.handle.follow(reading, self.hand)
+            is_stale = begun - control[HEARTBEAT] > staleness
+            if request.is_waiting:
+                self._step_exactly(deadlines.dt)
+            else:
+                self._step(deadlines.dt, is_stale=is_stale)
+            device.apply(self.out[:6])
+            state = self._count(request.handle.is_open, is_stale)
+            if at % tell_every == 0 or self.out[UNKNOWNS]:
+                self._tell()
+            if at % ask_every == 0 and self.out[HITS]:
+                self._ask(int(self.out[HITS]))
+            self._note(
+                at,
+                (begun - deadlines.started) * 1e-9,
+                deadlines.dt,
+                (begun - deadlines.due) * 1e-9,
+                (clock() - begun) * 1e-9,
+                reading.buttons,
+                state,
+            )
+            self.signal.state[DONE] = at + 1
+            deadlines.done()
+            if self._is_stopped() or (ends is not None and ends.is_over):
+                break
+            if at % look_every == 0 and parent_is_gone():
+                break
+        device.apply(np.zeros(6))
+        self.counts.frames = deadlines.frames
+        return deadlines.figures()
+
+    def _count(self, is_clutch_open: bool, is_stale: bool) -> int:  # noqa: FBT001 - of a frame
+        """Count a frame in; returns its recorded state."""
+        counts, out = self.counts, self.out.tolist()  # plain floats: a tenth of the time
+        flags = int(out[kernels.FLAGS])
+        state = State(0)
+        counts.substeps += int(out[kernels.SUBSTEPS])
+        if out[HITS]:
+            counts.hit_frames += 1
+            counts.peak_force = max(counts.peak_force, math.hypot(*out[:3]))
+            counts.peak_torque = max(counts.peak_torque, math.hypot(*out[3:6]))
+            if out[CONTACTS]:
+                counts.contact_frames += 1
+                counts.deepest = max(counts.deepest, out[DEEPEST])
+        if out[UNKNOWNS]:
+            counts.unknown_frames += 1
+            counts.unknown_points += int(out[UNKNOWNS])
+        if flags & (kernels.IS_HELD | kernels.IS_DROPPED):
+            if flags & kernels.IS_HELD:
+                counts.held_frames += 1
+                state |= State.HELD
+            if flags & kernels.IS_FADING:
+                state |= State.STALE
+            if flags & kernels.IS_DROPPED:
+                counts.dropped_frames += 1
+        if is_stale:
+            counts.stale_frames += 1
+        if is_clutch_open:
+            state |= State.CLUTCH_OPEN
+        return int(state)
+
+    def close(self) -> None:
+        """Take the force away, however the loop ended, and give the device back."""
+        with contextlib.suppress(Exception):  # one that has failed may fail in this, too
+            self.device.apply(np.zeros(6))
+        if isinstance(self.device, SupportsClose):
+            self.device.close()
+
+
+def ring_of(descriptor: int, n_frames: int) -> NDArray[np.float64]:
+    """Ring (n, WIDTH) of recorded frames in shared memory, a row a frame."""
+    memory = mmap.mmap(descriptor, ring_bytes(n_frames))
+    return np.ndarray((n_frames, servo.WIDTH), np.float64, memory)
+
+
+def ring_bytes(n_frames: int) -> int:
+    """Bytes of a ring of so many frames."""
+    return 8 * servo.WIDTH * n_frames
+
+
+def n_compiled() -> int:
+    """Signatures of all kernels that have been compiled or loaded."""
+    return sum(len(entry.signatures) for entry in ENTRIES if hasattr(entry, "signatures"))
+
+
+def work(request: LoopRequest, voice: Voice) -> None:
+    """Run a session's loop in this process, and say how it went."""
+    loop = Loop(request)
+    try:
+        loop.warm_up()
+        with undisturbed(request.timing) as granted:
+            empty = empty_loop(request.timing, min(EMPTY_SECONDS, request.seconds))
+            warm_up = loop.prepare()
+            compiled = n_compiled()
+            voice.say("running", warm_up)
+            figures = loop.run()
+            if n_compiled() != compiled:
+                raise HapticDBError("a kernel was compiled while the loop ran: report this")
+        loop.counts.conditions.update(granted)
+        voice.say("done", LoopAnswer(figures, empty, loop.counts, warm_up))
+    finally:
+        loop.close()

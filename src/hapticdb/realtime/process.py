@@ -1,0 +1,189 @@
+"""Processes of a real-time session: started with a request, heard over a pipe, ended for sure.
+
+Each is a plain ``python -c`` that calls a function of this package: a script needs no guard
+around its main part. Request and messages are pickles between a process and its own child.
+"""
+
+import contextlib
+import os
+import pickle
+import select
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any, BinaryIO, NamedTuple, Self
+
+from hapticdb.errors import HapticDBError, UsageError
+
+END_PATIENCE = 5.0
+"""Seconds in which a process that was told to end may do so."""
+
+
+class Message(NamedTuple):
+    """What a process says: a word, and what goes with it."""
+
+    word: str
+    content: Any = None
+
+
+class Process:
+    """One process of a session, seen from the one that started it.
+
+    Parameters
+    ----------
+    work : str
+        What it does: a function of a module, as ``package.module:function``, that takes the request
+        and a `Voice`.
+    request : object
+        What it is to do; picklable.
+    descriptors : sequence of int
+        Files that it inherits, under the same numbers.
+    """
+
+    def __init__(self, work: str, request: object, descriptors: Sequence[int]) -> None:
+        content = pickle.dumps(sys.path) + pickle.dumps(request)
+        self._buffer = b""
+        self._popen = subprocess.Popen(  # noqa: S603 - our own module, by the running interpreter
+            [sys.executable, "-c", f"from {__name__} import serve; serve({work!r})"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            pass_fds=tuple(descriptors),
+            # Ctrl-C in a terminal goes to the whole group; who started this decides what follows
+            start_new_session=True,
+        )
+        assert self._popen.stdin is not None  # noqa: S101 - asked for above
+        with contextlib.suppress(BrokenPipeError):  # it died at once: `receive` says so
+            self._popen.stdin.write(content)
+            self._popen.stdin.flush()
+        # left open: when it closes, the process knows that the one that started it is gone
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    @property
+    def pid(self) -> int:
+        """Its process id."""
+        return self._popen.pid
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether it runs."""
+        return self._popen.poll() is None
+
+    def receive(self, seconds: float) -> Message | None:
+        """Next message, or None when none came in that time or the process has ended.
+
+        Raises
+        ------
+        HapticDBError
+            One that the process ended with, of the same class.
+        """
+        assert self._popen.stdout is not None  # noqa: S101 - asked for above
+        descriptor = self._popen.stdout.fileno()
+        until = time.monotonic() + seconds
+        while True:
+            message = self._take()
+            if message is not None:
+                break
+            left = until - time.monotonic()
+            ready, _, _ = select.select([descriptor], [], [], max(left, 0.0))
+            if not ready:
+                return None
+            read = os.read(descriptor, 1 << 16)
+            if not read:
+                return None
+            self._buffer += read
+        if message.word == "error":
+            raise message.content
+        return message
+
+    def _take(self) -> Message | None:
+        """Take the first message out of the buffer, if it is whole."""
+        if len(self._buffer) < 8:
+            return None
+        size = int.from_bytes(self._buffer[:8], "little")
+        if len(self._buffer) < 8 + size:
+            return None
+        content, self._buffer = self._buffer[8 : 8 + size], self._buffer[8 + size :]
+        message = pickle.loads(content)  # noqa: S301 - from our own child
+        assert isinstance(message, Message)  # noqa: S101 - nothing else is sent
+        return message
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for its end; whether it came in that time."""
+        try:
+            self._popen.wait(seconds)
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def end(self) -> None:
+        """See to it that it has ended: told by its closed input, then by force."""
+        for stream in (self._popen.stdin, self._popen.stdout):
+            if stream is not None:
+                with contextlib.suppress(OSError):
+                    stream.close()
+        if not self.wait(END_PATIENCE):
+            self._popen.kill()
+            self._popen.wait()
+
+
+class Voice:
+    """What a process says to the one that started it."""
+
+    def __init__(self, stream: BinaryIO) -> None:
+        self._stream = stream
+
+    def say(self, word: str, content: object = None) -> None:
+        """Send a message; nothing happens when nobody is there to hear it."""
+        packed = pickle.dumps(Message(word, content))
+        with contextlib.suppress(OSError, ValueError):
+            self._stream.write(len(packed).to_bytes(8, "little") + packed)
+            self._stream.flush()
+
+
+def serve(work: str) -> None:
+    """Do what the request says, in the process that `Process` started, and end it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    voice = Voice(os.fdopen(os.dup(1), "wb"))
+    os.dup2(2, 1)  # drivers print; their words must not mix with messages
+    try:
+        sys.path[:] = pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
+        module, name = work.split(":")
+        function: Callable[[Any, Voice], None] = getattr(import_module(module), name)
+        function(_request(), voice)
+    except HapticDBError as error:
+        voice.say("error", error)
+    except BaseException as error:  # noqa: BLE001 - whatever it is, who waits must hear of it
+        import traceback  # noqa: PLC0415 - only now
+
+        traceback.print_exc()
+        cause = str(error).partition("\n")[0]
+        voice.say(
+            "error", HapticDBError(f"the session's process ended: {type(error).__name__}: {cause}")
+        )
+    sys.stderr.flush()
+    os._exit(0)  # no tidying up of drivers and buffers that another process still uses
+
+
+def _request() -> object:
+    """Read what the process is to do, once the modules that it names can be found."""
+    try:
+        return pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
+    except (AttributeError, ImportError) as error:
+        raise UsageError(
+            f"a session's process cannot find what it was given ({error}): define devices in a "
+            "module that can be imported, not in the script itself"
+        ) from error
+
+
+def parent_is_gone() -> bool:
+    """Whether the process that started this one has ended, or has closed the line."""
+    ready, _, _ = select.select([0], [], [], 0)
+    return bool(ready)

@@ -1,0 +1,174 @@
+"""ResidentCells: a table of cells and the process that fills it, for one or several sessions."""
+
+import time
+from collections.abc import Iterable
+from typing import NamedTuple, Self
+
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.grid import Grid
+from hapticdb.query import as_ids
+from hapticdb.realtime import prefetch
+from hapticdb.realtime.prefetch import FetchRequest, Wrap
+from hapticdb.realtime.process import Process
+from hapticdb.realtime.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellTable
+from hapticdb.store.connect import open_store
+
+START_PATIENCE = 60.0
+"""Seconds until a fetching process must be ready: it may have to compile and to calibrate."""
+RESTART_EVERY = 1.0
+SILENCE_NS = 1_000_000_000
+"""Nanoseconds after which a database that was asked and has not answered counts as away."""
+
+
+class CacheFigures(NamedTuple):
+    """What a fetching process has done.
+
+    budget_bytes : memory of the table, fixed; resident, empty : cells in memory, and known to be
+    empty; loaded, evicted, rows, ranges, statements : so far; latency, worst : seconds that the
+    database took for a batch, median of late and worst ever; hit_rate : share of the wanted cells
+    that were there when they were looked for; losses : how often the database was lost; restarts :
+    of the process itself.
+    """
+
+    budget_bytes: int
+    resident: int
+    empty: int
+    loaded: int
+    evicted: int
+    rows: int
+    ranges: int
+    statements: int
+    latency: float
+    worst: float
+    hit_rate: float
+    losses: int
+    restarts: int
+
+
+class ResidentCells:
+    """Cells of an environment in memory, kept there by a process of their own.
+
+    Sessions that leave out the same objects may share one. Also as a context manager.
+
+    Parameters
+    ----------
+    url : str
+        The environment, as `hapticdb.open` takes it.
+    budget_bytes : int
+        Memory for cells, never exceeded; 1 MiB at least.
+    exclude : iterable of int
+        Ids of objects that are not felt.
+    wrap : callable or None
+        Given the fetching process's store, returns the one that it uses; importable. For tests.
+
+    Raises
+    ------
+    UsageError
+        When the environment's curve has no cells, or the budget is too small.
+    DatabaseError
+        When it cannot be opened.
+    """
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        budget_bytes: int = DEFAULT_BUDGET,
+        exclude: Iterable[int] = (),
+        wrap: Wrap | None = None,
+    ) -> None:
+        self.url = url
+        self.exclude: tuple[int, ...] = tuple(as_ids(exclude).tolist())
+        self.grid = self._looked_up()
+        self.table = CellTable.create(budget_bytes)
+        self.restarts = 0
+        self._request = FetchRequest(
+            url, self.table.descriptor, self.table.n_slots, self.grid, self.exclude, wrap
+        )
+        self._process = self._started()
+        self._restarted_at = 0.0
+
+    def _looked_up(self) -> Grid:
+        """Grid of the environment, which must have cells, and the objects that are left out."""
+        store = open_store(self.url, read_only=True)
+        try:
+            if not store.grid.is_hierarchical:
+                raise UsageError(
+                    f"{store.url} is in lexicographic order, which has no cells: "
+                    "'hapticdb copy' it to one with --curve z"
+                )
+            for object_id in self.exclude:
+                store.object(object_id)
+            return store.grid
+        finally:
+            store.close()
+
+    def _started(self) -> Process:
+        process = Process(
+            "hapticdb.realtime.prefetch:fetch", self._request, [self.table.descriptor]
+        )
+        try:
+            is_ready = process.receive(START_PATIENCE) is not None
+        except BaseException:
+            process.end()
+            raise
+        if not is_ready:
+            process.end()
+            raise HapticDBError("the fetching process did not start: its errors are above")
+        return process
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def pid(self) -> int:
+        """Process id of the fetching process."""
+        return self._process.pid
+
+    @property
+    def is_away(self) -> bool:
+        """Whether the database cannot be reached now, or does not answer."""
+        control = self.table.cells.control
+        return bool(control[AWAY]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
+
+    def supervise(self) -> None:
+        """Start the fetching process again if it has ended; to be called now and then."""
+        now = time.monotonic()
+        if self._process.is_alive or now - self._restarted_at < RESTART_EVERY:
+            return
+        self._restarted_at = now
+        self.restarts += 1
+        self._process.end()
+        # the table goes on as it is: its last version is whole, whatever the process was doing
+        self._process = Process(
+            "hapticdb.realtime.prefetch:fetch", self._request, [self.table.descriptor]
+        )
+
+    def figures(self) -> CacheFigures:
+        """What the fetching process has done so far."""
+        counted = self.table.desk.figures
+        wishes = float(counted[prefetch.WISHES])
+        return CacheFigures(
+            budget_bytes=self.table.size_bytes,
+            resident=int(counted[prefetch.RESIDENT]),
+            empty=int(counted[prefetch.EMPTY]),
+            loaded=int(counted[prefetch.LOADED]),
+            evicted=int(counted[prefetch.EVICTED]),
+            rows=int(counted[prefetch.ROWS]),
+            ranges=int(counted[prefetch.RANGES]),
+            statements=int(counted[prefetch.BATCHES]),
+            latency=float(counted[prefetch.LATENCY]),
+            worst=float(counted[prefetch.WORST]),
+            hit_rate=float(counted[prefetch.GRANTED]) / wishes if wishes else 1.0,
+            losses=int(counted[prefetch.LOSSES]),
+            restarts=self.restarts,
+        )
+
+    def close(self) -> None:
+        """End the fetching process and give the memory back."""
+        self.table.cells.control[STOP] = 1
+        self._process.end()
+        self.table.close()

@@ -1,0 +1,334 @@
+"""Session: a hand in an environment, felt in real time by processes of its own."""
+
+import os
+import time
+from collections.abc import Iterable
+from dataclasses import asdict
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.force import TangentPlane
+from hapticdb.pointshell import PointShell
+from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.deadlines import Timing
+from hapticdb.realtime.devices import Device
+from hapticdb.realtime.handle import Handle
+from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
+from hapticdb.realtime.prefetch import ASKED_TO_END, DONE
+from hapticdb.realtime.process import Process
+from hapticdb.realtime.recorded import FRAME, Frames
+from hapticdb.realtime.recording import Header, Recorder
+from hapticdb.realtime.report import LoopAnswer, Report
+from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.table import DEFAULT_BUDGET, anonymous_memory
+
+Policy = Literal["hold", "wait"]
+RING_SECONDS = 4.0
+"""Seconds of frames that wait in memory for whoever records them."""
+DRAIN_EVERY = 0.05
+START_PATIENCE = 120.0
+END_PATIENCE = 10.0
+FOREVER = 1e9
+DEFAULT_STALENESS = 1.0
+
+
+class Session:
+    """A hand in an environment, felt in real time.
+
+    The loop runs in a process of its own, and so does what fetches cells for it; this object starts
+    them, looks after them, records, and reports. Also as a context manager.
+
+    Parameters
+    ----------
+    cells : ResidentCells or str
+        The environment: its resident cells, which several sessions may share, or its URL.
+    shell : PointShell
+        The tool.
+    device : Device
+        The hand; sent to the loop's process, so its class must be importable there.
+    rate : float
+        Frames a second, 10 to 20,000.
+    seconds : float or None
+        How long; until the device ends or `stop` unless given.
+    law : TangentPlane or None
+        Of the contacts; 1000 N/m unless given.
+    coupling : Coupling or None
+        Between hand and tool.
+    handle : Handle or None
+        How the hand maps to the scene: scale and clutch.
+    policy : {"hold", "wait"}
+        What a frame does whose cells are not resident: keep its wrench for a moment and let it
+        fall, or wait for them, exact and late.
+    staleness : float
+        Seconds that the database may be silent until all frames do as if nothing were known.
+    budget_bytes : int or None
+    exclude : iterable of int
+        As `ResidentCells` takes them; only with a URL: who shares cells feels the same objects.
+    record : path or None
+        A file for the recording; see `hapticdb.realtime.recording.Recorder`.
+    replace_recording : bool
+        Begin it anew in a file that is there.
+    is_fifo, processor
+        As `hapticdb.realtime.loop.Timing` has them.
+
+    Raises
+    ------
+    UsageError
+        When a number is out of its range, or options contradict one another.
+    DatabaseError
+        When the environment cannot be opened.
+    """
+
+    def __init__(
+        self,
+        cells: ResidentCells | str,
+        shell: PointShell,
+        device: Device,
+        *,
+        rate: float = 1000.0,
+        seconds: float | None = None,
+        law: TangentPlane | None = None,
+        coupling: Coupling | None = None,
+        handle: Handle | None = None,
+        policy: Policy = "hold",
+        staleness: float = DEFAULT_STALENESS,
+        budget_bytes: int | None = None,
+        exclude: Iterable[int] = (),
+        record: str | os.PathLike[str] | None = None,
+        replace_recording: bool = False,
+        is_fifo: bool = False,
+        processor: int | None = None,
+    ) -> None:
+        _check_times(rate, seconds, staleness)
+        self.shell, self.law = shell, law or TangentPlane()
+        self.coupling = coupling or Coupling()
+        self.handle = handle or Handle()
+        self.timing = Timing(rate, is_fifo, processor)
+        self._is_own = isinstance(cells, str)
+        if isinstance(cells, str):
+            self.cells = ResidentCells(
+                cells, budget_bytes=budget_bytes or DEFAULT_BUDGET, exclude=exclude
+            )
+        elif budget_bytes is not None or tuple(exclude):
+            raise UsageError("these cells have a budget and exclusions already: give a URL instead")
+        else:
+            self.cells = cells
+        self._row = self._memory = -1
+        self._process: Process | None = None
+        self._recorder: Recorder | None = None
+        self._drained = self._lost = 0
+        self._objects: set[int] = set()
+        self._answer: LoopAnswer | None = None
+        try:
+            self._begin(device, policy, staleness, seconds, record, replace_recording)
+        except BaseException:
+            self.close()
+            if self._recorder is not None and not replace_recording:
+                self._recorder.path.unlink(missing_ok=True)  # nothing was: the name stays free
+            raise
+
+    def _begin(
+        self,
+        device: Device,
+        policy: Policy,
+        staleness: float,
+        seconds: float | None,
+        record: str | os.PathLike[str] | None,
+        replace_recording: bool,  # noqa: FBT001 - handed on
+    ) -> None:
+        table = self.cells.table
+        if record is not None:
+            self._recorder = Recorder(record, self._header(), replace=replace_recording)
+        n_ring = max(int(RING_SECONDS * self.timing.rate), 1024)
+        self._memory = anonymous_memory("hapticdb-frames", ring_bytes(n_ring))
+        self._ring = ring_of(self._memory, n_ring)
+        self._row = table.join()
+        request = LoopRequest(
+            descriptor=table.descriptor,
+            n_slots=table.n_slots,
+            row=self._row,
+            ring=self._memory,
+            n_ring=n_ring,
+            grid=self.cells.grid,
+            shell=self.shell,
+            device=device,
+            stiffness=self.law.stiffness,
+            coupling=self.coupling,
+            handle=self.handle,
+            timing=self.timing,
+            seconds=FOREVER if seconds is None else seconds,
+            staleness=staleness,
+            is_waiting=policy == "wait",
+        )
+        self._process = Process(
+            "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory]
+        )
+        table.desk.pids[self._row] = self._process.pid
+        if self._process.receive(START_PATIENCE) is None:
+            raise HapticDBError("the loop's process did not start: its errors are above")
+
+    def _header(self) -> Header:
+        return Header(
+            environment=self.cells.url,
+            grid=self.cells.grid,
+            revision=self.cells.table.revision,
+            shell=self.shell,
+            rate=self.timing.rate,
+            law=self.law,
+            exclude=self.cells.exclude,
+            coupling=asdict(self.coupling),
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def n_frames(self) -> int:
+        """Frames so far."""
+        return int(self.cells.table.desk.state[self._open_row, DONE])
+
+    @property
+    def pid(self) -> int:
+        """Process id of the loop."""
+        return int(self.cells.table.desk.pids[self._open_row])
+
+    @property
+    def _open_row(self) -> int:
+        if self._row < 0:
+            raise UsageError("the session is closed: begin another")
+        return self._row
+
+    @property
+    def objects(self) -> tuple[int, ...]:
+        """Ids of the objects touched so far; asked for a hundred times a second."""
+        return tuple(sorted(self._objects))
+
+    def last(self) -> Frames | None:
+        """Latest frame, (1,) of `FRAME`; None before the first."""
+        done = self.n_frames
+        return frames_of(self._ring[[(done - 1) % len(self._ring)]]) if done else None
+
+    def wait(self, seconds: float | None = None) -> Report | None:
+        """Look after the session until it ends; its report, or None when that time is over.
+
+        To be called again and again, or without a time: it is here that frames are recorded, and
+        that a fetching process that has died is started again.
+        """
+        process = self._process
+        if process is None:
+            raise UsageError("the session is closed: begin another")
+        until = time.monotonic() + (FOREVER if seconds is None else seconds)
+        while self._answer is None and time.monotonic() < until:
+            is_alive = process.is_alive  # before: its last words may come with its end
+            message = process.receive(min(DRAIN_EVERY, max(until - time.monotonic(), 0.0)))
+            self._drain()
+            if message is not None:
+                self._answer = message.content
+            elif not is_alive:
+                raise HapticDBError(
+                    "the loop's process was ended from outside: begin the session again"
+                )
+            self.cells.supervise()
+        return self._report() if self._answer is not None else None
+
+    def ask_to_end(self) -> None:
+        """Have the loop end after its next frame; `wait` then gives the report."""
+        self.cells.table.desk.state[self._open_row, ASKED_TO_END] = 1.0
+
+    def stop(self) -> Report:
+        """End the session; its report."""
+        self.ask_to_end()
+        report = self.wait(END_PATIENCE)
+        if report is None:
+            raise HapticDBError("the loop did not end when asked to")
+        return report
+
+    def _drain(self) -> None:
+        """Record the frames that have come, and learn what they touched."""
+        desk, done = self.cells.table.desk, self.n_frames
+        ids = desk.ids[self._row]
+        self._objects.update(ids[1 : 1 + int(ids[0])].tolist())
+        if self._recorder is None:
+            return
+        size = len(self._ring)
+        if done - self._drained > size - 64:  # the loop may be writing over the oldest by now
+            self._lost += done - self._drained - size // 2
+            self._drained = done - size // 2
+        rows = self._ring[np.arange(self._drained, done) % size]
+        self._recorder.append(frames_of(rows))
+        self._drained = done
+
+    def _report(self) -> Report:
+        answer = self._answer
+        assert answer is not None  # noqa: S101 - asked before
+        counts = answer.counts
+        n_recorded = len(self._recorder) if self._recorder else 0
+        if self._recorder is not None:
+            self._recorder.close()
+        return Report(
+            rate=self.timing.rate,
+            loop=answer.loop,
+            empty=answer.empty,
+            hit_frames=counts.hit_frames,
+            contact_frames=counts.contact_frames,
+            unknown_frames=counts.unknown_frames,
+            held_frames=counts.held_frames,
+            stale_frames=counts.stale_frames,
+            points=counts.frames * len(self.shell),
+            unknown_points=counts.unknown_points,
+            substeps=counts.substeps,
+            dropped_frames=counts.dropped_frames,
+            peak_force=counts.peak_force,
+            peak_torque=counts.peak_torque,
+            deepest=counts.deepest,
+            warm_up=answer.warm_up,
+            cache=self.cells.figures(),
+            objects=self.objects,
+            recorded_frames=n_recorded,
+            lost_records=self._lost,
+            conditions={"points": str(len(self.shell)), **counts.conditions},
+        )
+
+    def close(self) -> None:
+        """End the processes and close the recording; what was recorded stays."""
+        if self._process is not None:
+            self.ask_to_end()
+            self._process.end()
+            self._process = None
+        if self._row >= 0:
+            self.cells.table.leave(self._row)
+            self._row = -1
+        if self._memory >= 0:
+            os.close(self._memory)
+            self._memory = -1
+        if self._recorder is not None:
+            self._recorder.close()
+        if self._is_own:
+            self.cells.close()
+
+
+def _check_times(rate: float, seconds: float | None, staleness: float) -> None:
+    if not 10.0 <= rate <= 20_000.0:
+        raise UsageError(f"a rate of {rate} Hz: give 10 to 20,000")
+    if seconds is not None and not 0.0 < seconds <= 1e6:
+        raise UsageError(f"{seconds} seconds: give a number above 0, a million at most")
+    if not staleness > 0.0:
+        raise UsageError(f"a staleness of {staleness} s: give a number above 0, or inf")
+
+
+def frames_of(rows: NDArray[np.float64]) -> Frames:
+    """Frames (n,) of `FRAME` from rows (n, WIDTH) of a ring."""
+    frames = np.empty(len(rows), dtype=FRAME)
+    at = 0
+    for name in FRAME.names or ():
+        shape = FRAME[name].shape
+        width = shape[0] if shape else 1
+        frames[name] = rows[:, at : at + width] if shape else rows[:, at]
+        at += width
+    return frames

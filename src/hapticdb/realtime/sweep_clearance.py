@@ -1,0 +1,118 @@
+"""Clearance along a path: from the shell's points to the nearest occupied voxel's box.
+
+Between two samples no point moves more than half a voxel, so a distance once found bounds those to
+come: a point is looked at again only when it may have come nearer than what is nearest already.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels import sweep as kernels
+from hapticdb.kernels.cells import UNKNOWN
+from hapticdb.realtime.frames import Frames
+from hapticdb.realtime.residency import BATCH
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+STRIDE = 16
+"""Samples between those whose surroundings are fetched ahead, half a voxel apart each."""
+CELL = 32
+
+
+class ClearanceSearch:
+    """Least distances along a path, sample after sample.
+
+    Parameters
+    ----------
+    frames : Frames
+        Of the shell; their cells are used, and more are fetched around the points.
+    limit : float
+        Voxels: what is farther is not looked for.
+    n_windows : int or None
+        Poses far apart, each a window of its own; all samples of a path are one unless given.
+
+    Raises
+    ------
+    UsageError
+        When the cells within the limit of one point are more than the table can hold.
+
+    Attributes
+    ----------
+    least : (W,) float64
+        Voxels, of each window; the limit where nothing is nearer.
+    """
+
+    def __init__(self, frames: Frames, limit: float, n_windows: int | None = None) -> None:
+        self._frames = frames
+        self._stride = STRIDE if n_windows is None else 1
+        self._reach = limit + kernels.MARGIN + 0.5 * self._stride
+        residency = frames.residency
+        self._most = (residency.table.n_slots - 1) // 2
+        n_cells = (int(2.0 * self._reach / CELL) + 2) ** 3
+        if n_cells > self._most:
+            size = limit * residency.grid.voxel_size
+            raise UsageError(
+                f"clearance up to {size:.4g} m needs {n_cells} cells around a point, more than "
+                f"fit into {residency.table.size_bytes} bytes: give less, or a larger budget"
+            )
+        self.least = np.full(n_windows or 1, limit)
+        self._bounds = kernels.Bounds(
+            np.full(len(frames.shell), -np.inf),
+            np.full(len(frames.shell), -1, dtype=np.int64),
+            self.least,
+            np.array([-np.inf, limit]),
+            np.array([-1, 0, -1, 0, 0], dtype=np.int64),
+        )
+
+    def look(self, first: int, poses: Floats, travels: Floats, windows: Ints) -> None:
+        """Look around at samples from `first` on.
+
+        poses (B, 4, 4); travels (B,), as `Path.travels` gives them; windows (B,) int64.
+        """
+        frames = self._frames
+        residency, table = frames.residency, frames.residency.table
+        done = 0
+        while True:
+            with table.reading() as row:
+                done = kernels.find_clearance(
+                    table.cells, row, frames.clusters.points, poses, done, first, travels,
+                    windows, residency.place, self._bounds,
+                )  # fmt: skip
+            if done == len(poses):
+                return
+            self._fetch(poses[done:], int(self._bounds.where[kernels.STOPPED]))
+
+    @property
+    def distance(self) -> float:
+        """Least distance so far, voxels; the limit when nothing was nearer."""
+        return float(self._bounds.state[kernels.LEAST])
+
+    @property
+    def nearest(self) -> tuple[int, int, int]:
+        """Sample, point and packed voxel of the least distance; meaningless without any."""
+        sample, point, voxel = self._bounds.where[:3].tolist()
+        return sample, point, voxel
+
+    def _fetch(self, poses: Floats, point: int) -> None:
+        """Make the surroundings resident of that point at the first pose, then of what follows."""
+        residency = self._frames.residency
+        found = np.full(1 << (2 * self._most).bit_length(), UNKNOWN, dtype=np.int64)
+        kernels.cells_near(
+            self._frames.clusters.points, poses, residency.place, point, self._stride,
+            self._reach * residency.grid.voxel_size, found, self._most,
+        )  # fmt: skip
+        cells = np.sort(found[found >= 0])
+        residency.round += 1
+        missing = residency.missing(cells)
+        for _ in range(4 + 2 * len(missing) // BATCH):
+            if not len(missing):
+                return
+            for at in range(0, len(missing), BATCH):
+                residency.load(missing[at : at + BATCH])
+            missing = residency.missing(cells)
+        raise UsageError(
+            f"{len(cells)} cells around the tool do not fit into {residency.table.size_bytes} "
+            "bytes: give a larger budget"
+        )

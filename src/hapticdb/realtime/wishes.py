@@ -1,0 +1,98 @@
+"""Which cells a tool may soon meet: what the fetching process brings in, and in which order."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import CELL_BITS, Grid
+from hapticdb.kernels.cell_table import cells_ahead
+from hapticdb.store.base import Keys
+
+REACH_VOXELS = 500.0
+"""Voxels a second that a hand may reach from rest: 1 m/s at 2 mm."""
+SLACK_VOXELS = 1.0
+"""How far a wish may move until its cells are looked for anew."""
+MOST_CELLS_WANTED = 1 << 15
+
+Floats = NDArray[np.float64]
+
+
+class Wish(NamedTuple):
+    """Where a tool is and may soon be, in voxels of the grid.
+
+    start, move (3,): the bounding sphere's centre, and its way to where the hand will be; radius:
+    of the sphere; margin: how far beside its way it may be.
+    """
+
+    start: Floats
+    move: Floats
+    radius: float
+    margin: float
+
+    @classmethod
+    def of_motion(
+        cls, grid: Grid, motion: Floats, lookahead: float, peak_speed: float
+    ) -> "Wish | None":
+        """Wish of a session's motion, or None when that is no motion.
+
+        motion (10,): centre of the tool and of where the hand wants it, the hand's velocity, the
+        shell's radius; metres, m/s. The sphere is swept from the tool to the hand and on along the
+        velocity for `lookahead` seconds; the hand may be elsewhere by then at 1.5 times the speed
+        (m/s) that it has shown of late or, from rest, `REACH_VOXELS`.
+        """
+        if not np.isfinite(motion).all():
+            return None
+        size = grid.voxel_size
+        tool, handle, velocity = motion[:3], motion[3:6], motion[6:9]
+        margin = max(1.5 * peak_speed / size, REACH_VOXELS) * lookahead
+        return cls(
+            (tool - np.array(grid.origin)) / size,
+            (handle - tool + velocity * lookahead) / size,
+            float(motion[9]) / size,
+            margin,
+        )
+
+    def is_near(self, other: "Wish") -> bool:
+        """Whether cells found for one serve the other."""
+        away = [
+            *(self.start - other.start),
+            *(self.start + self.move - other.start - other.move),
+            self.radius + self.margin - other.radius - other.margin,
+        ]
+        return bool(max(map(abs, away)) <= SLACK_VOXELS)
+
+    def cells(self, grid: Grid) -> tuple[Keys, Floats]:
+        """Cells within reach, most urgent first, and their urgency in voxels.
+
+        That is how far the sphere is from a cell at its nearest, and how far it has to go until
+        there.
+        """
+        n_cells = max(grid.side >> CELL_BITS, 1)
+        reach = self.radius + self.margin + 2.0 * SLACK_VOXELS
+        end = self.start + self.move
+        low = np.floor((np.minimum(self.start, end) - reach) / 32.0)
+        high = np.floor((np.maximum(self.start, end) + reach) / 32.0)
+        first = np.clip(low, 0, n_cells).astype(np.int64)
+        last = np.clip(high, -1, n_cells - 1).astype(np.int64)
+        if (first > last).any():
+            return np.empty(0, dtype=np.int64), np.empty(0)
+        self._trim(first, last)
+        room = int(np.prod(last - first + 1))
+        keys, urgency = np.empty(room, dtype=np.int64), np.empty(room)
+        margin = self.margin + 2.0 * SLACK_VOXELS
+        count = cells_ahead(first, last, self.start, self.move, self.radius, margin, keys, urgency)
+        order = np.argsort(urgency[:count], kind="stable")
+        return keys[:count][order], urgency[:count][order]
+
+    def _trim(self, first: Keys, last: Keys) -> None:
+        """Cut a box of too many cells at its far ends: what is near stays in it."""
+        spans = last - first + 1
+        while np.prod(spans) > MOST_CELLS_WANTED:
+            axis = int(np.argmax(spans))
+            middle = self.start[axis] / 32.0
+            if middle - first[axis] > last[axis] - middle:
+                first[axis] += max(spans[axis] // 4, 1)
+            else:
+                last[axis] -= max(spans[axis] // 4, 1)
+            spans = last - first + 1

@@ -1,0 +1,167 @@
+"""Cells and their directory stand against a dictionary and a plain set of voxels."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb import Grid
+from hapticdb.grid import CurveName
+from hapticdb.kernels import cell_table as kernels
+from hapticdb.kernels.cells import CELL_WORDS, Place, cell_key, spread_key
+from hapticdb.layout import rows_of_voxels
+from hapticdb.store.base import Layout, row_shift
+from naive import Voxel
+from realtime.worlds import HIERARCHICAL, cells_of, poses_in
+
+CAPACITY = 16
+
+
+def colliding(count: int) -> list[int]:
+    """Keys that a directory of 16 entries looks for at its end, so that their run goes round."""
+    ijk = np.random.default_rng(0).integers(0, 1 << 15, (4000, 3))
+    keys = [cell_key(i, j, k) for i, j, k in (ijk << 5).tolist()]
+    at_end = [int(key) for key in keys if spread_key(np.int64(key), CAPACITY) >= CAPACITY - 2]
+    return at_end[:count]
+
+
+KEYS = colliding(12)
+STEP = st.tuples(st.booleans(), st.sampled_from(KEYS), st.integers(0, 99))
+
+
+@given(st.lists(STEP, max_size=60))
+@settings(deadline=None)
+def test_a_directory_is_a_dictionary_however_keys_collide(
+    steps: list[tuple[bool, int, int]],
+) -> None:
+    keys = np.full((3, CAPACITY), -1, dtype=np.int64)
+    slots = np.zeros((3, CAPACITY), dtype=np.int32)
+    known: dict[int, int] = {}
+    out = np.empty(len(KEYS), dtype=np.int64)
+    for is_new, key, slot in steps:
+        one = np.array([key])
+        if is_new and (key in known or len(known) < CAPACITY // 2):
+            kernels.insert_cells(keys, slots, 1, one, np.array([slot]))
+            known[key] = slot
+        elif not is_new:
+            kernels.remove_cells(keys, slots, 1, one)
+            known.pop(key, None)
+        kernels.slots_of_cells(keys, slots, 1, np.array(KEYS), out)
+        assert out.tolist() == [known.get(k, -1) for k in KEYS]
+    assert (keys[[0, 2]] == -1).all()
+    assert sorted(keys[1][keys[1] >= 0].tolist()) == sorted(known)
+
+
+def filled(
+    grid: Grid, layout: Layout, objects: list[NDArray[np.int64]], exclude: list[int]
+) -> tuple[dict[int, set[Voxel]], dict[int, set[Voxel]]]:
+    """Voxels of each cell, by `fill_cells` from rows, and origins of the bricks of its mask."""
+    parts = [rows_of_voxels(ijk, grid, layout) for ijk in objects]
+    keys = np.concatenate([rows.keys for rows in parts])
+    ids = np.repeat(np.arange(1, len(parts) + 1), [len(rows) for rows in parts])
+    width = 64 if layout == "brick" else 0
+    bits = np.concatenate([rows.occupancy for rows in parts]).reshape(len(keys), width)
+    order = np.lexsort((ids, keys))
+    cells = cells_of(grid)
+    on_curve = np.empty(len(cells), dtype=np.int64)
+    kernels.curve_keys_of_cells(cells, grid.bits, grid.curve_code, on_curve)
+    back = np.empty_like(cells)
+    kernels.cells_of_curve_keys(on_curve, grid.bits, grid.curve_code, back)
+    assert (back == cells).all()
+    ascending = np.argsort(on_curve)
+    words = np.zeros((len(cells) + 1, CELL_WORDS), dtype=np.uint32)
+    masks = np.zeros(len(cells) + 1, dtype=np.uint64)
+    kernels.fill_cells(
+        keys[order], ids[order], np.frombuffer(bits[order].tobytes(), dtype=np.uint8),
+        np.array(exclude, dtype=np.int64), on_curve[ascending], ascending + 1, grid.bits,
+        grid.curve_code, row_shift(layout), words, masks,
+    )  # fmt: skip
+    assert not words[0].any()
+    voxels: dict[int, set[Voxel]] = {}
+    bricks: dict[int, set[Voxel]] = {}
+    for n, key in enumerate(cells.tolist()):
+        i, j, k = key >> 32 << 5, (key >> 16 & 0xFFFF) << 5, (key & 0xFFFF) << 5
+        set_bits = words[n + 1][:, None] >> np.arange(32, dtype=np.uint32) & 1
+        voxels[key] = {
+            (i + (w >> 5), j + (w & 31), k + b) for w, b in np.argwhere(set_bits).tolist()
+        }
+        mask = int(masks[n + 1])
+        bricks[key] = {
+            (i + (b >> 4) * 8, j + (b >> 2 & 3) * 8, k + (b & 3) * 8)
+            for b in range(64)
+            if mask >> b & 1
+        }
+    return voxels, bricks
+
+
+@pytest.mark.parametrize(("layout", "curve"), HIERARCHICAL)
+@given(bits=st.sampled_from([3, 4, 5, 6, 7]), seed=st.integers(0, 99), n_left_out=st.integers(0, 3))
+@settings(deadline=None, max_examples=15)
+def test_cells_hold_the_voxels_of_their_rows(
+    layout: Layout, curve: CurveName, bits: int, seed: int, n_left_out: int
+) -> None:
+    """Also at the grid's border, in grids smaller than a cell, without the excluded objects."""
+    grid = Grid(0.01, (0.0, 0.0, 0.0), bits, curve)
+    rng = np.random.default_rng(seed)
+    corners = np.array([[0, 0, 0], [grid.side - 1] * 3])
+    objects = [
+        np.unique(np.concatenate([corners[:n], rng.integers(0, grid.side, (90, 3))]), axis=0)
+        for n in range(3)
+    ]
+    exclude = sorted(rng.choice([1, 2, 3], n_left_out, replace=False).tolist())
+    voxels, bricks = filled(grid, layout, objects, exclude)
+    wanted = {
+        (i, j, k)
+        for n, ijk in enumerate(objects, 1)
+        if n not in exclude
+        for i, j, k in ijk.tolist()
+    }
+    for key, found in voxels.items():
+        inside = {v for v in wanted if cell_key(*v) == key}
+        assert found == inside
+        assert bricks[key] == {(i & ~7, j & ~7, k & ~7) for i, j, k in inside}
+
+
+@given(st.integers(0, 1000), st.integers(1, 30))
+@settings(deadline=None, max_examples=40)
+def test_cells_met_are_those_of_the_points(seed: int, most: int) -> None:
+    """Of as many poses as have no more cells than asked for, and of the first in any case."""
+    grid = Grid(0.01, (0.0, 0.0, 0.0), 8)
+    rng = np.random.default_rng(seed)
+    points = np.hstack([rng.normal(0, 0.2, (40, 3)), np.zeros((40, 3))])
+    poses = poses_in(grid, 6, seed)
+    sets: list[set[int]] = []
+    for pose in poses:
+        ijk = grid.voxels_of(points[:, :3] @ pose[:3, :3].T + pose[:3, 3])
+        sets.append({int(cell_key(*v)) for v in ijk[grid.contains(ijk)].tolist()})
+    found = np.full(256, -1, dtype=np.int64)
+    place = Place(*grid.origin, grid.voxel_size, float(grid.side))
+    n_poses, count = kernels.cells_met(points, poses, place, found, most)
+    united: set[int] = set().union(*sets[:n_poses])
+    assert set(found[found >= 0].tolist()) == united
+    assert count == len(united)
+    assert n_poses == 1 or count <= most
+    if n_poses < len(poses):
+        assert len(united | sets[n_poses]) > most
+
+
+def test_the_clock_passes_over_what_is_wanted_and_gives_used_slots_a_second_round() -> None:
+    cells = np.array([-1, 11, 12, -1, 14, 15])  # 0 is the empty slot, 3 is free
+    wanted_at = np.array([0, 5, 1, 0, 1, 1])
+    used = np.array([0, 0, 1, 0, 0, 0], dtype=np.uint8)
+    out = np.empty(6, dtype=np.int64)
+    count, hand = kernels.slots_to_free(cells, wanted_at, used, 3, 0, 2, out)
+    assert (out[:count].tolist(), hand) == ([4, 5], 5)
+    assert used[2] == 0
+    count, hand = kernels.slots_to_free(cells, wanted_at, used, 3, hand, 6, out)
+    assert out[:count].tolist() == [2]
+    assert kernels.slots_to_free(cells, wanted_at, used, 3, hand, 6, out)[0] == 0
+
+
+def test_the_oldest_version_read_is_that_of_readers_in_a_frame() -> None:
+    readers = np.zeros(16 * 8, dtype=np.int64)
+    nobody = kernels.oldest_version_read(readers)
+    assert nobody > 1 << 60
+    readers[8], readers[24] = 7, 5
+    assert kernels.oldest_version_read(readers) == 5

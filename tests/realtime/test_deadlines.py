@@ -1,0 +1,180 @@
+"""Deadlines on a clock that only moves when told, and what `undisturbed` restores."""
+
+import ctypes
+import gc
+import math
+import os
+import sys
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticdb.realtime.deadlines import (
+    SWITCH_INTERVAL,
+    Deadlines,
+    Timing,
+    empty_loop,
+    undisturbed,
+)
+from hapticdb.realtime.report import Times
+
+PERIOD = 1_000_000
+GET_TIMERSLACK = 30
+
+
+class Clock:
+    """Nanoseconds; every look takes 50, and who sleeps may wake late."""
+
+    def __init__(self, start: int = 12_345) -> None:
+        self.now = start
+        self.late = 0
+
+    def __call__(self) -> int:
+        self.now += 50
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.now += round(seconds * 1e9) + self.late
+
+
+def ticking() -> tuple[Clock, Deadlines]:
+    clock = Clock()
+    return clock, Deadlines(PERIOD, Times(), Times(), clock=clock, sleep=clock.sleep)
+
+
+@given(st.lists(st.integers(0, 5 * PERIOD), min_size=1, max_size=50))
+def test_every_frame_begins_at_a_deadline_of_the_grid(works: list[int]) -> None:
+    clock, deadlines = ticking()
+    for work in works:
+        begun = deadlines.wait()
+        assert 0 <= begun - deadlines.due < 200
+        assert (deadlines.due - deadlines.started) % PERIOD == 0
+        clock.now += work
+        deadlines.done()
+
+
+@given(st.lists(st.integers(0, 5 * PERIOD), min_size=1, max_size=50))
+def test_kept_and_missed_deadlines_are_all_there_were(works: list[int]) -> None:
+    clock, deadlines = ticking()
+    for work in works:
+        deadlines.wait()
+        clock.now += work
+        deadlines.done()
+    figures = deadlines.figures()
+    assert figures.frames == len(works)
+    assert deadlines.passed == figures.frames + figures.missed
+    assert deadlines.passed * PERIOD == deadlines.due - PERIOD - deadlines.started
+    assert (deadlines.passed - 1) * PERIOD <= figures.seconds * 1e9 + 1
+    assert figures.seconds * 1e9 <= (deadlines.passed + 1) * PERIOD
+
+
+def test_a_frame_of_two_and_a_half_periods_misses_two_deadlines() -> None:
+    clock, deadlines = ticking()
+    deadlines.wait()
+    clock.now += 5 * PERIOD // 2
+    deadlines.done()
+    deadlines.wait()
+    assert deadlines.missed == 2
+    assert deadlines.dt == pytest.approx(3e-3, abs=1e-6)
+    assert deadlines.figures().elapsed.worst == pytest.approx(2.5e-3, abs=1e-6)
+
+
+def test_a_late_wake_up_is_lateness_and_no_drift() -> None:
+    clock, deadlines = ticking()
+    clock.late = 300_000
+    for _ in range(100):
+        begun = deadlines.wait()
+        assert (begun - deadlines.due) == pytest.approx(240_000, abs=200)  # 60 us were for spinning
+        deadlines.done()
+    assert deadlines.missed == 0
+    assert deadlines.due - deadlines.started == 101 * PERIOD
+    assert deadlines.figures().lateness.p50 == pytest.approx(240e-6, abs=1e-6)
+
+
+def test_a_wake_up_later_than_a_period_misses_that_deadline() -> None:
+    clock, deadlines = ticking()
+    clock.late = 1_500_000
+    deadlines.wait()
+    deadlines.done()
+    assert deadlines.missed == 1
+
+
+def test_dt_is_measured_from_begin_to_begin() -> None:
+    clock, deadlines = ticking()
+    deadlines.wait()
+    assert deadlines.dt == 1e-3
+    deadlines.done()
+    clock.late = 500_000
+    deadlines.wait()
+    assert deadlines.dt == pytest.approx(1.44e-3, abs=1e-6)
+
+
+def test_percentiles_are_of_all_that_was_counted() -> None:
+    times = Times()
+    assert times.spread() == (0.0, 0.0, 0.0, 0.0)
+    for n in range(1, 1001):
+        times.add(n * 1e-6)
+    times.add(1.0)  # beyond the bins
+    spread = times.spread()
+    assert spread.p50 == pytest.approx(501e-6, abs=1e-6)
+    assert spread.p99 == pytest.approx(991e-6, abs=1e-6)
+    assert spread.worst == 1.0
+
+
+def test_an_empty_loop_lasts_as_many_deadlines_as_asked() -> None:
+    figures = empty_loop(Timing(500.0), 0.1)
+    assert 50 <= figures.frames + figures.missed < 60 + figures.missed
+    assert all(map(math.isfinite, (*figures.lateness, *figures.elapsed)))
+
+
+# -- what a loop changes in its process ----------------------------------------------------------
+
+
+def slack() -> int:
+    return int(ctypes.CDLL(None).prctl(GET_TIMERSLACK, 0, 0, 0, 0))
+
+
+def settings() -> tuple[object, ...]:
+    found: list[object] = [gc.isenabled(), gc.get_freeze_count(), sys.getswitchinterval()]
+    if sys.platform == "linux":
+        found += [os.sched_getaffinity(0), os.sched_getscheduler(0), slack()]
+    return tuple(found)
+
+
+@pytest.mark.parametrize("kind", [None, ValueError, KeyboardInterrupt])
+def test_all_is_as_before_afterwards(kind: type[BaseException] | None) -> None:
+    processor = min(os.sched_getaffinity(0)) if sys.platform == "linux" else None
+    before = settings()
+    try:
+        with undisturbed(Timing(1000.0, is_fifo=True, processor=processor)) as granted:
+            assert not gc.isenabled()
+            assert gc.get_freeze_count() > 0
+            assert sys.getswitchinterval() == pytest.approx(SWITCH_INTERVAL)
+            if sys.platform == "linux":
+                assert os.sched_getaffinity(0) == {processor}
+                assert slack() <= 1  # 0 for who is scheduled first in, first out
+                assert granted["processor"] == f"bound to processor {processor}"
+            assert granted["scheduling"].startswith("SCHED_FIFO")
+            if kind:
+                raise kind
+    except (ValueError, KeyboardInterrupt):
+        assert kind is not None
+    assert settings() == before
+
+
+def test_a_collector_that_was_off_stays_off() -> None:
+    gc.disable()
+    try:
+        with undisturbed(Timing()):
+            pass
+        assert not gc.isenabled()
+    finally:
+        gc.enable()
+
+
+def test_a_processor_that_is_not_there_is_told_and_nothing_breaks() -> None:
+    before = settings()
+    with undisturbed(Timing(processor=1023)) as granted:
+        assert granted["processor"].startswith(("processor 1023 not granted", "not on this"))
+    assert settings() == before

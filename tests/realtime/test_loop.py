@@ -1,0 +1,224 @@
+"""The loop in this process, on the cells of a fetching process: what it counts and refuses."""
+
+import dataclasses
+import io
+import pickle
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hapticdb import PointShell
+from hapticdb.errors import DeviceError, HapticDBError
+from hapticdb.kernels import servo
+from hapticdb.kernels.cells import RESULTS, UNKNOWNS
+from hapticdb.kernels.coupling import APPLIED, OUT
+from hapticdb.realtime import loop as subject
+from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.deadlines import Timing
+from hapticdb.realtime.devices import Device
+from hapticdb.realtime.handle import Handle
+from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of, work
+from hapticdb.realtime.process import Message, Voice
+from hapticdb.realtime.recorded import FRAME, State
+from hapticdb.realtime.report import LoopAnswer
+from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.session import frames_of
+from hapticdb.realtime.table import anonymous_memory
+from hapticdb.testing import floor_voxels, write_voxels
+from realtime.hands import Clutched, Slow, Talking, Unplugged, still, stroking
+from realtime.worlds import make
+
+N_RING = 4096
+Floats = NDArray[np.float64]
+
+
+class Ran(NamedTuple):
+    answer: LoopAnswer
+    frames: NDArray[np.void]
+
+
+Run = Callable[..., Ran]
+
+
+@pytest.fixture(scope="module")
+def cells(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ResidentCells]:
+    with make(tmp_path_factory.mktemp("loop"), bits=6) as env:
+        write_voxels(env.store, floor_voxels(env.grid, width=48), "floor")
+    with ResidentCells(env.url, budget_bytes=4 << 20) as made:
+        yield made
+
+
+@pytest.fixture
+def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
+    """Runs the loop's work in this process, and returns its answer and its frames."""
+    monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # a test's input may be closed
+    memory = anonymous_memory("frames", ring_bytes(N_RING))
+    with cells.table.reading() as row:
+
+        def ran(device: Device, **options: object) -> Ran:
+            given: dict[str, object] = {"seconds": 0.3, "staleness": 60.0, "is_waiting": False}
+            rate = float(str(options.pop("rate", 500.0)))
+            request = LoopRequest(
+                descriptor=cells.table.descriptor,
+                n_slots=cells.table.n_slots,
+                row=row,
+                ring=memory,
+                n_ring=N_RING,
+                grid=cells.grid,
+                shell=sphere,
+                device=device,
+                stiffness=1000.0,
+                coupling=Coupling(),
+                handle=Handle(),
+                timing=Timing(rate),
+                seconds=0.3,
+                staleness=60.0,
+                is_waiting=False,
+            )
+            heard = io.BytesIO()
+            work(dataclasses.replace(request, **(given | options)), Voice(heard))  # type: ignore[arg-type]
+            said = list(messages(heard.getvalue()))
+            assert [message.word for message in said] == ["running", "done"]
+            answer = said[-1].content
+            frames = frames_of(ring_of(memory, N_RING)[: answer.loop.frames])
+            return Ran(answer, frames)
+
+        yield ran
+
+
+def messages(content: bytes) -> Iterator[Message]:
+    while content:
+        size = int.from_bytes(content[:8], "little")
+        yield pickle.loads(content[8 : 8 + size])  # noqa: S301 - what was just said
+        content = content[8 + size :]
+
+
+def test_a_loop_counts_what_it_records(run: Run) -> None:
+    answer, frames = run(stroking(0.010, 0.5), seconds=0.6)
+    counts = answer.counts
+    assert counts.frames == answer.loop.frames == len(frames)
+    assert counts.hit_frames == np.count_nonzero(frames["hits"]) > 0
+    assert counts.contact_frames == np.count_nonzero(frames["contacts"]) > 0
+    assert counts.unknown_frames == np.count_nonzero(frames["unknown"])
+    assert counts.unknown_points == frames["unknown"].sum()
+    assert counts.held_frames == np.count_nonzero(frames["state"] & State.HELD)
+    np.testing.assert_allclose(counts.deepest, frames["deepest"].max(), rtol=1e-6)
+    forces = np.linalg.norm(frames["applied"][:, :3], axis=1)
+    assert counts.peak_force == pytest.approx(forces.max())
+    assert counts.peak_torque == pytest.approx(
+        np.linalg.norm(frames["applied"][:, 3:], axis=1).max()
+    )
+    # the path pushes 2 mm into a floor of 2 mm voxels; the spring is clamped at half a voxel
+    assert 0.1 < counts.peak_force < 5.0
+
+
+def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
+    applied: list[Floats] = []
+    hand = stroking(0.010, 0.2)
+    hand.apply = applied.append  # type: ignore[method-assign]
+    answer, frames = run(hand, seconds=1e9)
+    assert frames["time"][-1] >= 0.2
+    assert answer.counts.peak_force > 0.0
+    assert not applied[-1].any()
+
+
+def test_nothing_is_felt_where_nothing_is(run: Run) -> None:
+    answer, frames = run(still(0.03))
+    assert answer.counts.hit_frames == 0
+    assert not frames["applied"].any()
+    assert not frames["wrench"].any()
+
+
+def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
+    answer, frames = run(Slow(still(0.03), every=10, seconds=0.011), seconds=0.5, rate=250.0)
+    loop = answer.loop
+    assert loop.missed >= len(frames) // 10
+    assert loop.frames + loop.missed >= 125
+    due = frames["time"] - frames["lateness"].astype(np.float64)
+    nth = due * 250.0
+    np.testing.assert_allclose(nth, np.round(nth), atol=1e-4)
+    np.testing.assert_allclose(np.diff(frames["time"]), frames["dt"][1:], atol=1e-9)
+
+
+def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> None:
+    answer, frames = run(Clutched(stroking(0.010, 0.5), 1 << 30, 0.0), handle=Handle(clutch=0))
+    is_open = frames["state"] & State.CLUTCH_OPEN > 0
+    assert is_open.any()
+    assert not is_open.all()
+    np.testing.assert_array_equal(is_open, frames["buttons"] & 1 > 0)
+    assert not frames["hand_velocity"][is_open].any()
+    assert answer.counts.frames == len(frames)
+
+
+def test_a_kernel_compiled_while_the_loop_runs_is_told(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Kernel:
+        signatures: list[str] = []  # noqa: RUF012 - of one test
+
+    class Compiling(Slow):
+        def read(self):  # type: ignore[no-untyped-def]  # noqa: ANN202 - as its base
+            if self.reads == 50:
+                Kernel.signatures.append("one more")
+            return super().read()
+
+    monkeypatch.setattr(subject, "ENTRIES", [Kernel()])
+    with pytest.raises(HapticDBError, match="a kernel was compiled while the loop ran"):
+        run(Compiling(still(0.03), 1 << 30, 0.0))
+
+
+def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
+    applied: list[Floats] = []
+    hand = Unplugged(still(0.010), 100)
+    hand.apply = applied.append  # type: ignore[method-assign]
+    with pytest.raises(DeviceError, match="unplugged"):
+        run(hand)
+    assert any(wrench.any() for wrench in applied)
+    assert not applied[-1].any()
+
+
+def test_after_an_answer_the_loop_runs_as_often_as_one_likes(run: Run) -> None:
+    for _ in range(2):
+        assert run(Talking(still(0.03), 1 << 30, 0.0), seconds=0.1).answer.loop.frames > 0
+
+
+def test_a_loop_of_no_time_has_one_frame(run: Run) -> None:
+    assert run(still(0.03), seconds=1e-9).answer.loop.frames == 1
+
+
+def test_a_recorded_frame_has_the_unknown_points_of_the_pose_that_was_tried() -> None:
+    """The frame that is felt has none by definition."""
+    ring = np.zeros((4, servo.WIDTH))
+    out = np.zeros(OUT)
+    out[APPLIED : APPLIED + 6] = range(1, 7)
+    out[UNKNOWNS] = 5.0
+    servo.note(
+        ring, 6, 1.0, 0.001, 0.0, 0.0, np.arange(14.0), np.arange(64.0), np.zeros(RESULTS), out,
+        7.0, 3, 1,
+    )  # fmt: skip
+    (frame,) = frames_of(ring[[2]])
+    assert frame["unknown"] == 5
+    assert frame["hits"] == 0
+    assert frame["applied"].tolist() == [1, 2, 3, 4, 5, 6]
+    assert (frame["revision"], frame["buttons"], frame["state"]) == (7, 3, 1)
+    assert frame["hand"].tolist() == list(range(7))
+    assert frame["hand_velocity"].tolist() == list(range(7, 13))
+
+
+def test_a_row_of_the_ring_is_as_wide_as_a_frame() -> None:
+    assert sum(int(np.prod(FRAME[name].shape)) for name in FRAME.names or ()) == servo.WIDTH
+
+
+def test_a_database_that_is_silent_for_too_long_makes_frames_hold(run: Run) -> None:
+    answer, frames = run(still(0.010), staleness=-60.0)
+    assert answer.counts.stale_frames == answer.counts.held_frames == len(frames)
+    assert not frames["applied"][frames["time"] > 0.1].any()
+
+
+def test_waiting_frames_take_no_heed_of_silence(run: Run) -> None:
+    answer, frames = run(still(0.010), staleness=-60.0, is_waiting=True)
+    assert answer.counts.held_frames == answer.counts.unknown_frames == 0
+    assert frames["applied"][-1].any()

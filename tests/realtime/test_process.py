@@ -1,0 +1,96 @@
+"""A session's process says what happened, and ends when its session does."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from hapticdb import DatabaseError, HapticDBError
+from hapticdb.realtime import process as module
+from hapticdb.realtime.process import Message, Process
+
+WORKERS = "realtime.workers:work"
+LONG = 60.0
+
+
+@pytest.fixture(autouse=True)
+def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
+
+
+def test_messages_come_whole_and_in_order_whatever_is_printed() -> None:
+    large = list(range(100_000))
+    with Process(WORKERS, ("echo", large), []) as process:
+        assert process.receive(LONG) == Message("heard", large)
+        word, content = process.receive(LONG) or ("", None)
+        assert (word, content) == ("again", (large, process.pid))
+        assert process.receive(LONG) is None
+        assert process.wait(LONG)
+
+
+def test_its_errors_are_raised_here() -> None:
+    with (
+        Process(WORKERS, ("fail", None), []) as process,
+        pytest.raises(DatabaseError, match=r"^no such place: make it first$"),
+    ):
+        process.receive(LONG)
+
+
+@pytest.mark.parametrize(
+    ("word", "cause"), [("break", "ZeroDivisionError: one$"), ("exit", "SystemExit: 3$")]
+)
+def test_what_nobody_expected_is_one_line_here(word: str, cause: str) -> None:
+    with (
+        Process(WORKERS, (word, None), []) as process,
+        pytest.raises(HapticDBError, match=f"the session's process ended: {cause}"),
+    ):
+        process.receive(LONG)
+
+
+def test_silence_is_no_message() -> None:
+    with Process(WORKERS, ("wait", None), []) as process:
+        assert process.receive(LONG) == Message("waiting")
+        assert process.receive(0.01) is None
+        assert process.is_alive
+
+
+def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "END_PATIENCE", 0.5)
+    for word, status in (("wait", 0), ("hang", -signal.SIGKILL)):
+        process = Process(WORKERS, (word, None), [])
+        assert process.receive(LONG) is not None
+        monkeypatch.setattr(module, "END_PATIENCE", 0.5 if word == "hang" else LONG)
+        process.end()
+        assert process._popen.returncode == status
+        process.end()
+
+
+def test_one_killed_is_silent_and_not_alive() -> None:
+    with Process(WORKERS, ("hang", None), []) as process:
+        assert process.receive(LONG) is not None
+        os.kill(process.pid, signal.SIGKILL)
+        assert process.receive(LONG) is None
+        assert process.wait(LONG)
+        assert not process.is_alive
+
+
+def test_it_ends_with_a_session_that_was_killed() -> None:
+    script = (
+        "import sys, time; from hapticdb.realtime.process import Process;"
+        f"p = Process({WORKERS!r}, ('wait', None), []); p.receive({LONG});"
+        "print(p.pid, flush=True); time.sleep(1000)"
+    )
+    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as session:
+        assert session.stdout is not None
+        pid = int(session.stdout.readline())
+        session.kill()
+    deadline = time.monotonic() + LONG
+    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert not Path(f"/proc/{pid}").exists()

@@ -1,0 +1,503 @@
+"""Sessions: whole, cut short, and with any of their processes killed; each a few seconds."""
+
+import json
+import math
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.errors import DeviceError, HapticDBError, UsageError
+from hapticdb.force import TangentPlane
+from hapticdb.kernels.motion import poses_of
+from hapticdb.realtime.devices import Player
+from hapticdb.realtime.recorded import State
+from hapticdb.realtime.recording import Recording
+from hapticdb.realtime.replay import replay, touching
+from hapticdb.realtime.report import Report
+from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.session import Session
+from hapticdb.realtime.table import is_alive
+from hapticdb.testing import floor_voxels, write_voxels
+from realtime.hands import Beckoned, Talking, Unplugged, at, still, stroking
+from realtime.worlds import SIZE, make, move
+from servers import Place
+
+RATE = 500.0
+PATIENCE = 30.0
+NEVER_STALE = 1e6
+Recorded = NDArray[np.void]
+
+
+def until(claim: Callable[[], object], session: Session | None = None) -> None:
+    """Wait until that is so, looking after a session meanwhile."""
+    deadline = time.monotonic() + PATIENCE
+    while not claim():
+        assert time.monotonic() < deadline
+        if session is None:
+            time.sleep(0.01)
+        else:
+            assert session.wait(0.02) is None
+
+
+def floored(env: Environment, width: int = 48) -> Environment:
+    write_voxels(env.store, floor_voxels(env.grid, width=width), "floor")
+    return env
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    """A floor, its top at z = 0, on SQLite."""
+    with floored(make(tmp_path_factory.mktemp("session"), bits=6)) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def cells(env: Environment) -> Iterator[ResidentCells]:
+    with ResidentCells(env.url, budget_bytes=4 << 20) as made:
+        yield made
+
+
+class Played(NamedTuple):
+    """A session that came to its end by itself."""
+
+    report: Report
+    frames: Recorded
+    recording: Recording
+    loop_pid: int
+
+
+@pytest.fixture(scope="module")
+def played(
+    cells: ResidentCells, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
+) -> Played:
+    """Strokes over the floor, to the device's end, 2 mm deep."""
+    path = tmp_path_factory.mktemp("played") / "session.hdbrec"
+    with Session(
+        cells, sphere, stroking(0.010), rate=RATE, record=path, staleness=NEVER_STALE
+    ) as session:
+        pid = session.pid
+        report = session.wait()
+    assert report is not None
+    recording = Recording(path)
+    return Played(report, np.concatenate(list(recording.frames())), recording, pid)
+
+
+# -- one that is left alone --------------------------------------------------------------------
+
+
+def test_a_session_ends_with_its_device(played: Played) -> None:
+    assert played.report.loop.seconds == pytest.approx(1.0, abs=0.1)
+    assert not is_alive(played.loop_pid)
+
+
+def test_every_deadline_was_kept_or_missed(played: Played) -> None:
+    loop = played.report.loop
+    assert loop.frames + loop.missed == pytest.approx(RATE * loop.seconds, abs=2.0)
+    assert loop.rate <= RATE * 1.01
+
+
+def test_the_recording_has_every_frame(played: Played) -> None:
+    report, frames = played.report, played.frames
+    assert len(frames) == report.loop.frames == report.recorded_frames
+    assert report.lost_records == 0
+    np.testing.assert_allclose(np.diff(frames["time"]), frames["dt"][1:], atol=1e-9)
+    assert (np.diff(frames["time"]) > 0.0).all()
+
+
+def test_the_figures_are_those_of_the_frames(played: Played) -> None:
+    report, frames = played.report, played.frames
+    assert report.points == 300 * len(frames)
+    assert report.hit_frames == np.count_nonzero(frames["hits"]) > 0
+    assert report.contact_frames == np.count_nonzero(frames["contacts"])
+    assert report.unknown_frames == np.count_nonzero(frames["unknown"])
+    assert report.unknown_points == frames["unknown"].sum()
+    assert report.hit_rate == 1.0 - frames["unknown"].sum() / report.points
+    assert report.held_frames == np.count_nonzero(frames["state"] & State.HELD)
+    assert report.loop.lateness.worst == pytest.approx(frames["lateness"].max(), rel=1e-6)
+    assert report.peak_force == np.linalg.norm(frames["applied"][:, :3], axis=1).max()
+    assert report.objects == (1,)
+    assert report.stale_frames == report.dropped_frames == report.cache.losses == 0
+
+
+def finite(value: object) -> bool:
+    if isinstance(value, dict):
+        return all(map(finite, value.values()))
+    if isinstance(value, list | tuple):
+        return all(map(finite, value))
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+def test_the_report_survives_json_and_is_finite(played: Played) -> None:
+    figures = played.report.figures()
+    assert finite(figures)
+    again = json.loads(json.dumps(figures, allow_nan=False))
+    assert again == json.loads(json.dumps(again))
+    assert again["loop"]["frames"] == played.report.loop.frames
+    assert again["loop"]["lateness"]["p99"] == played.report.loop.lateness.p99
+    assert again["empty"]["frames"] == played.report.empty.frames > 0
+    assert again["cache"]["budget_bytes"] <= 4 << 20
+
+
+def test_wrenches_are_those_of_a_touch_bit_for_bit(played: Played, env: Environment) -> None:
+    replayed = replay(played.recording, env)
+    assert replayed.is_equal, replayed.describe()
+    assert replayed.n_compared == len(played.frames) - played.report.held_frames
+    assert played.frames["wrench"].any()
+
+
+def test_nothing_is_sent_while_nothing_is_touched(played: Played) -> None:
+    is_free = played.frames["hits"] == 0
+    assert is_free.any()
+    assert not played.frames["applied"][is_free].any()
+
+
+# -- one that is not ---------------------------------------------------------------------------
+
+
+def test_a_session_is_waited_for_in_steps_and_stopped(
+    cells: ResidentCells, sphere: PointShell
+) -> None:
+    with Session(cells, sphere, Talking(still(0.010), 1 << 30, 0.0), rate=RATE) as session:
+        until(lambda: session.n_frames > 100, session)
+        last = session.last()
+        assert last is not None
+        assert last["hits"][0] > 0
+        until(lambda: session.objects == (1,), session)
+        report = session.stop()
+        assert report.loop.frames >= 100
+        assert session.wait() == session.stop()  # said again
+    for closed in (session.stop, session.wait, session.last):
+        with pytest.raises(UsageError, match="the session is closed"):
+            closed()
+
+
+def test_a_session_lasts_its_seconds_however_slow_it_is(
+    cells: ResidentCells, sphere: PointShell
+) -> None:
+    """20,000 Hz are more than a machine that does much else can do."""
+    with Session(cells, sphere, still(0.03), rate=20_000.0, seconds=0.5) as session:
+        report = session.wait()
+    assert report is not None
+    loop = report.loop
+    assert loop.frames + loop.missed >= 10_000
+    assert loop.frames + loop.missed == pytest.approx(20_000 * loop.seconds, abs=2)
+
+
+def test_a_loop_that_is_killed_is_one_clear_error(
+    cells: ResidentCells, sphere: PointShell, tmp_path: Path
+) -> None:
+    path = tmp_path / "cut.hdbrec"
+    with Session(cells, sphere, still(0.010), rate=RATE, record=path) as session:
+        until(lambda: session.n_frames > 50, session)
+        os.kill(session.pid, signal.SIGKILL)
+        with pytest.raises(HapticDBError, match="ended from outside") as raised:
+            session.wait(PATIENCE)
+    assert "\n" not in str(raised.value)
+    n_frames = sum(map(len, Recording(path).frames()))
+    assert n_frames > 50
+    with Session(cells, sphere, still(0.010), rate=RATE, seconds=0.1) as session:
+        report = session.wait()  # the cells are none the worse for it
+    assert report is not None
+    assert report.hit_frames == report.loop.frames
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [(DeviceError, r"^the hand was unplugged"), (ValueError, r"ended: ValueError: the hand was")],
+)
+def test_a_hand_that_fails_ends_the_session_with_its_error(
+    cells: ResidentCells, sphere: PointShell, kind: type[Exception], message: str
+) -> None:
+    hand = Unplugged(still(0.010), 200, kind)
+    with Session(cells, sphere, hand, rate=RATE) as session:
+        with pytest.raises(HapticDBError, match=message):
+            session.wait(PATIENCE)
+        pid = session.pid
+    assert not is_alive(pid)
+
+
+def test_a_session_that_does_not_begin_leaves_no_recording(
+    cells: ResidentCells, sphere: PointShell, tmp_path: Path
+) -> None:
+    path = tmp_path / "never.hdbrec"
+    hand = Unplugged(still(0.010), 1)
+    for _ in range(2):
+        with pytest.raises(DeviceError, match="unplugged"):
+            Session(cells, sphere, hand, record=path)
+        assert not path.exists()
+    path.write_text("mine")
+    with pytest.raises(UsageError, match="is there already"):
+        Session(cells, sphere, still(0.010), record=path)
+    assert path.read_text() == "mine"
+    assert not cells.table.desk.pids.any()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rate": 0.0}, "a rate of 0.0 Hz"),
+        ({"rate": math.nan}, "a rate of nan Hz"),
+        ({"rate": 1e5}, "a rate of"),
+        ({"seconds": 0.0}, "0.0 seconds"),
+        ({"seconds": math.inf}, "inf seconds"),
+        ({"staleness": 0.0}, "a staleness of 0.0 s"),
+        ({"exclude": [1]}, "give a URL instead"),
+        ({"budget_bytes": 1 << 20}, "give a URL instead"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(
+    cells: ResidentCells, sphere: PointShell, options: dict[str, object], message: str
+) -> None:
+    with pytest.raises(UsageError, match=re.escape(message)):
+        Session(cells, sphere, still(0.01), **options)  # type: ignore[arg-type]
+
+
+def test_other_exclusions_need_cells_of_their_own(env: Environment, sphere: PointShell) -> None:
+    with Session(
+        env.url, sphere, still(0.010), rate=RATE, seconds=0.2, exclude=[1], budget_bytes=1 << 20
+    ) as session:
+        report = session.wait()
+        pid = session.cells.pid
+    assert report is not None
+    assert report.hit_frames == 0
+    assert report.hit_rate == 1.0
+    assert not is_alive(pid)
+
+
+# -- processes that are killed -----------------------------------------------------------------
+
+SCRIPT = """
+import sys, time
+import numpy as np
+import hapticdb
+from hapticdb.realtime.session import Session
+from realtime.hands import still
+points = hapticdb.PointShell.load(sys.argv[2])
+with Session(sys.argv[1], points, still(0.010), rate=100.0, policy=sys.argv[3]) as session:
+    session.wait(0.2)
+    print(session.pid, session.cells.pid, flush=True)
+    session.wait()
+"""
+
+
+@pytest.mark.parametrize("policy", ["hold", "wait"])
+def test_processes_end_with_the_one_that_started_them(
+    env: Environment, sphere: PointShell, tmp_path: Path, policy: str
+) -> None:
+    sphere.save(tmp_path / "sphere.npz")
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
+    args = [sys.executable, "-c", SCRIPT, env.url, str(tmp_path / "sphere.npz"), policy]
+    with subprocess.Popen(args, stdout=subprocess.PIPE, text=True, env=environment) as child:
+        assert child.stdout is not None
+        pids = list(map(int, child.stdout.readline().split()))
+        assert len(pids) == 2
+        assert all(map(is_alive, pids))
+        child.kill()
+    until(lambda: not any(map(is_alive, pids)))
+
+
+OWN_DEVICE = """
+import sys
+import hapticdb
+from hapticdb.realtime.session import Session
+from realtime.hands import still
+class Mine:
+    def read(self): ...
+    def apply(self, wrench): ...
+try:
+    Session(sys.argv[1], hapticdb.PointShell.load(sys.argv[2]), Mine())
+except hapticdb.UsageError as error:
+    print(error)
+"""
+
+
+def test_a_device_of_the_script_itself_is_refused_with_the_way_out(
+    env: Environment, sphere: PointShell, tmp_path: Path
+) -> None:
+    sphere.save(tmp_path / "sphere.npz")
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
+    args = [sys.executable, "-c", OWN_DEVICE, env.url, str(tmp_path / "sphere.npz")]
+    done = subprocess.run(args, capture_output=True, text=True, env=environment, check=True)
+    assert done.stderr == ""
+    assert re.fullmatch(r".*Mine.*: define devices in a module .*\n", done.stdout)
+
+
+def recorded(path: Path) -> Recorded:
+    return np.concatenate(list(Recording(path).frames()))
+
+
+def held_for(frames: Recorded) -> NDArray[np.float64]:
+    """Seconds for which each frame's wrench had been kept, by what the coupling goes by."""
+    out, kept = np.zeros(len(frames)), 0.0
+    for n, frame in enumerate(frames):
+        kept = kept + max(float(frame["dt"]), 0.0) if frame["state"] & State.HELD else 0.0
+        out[n] = kept
+    return out
+
+
+def check_falling(frames: Recorded) -> None:
+    """Kept for 20 ms bit for bit, zero from 40 ms on, never growing between."""
+    seconds = held_for(frames)
+    sizes = np.linalg.norm(frames["applied"], axis=1)
+    kept = np.zeros(6)
+    for n, frame in enumerate(frames):
+        if seconds[n] == 0.0:
+            kept = frame["applied"]
+        elif seconds[n] <= 0.02:
+            np.testing.assert_array_equal(frame["applied"], kept)
+        elif seconds[n] >= 0.04:
+            assert not frame["applied"].any()
+        else:
+            assert sizes[n] <= sizes[n - 1]
+
+
+def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
+    env: Environment, sphere: PointShell, tmp_path: Path
+) -> None:
+    path = tmp_path / "killed.hdbrec"
+    with (
+        ResidentCells(env.url, budget_bytes=1 << 20) as cells,
+        Session(cells, sphere, still(0.010), rate=RATE, staleness=0.2, record=path) as session,
+    ):
+        until(lambda: session.n_frames > 50, session)
+        killed = cells.pid
+        os.kill(killed, signal.SIGKILL)
+
+        def is_held() -> bool:
+            last = session.last()
+            return last is not None and bool(last["state"][0] & State.STALE)
+
+        until(is_held, session)
+        until(lambda: not is_held() and cells.pid != killed, session)
+        n_frames = session.n_frames
+        until(lambda: session.n_frames > n_frames + 50, session)
+        report = session.stop()
+    assert report.cache.restarts == 1
+    assert report.stale_frames > 0
+    frames = recorded(path)
+    check_falling(frames)
+    is_silent = frames["state"] & State.STALE > 0
+    assert not frames["applied"][is_silent][-1].any()
+    last = np.flatnonzero(is_silent)[-1]
+    assert frames["applied"][:50].any(axis=1).all()
+    assert frames["applied"][last + 1 :].any(axis=1).any()
+    assert replay(Recording(path), env).is_equal
+
+
+def test_unknown_cells_hold_and_fade_for_one_session_and_are_waited_for_by_another(
+    sphere: PointShell, tmp_path: Path
+) -> None:
+    """Both on the same cells; the fetching process stands still while the hand goes far."""
+    path = Player([0.0, 0.4, 1.5], [at(x, 0.0, 0.010) for x in (-0.2, 0.2, 0.2)])
+    hand = Beckoned(path, tmp_path / "come")
+    with floored(make(tmp_path, bits=8), width=256) as env:
+        with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
+            holding = Session(
+                cells, sphere, hand, rate=RATE, record=tmp_path / "a", staleness=NEVER_STALE
+            )
+            waiting = Session(cells, sphere, hand, rate=RATE, record=tmp_path / "b", policy="wait")
+            with holding, waiting:
+                until(lambda: min(holding.n_frames, waiting.n_frames) > 100, holding)
+                os.kill(cells.pid, signal.SIGSTOP)
+                try:
+                    hand.path.touch()
+                    until(lambda: held_now(holding), holding)
+                    time.sleep(0.2)
+                finally:
+                    os.kill(cells.pid, signal.SIGCONT)
+                reports = [session.wait() for session in (holding, waiting)]
+        for report, name in zip(reports, "ab", strict=True):
+            assert report is not None
+            replayed = replay(Recording(tmp_path / name), env)
+            assert replayed.is_equal, replayed.describe()
+            assert replayed.n_skipped == (report.held_frames if name == "a" else 0)
+    frames = recorded(tmp_path / "a")
+    check_falling(frames)
+    is_unknown = frames["unknown"] > 0
+    assert is_unknown.any()
+    assert (frames["state"][is_unknown] & State.HELD > 0).all()
+    assert held_for(frames).max() > 0.04
+    assert frames["applied"][-1].any()
+    exact = recorded(tmp_path / "b")
+    assert not exact["unknown"].any()
+    assert not (exact["state"] & State.HELD).any()
+    np.testing.assert_allclose(exact["tool"][-1, 0], 0.2, atol=1e-3)
+
+
+def held_now(session: Session) -> bool:
+    last = session.last()
+    return last is not None and bool(last["unknown"][0])
+
+
+# -- while others edit -------------------------------------------------------------------------
+
+
+def felt_at(env: Environment, shell: PointShell, frames: Recorded) -> NDArray[np.float64]:
+    poses = np.empty((len(frames), 4, 4))
+    poses_of(np.ascontiguousarray(frames["tool"]), poses)
+    return touching(env, shell, TangentPlane())(poses)[0]
+
+
+def test_edits_are_felt_and_no_frame_mixes_two_revisions(
+    sphere: PointShell, tmp_path: Path, record_property: Callable[..., None]
+) -> None:
+    """The floor gives way by 6 mm under a hand that presses 2 mm into it, and comes back."""
+    with floored(make(tmp_path, bits=6)) as env:
+        check_edits(env, sphere, tmp_path, record_property)
+
+
+def test_edits_on_a_server_are_felt_and_no_frame_mixes_two_revisions(
+    place: Place, sphere: PointShell, tmp_path: Path, record_property: Callable[..., None]
+) -> None:
+    grid = Grid(SIZE, (-32 * SIZE,) * 3, 6)
+    with floored(hapticdb.create(place(), grid, layout="brick")) as env:
+        check_edits(env, sphere, tmp_path, record_property)
+
+
+def check_edits(
+    edited: Environment, sphere: PointShell, tmp_path: Path, note: Callable[..., None]
+) -> None:
+    up = floor_voxels(edited.grid, width=48)
+    down = up - np.array([0, 0, 3])
+    path = tmp_path / "edited.hdbrec"
+    with Session(
+        edited.url, sphere, stroking(0.010, 0.4, loops=True), rate=RATE, record=path,
+        budget_bytes=1 << 20, staleness=NEVER_STALE,
+    ) as session:  # fmt: skip
+        for ijk in (down, up, down):
+            n_frames = session.n_frames
+            until(lambda n=n_frames: session.n_frames > n + 250, session)  # type: ignore[misc]
+            started = time.monotonic()
+            move(edited.store, 1, ijk)
+            revision = edited.store.revision()
+            until(lambda r=revision: last_revision(session) == r, session)  # type: ignore[misc]
+            note("seconds until felt", time.monotonic() - started)
+        session.wait(0.3)
+        session.stop()
+    frames = recorded(path)
+    frames = frames[frames["state"] & State.HELD == 0]
+    revisions = np.unique(frames["revision"]).tolist()
+    assert revisions == [revision - 3, revision - 2, revision - 1, revision]
+    assert (np.diff(frames["revision"]) >= 0).all()
+    for ijk, these in ((down, revisions[1::2]), (up, revisions[::2])):
+        move(edited.store, 1, ijk)
+        mine = frames[np.isin(frames["revision"], these)]
+        np.testing.assert_array_equal(felt_at(edited, sphere, mine), mine["wrench"])
+        assert mine["wrench"].any() == (ijk is up)
+
+
+def last_revision(session: Session) -> int:
+    last = session.last()
+    return -1 if last is None else int(last["revision"][0])

@@ -1,0 +1,109 @@
+"""A store that is slow, errs and goes away, as a real one may: the same for a seed."""
+
+import contextlib
+import functools
+import itertools
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+
+from hapticdb.errors import BusyError, ConnectionLostError, DatabaseError, StuckError
+from hapticdb.store.base import Store
+
+ROUND_TRIPS = {"revision", "changes", "scan", "lookup", "costs", "quantiles", "size", "object"}
+ERRORS: list[type[DatabaseError]] = [ConnectionLostError, BusyError, StuckError]
+Wait = Callable[[float], None]
+_openings = itertools.count()
+
+
+class Troubled:
+    """A store in front of another.
+
+    Parameters
+    ----------
+    store : Store
+        What answers in the end.
+    latency, jitter : float
+        Seconds that are added to each round trip, the jitter up to so much.
+    errors : float
+        Probability that a round trip fails.
+    away : path or None
+        While such a file exists, nothing answers.
+    seed : int
+        Of jitter and errors; each opening in a process goes on with another number.
+    wait : callable
+        Lets so many seconds pass.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        *,
+        latency: float = 0.0,
+        jitter: float = 0.0,
+        errors: float = 0.0,
+        away: str | None = None,
+        seed: int = 0,
+        wait: Wait = time.sleep,
+    ) -> None:
+        self._store = store
+        self._latency, self._jitter, self._errors = latency, jitter, errors
+        self._away = Path(away) if away else None
+        self._rng = np.random.default_rng([seed, next(_openings)])
+        self._wait = wait
+        self.check()
+
+    def check(self) -> None:
+        """Fail while away."""
+        if self._away and self._away.exists():
+            raise ConnectionLostError(f"{self._store.url} is away: wait")
+
+    def _travel(self) -> None:
+        self.check()
+        if self._latency or self._jitter:
+            self._wait(self._latency + float(self._rng.uniform(0, self._jitter)))
+        if self._rng.random() < self._errors:
+            kind = ERRORS[self._rng.integers(len(ERRORS))]
+            raise kind(f"{self._store.url} failed: try again")
+
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        self._travel()
+        with self._store.snapshot():
+            yield
+
+    def has_changed(self) -> bool:
+        self.check()
+        return bool(cast("Any", self._store).has_changed())
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the store has
+        found = getattr(self._store, name)
+        if name not in ROUND_TRIPS:
+            return found
+
+        @functools.wraps(found)
+        def travelled(*given: Any) -> Any:  # noqa: ANN401 - whatever it takes
+            self._travel()
+            return found(*given)
+
+        return travelled
+
+
+def troubled(store: Store, **trouble: Any) -> Store:  # noqa: ANN401 - see `Troubled`
+    """Put trouble in front of a store; `functools.partial` of it crosses to another process."""
+    return cast("Store", Troubled(store, **trouble))
+
+
+def refuse(store: Store) -> Store:
+    """Fail as a database does."""
+    store.close()
+    raise DatabaseError(f"{store.url} is not for us: ask another")
+
+
+def refuse_strangely(store: Store) -> Store:
+    """Fail as nobody expects."""
+    store.close()
+    raise ZeroDivisionError(store.url)

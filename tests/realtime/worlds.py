@@ -1,0 +1,145 @@
+"""Environments for the tests of resident cells, and what a frame in them must find."""
+
+import dataclasses
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+import hapticdb
+import naive_frame
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.grid import CurveName
+from hapticdb.kernels.cells import HITS, RESULTS, UNKNOWNS, WRENCH, Cells, Place, feel_kernel
+from hapticdb.layout import rows_of_voxels
+from hapticdb.realtime.frames import clusters_of
+from hapticdb.realtime.table import CellTable
+from hapticdb.store.base import Layout, Store
+from hapticdb.testing import voxel_object, write_voxels
+from naive import Voxel
+
+Voxels = NDArray[np.int64]
+HIERARCHICAL: list[tuple[Layout, CurveName]] = [
+    ("voxel", "z"),
+    ("voxel", "hilbert"),
+    ("brick", "z"),
+    ("brick", "hilbert"),
+]
+SIZE = 0.002
+
+
+def make(
+    folder: Path, bits: int = 7, layout: Layout = "brick", curve: CurveName = "z"
+) -> Environment:
+    """An empty environment of 2 mm voxels about the world's origin."""
+    half = SIZE * (1 << bits) / 2
+    grid = Grid(SIZE, (-half, -half, -half), bits, curve)
+    return hapticdb.create(folder / f"{layout}-{curve}-{bits}.db", grid, layout=layout)
+
+
+def scatter(env: Environment, n_objects: int = 3, n_voxels: int = 4000, seed: int = 0) -> None:
+    """Objects of random voxels, in clumps; some voxels belong to several."""
+    rng = np.random.default_rng(seed)
+    side = env.grid.side
+    for n in range(n_objects):
+        centers = rng.integers(0, side, (12, 3))
+        ijk = centers[rng.integers(0, 12, n_voxels)] + rng.integers(-9, 10, (n_voxels, 3))
+        ijk = np.unique(ijk[env.grid.contains(ijk)], axis=0)
+        write_voxels(env.store, ijk, f"object {n}")
+
+
+def ids_by_voxel(env: Environment) -> dict[Voxel, list[int]]:
+    """Every voxel with the objects in it."""
+    found: dict[Voxel, list[int]] = {}
+    for obj in env.objects():
+        for i, j, k in env.voxels(obj.id).tolist():
+            found.setdefault((i, j, k), []).append(obj.id)
+    return found
+
+
+def move(store: Store, object_id: int, ijk: Voxels) -> None:
+    """Put an object's voxels elsewhere, in one transaction."""
+    before = store.object(object_id)
+    after = voxel_object(store.grid, ijk, before.name)
+    record = dataclasses.replace(
+        before, voxels=after.voxels, bounds=after.bounds, digest=after.digest
+    )
+    store.replace(record, rows_of_voxels(ijk, store.grid, store.layout), lambda _: [(0, 2**62)])
+
+
+def block(low: Iterable[int], high: Iterable[int]) -> Voxels:
+    """Voxels (n, 3) from one corner to another, both within."""
+    axes = [np.arange(a, b + 1) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def cells_of(grid: Grid) -> Voxels:
+    """Keys of all cells of a grid, as directories name them."""
+    n = max(grid.side >> 5, 1)
+    ijk = block((0, 0, 0), (n - 1, n - 1, n - 1))
+    return (ijk[:, 0] << 32) | (ijk[:, 1] << 16) | ijk[:, 2]
+
+
+def turned(rng: np.random.Generator, place: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A pose (4, 4) at a place (3,), turned at random."""
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    if np.linalg.det(q) < 0:
+        q[:, 0] *= -1
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = q, place
+    return pose
+
+
+def poses_in(grid: Grid, count: int, seed: int = 0, beyond: float = 0.1) -> NDArray[np.float64]:
+    """Poses (count, 4, 4) in a grid and, by that share of its edge, beside it."""
+    rng = np.random.default_rng(seed)
+    low, high = grid.bounds
+    spare = beyond * grid.edge
+    return np.stack([turned(rng, rng.uniform(low - spare, high + spare)) for _ in range(count)])
+
+
+def expected(
+    ids: dict[Voxel, list[int]],
+    grid: Grid,
+    shell: PointShell,
+    pose: NDArray[np.float64],
+    exclude: Iterable[int] = (),
+) -> naive_frame.NaiveTouch:
+    """What the oracle finds."""
+    return naive_frame.touch(
+        ids,
+        [(x, y, z) for x, y, z in shell.points.tolist()],
+        [(x, y, z) for x, y, z in shell.normals.tolist()],
+        (shell.center[0], shell.center[1], shell.center[2]),
+        pose.tolist(),
+        grid.origin,
+        grid.voxel_size,
+        grid.side,
+        exclude=tuple(exclude),
+    )
+
+
+class Reader:
+    """One reader's frames over a table, whoever fills it; unknown cells stay unknown."""
+
+    def __init__(self, table: CellTable, grid: Grid, shell: PointShell) -> None:
+        self.table = table
+        self.cells: Cells = table.cells
+        self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
+        self.clusters = clusters_of(shell, grid.voxel_size)
+        self.row = table.join()
+        self.met = np.empty(len(shell), dtype=np.int64)
+        self.missed = np.zeros(64, dtype=np.int64)
+        self.out = np.zeros((1, RESULTS))
+
+    def feel(self, pose: NDArray[np.float64]) -> tuple[list[int], bytes, int]:
+        """Hits, wrench and number of unknown points."""
+        feel_kernel(
+            self.cells, self.row, self.clusters, pose[None], self.place, 1000.0, self.met,
+            self.missed, self.out,
+        )  # fmt: skip
+        row = self.out[0]
+        wrench = row[WRENCH : WRENCH + 6] + 0.0  # no zero is negative
+        return self.met[: int(row[HITS])].tolist(), wrench.tobytes(), int(row[UNKNOWNS])

@@ -1,0 +1,226 @@
+"""The verbs feel and replay, as a newcomer uses them: with mistakes, and with Ctrl-C."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from command_line import Run, made, poses, refused, run, scene, tool  # noqa: F401 - fixtures
+from hapticdb.realtime.recording import Recording
+from hapticdb.realtime.table import is_alive
+
+PATIENCE = 60.0
+ABOVE = "0,0,0.3"
+PLAY = ("--device", "path.csv", "--rate", 500)
+
+
+def children() -> set[int]:
+    """Ids of the processes that this one has started and that run."""
+    me, found = str(os.getpid()), set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if fields[1] == me and fields[0] != "Z":
+            found.add(int(path.parent.name))
+    return found
+
+
+def feel(*args: object) -> tuple[object, ...]:
+    return ("feel", "scene.db", "--tool", "tool.npz", *args)
+
+
+def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) -> None:
+    """And told to differ once an object has moved."""
+    before = children()
+    code, out, err = run(*feel(*PLAY, "--speed", 0.5, "--record", "felt.hdbrec"))
+    assert (code, err) == (0, "")
+    rows = dict(
+        re.split(r"  +", line.strip(), maxsplit=1) for line in out.splitlines() if "  " in line
+    )
+    recording = Recording(scene.with_name("felt.hdbrec"))
+    n_frames = sum(map(len, recording.frames()))
+    assert rows["frames"].split()[0] == f"{n_frames:,}"
+    assert rows["recorded"] == f"{n_frames:,} frames in felt.hdbrec"
+    assert rows["objects"].startswith("2 touched: box")
+    assert rows["resident"].endswith("in 256 MiB")
+    assert "outages" not in rows
+    assert max(map(len, out.splitlines())) <= 100
+    assert children() == before
+
+    code, out, err = run("replay", "felt.hdbrec")
+    assert (code, err) == (0, "")
+    assert out.startswith("equal: ")
+    code, out, _ = run("replay", "felt.hdbrec", "scene.db", "--json")
+    replayed = json.loads(out)
+    assert (code, replayed["differing"], replayed["parts_at"]) == (0, 0, None)
+    assert replayed["compared"] + replayed["skipped"] == n_frames
+
+    code, out, err = run(
+        *feel("--device", "felt.hdbrec", "--rate", 500, "--json", "--budget", 8, "--scale", 1.0)
+    )
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert report["hit_frames"] > 0
+    assert report["objects"]
+    assert report["cache"]["budget_bytes"] <= 8 << 20
+    assert report["loop"]["seconds"] == pytest.approx(recording.poses()[0][-1], rel=0.1)
+
+    assert run("move", "scene.db", 1, "--translate", "0,0,0.01")[0] == 0
+    code, out, err = run("replay", "felt.hdbrec")
+    assert (code, err) == (1, "")
+    parted = re.match(r"parts at frame (\d+) \(\d+\.\d{3} s\)", out)
+    assert parted
+    frames = np.concatenate(list(recording.frames()))
+    assert frames["hits"][int(parted[1])] > 0
+    code, out, _ = run("replay", "felt.hdbrec", "--json")
+    assert (code, json.loads(out)["parts_at"]) == (1, int(parted[1]))
+
+
+def test_what_is_excluded_is_not_felt(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    code, out, _ = run(*feel(*PLAY, "--seconds", 0.3, "--exclude", "1,2", "--exclude", 3, "--json"))
+    assert code == 0
+    assert json.loads(out)["hit_frames"] == 0
+
+
+def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    args = ("--device", "random", "--at", "0,0,0.05", "--seconds", 0.5, "--simulate", "--seed", 2)
+    code, out, err = run(*feel(*args, "--policy", "wait", "--rate", 200, "--json"))
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert report["unknown_frames"] == report["held_frames"] == 0
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--device", "joystick"], ["--device 'joystick'", ".csv", "random"]),
+        (["--device", "nowhere.csv"], ["nowhere.csv"]),
+        (["--device", "nowhere.hdbrec"], ["no recording at nowhere.hdbrec"]),
+        (["--device", "random"], ["give --at"]),
+        (["--device", "path.csv", "--at", ABOVE], ["--at belongs to random"]),
+        (["--device", "random", "--at", "here"], ["--at 'here'", "0.5,0,1.2"]),
+        (["--device", "path.csv", "--speed", 0], ["speed", "positive"]),
+        (["--device", "haply", "--speed", 1], ["real hand"]),
+        (["--device", "haply", "--policy", "wait"], ["cannot wait"]),
+        ([*PLAY, "--rate", 5], ["a rate of 5.0 Hz: give 10 to 20,000"]),
+        ([*PLAY, "--seconds", -1], ["-1.0 seconds"]),
+        ([*PLAY, "--staleness", 0], ["staleness"]),
+        ([*PLAY, "--scale", 0], ["a scale of 0.0"]),
+        ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
+        ([*PLAY, "--budget", 0.5], ["--budget 0.5: give MiB"]),
+        ([*PLAY, "--stiffness", -5], ["stiffness"]),
+        ([*PLAY, "--policy", "hope"], ["hold", "wait"]),
+        ([*PLAY, "--exclude", "box"], ["--exclude 'box'", "3,4"]),
+        ([*PLAY, "--exclude", 99], ["no object 99"]),
+        ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),
+        ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already"]),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_no_process(
+    run: Run, scene: Path, args: list[object], words: list[str]
+) -> None:
+    assert scene.exists()
+    before = children()
+    refused(run(*feel(*args)), *words)
+    assert children() == before
+
+
+def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path) -> None:
+    path = scene.with_name("path.csv")
+    missing = run("feel", "nowhere.db", "--tool", "tool.npz", *PLAY)
+    refused(missing, "nowhere.db", "hapticdb import")
+    refused(run("feel", "scene.db", "--tool", "path.csv", *PLAY), "path.csv")
+    refused(run("feel", "scene.db", "--tool", "nowhere.stl", *PLAY), "nowhere.stl")
+    refused(run("feel", path, "--tool", "tool.npz", *PLAY), "path.csv")
+    assert run("copy", "scene.db", "lexical.db", "--curve", "lexicographic")[0] == 0
+    refused(run("feel", "lexical.db", "--tool", "tool.npz", *PLAY), "lexicographic", "--curve z")
+
+
+def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    refused(run("replay", "nowhere.hdbrec"), "no recording at nowhere.hdbrec")
+    refused(run("replay", "path.csv"), "path.csv")
+
+
+def command(*args: object) -> list[str]:
+    return [sys.executable, "-m", "hapticdb", *map(str, args)]
+
+
+def frames_in(path: Path) -> bool:
+    """Whether a session has begun to record."""
+    try:
+        return sum(map(len, Recording(path).frames(until_damage=True))) > 0
+    except hapticdb.HapticDBError:
+        return False
+
+
+def descendants(pid: int) -> list[int]:
+    found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return list(map(int, found))
+
+
+def test_ctrl_c_ends_a_session_with_its_report(scene: Path) -> None:
+    """And with a recording that has every frame."""
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
+    with subprocess.Popen(
+        command(*args, "--json"),
+        cwd=scene.parent,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        deadline = time.monotonic() + PATIENCE
+        while not frames_in(scene.with_name("cut.hdbrec")):  # the first chunk is full
+            assert time.monotonic() < deadline
+            assert process.poll() is None
+            time.sleep(0.05)
+        started = descendants(process.pid)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert re.fullmatch(r"hapticdb: ended by Ctrl-C after [\d.]+ s\n", err)
+    report = json.loads(out)
+    frames = np.concatenate(list(Recording(scene.with_name("cut.hdbrec")).frames()))
+    assert len(frames) == report["loop"]["frames"] == report["recorded_frames"]
+    np.testing.assert_allclose(np.diff(frames["time"]), frames["dt"][1:], atol=1e-9)
+    assert len(started) == 2
+    assert not any(map(is_alive, started))
+
+
+def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE)
+    with subprocess.Popen(
+        command(*args), cwd=scene.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + PATIENCE
+        while not descendants(process.pid):
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        started = descendants(process.pid)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert (out, err) == ("", "hapticdb: interrupted\n")
+    while any(map(is_alive, started)):
+        assert time.monotonic() < deadline + PATIENCE
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("verb", ["feel", "replay"])
+def test_help_fits_a_terminal_and_has_an_example(run: Run, verb: str) -> None:
+    code, out, _ = run(verb, "--help")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 80
+    assert f"Example: hapticdb {verb} " in " ".join(out.split())

@@ -1,0 +1,155 @@
+"""The verb sweep, used rightly and wrongly."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+from pathlib import Path
+
+import matplotlib.image
+import pytest
+
+import hapticdb
+from command_line import Run, made, poses, refused, run, scene  # noqa: F401 - fixtures
+from hapticdb.realtime import sweep as sweeping
+
+TOOL = ("--tool", "tool.stl")
+
+
+@pytest.fixture
+def free(scene: Path) -> Path:
+    """A path above the boxes."""
+    return poses(scene.parent / "free.csv", (0.0, 0.0, 0.1), (0.4, 0.0, 0.1))
+
+
+@pytest.fixture
+def through(scene: Path) -> Path:
+    """A path from above into the first box and on through all of them."""
+    return poses(
+        scene.parent / "through.csv", (-0.05, 0.0, 0.15), (-0.05, 0.0, 0.0), (0.45, 0.0, 0.0)
+    )
+
+
+@pytest.mark.usefixtures("free")
+def test_what_comes_out_is_said_with_its_clearance(run: Run, scene: Path) -> None:
+    code, out, err = run("sweep", scene, *TOOL, "--path", "free.csv")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0].startswith("comes out: no hit in ")
+    # voxels of 12.5 mm: those of a box end at 62.5, the tool begins at 90
+    assert lines[0].endswith(", least clearance 27.5 mm from box0")
+    assert any(line.startswith("clearance") and "its surface is" in line for line in lines)
+
+
+@pytest.mark.usefixtures("through")
+def test_what_is_caught_is_said_with_where_and_by_what(run: Run, scene: Path) -> None:
+    code, out, err = run("sweep", scene, *TOOL, "--path", "through.csv")
+    assert (code, err) == (1, "")
+    first, *rest = out.splitlines()
+    assert first.startswith("is caught: first contact at ")
+    assert "(segment 0) with box0" in first
+    assert [name for name in ("box0", "box1", "box2") if any(name in line for line in rest)] == [
+        "box0", "box1", "box2",
+    ]  # fmt: skip
+
+
+def test_what_touches_only_at_its_start_is_said_to(run: Run, scene: Path) -> None:
+    poses(scene.parent / "up.csv", (0.0, 0.0, 0.055), (0.0, 0.0, 0.2))
+    code, out, _ = run("sweep", scene, *TOOL, "--path", "up.csv")
+    assert code == 1
+    assert out.startswith("touches box0 where it starts; no hit after ")
+
+
+@pytest.mark.usefixtures("free")
+def test_nothing_near_is_said_as_a_bound(run: Run, scene: Path) -> None:
+    out = run("sweep", scene, *TOOL, "--path", "free.csv", "--clearance", 0.02)[1]
+    assert ", nothing nearer than 20 mm" in out.splitlines()[0]
+    out = run("sweep", scene, *TOOL, "--path", "free.csv", "--clearance", 0)[1]
+    assert out.splitlines()[0].endswith("samples")
+
+
+@pytest.mark.usefixtures("through")
+def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
+    code, out, err = run("sweep", scene, *TOOL, "--path", "through.csv", "--json", "--points", 50)
+    assert (code, err) == (1, "")
+    found = json.loads(out)
+    assert list(found) == [
+        "comes_out", "verdict", "poses", "samples", "hits", "contacts", "first_hit",
+        "first_contact", "deepest", "objects", "hit_intervals", "contact_intervals", "clearance",
+        "tool", "revision", "elapsed", "cells",
+    ]  # fmt: skip
+    assert list(found["first_contact"]) == ["sample", "fraction", "segment", "pose", "objects"]
+    assert list(found["deepest"]) == ["depth", "point", "moment"]
+    assert list(found["clearance"]) == [
+        "distance", "at_least", "at_most", "is_beyond", "point", "voxel", "moment",
+    ]  # fmt: skip
+    assert list(found["objects"][0]) == [
+        "id", "name", "first", "last", "samples", "contacts", "deepest",
+    ]  # fmt: skip
+    assert (found["comes_out"], found["poses"], found["tool"]["points"]) == (False, 3, 50)
+    assert found["clearance"]["distance"] == 0.0
+
+
+@pytest.mark.usefixtures("free")
+def test_sweep_json_of_a_free_path_has_the_same_keys(run: Run, scene: Path) -> None:
+    caught = ("first_hit", "first_contact", "deepest")
+    code, out, _ = run("sweep", scene, *TOOL, "--path", "free.csv", "--json", "--clearance", 0.01)
+    found = json.loads(out)
+    assert code == 0
+    assert [found[name] for name in caught] == [None, None, None]
+    assert (found["clearance"]["at_most"], found["clearance"]["is_beyond"]) == (None, True)
+
+
+def test_a_part_moves_by_displacements_from_where_it_sits(run: Run, scene: Path) -> None:
+    poses(scene.parent / "out.csv", (0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
+    assert run("sweep", scene, "--part", 2, "--path", "out.csv")[0] == 0
+    poses(scene.parent / "aside.csv", (0.0, 0.0, 0.0), (0.2, 0.0, 0.0))
+    code, out, _ = run("sweep", scene, "--part", 2, "--path", "aside.csv", "--json")
+    found = json.loads(out)
+    assert code == 1
+    assert [one["name"] for one in found["objects"]] == ["box2"]
+    assert found["tool"] == {"points": 300, "part": 2, "excluded": [2]}
+    more = ("--exclude", 3)
+    assert run("sweep", scene, "--part", 2, "--path", "aside.csv", *more)[0] == 0
+
+
+@pytest.mark.usefixtures("through")
+def test_a_picture_is_drawn(run: Run, scene: Path) -> None:
+    code, out, _ = run("sweep", scene, *TOOL, "--path", "through.csv", "--picture", "out.png")
+    assert code == 1
+    assert out.splitlines()[-1] == "picture: out.png"
+    image = matplotlib.image.imread("out.png")
+    assert image.shape[:2] == (1000, 1600)
+    assert image[..., :3].std() > 0.05
+
+
+@pytest.mark.usefixtures("free")
+def test_others_who_write_meanwhile_are_told_of(
+    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    swept_by = sweeping.sweep
+
+    def disturbed(*args: object, **options: object) -> object:
+        found = swept_by(*args, **options)  # type: ignore[arg-type]
+        with hapticdb.open(scene) as env:
+            env.remove(3)
+        return found
+
+    monkeypatch.setattr(sweeping, "sweep", disturbed)
+    code, _, err = run("sweep", scene, *TOOL, "--path", "free.csv")
+    assert code == 0
+    assert "was written meanwhile; this is of revision 3" in err
+
+
+def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
+    path = ("--path", "path.csv")
+    refused(run("sweep", scene, *path), "--tool and --part")
+    refused(run("sweep", scene, *path, *TOOL, "--part", 1), "--tool and --part")
+    refused(run("sweep", scene, *path, "--part", 1, "--tool-unit", "mm"), "--tool-unit")
+    refused(run("sweep", scene, *path, "--part", 9), "no object 9")
+    refused(run("sweep", scene, *path, *TOOL, "--exclude", "9"), "no object 9")
+    refused(run("sweep", scene, *path, *TOOL, "--exclude", "x"), "--exclude")
+    refused(run("sweep", scene, *path, *TOOL, "--budget", 0.5), "--budget")
+    refused(run("sweep", scene, *path, *TOOL, "--clearance", -1), "clearance")
+    refused(run("sweep", scene, *path, *TOOL, "--picture", "no/folder.png"), "cannot write")
+    refused(run("sweep", scene, "--path", "none.csv", *TOOL), "no file of poses")
+    refused(run("sweep", "none.db", *path, *TOOL), "none.db")

@@ -1,5 +1,7 @@
 """The verbs feel and replay, as a newcomer uses them: with mistakes, and with Ctrl-C."""
 
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
 import json
 import os
 import re
@@ -13,12 +15,13 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, made, poses, refused, run, scene, tool  # noqa: F401 - fixtures
+from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.realtime.recording import Recording
 from hapticdb.realtime.table import is_alive
 
 PATIENCE = 60.0
 ABOVE = "0,0,0.3"
+LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
 PLAY = ("--device", "path.csv", "--rate", 500)
 
 
@@ -44,9 +47,8 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     before = children()
     code, out, err = run(*feel(*PLAY, "--speed", 0.5, "--record", "felt.hdbrec"))
     assert (code, err) == (0, "")
-    rows = dict(
-        re.split(r"  +", line.strip(), maxsplit=1) for line in out.splitlines() if "  " in line
-    )
+    lines = [line.strip() for line in out.splitlines()]
+    rows = dict(re.split(r"  +", line, maxsplit=1) for line in lines if "  " in line)
     recording = Recording(scene.with_name("felt.hdbrec"))
     n_frames = sum(map(len, recording.frames()))
     assert rows["frames"].split()[0] == f"{n_frames:,}"
@@ -75,7 +77,7 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert report["cache"]["budget_bytes"] <= 8 << 20
     assert report["loop"]["seconds"] == pytest.approx(recording.poses()[0][-1], rel=0.1)
 
-    assert run("move", "scene.db", 1, "--translate", "0,0,0.01")[0] == 0
+    assert run("move", "scene.db", 1, "--translate", "0,0,0.05")[0] == 0
     code, out, err = run("replay", "felt.hdbrec")
     assert (code, err) == (1, "")
     parted = re.match(r"parts at frame (\d+) \(\d+\.\d{3} s\)", out)
@@ -144,7 +146,7 @@ def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path
     refused(run("feel", "scene.db", "--tool", "path.csv", *PLAY), "path.csv")
     refused(run("feel", "scene.db", "--tool", "nowhere.stl", *PLAY), "nowhere.stl")
     refused(run("feel", path, "--tool", "tool.npz", *PLAY), "path.csv")
-    assert run("copy", "scene.db", "lexical.db", "--curve", "lexicographic")[0] == 0
+    assert run("copy", "scene.db", "lexical.db", *LEXICOGRAPHIC)[0] == 0
     refused(run("feel", "lexical.db", "--tool", "tool.npz", *PLAY), "lexicographic", "--curve z")
 
 
@@ -212,7 +214,8 @@ def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert (out, err) == ("", "hapticdb: interrupted\n")
+    assert out == ""
+    assert "hapticdb: interrupted" in err.splitlines()
     while any(map(is_alive, started)):
         assert time.monotonic() < deadline + PATIENCE
         time.sleep(0.05)

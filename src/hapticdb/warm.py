@@ -12,18 +12,18 @@ from hapticdb.ingest import rows_of_part
 from hapticdb.layout import rows_of_voxels
 from hapticdb.mesh import Part
 from hapticdb.pointshell import PointShell
-from hapticdb.query import NOTHING_EXCLUDED, STRATEGIES
+from hapticdb.query import STRATEGIES
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.devices import Line, RandomHand
 from hapticdb.realtime.frames import Frames
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import Loop, LoopRequest, ring_bytes
+from hapticdb.realtime.prefetch import Fetching, FetchRequest
 from hapticdb.realtime.residency import Residency
 from hapticdb.realtime.simulated import SimulatedDevice
 from hapticdb.realtime.sweep import sweep
 from hapticdb.realtime.table import LEAST_BUDGET, CellTable, anonymous_memory
-from hapticdb.realtime.touched import ids_of_voxels
 from hapticdb.store.base import Layout, Object
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float64)
@@ -40,7 +40,7 @@ def warm_up() -> None:
     corners = np.concatenate([CORNERS, 0.1 + 0.1 * CORNERS])
     shell = PointShell.from_mesh(corners, np.concatenate([FACES, FACES + 4]), points=12)
     kinds: tuple[tuple[Layout, Grid], ...] = (
-        ("brick", Grid(0.1, (-1, -1, -1), 5)),
+        ("brick", Grid(0.1, (-1, -1, -1), 6)),
         ("voxel", Grid(0.1, (-1, -1, -1), 5, "hilbert")),
     )
     with tempfile.TemporaryDirectory() as folder:
@@ -73,10 +73,14 @@ def _feel(env: Environment, shell: PointShell) -> None:
         frames = Frames(residency, shell, run=4)
         frames.feel(np.eye(4)[None])
         frames.close()
-        ids_of_voxels(env.store, np.zeros(1, dtype=np.int64), NOTHING_EXCLUDED)
+        with CellTable.create(LEAST_BUDGET) as other:
+            request = FetchRequest(env.url, other.descriptor, other.n_slots, env.grid)
+            fetching = Fetching(request)
+            fetching.warm_up()
+            fetching.store.close()
         memory = anonymous_memory("hapticdb-frames", ring_bytes(4))
         with table.reading() as row:
-            request = LoopRequest(
+            loop = LoopRequest(
                 descriptor=table.descriptor,
                 n_slots=table.n_slots,
                 row=row,
@@ -93,9 +97,9 @@ def _feel(env: Environment, shell: PointShell) -> None:
                 staleness=1.0,
                 is_waiting=False,
             )
-            Loop(request).warm_up()
+            Loop(loop).warm_up()
         os.close(memory)
         sweep(env, shell, [np.eye(4), np.eye(4)], profile=True)
         sweep(env, shell, [np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4)])
+        sweep(env, shell, [np.eye(4)] * 2, exclude=[obj.id for obj in env.objects()])
         Line((0.0, 0.0, 0.0), (0.1, 0.0, 0.0)).read()
-

@@ -28,7 +28,8 @@ def reading(rng: np.random.Generator, buttons: int = 0) -> Reading:
 def pose(hand: Floats) -> Floats:
     out = np.empty((1, 4, 4))
     poses_of(hand[None, :7].copy(), out)
-    return out[0]
+    found: Floats = out[0]
+    return found
 
 
 @few

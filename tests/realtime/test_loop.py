@@ -118,7 +118,7 @@ def test_a_loop_counts_what_it_records(run: Run) -> None:
 def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
     applied: list[Floats] = []
     hand = stroking(0.010, 0.2)
-    hand.apply = applied.append  # type: ignore[method-assign]
+    hand.apply = applied.append  # type: ignore[assignment]
     answer, frames = run(hand, seconds=1e9)
     assert frames["time"][-1] >= 0.2
     assert answer.counts.peak_force > 0.0
@@ -173,7 +173,7 @@ def test_a_kernel_compiled_while_the_loop_runs_is_told(
 def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
     applied: list[Floats] = []
     hand = Unplugged(still(0.010), 100)
-    hand.apply = applied.append  # type: ignore[method-assign]
+    hand.apply = applied.append  # type: ignore[assignment]
     with pytest.raises(DeviceError, match="unplugged"):
         run(hand)
     assert any(wrench.any() for wrench in applied)

@@ -31,7 +31,7 @@ from hapticdb.realtime.session import Session
 from hapticdb.realtime.table import is_alive
 from hapticdb.testing import floor_voxels, write_voxels
 from realtime.hands import Beckoned, Talking, Unplugged, at, still, stroking
-from realtime.worlds import SIZE, make, move
+from realtime.worlds import SIZE, block, make, move
 from servers import Place
 
 RATE = 500.0
@@ -51,8 +51,8 @@ def until(claim: Callable[[], object], session: Session | None = None) -> None:
             assert session.wait(0.02) is None
 
 
-def floored(env: Environment, width: int = 48) -> Environment:
-    write_voxels(env.store, floor_voxels(env.grid, width=width), "floor")
+def floored(env: Environment) -> Environment:
+    write_voxels(env.store, floor_voxels(env.grid, width=48), "floor")
     return env
 
 
@@ -400,9 +400,10 @@ def test_unknown_cells_hold_and_fade_for_one_session_and_are_waited_for_by_anoth
     sphere: PointShell, tmp_path: Path
 ) -> None:
     """Both on the same cells; the fetching process stands still while the hand goes far."""
-    path = Player([0.0, 0.4, 1.5], [at(x, 0.0, 0.010) for x in (-0.2, 0.2, 0.2)])
+    path = Player([0.0, 0.4, 1.5], [at(x, 0.0, 0.010) for x in (-0.45, 0.45, 0.45)])
     hand = Beckoned(path, tmp_path / "come")
-    with floored(make(tmp_path, bits=8), width=256) as env:
+    with make(tmp_path, bits=9) as env:
+        write_voxels(env.store, block((0, 240, 248), (511, 271, 255)), "floor, 1 m long")
         with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
             holding = Session(
                 cells, sphere, hand, rate=RATE, record=tmp_path / "a", staleness=NEVER_STALE
@@ -433,7 +434,7 @@ def test_unknown_cells_hold_and_fade_for_one_session_and_are_waited_for_by_anoth
     exact = recorded(tmp_path / "b")
     assert not exact["unknown"].any()
     assert not (exact["state"] & State.HELD).any()
-    np.testing.assert_allclose(exact["tool"][-1, 0], 0.2, atol=1e-3)
+    np.testing.assert_allclose(exact["tool"][-1, 0], 0.45, atol=1e-3)
 
 
 def held_now(session: Session) -> bool:

@@ -117,7 +117,9 @@ def feel(
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
     hand = _device(device, speed=speed, at=at, seed=seed or 0, loops=loop, is_simulated=simulate)
     handle = Handle(scale=scale, clutch=clutch)
-    shell = shell_of(tool, tool_unit, points, seed)
+    # a saved shell takes no seed, and a random hand does
+    is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
+    shell = shell_of(tool, tool_unit, points, None if is_for_hand_alone else seed)
     with ResidentCells(url, budget_bytes=int(budget * (1 << 20)), exclude=excluded) as cells:
         with (
             Session(

@@ -67,6 +67,6 @@ def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a leaf that takes arrays: numba puts it into its caller, with no counted reference."""
+    """Compile a leaf that takes arrays: put into its caller by numba, with no counted reference."""
     decorate = numba.njit(nogil=True, error_model="numpy", inline="always")
     return decorate(function)  # type: ignore[no-any-return]

@@ -66,8 +66,7 @@ def slots_of_cells(keys, slots, which, asked, out):
 @leaf
 def mark_brick(masks, slot, i, j, k):
     """Mark the brick that holds voxel (i, j, k) in the mask of its cell's slot."""
-    brick = (((i >> 3) & 3) << 4) | (((j >> 3) & 3) << 2) | ((k >> 3) & 3)
-    masks[slot] |= np.uint64(1) << np.uint64(brick)
+    masks[slot] |= np.uint64(1) << brick_bit(i, j, k)
 
 
 @leaf

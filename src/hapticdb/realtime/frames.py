@@ -22,7 +22,7 @@ from hapticdb.kernels.cells import (
     feel_kernel,
 )
 from hapticdb.pointshell import PointShell
-from hapticdb.realtime.residency import BATCH, Residency
+from hapticdb.realtime.residency import Residency
 
 RUN = 64
 """Points of a cluster."""
@@ -143,18 +143,8 @@ class Frames:
         found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
         n_poses, _ = kernels.cells_met(self.clusters.points, poses, residency.place, found, most)
         cells = found[found >= 0]
-        residency.round += 1
-        missing = residency.missing(cells)
-        for _ in range(4 + 2 * len(missing) // BATCH):
-            if not len(missing):
-                return int(n_poses)
-            for at in range(0, len(missing), BATCH):
-                residency.load(missing[at : at + BATCH])
-            missing = residency.missing(cells)
-        raise UsageError(
-            f"the tool meets {len(cells)} cells at once, more than fit into "
-            f"{residency.table.size_bytes} bytes: give a larger budget"
-        )
+        residency.bring(cells)
+        return int(n_poses)
 
     def _run(self, poses: Floats, out: Floats, start: int, n_poses: int) -> None:
         """Frames at poses start .. start + n_poses, whose cells are resident."""

@@ -179,11 +179,12 @@ class Loop:
 
     def _step_exactly(self, dt: float) -> None:
         """Advance once all cells that it needs are there, however long that takes."""
-        before, met = self.state.copy(), self.met.copy()
+        before, met, frame = self.state.copy(), self.met.copy(), self.frame.copy()
         self._step(dt, is_stale=False)
         while self.out[UNKNOWNS] and not self._is_left():
             self.state[:] = before
             self.met[:] = met
+            self.frame[:] = frame
             self._tell()
             time.sleep(2e-4)
             self._step(dt, is_stale=False)

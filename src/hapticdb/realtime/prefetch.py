@@ -155,6 +155,7 @@ class Fetching:
         wish = Wish.of_motion(grid, np.array([*grid.origin] * 2 + [0.0] * 4), LOOKAHEAD, 0.0)
         assert wish is not None  # noqa: S101 - the origin is a place
         self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
+        self.residency.warm_up()
         ids_of_voxels(self.store, np.zeros(1, dtype=np.int64), self.residency.exclude)
 
     @property

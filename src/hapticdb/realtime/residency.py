@@ -207,6 +207,36 @@ class Residency:
         self.want(cells, slots)
         return np.compress(slots == UNKNOWN, cells)
 
+    def bring(self, cells: Keys) -> None:
+        """Make cells (n,) resident, all of them at once, however many statements that takes.
+
+        Raises
+        ------
+        UsageError
+            When they do not fit into the table together.
+        """
+        self.round += 1
+        missing = self.missing(cells)
+        for _ in range(4 + 2 * len(missing) // BATCH):
+            if not len(missing):
+                return
+            for at in range(0, len(missing), BATCH):
+                self.load(missing[at : at + BATCH])
+            missing = self.missing(cells)
+        raise UsageError(
+            f"the tool and its surroundings meet {len(cells)} cells at once, more than fit into "
+            f"{self.table.size_bytes} bytes: give a larger budget"
+        )
+
+    def warm_up(self) -> None:
+        """Compile what first comes with an eviction or a change."""
+        bits, curve = self.grid.bits, self.grid.curve_code
+        kernels.cells_of_curve_keys(_NO_CELLS, bits, curve, np.empty(0, dtype=np.int64))
+        kernels.slots_to_free(
+            self._cell_of_slot, self._wanted_at, self.table.cells.used, 0, 0, 0,
+            np.empty(0, dtype=np.int64),
+        )  # fmt: skip
+
     def load(self, cells: Keys) -> Loaded:
         """Bring in cells (n,), distinct and unknown, by one statement; at most `BATCH` are taken.
 

@@ -11,7 +11,6 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels import sweep as kernels
 from hapticdb.kernels.cells import UNKNOWN
 from hapticdb.realtime.frames import Frames
-from hapticdb.realtime.residency import BATCH
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -103,16 +102,4 @@ class ClearanceSearch:
             self._frames.clusters.points, poses, residency.place, point, self._stride,
             self._reach * residency.grid.voxel_size, found, self._most,
         )  # fmt: skip
-        cells = np.sort(found[found >= 0])
-        residency.round += 1
-        missing = residency.missing(cells)
-        for _ in range(4 + 2 * len(missing) // BATCH):
-            if not len(missing):
-                return
-            for at in range(0, len(missing), BATCH):
-                residency.load(missing[at : at + BATCH])
-            missing = residency.missing(cells)
-        raise UsageError(
-            f"{len(cells)} cells around the tool do not fit into {residency.table.size_bytes} "
-            "bytes: give a larger budget"
-        )
+        residency.bring(np.sort(found[found >= 0]))

@@ -1,0 +1,222 @@
+"""Real time: frames against memory beside a dense bitmap, and sessions beside an empty loop.
+
+    make realtime                              # the sample car, ten seconds a session
+    python benchmarks/in_real_time.py --model FILE --seconds 60 --out results/realtime.json
+
+Frames: the resident cells' kernels and the same flat loop over one dense bitmap, in turns, the
+same poses. Sessions: `hapticdb feel` as a user runs it, on SQLite and on a private server.
+"""
+
+import argparse
+import contextlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import hapticdb
+from awake import awake
+from dense_frame import dense_bitmap, dense_feel
+from hapticdb import GridOptions, ImportOptions, PointShell
+from hapticdb.bench import records
+from hapticdb.kernels.cells import BUFFERS, RESULTS, feel_kernel
+from hapticdb.mesh import read_file
+from hapticdb.poses import read_poses
+from hapticdb.realtime.frames import Frames
+from hapticdb.realtime.residency import Residency
+from hapticdb.realtime.table import CellTable
+from hapticdb.sample import write_sample
+from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.private_server import find_binaries
+from places import serving
+
+BITS = 11
+EXTENT = 1.6
+ROUNDS = 15
+LIFT = 1.0
+"""Metres that a part is lifted out of the car."""
+N_LIFTED = 40
+PARTS = ("body/hood", "body/door_front_left", "supply/fuel_tank", "seats/bench_cushion")
+RUNS = {"flat": 0, "clusters": None}
+RATES = (1000, 5000, 10_000)
+LARGE = 100_000
+SETTINGS = {"shared_buffers": "256MB"}
+
+
+def measure_frames(
+    database: Path, shell: PointShell, poses: NDArray[np.float64], exclude: Sequence[int]
+) -> dict[str, Any]:
+    """Medians, in us a frame, of the flat loop, clusters and the dense bitmap, in turns."""
+    with hapticdb.open(database, read_only=True) as env, CellTable.create() as table:
+        residency = Residency(env.store, table, exclude)
+        frames = {name: Frames(residency, shell, run=run) for name, run in RUNS.items()}
+        frames["flat"].feel(poses)
+        bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
+        first = frames["flat"]
+        times: dict[str, list[float]] = {"dense": [], **{name: [] for name in RUNS}}
+        found: dict[str, NDArray[np.float64]] = {}
+        with table.reading() as row, awake():
+            for _ in range(ROUNDS + 1):
+                for name, spent in times.items():
+                    out = np.zeros((len(poses), RESULTS))
+                    started = time.perf_counter()
+                    if name == "dense":
+                        dense_feel(
+                            bitmap, first.clusters, poses, residency.place, 1000.0, first.met, out
+                        )
+                    else:
+                        one = frames[name]
+                        feel_kernel(
+                            table.cells, row, one.clusters, poses, residency.place, 1000.0,
+                            one.met, one.missed, out,
+                        )  # fmt: skip
+                    spent.append((time.perf_counter() - started) / len(poses) * 1e6)
+                    found[name] = out
+        assert all(np.array_equal(out, found["dense"]) for out in found.values()), "bit for bit"
+        medians = {name: float(np.median(spent[1:])) for name, spent in times.items()}
+        return {
+            "points": len(shell),
+            "poses": len(poses),
+            "extent_m": np.ptp(shell.points, axis=0).round(3).tolist(),
+            "hits": float(found["dense"][:, 6].mean()),
+            "cells": residency.n_resident,
+            "bitmap_mb": bitmap.nbytes / 1e6,
+            "us_per_frame": medians,
+            "ratio": {name: medians[name] / medians["dense"] for name in RUNS},
+        }
+
+
+def lifted(database: Path, model: Path, name: str) -> dict[str, Any]:
+    """A part of the car with 100,000 points, lifted out of it."""
+    with hapticdb.open(database, read_only=True) as env:
+        (own,) = [obj for obj in env.objects() if obj.name == name]
+    (part,) = [part for part in read_file(model).parts if part.name == name]
+    assert part.faces is not None
+    placed = part.vertices @ part.world_from_part[:3, :3].T + part.world_from_part[:3, 3]
+    shell = PointShell.from_mesh(placed, part.faces, points=LARGE)
+    poses = np.tile(np.eye(4), (N_LIFTED, 1, 1))
+    poses[:, 2, 3] = np.linspace(0.0, LIFT, N_LIFTED)
+    return {"part": name} | measure_frames(database, shell, poses, [own.id])
+
+
+def session(url: str, tool: Path, path: Path, rate: int, seconds: float) -> dict[str, Any]:
+    """What `hapticdb feel` reports; a failure names itself."""
+    command = [
+        str(Path(sys.executable).with_name("hapticdb")), "feel", url, "--tool", str(tool),
+        "--device", str(path), "--loop", "--speed", "0.2", "--rate", str(rate),
+        "--seconds", str(seconds), "--json",
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    report: dict[str, Any] = json.loads(done.stdout)
+    return report
+
+
+@contextlib.contextmanager
+def environments(folder: Path, model: Path) -> Iterator[dict[str, str]]:
+    """The model in SQLite and on the newest PostgreSQL that is found: engine -> URL."""
+    options = ImportOptions(grid=GridOptions(bits=BITS, extent=EXTENT))
+    file = str(folder / "environment.db")
+    hapticdb.import_files(file, [model], options)
+    binaries = max(find_binaries(), key=lambda found: found.major)
+    with serving(folder / "server", binaries, SETTINGS) as server:
+        url = with_environment(server.conninfo(), "environment")
+        hapticdb.import_files(url, [model], options)
+        yield {"SQLite": file, f"PostgreSQL {binaries.major}": url}
+
+
+def measure(
+    folder: Path, model: Path | None, seconds: float, rates: Sequence[int]
+) -> dict[str, Any]:
+    """All of it, as records."""
+    sample = write_sample(folder)
+    results: dict[str, Any] = {"machine": records.machine(), "seconds": seconds}
+    with environments(folder, model or sample.car) as urls:
+        database = Path(urls["SQLite"])
+        tool, path = sample.wrench, sample.path
+        if model is not None:
+            along = folder / "along"
+            command = [str(Path(sys.executable).with_name("hapticdb")), "sample", str(along)]
+            subprocess.run([*command, "--along", str(database)], check=True, capture_output=True)
+            tool, path = along / "wrench.stl", along / "path.csv"
+        with hapticdb.open(database, read_only=True) as env:
+            results["object_voxels"] = sum(obj.voxels for obj in env.objects())
+            results["voxel_size"] = env.grid.voxel_size
+        poses = read_poses(path)
+        results["frames"] = [
+            {"part": "wrench, sliding"}
+            | measure_frames(database, PointShell.from_file(tool, points), poses[::step], [])
+            for points, step in ((300, 1), (LARGE, 20))
+        ]
+        if model is None:
+            results["frames"] += [lifted(database, sample.car, name) for name in PARTS]
+        results["sessions"] = [
+            {"engine": engine} | session(url, tool, path, rate, seconds)
+            for engine, url in urls.items()
+            for rate in rates
+        ]
+    return results
+
+
+def table(results: dict[str, Any]) -> str:
+    """The figures as Markdown."""
+    lines = [
+        "| shell | points | hits | dense bitmap, us | flat, times dense | clusters, times dense |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    lines += [
+        f"| {one['part']} | {one['points']:,} | {one['hits']:,.0f} | "
+        f"{one['us_per_frame']['dense']:,.1f} | {one['ratio']['flat']:.2f} | "
+        f"{one['ratio']['clusters']:.2f} |"
+        for one in results["frames"]
+    ]
+    lines += [
+        "",
+        (
+            "| engine | rate asked | rate | missed | late p50 / p99 / p99.9 / worst, us | "
+            "computing, us | empty loop: rate, missed, late | unknown frames |"
+        ),
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for one in results["sessions"]:
+        loop, empty = one["loop"], one["empty"]
+        lines.append(
+            f"| {one['engine']} | {one['rate']:,.0f} | {loop['rate']:,.1f} | {loop['missed']:,} | "
+            f"{_spread(loop['lateness'])} | {_spread(loop['elapsed'])} | "
+            f"{empty['rate']:,.1f}, {empty['missed']:,}, {_spread(empty['lateness'])} | "
+            f"{one['unknown_frames']:,} |"
+        )
+    return "\n".join(lines)
+
+
+def _spread(spread: dict[str, float]) -> str:
+    return " / ".join(f"{1e6 * spread[name]:,.1f}" for name in ("p50", "p99", "p999", "worst"))
+
+
+def main() -> None:
+    """Measure, print the figures, and keep them."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--model", type=Path, help="a car or another model; the sample otherwise")
+    parser.add_argument("--seconds", type=float, default=10.0, help="of each session")
+    parser.add_argument("--rates", default=",".join(map(str, RATES)), help="of the sessions, Hz")
+    parser.add_argument("--out", type=Path, default=Path("results/realtime.json"))
+    given = parser.parse_args()
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+    with tempfile.TemporaryDirectory(prefix="hapticdb-realtime-") as folder:
+        rates = [int(word) for word in given.rates.split(",") if word]
+        results = measure(Path(folder), given.model, given.seconds, rates)
+    given.out.write_text(json.dumps(results, indent=1) + "\n")
+    print(table(results))
+
+
+if __name__ == "__main__":
+    main()

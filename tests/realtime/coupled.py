@@ -1,0 +1,138 @@
+"""A tool on its coupling among resident cells, for tests that move its handle by hand."""
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import hapticdb
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.kernels import coupling as kernels
+from hapticdb.kernels.cells import HITS, MOST_MISSED, RESULTS
+from hapticdb.kernels.motion import poses_of
+from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.frames import clusters_of
+from hapticdb.realtime.residency import Residency
+from hapticdb.realtime.table import CellTable
+from hapticdb.testing import write_voxels
+from realtime.worlds import cells_of
+
+Floats = NDArray[np.float64]
+SIZE = 0.005
+BITS = 6
+SIDE = 1 << BITS
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+
+
+class World:
+    """Voxels of 5 mm about the world's origin, all cells resident unless told otherwise."""
+
+    def __init__(self, ijk: ArrayLike = (), *, is_known: bool = True) -> None:
+        self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
+        self._folder = tempfile.TemporaryDirectory()
+        path = Path(self._folder.name) / "world.db"
+        self.environment: Environment = hapticdb.create(path, self.grid)
+        voxels = np.asarray(ijk, dtype=np.int64).reshape(-1, 3)
+        self.occupied = np.zeros((SIDE,) * 3, dtype=np.bool_)
+        self.occupied[tuple(voxels.T)] = True
+        if len(voxels):
+            write_voxels(self.environment.store, voxels)
+        self.table = CellTable.create(4 << 20)
+        self.residency = Residency(self.environment.store, self.table)
+        if is_known:
+            self.load(cells_of(self.grid))
+
+    def load(self, cells: NDArray[np.int64]) -> None:
+        while len(missing := self.residency.missing(cells)):
+            self.residency.load(missing)
+
+    def close(self) -> None:
+        self.environment.close()
+        self.table.close()
+        self._folder.cleanup()
+
+
+class Tool:
+    """A shell on its coupling, its handle where the test puts it."""
+
+    def __init__(
+        self,
+        world: World,
+        shell: PointShell,
+        position: ArrayLike,
+        *,
+        quaternion: ArrayLike = UPRIGHT,
+        contact: float = 1000.0,
+        coupling: Coupling | None = None,
+    ) -> None:
+        self.world = world
+        self.shell = shell
+        self.place = world.residency.place
+        self.clusters = clusters_of(shell, SIZE)
+        self.body = (coupling or Coupling()).body(shell, self.place, contact)
+        self.row = world.table.join()
+        self.state = np.zeros(kernels.STATE)
+        self.state[:3], self.state[3:7] = position, quaternion
+        self.hand = np.zeros(kernels.HAND)
+        self.hand[:7] = self.state[:7]
+        self.met = np.empty((kernels.MET_ROWS, len(shell)), dtype=np.int64)
+        self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        self.frame = np.zeros(RESULTS)
+        self.out = np.zeros(kernels.OUT)
+
+    def advance(self, dt: float = 1e-3) -> None:
+        kernels.advance(
+            self.world.table.cells, self.row, self.clusters, self.place, self.body, self.state,
+            self.hand, dt, self.met, self.missed, self.frame, self.out,
+        )  # fmt: skip
+
+    def settle(self, seconds: float, rate: float = 1000.0) -> None:
+        for _ in range(round(seconds * rate)):
+            self.advance(1.0 / rate)
+
+    @property
+    def pose(self) -> Floats:
+        pose: Floats = np.empty((1, 4, 4))
+        poses_of(self.state[None, :7], pose)
+        return pose.reshape(4, 4)
+
+    @property
+    def voxels(self) -> NDArray[np.int64]:
+        """Voxel of each point (N, 3), outside the grid, too."""
+        placed = self.shell.points @ self.pose[:3, :3].T + self.pose[:3, 3]
+        voxels: NDArray[np.int64] = np.floor(placed / SIZE + SIDE / 2).astype(np.int64)
+        return voxels
+
+    @property
+    def n_hits(self) -> int:
+        return int(self.out[HITS])
+
+    @property
+    def flags(self) -> int:
+        return int(self.out[kernels.FLAGS])
+
+    @property
+    def is_at_rest(self) -> bool:
+        speed = np.linalg.norm(self.state[7:10])
+        turning = np.linalg.norm(self.state[10:13]) * self.body.radius
+        return bool(speed + turning < 1e-4)
+
+
+def box(size: ArrayLike, points: int = 200) -> PointShell:
+    """A box about the tool's origin."""
+    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+    faces = [
+        [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
+        [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
+    ]  # fmt: skip
+    return PointShell.from_mesh(corners * (np.asarray(size) / 2.0), faces, points)
+
+
+def punch(n_across: int, pitch: float = 0.002) -> PointShell:
+    """A flat square of points, facing down."""
+    across = (np.arange(n_across) - (n_across - 1) / 2.0) * pitch
+    x, y = np.meshgrid(across, across, indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(n_across**2)], axis=1)
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    return PointShell(points, normals, np.zeros(3), is_closed=False)

@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/ready
 
-.PHONY: demo test test-plain lint types bench figures peers scale wheel pins clean
+.PHONY: demo test test-plain lint types bench figures peers realtime scale wheel pins clean
 
 demo: $(READY)
 	$(BIN)/hapticdb demo demo
@@ -37,6 +37,10 @@ figures: $(READY) .venv/figures
 # Frames and bytes at 1.4 million to 1.4 billion voxels: five minutes, 10 GB of disk.
 scale: $(READY)
 	$(BIN)/python benchmarks/scale.py --report docs/evaluation.md $(ARGS)
+
+# Frames in memory beside a dense bitmap, and sessions beside an empty loop: three minutes.
+realtime: $(READY)
+	$(BIN)/python benchmarks/in_real_time.py $(ARGS)
 
 peers: .venv/figures
 

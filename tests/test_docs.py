@@ -47,6 +47,30 @@ def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
     assert len(done.stdout.splitlines()) >= 100
 
 
+def test_every_block_of_the_realtime_page_runs(tmp_path: Path) -> None:
+    """As one reads it: what the shell has made, Python goes on with."""
+    page = "docs/realtime.md"
+    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for block in blocks("sh", page):
+        for line in block.splitlines():
+            done = subprocess.run(
+                ["bash", "-euo", "pipefail", "-c", line],
+                cwd=tmp_path,
+                env=os.environ | {"PATH": tools},
+                capture_output=True,
+                text=True,
+                check=False,
+            )
+            # a sweep says by 1 that the part is caught
+            assert done.returncode == (1 if " sweep " in line else 0), done.stderr
+    session = "\n".join(blocks("python", page))
+    done = subprocess.run(
+        [sys.executable, "-c", session], cwd=tmp_path, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "sweep.png").stat().st_size > 10_000
+
+
 @pytest.mark.parametrize("binaries", [b for b in FOUND if not isinstance(b, str)], ids=named)
 def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
     """On a private server that libpq's environment variables lead to, by its own pg_dump."""

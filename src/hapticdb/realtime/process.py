@@ -158,6 +158,8 @@ def serve(work: str) -> None:
         module, name = work.split(":")
         function: Callable[[Any, Voice], None] = getattr(import_module(module), name)
         function(_request(), voice)
+    except EOFError:
+        pass  # who started this has gone before it said what to do
     except HapticDBError as error:
         voice.say("error", error)
     except BaseException as error:  # noqa: BLE001 - whatever it is, who waits must hear of it

@@ -1,0 +1,38 @@
+"""What the tests of sessions share: a floor, patience, and frames read back."""
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb import Environment
+from hapticdb.realtime.recording import Recording
+from hapticdb.realtime.session import Session
+from hapticdb.testing import floor_voxels, write_voxels
+
+RATE = 500.0
+PATIENCE = 30.0
+NEVER_STALE = 1e6
+Recorded = NDArray[np.void]
+
+
+def until(claim: Callable[[], object], session: Session | None = None) -> None:
+    """Wait until that is so, looking after a session meanwhile."""
+    deadline = time.monotonic() + PATIENCE
+    while not claim():
+        assert time.monotonic() < deadline
+        if session is None:
+            time.sleep(0.01)
+        else:
+            assert session.wait(0.02) is None
+
+
+def floored(env: Environment) -> Environment:
+    write_voxels(env.store, floor_voxels(env.grid, width=48), "floor")
+    return env
+
+
+def recorded(path: Path) -> Recorded:
+    return np.concatenate(list(Recording(path).frames()))

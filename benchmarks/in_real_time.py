@@ -29,7 +29,7 @@ from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.bench import records
 from hapticdb.kernels.cells import BUFFERS, RESULTS, feel_kernel
 from hapticdb.mesh import read_file
-from hapticdb.poses import read_poses
+from hapticdb.poses import read_poses, write_poses
 from hapticdb.realtime.frames import Frames
 from hapticdb.realtime.residency import Residency
 from hapticdb.realtime.table import CellTable
@@ -152,6 +152,8 @@ def measure(
             results["object_voxels"] = sum(obj.voxels for obj in env.objects())
             results["voxel_size"] = env.grid.voxel_size
         poses = read_poses(path)
+        round_trip = folder / "round_trip.csv"  # no hand jumps from a path's end to its start
+        write_poses(round_trip, np.concatenate([poses, poses[::-1]]))
         results["frames"] = [
             {"part": "wrench, sliding"}
             | measure_frames(database, PointShell.from_file(tool, points), poses[::step], [])
@@ -160,7 +162,7 @@ def measure(
         if model is None:
             results["frames"] += [lifted(database, sample.car, name) for name in PARTS]
         results["sessions"] = [
-            {"engine": engine} | session(url, tool, path, rate, seconds)
+            {"engine": engine} | session(url, tool, round_trip, rate, seconds)
             for engine, url in urls.items()
             for rate in rates
         ]

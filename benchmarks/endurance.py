@@ -57,11 +57,12 @@ Frames = NDArray[np.void]
 
 
 class Trouble(NamedTuple):
-    """What was done, and in which seconds of the session."""
+    """What was done, and in which seconds of the session; until when its server was surely away."""
 
     kind: str
     begun: float
     ended: float
+    away_until: float
 
 
 class Course:
@@ -72,6 +73,7 @@ class Course:
         self.conninfo = parse(url).conninfo
         self.rng = np.random.default_rng(seed)
         self.troubles: list[Trouble] = []
+        self.away_until = 0.0
         self.kinds = [self.kill_server] if server else []
         self.kinds += [self.terminate_backends, self.kill_fetching]
         self.started = min(self.start_by_last_frame() for _ in range(100))
@@ -93,7 +95,7 @@ class Course:
             trouble = self.kinds[len(self.troubles) % len(self.kinds)]
             begun = self.now()
             trouble()
-            self.troubles.append(Trouble(trouble.__name__, begun, self.now()))
+            self.troubles.append(Trouble(trouble.__name__, begun, self.now(), self.away_until))
         self.look_after(max(*APART))
 
     def look_after(self, seconds: float) -> None:
@@ -105,6 +107,7 @@ class Course:
         assert self.server is not None
         self.server.kill()
         self.look_after(self.rng.uniform(*AWAY))
+        self.away_until = self.now()  # it answers some time before `start` returns
         starting = threading.Thread(target=self.server.start)  # frames are recorded meanwhile
         starting.start()
         while starting.is_alive():
@@ -172,7 +175,7 @@ def check(troubles: list[Trouble], frames: Frames) -> None:
             continue
         # the loop goes by the last answer, which may be younger than the kill was noted
         silent = trouble.begun + STALENESS + FALLING + SPARE
-        is_away = (times >= silent) & (times < trouble.ended - SPARE)
+        is_away = (times >= silent) & (times < trouble.away_until)
         # from the third such frame on: the fall is measured by periods, which may be long here
         assert not frames["applied"][np.flatnonzero(is_away)[2:]].any(), f"force during {trouble}"
 

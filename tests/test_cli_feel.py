@@ -115,6 +115,12 @@ def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
         (["--device", "random", "--at", "here"], ["--at 'here'", "0.5,0,1.2"]),
         (["--device", "path.csv", "--speed", 0], ["speed", "positive"]),
         (["--device", "haply", "--speed", 1], ["real hand"]),
+        (["--device", "felt.hdbrec", "--speed", 1], ["--speed", "has its own"]),
+        (["--device", "tumble", "--at", ABOVE, "--speed", 1], ["--speed", "tumble has its own"]),
+        (["--device", "tumble", "--at", ABOVE, "--loop"], ["--loop", "tumble has no end"]),
+        (["--device", "random", "--at", ABOVE, "--loop"], ["--loop", "random has no end"]),
+        ([*PLAY, "--processor", -1], ["processor -1", "0 to 4095"]),
+        ([*PLAY, "--processor", 10**30], ["processor 1e+30", "0 to 4095"]),
         (["--device", "haply", "--policy", "wait"], ["cannot wait"]),
         ([*PLAY, "--rate", 5], ["a rate of 5.0 Hz: give 10 to 20,000"]),
         ([*PLAY, "--seconds", -1], ["-1.0 seconds"]),
@@ -173,7 +179,13 @@ def descendants(pid: int) -> list[int]:
     return list(map(int, found))
 
 
-def test_ctrl_c_ends_a_session_with_its_report(scene: Path) -> None:
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")],
+)
+def test_a_signal_ends_a_session_with_its_report(
+    scene: Path, number: signal.Signals, code: int, words: str
+) -> None:
     """And with a recording that has every frame."""
     args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
     with subprocess.Popen(
@@ -189,10 +201,10 @@ def test_ctrl_c_ends_a_session_with_its_report(scene: Path) -> None:
             assert process.poll() is None
             time.sleep(0.05)
         started = descendants(process.pid)
-        process.send_signal(signal.SIGINT)
+        process.send_signal(number)
         out, err = process.communicate(timeout=PATIENCE)
-    assert process.returncode == 130
-    assert re.fullmatch(r"hapticdb: ended by Ctrl-C after [\d.]+ s\n", err)
+    assert process.returncode == code
+    assert re.fullmatch(rf"hapticdb: ended by {words} after [\d.]+ s\n", err)
     report = json.loads(out)
     frames = np.concatenate(list(Recording(scene.with_name("cut.hdbrec")).frames()))
     assert len(frames) == report["loop"]["frames"] == report["recorded_frames"]
@@ -219,6 +231,22 @@ def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
     while any(map(is_alive, started)):
         assert time.monotonic() < deadline + PATIENCE
         time.sleep(0.05)
+
+
+def test_sigterm_before_the_first_frame_leaves_nothing(scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE, "--record", "never.hdbrec")
+    path = scene.with_name("never.hdbrec")
+    with subprocess.Popen(
+        command(*args), cwd=scene.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        deadline = time.monotonic() + PATIENCE
+        while not path.exists():
+            assert time.monotonic() < deadline
+            time.sleep(0.002)
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, out, err) == (143, "", "")
+    assert not path.exists()
 
 
 @pytest.mark.parametrize("verb", ["feel", "replay"])

@@ -151,5 +151,6 @@ def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
     refused(run("sweep", scene, *path, *TOOL, "--budget", 0.5), "--budget")
     refused(run("sweep", scene, *path, *TOOL, "--clearance", -1), "clearance")
     refused(run("sweep", scene, *path, *TOOL, "--picture", "no/folder.png"), "cannot write")
+    refused(run("sweep", scene, *path, *TOOL, "--clearance", 1e300), "up to 1e+300 m needs more")
     refused(run("sweep", scene, "--path", "none.csv", *TOOL), "no file of poses")
     refused(run("sweep", "none.db", *path, *TOOL), "none.db")

@@ -7,6 +7,7 @@ import itertools
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from psycopg import sql
 import hapticdb
 from crashes import server, template  # noqa: F401 - fixtures
 from hapticdb import Grid
+from hapticdb.store import sqlite_file
 from hapticdb.store.base import SupportsWatch
 from hapticdb.store.connect import create_store, grant, open_store
 from hapticdb.store.postgres import watching
@@ -118,6 +120,31 @@ def test_an_immutable_reader_is_told_by_the_files_stamp(
         assert reader.has_changed()
         with pytest.raises(hapticdb.BusyError, match="open it again"):
             reader.objects()
+        with pytest.raises(hapticdb.BusyError, match="open it again"), reader.snapshot():
+            pass
+    reader.close()
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_replaced: bool
+) -> None:
+    monkeypatch.setattr(sqlite_file, "LOOK_SECONDS", 0.0)
+    reader = SQLiteStore.open(file, read_only=True)
+    reader.watch()
+    assert not reader.has_changed()
+    kept = tmp_path / "kept"
+    Path(file).rename(kept)
+    words = "cannot be reached any more"
+    if is_replaced:
+        create_store(tmp_path / "other.db", GRID).close()
+        (tmp_path / "other.db").rename(file)
+        words = "is another file than before: open it again"
+    for _ in range(2):
+        with pytest.raises(hapticdb.ConnectionLostError, match=words):
+            reader.has_changed()
+    kept.replace(file)
+    assert not reader.has_changed()
     reader.close()
 
 
@@ -211,6 +238,25 @@ def test_a_reader_that_lost_its_connection_listens_again(
         assert not reader.has_changed()
         write(url)
         assert is_noticed(reader)
+
+
+def test_a_server_that_comes_back_is_found_within_half_a_second(
+    reader: PostgresStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: list[float] = []
+    connect = Session.connect
+
+    def refused_at_first(session: Session) -> None:
+        if len(pauses) < 8:
+            raise hapticdb.ConnectionLostError("refused")
+        connect(session)
+
+    monkeypatch.setattr(Session, "connect", refused_at_first)
+    monkeypatch.setattr(time, "sleep", pauses.append)
+    reader.session.connection.close()
+    assert reader.objects() == []
+    assert len(pauses) == 8
+    assert max(pauses) <= 0.5
 
 
 def test_a_writer_that_does_not_notify_is_noticed_too(

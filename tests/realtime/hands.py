@@ -56,6 +56,16 @@ class Clutched(Slow):
         return reading._replace(buttons=(self.reads // 100) & 1)
 
 
+class Lost(Slow):
+    """A hand whose first reads, so many, are no place."""
+
+    def read(self) -> Reading:
+        reading = super().read()
+        if self.reads <= self.every:
+            return reading._replace(pose=np.full((4, 4), np.nan), velocity=np.full(6, np.nan))
+        return reading
+
+
 class Unplugged(Slow):
     """A hand whose cable is pulled at its n-th read, with an error of some kind."""
 

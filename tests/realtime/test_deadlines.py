@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from hapticdb.errors import UsageError
 from hapticdb.realtime.deadlines import (
     SWITCH_INTERVAL,
     Deadlines,
@@ -171,6 +172,12 @@ def test_a_collector_that_was_off_stays_off() -> None:
         assert not gc.isenabled()
     finally:
         gc.enable()
+
+
+@pytest.mark.parametrize("processor", [-1, 4096, 10**40])
+def test_a_processor_that_cannot_be_is_refused(processor: int) -> None:
+    with pytest.raises(UsageError, match=r"^processor \S{1,20}: give its number, 0 to 4095$"):
+        Timing(processor=processor)
 
 
 def test_a_processor_that_is_not_there_is_told_and_nothing_breaks() -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.coupling import HAND, HAND_VELOCITY, IS_STALE
+from hapticdb.kernels.coupling import HAND, HAND_VELOCITY, IS_OPEN, IS_STALE
 from hapticdb.kernels.motion import poses_of
 from hapticdb.realtime.devices import Reading
 from hapticdb.realtime.handle import Handle
@@ -113,6 +113,69 @@ def test_a_handle_starts_where_it_is_told_to(seed: int, scale: float) -> None:
         np.testing.assert_allclose(pose(hand), start, atol=1e-12 * max(scale, 1.0))
         assert not hand[7:13].any()
         handle.follow(reading(rng), hand)
+
+
+def lost(rng: np.random.Generator, bad: float, at: int, buttons: int = 0) -> Reading:
+    """A reading of which one number is not finite."""
+    found = reading(rng, buttons)
+    if at < 12:
+        found.pose.ravel()[at] = bad
+    else:
+        found.velocity[at - 12] = bad
+    return found
+
+
+@few
+@given(SEEDS, SCALES, st.sampled_from([math.nan, math.inf]), st.integers(0, 17))
+def test_after_readings_that_are_not_finite_all_is_as_if_they_had_not_been(
+    seed: int, scale: float, bad: float, at: int
+) -> None:
+    """Also while the clutch is open, and when it closes."""
+    rng = np.random.default_rng(seed)
+    handles = [Handle(scale=scale, clutch=0) for _ in range(2)]
+    hands = np.zeros((2, HAND))
+    first = reading(rng)
+    for handle, hand in zip(handles, hands, strict=True):
+        handle.start(first, hand)
+    for buttons in rng.integers(2, size=30).tolist():
+        for _ in range(int(rng.integers(3))):
+            handles[0].follow(lost(rng, bad, at, int(rng.integers(2))), hands[0])
+            assert math.isnan(hands[0, 0])
+            np.testing.assert_array_equal(hands[0, 1:], hands[1, 1:])
+        given_ = reading(rng, buttons)
+        for handle, hand in zip(handles, hands, strict=True):
+            handle.follow(given_, hand)
+            assert np.isfinite(hand).all()
+        np.testing.assert_array_equal(hands[0], hands[1])
+
+
+@few
+@given(SEEDS, st.integers(0, 17), st.booleans())
+def test_a_handle_that_starts_nowhere_starts_with_the_first_finite_reading(
+    seed: int, at: int, is_placed: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    start = turned(rng, rng.uniform(-1, 1, 3)) if is_placed else None
+    handle, hand = Handle(start=start), np.zeros(HAND)
+    handle.start(lost(rng, math.nan, at), hand)
+    handle.follow(lost(rng, math.inf, at), hand)
+    assert math.isnan(hand[0])
+    first = reading(rng)
+    handle.follow(first, hand)
+    np.testing.assert_allclose(pose(hand), first.pose if start is None else start, atol=1e-12)
+    assert np.isfinite(hand).all()
+
+
+def test_the_coupling_is_told_of_an_open_clutch() -> None:
+    handle, hand = Handle(clutch=0), np.zeros(HAND)
+    rng = np.random.default_rng(0)
+    handle.start(reading(rng), hand)
+    for buttons in (1, 1, 0, 1, 0, 0):
+        handle.follow(reading(rng, buttons), hand)
+        assert hand[IS_OPEN] == buttons
+    handle.follow(reading(rng, 1), hand)
+    handle.start(reading(rng), hand)
+    assert hand[IS_OPEN] == 0.0
 
 
 def test_other_buttons_leave_the_clutch_alone() -> None:

@@ -28,7 +28,7 @@ from hapticdb.realtime.resident import ResidentCells
 from hapticdb.realtime.session import frames_of
 from hapticdb.realtime.table import anonymous_memory
 from hapticdb.testing import floor_voxels, write_voxels
-from realtime.hands import Clutched, Slow, Talking, Unplugged, still, stroking
+from realtime.hands import Clutched, Lost, Slow, Talking, Unplugged, still, stroking
 from realtime.worlds import make
 
 N_RING = 4096
@@ -178,6 +178,55 @@ def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
         run(hand)
     assert any(wrench.any() for wrench in applied)
     assert not applied[-1].any()
+
+
+def test_a_hand_that_does_not_know_its_place_at_once_is_asked_again(run: Run) -> None:
+    answer, frames = run(Lost(still(0.010), 20, 0.0))
+    assert np.isfinite(frames["tool"]).all()
+    assert answer.counts.hit_frames == len(frames)
+    assert answer.is_warm
+
+
+def test_a_hand_that_never_knows_its_place_is_an_error(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.05)
+    with pytest.raises(DeviceError, match=r"has not said where it is within 0.05 s.*calibration$"):
+        run(Lost(still(0.010), 1 << 30, 0.0))
+
+
+def test_a_start_without_cells_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)
+    assert not run(still(0.03)).answer.is_warm
+
+
+def test_a_frame_that_waits_lets_go_and_ends_with_the_session(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    applied: list[Floats] = []
+    hand = still(0.010)
+    hand.apply = lambda wrench: applied.append(wrench.copy())  # type: ignore[method-assign]
+    known, n_steps = subject.Loop._step, 0
+
+    def step(loop: subject.Loop, dt: float, *, is_stale: bool) -> None:
+        nonlocal n_steps
+        n_steps += 1
+        known(loop, dt, is_stale=is_stale)
+        if n_steps > 50:  # from now on all is unknown
+            loop.out[UNKNOWNS] = 1.0
+
+    monkeypatch.setattr(subject.Loop, "_step", step)
+    answer, frames = run(hand, is_waiting=True, seconds=0.5)
+    assert answer.counts.unknown_frames == 1
+    assert answer.loop.seconds == pytest.approx(0.5, abs=0.2)
+    assert applied[-5].any()
+    assert not np.any(applied[-4:])  # while it waited, of that frame, and twice at the end
+    assert not frames["applied"][-1].any()
+
+
+def test_frames_in_which_the_tool_was_held_back_are_counted(run: Run) -> None:
+    assert run(stroking(-0.010, 0.5), seconds=0.6, stiffness=0.0).answer.counts.cut_frames > 0
+    assert run(still(0.03)).answer.counts.cut_frames == 0
 
 
 def test_after_an_answer_the_loop_runs_as_often_as_one_likes(run: Run) -> None:

@@ -20,7 +20,7 @@ from hapticdb.kernels import servo
 from hapticdb.kernels.cells import cell_key
 from hapticdb.realtime.devices import RandomHand
 from hapticdb.realtime.prefetch import (
-    ACTIVE,
+    CONFIRM_EVERY,
     HANDLE,
     HEARD,
     MISSING,
@@ -31,7 +31,7 @@ from hapticdb.realtime.prefetch import (
     FetchRequest,
 )
 from hapticdb.realtime.resident import ResidentCells
-from hapticdb.realtime.table import AWAY, HEARTBEAT, LEAST_BUDGET, CellTable
+from hapticdb.realtime.table import ACTIVE, AWAY, HEARTBEAT, LEAST_BUDGET, CellTable
 from hapticdb.realtime.wishes import Wish
 from hapticdb.testing import write_voxels
 from realtime.troubled import refuse, refuse_strangely, troubled
@@ -275,6 +275,41 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
     step.warm_start()
     naive = expected(ids_by_voxel(world), world.grid, sphere, step.pose)
     assert step.side.reader.feel(step.pose)[0] == naive.hits
+
+
+def test_the_heartbeat_waits_for_an_answer(
+    world: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To hear of no commit is none; a question for the revision is, a while after the last."""
+    step = LockStep(world, sphere)
+    step.warm_start()
+    step.run(0.2)
+    control = step.table.cells.control
+    asked: list[float] = []
+    revision = step.fetching.store.revision
+
+    def counted() -> int:
+        asked.append(step.now)
+        return revision()
+
+    monkeypatch.setattr(step.fetching.store, "revision", counted, raising=False)
+    while not asked:
+        step.round()
+    heard = int(control[HEARTBEAT])
+    step.run(0.5 * CONFIRM_EVERY)
+    assert (len(asked), int(control[HEARTBEAT])) == (1, heard)
+    step.run(CONFIRM_EVERY)
+    assert len(asked) == 2
+    assert int(control[HEARTBEAT]) > heard
+
+    def unanswered() -> int:
+        raise hapticdb.ConnectionLostError("gone")
+
+    monkeypatch.setattr(step.fetching.store, "revision", unanswered, raising=False)
+    heard = int(control[HEARTBEAT])
+    with pytest.raises(hapticdb.ConnectionLostError):
+        step.run(2 * CONFIRM_EVERY)
+    assert int(control[HEARTBEAT]) == heard
 
 
 def test_a_round_asks_nothing_when_nothing_has_moved(

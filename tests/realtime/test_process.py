@@ -1,6 +1,7 @@
 """A session's process says what happened, and ends when its session does."""
 
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -41,7 +42,12 @@ def test_its_errors_are_raised_here() -> None:
 
 
 @pytest.mark.parametrize(
-    ("word", "cause"), [("break", "ZeroDivisionError: one$"), ("exit", "SystemExit: 3$")]
+    ("word", "cause"),
+    [
+        ("break", "ZeroDivisionError: one$"),
+        ("exit", "SystemExit: 3$"),
+        ("end of file", "EOFError: of something else$"),
+    ],
 )
 def test_what_nobody_expected_is_one_line_here(word: str, cause: str) -> None:
     with (
@@ -69,6 +75,28 @@ def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
         process.end()
         assert process._popen.returncode == status
         process.end()
+
+
+def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
+    with Process(WORKERS, ("tidy", None), []) as process:
+        assert process.receive(LONG) == Message("waiting")
+        os.kill(process.pid, signal.SIGTERM)
+        assert process.receive(LONG) == Message("tidied")
+        assert process.receive(LONG) is None
+        assert process.wait(LONG)
+        assert process._popen.returncode == 128 + signal.SIGTERM
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_a_request_that_is_cut_ends_it_quietly(share: float) -> None:
+    content = pickle.dumps(sys.path) + pickle.dumps(("echo", list(range(1000))))
+    done = subprocess.run(
+        [sys.executable, "-c", f"from {module.__name__} import serve; serve({WORKERS!r})"],
+        input=content[: round(share * len(content))],
+        capture_output=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
 
 
 def test_one_killed_is_silent_and_not_alive() -> None:

@@ -280,6 +280,22 @@ def test_another_environment_in_the_same_place_is_refused(tmp_path: Path, table:
         residency.reopened(make(tmp_path, bits=6).store)
 
 
+def test_another_file_of_the_same_grid_makes_all_unknown(tmp_path: Path, table: CellTable) -> None:
+    """Though its writes be of the same numbers."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    for folder in (first, second):
+        folder.mkdir()
+    env, other = make(first), make(second)
+    write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
+    write_voxels(other.store, block((60, 60, 60), (70, 70, 70)))
+    residency = Residency(env.store, table)
+    residency.load(residency.missing(cells_of(env.grid))[:100])
+    residency.reopened(other.store, is_same=False)
+    check(residency, voxels_by_cell(other))
+    residency.load(residency.missing(cells_of(env.grid))[:100])
+    assert check(residency, voxels_by_cell(other)) > 0
+
+
 def test_an_order_without_cells_is_refused(tmp_path: Path, table: CellTable) -> None:
     env = make(tmp_path, layout="voxel", curve="lexicographic")
     with pytest.raises(

@@ -190,6 +190,34 @@ def test_a_loop_that_is_killed_is_one_clear_error(
     assert report.hit_frames == report.loop.frames
 
 
+def test_a_session_that_is_closed_without_waiting_has_recorded_all(
+    cells: ResidentCells, sphere: PointShell, tmp_path: Path
+) -> None:
+    path = tmp_path / "unwatched.hdbrec"
+    with Session(cells, sphere, still(0.010), rate=RATE, record=path) as session:
+        until(lambda: session.n_frames > 50)
+        n_frames = session.n_frames
+    assert len(recorded(path)) >= n_frames
+
+
+def test_what_is_recorded_reaches_the_file_within_a_second(
+    cells: ResidentCells, sphere: PointShell, tmp_path: Path
+) -> None:
+    path = tmp_path / "slow.hdbrec"
+    with Session(cells, sphere, still(0.010), rate=50.0, record=path) as session:
+        assert session.wait(1.5) is None
+        assert sum(map(len, Recording(path).frames())) > 10
+
+
+def test_a_loop_that_the_system_ends_is_one_clear_error_too(
+    cells: ResidentCells, sphere: PointShell
+) -> None:
+    with Session(cells, sphere, still(0.010), rate=RATE) as session:
+        os.kill(session.pid, signal.SIGTERM)
+        with pytest.raises(HapticDBError, match="ended from outside"):
+            session.wait(PATIENCE)
+
+
 @pytest.mark.parametrize(
     ("kind", "message"),
     [(DeviceError, r"^the hand was unplugged"), (ValueError, r"ended: ValueError: the hand was")],
@@ -229,6 +257,7 @@ def test_a_session_that_does_not_begin_leaves_no_recording(
         ({"rate": 1e5}, "a rate of"),
         ({"seconds": 0.0}, "0.0 seconds"),
         ({"seconds": math.inf}, "inf seconds"),
+        ({"processor": -1}, "processor -1: give its number"),
         ({"staleness": 0.0}, "a staleness of 0.0 s"),
         ({"exclude": [1]}, "give a URL instead"),
         ({"budget_bytes": 1 << 20}, "give a URL instead"),
@@ -350,7 +379,7 @@ def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
 
         def is_held() -> bool:
             last = session.last()
-            return last is not None and bool(last["state"][0] & State.STALE)
+            return last is not None and bool(last["state"][0] & State.FADING)
 
         until(is_held, session)
         until(lambda: not is_held() and cells.pid != killed, session)
@@ -361,7 +390,7 @@ def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
     assert report.stale_frames > 0
     frames = recorded(path)
     check_falling(frames)
-    is_silent = frames["state"] & State.STALE > 0
+    is_silent = frames["state"] & State.FADING > 0
     assert not frames["applied"][is_silent][-1].any()
     last = np.flatnonzero(is_silent)[-1]
     assert frames["applied"][:50].any(axis=1).all()

@@ -22,6 +22,14 @@ def work(request: tuple[str, object], voice: Voice) -> None:
         voice.say("waiting")
         while not parent_is_gone():
             time.sleep(1e-3)
+    elif word == "tidy":
+        try:
+            voice.say("waiting")
+            time.sleep(1000)
+        finally:
+            voice.say("tidied")
+    elif word == "end of file":
+        raise EOFError("of something else")
     elif word == "hang":
         voice.say("hanging")
         time.sleep(1000)

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 PolicyName = Literal["hold", "wait"]
 MOST_NAMED = 8
+TERMINATED = 128 + signal.SIGTERM
 DEFAULT_SPEED = 0.3
 VENDORS = {
     "force-dimension": ("hapticdb.realtime.vendors.force_dimension", "ForceDimensionDevice"),
@@ -120,7 +121,10 @@ def feel(
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
     shell = shell_of(tool, tool_unit, points, None if is_for_hand_alone else seed)
-    with ResidentCells(url, budget_bytes=int(budget * (1 << 20)), exclude=excluded) as cells:
+    with (
+        _leaving_in_order(),
+        ResidentCells(url, budget_bytes=int(budget * (1 << 20)), exclude=excluded) as cells,
+    ):
         with (
             Session(
                 cells,
@@ -136,7 +140,7 @@ def feel(
                 is_fifo=fifo,
                 processor=processor,
             ) as session,
-            _ended_by_ctrl_c(session) as presses,
+            _ended_by_signals(session) as signals,
         ):
             report = session.wait()
         assert report is not None  # noqa: S101 - waited for without a limit
@@ -144,27 +148,56 @@ def feel(
             render.say_json(report.figures())
         else:
             _show(report, cells, record)
-    if presses:
+    if signal.SIGTERM in signals:
+        render.note(f"ended by SIGTERM after {report.loop.seconds:.3g} s")
+        raise typer.Exit(TERMINATED)
+    if signals:
         raise Interrupted(f"ended by Ctrl-C after {report.loop.seconds:.3g} s")
 
 
 @contextmanager
-def _ended_by_ctrl_c(session: "Session") -> Iterator[list[int]]:
-    """Let Ctrl-C end the session, with its report, and a second one the program; yields presses."""
-    presses: list[int] = []
-    before = signal.getsignal(signal.SIGINT)
+def _leaving_in_order() -> Iterator[None]:
+    """Let SIGTERM end the program by way of every clean-up."""
+    if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:  # somebody wants it otherwise
+        yield
+        return
+    signal.signal(signal.SIGTERM, _leave)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _leave(number: int, _: object) -> None:
+    raise SystemExit(128 + number)
+
+
+@contextmanager
+def _ended_by_signals(session: "Session") -> Iterator[list[int]]:
+    """Let Ctrl-C or SIGTERM end the session, with its report, and a second one the program.
+
+    Yields the signals that came.
+    """
+    came: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {  # another's handler stays
+        number: handler
+        for number, handler in handlers.items()
+        if handler in {signal.default_int_handler, _leave}
+    }
 
     def end(number: int, _: object) -> None:
-        presses.append(number)
+        came.append(number)
         session.ask_to_end()
-        signal.signal(signal.SIGINT, before)
+        signal.signal(number, before[signal.Signals(number)])
 
-    if before is signal.default_int_handler:  # otherwise somebody wants it ignored
-        signal.signal(signal.SIGINT, end)
+    for number in before:
+        signal.signal(number, end)
     try:
-        yield presses
+        yield came
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def replay(
@@ -240,6 +273,10 @@ def _device(
         raise UsageError(f"--device {word}: give --at, where the hand is")
     if word not in {"random", "tumble"} and place is not None:
         raise UsageError(f"--at belongs to random and tumble, not to {word}")
+    if loops and word in {"random", "tumble"}:
+        raise UsageError(f"--loop: --device {word} has no end; leave it out")
+    if speed is not None and (word == "tumble" or word.lower().endswith(".hdbrec")):
+        raise UsageError(f"--speed: --device {word} has its own; leave it out")
     hand: Device
     if word in VENDORS:
         if is_simulated or loops or speed is not None:
@@ -284,7 +321,8 @@ def _show(report: "Report", cells: "ResidentCells", record: str | None) -> None:
             "touching",
             (
                 f"{render.counted(report.hit_frames, 'frame')} with a hit, "
-                f"{report.contact_frames:,} in contact"
+                f"{report.contact_frames:,} in contact, "
+                f"{report.cut_frames:,} held back at surfaces"
             ),
         ),
         (
@@ -317,7 +355,7 @@ def _show(report: "Report", cells: "ResidentCells", record: str | None) -> None:
                 f"{cache.evicted:,} evicted"
             ),
         ),
-        ("warm start", f"{1e3 * report.warm_up:.3g} ms"),
+        ("warm start", f"{1e3 * report.warm_up:.3g} ms" + _cold_clause(report)),
         (
             "peak",
             (
@@ -342,6 +380,10 @@ def _show(report: "Report", cells: "ResidentCells", record: str | None) -> None:
         facts.append(("recorded", f"{report.recorded_frames:,} frames in {record}{lost}"))
     facts += sorted(report.conditions.items())
     render.show(render.facts(facts))
+
+
+def _cold_clause(report: "Report") -> str:
+    return "" if report.is_warm else ", and begun although cells were missing"
 
 
 def _times(what: str, spreads: "list[Spread]") -> list[tuple[str, ...]]:

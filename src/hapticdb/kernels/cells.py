@@ -42,6 +42,8 @@ READER_STRIDE = 8
 """Readers stand a cache line apart."""
 MOST_MISSED = 63
 """Unknown cells that a frame names, for whoever fetches them."""
+GROUP = 4
+"""Runs of a group, which are skipped together."""
 MOST_COLUMNS = 64
 """Of a cluster's box, looked at one by one: more, and an occupied brick counts as near."""
 MOST_CELLS = 8
@@ -82,6 +84,7 @@ class Clusters(NamedTuple):
 
     points (N, 6): metres and inward normals, tool frame, in the order of the shell; center (3,);
     spheres (C, 4): centre and radius, metres, of each run of `run` points, or (0, 4) for none;
+    groups (G, 4): likewise of each `GROUP` of them;
     columns (3, N): the points again, an axis a row; scratch (6, run): where a run is placed. A
     thread of its own needs a scratch of its own.
     """
@@ -89,6 +92,7 @@ class Clusters(NamedTuple):
     points: Floats
     center: Floats
     spheres: Floats
+    groups: Floats
     run: int
     columns: Floats
     scratch: Floats
@@ -213,6 +217,35 @@ def is_something_near(
 
 
 @inlined
+def is_sphere_free(
+    keys, slots, words, masks, used, which, spheres, n, side, size, ox, oy, oz,
+    a, b, c, u, d, e, f, v, g, h, m, w,
+):  # fmt: skip
+    """Whether no voxel is in the box around sphere n, placed by rotation a .. m and shift u, v, w.
+
+    Unknown cells count as voxels; what is outside the grid is free.
+    """
+    x, y, z = spheres[n, 0], spheres[n, 1], spheres[n, 2]
+    radius = spheres[n, 3] / size
+    sx = (turn(a, b, c, x, y, z) + u - ox) / size
+    sy = (turn(d, e, f, x, y, z) + v - oy) / size
+    sz = (turn(g, h, m, x, y, z) + w - oz) / size
+    if sx + radius < 0.0 or sy + radius < 0.0 or sz + radius < 0.0:
+        return True
+    if sx - radius >= side or sy - radius >= side or sz - radius >= side:
+        return True
+    return not is_something_near(
+        keys, slots, words, masks, used, which,
+        np.int64(max(sx - radius, 0.0)),
+        np.int64(max(sy - radius, 0.0)),
+        np.int64(max(sz - radius, 0.0)),
+        np.int64(min(sx + radius, side - 1.0)),
+        np.int64(min(sy + radius, side - 1.0)),
+        np.int64(min(sz + radius, side - 1.0)),
+    )  # fmt: skip
+
+
+@inlined
 def with_missed(missed, count, key):
     """Put an unknown cell on the list, once; returns how many are on it."""
     for n in range(1, count + 1):
@@ -256,29 +289,19 @@ def felt(cells, which, shell, pose, place, stiffness, met, missed, out):
     while start < total:
         end = min(start + run, total)
         if n_clusters > 0:
-            x, y, z = (
-                shell.spheres[cluster, 0],
-                shell.spheres[cluster, 1],
-                shell.spheres[cluster, 2],
-            )
-            radius = shell.spheres[cluster, 3] / size
-            cluster += 1
-            sx = (turn(a, b, c, x, y, z) + u - ox) / size
-            sy = (turn(d, e, f, x, y, z) + v - oy) / size
-            sz = (turn(g, h, m, x, y, z) + w - oz) / size
-            if (
-                sx + radius < 0.0 or sy + radius < 0.0 or sz + radius < 0.0
-                or sx - radius >= side or sy - radius >= side or sz - radius >= side
-                or not is_something_near(
-                    keys, slots, words, masks, used, which,
-                    np.int64(max(sx - radius, 0.0)),
-                    np.int64(max(sy - radius, 0.0)),
-                    np.int64(max(sz - radius, 0.0)),
-                    np.int64(min(sx + radius, side - 1.0)),
-                    np.int64(min(sy + radius, side - 1.0)),
-                    np.int64(min(sz + radius, side - 1.0)),
-                )
+            if cluster % GROUP == 0 and is_sphere_free(
+                keys, slots, words, masks, used, which, shell.groups, cluster // GROUP, side,
+                size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
             ):  # fmt: skip
+                start += GROUP * run
+                cluster += GROUP
+                continue
+            is_free = is_sphere_free(
+                keys, slots, words, masks, used, which, shell.spheres, cluster, side,
+                size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
+            )  # fmt: skip
+            cluster += 1
+            if is_free:
                 start = end
                 continue
         # a run at a time, an axis after another: these loops the compiler makes vectors of, which

@@ -40,18 +40,20 @@ from hapticdb.kernels.motion import pose_of_quaternion, product, quaternion_by, 
 
 POSITION, QUATERNION, VELOCITY, TURNING, KEPT = 0, 3, 7, 10, 13
 """Where `state` has what: m and unit quaternion of the tool's frame, m/s of its centre of mass,
-rad/s, and the wrench that was sent last."""
-HELD_FOR, FELT, _NEXT, _LOOSE, _POSE, _NEXT_POSE = 19, 20, 21, 31, 32, 48
-STATE = 64
+rad/s, and the wrench that the hand was to feel last, in full."""
+HELD_FOR, FELT, _NEXT, _LOOSE, _POSE, _NEXT_POSE, RISEN = 19, 20, 21, 31, 32, 48, 64
+"""Seconds for which the wrench is held; and, at last, the share of it that is sent, 0 to 1."""
+STATE = 65
 """Numbers of a state; zero but for position and quaternion at the start."""
-HAND_VELOCITY, IS_STALE = 7, 13
-HAND = 14
+HAND_VELOCITY, IS_STALE, IS_OPEN = 7, 13, 14
+HAND = 15
 """Numbers of a hand: position, unit quaternion, velocity (6,) of the handle's frame, scene metres;
-and whether to hold as if all were unknown, 0 or 1."""
+whether to hold as if all were unknown, and whether the clutch is open, 0 or 1."""
 APPLIED, SUBSTEPS, FLAGS, OUT_REVISION = 0, 10, 11, 12
 OUT = 13
-"""Numbers of a result: the wrench for the device (6,); hits, contacts, unknown points and deepest
-where `cells` has them in a frame's result; steps made, flags, the database's revision."""
+"""Numbers of a result: the wrench for the device (6,), about the handle's origin; hits, contacts,
+unknown points and deepest where `cells` has them in a frame's result; steps made, flags, the
+database's revision."""
 MET_ROWS = 3
 """Rows of `met`: the hits' indices, those of a frame that is tried, and each point's anchor."""
 
@@ -101,7 +103,9 @@ def clamped(x, y, z, longest):
 def pull_of(body, state, hand, pose, center, size, hits):
     """Spring and damper at a state -> displacement (3), turn (3), relative velocities (3), (3).
 
-    Displacement and turn are clamped while a point hits.
+    And the lever (3) of the handle's centre about the handle's origin. While a point hits,
+    displacement and turn are clamped, and the velocities so that the damper pulls no harder than
+    the spring can.
     """
     x, y, z = center[0], center[1], center[2]
     hw, hx, hy, hz = hand[3], hand[4], hand[5], hand[6]
@@ -114,14 +118,49 @@ def pull_of(body, state, hand, pose, center, size, hits):
     dy = hand[1] + ry - (turn(pose[1, 0], pose[1, 1], pose[1, 2], x, y, z) + pose[1, 3])
     dz = hand[2] + rz - (turn(pose[2, 0], pose[2, 1], pose[2, 2], x, y, z) + pose[2, 3])
     tx, ty, tz = turn_of(*product(hw, hx, hy, hz, state[3], -state[4], -state[5], -state[6]))
-    if hits > 0.0:
-        dx, dy, dz = clamped(dx, dy, dz, 0.5 * size)
-        tx, ty, tz = clamped(tx, ty, tz, 0.5 * size / body.radius)
     wx, wy, wz = hand[10], hand[11], hand[12]
     vx = hand[7] + (wy * rz - wz * ry) - state[7]
     vy = hand[8] + (wz * rx - wx * rz) - state[8]
     vz = hand[9] + (wx * ry - wy * rx) - state[9]
-    return dx, dy, dz, tx, ty, tz, vx, vy, vz, wx - state[10], wy - state[11], wz - state[12]
+    wx, wy, wz = wx - state[10], wy - state[11], wz - state[12]
+    if hits > 0.0:
+        way, angle = 0.5 * size, 0.5 * size / body.radius
+        dx, dy, dz = clamped(dx, dy, dz, way)
+        tx, ty, tz = clamped(tx, ty, tz, angle)
+        vx, vy, vz = clamped(vx, vy, vz, way * body.spring / body.damping)
+        wx, wy, wz = clamped(wx, wy, wz, angle * body.turn_spring / body.turn_damping)
+    return dx, dy, dz, tx, ty, tz, vx, vy, vz, wx, wy, wz, rx, ry, rz
+
+
+@leaf
+def push_hand(body, state, hand, pose, center, size, wrench):
+    """What the coupling does to the hand about the handle's origin, in full, into wrench (6,)."""
+    dx, dy, dz, tx, ty, tz, ux, uy, uz, wx, wy, wz, rx, ry, rz = pull_of(
+        body, state, hand, pose, center, size, 1.0
+    )
+    fx = -(body.spring * dx + body.damping * ux)
+    fy = -(body.spring * dy + body.damping * uy)
+    fz = -(body.spring * dz + body.damping * uz)
+    wrench[0], wrench[1], wrench[2] = fx, fy, fz
+    # the hand is pushed at its origin, the spring pulls at the centre
+    wrench[3] = ry * fz - rz * fy - (body.turn_spring * tx + body.turn_damping * wx)
+    wrench[4] = rz * fx - rx * fz - (body.turn_spring * ty + body.turn_damping * wy)
+    wrench[5] = rx * fy - ry * fx - (body.turn_spring * tz + body.turn_damping * wz)
+
+
+@inlined
+def is_finite(numbers, first, end):
+    """Whether all of numbers[first:end] are."""
+    count = 0
+    for n in range(first, end):
+        count += math.isfinite(numbers[n])
+    return count == end - first
+
+
+@leaf
+def faded_of(body, seconds):
+    """Share of the wrench that is gone when it was held for so long."""
+    return min(max((seconds - body.hold) / body.fade, 0.0), 1.0)
 
 
 @leaf
@@ -259,11 +298,18 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
 
     state (STATE,), hand (HAND,) and out (OUT,) as above; met (MET_ROWS, N) int64 and missed as
     `felt` has them, the frame's hits in row 0 of met; frame (RESULTS,) is what `felt` says at
-    exactly the pose state[0:7], among the cells of one published version. out's wrench is what the
-    coupling does to the hand, exactly zero while no point hits.
+    exactly the pose state[0:7], among the cells of one published version, its wrench about the
+    tool's centre of mass. out's wrench is what the coupling does to the hand, about the handle's
+    origin, exactly zero while no point hits. Its force is k s at most, s the voxels' size: half
+    from the spring, half from the damper; so is its torque about the centre, k r s of the radius r.
 
     Where the tool would meet unknown cells it stays, still, and the wrench is kept for `hold`
     seconds, then falls to zero within `fade`; out and missed then tell of the pose that was tried.
+    After that, and from the first frame on, it rises to its full size within `fade`; while the
+    clutch is open it falls likewise, and the tool goes on.
+
+    With a hand that is not finite all is held; a state that is not is placed anew, at rest, at the
+    first hand that is finite.
     """
     which = begin_frame(cells, reader)
     version = float(cells.readers[reader * READER_STRIDE])
@@ -277,10 +323,13 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
     flags = 0
     n_steps = 0
     n_unknown = np.int64(0)
-    is_held = hand[IS_STALE] != 0.0
-    for n in range(HAND):
-        if not math.isfinite(hand[n]):
-            is_held = True
+    is_hand = is_finite(hand, 0, HAND)
+    is_held = hand[IS_STALE] != 0.0 or not is_hand
+    if not is_finite(state, 0, FELT):
+        state[7:] = 0.0
+        frame[:] = 0.0
+        if is_hand:
+            state[0:7] = hand[0:7]
     if not is_held and state[FELT] != version:
         is_first = state[FELT] == 0.0
         pose_of_quaternion(
@@ -310,7 +359,7 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
             flags |= IS_DROPPED
             break
         hits = frame[HITS]
-        dx, dy, dz, tx, ty, tz, ux, uy, uz, wx, wy, wz = pull_of(
+        dx, dy, dz, tx, ty, tz, ux, uy, uz, wx, wy, wz, _, _, _ = pull_of(
             body, state, hand, pose, center, place.size, hits
         )
         ax = (body.spring * dx + body.damping * ux + frame[0]) / body.mass
@@ -389,26 +438,28 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         frame[:] = next_frame
     end_frame(cells, reader)
     is_held = is_held or n_unknown > 0
+    passed = max(dt, 0.0) / body.fade
+    kept = state[KEPT : KEPT + 6]
+    faded = 0.0
     if is_held:
         state[7:13] = 0.0
         state[HELD_FOR] += max(dt, 0.0)
-        faded = min(max((state[HELD_FOR] - body.hold) / body.fade, 0.0), 1.0)
-        for axis in range(6):
-            out[axis] = (1.0 - faded) * state[KEPT + axis]
+        faded = faded_of(body, state[HELD_FOR])
         flags |= IS_HELD | (IS_FADING if faded > 0.0 else 0)
     else:
+        state[RISEN] *= 1.0 - faded_of(body, state[HELD_FOR])
         state[HELD_FOR] = 0.0
-        dx, dy, dz, tx, ty, tz, ux, uy, uz, wx, wy, wz = pull_of(
-            body, state, hand, pose, center, place.size, frame[HITS]
-        )
-        is_felt = frame[HITS] > 0.0
-        out[0] = -(body.spring * dx + body.damping * ux) if is_felt else 0.0
-        out[1] = -(body.spring * dy + body.damping * uy) if is_felt else 0.0
-        out[2] = -(body.spring * dz + body.damping * uz) if is_felt else 0.0
-        out[3] = -(body.turn_spring * tx + body.turn_damping * wx) if is_felt else 0.0
-        out[4] = -(body.turn_spring * ty + body.turn_damping * wy) if is_felt else 0.0
-        out[5] = -(body.turn_spring * tz + body.turn_damping * wz) if is_felt else 0.0
-        state[KEPT : KEPT + 6] = out[0:6]
+        if hand[IS_OPEN] == 0.0:
+            state[RISEN] = min(state[RISEN] + passed, 1.0)
+        kept[:] = 0.0
+        if frame[HITS] > 0.0:
+            push_hand(body, state, hand, pose, center, place.size, kept)
+            if not is_finite(kept, 0, 6):  # the next frame heals the state
+                kept[:] = 0.0
+    if hand[IS_OPEN] != 0.0:
+        state[RISEN] = max(state[RISEN] - passed, 0.0)
+    for axis in range(6):
+        out[axis] = (1.0 - faded) * state[RISEN] * kept[axis]
     out[HITS] = frame[HITS]
     out[CONTACTS] = frame[CONTACTS]
     out[UNKNOWNS] = n_unknown

@@ -1,10 +1,25 @@
 """How a hand carries the handle: scale, and the offset that a clutch leaves between them."""
 
+import math
+
 from hapticdb.kernels._jit import entry
 from hapticdb.kernels.motion import product, quaternion_in
 
 POSITION, QUATERNION, VELOCITY = 0, 3, 7
-"""Where a hand (14,) has what; an offset (7,) has the first two."""
+"""Where a hand (15,) has what; an offset (7,) has the first two."""
+
+
+@entry
+def is_somewhere(pose, velocity):
+    """Whether a pose (4, 4) and a velocity (6,) are all finite."""
+    for row in range(3):
+        for column in range(4):
+            if not math.isfinite(pose[row, column]):
+                return False
+    for axis in range(6):
+        if not math.isfinite(velocity[axis]):
+            return False
+    return True
 
 
 @entry
@@ -25,7 +40,7 @@ def grip(pose, scale, offset, hand):
 def carry(pose, velocity, scale, offset, hand):
     """Where the handle is, and how fast, for a hand at pose (4, 4) with velocity (6,).
 
-    Into hand (14,); without an offset, at scale 1, it is where the hand is, exactly.
+    Into hand (15,); without an offset, at scale 1, it is where the hand is, exactly.
     """
     w, x, y, z = quaternion_in(pose)
     w, x, y, z = product(w, x, y, z, offset[3], offset[4], offset[5], offset[6])

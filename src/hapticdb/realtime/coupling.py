@@ -20,6 +20,10 @@ class Coupling:
     lever then moves no point more than twice as easily as one at the centre, so that long tools are
     as stable as round ones. Stiffness and damping of turns are those of moves, times r^2.
 
+    In contact the spring is stretched by half a voxel at most, and the damper pulls no harder than
+    that spring, so that the force is `stiffness` times a voxel at most, however fast the hand is
+    said to be; likewise for turns. What is sent to the device is about the handle's origin.
+
     Attributes
     ----------
     mass : float
@@ -28,7 +32,8 @@ class Coupling:
         Of the spring, N/m.
     hold, fade : float
         Seconds that the last wrench is kept where cells are unknown, and in which it then falls to
-        zero.
+        zero; it rises again within `fade`, as it does when a session starts, and as it falls and
+        rises when the clutch opens and closes.
     most_substeps : int
         Of a period; the rest of a period that needs more is dropped.
 

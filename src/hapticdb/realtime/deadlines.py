@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+from hapticdb.errors import UsageError
 from hapticdb.realtime.report import LoopFigures, Times
 
 SPIN = 60e-6
@@ -17,6 +18,7 @@ SWITCH_INTERVAL = 1e-4
 _PR_SET_TIMERSLACK = 29
 _PR_GET_TIMERSLACK = 30
 DEFAULT_SLACK_NS = 50_000
+MOST_PROCESSORS = 4096
 
 
 @dataclass(frozen=True)
@@ -30,12 +32,23 @@ class Timing:
     is_fifo : bool
         Ask for `SCHED_FIFO`, where the system allows it.
     processor : int or None
-        Number of the processor that the loop is bound to.
+        Number of the processor that the loop is bound to, where the system allows it.
+
+    Raises
+    ------
+    UsageError
+        When no processor can have that number.
     """
 
     rate: float = 1000.0
     is_fifo: bool = False
     processor: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.processor is not None and not 0 <= self.processor < MOST_PROCESSORS:
+            raise UsageError(
+                f"processor {self.processor:.10g}: give its number, 0 to {MOST_PROCESSORS - 1}"
+            )
 
 
 class Deadlines:

@@ -11,6 +11,7 @@ from hapticdb.kernels import cell_table as kernels
 from hapticdb.kernels.cells import (
     CONTACTS,
     DEEPEST,
+    GROUP,
     HITS,
     MOST_MISSED,
     RESULTS,
@@ -26,8 +27,8 @@ from hapticdb.realtime.residency import Residency
 
 RUN = 64
 """Points of a cluster."""
-CLUSTERED_FROM = 2000
-"""Points from which clusters pay: below, a frame is over before they would have saved anything."""
+FLAT_RUN = 512
+"""Points that are placed at once without clusters: as many as a processor's first cache holds."""
 LEAST_FOUND = 1 << 16
 
 Floats = NDArray[np.float64]
@@ -59,17 +60,20 @@ def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) ->
     voxel_size : float
         Metres; spheres are a thousandth of it larger, above all rounding.
     run : int or None
-        Points of a cluster, 0 for no clusters; what pays at this number of points unless given.
+        Points of a cluster, 0 for no clusters; 64 unless given.
     """
     if run is None:
-        run = RUN if len(shell) >= CLUSTERED_FROM else 0
+        run = RUN if len(shell) > RUN else 0
     points = np.hstack([shell.points, shell.normals])
     spheres = np.empty((-(-len(points) // run) if run else 0, 4))
+    groups = np.empty((-(-len(spheres) // GROUP), 4))
     if run:
         bounding_spheres(points, run, 1e-3 * voxel_size, spheres)
-    run = run or RUN
+        bounding_spheres(points, GROUP * run, 1e-3 * voxel_size, groups)
+    run = run or min(len(points), FLAT_RUN)
     columns = np.ascontiguousarray(shell.points.T)
-    return Clusters(points, np.array(shell.center), spheres, run, columns, np.empty((6, run)))
+    scratch = np.empty((6, run))
+    return Clusters(points, np.array(shell.center), spheres, groups, run, columns, scratch)
 
 
 class Frames:

@@ -7,8 +7,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.contact import is_rigid
-from hapticdb.kernels.coupling import HAND_VELOCITY
-from hapticdb.kernels.handle import carry, grip
+from hapticdb.kernels.coupling import HAND_VELOCITY, IS_OPEN, IS_STALE
+from hapticdb.kernels.handle import carry, grip, is_somewhere
 from hapticdb.poses import quaternion_of
 from hapticdb.realtime.devices import Reading, pose_at
 
@@ -19,7 +19,8 @@ class Handle:
     """Where the hand is in the scene: the handle, which the tool is pulled to.
 
     While the clutch is open the hand moves and the handle stays; when it closes the handle goes on
-    from there. A handle holds the state of one session.
+    from there. A reading that is not finite leaves the handle nowhere, its x not a number, until
+    the next that is. A handle holds the state of one session.
 
     Parameters
     ----------
@@ -51,25 +52,49 @@ class Handle:
             raise UsageError("a handle starts at a pose that is a rigid transform")
         self.is_open = False
         self._offset = np.zeros(7)  # of the handle beyond the hand: position and turn
+        self._is_placed = False
+        self._x = 0.0  # where the handle was before it was nowhere
 
     def start(self, reading: Reading, hand: Floats) -> None:
-        """Place the handle for a reading, at rest: into hand (HAND,), its last number left."""
+        """Place the handle for a reading, at rest: into hand (HAND,), its `IS_STALE` left.
+
+        When the reading is not finite, the next that is places it, in `follow`.
+        """
         self.is_open = False
-        self._offset[:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+        self._is_placed = is_somewhere(reading.pose, reading.velocity)
+        hand[:IS_STALE] = 0.0
+        hand[3] = 1.0
+        hand[IS_OPEN] = 0.0
         if self._start is not None:
             hand[:3] = self._start[:3, 3]
             hand[3:7] = quaternion_of(self._start[:3, :3])[0]
-            grip(reading.pose, self.scale, self._offset, hand)
+        # also where it is not needed: what is compiled before the loop runs is not compiled in it
+        grip(reading.pose, self.scale, self._offset, hand)
+        if self._start is None:
+            self._offset[:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
         carry(reading.pose, reading.velocity, self.scale, self._offset, hand)
         hand[HAND_VELOCITY : HAND_VELOCITY + 6] = 0.0
+        if not self._is_placed:
+            hand[:IS_STALE] = (math.nan, 0.0, 0.0, 1.0, *(0.0,) * 9)
 
     def follow(self, reading: Reading, hand: Floats) -> None:
         """Move the handle on to where a reading carries it: into hand (HAND,)."""
+        if not is_somewhere(reading.pose, reading.velocity):
+            if not math.isnan(hand[0]):
+                self._x = hand[0]
+                hand[0] = math.nan
+            return
+        if not self._is_placed:
+            self.start(reading, hand)
+        elif math.isnan(hand[0]):
+            hand[0] = self._x
         if reading.buttons & self._bit:
             self.is_open = True
+            hand[IS_OPEN] = 1.0
             hand[HAND_VELOCITY : HAND_VELOCITY + 6] = 0.0
             return
         if self.is_open:
             self.is_open = False
+            hand[IS_OPEN] = 0.0
             grip(reading.pose, self.scale, self._offset, hand)
         carry(reading.pose, reading.velocity, self.scale, self._offset, hand)

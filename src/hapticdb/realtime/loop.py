@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import HapticDBError
+from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.kernels import coupling as kernels
 from hapticdb.kernels import servo
@@ -33,6 +33,7 @@ from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
 from hapticdb.realtime.devices import (
     Device,
+    Reading,
     SupportsClose,
     SupportsEnd,
     SupportsOpen,
@@ -41,7 +42,6 @@ from hapticdb.realtime.devices import (
 from hapticdb.realtime.frames import clusters_of
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.prefetch import (
-    ACTIVE,
     ASKED_TO_END,
     DONE,
     HANDLE,
@@ -54,7 +54,7 @@ from hapticdb.realtime.prefetch import (
 from hapticdb.realtime.process import Voice, parent_is_gone
 from hapticdb.realtime.recorded import State
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
-from hapticdb.realtime.table import HEARTBEAT, STOP, CellTable
+from hapticdb.realtime.table import ACTIVE, HEARTBEAT, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
 """Length of the empty loop, at most: shorter sessions have shorter ones."""
@@ -64,7 +64,7 @@ LOOK_EVERY = 0.25
 """Seconds between what the fetching process is told, between names asked for, and between looks
 whether the process that started the loop is still there."""
 WARM_PATIENCE = 30.0
-"""Seconds that the loop waits for its first cells."""
+"""Seconds that the loop waits for its first cells, and for a device to say where it is."""
 
 
 @dataclass(frozen=True)
@@ -119,6 +119,7 @@ class Loop:
             desk.sequence[row : row + 1], desk.state[row], desk.missed[row], desk.voxels[row]
         )
         self.counts = Counts()
+        self.is_warm = False
         self.lateness, self.elapsed = Times(), Times()
 
     # -- before the first frame --------------------------------------------------------------
@@ -132,6 +133,7 @@ class Loop:
         while time.monotonic() - started < WARM_PATIENCE and not self._is_left():
             if asked and state[HEARD] >= asked:
                 if state[MISSING] == 0:
+                    self.is_warm = True
                     break
                 asked = 0
             if not asked:  # a hand of flesh does not wait: where it is by now is what counts
@@ -147,9 +149,23 @@ class Loop:
         """Put the tool where the hand is, at rest."""
         if isinstance(self.device, SupportsRewind):
             self.device.rewind()
-        self.request.handle.start(self.device.read(), self.hand)
+        self.request.handle.start(self._read(), self.hand)
         self.state[:] = 0.0
         self.state[:7] = self.hand[:7]
+
+    def _read(self) -> Reading:
+        """Read where the hand is: a device that has just been opened may not know at once."""
+        until = time.monotonic() + WARM_PATIENCE
+        reading = self.device.read()
+        while not (np.isfinite(reading.pose).all() and np.isfinite(reading.velocity).all()):
+            if time.monotonic() > until or self._is_left():
+                raise DeviceError(
+                    f"the device has not said where it is within {WARM_PATIENCE:g} s, its numbers "
+                    "are not finite: check its connection and calibration"
+                )
+            time.sleep(1e-3)
+            reading = self.device.read()
+        return reading
 
     def warm_up(self) -> None:
         """Run every kernel of a frame, on the spot, until no more of them is compiled."""
@@ -157,7 +173,7 @@ class Loop:
             self.device.open()
         self._place()
         for at in range(3):
-            reading = self.device.read()
+            reading = self._read()
             for buttons in (-1, 0):  # a clutch that opens, and closes
                 self.request.handle.follow(reading._replace(buttons=buttons), self.hand)
             self._step(1e-3, is_stale=False)
@@ -177,17 +193,28 @@ class Loop:
             self.hand, dt, self.met, self.missed, self.frame, self.out,
         )  # fmt: skip
 
-    def _step_exactly(self, dt: float) -> None:
-        """Advance once all cells that it needs are there, however long that takes."""
+    def _step_exactly(self, dt: float, ends: int) -> None:
+        """Advance once all cells that it needs are there; until then there is no force for long.
+
+        The session's end, ns, is not waited beyond.
+        """
+        clock = time.perf_counter_ns
+        holds = clock() + round(min(self.request.coupling.hold, 1e9) * 1e9)
+        is_let_go = False
         before, met, frame = self.state.copy(), self.met.copy(), self.frame.copy()
         self._step(dt, is_stale=False)
-        while self.out[UNKNOWNS] and not self._is_left():
+        while self.out[UNKNOWNS] and clock() < ends and not self._is_left():
+            if not is_let_go and clock() > holds:
+                self.device.apply(np.zeros(6))
+                is_let_go = True
             self.state[:] = before
             self.met[:] = met
             self.frame[:] = frame
             self._tell()
             time.sleep(2e-4)
             self._step(dt, is_stale=False)
+        if is_let_go and self.out[UNKNOWNS]:
+            self.out[:6] = 0.0
 
     def _tell(self) -> None:
         """Say where tool and hand are, and which cells the last frame missed."""
@@ -244,6 +271,7 @@ class Loop:
         staleness = round(min(request.staleness, 1e9) * 1e9)
         ends = device if isinstance(device, SupportsEnd) else None
         deadlines = Deadlines(round(1e9 / rate), self.lateness, self.elapsed)
+        over = deadlines.started + round(request.seconds * 1e9)
         while deadlines.passed < n_deadlines:
             at = deadlines.frames
             begun = deadlines.wait()
@@ -251,7 +279,7 @@ class Loop:
             request.handle.follow(reading, self.hand)
             is_stale = begun - control[HEARTBEAT] > staleness
             if request.is_waiting:
-                self._step_exactly(deadlines.dt)
+                self._step_exactly(deadlines.dt, over)
             else:
                 self._step(deadlines.dt, is_stale=is_stale)
             device.apply(self.out[:6])
@@ -300,9 +328,11 @@ class Loop:
                 counts.held_frames += 1
                 state |= State.HELD
             if flags & kernels.IS_FADING:
-                state |= State.STALE
+                state |= State.FADING
             if flags & kernels.IS_DROPPED:
                 counts.dropped_frames += 1
+        if flags & (kernels.IS_CUT | kernels.IS_STOPPED):
+            counts.cut_frames += 1
         if is_stale:
             counts.stale_frames += 1
         if is_clutch_open:
@@ -347,6 +377,6 @@ def work(request: LoopRequest, voice: Voice) -> None:
             if n_compiled() != compiled:
                 raise HapticDBError("a kernel was compiled while the loop ran: report this")
         loop.counts.conditions.update(granted)
-        voice.say("done", LoopAnswer(figures, empty, loop.counts, warm_up))
+        voice.say("done", LoopAnswer(figures, empty, loop.counts, warm_up, loop.is_warm))
     finally:
         loop.close()

@@ -32,22 +32,6 @@ from hapticdb.realtime.wishes import Wish
 from hapticdb.store.base import NO_KEYS, Keys, Store, SupportsWatch
 from hapticdb.store.connect import open_store
 
-__all__ = [
-    "ACTIVE",
-    "ASKED_TO_END",
-    "DONE",
-    "HANDLE",
-    "HEARD",
-    "MISSING",
-    "RADIUS",
-    "TOOL",
-    "VELOCITY",
-    "FetchRequest",
-    "Fetching",
-    "Wrap",
-    "fetch",
-]
-
 TOOL, HANDLE, VELOCITY, RADIUS = 1, 4, 7, 10
 MISSING, HEARD, ASKED_TO_END, DONE = 16, 17, 18, 19
 """Where a row of `Desk.state` has what, beside `ACTIVE`: centre of the tool and of where
@@ -67,6 +51,8 @@ ASK_EVERY = 5e-3
 """Seconds between questions for the objects that a tool touches."""
 POLL_EVERY = 0.02
 """Seconds between questions for the revision, where an engine cannot tell of commits."""
+CONFIRM_EVERY = 0.1
+"""Where it can, which may cost no round trip: seconds until it is asked whether it is there."""
 RELEASE_EVERY = 1.0
 """Seconds between looks for sessions whose processes have ended."""
 RETRY = (0.05, 0.5)
@@ -134,7 +120,9 @@ class Fetching:
         self._headings: dict[int, _Heading] = {}
         self._seen = -1
         self._now = clock()
-        self._looked_at = self._asked_at = self._released_at = self._now
+        self._asked_at = self._released_at = self._now
+        self._confirmed_at = -np.inf
+        self._is_confirmed = False
 
     def _open(self) -> Store:
         store = open_store(self.request.url, read_only=True)
@@ -166,9 +154,11 @@ class Fetching:
     def round(self) -> bool:
         """Look for writes, bring in a batch, name objects; whether any cell came."""
         before, self._now = self._now, self.clock()
-        confirmed = time.monotonic_ns()
+        begun = time.monotonic_ns()
+        self._is_confirmed = False
         if self._has_changed():
             self.residency.refresh()
+            self._is_confirmed = True
             for heading in self._headings.values():
                 heading.asked = b""
         is_busy = self._bring_in(self._now - before)
@@ -178,17 +168,20 @@ class Fetching:
         if self._now - self._released_at >= RELEASE_EVERY:
             self._released_at = self._now
             self.table.release_dead()
-        # at the end: nothing that was asked went unanswered; all that is resident was true before
-        self.table.cells.control[HEARTBEAT] = confirmed
-        self.table.cells.control[AWAY] = 0
+        if self._is_confirmed:
+            # at the end: nothing that was asked went unanswered; all that is resident was true then
+            self._confirmed_at = self._now
+            self.table.cells.control[HEARTBEAT] = begun
+            self.table.cells.control[AWAY] = 0
         return is_busy
 
     def _has_changed(self) -> bool:
-        if isinstance(self.store, SupportsWatch):
-            return self.store.has_changed()
-        if self._now - self._looked_at < POLL_EVERY:
+        is_watched = isinstance(self.store, SupportsWatch)
+        if isinstance(self.store, SupportsWatch) and self.store.has_changed():
+            return True
+        if self._now - self._confirmed_at < (CONFIRM_EVERY if is_watched else POLL_EVERY):
             return False
-        self._looked_at = self._now
+        self._is_confirmed = True
         return self.store.revision() != self.residency.revision
 
     # -- cells -------------------------------------------------------------------------------
@@ -234,6 +227,7 @@ class Fetching:
         if not len(missing):
             return False
         loaded = residency.load(missing[:BATCH])
+        self._is_confirmed |= loaded.ranges > 0  # none is asked where there is no room
         self._note(loaded)
         return loaded.cells > 0
 
@@ -314,8 +308,10 @@ class Fetching:
     def reopen(self) -> None:
         """Open the database anew and catch up with what was written meanwhile."""
         self.close()
+        before = _identity_of(self.store)
         self.store = self._open()
-        self.residency.reopened(self.store)
+        self._confirmed_at = -np.inf
+        self.residency.reopened(self.store, is_same=_identity_of(self.store) == before)
         self._seen = -1
 
     def close(self) -> None:
@@ -324,28 +320,43 @@ class Fetching:
             self.store.close()
 
 
+def _identity_of(store: Store) -> object:
+    """What tells a store's file from another at the same path; servers have none."""
+    return getattr(store, "identity", None)
+
+
 def fetch(request: FetchRequest, voice: Voice) -> None:
     """Fetch until told to stop, whatever happens to the database meanwhile.
 
     Only who fetches first fails when it cannot be opened; who goes on with the table of one that
     has ended tries again.
+
+    Raises
+    ------
+    GridError
+        When an environment of another grid has taken the place of the request's.
     """
     table = CellTable(request.descriptor, request.n_slots)
     is_first = table.version == FIRST_VERSION
     fetching: Fetching | None = None
     patience, at_most = RETRY
-    is_lost = False
+    is_lost = is_ready = False
     while not table.cells.control[STOP] and not parent_is_gone():
         try:
             if fetching is None:
                 fetching = Fetching(request)
-                fetching.warm_up()
-                voice.say("ready", fetching.store.engine)
             elif is_lost:
                 fetching.reopen()
-            if not fetching.round():
+            if not is_ready:
+                fetching.warm_up()
+            is_busy = fetching.round()
+            if not is_ready:
+                voice.say("ready", fetching.store.engine)
+            if not is_busy:
                 time.sleep(IDLE)
-            is_lost, patience = False, RETRY[0]
+            is_lost, is_ready, patience = False, True, RETRY[0]
+        except GridError:
+            raise
         except (HapticDBError, OSError):
             if is_first and fetching is None:
                 raise

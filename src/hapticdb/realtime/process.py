@@ -134,6 +134,14 @@ class Process:
             self._popen.wait()
 
 
+class _Ended(SystemExit):
+    """To end without a word: asked to by the system, or nobody is there who would hear it."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(status)
+        self.status = status
+
+
 class Voice:
     """What a process says to the one that started it."""
 
@@ -151,15 +159,17 @@ class Voice:
 def serve(work: str) -> None:
     """Do what the request says, in the process that `Process` started, and end it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    status = 0
     voice = Voice(os.fdopen(os.dup(1), "wb"))
     os.dup2(2, 1)  # drivers print; their words must not mix with messages
     try:
-        sys.path[:] = pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
+        signal.signal(signal.SIGTERM, _end)
+        sys.path[:] = _load()
         module, name = work.split(":")
         function: Callable[[Any, Voice], None] = getattr(import_module(module), name)
         function(_request(), voice)
-    except EOFError:
-        pass  # who started this has gone before it said what to do
+    except _Ended as ended:
+        status = ended.status
     except HapticDBError as error:
         voice.say("error", error)
     except BaseException as error:  # noqa: BLE001 - whatever it is, who waits must hear of it
@@ -171,13 +181,27 @@ def serve(work: str) -> None:
             "error", HapticDBError(f"the session's process ended: {type(error).__name__}: {cause}")
         )
     sys.stderr.flush()
-    os._exit(0)  # no tidying up of drivers and buffers that another process still uses
+    os._exit(status)  # no tidying up of drivers and buffers that another process still uses
+
+
+def _end(number: int, _: object) -> None:
+    """Leave by way of every `finally`: a device must not keep its force."""
+    signal.signal(number, signal.SIG_IGN)  # nor be left half closed by a second one
+    raise _Ended(128 + number)
+
+
+def _load() -> Any:  # noqa: ANN401 - whatever was sent
+    """Next of what the parent has sent."""
+    try:
+        return pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
+    except (EOFError, pickle.UnpicklingError):  # it has gone before all was said
+        raise _Ended(0) from None
 
 
 def _request() -> object:
     """Read what the process is to do, once the modules that it names can be found."""
     try:
-        return pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
+        return _load()
     except (AttributeError, ImportError) as error:
         raise UsageError(
             f"a session's process cannot find what it was given ({error}): define devices in a "

@@ -13,7 +13,7 @@ class State(enum.IntFlag):
 
     HELD = 1
     """The wrench was kept from an earlier frame."""
-    STALE = 2
+    FADING = 2
     """It was kept for so long that it fell towards zero."""
     CLUTCH_OPEN = 4
     """The handle did not follow the hand."""
@@ -28,8 +28,8 @@ FRAME: np.dtype[np.void] = np.dtype(
         ("hand", "<f8", (7,)),  # the handle: position m, unit quaternion, scalar first
         ("hand_velocity", "<f8", (6,)),  # m/s, rad/s
         ("tool", "<f8", (7,)),  # the simulated body, likewise
-        ("wrench", "<f8", (6,)),  # contact wrench at `tool`, on the tool: N, N m
-        ("applied", "<f8", (6,)),  # sent to the device: N, N m
+        ("wrench", "<f8", (6,)),  # contact wrench at `tool`, about its centre: N, N m
+        ("applied", "<f8", (6,)),  # sent to the device, about the handle's origin: N, N m
         ("hits", "<i4"),
         ("contacts", "<i4"),
         ("unknown", "<i4"),  # points in cells that were not resident

@@ -82,6 +82,7 @@ class Counts:
     unknown_points: int = 0
     substeps: int = 0
     dropped_frames: int = 0
+    cut_frames: int = 0
     peak_force: float = 0.0
     peak_torque: float = 0.0
     deepest: float = 0.0
@@ -95,6 +96,7 @@ class LoopAnswer(NamedTuple):
     empty: LoopFigures
     counts: Counts
     warm_up: float
+    is_warm: bool
 
 
 @dataclass(frozen=True)
@@ -117,10 +119,15 @@ class Report:
         Of the coupling, in all frames.
     dropped_frames : int
         Frames whose period was too long to be simulated to its end.
+    cut_frames : int
+        Frames in which the tool was held back at surfaces: a step was cut back, or not made.
     peak_force, peak_torque, deepest : float
         Greatest norm sent to the device, N and N m; deepest contact, metres.
     warm_up : float
-        Seconds until all wanted cells were resident, before the first frame.
+        Seconds until all wanted cells were resident, before the first frame; after
+        `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
+    is_warm : bool
+        Whether they were there.
     cache : CacheFigures
         What the fetching process did.
     objects : tuple of int
@@ -141,10 +148,12 @@ class Report:
     unknown_points: int
     substeps: int
     dropped_frames: int
+    cut_frames: int
     peak_force: float
     peak_torque: float
     deepest: float
     warm_up: float
+    is_warm: bool
     cache: CacheFigures
     objects: tuple[int, ...] = ()
     recorded_frames: int = 0

@@ -37,6 +37,15 @@ FEW_CELLS = 1 << 14
 """In the ranges of a write: more, and what is known is looked through instead of them."""
 
 
+def check_cells(store: Store) -> None:
+    """Refuse an environment whose curve has no cells."""
+    if not store.grid.is_hierarchical:
+        raise UsageError(
+            f"{store.url} is in lexicographic order, which has no cells: "
+            "'hapticdb copy' it to one with --curve z"
+        )
+
+
 class Loaded(NamedTuple):
     """What a load did: cells brought in, rows read, ranges asked, seconds that the database took.
 
@@ -92,11 +101,7 @@ class Residency:
         *,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
-        if not store.grid.is_hierarchical:
-            raise UsageError(
-                f"{store.url} is in lexicographic order, which has no cells: "
-                "'hapticdb copy' it to one with --curve z"
-            )
+        check_cells(store)
         self.store = store
         self.table = table
         self.exclude = as_ids(exclude)
@@ -147,8 +152,10 @@ class Residency:
         table.control[LOADING] = 0
         self._wait_for_readers(self.table.version)  # what older versions showed is free now
 
-    def reopened(self, store: Store) -> None:
+    def reopened(self, store: Store, *, is_same: bool = True) -> None:
         """Go on with another connection to the same environment, after the first was lost.
+
+        What came in its place, another file of the same grid, makes all cells unknown.
 
         Raises
         ------
@@ -161,6 +168,8 @@ class Residency:
             )
         self.store = store
         self._version = -1
+        if not is_same:
+            self._revision = -1
         taken = {slot for _, slots in self._limbo for slot in slots}
         self._free = [  # those, too, that a load had taken when the connection was lost
             slot

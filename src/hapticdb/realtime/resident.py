@@ -1,15 +1,17 @@
 """ResidentCells: a table of cells and the process that fills it, for one or several sessions."""
 
+import threading
 import time
 from collections.abc import Iterable
 from typing import NamedTuple, Self
 
-from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.errors import GridError, HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.query import as_ids
 from hapticdb.realtime import prefetch
 from hapticdb.realtime.prefetch import FetchRequest, Wrap
 from hapticdb.realtime.process import Process
+from hapticdb.realtime.residency import check_cells
 from hapticdb.realtime.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellTable
 from hapticdb.store.connect import open_store
 
@@ -85,18 +87,20 @@ class ResidentCells:
         self._request = FetchRequest(
             url, self.table.descriptor, self.table.n_slots, self.grid, self.exclude, wrap
         )
-        self._process = self._started()
+        try:
+            self._process = self._started()
+        except BaseException:
+            self.table.close()
+            raise
         self._restarted_at = 0.0
+        self._failure: GridError | None = None
+        self._supervising = threading.Lock()
 
     def _looked_up(self) -> Grid:
         """Grid of the environment, which must have cells, and the objects that are left out."""
         store = open_store(self.url, read_only=True)
         try:
-            if not store.grid.is_hierarchical:
-                raise UsageError(
-                    f"{store.url} is in lexicographic order, which has no cells: "
-                    "'hapticdb copy' it to one with --curve z"
-                )
+            check_cells(store)
             for object_id in self.exclude:
                 store.object(object_id)
             return store.grid
@@ -135,17 +139,40 @@ class ResidentCells:
         return bool(control[AWAY]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
 
     def supervise(self) -> None:
-        """Start the fetching process again if it has ended; to be called now and then."""
-        now = time.monotonic()
-        if self._process.is_alive or now - self._restarted_at < RESTART_EVERY:
+        """Start the fetching process again if it has ended; to be called now and then.
+
+        Raises
+        ------
+        GridError
+            When an environment of another grid has taken the place of this one.
+        """
+        with self._supervising:
+            if self._process.is_alive or self.table.cells.control[STOP]:
+                return
+            self._hear_last_words()
+            now = time.monotonic()
+            if now - self._restarted_at < RESTART_EVERY:
+                return
+            self._restarted_at = now
+            self.restarts += 1
+            ended = self._process
+            # the table goes on as it is: its last version is whole, whatever the process was doing
+            self._process = Process(
+                "hapticdb.realtime.prefetch:fetch", self._request, [self.table.descriptor]
+            )
+            ended.end()
+
+    def _hear_last_words(self) -> None:
+        """Raise what no new process would get over; what else ended one is tried again."""
+        try:
+            while self._failure is None and self._process.receive(0.0):
+                pass
+        except GridError as error:
+            self._failure = error
+        except HapticDBError:
             return
-        self._restarted_at = now
-        self.restarts += 1
-        self._process.end()
-        # the table goes on as it is: its last version is whole, whatever the process was doing
-        self._process = Process(
-            "hapticdb.realtime.prefetch:fetch", self._request, [self.table.descriptor]
-        )
+        if self._failure is not None:
+            raise self._failure
 
     def figures(self) -> CacheFigures:
         """What the fetching process has done so far."""
@@ -170,5 +197,6 @@ class ResidentCells:
     def close(self) -> None:
         """End the fetching process and give the memory back."""
         self.table.cells.control[STOP] = 1
-        self._process.end()
-        self.table.close()
+        with self._supervising:
+            self._process.end()
+            self.table.close()

@@ -29,6 +29,8 @@ Policy = Literal["hold", "wait"]
 RING_SECONDS = 4.0
 """Seconds of frames that wait in memory for whoever records them."""
 DRAIN_EVERY = 0.05
+FLUSH_EVERY = 1.0
+"""Seconds of frames that are lost at most when this process is killed."""
 START_PATIENCE = 120.0
 END_PATIENCE = 10.0
 FOREVER = 1e9
@@ -72,7 +74,7 @@ class Session:
     replace_recording : bool
         Begin it anew in a file that is there.
     is_fifo, processor
-        As `hapticdb.realtime.loop.Timing` has them.
+        As `hapticdb.realtime.deadlines.Timing` has them.
 
     Raises
     ------
@@ -119,6 +121,8 @@ class Session:
         self._row = self._memory = -1
         self._process: Process | None = None
         self._recorder: Recorder | None = None
+        self._is_recording = False
+        self._flushed = 0.0
         self._drained = self._lost = 0
         self._objects: set[int] = set()
         self._answer: LoopAnswer | None = None
@@ -142,6 +146,8 @@ class Session:
         table = self.cells.table
         if record is not None:
             self._recorder = Recorder(record, self._header(), replace=replace_recording)
+            self._is_recording = True
+            self._flushed = time.monotonic()
         n_ring = max(int(RING_SECONDS * self.timing.rate), 1024)
         self._memory = anonymous_memory("hapticdb-frames", ring_bytes(n_ring))
         self._ring = ring_of(self._memory, n_ring)
@@ -254,8 +260,9 @@ class Session:
         desk, done = self.cells.table.desk, self.n_frames
         ids = desk.ids[self._row]
         self._objects.update(ids[1 : 1 + int(ids[0])].tolist())
-        if self._recorder is None:
+        if self._recorder is None or not self._is_recording:
             return
+        self._is_recording = False  # unless this goes well: one that failed takes no more
         size = len(self._ring)
         if done - self._drained > size - 64:  # the loop may be writing over the oldest by now
             self._lost += done - self._drained - size // 2
@@ -263,6 +270,10 @@ class Session:
         rows = self._ring[np.arange(self._drained, done) % size]
         self._recorder.append(frames_of(rows))
         self._drained = done
+        if time.monotonic() - self._flushed >= FLUSH_EVERY:
+            self._recorder.flush()
+            self._flushed = time.monotonic()
+        self._is_recording = True
 
     def _report(self) -> Report:
         answer = self._answer
@@ -270,6 +281,7 @@ class Session:
         counts = answer.counts
         n_recorded = len(self._recorder) if self._recorder else 0
         if self._recorder is not None:
+            self._is_recording = False
             self._recorder.close()
         return Report(
             rate=self.timing.rate,
@@ -284,10 +296,12 @@ class Session:
             unknown_points=counts.unknown_points,
             substeps=counts.substeps,
             dropped_frames=counts.dropped_frames,
+            cut_frames=counts.cut_frames,
             peak_force=counts.peak_force,
             peak_torque=counts.peak_torque,
             deepest=counts.deepest,
             warm_up=answer.warm_up,
+            is_warm=answer.is_warm,
             cache=self.cells.figures(),
             objects=self.objects,
             recorded_frames=n_recorded,
@@ -301,6 +315,13 @@ class Session:
             self.ask_to_end()
             self._process.end()
             self._process = None
+        try:
+            if self._row >= 0:
+                self._drain()
+        finally:
+            self._let_go()
+
+    def _let_go(self) -> None:
         if self._row >= 0:
             self.cells.table.leave(self._row)
             self._row = -1

@@ -49,12 +49,12 @@ class ClearanceSearch:
         self._reach = limit + kernels.MARGIN + 0.5 * self._stride
         residency = frames.residency
         self._most = (residency.table.n_slots - 1) // 2
-        n_cells = (int(2.0 * self._reach / CELL) + 2) ** 3
-        if n_cells > self._most:
+        across = 2.0 * self._reach / CELL
+        if across > self._most or (int(across) + 2) ** 3 > self._most:
             size = limit * residency.grid.voxel_size
             raise UsageError(
-                f"clearance up to {size:.4g} m needs {n_cells} cells around a point, more than "
-                f"fit into {residency.table.size_bytes} bytes: give less, or a larger budget"
+                f"clearance up to {size:.4g} m needs more cells around a point than fit into "
+                f"{residency.table.size_bytes} bytes: give less, or a larger budget"
             )
         self.least = np.full(n_windows or 1, limit)
         self._bounds = kernels.Bounds(

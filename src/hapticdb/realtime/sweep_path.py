@@ -13,6 +13,8 @@ from hapticdb.poses import quaternion_of, rotation_of
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+MOST_SAMPLES = 1e9
+"""A path of more is in another unit than its environment, or takes days."""
 RIGID = 1e-6
 """What a rotation's columns may deviate from orthonormal ones, as in a frame."""
 
@@ -53,7 +55,7 @@ class Path:
         Raises
         ------
         UsageError
-            When there is none, or one that is not rigid.
+            When there is none, one that is not rigid, or the path is too long for its voxels.
         """
         given = _checked(poses)
         low, high = shell.points.min(axis=0), shell.points.max(axis=0)
@@ -63,13 +65,21 @@ class Path:
         quaternions = quaternion_of(rotations)
         centers = rotations @ center + given[:, :3, 3]
         turns = _turns_between(quaternions)
-        motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+        with np.errstate(over="ignore"):
+            motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
         motion += radius * np.linalg.norm(turns, axis=1)
         # a given rotation is not quite that of its quaternion, from which the samples between start
         off = radius * np.linalg.norm(rotations - rotation_of(quaternions), axis=(1, 2))
         slack = off[:-1] + off[1:]
         step = np.maximum(0.5 * voxel_size - slack, 0.25 * voxel_size)
-        counts = np.maximum(np.ceil(motion / step), 1.0).astype(np.int64)
+        with np.errstate(over="ignore"):
+            steps = np.maximum(np.ceil(motion / step), 1.0)
+            if steps.sum() > MOST_SAMPLES:
+                way = np.hypot.reduce(np.diff(centers, axis=0), axis=1).sum()
+                raise UsageError(
+                    f"the path moves {way:.4g} m in voxels of {voxel_size:.4g} m: check its unit"
+                )
+        counts = steps.astype(np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])
         travels = (motion / counts + slack) / voxel_size + kernels.CAUTION
         return cls(

@@ -87,6 +87,8 @@ class SQLiteStore:
         self._stamp = (
             sqlite_file.stamp(path) if read_only and sqlite_file.needs_immutable(path) else None
         )
+        self._file = sqlite_file.OpenedFile(path)
+        self.identity = self._file.identity
         self._depth = 0
         self._noticed = -1
         self._thread = get_ident()
@@ -163,9 +165,9 @@ class SQLiteStore:
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
         """All reads inside see one committed revision. May be nested."""
-        self._depth += 1
-        if self._depth == 1:
+        if self._depth == 0:
             self._fetch("BEGIN")
+        self._depth += 1
         try:
             yield
         finally:
@@ -378,12 +380,14 @@ class SQLiteStore:
         """Whether another connection has committed since `watch` or the last call.
 
         By the pragma, which looks at the file's log: the binding's own `data_version` says what the
-        last read has seen. Of an immutable opening by its stamp, and then for good.
+        last read has seen. Of an immutable opening by its stamp, and then for good. Raises
+        ConnectionLostError when the path leads to another file than the one that was opened.
         """
         check_outside(self._depth, self.url)
         if self._stamp is not None:
             check_thread(self._thread, self.url)
             return sqlite_file.stamp(self.path) != self._stamp
+        self._file.check()
         before = self._noticed
         self._noticed = self._fetch("PRAGMA data_version")[0][0]
         return self._noticed != before

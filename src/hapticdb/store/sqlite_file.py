@@ -2,6 +2,7 @@
 
 import contextlib
 import os
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import cast
@@ -10,6 +11,7 @@ import apsw
 
 from hapticdb.errors import (
     BusyError,
+    ConnectionLostError,
     DamagedError,
     DatabaseError,
     EnvironmentExistsError,
@@ -27,6 +29,8 @@ PAGE_BYTES = 8192
 """The paper's block."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
+LOOK_SECONDS = 0.25
+"""How long it may go unnoticed that a path leads to another file than before."""
 
 
 @contextlib.contextmanager
@@ -188,6 +192,38 @@ def stamp(path: Path) -> tuple[int, int, bool]:
     except FileNotFoundError:
         return 0, 0, False
     return status.st_mtime_ns, status.st_size, Path(f"{path}-wal").exists()
+
+
+class OpenedFile:
+    """The file that a path led to when it was opened; its engine keeps reading that one."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._due = 0.0
+        self.identity = self._found()
+
+    def check(self) -> None:
+        """Refuse to go on, now and then, when the path leads elsewhere.
+
+        Raises
+        ------
+        ConnectionLostError
+            When the file was moved, deleted or replaced.
+        """
+        if time.monotonic() < self._due:
+            return
+        if self._found() != self.identity:
+            raise ConnectionLostError(f"{self._path} is another file than before: open it again")
+        self._due = time.monotonic() + LOOK_SECONDS
+
+    def _found(self) -> tuple[int, int]:
+        try:
+            status = self._path.stat()
+        except OSError as error:
+            raise ConnectionLostError(
+                f"{self._path} cannot be reached any more ({error.strerror}): put it back"
+            ) from error
+        return status.st_dev, status.st_ino
 
 
 def needs_immutable(path: Path) -> bool:

@@ -45,6 +45,7 @@ SETTINGS = {
 }
 RECONNECT_SECONDS = 15.0
 FIRST_PAUSE_SECONDS = 0.05
+MOST_PAUSE_SECONDS = 0.5
 CONNECT_SECONDS = 10
 WRITE_TRIES = 3
 GRACE_MS = 3000
@@ -168,7 +169,7 @@ class Session:
                 if time.monotonic() + pause > deadline:
                     raise
                 time.sleep(pause)
-                pause = min(2 * pause, 2.0)
+                pause = min(2 * pause, MOST_PAUSE_SECONDS)
             else:
                 return
 

@@ -1,0 +1,181 @@
+"""The fetching process and what becomes of its file: gone, put back, another, of another grid."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hapticdb
+from hapticdb import Environment, PointShell
+from hapticdb.errors import GridError
+from hapticdb.realtime import prefetch, resident
+from hapticdb.realtime.prefetch import Fetching, FetchRequest
+from hapticdb.realtime.process import Process
+from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.table import LEAST_BUDGET, STOP, CellTable
+from hapticdb.store.sqlite_file import remove_file
+from hapticdb.testing import write_voxels
+from realtime.test_prefetch import Side, until
+from realtime.worlds import block, expected, ids_by_voxel, make
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> Environment:
+    made = make(tmp_path)
+    write_voxels(made.store, block((50, 50, 58), (78, 78, 63)))
+    return made
+
+
+@pytest.fixture
+def cells(env: Environment) -> Iterator[ResidentCells]:
+    with ResidentCells(env.url, budget_bytes=LEAST_BUDGET) as made:
+        yield made
+
+
+def replace(env: Environment, folder: Path, bits: int = 7) -> Environment:
+    """Put another environment, with another object, in the place of one; returns it, moved."""
+    folder.mkdir()
+    other = make(folder, bits=bits)
+    middle = other.grid.side // 2
+    corner = (middle - 2, middle - 8, middle - 8)
+    write_voxels(other.store, block(corner, (middle + 4, middle + 8, middle + 8)))
+    other.close()
+    env.close()
+    remove_file(Path(env.url))
+    Path(other.url).rename(env.url)
+    return hapticdb.open(env.url)
+
+
+def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
+    env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
+) -> None:
+    side, pose = Side(cells.table, env.grid, sphere), np.eye(4)
+    side.be_at(pose)
+    assert until(lambda: side.is_served)
+    naive = expected(ids_by_voxel(env), env.grid, sphere, pose)
+    Path(env.url).rename(tmp_path / "elsewhere")
+    assert until(lambda: cells.is_away)
+    (tmp_path / "elsewhere").rename(env.url)
+    assert until(lambda: not cells.is_away)
+    assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
+    assert cells.figures().losses == 1
+
+
+def test_another_file_of_the_same_grid_is_felt_instead(
+    env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
+) -> None:
+    side, pose = Side(cells.table, env.grid, sphere), np.eye(4)
+    side.be_at(pose)
+    assert until(lambda: side.is_served)
+    before = side.reader.feel(pose)[0]
+    other = replace(env, tmp_path / "other")
+    naive = expected(ids_by_voxel(other), other.grid, sphere, pose)
+    assert naive.hits != before
+    assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
+
+
+def test_another_grid_ends_the_fetching_and_is_told(
+    env: Environment, cells: ResidentCells, tmp_path: Path
+) -> None:
+    replace(env, tmp_path / "other", bits=6)
+    pid = cells.pid
+    told: list[str] = []
+
+    def supervise() -> None:
+        try:
+            cells.supervise()
+        except GridError as error:
+            told.append(str(error))
+
+    assert until(lambda: len(told) == 2, supervise)  # and whenever one asks
+    assert all("another environment than before: start the session again" in t for t in told)
+    assert "\n" not in told[0]
+    assert (cells.pid, cells.restarts) == (pid, 0)
+
+
+class Listener:
+    """Stands in for a `Voice`: what was said, and ends the fetching after it."""
+
+    def __init__(self, table: CellTable) -> None:
+        self.table = table
+        self.said: list[str] = []
+
+    def say(self, word: str, content: object = None) -> None:
+        assert content
+        self.said.append(word)
+        self.table.cells.control[STOP] = 1
+
+
+def test_a_connection_lost_while_warming_up_puts_ready_off(
+    env: Environment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    losses = iter([hapticdb.ConnectionLostError("gone")] * 2)
+    warm_up: Callable[[Fetching], None] = Fetching.warm_up
+
+    def lost_at_first(fetching: Fetching) -> None:
+        for error in losses:
+            raise error
+        warm_up(fetching)
+
+    monkeypatch.setattr(Fetching, "warm_up", lost_at_first)
+    monkeypatch.setattr(prefetch, "parent_is_gone", lambda: False)
+    with CellTable.create(LEAST_BUDGET) as table:
+        listener: Any = Listener(table)
+        prefetch.fetch(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid), listener)
+        assert listener.said == ["ready"]
+        assert next(losses, None) is None
+        assert table.desk.figures[prefetch.LOSSES] == 1
+
+
+def test_a_table_goes_when_its_process_does_not_start(
+    env: Environment, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made: list[CellTable] = []
+    create = CellTable.create
+
+    def noted(budget_bytes: int) -> CellTable:
+        made.append(create(budget_bytes))
+        return made[-1]
+
+    def refuse(_: ResidentCells) -> Process:
+        raise hapticdb.ConnectionLostError("gone")
+
+    monkeypatch.setattr(CellTable, "create", noted)
+    monkeypatch.setattr(ResidentCells, "_started", refuse)
+    with pytest.raises(hapticdb.ConnectionLostError):
+        ResidentCells(env.url)
+    assert [table.descriptor for table in made] == [-1]
+
+
+def test_threads_that_supervise_together_start_one_process(
+    cells: ResidentCells, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    os.kill(cells.pid, signal.SIGKILL)
+    assert cells._process.wait(10.0)
+    started: list[Process] = []
+    barrier = threading.Barrier(4)
+
+    def noted(*given: Any) -> Process:  # noqa: ANN401 - what a `Process` takes
+        started.append(Process(*given))
+        return started[-1]
+
+    def supervise() -> None:
+        barrier.wait()
+        cells.supervise()
+
+    monkeypatch.setattr(resident, "Process", noted)
+    monkeypatch.setattr(resident, "RESTART_EVERY", 0.0)
+    threads = [threading.Thread(target=supervise) for _ in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert len(started) == cells.restarts == 1
+    cells.close()
+    cells.supervise()
+    assert len(started) == 1

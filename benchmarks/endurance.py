@@ -247,6 +247,7 @@ def main() -> None:
         "--url", help="an environment on another server, which is not killed; it holds the sample"
     )
     args = parser.parse_args()
+    hapticdb.warm_up()  # what compiles for longer than errors are spared would never begin
     with tempfile.TemporaryDirectory(prefix="hapticdb-endurance-") as name:
         folder = Path(name)
         if args.url:

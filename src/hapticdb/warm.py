@@ -33,8 +33,8 @@ FACES = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], dtype=np.int64)
 def warm_up() -> None:
     """Compile every kernel, or load it from the cache, by using each once on a small scene.
 
-    Takes half a minute on a machine that never did it, and a second or two later. Afterwards no
-    import and no touch compiles anything (`tests/test_warm.py`).
+    Takes a minute or two on a machine that never did it, and a few seconds later. Afterwards no
+    import, touch, session or sweep compiles anything (`tests/test_warm.py`).
     """
     # a body with another inside: which of them is a void is asked only where there are two
     corners = np.concatenate([CORNERS, 0.1 + 0.1 * CORNERS])

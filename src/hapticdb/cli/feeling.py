@@ -8,7 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Interrupted, Json, UnitName, Url, ids_of, numbers_of
+from hapticdb.cli.root import (
+    Budget,
+    Exclude,
+    Interrupted,
+    Json,
+    Points,
+    ToolUnit,
+    Url,
+    ids_of,
+    numbers_of,
+)
 from hapticdb.cli.touching import shell_of
 
 if TYPE_CHECKING:
@@ -64,16 +74,11 @@ def feel(
         int | None,
         typer.Option(metavar="BUTTON", help="While it is down, 0 the first, only the hand moves."),
     ] = None,
-    exclude: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ID", help="Objects that are not felt; again, or 3,4, for more."),
-    ] = None,
+    exclude: Exclude = None,
     record: Annotated[
         str | None, typer.Option(metavar="FILE", help="Record the session: a new .hdbrec.")
     ] = None,
-    budget: Annotated[
-        float, typer.Option(metavar="MIB", help="Memory for resident cells.")
-    ] = 256.0,
+    budget: Budget = 256.0,
     policy: Annotated[
         PolicyName,
         typer.Option(
@@ -84,12 +89,8 @@ def feel(
         float, typer.Option(metavar="S", help="Silence of the database after which force falls.")
     ] = 1.0,
     stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")] = 1000.0,
-    tool_unit: Annotated[
-        UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
-    ] = None,
-    points: Annotated[
-        int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
-    ] = None,
+    tool_unit: ToolUnit = None,
+    points: Points = None,
     seed: Annotated[
         int | None,
         typer.Option(metavar="N", help="Of the points, and of a random hand.", show_default="0"),

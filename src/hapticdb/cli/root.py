@@ -17,6 +17,20 @@ Url = Annotated[
         metavar="URL", help="The environment: a path, sqlite:///path, postgresql://host/database."
     ),
 ]
+ToolUnit = Annotated[
+    UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
+]
+Points = Annotated[
+    int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
+]
+Seed = Annotated[
+    int | None, typer.Option(metavar="N", help="Seed of their places.", show_default="0")
+]
+Exclude = Annotated[
+    list[str] | None,
+    typer.Option(metavar="ID", help="Objects that are not felt; again, or 3,4, for more."),
+]
+Budget = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, an object a line.")]
 
 

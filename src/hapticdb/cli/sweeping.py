@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Json, UnitName, Url, ids_of
+from hapticdb.cli.root import Budget, Exclude, Json, Points, Seed, ToolUnit, Url, ids_of
 from hapticdb.cli.touching import DEFAULT_POINTS, shell_of
 
 if TYPE_CHECKING:
@@ -34,10 +34,7 @@ def sweep(
         str,
         typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header, metres."),
     ],
-    exclude: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ID", help="Objects that are not felt; again, or 3,4, for more."),
-    ] = None,
+    exclude: Exclude = None,
     clearance: Annotated[
         float | None,
         typer.Option(
@@ -46,18 +43,10 @@ def sweep(
             show_default="32 voxels",
         ),
     ] = None,
-    budget: Annotated[
-        float, typer.Option(metavar="MIB", help="Memory for resident cells.")
-    ] = 256.0,
-    tool_unit: Annotated[
-        UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
-    ] = None,
-    points: Annotated[
-        int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(metavar="N", help="Seed of their places.", show_default="0")
-    ] = None,
+    budget: Budget = 256.0,
+    tool_unit: ToolUnit = None,
+    points: Points = None,
+    seed: Seed = None,
     picture: Annotated[
         str | None, typer.Option(metavar="PNG", help="Draw the path, its hits and clearance.")
     ] = None,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Json, StrategyName, UnitName, Url, ids_of
+from hapticdb.cli.root import Exclude, Json, Points, Seed, StrategyName, ToolUnit, Url, ids_of
 
 if TYPE_CHECKING:
     from hapticdb.environment import Touch
@@ -28,23 +28,14 @@ def touch(
         str,
         typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header, metres."),
     ],
-    tool_unit: Annotated[
-        UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
-    ] = None,
-    points: Annotated[
-        int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(metavar="N", help="Seed of their places.", show_default="0")
-    ] = None,
+    tool_unit: ToolUnit = None,
+    points: Points = None,
+    seed: Seed = None,
     strategy: Annotated[StrategyName, typer.Option(help="How the database is asked.")] = "auto",
     maxgap: Annotated[
         int, typer.Option(metavar="KEYS", help="Of the strategy maxgap, in voxel keys.")
     ] = 500,
-    exclude: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ID", help="Objects that are not felt; again, or 3,4, for more."),
-    ] = None,
+    exclude: Exclude = None,
     stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")] = 1000.0,
     json: Json = False,
 ) -> None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels._jit import entry, leaf
 from hapticdb.kernels.cells import CONTACTS, DEEPEST, EMPTY_SLOT, HITS, Cells
 from hapticdb.kernels.contact import (
-    AVERAGE_FROM,
+    average_into,
     center_of,
     contact_depth,
     contact_force,
@@ -85,16 +85,7 @@ def dense_felt(bitmap, shell, pose, place, stiffness, met, out):  # type: ignore
             tx += x
             ty += y
             tz += z
-    out[0] = fx
-    out[1] = fy
-    out[2] = fz
-    out[3] = tx
-    out[4] = ty
-    out[5] = tz
-    if count >= AVERAGE_FROM:
-        tenth = count / 10.0
-        for axis in range(6):
-            out[axis] /= tenth
+    average_into(out, count, fx, fy, fz, tx, ty, tz)
     out[HITS] = count
     out[CONTACTS] = n_contacts
     out[DEEPEST] = deepest

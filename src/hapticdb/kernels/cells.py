@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import entry, inlined, leaf
 from hapticdb.kernels.contact import (
-    AVERAGE_FROM,
+    average_into,
     center_of,
     contact_depth,
     contact_force,
@@ -365,16 +365,7 @@ def felt(cells, which, shell, pose, place, stiffness, met, missed, out):
                 ty += y
                 tz += z
         start = end
-    out[0] = fx
-    out[1] = fy
-    out[2] = fz
-    out[3] = tx
-    out[4] = ty
-    out[5] = tz
-    if count >= AVERAGE_FROM:
-        tenth = count / 10.0
-        for axis in range(6):
-            out[axis] /= tenth
+    average_into(out, count, fx, fy, fz, tx, ty, tz)
     out[HITS] = count
     out[CONTACTS] = n_contacts
     out[UNKNOWNS] = n_unknown

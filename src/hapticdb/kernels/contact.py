@@ -54,20 +54,18 @@ def moment(rx, ry, rz, fx, fy, fz):
 
 
 @leaf
-def averaged(n_hits, fx, fy, fz, tx, ty, tz):
-    """Wrench (6,): divided by a tenth of the hits when there are ten or more."""
-    wrench = np.empty(6)
-    wrench[0] = fx
-    wrench[1] = fy
-    wrench[2] = fz
-    wrench[3] = tx
-    wrench[4] = ty
-    wrench[5] = tz
+def average_into(out, n_hits, fx, fy, fz, tx, ty, tz):
+    """Wrench into out (6+,): divided by a tenth of the hits when there are ten or more."""
+    out[0] = fx
+    out[1] = fy
+    out[2] = fz
+    out[3] = tx
+    out[4] = ty
+    out[5] = tz
     if n_hits >= AVERAGE_FROM:
         tenth = n_hits / 10.0
         for axis in range(6):
-            wrench[axis] /= tenth
-    return wrench
+            out[axis] /= tenth
 
 
 @leaf
@@ -374,7 +372,7 @@ def refine_kernel(
             tx += x
             ty += y
             tz += z
-    felt[:6] = averaged(count, fx, fy, fz, tx, ty, tz)
+    average_into(felt, count, fx, fy, fz, tx, ty, tz)
     n_ids = 0
     for row in range(row_ids.shape[0]):
         if touched[row]:
@@ -473,7 +471,9 @@ def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, 
             tx += x
             ty += y
             tz += z
-    return averaged(ordinals.shape[0], fx, fy, fz, tx, ty, tz)
+    wrench = np.empty(6)
+    average_into(wrench, ordinals.shape[0], fx, fy, fz, tx, ty, tz)
+    return wrench
 
 
 @entry

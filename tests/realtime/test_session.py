@@ -20,7 +20,7 @@ from hapticdb import Environment, PointShell
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
 from hapticdb.realtime.devices import Player
 from hapticdb.realtime.recorded import State
-from hapticdb.realtime.recording import Recording
+from hapticdb.realtime.recording import Recorder, Recording
 from hapticdb.realtime.replay import replay
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident import ResidentCells
@@ -247,6 +247,31 @@ def test_a_session_that_does_not_begin_leaves_no_recording(
         Session(cells, sphere, still(0.010), record=path)
     assert path.read_text() == "mine"
     assert not cells.table.desk.pids.any()
+
+
+@pytest.mark.parametrize("step", ["_open", "_begin"])
+def test_a_session_ended_while_its_recording_is_made_leaves_none(
+    cells: ResidentCells,
+    sphere: PointShell,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    step: str,
+) -> None:
+    path = tmp_path / "never.hdbrec"
+    whole = getattr(Recorder, step)
+
+    def ended(recorder: Recorder, **options: bool) -> None:
+        whole(recorder, **options)
+        raise SystemExit(143)
+
+    monkeypatch.setattr(Recorder, step, ended)
+    with pytest.raises(SystemExit):
+        Session(cells, sphere, still(0.010), record=path)
+    assert not path.exists()
+    path.write_text("mine")
+    with pytest.raises(SystemExit):
+        Session(cells, sphere, still(0.010), record=path, replace_recording=True)
+    assert path.exists()
 
 
 @pytest.mark.parametrize(

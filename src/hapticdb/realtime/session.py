@@ -3,7 +3,9 @@
 import os
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict
+from pathlib import Path
 from typing import Literal, Self
 
 import numpy as np
@@ -121,6 +123,7 @@ class Session:
         self._row = self._memory = -1
         self._process: Process | None = None
         self._recorder: Recorder | None = None
+        self._new: Path | None = None
         self._is_recording = False
         self._flushed = 0.0
         self._drained = self._lost = 0
@@ -130,8 +133,9 @@ class Session:
             self._begin(device, policy, staleness, seconds, record, replace_recording)
         except BaseException:
             self.close()
-            if self._recorder is not None and not replace_recording:
-                self._recorder.path.unlink(missing_ok=True)  # nothing was: the name stays free
+            if self._new is not None:  # nothing was recorded: the name stays free
+                with suppress(OSError):
+                    self._new.unlink()
             raise
 
     def _begin(
@@ -145,9 +149,7 @@ class Session:
     ) -> None:
         table = self.cells.table
         if record is not None:
-            self._recorder = Recorder(record, self._header(), replace=replace_recording)
-            self._is_recording = True
-            self._flushed = time.monotonic()
+            self._begin_recording(Path(record), replace_recording)
         n_ring = max(int(RING_SECONDS * self.timing.rate), 1024)
         self._memory = anonymous_memory("hapticdb-frames", ring_bytes(n_ring))
         self._ring = ring_of(self._memory, n_ring)
@@ -175,6 +177,17 @@ class Session:
         table.desk.pids[self._row] = self._process.pid
         if self._process.receive(START_PATIENCE) is None:
             raise HapticDBError("the loop's process did not start: its errors are above")
+
+    def _begin_recording(self, path: Path, is_replaced: bool) -> None:  # noqa: FBT001
+        # noted before the file is made: a signal may end the making at any moment
+        self._new = None if is_replaced or os.path.lexists(path) else path
+        try:
+            self._recorder = Recorder(path, self._header(), replace=is_replaced)
+        except UsageError:  # another has made it meanwhile
+            self._new = None
+            raise
+        self._is_recording = True
+        self._flushed = time.monotonic()
 
     def _header(self) -> Header:
         return Header(

@@ -321,6 +321,25 @@ def test_a_standby_tells_of_the_commits_that_it_follows(
         replica.stop()
 
 
+def test_an_environment_made_anew_is_told_from_the_one_before(
+    url: str, reader: PostgresStore, admin: psycopg.Connection
+) -> None:
+    write(url)
+    assert is_noticed(reader)
+    schema = sql.Identifier(parse(url).environment)
+    with admin.transaction():
+        admin.execute("SET LOCAL client_min_messages = warning")
+        admin.execute(sql.SQL("DROP SCHEMA {} CASCADE").format(schema))
+    create_store(url, GRID).close()
+    write(url)  # the same revision as before
+    for _ in range(2):
+        with pytest.raises(hapticdb.ConnectionLostError, match="another environment than before"):
+            is_noticed(reader)
+    again = PostgresStore.open(url, read_only=True)
+    assert again.identity != reader.identity
+    again.close()
+
+
 def test_words_of_strangers_on_the_channel_are_passed_over(
     url: str, reader: PostgresStore, admin: psycopg.Connection
 ) -> None:

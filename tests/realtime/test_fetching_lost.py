@@ -8,20 +8,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psycopg
 import pytest
+from psycopg import sql
 
 import hapticdb
-from hapticdb import Environment, PointShell
+from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import GridError
 from hapticdb.realtime import prefetch, resident
 from hapticdb.realtime.prefetch import Fetching, FetchRequest
 from hapticdb.realtime.process import Process
 from hapticdb.realtime.resident import ResidentCells
 from hapticdb.realtime.table import LEAST_BUDGET, STOP, CellTable
+from hapticdb.store.postgres.address import parse
 from hapticdb.store.sqlite_file import remove_file
 from hapticdb.testing import write_voxels
 from realtime.test_prefetch import Side, until
-from realtime.worlds import block, expected, ids_by_voxel, make
+from realtime.worlds import SIZE, block, expected, ids_by_voxel, make
+from servers import Place
 
 
 @pytest.fixture
@@ -77,6 +81,30 @@ def test_another_file_of_the_same_grid_is_felt_instead(
     naive = expected(ids_by_voxel(other), other.grid, sphere, pose)
     assert naive.hits != before
     assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
+
+
+def test_an_environment_of_a_server_made_anew_is_felt_instead(
+    place: Place, admin: psycopg.Connection, sphere: PointShell
+) -> None:
+    url, pose = place(), np.eye(4)
+    half = SIZE * (1 << 7) / 2
+    grid = Grid(SIZE, (-half, -half, -half), 7)
+    with hapticdb.create(url, grid) as env:
+        write_voxels(env.store, block((50, 50, 58), (78, 78, 63)))
+    with ResidentCells(url, budget_bytes=LEAST_BUDGET) as cells:
+        side = Side(cells.table, grid, sphere)
+        side.be_at(pose)
+        assert until(lambda: side.is_served)
+        before = side.reader.feel(pose)[0]
+        with admin.transaction():
+            admin.execute("SET LOCAL client_min_messages = warning")
+            schema = sql.Identifier(parse(url).environment)
+            admin.execute(sql.SQL("DROP SCHEMA {} CASCADE").format(schema))
+        with hapticdb.create(url, grid) as env:  # of the same revision
+            write_voxels(env.store, block((62, 56, 56), (68, 72, 72)))
+            naive = expected(ids_by_voxel(env), grid, sphere, pose)
+        assert naive.hits != before
+        assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
 
 
 def test_another_grid_ends_the_fetching_and_is_told(

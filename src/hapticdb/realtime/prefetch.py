@@ -321,7 +321,7 @@ class Fetching:
 
 
 def _identity_of(store: Store) -> object:
-    """What tells a store's file from another at the same path; servers have none."""
+    """What tells a store from another at the same URL."""
     return getattr(store, "identity", None)
 
 

@@ -158,15 +158,17 @@ def _check_writable(session: Session) -> None:
         )
 
 
-def read_environment(session: Session) -> tuple[Grid, Layout]:
-    """Grid and layout of an environment."""
+def read_environment(session: Session) -> tuple[Grid, Layout, int]:
+    """Grid and layout of an environment, and what tells it from another in its place."""
     rows = session.rows(
-        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout FROM environment"
+        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, tableoid::bigint"
+        " FROM environment"
     )
     if len(rows) != 1 or rows[0][6] not in LAYOUTS:
         raise failures.damaged(session.shown, "no grid")
-    size, x, y, z, bits, curve, layout = rows[0]
-    return Grid(size, (x, y, z), bits, cast("CurveName", curve)), cast("Layout", layout)
+    size, x, y, z, bits, curve, layout, identity = rows[0]
+    grid = Grid(size, (x, y, z), bits, cast("CurveName", curve))
+    return grid, cast("Layout", layout), identity
 
 
 def created(url: str, grid: Grid, layout: Layout) -> None:

@@ -60,7 +60,7 @@ class PostgresStore:
         self.engine = "PostgreSQL {}.{}".format(*divmod(session.server_version, 10_000))
         self.is_read_only = session.is_read_only
         try:
-            self.grid, self.layout = schema_of.read_environment(session)
+            self.grid, self.layout, self.identity = schema_of.read_environment(session)
         except BaseException:
             session.close()
             raise
@@ -69,7 +69,7 @@ class PostgresStore:
         self._written: tuple[int, str, int, str] = (0, "", 0, "")
         self._highest_id = (0, 0)  # at which revision
         self._loading = Loading(session, self.layout)
-        self._watch = Watch(session)
+        self._watch = Watch(session, self.identity)
         if not self.is_read_only:
             self._loading.mend()
 

@@ -3,7 +3,8 @@
 Each write notifies the environment's channel, with its revision as payload, in its transaction
 (PostgreSQL's manual: NOTIFY). The server sends that to whoever listens, once it is committed; to
 look whether it has come costs no round trip. A server that refuses LISTEN, as a standby does, and
-writers that do not notify are found out by asking for the revision now and then.
+writers that do not notify are found out by asking for the revision now and then. So is an
+environment that somebody has dropped and made anew: its table has another oid.
 """
 
 import contextlib
@@ -12,11 +13,12 @@ import time
 
 import psycopg
 
+from hapticdb.errors import ConnectionLostError
 from hapticdb.store.postgres import failures, wire
 from hapticdb.store.postgres.address import LONGEST_NAME
 from hapticdb.store.postgres.session import Session, identifier
 
-REVISION = "SELECT revision FROM environment WHERE id = 1"
+REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 DIGEST_DIGITS = 32
 HEARING_S = 1.0
 """How long a writer that does not notify may go unnoticed where LISTEN works."""
@@ -36,8 +38,9 @@ def channel_of(environment: str) -> str:
 class Watch:
     """What one session has heard of the commits of others."""
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, identity: int) -> None:
         self._session = session
+        self._identity = identity
         self._connection: psycopg.Connection[tuple[object, ...]] | None = None
         self._revision = -1
         self._heard = -1
@@ -54,7 +57,8 @@ class Watch:
         """Whether something was committed since `begin` or the last call.
 
         A round trip only when the revision has to be asked for, and after a lost connection: then
-        the answer is yes, since what came meanwhile was not heard.
+        the answer is yes, since what came meanwhile was not heard. Raises ConnectionLostError when
+        the environment was made anew.
         """
         self._session.check_outside()
         if self._session.again(self._listen):
@@ -91,7 +95,11 @@ class Watch:
     def _ask(self) -> bool:
         """Whether the revision is another than the one known."""
         before = self._revision
-        (found,) = self._session.fetch(REVISION)
+        found, identity = self._session.fetch(REVISION)
+        if wire.read_int8(identity or b"") != self._identity:
+            raise ConnectionLostError(
+                f"{self._session.shown} is another environment than before: open it again"
+            )
         self._revision = self._heard = wire.read_int8(found or b"")
         self._due = time.monotonic() + (DEAF_S if self._is_deaf else HEARING_S)
         return self._revision != before

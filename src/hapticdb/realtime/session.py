@@ -291,7 +291,8 @@ class Session:
     def _report(self) -> Report:
         answer = self._answer
         assert answer is not None  # noqa: S101 - asked before
-        counts = answer.counts
+        counts = asdict(answer.counts)
+        n_frames, conditions = counts.pop("frames"), counts.pop("conditions")
         n_recorded = len(self._recorder) if self._recorder else 0
         if self._recorder is not None:
             self._is_recording = False
@@ -300,26 +301,15 @@ class Session:
             rate=self.timing.rate,
             loop=answer.loop,
             empty=answer.empty,
-            hit_frames=counts.hit_frames,
-            contact_frames=counts.contact_frames,
-            unknown_frames=counts.unknown_frames,
-            held_frames=counts.held_frames,
-            stale_frames=counts.stale_frames,
-            points=counts.frames * len(self.shell),
-            unknown_points=counts.unknown_points,
-            substeps=counts.substeps,
-            dropped_frames=counts.dropped_frames,
-            cut_frames=counts.cut_frames,
-            peak_force=counts.peak_force,
-            peak_torque=counts.peak_torque,
-            deepest=counts.deepest,
+            points=n_frames * len(self.shell),
             warm_up=answer.warm_up,
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
             objects=self.objects,
             recorded_frames=n_recorded,
             lost_records=self._lost,
-            conditions={"points": str(len(self.shell)), **counts.conditions},
+            conditions={"points": str(len(self.shell)), **conditions},
+            **counts,
         )
 
     def close(self) -> None:

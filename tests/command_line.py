@@ -1,6 +1,7 @@
 """The command line as tests use it: run in an empty folder, on a small environment."""
 
 import shutil
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -29,6 +30,11 @@ def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_
         return code, out, err
 
     return call
+
+
+def command(*args: object) -> list[str]:
+    """The same in a process of its own."""
+    return [sys.executable, "-m", "hapticdb", *map(str, args)]
 
 
 def refused(result: tuple[int, str, str], *words: str) -> str:

@@ -15,7 +15,7 @@ from typing import get_args
 import pytest
 
 import hapticdb
-from command_line import Run, boxes, made, poses, refused, rows_of, run, scene  # noqa: F401 - fixtures
+from command_line import Run, boxes, command, made, poses, refused, rows_of, run, scene  # noqa: F401 - fixtures
 from hapticdb.cli import root
 from hapticdb.grid import CURVE_NAMES
 from hapticdb.mesh.reader import UNITS
@@ -223,10 +223,6 @@ def test_a_missing_environment_is_named(run: Run, verb: str) -> None:
 
 
 # -- as a process ---------------------------------------------------------------------------------
-
-
-def command(*args: object) -> list[str]:
-    return [sys.executable, "-m", "hapticdb", *map(str, args)]
 
 
 def test_it_runs_as_a_module(scene: Path) -> None:

@@ -7,7 +7,6 @@ import os
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.realtime.recording import Recording
 from hapticdb.realtime.table import is_alive
 
@@ -160,10 +159,6 @@ def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
     assert scene.exists()
     refused(run("replay", "nowhere.hdbrec"), "no recording at nowhere.hdbrec")
     refused(run("replay", "path.csv"), "path.csv")
-
-
-def command(*args: object) -> list[str]:
-    return [sys.executable, "-m", "hapticdb", *map(str, args)]
 
 
 def frames_in(path: Path) -> bool:

@@ -7,7 +7,6 @@ import os
 import pty
 import signal
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, made, refused, rows_of, run, scene  # noqa: F401 - fixtures
+from command_line import Run, command, made, refused, rows_of, run, scene  # noqa: F401 - fixtures
 from hapticdb import Grid
 from hapticdb.cli import moving
 from hapticdb.layout import rows_of_voxels
@@ -192,8 +191,8 @@ def test_a_copy_that_is_interrupted_says_that_it_goes_on(run: Run, tmp_path: Pat
         for n in range(40):
             write_voxels(env.store, blob(n, (30 + 4 * n, 100, 100), 24), f"blob {n}")
     urls = [str(source), str(target)]
-    command = [sys.executable, "-m", "hapticdb", "copy", *urls, "--layout", "voxel"]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as child:
+    args = command("copy", *urls, "--layout", "voxel")
+    with subprocess.Popen(args, stderr=subprocess.PIPE, text=True) as child:
         wait_for_an_object(target, child)
         child.send_signal(signal.SIGINT)
         _, err = child.communicate(timeout=60)
@@ -222,8 +221,8 @@ def wait_for_an_object(path: Path, child: "subprocess.Popen[str]") -> None:
 def test_a_terminal_sees_a_bar_with_objects(run: Run, scene: Path) -> None:
     assert callable(run)
     ours, theirs = pty.openpty()
-    command = [sys.executable, "-m", "hapticdb", "copy", str(scene), "b.db"]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=theirs) as child:
+    args = command("copy", scene, "b.db")
+    with subprocess.Popen(args, stdout=subprocess.PIPE, stderr=theirs) as child:
         os.close(theirs)
         seen = b""
         while chunk := read_terminal(ours):

@@ -15,7 +15,7 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from command_line import PLACES, Run, boxes, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
+from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
 from hapticdb.demo import prepare
 from hapticdb.query import STRATEGIES
 from hapticdb.store.connect import beside, redact
@@ -247,7 +247,7 @@ PRIVATE = "postgresql:///local?data=server"
 def started(tmp_path: Path, *args: object) -> "subprocess.Popen[str]":
     """The command line in a process of its own: a private server is released at its end."""
     return subprocess.Popen(
-        [sys.executable, "-m", "hapticdb", *map(str, args)],
+        command(*args),
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -3,13 +3,16 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
+import os
+import signal
+import subprocess
 from pathlib import Path
 
 import matplotlib.image
 import pytest
 
 import hapticdb
-from command_line import Run, made, poses, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.realtime import sweep as sweeping
 
 TOOL = ("--tool", "tool.stl")
@@ -120,6 +123,21 @@ def test_a_picture_is_drawn(run: Run, scene: Path) -> None:
     image = matplotlib.image.imread("out.png")
     assert image.shape[:2] == (1000, 1600)
     assert image[..., :3].std() > 0.05
+
+
+@pytest.mark.usefixtures("free")
+def test_the_picture_is_drawn_although_nobody_reads_on(scene: Path) -> None:
+    args = command("sweep", scene.name, *TOOL, "--path", "free.csv", "--picture", "out.png")
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = subprocess.run(
+            args, cwd=scene.parent, stdout=writing, stderr=subprocess.PIPE, check=False
+        )
+    finally:
+        os.close(writing)
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+    assert matplotlib.image.imread(scene.parent / "out.png").shape[:2] == (1000, 1600)
 
 
 @pytest.mark.usefixtures("free")

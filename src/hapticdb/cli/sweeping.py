@@ -101,14 +101,16 @@ def sweep(
             )
         if env.store.revision() != found.revision:
             render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
-        if json:
-            render.say_json(_record(found, shell, part, sorted(set(excluded))))
-        else:
-            _show(env, found, shell)
-        if picture is not None:
-            from hapticdb.sweep_picture import draw_sweep
+        try:
+            if json:
+                render.say_json(_record(found, shell, part, sorted(set(excluded))))
+            else:
+                _show(env, found, shell)
+        finally:  # also when who reads, such as head, has enough
+            if picture is not None:
+                from hapticdb.sweep_picture import draw_sweep
 
-            draw_sweep(picture, env, shell, found, exclude=excluded, verdict=_verdict(found))
+                draw_sweep(picture, env, shell, found, exclude=excluded, verdict=_verdict(found))
     if not json and picture is not None:
         render.say(f"picture: {picture}")
     if not found.comes_out:

@@ -136,6 +136,55 @@ def test_a_hand_through_a_sheet_at_2_metres_a_second_leaves_the_tool_behind(
     assert tool.n_hits > 0
 
 
+@pytest.mark.parametrize("rate", [1000.0, 10000.0])
+@pytest.mark.parametrize("name", ["ball", "box", "needle"])
+def test_a_tool_that_starts_in_something_is_held_by_what_is_farther_away(
+    name: str, rate: float
+) -> None:
+    """It slides over a floor, from within its first layer, against a sheet upright on it."""
+    middle, last = SIDE // 2, SIDE - 1
+    at = middle + 20
+    shell = TOOLS[name]
+    floor = block((0, 0, middle - 1), (last, last, middle - 1))
+    world = World(np.concatenate([floor, block((at, 0, middle), (at, last, last))]))
+    height = -shell.points[:, 2].min() - 0.3 * SIZE
+    tool = Tool(world, shell, (-0.08, 0.002, height), contact=0.0)
+    was_loose = False
+    for n in range(round(0.2 * rate)):
+        tool.hand[0], tool.hand[7] = -0.08 + 2.0 * n / rate, 2.0
+        tool.advance(1.0 / rate)
+        assert is_on_the_entry_side(tool, np.array([-1.0, 0.0, 0.0]), SIDE / 2 - at - 0.5)
+        assert tool.n_hits > 0
+        was_loose |= bool((tool.met[2] == LOOSE).any())
+    assert was_loose
+    assert tool.voxels[:, 0].max() >= at
+    tool.hand[:3] = -0.08, 0.002, 0.1
+    tool.hand[7] = 0.0
+    tool.settle(0.5, rate)
+    assert tool.state[:3] == pytest.approx(tool.hand[:3], abs=1e-3)
+    assert (tool.met[2] != LOOSE).all()
+
+
+@pytest.mark.parametrize("name", ["ball", "box", "plate", "needle"])
+@pytest.mark.parametrize("way", [-1.0, 1.0])
+def test_a_tool_that_starts_across_a_sheet_may_leave_by_either_side(name: str, way: float) -> None:
+    middle = SIDE // 2
+    world = World(block((0, 0, middle), (SIDE - 1, SIDE - 1, middle)))
+    shell = TOOLS[name]
+    quaternion = np.array([0.9, 0.3, 0.2, 0.1])
+    tool = Tool(world, shell, (0.0, 0.0, 0.0), quaternion=quaternion / np.linalg.norm(quaternion))
+    tool.advance()
+    assert tool.n_hits > 0
+    for n in range(300):
+        tool.hand[2] = way * min(n / 200.0, 1.0) * 0.09
+        tool.advance()
+    tool.settle(0.3)
+    assert tool.state[2] == pytest.approx(way * 0.09, abs=1e-3)
+    tool.hand[2] = -way * 0.09
+    tool.settle(0.3)
+    assert is_on_the_entry_side(tool, np.array([0.0, 0.0, way]), way * 0.5)
+
+
 def test_a_blocked_ball_slides_along_the_sheet() -> None:
     """Without any contact force: only steps that are cut back hold it."""
     normal = np.array([0.3, 0.1, 0.9]) / np.linalg.norm([0.3, 0.1, 0.9])

@@ -12,8 +12,10 @@ this: it holds for the points of a needle as for those of a ball. The surface ne
 where it has a hole of a voxel or more a point goes through, as it should.
 
 Where something is put upon the tool, or the tool is first placed in something, points on either
-side of it would hold the tool for ever. So as long as such a point hits, and until all are free, no
-point has an anchor, and the tool may leave by any side.
+side of it would hold the tool for ever. So such points have no anchor, nor has any that comes to
+hit as near to where they were as the tool reaches: it may leave by any side. When the last of them
+is free, all hits have anchors again. One that goes on hitting till it is farther away gets one on
+the side of the tool's centre, if that is clear, and what is met there holds the tool as ever.
 """
 
 import math
@@ -26,6 +28,8 @@ from hapticdb.kernels.contact import turn
 
 NO_ANCHOR, LOOSE = -1, -2
 """Instead of an anchor, of points that do not hit, and of those that may leave by any side."""
+CLEARLY = 0.8
+"""Of the cosine to the best of two sides: below it lies the other."""
 
 
 @inlined
@@ -119,26 +123,65 @@ def outward(keys, slots, words, which, side, ai, aj, ak, i, j, k):
 
 
 @leaf
+def towards(keys, slots, words, which, side, x, y, z, i, j, k):
+    """Code of the free voxel beside (i, j, k) that lies nearest to direction (x, y, z).
+
+    NO_ANCHOR when none does, or when one that it does not touch lies almost as near: then it is
+    not clear which side of a surface is meant.
+    """
+    best = np.int64(NO_ANCHOR)
+    most = 0.0
+    for is_second in range(2):
+        bi, bj, bk = anchor_of(best, 0, 0, 0)
+        for di in range(-1, 2):
+            for dj in range(-1, 2):
+                for dk in range(-1, 2):
+                    along = di * x + dj * y + dk * z
+                    if along <= 0.0:
+                        continue
+                    along /= math.sqrt(di * di + dj * dj + dk * dk)
+                    if is_second:
+                        if along < CLEARLY * most or are_beside(bi, bj, bk, di, dj, dk):
+                            continue
+                    elif along <= most:
+                        continue
+                    if state_of(keys, slots, words, which, side, i + di, j + dj, k + dk) != 0:
+                        continue
+                    if is_second:
+                        return np.int64(NO_ANCHOR)
+                    most = along
+                    best = np.int64(anchor_code(di, dj, dk))
+        if best == NO_ANCHOR:
+            break
+    return best
+
+
+@leaf
+def is_within(box, i, j, k):
+    """Whether voxel (i, j, k) is in a half-open box (6,), lower corner first."""
+    return box[0] <= i < box[3] and box[1] <= j < box[4] and box[2] <= k < box[5]
+
+
+@leaf
+def extend(box, i, j, k, reach):
+    """Take all voxels that are no farther than `reach` on any axis into a box, empty if zero."""
+    is_empty = not box[0] < box[3]
+    for axis in range(3):
+        at = i if axis == 0 else (j if axis == 1 else k)
+        box[axis] = at - reach if is_empty else min(box[axis], at - reach)
+        box[3 + axis] = at + reach + 1.0 if is_empty else max(box[3 + axis], at + reach + 1.0)
+
+
+@leaf
 def settle_anchors(
-    keys,
-    slots,
-    words,
-    which,
-    points,
-    place,
-    met,
-    n_before,
-    n_after,
-    before,
-    after,
-    is_new,
-    is_loose,
-):
+    keys, slots, words, which, points, center, place, met, n_before, n_after, before, after, is_new,
+    box, reach,
+):  # fmt: skip
     """Give the hits of a frame at `after` their anchors, given those at `before`, a step away.
 
     met (3, N): the hits before, the hits after, the anchors. is_new: the cells are of another
-    version, in which what was free may be occupied. is_loose: no hit gets an anchor. Returns
-    whether a hit has none.
+    version, in which what was free may be occupied. box (6,): voxels in which no new hit gets an
+    anchor, as near to what the tool was found in as `reach`, voxels; zero while all have one.
     """
     side = np.int64(place.side)
     for m in range(n_before):
@@ -152,24 +195,42 @@ def settle_anchors(
             met[2, n] = NO_ANCHOR
             continue
         if met[2, n] < 0:
+            if not is_within(box, i, j, k):
+                x, y, z = (
+                    center[0] - points[n, 0],
+                    center[1] - points[n, 1],
+                    center[2] - points[n, 2],
+                )
+                code = towards(
+                    keys, slots, words, which, side,
+                    turn(after[0, 0], after[0, 1], after[0, 2], x, y, z),
+                    turn(after[1, 0], after[1, 1], after[1, 2], x, y, z),
+                    turn(after[2, 0], after[2, 1], after[2, 2], x, y, z),
+                    i, j, k,
+                )  # fmt: skip
+                met[2, n] = LOOSE if code == NO_ANCHOR else code
             continue
         ai, aj, ak = anchor_of(met[2, n], oi, oj, ok)
         if is_same and state_of(keys, slots, words, which, side, ai, aj, ak) == 0:
             continue
-        code = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
-        met[2, n] = LOOSE if code == NO_ANCHOR else code
+        met[2, n] = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
+        if met[2, n] == NO_ANCHOR:
+            met[2, n] = LOOSE
+            extend(box, i, j, k, reach)
     any_loose = False
     for m in range(n_after):
         n = met[1, m]
         met[0, m] = n
-        if is_loose:
-            met[2, n] = LOOSE
-        elif met[2, n] == NO_ANCHOR:
+        if met[2, n] == NO_ANCHOR:
             i, j, k = voxel_under(points, n, after, place)
             ai, aj, ak = voxel_under(points, n, before, place)
-            code = np.int64(NO_ANCHOR)
-            if are_beside(ai, aj, ak, i, j, k) and not (ai == i and aj == j and ak == k):
-                code = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
-            met[2, n] = LOOSE if code == NO_ANCHOR else code
+            if is_within(box, i, j, k):
+                met[2, n] = LOOSE
+            elif are_beside(ai, aj, ak, i, j, k) and not (ai == i and aj == j and ak == k):
+                met[2, n] = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
+            if met[2, n] == NO_ANCHOR:
+                met[2, n] = LOOSE
+                extend(box, i, j, k, reach)
         any_loose = any_loose or met[2, n] == LOOSE
-    return any_loose
+    if not any_loose:
+        box[:] = 0.0

@@ -41,9 +41,10 @@ from hapticdb.kernels.motion import pose_of_quaternion, product, quaternion_by, 
 POSITION, QUATERNION, VELOCITY, TURNING, KEPT = 0, 3, 7, 10, 13
 """Where `state` has what: m and unit quaternion of the tool's frame, m/s of its centre of mass,
 rad/s, and the wrench that the hand was to feel last, in full."""
-HELD_FOR, FELT, _NEXT, _LOOSE, _POSE, _NEXT_POSE, RISEN = 19, 20, 21, 31, 32, 48, 64
-"""Seconds for which the wrench is held; and, at last, the share of it that is sent, 0 to 1."""
-STATE = 65
+HELD_FOR, FELT, _NEXT, _POSE, _NEXT_POSE, RISEN, _BOX = 19, 20, 21, 31, 47, 63, 64
+"""Seconds for which the wrench is held; and, before the box of `settle_anchors`, the share of it
+that is sent, 0 to 1."""
+STATE = 70
 """Numbers of a state; zero but for position and quaternion at the start."""
 HAND_VELOCITY, IS_STALE, IS_OPEN = 7, 13, 14
 HAND = 15
@@ -318,6 +319,8 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
     pose = state[_POSE : _POSE + 16].reshape(4, 4)
     next_pose = state[_NEXT_POSE : _NEXT_POSE + 16].reshape(4, 4)
     next_frame = state[_NEXT : _NEXT + RESULTS]
+    box = state[_BOX : _BOX + 6]
+    reach = body.radius / place.size
     v = out[0:6]  # of the step that is tried, until the wrench is known
     next_met = met[1]
     flags = 0
@@ -342,9 +345,9 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
                 met[2, :] = NO_ANCHOR
             n_before = 0 if is_first else np.int64(frame[HITS])
             n_after = np.int64(next_frame[HITS])
-            state[_LOOSE] = settle_anchors(
-                keys, slots, words, which, points, place, met, n_before, n_after, pose, pose, True,
-                state[_LOOSE] != 0.0,
+            settle_anchors(
+                keys, slots, words, which, points, center, place, met, n_before, n_after,
+                pose, pose, True, box, reach,
             )  # fmt: skip
             frame[:] = next_frame
             state[FELT] = version
@@ -430,9 +433,9 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         state[0], state[1], state[2] = px, py, pz
         state[3], state[4], state[5], state[6] = qw, qx, qy, qz
         state[7:13] = v
-        state[_LOOSE] = settle_anchors(
-            keys, slots, words, which, points, place, met, n_hits, n_after, pose, next_pose, False,
-            state[_LOOSE] != 0.0,
+        settle_anchors(
+            keys, slots, words, which, points, center, place, met, n_hits, n_after,
+            pose, next_pose, False, box, reach,
         )  # fmt: skip
         pose[:, :] = next_pose
         frame[:] = next_frame

@@ -4,7 +4,8 @@
     python benchmarks/in_real_time.py --model FILE --seconds 60 --out results/realtime.json
 
 Frames: the resident cells' kernels and the same flat loop over one dense bitmap, in turns, the
-same poses. Sessions: `hapticdb feel` as a user runs it, on SQLite and on a private server.
+same poses. Sessions: `hapticdb feel` as a user runs it, on SQLite and on a private server. Edits:
+how soon a session feels what another process commits.
 """
 
 import argparse
@@ -25,6 +26,7 @@ from numpy.typing import NDArray
 import hapticdb
 from awake import awake
 from dense_frame import dense_bitmap, dense_feel
+from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.bench import records
 from hapticdb.kernels.cells import BUFFERS, RESULTS, feel_kernel
@@ -166,6 +168,9 @@ def measure(
             for engine, url in urls.items()
             for rate in rates
         ]
+        results["edits"] = [
+            {"engine": engine} | edits(url, tool, round_trip) for engine, url in urls.items()
+        ]
     return results
 
 
@@ -195,6 +200,17 @@ def table(results: dict[str, Any]) -> str:
             f"| {one['engine']} | {one['rate']:,.0f} | {loop['rate']:,.1f} | {loop['missed']:,} | "
             f"{_spread(loop['lateness'])} | {_spread(loop['elapsed'])} | "
             f"{empty['rate']:,.1f}, {empty['missed']:,}, {_spread(empty['lateness'])} | "
+            f"{one['unknown_frames']:,} |"
+        )
+    lines += [
+        "",
+        "| engine | edits | voxels | felt after p50 / p90 / worst, ms | unknown frames |",
+        "| --- | --- | --- | --- | --- |",
+    ]
+    for one in results["edits"]:
+        felt = " / ".join(f"{ms:,.1f}" for ms in one["felt_after_ms"].values())
+        lines.append(
+            f"| {one['engine']} | {one['edits']:,} | {one['voxels']:,} | {felt} | "
             f"{one['unknown_frames']:,} |"
         )
     return "\n".join(lines)

@@ -7,6 +7,7 @@ import pytest
 
 import hapticdb
 from across import over, places_over
+from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.poses import read_poses
 from hapticdb.sample import SampleFiles, write_sample
@@ -52,9 +53,26 @@ def test_a_table_has_a_row_for_each_measurement() -> None:
         "ratio": {"flat": 1.1, "clusters": 0.3},
     }
     session = {"engine": "SQLite", "rate": 1000, "loop": LOOP, "empty": LOOP, "unknown_frames": 0}
-    text = table({"frames": [frame] * 3, "sessions": [session] * 2})
+    edit = {
+        "engine": "PostgreSQL",
+        "edits": 60,
+        "voxels": 1000,
+        "felt_after_ms": {"p50": 2.0, "p90": 4.0, "worst": 9.0},
+        "unknown_frames": 0,
+    }
+    text = table({"frames": [frame] * 3, "sessions": [session] * 2, "edits": [edit]})
     assert text.count("body/hood") == 3
     assert text.count("SQLite") == 2
+    assert text.count("2.0 / 4.0 / 9.0") == 1
+
+
+def test_edits_are_felt_and_taken_back(database: Path, sample: SampleFiles) -> None:
+    with hapticdb.open(database, read_only=True) as env:
+        before = [(obj.id, obj.transform.tolist(), obj.voxels) for obj in env.objects()]
+    found = edits(str(database), Path(sample.wrench), Path(sample.path), n_edits=2)
+    assert (found["edits"], found["voxels"] > 0) == (2, True)
+    with hapticdb.open(database, read_only=True) as env:
+        assert [(obj.id, obj.transform.tolist(), obj.voxels) for obj in env.objects()] == before
 
 
 def test_a_hand_flies_over_every_place(database: Path) -> None:

@@ -16,6 +16,7 @@ from hapticdb.cli.root import (
     Points,
     ToolUnit,
     Url,
+    bytes_of,
     ids_of,
     numbers_of,
 )
@@ -112,8 +113,7 @@ def feel(
     from hapticdb.realtime.session import Session
 
     law = hapticdb.TangentPlane(stiffness)
-    if not 1.0 <= budget <= 1e6:
-        raise UsageError(f"--budget {budget}: give MiB, 1 to a million")
+    budget_bytes = bytes_of(budget)
     excluded = ids_of(exclude or (), "--exclude")
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
@@ -124,7 +124,7 @@ def feel(
     shell = shell_of(tool, tool_unit, points, None if is_for_hand_alone else seed)
     with (
         _leaving_in_order(),
-        ResidentCells(url, budget_bytes=int(budget * (1 << 20)), exclude=excluded) as cells,
+        ResidentCells(url, budget_bytes=budget_bytes, exclude=excluded) as cells,
     ):
         with (
             Session(

@@ -129,6 +129,15 @@ def numbers_of(text: str, counts: Iterable[int], option: str, example: str) -> l
     return numbers
 
 
+def bytes_of(budget: float) -> int:
+    """Bytes of a `Budget`."""
+    from hapticdb.errors import UsageError
+
+    if not 1.0 <= budget <= 1e6:
+        raise UsageError(f"--budget {budget}: give MiB, 1 to a million")
+    return int(budget * (1 << 20))
+
+
 def ids_of(words: Iterable[str], option: str) -> list[int]:
     """Ids of objects from words such as ``7`` and ``3,4``."""
     from hapticdb.errors import UsageError

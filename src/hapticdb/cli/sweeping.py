@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Budget, Exclude, Json, Points, Seed, ToolUnit, Url, ids_of
+from hapticdb.cli.root import Budget, Exclude, Json, Points, Seed, ToolUnit, Url, bytes_of, ids_of
 from hapticdb.cli.touching import DEFAULT_POINTS, shell_of
 
 if TYPE_CHECKING:
@@ -75,8 +75,7 @@ def sweep(
         raise UsageError("give one of --tool and --part")
     if part is not None and tool_unit is not None:
         raise UsageError("--tool-unit is of a --tool; a part has the unit that it was imported in")
-    if not 1.0 <= budget <= 1e6:
-        raise UsageError(f"--budget {budget}: give MiB, 1 to a million")
+    budget_bytes = bytes_of(budget)
     excluded = ids_of(exclude or (), "--exclude")
     poses = read_poses(path)
     with hapticdb.open(url, read_only=True) as env:
@@ -94,7 +93,7 @@ def sweep(
                 shell,
                 poses,
                 exclude=excluded,
-                budget_bytes=int(budget * (1 << 20)),
+                budget_bytes=budget_bytes,
                 clearance_limit=clearance,
                 profile=picture is not None,
                 progress=progress,

@@ -57,6 +57,17 @@ def voxel_under(points, n, pose, place):
     )
 
 
+@inlined
+def lever_of(points, n, pose, center):
+    """Lever of point n about the centre, world frame."""
+    x, y, z = points[n, 0] - center[0], points[n, 1] - center[1], points[n, 2] - center[2]
+    return (
+        turn(pose[0, 0], pose[0, 1], pose[0, 2], x, y, z),
+        turn(pose[1, 0], pose[1, 1], pose[1, 2], x, y, z),
+        turn(pose[2, 0], pose[2, 1], pose[2, 2], x, y, z),
+    )
+
+
 @leaf
 def are_beside(ai, aj, ak, i, j, k):
     """Whether two voxels are the same, or touch by a face, an edge or a corner."""
@@ -123,6 +134,13 @@ def outward(keys, slots, words, which, side, ai, aj, ak, i, j, k):
 
 
 @leaf
+def cosine_to(code, x, y, z):
+    """Cosine, times the length of (x, y, z), between it and the way to that anchor; 0 for none."""
+    di, dj, dk = anchor_of(code, 0, 0, 0)
+    return (di * x + dj * y + dk * z) / math.sqrt(max(di * di + dj * dj + dk * dk, 1))
+
+
+@leaf
 def towards(keys, slots, words, which, side, x, y, z, i, j, k):
     """Code of the free voxel beside (i, j, k) that lies nearest to direction (x, y, z).
 
@@ -131,28 +149,21 @@ def towards(keys, slots, words, which, side, x, y, z, i, j, k):
     """
     best = np.int64(NO_ANCHOR)
     most = 0.0
-    for is_second in range(2):
-        bi, bj, bk = anchor_of(best, 0, 0, 0)
-        for di in range(-1, 2):
-            for dj in range(-1, 2):
-                for dk in range(-1, 2):
-                    along = di * x + dj * y + dk * z
-                    if along <= 0.0:
-                        continue
-                    along /= math.sqrt(di * di + dj * dj + dk * dk)
-                    if is_second:
-                        if along < CLEARLY * most or are_beside(bi, bj, bk, di, dj, dk):
-                            continue
-                    elif along <= most:
-                        continue
-                    if state_of(keys, slots, words, which, side, i + di, j + dj, k + dk) != 0:
-                        continue
-                    if is_second:
-                        return np.int64(NO_ANCHOR)
-                    most = along
-                    best = np.int64(anchor_code(di, dj, dk))
-        if best == NO_ANCHOR:
-            break
+    for code in range(27):
+        ai, aj, ak = anchor_of(code, i, j, k)
+        along = cosine_to(code, x, y, z)
+        if along > most and state_of(keys, slots, words, which, side, ai, aj, ak) == 0:
+            most = along
+            best = np.int64(code)
+    if best == NO_ANCHOR:
+        return best
+    bi, bj, bk = anchor_of(best, i, j, k)
+    for code in range(27):
+        ai, aj, ak = anchor_of(code, i, j, k)
+        if cosine_to(code, x, y, z) < CLEARLY * most or are_beside(bi, bj, bk, ai, aj, ak):
+            continue
+        if state_of(keys, slots, words, which, side, ai, aj, ak) == 0:
+            return np.int64(NO_ANCHOR)
     return best
 
 
@@ -170,6 +181,15 @@ def extend(box, i, j, k, reach):
         at = i if axis == 0 else (j if axis == 1 else k)
         box[axis] = at - reach if is_empty else min(box[axis], at - reach)
         box[3 + axis] = at + reach + 1.0 if is_empty else max(box[3 + axis], at + reach + 1.0)
+
+
+@leaf
+def anchor_or_loose(code, box, i, j, k, reach):
+    """That code, or, where it is no anchor, LOOSE, and the box extended around the voxel."""
+    if code != NO_ANCHOR:
+        return np.int64(code)
+    extend(box, i, j, k, reach)
+    return np.int64(LOOSE)
 
 
 @leaf
@@ -196,27 +216,15 @@ def settle_anchors(
             continue
         if met[2, n] < 0:
             if not is_within(box, i, j, k):
-                x, y, z = (
-                    center[0] - points[n, 0],
-                    center[1] - points[n, 1],
-                    center[2] - points[n, 2],
-                )
-                code = towards(
-                    keys, slots, words, which, side,
-                    turn(after[0, 0], after[0, 1], after[0, 2], x, y, z),
-                    turn(after[1, 0], after[1, 1], after[1, 2], x, y, z),
-                    turn(after[2, 0], after[2, 1], after[2, 2], x, y, z),
-                    i, j, k,
-                )  # fmt: skip
+                rx, ry, rz = lever_of(points, n, after, center)
+                code = towards(keys, slots, words, which, side, -rx, -ry, -rz, i, j, k)
                 met[2, n] = LOOSE if code == NO_ANCHOR else code
             continue
         ai, aj, ak = anchor_of(met[2, n], oi, oj, ok)
         if is_same and state_of(keys, slots, words, which, side, ai, aj, ak) == 0:
             continue
-        met[2, n] = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
-        if met[2, n] == NO_ANCHOR:
-            met[2, n] = LOOSE
-            extend(box, i, j, k, reach)
+        code = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
+        met[2, n] = anchor_or_loose(code, box, i, j, k, reach)
     any_loose = False
     for m in range(n_after):
         n = met[1, m]
@@ -224,13 +232,12 @@ def settle_anchors(
         if met[2, n] == NO_ANCHOR:
             i, j, k = voxel_under(points, n, after, place)
             ai, aj, ak = voxel_under(points, n, before, place)
+            code = np.int64(NO_ANCHOR)
             if is_within(box, i, j, k):
-                met[2, n] = LOOSE
+                code = np.int64(LOOSE)
             elif are_beside(ai, aj, ak, i, j, k) and not (ai == i and aj == j and ak == k):
-                met[2, n] = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
-            if met[2, n] == NO_ANCHOR:
-                met[2, n] = LOOSE
-                extend(box, i, j, k, reach)
+                code = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
+            met[2, n] = anchor_or_loose(code, box, i, j, k, reach)
         any_loose = any_loose or met[2, n] == LOOSE
     if not any_loose:
         box[:] = 0.0

@@ -18,6 +18,7 @@ from hapticdb.kernels._jit import entry, inlined, leaf
 from hapticdb.kernels.anchors import (
     NO_ANCHOR,
     anchor_of,
+    lever_of,
     may_enter,
     outward,
     settle_anchors,
@@ -203,17 +204,6 @@ def stopped_along(gx, gy, gz, floor, rx, ry, rz, vx, vy, vz, wx, wy, wz, lightne
         vx + push * gx, vy + push * gy, vz + push * gz,
         wx + twist * ax, wy + twist * ay, wz + twist * az,
     )  # fmt: skip
-
-
-@inlined
-def lever_of(points, n, pose, center):
-    """Lever of point n about the centre, world frame."""
-    x, y, z = points[n, 0] - center[0], points[n, 1] - center[1], points[n, 2] - center[2]
-    return (
-        turn(pose[0, 0], pose[0, 1], pose[0, 2], x, y, z),
-        turn(pose[1, 0], pose[1, 1], pose[1, 2], x, y, z),
-        turn(pose[2, 0], pose[2, 1], pose[2, 2], x, y, z),
-    )
 
 
 @leaf

@@ -26,6 +26,7 @@ from hapticdb.store.base import SupportsWatch
 from hapticdb.store.connect import create_store, grant, open_store
 from hapticdb.store.postgres import watching
 from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment
+from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.session import Session
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.watching import channel_of
@@ -322,14 +323,12 @@ def test_a_standby_tells_of_the_commits_that_it_follows(
 
 
 def test_an_environment_made_anew_is_told_from_the_one_before(
-    url: str, reader: PostgresStore, admin: psycopg.Connection
+    url: str, reader: PostgresStore
 ) -> None:
     write(url)
     assert is_noticed(reader)
-    schema = sql.Identifier(parse(url).environment)
-    with admin.transaction():
-        admin.execute("SET LOCAL client_min_messages = warning")
-        admin.execute(sql.SQL("DROP SCHEMA {} CASCADE").format(schema))
+    with contextlib.closing(PostgresStore.open(url)) as store:
+        drop(store.session)
     create_store(url, GRID).close()
     write(url)  # the same revision as before
     for _ in range(2):

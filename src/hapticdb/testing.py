@@ -401,6 +401,16 @@ class StoreContract:
         assert store.costs("here") == {"row": 0.25, "row.spread": 0.5}
         assert store.costs("there") is None
 
+    def test_an_environment_is_told_from_another(self) -> None:
+        """However it was opened, and however alike the other is."""
+        grid = Grid(0.01, (0, 0, 0), 5)
+        one, other = self.make(grid, "brick"), self.make(grid, "brick", "other")
+        again = self.reopen(one)
+        assert one.identity == again.identity != other.identity
+        again.close()
+        one.discard()
+        other.discard()
+
     def test_an_empty_environment_answers(self) -> None:
         """No rows, no objects, no revision."""
         store = self.make(Grid(0.01, (0, 0, 0), 5), "brick")

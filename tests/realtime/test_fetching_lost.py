@@ -1,5 +1,6 @@
 """The fetching process and what becomes of its file: gone, put back, another, of another grid."""
 
+import contextlib
 import os
 import signal
 import threading
@@ -8,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import psycopg
 import pytest
-from psycopg import sql
+from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
@@ -20,7 +20,8 @@ from hapticdb.realtime.prefetch import Fetching, FetchRequest
 from hapticdb.realtime.process import Process
 from hapticdb.realtime.resident import ResidentCells
 from hapticdb.realtime.table import LEAST_BUDGET, STOP, CellTable
-from hapticdb.store.postgres.address import parse
+from hapticdb.store.postgres.schema_of import drop
+from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.sqlite_file import remove_file
 from hapticdb.testing import write_voxels
 from realtime.test_prefetch import Side, until
@@ -55,12 +56,19 @@ def replace(env: Environment, folder: Path, bits: int = 7) -> Environment:
     return hapticdb.open(env.url)
 
 
+def served(cells: ResidentCells, shell: PointShell, pose: NDArray[np.float64]) -> Side:
+    """A session whose tool is at a pose, all cells there resident."""
+    side = Side(cells.table, cells.grid, shell)
+    side.be_at(pose)
+    assert until(lambda: side.is_served)
+    return side
+
+
 def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
     env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
-    side, pose = Side(cells.table, env.grid, sphere), np.eye(4)
-    side.be_at(pose)
-    assert until(lambda: side.is_served)
+    pose = np.eye(4)
+    side = served(cells, sphere, pose)
     naive = expected(ids_by_voxel(env), env.grid, sphere, pose)
     Path(env.url).rename(tmp_path / "elsewhere")
     assert until(lambda: cells.is_away)
@@ -73,9 +81,8 @@ def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
 def test_another_file_of_the_same_grid_is_felt_instead(
     env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
-    side, pose = Side(cells.table, env.grid, sphere), np.eye(4)
-    side.be_at(pose)
-    assert until(lambda: side.is_served)
+    pose = np.eye(4)
+    side = served(cells, sphere, pose)
     before = side.reader.feel(pose)[0]
     other = replace(env, tmp_path / "other")
     naive = expected(ids_by_voxel(other), other.grid, sphere, pose)
@@ -84,7 +91,7 @@ def test_another_file_of_the_same_grid_is_felt_instead(
 
 
 def test_an_environment_of_a_server_made_anew_is_felt_instead(
-    place: Place, admin: psycopg.Connection, sphere: PointShell
+    place: Place, sphere: PointShell
 ) -> None:
     url, pose = place(), np.eye(4)
     half = SIZE * (1 << 7) / 2
@@ -92,14 +99,10 @@ def test_an_environment_of_a_server_made_anew_is_felt_instead(
     with hapticdb.create(url, grid) as env:
         write_voxels(env.store, block((50, 50, 58), (78, 78, 63)))
     with ResidentCells(url, budget_bytes=LEAST_BUDGET) as cells:
-        side = Side(cells.table, grid, sphere)
-        side.be_at(pose)
-        assert until(lambda: side.is_served)
+        side = served(cells, sphere, pose)
         before = side.reader.feel(pose)[0]
-        with admin.transaction():
-            admin.execute("SET LOCAL client_min_messages = warning")
-            schema = sql.Identifier(parse(url).environment)
-            admin.execute(sql.SQL("DROP SCHEMA {} CASCADE").format(schema))
+        with contextlib.closing(PostgresStore.open(url)) as store:
+            drop(store.session)
         with hapticdb.create(url, grid) as env:  # of the same revision
             write_voxels(env.store, block((62, 56, 56), (68, 72, 72)))
             naive = expected(ids_by_voxel(env), grid, sphere, pose)

@@ -290,7 +290,7 @@ def test_another_file_of_the_same_grid_makes_all_unknown(tmp_path: Path, table: 
     write_voxels(other.store, block((60, 60, 60), (70, 70, 70)))
     residency = Residency(env.store, table)
     residency.load(residency.missing(cells_of(env.grid))[:100])
-    residency.reopened(other.store, is_same=False)
+    residency.reopened(other.store)
     check(residency, voxels_by_cell(other))
     residency.load(residency.missing(cells_of(env.grid))[:100])
     assert check(residency, voxels_by_cell(other)) > 0

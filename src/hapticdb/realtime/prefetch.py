@@ -308,21 +308,15 @@ class Fetching:
     def reopen(self) -> None:
         """Open the database anew and catch up with what was written meanwhile."""
         self.close()
-        before = _identity_of(self.store)
         self.store = self._open()
         self._confirmed_at = -np.inf
-        self.residency.reopened(self.store, is_same=_identity_of(self.store) == before)
+        self.residency.reopened(self.store)
         self._seen = -1
 
     def close(self) -> None:
         """Give the connection back."""
         with contextlib.suppress(HapticDBError, OSError):  # a broken one may break in this, too
             self.store.close()
-
-
-def _identity_of(store: Store) -> object:
-    """What tells a store from another at the same URL."""
-    return getattr(store, "identity", None)
 
 
 def fetch(request: FetchRequest, voice: Voice) -> None:

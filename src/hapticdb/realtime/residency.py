@@ -152,10 +152,10 @@ class Residency:
         table.control[LOADING] = 0
         self._wait_for_readers(self.table.version)  # what older versions showed is free now
 
-    def reopened(self, store: Store, *, is_same: bool = True) -> None:
+    def reopened(self, store: Store) -> None:
         """Go on with another connection to the same environment, after the first was lost.
 
-        What came in its place, another file of the same grid, makes all cells unknown.
+        What came in its place, another environment of the same grid, makes all cells unknown.
 
         Raises
         ------
@@ -166,10 +166,10 @@ class Residency:
             raise GridError(
                 f"{store.url} is another environment than before: start the session again"
             )
+        if store.identity != self.store.identity:
+            self._revision = -1
         self.store = store
         self._version = -1
-        if not is_same:
-            self._revision = -1
         taken = {slot for _, slots in self._limbo for slot in slots}
         self._free = [  # those, too, that a load had taken when the connection was lost
             slot

@@ -212,6 +212,10 @@ class Store(Protocol):
     def is_read_only(self) -> bool:
         """Whether writes are refused."""
 
+    @property
+    def identity(self) -> object:
+        """What tells it from another environment that has taken its place, by comparing."""
+
     def close(self) -> None:
         """Give back what the connection holds."""
 

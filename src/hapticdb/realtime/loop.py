@@ -27,6 +27,7 @@ from hapticdb.kernels.cells import (
     UNKNOWNS,
     Place,
 )
+from hapticdb.kernels.handle import is_somewhere
 from hapticdb.kernels.motion import poses_of
 from hapticdb.pointshell import PointShell
 from hapticdb.realtime.coupling import Coupling
@@ -157,7 +158,7 @@ class Loop:
         """Read where the hand is: a device that has just been opened may not know at once."""
         until = time.monotonic() + WARM_PATIENCE
         reading = self.device.read()
-        while not (np.isfinite(reading.pose).all() and np.isfinite(reading.velocity).all()):
+        while not is_somewhere(reading.pose, reading.velocity):
             if time.monotonic() > until or self._is_left():
                 raise DeviceError(
                     f"the device has not said where it is within {WARM_PATIENCE:g} s, its numbers "

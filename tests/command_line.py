@@ -1,7 +1,9 @@
 """The command line as tests use it: run in an empty folder, on a small environment."""
 
 import shutil
+import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,6 +37,51 @@ def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_
 def command(*args: object) -> list[str]:
     """The same in a process of its own."""
     return [sys.executable, "-m", "hapticdb", *map(str, args)]
+
+
+HALTING = """
+import sys, time
+from hapticdb.cli import main
+from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.sqlite import SQLiteStore
+
+left = int(sys.argv.pop(1))
+
+def halting(add):
+    def until_told(store, record, rows):
+        global left
+        if left == 0:
+            time.sleep(60)
+        left -= 1
+        return add(store, record, rows)
+    return until_told
+
+for kind in (SQLiteStore, PostgresStore):
+    kind.add = halting(kind.add)
+sys.exit(main())
+"""
+
+
+def command_that_halts(n_objects: int, *args: object) -> list[str]:
+    """The same, which writes so many objects and waits: no signal can come when it has ended."""
+    return [sys.executable, "-c", HALTING, str(n_objects), *map(str, args)]
+
+
+def wait_for_an_object(url: Path | str, child: "subprocess.Popen[Any]") -> None:
+    """Until an import or a copy has committed something."""
+    deadline = time.monotonic() + 120
+    while not count_objects(url):
+        assert child.poll() is None, "it ended before it could be interrupted"
+        assert time.monotonic() < deadline, "it has written nothing in two minutes"
+        time.sleep(0.005)
+
+
+def count_objects(url: Path | str) -> int:
+    try:
+        with hapticdb.open(url, read_only=True) as env:
+            return len(env.objects())
+    except hapticdb.EnvironmentNotFoundError:
+        return 0
 
 
 def refused(result: tuple[int, str, str], *words: str) -> str:

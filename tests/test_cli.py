@@ -8,14 +8,25 @@ import re
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import get_args
 
 import pytest
 
 import hapticdb
-from command_line import Run, boxes, command, made, poses, refused, rows_of, run, scene  # noqa: F401 - fixtures
+from command_line import (  # noqa: F401 - fixtures among them
+    Run,
+    boxes,
+    command,
+    command_that_halts,
+    made,
+    poses,
+    refused,
+    rows_of,
+    run,
+    scene,
+    wait_for_an_object,
+)
 from hapticdb.cli import root
 from hapticdb.grid import CURVE_NAMES
 from hapticdb.mesh.reader import UNITS
@@ -258,7 +269,7 @@ def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) 
     file = boxes(tmp_path / "many.glb", count=60, side=0.15)
     options = ("--layout", "voxel", "--voxel-size", 0.002)
     assert run("import", "whole.db", file, *options)[0] == 0
-    args = command("import", "cut.db", file, *options)
+    args = command_that_halts(30, "import", "cut.db", file, *options)
     with subprocess.Popen(
         args, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
     ) as process:
@@ -279,15 +290,3 @@ def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) 
     assert f"{60 - n_objects} objects imported" in out
     assert f"{n_objects} were there already" in out
     assert rows_of(cut) == rows_of(tmp_path / "whole.db")
-
-
-def wait_for_an_object(path: Path, process: "subprocess.Popen[bytes]") -> None:
-    """Return when the import has committed something, long before it ends."""
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and process.poll() is None:
-        if path.exists():
-            with hapticdb.open(path, read_only=True) as env:
-                if env.objects():
-                    return
-        time.sleep(0.005)
-    pytest.fail("the import ended before it could be interrupted")

@@ -7,7 +7,6 @@ import os
 import pty
 import signal
 import subprocess
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +14,17 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, command, made, refused, rows_of, run, scene  # noqa: F401 - fixtures
+from command_line import (  # noqa: F401 - fixtures among them
+    Run,
+    command,
+    command_that_halts,
+    made,
+    refused,
+    rows_of,
+    run,
+    scene,
+    wait_for_an_object,
+)
 from hapticdb import Grid
 from hapticdb.cli import moving
 from hapticdb.layout import rows_of_voxels
@@ -191,7 +200,7 @@ def test_a_copy_that_is_interrupted_says_that_it_goes_on(run: Run, tmp_path: Pat
         for n in range(40):
             write_voxels(env.store, blob(n, (30 + 4 * n, 100, 100), 24), f"blob {n}")
     urls = [str(source), str(target)]
-    args = command("copy", *urls, "--layout", "voxel")
+    args = command_that_halts(20, "copy", *urls, "--layout", "voxel")
     with subprocess.Popen(args, stderr=subprocess.PIPE, text=True) as child:
         wait_for_an_object(target, child)
         child.send_signal(signal.SIGINT)
@@ -204,18 +213,6 @@ def test_a_copy_that_is_interrupted_says_that_it_goes_on(run: Run, tmp_path: Pat
     assert code == 0
     assert "were there already" in out
     assert run("diff", source, target)[0] == 0
-
-
-def wait_for_an_object(path: Path, child: "subprocess.Popen[str]") -> None:
-    """Until the copy has committed something, long before it ends."""
-    deadline = time.monotonic() + 120
-    while time.monotonic() < deadline and child.poll() is None:
-        if path.exists():
-            with hapticdb.open(path, read_only=True) as env:
-                if env.objects():
-                    return
-        time.sleep(0.005)
-    pytest.fail("the copy ended before it could be interrupted")
 
 
 def test_a_terminal_sees_a_bar_with_objects(run: Run, scene: Path) -> None:

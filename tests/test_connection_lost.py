@@ -6,7 +6,6 @@ import contextlib
 import signal
 import socket
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable
@@ -18,7 +17,7 @@ import pytest
 
 import hapticdb
 from assemblies import placement
-from command_line import tool
+from command_line import command, command_that_halts, tool, wait_for_an_object
 from crashes import (  # noqa: F401 - fixtures among them
     EDITS,
     N_PARTS,
@@ -227,13 +226,8 @@ def test_a_snapshot_does_not_go_on_over_another_connection(
 # --- Ctrl-C -------------------------------------------------------------------------------------
 
 
-def started(*args: object) -> "subprocess.Popen[str]":
-    return subprocess.Popen(
-        [sys.executable, "-u", "-m", "hapticdb", *map(str, args)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+def started(args: list[str]) -> "subprocess.Popen[str]":
+    return subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_an_interrupted_import_is_finished_by_the_same_command(
@@ -241,12 +235,9 @@ def test_an_interrupted_import_is_finished_by_the_same_command(
 ) -> None:
     where = place()
     text = file.read_text()
-    with started("import", where, file, "--bits", 7, "--layout", "voxel", "--jobs", 1) as child:
-        while True:
-            with_objects = count_objects(where)
-            if with_objects >= 1:
-                break
-            assert child.poll() is None
+    args = ("import", where, file, "--bits", 7, "--layout", "voxel", "--jobs", 1)
+    with started(command_that_halts(N_PARTS // 2, *args)) as child:
+        wait_for_an_object(where, child)
         child.send_signal(signal.SIGINT)
         _, err = child.communicate(timeout=60)
     assert child.returncode == 130, err
@@ -258,14 +249,6 @@ def test_an_interrupted_import_is_finished_by_the_same_command(
     assert not list(tmp_path.iterdir())
 
 
-def count_objects(url: str) -> int:
-    try:
-        with hapticdb.open(url, read_only=True) as env:
-            return len(env.objects())
-    except hapticdb.EnvironmentNotFoundError:
-        return 0
-
-
 def test_an_interrupted_touch_leaves_nothing_behind(
     place: Place, file: Path, tmp_path: Path, admin: psycopg.Connection
 ) -> None:
@@ -274,7 +257,7 @@ def test_an_interrupted_touch_leaves_nothing_behind(
     many = tmp_path / "path.csv"
     many.write_text("x,y,z,qw,qx,qy,qz\n" + "0,0,0,1,0,0,0\n" * 5_000)
     stl = tool(tmp_path / "tool.stl")
-    with started("touch", where, "--tool", stl, "--poses", many, "--json") as child:
+    with started(command("touch", where, "--tool", stl, "--poses", many, "--json")) as child:
         assert child.stdout is not None
         for _ in range(5):
             child.stdout.readline()

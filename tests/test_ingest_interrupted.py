@@ -1,6 +1,7 @@
 """An import that ends at any moment leaves a valid database, and again it ends as if undisturbed.
 
-Each interrupted import is a process of its own that says how many parts it has committed.
+Each interrupted import is a process of its own that says how many parts it has committed, and
+waits before the last of them, so that no signal comes when it has ended.
 """
 
 import signal
@@ -24,14 +25,20 @@ N_PARTS = 60
 MOMENTS = np.random.default_rng(20).permutation(np.arange(1, N_PARTS))[:10].tolist()
 
 IMPORT = """
-import sys
+import sys, time
 import hapticdb
 from hapticdb import GridOptions, ImportOptions
 
 database, file, jobs = sys.argv[1:]
 options = ImportOptions(grid=GridOptions(bits=8), layout="voxel", jobs=int(jobs))
+
+def say(progress):
+    print(progress.parts_done, flush=True)
+    if progress.parts_done == progress.parts_total - 1:
+        time.sleep(60)
+
 print(0, flush=True)
-hapticdb.import_files(database, [file], options, lambda p: print(p.parts_done, flush=True))
+hapticdb.import_files(database, [file], options, say)
 """
 
 

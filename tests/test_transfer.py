@@ -361,14 +361,17 @@ def test_progress_counts_objects_and_voxels(tmp_path: Path) -> None:
 # --- interrupted --------------------------------------------------------------------------------
 
 COPY = """
-import sys
+import sys, time
 import hapticdb
+
+def say(now):
+    print(now.objects_done, flush=True)
+    if now.objects_done == now.objects_total - 1:  # so that no signal comes when it has ended
+        time.sleep(60)
 
 source, target, layout = sys.argv[1:]
 print(0, flush=True)
-hapticdb.copy_environment(
-    source, target, layout=layout, progress=lambda now: print(now.objects_done, flush=True)
-)
+hapticdb.copy_environment(source, target, layout=layout, progress=say)
 """
 N_OBJECTS = 40
 

@@ -57,9 +57,12 @@ class Proxy:
         self._listener = socket.socket(socket.AF_UNIX)
         self._listener.bind(str(folder / ".s.PGSQL.5432"))
         self._listener.listen()
-        threading.Thread(target=self._accept, daemon=True).start()
+        self._accepting = threading.Thread(target=self._accept, daemon=True)
+        self._accepting.start()
 
     def close(self) -> None:
+        self._listener.shutdown(socket.SHUT_RDWR)  # a close alone would not wake the other thread
+        self._accepting.join()
         self._listener.close()
 
     def _accept(self) -> None:
@@ -95,7 +98,7 @@ class Proxy:
             upstream.sendall(block)
             time.sleep(0.05)
         with contextlib.suppress(OSError):
-            upstream.shutdown(socket.SHUT_RDWR)  # a close alone would not wake the other thread
+            upstream.shutdown(socket.SHUT_RDWR)
 
     def _pass_on(self, upstream: socket.socket, client: socket.socket) -> None:
         try:

@@ -80,6 +80,17 @@ class Unplugged(Slow):
         return reading
 
 
+class Noted(Slow):
+    """A hand whose driver keeps the latest wrench in a file."""
+
+    def __init__(self, hand: Player, path: Path) -> None:
+        super().__init__(hand, 1 << 30, 0.0)
+        self.path = path
+
+    def apply(self, wrench: Floats) -> None:
+        self.path.write_bytes(wrench.tobytes())
+
+
 class Talking(Slow):
     """A hand whose driver prints to standard output."""
 

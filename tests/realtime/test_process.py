@@ -1,5 +1,6 @@
 """A session's process says what happened, and ends when its session does."""
 
+import gc
 import os
 import pickle
 import signal
@@ -13,6 +14,7 @@ import pytest
 from hapticdb import DatabaseError, HapticDBError
 from hapticdb.realtime import process as module
 from hapticdb.realtime.process import Message, Process
+from hapticdb.realtime.table import is_alive
 
 WORKERS = "realtime.workers:work"
 LONG = 60.0
@@ -91,7 +93,7 @@ def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
 def test_a_request_that_is_cut_ends_it_quietly(share: float) -> None:
     content = pickle.dumps(sys.path) + pickle.dumps(("echo", list(range(1000))))
     done = subprocess.run(
-        [sys.executable, "-c", f"from {module.__name__} import serve; serve({WORKERS!r})"],
+        [sys.executable, "-c", f"from {module.__name__} import serve; serve({WORKERS!r}, 1)"],
         input=content[: round(share * len(content))],
         capture_output=True,
         check=False,
@@ -108,17 +110,45 @@ def test_one_killed_is_silent_and_not_alive() -> None:
         assert not process.is_alive
 
 
-def test_it_ends_with_a_session_that_was_killed() -> None:
-    script = (
-        "import sys, time; from hapticdb.realtime.process import Process;"
-        f"p = Process({WORKERS!r}, ('wait', None), []); p.receive({LONG});"
-        "print(p.pid, flush=True); time.sleep(1000)"
-    )
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE) as session:
-        assert session.stdout is not None
-        pid = int(session.stdout.readline())
-        session.kill()
+def until_gone(pid: int) -> None:
     deadline = time.monotonic() + LONG
-    while Path(f"/proc/{pid}").exists() and time.monotonic() < deadline:
+    while is_alive(pid):
+        assert time.monotonic() < deadline
         time.sleep(0.01)
-    assert not Path(f"/proc/{pid}").exists()
+
+
+SCRIPT = f"""
+import os, time
+from hapticdb.realtime.process import Process
+process = Process({WORKERS!r}, ("wait", None), [])
+process.receive({LONG})
+forked = os.fork() if {{forks}} else 0
+if forked or not {{forks}}:
+    print(process.pid, forked, flush=True)
+time.sleep(1000)
+"""
+
+
+@pytest.mark.parametrize("forks", [False, True])
+def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
+    """Though a process that was forked from it holds the line to it open."""
+    args = [sys.executable, "-c", SCRIPT.format(forks=forks)]
+    with subprocess.Popen(args, stdout=subprocess.PIPE) as session:
+        assert session.stdout is not None
+        pid, forked = map(int, session.stdout.readline().split())
+        session.kill()
+        session.wait()
+        try:
+            until_gone(pid)
+        finally:
+            if forks:
+                os.kill(forked, signal.SIGKILL)
+
+
+def test_one_that_is_dropped_ends() -> None:
+    process = Process(WORKERS, ("wait", None), [])
+    assert process.receive(LONG) is not None
+    pid = process.pid
+    del process
+    gc.collect()
+    until_gone(pid)

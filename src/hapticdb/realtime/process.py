@@ -12,6 +12,7 @@ import signal
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from typing import Any, BinaryIO, NamedTuple, Self
@@ -20,6 +21,8 @@ from hapticdb.errors import HapticDBError, UsageError
 
 END_PATIENCE = 5.0
 """Seconds in which a process that was told to end may do so."""
+_starter = 0
+"""Process id of the one that started this one."""
 
 
 class Message(NamedTuple):
@@ -47,7 +50,7 @@ class Process:
         content = pickle.dumps(sys.path) + pickle.dumps(request)
         self._buffer = b""
         self._popen = subprocess.Popen(  # noqa: S603 - our own module, by the running interpreter
-            [sys.executable, "-c", f"from {__name__} import serve; serve({work!r})"],
+            [sys.executable, "-c", f"from {__name__} import serve; serve({work!r}, {os.getpid()})"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=tuple(descriptors),
@@ -58,7 +61,9 @@ class Process:
         with contextlib.suppress(BrokenPipeError):  # it died at once: `receive` says so
             self._popen.stdin.write(content)
             self._popen.stdin.flush()
-        # left open: when it closes, the process knows that the one that started it is gone
+        # left open: when it closes, the process knows that the one that started it is gone; by
+        # itself, a Popen that is dropped would live on, and its pipes with it
+        weakref.finalize(self, _close, self._popen)
 
     def __enter__(self) -> Self:
         return self
@@ -125,13 +130,18 @@ class Process:
 
     def end(self) -> None:
         """See to it that it has ended: told by its closed input, then by force."""
-        for stream in (self._popen.stdin, self._popen.stdout):
-            if stream is not None:
-                with contextlib.suppress(OSError):
-                    stream.close()
+        _close(self._popen)
         if not self.wait(END_PATIENCE):
             self._popen.kill()
             self._popen.wait()
+
+
+def _close(popen: "subprocess.Popen[bytes]") -> None:
+    """Close the pipes to a process, whereupon it ends."""
+    for stream in (popen.stdin, popen.stdout):
+        if stream is not None:
+            with contextlib.suppress(OSError):
+                stream.close()
 
 
 class _Ended(SystemExit):
@@ -156,8 +166,10 @@ class Voice:
             self._stream.flush()
 
 
-def serve(work: str) -> None:
+def serve(work: str, starter: int) -> None:
     """Do what the request says, in the process that `Process` started, and end it."""
+    global _starter  # noqa: PLW0603 - one a process
+    _starter = starter
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     status = 0
     voice = Voice(os.fdopen(os.dup(1), "wb"))
@@ -211,5 +223,7 @@ def _request() -> object:
 
 def parent_is_gone() -> bool:
     """Whether the process that started this one has ended, or has closed the line."""
+    if os.getppid() != _starter:  # others that it forked may still hold the line open
+        return True
     ready, _, _ = select.select([0], [], [], 0)
     return bool(ready)

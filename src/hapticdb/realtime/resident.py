@@ -1,8 +1,10 @@
 """ResidentCells: a table of cells and the process that fills it, for one or several sessions."""
 
+import os
 import threading
 import time
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import NamedTuple, Self
 
 from hapticdb.errors import GridError, HapticDBError
@@ -16,7 +18,8 @@ from hapticdb.realtime.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellT
 from hapticdb.store.connect import open_store
 
 START_PATIENCE = 60.0
-"""Seconds until a fetching process must be ready: it may have to compile and to calibrate."""
+"""Seconds until a fetching process must be ready: it may have to compile and, where round trips are
+short, to calibrate."""
 RESTART_EVERY = 1.0
 SILENCE_NS = 1_000_000_000
 """Nanoseconds after which a database that was asked and has not answered counts as away."""
@@ -47,6 +50,18 @@ class CacheFigures(NamedTuple):
     restarts: int
 
 
+def never_began(process: Process, name: str, seconds: float) -> HapticDBError:
+    """End a process that has not said in that time that it is ready, and say why it has not."""
+    is_slow = process.is_alive
+    process.end()
+    if is_slow:
+        return HapticDBError(
+            f"the {name} process was not ready after {seconds:g} s: the database or this machine "
+            "is too slow now; try again"
+        )
+    return HapticDBError(f"the {name} process did not start: its errors are above")
+
+
 class ResidentCells:
     """Cells of an environment in memory, kept there by a process of their own.
 
@@ -70,6 +85,9 @@ class ResidentCells:
     DatabaseError
         When it cannot be opened.
     """
+
+    _pid = 0
+    """Of the process that made these; in another, forked from it, they are not to be ended."""
 
     def __init__(
         self,
@@ -95,6 +113,7 @@ class ResidentCells:
         self._restarted_at = 0.0
         self._failure: GridError | None = None
         self._supervising = threading.Lock()
+        self._pid = os.getpid()
 
     def _looked_up(self) -> Grid:
         """Grid of the environment, which must have cells, and the objects that are left out."""
@@ -117,8 +136,7 @@ class ResidentCells:
             process.end()
             raise
         if not is_ready:
-            process.end()
-            raise HapticDBError("the fetching process did not start: its errors are above")
+            raise never_began(process, "fetching", START_PATIENCE)
         return process
 
     def __enter__(self) -> Self:
@@ -126,6 +144,15 @@ class ResidentCells:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def __del__(self) -> None:
+        with suppress(Exception):
+            self.close()
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether they were given back."""
+        return self.table.descriptor < 0
 
     @property
     def pid(self) -> int:
@@ -156,7 +183,7 @@ class ResidentCells:
             self._restarted_at = now
             self.restarts += 1
             ended = self._process
-            # the table goes on as it is: its last version is whole, whatever the process was doing
+            # the table goes on as it is until the new one has read again: its last version is whole
             self._process = Process(
                 "hapticdb.realtime.prefetch:fetch", self._request, [self.table.descriptor]
             )
@@ -195,7 +222,9 @@ class ResidentCells:
         )
 
     def close(self) -> None:
-        """End the fetching process and give the memory back."""
+        """End the fetching process and give the memory back; nothing in a forked copy."""
+        if os.getpid() != self._pid:
+            return
         self.table.cells.control[STOP] = 1
         with self._supervising:
             self._process.end()

@@ -3,10 +3,10 @@
 import os
 import time
 from collections.abc import Iterable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Literal, Self
+from typing import Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from hapticdb.realtime.process import Process
 from hapticdb.realtime.recorded import FRAME, Frames
 from hapticdb.realtime.recording import Header, Recorder
 from hapticdb.realtime.report import LoopAnswer, Report
-from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.resident import ResidentCells, never_began
 from hapticdb.realtime.table import DEFAULT_BUDGET, anonymous_memory
 
 Policy = Literal["hold", "wait"]
@@ -67,7 +67,8 @@ class Session:
         What a frame does whose cells are not resident: keep its wrench for a moment and let it
         fall, or wait for them, exact and late.
     staleness : float
-        Seconds that the database may be silent until all frames do as if nothing were known.
+        Seconds that the database may be silent until all frames do as if nothing were known; with
+        the policy "wait", what is resident goes on being felt.
     budget_bytes : int or None
     exclude : iterable of int
         As `ResidentCells` takes them; only with a URL: who shares cells feels the same objects.
@@ -85,6 +86,9 @@ class Session:
     DatabaseError
         When the environment cannot be opened.
     """
+
+    _pid = 0
+    """Of the process that began it; in another, forked from it, it is not to be ended."""
 
     def __init__(
         self,
@@ -107,19 +111,23 @@ class Session:
         processor: int | None = None,
     ) -> None:
         _check_times(rate, seconds, staleness)
+        if policy not in get_args(Policy):
+            raise UsageError(f"policy {policy!r}: give 'hold' or 'wait'")
         self.shell, self.law = shell, law or TangentPlane()
         self.coupling = coupling or Coupling()
         self.handle = handle or Handle()
         self.timing = Timing(rate, is_fifo, processor)
         self._is_own = isinstance(cells, str)
         if isinstance(cells, str):
-            self.cells = ResidentCells(
-                cells, budget_bytes=budget_bytes or DEFAULT_BUDGET, exclude=exclude
-            )
+            budget_bytes = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
+            self.cells = ResidentCells(cells, budget_bytes=budget_bytes, exclude=exclude)
         elif budget_bytes is not None or tuple(exclude):
             raise UsageError("these cells have a budget and exclusions already: give a URL instead")
+        elif cells.is_closed:
+            raise UsageError("these cells are closed: make others")
         else:
             self.cells = cells
+        self._pid = os.getpid()
         self._row = self._memory = -1
         self._process: Process | None = None
         self._recorder: Recorder | None = None
@@ -176,7 +184,7 @@ class Session:
         )
         table.desk.pids[self._row] = self._process.pid
         if self._process.receive(START_PATIENCE) is None:
-            raise HapticDBError("the loop's process did not start: its errors are above")
+            raise never_began(self._process, "loop's", START_PATIENCE)
 
     def _begin_recording(self, path: Path, is_replaced: bool) -> None:  # noqa: FBT001
         # noted before the file is made: a signal may end the making at any moment
@@ -206,6 +214,10 @@ class Session:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    def __del__(self) -> None:
+        with suppress(Exception):
+            self.close()
 
     @property
     def n_frames(self) -> int:
@@ -313,28 +325,32 @@ class Session:
         )
 
     def close(self) -> None:
-        """End the processes and close the recording; what was recorded stays."""
-        if self._process is not None:
-            self.ask_to_end()
-            self._process.end()
-            self._process = None
-        try:
-            if self._row >= 0:
-                self._drain()
-        finally:
-            self._let_go()
+        """End the processes and close the recording; what was recorded stays.
 
-    def _let_go(self) -> None:
+        In a copy that was forked it does nothing: the session is the parent's.
+        """
+        if os.getpid() != self._pid:
+            return
+        with ExitStack() as ends:  # each whatever becomes of those below it, which come first
+            if self._is_own:
+                ends.callback(self.cells.close)
+            if self._recorder is not None:
+                ends.callback(self._recorder.close)
+            ends.callback(self._leave)
+            if self._row >= 0:
+                ends.callback(self._drain)
+            if self._process is not None:
+                self.ask_to_end()
+                ends.callback(self._process.end)
+                self._process = None
+
+    def _leave(self) -> None:
         if self._row >= 0:
             self.cells.table.leave(self._row)
             self._row = -1
         if self._memory >= 0:
             os.close(self._memory)
             self._memory = -1
-        if self._recorder is not None:
-            self._recorder.close()
-        if self._is_own:
-            self.cells.close()
 
 
 def _check_times(rate: float, seconds: float | None, staleness: float) -> None:

@@ -1,0 +1,169 @@
+"""Sessions that nobody closes, that are forked, or whose end fails: nothing of them stays."""
+
+import contextlib
+import gc
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hapticdb import Environment, PointShell
+from hapticdb.errors import FileError, HapticDBError, UsageError
+from hapticdb.realtime import resident
+from hapticdb.realtime import session as module
+from hapticdb.realtime.recording import Recorder, Recording
+from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.session import Session
+from hapticdb.realtime.table import MOST_READERS, is_alive
+from realtime.hands import Noted, still
+from realtime.sessions import RATE, floored, until
+from realtime.worlds import make
+
+DEEP = 0.0085
+"""Height of a hand whose tool reaches into the floor."""
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    """A floor, its top at z = 0, on SQLite."""
+    with floored(make(tmp_path_factory.mktemp("left"), bits=6)) as made:
+        yield made
+
+
+def force_in(path: Path) -> float:
+    return float(np.abs(np.frombuffer(path.read_bytes())).sum())
+
+
+def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
+    env: Environment, sphere: PointShell, tmp_path: Path
+) -> None:
+    path, record = tmp_path / "wrench", tmp_path / "dropped.hdbrec"
+    hand = Noted(still(DEEP), path)
+    n_before = n_memories()
+    sessions = [Session(env.url, sphere, hand, rate=RATE, budget_bytes=4 << 20, record=record)]
+    pids = sessions[0].pid, sessions[0].cells.pid
+    until(lambda: sessions[0].n_frames > 100 and force_in(path) > 0, sessions[0])
+    n_frames = sessions[0].n_frames
+    assert n_memories() == n_before + 2 * len(("cells", "frames"))  # each mapping keeps one, too
+    sessions.clear()
+    gc.collect()
+    assert path.read_bytes() == bytes(48)
+    assert not any(map(is_alive, pids))
+    assert n_memories() == n_before
+    assert sum(map(len, Recording(record).frames())) >= n_frames
+
+
+def n_memories() -> int:
+    """Shared memories that are open here: by number, and as mappings."""
+    gc.collect()
+    found = []
+    for link in Path("/proc/self/fd").iterdir():
+        with contextlib.suppress(OSError):  # the one by which the folder is read
+            found.append(link.readlink())
+    return sum("hapticdb-" in name.name for name in found)
+
+
+def test_dropped_sessions_leave_their_rows_to_others(env: Environment, sphere: PointShell) -> None:
+    with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
+        for _ in range(2):
+            Session(cells, sphere, still(0.03), rate=RATE)
+            gc.collect()
+            assert cells.table.desk.pids.tolist() == [0] * MOST_READERS
+
+
+def test_cells_that_are_dropped_are_given_back(env: Environment) -> None:
+    n_before = n_memories()
+    cells = ResidentCells(env.url, budget_bytes=4 << 20)
+    pid = cells.pid
+    del cells
+    assert n_memories() == n_before
+    assert not is_alive(pid)
+
+
+def in_a_fork(work: Callable[[], object]) -> int:
+    """Exit status of a copy of this process that does that."""
+    pid = os.fork()
+    if pid == 0:
+        status = 1
+        try:
+            work()
+            status = 0
+        finally:
+            os._exit(status)
+    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+
+
+def test_a_forked_copy_that_leaves_a_session_does_not_end_it(
+    env: Environment, sphere: PointShell, tmp_path: Path
+) -> None:
+    path = tmp_path / "forked.hdbrec"
+    with (
+        ResidentCells(env.url, budget_bytes=4 << 20) as cells,
+        Session(cells, sphere, still(DEEP), rate=RATE, record=path) as session,
+    ):
+        until(lambda: session.n_frames > 50, session)
+
+        def leave() -> None:
+            session.__exit__()
+            cells.__exit__()
+
+        assert in_a_fork(leave) == 0
+        n_frames = session.n_frames
+        until(lambda: session.n_frames > n_frames + 50, session)
+        report = session.stop()
+        assert is_alive(cells.pid)
+    assert report.recorded_frames == report.loop.frames
+    assert sum(map(len, Recording(path).frames())) == report.loop.frames
+
+
+def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
+    env: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: Recorder) -> None:
+        raise FileError("no space is left: free some")
+
+    path = tmp_path / "full.hdbrec"
+    session = Session(env.url, sphere, still(DEEP), rate=RATE, budget_bytes=4 << 20, record=path)
+    pids = session.pid, session.cells.pid
+    with monkeypatch.context() as patch:
+        patch.setattr(Recorder, "close", full)
+        with pytest.raises(FileError, match="no space is left"):
+            session.close()
+    assert not any(map(is_alive, pids))
+    assert session.cells.is_closed
+    session.close()
+
+
+# -- what is misread -----------------------------------------------------------------------------
+
+
+def test_a_budget_of_nothing_is_refused(env: Environment, sphere: PointShell) -> None:
+    with pytest.raises(UsageError, match="budget of 0 bytes"):
+        Session(env.url, sphere, still(0.03), budget_bytes=0)
+
+
+def test_a_policy_that_is_none_is_refused(env: Environment, sphere: PointShell) -> None:
+    with pytest.raises(UsageError, match=r"^policy 'Wait': give 'hold' or 'wait'$"):
+        Session(env.url, sphere, still(0.03), policy="Wait")  # type: ignore[arg-type]
+
+
+def test_cells_that_are_closed_are_refused(env: Environment, sphere: PointShell) -> None:
+    with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
+        pass
+    with pytest.raises(UsageError, match=r"^these cells are closed: make others$"):
+        Session(cells, sphere, still(0.03))
+
+
+@pytest.mark.parametrize(("place", "name"), [(resident, "fetching"), (module, "loop's")])
+def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
+    env: Environment,
+    sphere: PointShell,
+    monkeypatch: pytest.MonkeyPatch,
+    place: object,
+    name: str,
+) -> None:
+    monkeypatch.setattr(place, "START_PATIENCE", 0.0)
+    with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s: "):
+        Session(env.url, sphere, still(0.03), budget_bytes=4 << 20)

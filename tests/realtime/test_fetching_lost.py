@@ -90,6 +90,51 @@ def test_another_file_of_the_same_grid_is_felt_instead(
     assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
 
 
+def test_another_file_is_felt_instead_that_came_while_nobody_fetched(
+    env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
+) -> None:
+    """Also when the system gives it the number of the old: no revision tells them apart."""
+    pose = np.eye(4)
+    side = served(cells, sphere, pose)
+    before, revision = side.reader.feel(pose)[0], env.store.revision()
+    os.kill(cells.pid, signal.SIGKILL)
+    assert cells._process.wait(10.0)
+    other = replace(env, tmp_path / "other")
+    assert other.store.revision() == revision
+    naive = expected(ids_by_voxel(other), other.grid, sphere, pose)
+    assert naive.hits != before
+    assert until(lambda: side.reader.feel(pose)[0] == naive.hits, cells.supervise)
+    assert cells.restarts == 1
+
+
+def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its_number(
+    env: Environment, sphere: PointShell, tmp_path: Path
+) -> None:
+    pose = np.eye(4)
+    with CellTable.create(LEAST_BUDGET) as table:
+        side = Side(table, env.grid, sphere)
+        fetching = Fetching(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid))
+        side.be_at(pose)
+        while not side.is_served:
+            fetching.round()
+        before, grid = side.reader.feel(pose)[0], env.grid
+        env.close()
+        remove_file(Path(env.url))
+        with pytest.raises(hapticdb.EnvironmentNotFoundError):
+            fetching.reopen()
+        assert fetching.store.revision() == 1  # SQLite reads the deleted file on
+        other = make(tmp_path)
+        write_voxels(other.store, block((62, 56, 56), (68, 72, 72)))
+        naive = expected(ids_by_voxel(other), grid, sphere, pose)
+        assert naive.hits != before
+        fetching.reopen()
+        side.be_at(pose)
+        while not side.is_served:
+            fetching.round()
+        assert side.reader.feel(pose)[0] == naive.hits
+        fetching.close()
+
+
 def test_an_environment_of_a_server_made_anew_is_felt_instead(
     place: Place, sphere: PointShell
 ) -> None:

@@ -7,7 +7,7 @@ for what others have written, and names the objects that tools touch.
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -109,16 +109,20 @@ class Fetching:
         self.table = CellTable(request.descriptor, request.n_slots)
         self.clock = clock
         self.figures = self.table.desk.figures
-        self.store = self._open()
-        try:
-            self.residency = Residency(self.store, self.table, request.exclude, clock=clock)
-        except BaseException:
-            self.store.close()
-            raise
         self._evicted_before = self.figures[EVICTED]
         self._latencies: list[float] = [0.0]
         self._headings: dict[int, _Heading] = {}
         self._seen = -1
+        self.store = self._open()
+        try:
+            self._read_desk(0.0)  # the first of them when a process has died
+            urgent = _ranked([(h.cells, h.urgency) for h in self._headings.values()])
+            self.residency = Residency(
+                self.store, self.table, request.exclude, urgent=urgent, clock=clock
+            )
+        except BaseException:
+            self.store.close()
+            raise
         self._now = clock()
         self._asked_at = self._released_at = self._now
         self._confirmed_at = -np.inf
@@ -236,15 +240,9 @@ class Fetching:
         residency = self.residency
         residency.round += 1
         self._seen = self.table.version
-        ranked = [part for row in self._headings for part in self._wanted(row)]
-        if not ranked:
-            return NO_KEYS
-        cells = np.concatenate([cells for cells, _ in ranked])
-        order = np.argsort(np.concatenate([urgency for _, urgency in ranked]), kind="stable")
-        if len(ranked) > 1:
-            _, first = np.unique(cells[order], return_index=True)
-            order = order[np.sort(first)]
-        return residency.missing(cells[order])
+        return residency.missing(
+            _ranked([part for row in self._headings for part in self._wanted(row)])
+        )
 
     def _wanted(self, row: int) -> Iterator[tuple[Keys, NDArray[np.float64]]]:
         """Cells of one session with their urgency: what its share of the table has room for."""
@@ -307,8 +305,9 @@ class Fetching:
 
     def reopen(self) -> None:
         """Open the database anew and catch up with what was written meanwhile."""
-        self.close()
-        self.store = self._open()
+        opened = self._open()
+        self.close()  # not before: no other file can have the identity of one that is held open
+        self.store = opened
         self._confirmed_at = -np.inf
         self.residency.reopened(self.store)
         self._seen = -1
@@ -317,6 +316,18 @@ class Fetching:
         """Give the connection back."""
         with contextlib.suppress(HapticDBError, OSError):  # a broken one may break in this, too
             self.store.close()
+
+
+def _ranked(wanted: Sequence[tuple[Keys, NDArray[np.float64]]]) -> Keys:
+    """Distinct cells of several wishes, each with its urgency, most urgent first."""
+    if not wanted:
+        return NO_KEYS
+    cells = np.concatenate([cells for cells, _ in wanted])
+    order = np.argsort(np.concatenate([urgency for _, urgency in wanted]), kind="stable")
+    if len(wanted) > 1:
+        _, first = np.unique(cells[order], return_index=True)
+        order = order[np.sort(first)]
+    return cells[order]
 
 
 def fetch(request: FetchRequest, voice: Voice) -> None:

@@ -12,15 +12,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.calibration import calibrate
 from hapticdb.errors import GridError, UsageError
 from hapticdb.grouping import group_spans
 from hapticdb.kernels import cell_table as kernels
 from hapticdb.kernels.cells import BUFFERS, EMPTY_SLOT, UNKNOWN, Place
 from hapticdb.query import as_ids
+from hapticdb.realtime.costs import costs_at_start
 from hapticdb.realtime.table import FIRST_VERSION, LOADING, CellTable
-from hapticdb.statistics import CostModel, QuantileVector, machine_name
-from hapticdb.store.base import CELL_SHIFT, Change, Keys, Store, row_shift
+from hapticdb.statistics import QuantileVector
+from hapticdb.store.base import CELL_SHIFT, NO_KEYS, Change, Keys, Store, row_shift
 
 BATCH = 256
 """Cells that one statement asks for at most."""
@@ -81,9 +81,12 @@ class Residency:
     store : Store
         A connection of its own; `reopened` exchanges it.
     table : CellTable
-        Made for this; nobody else writes to it. One that another has filled is gone on with.
+        Made for this; nobody else writes to it. One that another has filled is gone on with: its
+        most urgent cells are read again, the others forgotten, in one version.
     exclude : iterable of int
         Ids of objects that are left out of all cells.
+    urgent : (n,) int64
+        Cells that tools are near, distinct, most urgent first.
     clock : callable
         Seconds, for what a load reports.
 
@@ -99,6 +102,7 @@ class Residency:
         table: CellTable,
         exclude: Iterable[int] = (),
         *,
+        urgent: Keys = NO_KEYS,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
         check_cells(store)
@@ -111,7 +115,7 @@ class Residency:
         self._clock = clock
         self._cell_of_slot = np.full(table.n_slots, UNKNOWN, dtype=np.int64)
         self._wanted_at = np.zeros(table.n_slots, dtype=np.int64)
-        self._urgent = _NO_CELLS
+        self._urgent = NO_KEYS
         self._free = list(range(table.n_slots - 1, EMPTY_SLOT, -1))
         self._limbo: deque[tuple[int, list[int]]] = deque()
         self._empty: dict[int, None] = {}  # in the order in which they came
@@ -122,24 +126,20 @@ class Residency:
         self._revision = -1
         self._version = -1
         self._quantiles = QuantileVector.of(store)
-        self._costs = self._costs_of(store, is_hurried=table.version > FIRST_VERSION)
-        if table.version > FIRST_VERSION:
-            self._adopt()
+        is_first = table.version == FIRST_VERSION
+        may_measure = is_first and self._quantiles.n_rows > 0
+        self._costs = costs_at_start(store, clock, may_measure=may_measure)
+        if not is_first:
+            self._adopt(urgent)
         self.refresh()
 
-    def _costs_of(self, store: Store, *, is_hurried: bool) -> CostModel:
-        """What ranges and rows cost on this machine; somebody in a hurry measures nothing."""
-        kept = store.costs(machine_name())
-        if kept:
-            return CostModel.from_figures(kept)
-        if is_hurried or not self._quantiles.n_rows:
-            return CostModel.of_equal_parts()
-        return calibrate(store)
+    def _adopt(self, urgent: Keys) -> None:
+        """Go on with the table of a writer that has ended: its last version is whole.
 
-    def _adopt(self) -> None:
-        """Go on with the table of a writer that has ended: its last version is whole."""
+        Its cells are those of an environment that may have been replaced since, and nothing tells:
+        a new file may have the number of the old. So none of them is known to be true.
+        """
         table, which = self.table.cells, self.table.version % BUFFERS
-        self._revision = self.table.revision
         entries = np.flatnonzero(table.keys[which] >= 0)
         cells, slots = table.keys[which][entries], table.slots[which][entries].astype(np.int64)
         is_filled = slots > EMPTY_SLOT
@@ -151,6 +151,8 @@ class Residency:
         self._n_outdated = BUFFERS - 1
         table.control[LOADING] = 0
         self._wait_for_readers(self.table.version)  # what older versions showed is free now
+        urgent = urgent[: min(MOST_RENEWED, self.table.n_slots // 3)]  # and room to read them again
+        self.want(urgent, self.slots_of(urgent))
 
     def reopened(self, store: Store) -> None:
         """Go on with another connection to the same environment, after the first was lost.
@@ -240,7 +242,7 @@ class Residency:
     def warm_up(self) -> None:
         """Compile what first comes with an eviction or a change."""
         bits, curve = self.grid.bits, self.grid.curve_code
-        kernels.cells_of_curve_keys(_NO_CELLS, bits, curve, np.empty(0, dtype=np.int64))
+        kernels.cells_of_curve_keys(NO_KEYS, bits, curve, np.empty(0, dtype=np.int64))
         kernels.slots_to_free(
             self._cell_of_slot, self._wanted_at, self.table.cells.used, 0, 0, 0,
             np.empty(0, dtype=np.int64),
@@ -262,7 +264,7 @@ class Residency:
                 self._give_back(brought.slots)
                 brought = self._catch_up(cells)[1]
             else:
-                self._enter(_NO_CELLS, brought)
+                self._enter(NO_KEYS, brought)
         finally:
             self.table.cells.control[LOADING] = 0
         elapsed = self._clock() - started
@@ -276,7 +278,7 @@ class Residency:
         Cells that a write touched become known anew, or unknown, in one version: no frame mixes
         two revisions of an object.
         """
-        return self._catch_up(_NO_CELLS)[0]
+        return self._catch_up(NO_KEYS)[0]
 
     def _catch_up(self, asked: Keys) -> tuple[int, _Brought]:
         """Bring known cells to the last revision, and unknown ones (n,) with them.
@@ -305,7 +307,7 @@ class Residency:
     def _changes(self, revision: int) -> list[Change] | None:
         """Writes since the known revision, or None when they cannot be told one by one."""
         missed = revision - self._revision
-        if not 0 <= missed <= MOST_CHANGES:
+        if self._revision < 0 or not 0 <= missed <= MOST_CHANGES:
             return None  # below: a server came back without its last commits
         changes = list(self.store.changes(self._revision)) if missed else []
         return changes if len(changes) >= missed else None
@@ -315,8 +317,8 @@ class Residency:
         self._make_room(len(cells))
         parts = [self._bring(cells[at : at + BATCH]) for at in range(0, len(cells), BATCH)]
         return _Brought(
-            np.concatenate([_NO_CELLS, *(part.cells for part in parts)]),
-            np.concatenate([_NO_CELLS, *(part.slots for part in parts)]),
+            np.concatenate([NO_KEYS, *(part.cells for part in parts)]),
+            np.concatenate([NO_KEYS, *(part.slots for part in parts)]),
             sum(part.rows for part in parts),
             sum(part.ranges for part in parts),
         )
@@ -325,7 +327,7 @@ class Residency:
         """Read cells (n,) by one statement into free slots, which no frame can see."""
         count = min(len(cells), len(self._free))
         if not count:
-            return _Brought(_NO_CELLS, _NO_CELLS)
+            return _Brought(NO_KEYS, NO_KEYS)
         cells = cells[:count]
         slots = np.array(self._free[-count:], dtype=np.int64)
         bits, curve = self.grid.bits, self.grid.curve_code
@@ -366,7 +368,7 @@ class Residency:
         """Resident and empty cells whose voxel keys meet closed spans (n, 2)."""
         bits, curve = self.grid.bits, self.grid.curve_code
         if not len(spans):
-            return _NO_CELLS
+            return NO_KEYS
         first, last = spans[:, 0] >> CELL_SHIFT, spans[:, 1] >> CELL_SHIFT
         if (last - first + 1).sum() <= FEW_CELLS:
             met = np.concatenate([np.arange(a, b + 1) for a, b in zip(first, last, strict=True)])
@@ -405,7 +407,7 @@ class Residency:
                 break
         if count:
             self.evicted += count
-            self._enter(self._cell_of_slot[out[:count]], _Brought(_NO_CELLS, _NO_CELLS))
+            self._enter(self._cell_of_slot[out[:count]], _Brought(NO_KEYS, NO_KEYS))
             self._wait_for_readers(self.table.version)
             self._collect()
 
@@ -450,7 +452,7 @@ class Residency:
         """
         surplus = len(self._empty) + n_new - self._most_empty
         if surplus <= 0:
-            return _NO_CELLS
+            return NO_KEYS
         known = np.fromiter(self._empty, np.int64, len(self._empty))
         others = known[~np.isin(known, self._urgent)]
         wanted = self._urgent[::-1][np.isin(self._urgent[::-1], known)]
@@ -489,5 +491,4 @@ class Residency:
                 waited_since = time.monotonic()
 
 
-_NO_CELLS = np.empty(0, dtype=np.int64)
 _NO_SPANS = np.empty((0, 2), dtype=np.int64)

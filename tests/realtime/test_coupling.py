@@ -11,7 +11,17 @@ from numpy.typing import NDArray
 
 from hapticdb import PointShell, UsageError
 from hapticdb.kernels import coupling as kernels
-from hapticdb.kernels.cells import DEEPEST, UNKNOWNS, WRENCH, feel_kernel
+from hapticdb.kernels.cells import (
+    BUFFERS,
+    DEEPEST,
+    REVISION,
+    UNKNOWNS,
+    VERSION,
+    WRENCH,
+    Cells,
+    end_frame,
+    feel_kernel,
+)
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.testing import write_voxels
 from realtime.coupled import SIDE, SIZE, Tool, World, box, punch
@@ -322,6 +332,25 @@ def test_the_tool_waits_at_unknown_cells_and_goes_on_when_they_come() -> None:
     tool.settle(0.3)
     assert tool.out[UNKNOWNS] == 0
     assert tool.state[2] == pytest.approx(0.05, abs=1e-4)
+
+
+def test_a_frame_has_the_revision_of_the_version_that_it_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Not of one that takes its buffer as soon as the frame has let go of it."""
+    tool = Tool(World(FLOOR), PointShell.sphere(0.012), (0.0, 0.0, 0.05))
+    control = tool.world.table.cells.control
+    read = float(control[REVISION + control[VERSION] % BUFFERS])
+
+    def end_frame_and_lose_it(cells: Cells, reader: int) -> None:
+        end_frame(cells, reader)
+        control[REVISION : REVISION + BUFFERS] += 5
+
+    monkeypatch.setattr(kernels, "end_frame", end_frame_and_lose_it)
+    monkeypatch.setattr(kernels, "advance", getattr(kernels.advance, "py_func", kernels.advance))
+    tool.hand[kernels.IS_STALE] = 1.0  # most of a frame is left out
+    tool.advance()
+    assert tool.out[kernels.OUT_REVISION] == read
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])

@@ -166,6 +166,20 @@ def test_after_a_hold_the_wrench_rises_from_where_it_fell_to(
     assert found[-1] == 1.0
 
 
+def test_after_a_fall_no_period_however_long_raises_the_wrench_at_once(floor: World) -> None:
+    tool = pressing(floor)
+    tool.hand[kernels.IS_STALE] = 1.0
+    tool.advance(1.0)
+    assert not tool.out[:6].any()  # falling takes all of the time that passed
+    tool.hand[kernels.IS_STALE] = 0.0
+    found = []
+    for _ in range(kernels.RISE_FRAMES + 1):
+        tool.advance(1.0)
+        found.append(share(tool))
+    rising = np.arange(1, kernels.RISE_FRAMES + 1) / kernels.RISE_FRAMES
+    assert found == pytest.approx([*rising, 1.0])
+
+
 @pytest.mark.parametrize("is_held", [False, True])
 def test_an_open_clutch_lets_the_hand_go_and_takes_it_again_softly(
     floor: World, *, is_held: bool
@@ -211,6 +225,23 @@ def test_a_state_that_is_not_finite_is_placed_anew(floor: World, at: int) -> Non
         assert np.isfinite(tool.state).all()
         assert np.isfinite(tool.out).all()
     assert tool.state[2] > 0.02
+
+
+@pytest.mark.parametrize("far", [-1e3, -1e6, -1e30, -1e38, 1e40, -1e60])
+def test_one_absurd_place_of_the_hand_moves_the_tool_no_farther_than_its_steps(far: float) -> None:
+    """And once the hand is back, so is the tool, soon."""
+    tool = Tool(World(), box((0.02, 0.02, 0.02)), (0.0, 0.0, 0.03))
+    tool.settle(0.02)
+    for n_frames in (1, 30):
+        for _ in range(n_frames):
+            before = tool.state[:3].copy()
+            tool.hand[2] = far
+            tool.advance()
+            moved = float(np.linalg.norm(tool.state[:3] - before))
+            assert moved <= 0.5 * SIZE * tool.out[kernels.SUBSTEPS] * (1 + 1e-9)
+        tool.hand[2] = 0.03
+        tool.settle(1.0)
+        np.testing.assert_allclose(tool.state[:3], (0.0, 0.0, 0.03), atol=1e-6)
 
 
 def test_a_hand_beyond_all_numbers_pushes_nothing(floor: World) -> None:

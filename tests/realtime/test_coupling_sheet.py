@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from hapticdb import Grid, PointShell
 from hapticdb.kernels import coupling as kernels
 from hapticdb.kernels.anchors import LOOSE
+from hapticdb.kernels.cells import UNKNOWNS
 from hapticdb.kernels.voxelize import voxelize
 from hapticdb.poses import rotation_of
-from realtime.coupled import BITS, SIDE, SIZE, Tool, World, box
+from realtime.coupled import BITS, SIDE, SIZE, Tool, World, box, punch
 from realtime.worlds import block
 
 Floats = NDArray[np.float64]
@@ -202,6 +203,29 @@ def test_a_blocked_ball_slides_along_the_sheet() -> None:
         assert is_on_the_entry_side(tool, normal, 0.0)
     assert n_cut > 10
     assert tool.state[:3] @ along > 0.04
+
+
+def test_a_sheet_holds_when_the_cell_of_the_anchors_goes_and_comes_back() -> None:
+    """The sheet is the last layer of its cell; the anchors lie in the cell above."""
+    side = np.arange(SIDE)
+    flat = np.stack(np.meshgrid(side, side, [SIDE // 2 - 1], indexing="ij"), axis=-1)
+    world = World(flat.reshape(-1, 3))
+    tool = Tool(world, punch(10), (0.0, 0.0, 0.02), contact=20.0)
+    tool.settle(0.05)
+    tool.hand[2] = -0.02
+    tool.settle(0.2)
+    keys = world.table.cells.keys
+    known = keys.copy()
+    for is_above_known in (False, True, True):
+        keys[:] = known
+        if not is_above_known:  # entries of cells that are nowhere, so that others are still found
+            keys[(known >= 0) & (known & 0xFFFF == 1)] |= 0xFFFE
+        tool.state[kernels.FELT] = -1.0  # as of another version
+        tool.settle(0.2)
+        assert tool.n_hits == len(tool.shell)
+        assert not tool.out[UNKNOWNS]
+        assert (tool.met[2] != LOOSE).all()
+        assert tool.state[2] > -SIZE
 
 
 def test_a_hole_lets_the_tool_through() -> None:

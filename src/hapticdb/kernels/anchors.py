@@ -221,7 +221,8 @@ def settle_anchors(
                 met[2, n] = LOOSE if code == NO_ANCHOR else code
             continue
         ai, aj, ak = anchor_of(met[2, n], oi, oj, ok)
-        if is_same and state_of(keys, slots, words, which, side, ai, aj, ak) == 0:
+        # one whose cell has gone was free, and is still on the side from which the point came
+        if is_same and state_of(keys, slots, words, which, side, ai, aj, ak) != 1:
             continue
         code = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
         met[2, n] = anchor_or_loose(code, box, i, j, k, reach)

@@ -70,6 +70,8 @@ FREE_STEP = 0.5
 """Longest step of free motion, times the spring's frequency: for precision, not for stability."""
 CONTACT_STIFFNESS = 10.0
 """Contacts of a frame, averaged, are never stiffer than so many."""
+RISE_FRAMES = 4
+"""Frames, at least, in which a wrench rises: after a period that lasted long it must not jump."""
 
 
 class Body(NamedTuple):
@@ -283,6 +285,16 @@ def length_of(x, y, z):
     return math.sqrt(x * x + y * y + z * z)
 
 
+@leaf
+def slow_down(state, radius, fastest):
+    """Take from a state's velocities what would make a point faster than that, m/s."""
+    speed = length_of(state[7], state[8], state[9])
+    speed += radius * length_of(state[10], state[11], state[12])
+    if speed > fastest:
+        for n in range(7, 13):
+            state[n] *= fastest / speed
+
+
 @entry
 def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, frame, out):
     """Move the tool for one period of dt seconds.
@@ -296,8 +308,8 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
 
     Where the tool would meet unknown cells it stays, still, and the wrench is kept for `hold`
     seconds, then falls to zero within `fade`; out and missed then tell of the pose that was tried.
-    After that, and from the first frame on, it rises to its full size within `fade`; while the
-    clutch is open it falls likewise, and the tool goes on.
+    After that, and from the first frame on, it rises to its full size within `fade`, and in
+    RISE_FRAMES frames at least; while the clutch is open it falls, and the tool goes on.
 
     With a hand that is not finite all is held; a state that is not is placed anew, at rest, at the
     first hand that is finite.
@@ -350,6 +362,8 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
     while left > 0.0:
         if n_steps >= body.most_substeps:
             flags |= IS_DROPPED
+            # else one absurd hand would leave a speed whose steps are too short to brake it
+            slow_down(state, body.radius, body.most_substeps * way / dt)
             break
         hits = frame[HITS]
         dx, dy, dz, tx, ty, tz, ux, uy, uz, wx, wy, wz, _, _, _ = pull_of(
@@ -365,7 +379,8 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         speed += body.radius * length_of(state[10], state[11], state[12])
         gain = length_of(ax, ay, az) + body.radius * length_of(bx, by, bz)
         step = min(longest_step(speed, gain, way), contact_step if hits > 0.0 else free_step)
-        step = left / math.ceil(left / step) if step < left else left
+        # numpy's, a float: more steps than an integer holds are none of a negative length
+        step = left / np.ceil(left / step) if step < left else left
         n_steps += 1
         # the damper implicit: no step is too long for it
         share = step / (1.0 + step * body.damping / body.mass)
@@ -429,6 +444,7 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         )  # fmt: skip
         pose[:, :] = next_pose
         frame[:] = next_frame
+    revision = cells.control[REVISION + which]  # of what was read: later the buffer is another's
     end_frame(cells, reader)
     is_held = is_held or n_unknown > 0
     passed = max(dt, 0.0) / body.fade
@@ -443,7 +459,7 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         state[RISEN] *= 1.0 - faded_of(body, state[HELD_FOR])
         state[HELD_FOR] = 0.0
         if hand[IS_OPEN] == 0.0:
-            state[RISEN] = min(state[RISEN] + passed, 1.0)
+            state[RISEN] = min(state[RISEN] + min(passed, 1.0 / RISE_FRAMES), 1.0)
         kept[:] = 0.0
         if frame[HITS] > 0.0:
             push_hand(body, state, hand, pose, center, place.size, kept)
@@ -459,4 +475,4 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
     out[DEEPEST] = frame[DEEPEST]
     out[SUBSTEPS] = n_steps
     out[FLAGS] = flags
-    out[OUT_REVISION] = cells.control[REVISION + which]
+    out[OUT_REVISION] = revision

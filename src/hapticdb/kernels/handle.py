@@ -1,23 +1,23 @@
 """How a hand carries the handle: scale, and the offset that a clutch leaves between them."""
 
-import math
-
 from hapticdb.kernels._jit import entry
 from hapticdb.kernels.motion import product, quaternion_in
 
 POSITION, QUATERNION, VELOCITY = 0, 3, 7
 """Where a hand (15,) has what; an offset (7,) has the first two."""
+FARTHEST = 1e6
+"""Metres, m/s or rad/s: no hand is farther or faster, it is its device's numbers that are wrong."""
 
 
 @entry
 def is_somewhere(pose, velocity):
-    """Whether a pose (4, 4) and a velocity (6,) are all finite."""
+    """Whether a pose (4, 4) and a velocity (6,) are all numbers, none beyond FARTHEST."""
     for row in range(3):
         for column in range(4):
-            if not math.isfinite(pose[row, column]):
+            if not abs(pose[row, column]) <= FARTHEST:  # nor is what is not a number
                 return False
     for axis in range(6):
-        if not math.isfinite(velocity[axis]):
+        if not abs(velocity[axis]) <= FARTHEST:
             return False
     return True
 

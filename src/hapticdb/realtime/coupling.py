@@ -32,8 +32,8 @@ class Coupling:
         Of the spring, N/m.
     hold, fade : float
         Seconds that the last wrench is kept where cells are unknown, and in which it then falls to
-        zero; it rises again within `fade`, as it does when a session starts, and as it falls and
-        rises when the clutch opens and closes.
+        zero; it rises again within `fade`, in four frames at least, as it does when a session
+        starts, and as it falls and rises when the clutch opens and closes.
     most_substeps : int
         Of a period; the rest of a period that needs more is dropped.
 

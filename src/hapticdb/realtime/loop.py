@@ -7,6 +7,7 @@ compiled or collected once it runs.
 import contextlib
 import math
 import mmap
+import signal
 import time
 from dataclasses import dataclass
 
@@ -27,7 +28,7 @@ from hapticdb.kernels.cells import (
     UNKNOWNS,
     Place,
 )
-from hapticdb.kernels.handle import is_somewhere
+from hapticdb.kernels.handle import FARTHEST, is_somewhere
 from hapticdb.kernels.motion import poses_of
 from hapticdb.pointshell import PointShell
 from hapticdb.realtime.coupling import Coupling
@@ -64,6 +65,9 @@ ASK_EVERY = 1e-2
 LOOK_EVERY = 0.25
 """Seconds between what the fetching process is told, between names asked for, and between looks
 whether the process that started the loop is still there."""
+WITHDRAWN_NS = 250_000_000
+"""What was asked is withdrawn when the database has answered that much later: by then objects have
+been named for it, and whoever started the session has read them."""
 WARM_PATIENCE = 30.0
 """Seconds that the loop waits for its first cells, and for a device to say where it is."""
 
@@ -121,6 +125,7 @@ class Loop:
         )
         self.counts = Counts()
         self.is_warm = False
+        self._asked_at = 0  # ns; 0 when nothing is asked
         self.lateness, self.elapsed = Times(), Times()
 
     # -- before the first frame --------------------------------------------------------------
@@ -153,6 +158,7 @@ class Loop:
         self.request.handle.start(self._read(), self.hand)
         self.state[:] = 0.0
         self.state[:7] = self.hand[:7]
+        self.frame[:] = 0.0  # a first frame that is held must not tell of an earlier place's hits
 
     def _read(self) -> Reading:
         """Read where the hand is: a device that has just been opened may not know at once."""
@@ -162,7 +168,7 @@ class Loop:
             if time.monotonic() > until or self._is_left():
                 raise DeviceError(
                     f"the device has not said where it is within {WARM_PATIENCE:g} s, its numbers "
-                    "are not finite: check its connection and calibration"
+                    f"are none or beyond {FARTHEST:g}: check its connection and calibration"
                 )
             time.sleep(1e-3)
             reading = self.device.read()
@@ -194,10 +200,11 @@ class Loop:
             self.hand, dt, self.met, self.missed, self.frame, self.out,
         )  # fmt: skip
 
-    def _step_exactly(self, dt: float, ends: int) -> None:
+    def _step_exactly(self, reading: Reading, dt: float, ends: int) -> Reading:
         """Advance once all cells that it needs are there; until then there is no force for long.
 
-        The session's end, ns, is not waited beyond.
+        The session's end, ns, is not waited beyond. Returns the reading that was followed: where a
+        hand is that was let go counts by then.
         """
         clock = time.perf_counter_ns
         holds = clock() + round(min(self.request.coupling.hold, 1e9) * 1e9)
@@ -208,14 +215,19 @@ class Loop:
             if not is_let_go and clock() > holds:
                 self.device.apply(np.zeros(6))
                 is_let_go = True
+                before[kernels.RISEN] = 0.0  # from nothing, not back to where it was
             self.state[:] = before
             self.met[:] = met
             self.frame[:] = frame
             self._tell()
             time.sleep(2e-4)
+            if is_let_go:
+                reading = self.device.read()
+                self.request.handle.follow(reading, self.hand)
             self._step(dt, is_stale=False)
         if is_let_go and self.out[UNKNOWNS]:
             self.out[:6] = 0.0
+        return reading
 
     def _tell(self) -> None:
         """Say where tool and hand are, and which cells the last frame missed."""
@@ -236,6 +248,19 @@ class Loop:
             self.signal, self.clusters, self.pose, self.place, grid.bits, grid.curve_code,
             self.met[0], n_hits,
         )  # fmt: skip
+
+    def _ask_or_withdraw(self, now: int) -> None:
+        """Ask about the last frame's hits; without any, take back what was asked and answered.
+
+        What stayed would be asked anew at each write, of voxels that are no longer touched; what
+        went at once would never be answered where the database is slow.
+        """
+        if self.out[HITS]:
+            self._ask(int(self.out[HITS]))
+            self._asked_at = now
+        elif self._asked_at and self.cells.control[HEARTBEAT] > self._asked_at + WITHDRAWN_NS:
+            self._ask(0)
+            self._asked_at = 0
 
     def _note(
         self,
@@ -280,15 +305,15 @@ class Loop:
             request.handle.follow(reading, self.hand)
             is_stale = begun - control[HEARTBEAT] > staleness
             if request.is_waiting:
-                self._step_exactly(deadlines.dt, over)
+                reading = self._step_exactly(reading, deadlines.dt, over)
             else:
                 self._step(deadlines.dt, is_stale=is_stale)
             device.apply(self.out[:6])
             state = self._count(request.handle.is_open, is_stale)
             if at % tell_every == 0 or self.out[UNKNOWNS]:
                 self._tell()
-            if at % ask_every == 0 and self.out[HITS]:
-                self._ask(int(self.out[HITS]))
+            if at % ask_every == 0:
+                self._ask_or_withdraw(begun)
             self._note(
                 at,
                 (begun - deadlines.started) * 1e-9,
@@ -380,4 +405,7 @@ def work(request: LoopRequest, voice: Voice) -> None:
         loop.counts.conditions.update(granted)
         voice.say("done", LoopAnswer(figures, empty, loop.counts, warm_up, loop.is_warm))
     finally:
-        loop.close()
+        try:  # whoever asks for the end has it: the device is not to be left half closed for that
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        finally:
+            loop.close()

@@ -1,0 +1,250 @@
+"""The loop when cells go, the hand leaves, or its process is told to end: frame by frame."""
+
+import io
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hapticdb.errors import DeviceError
+from hapticdb.kernels import coupling as kernels
+from hapticdb.kernels.cells import UNKNOWNS
+from hapticdb.realtime import loop as subject
+from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.deadlines import Timing
+from hapticdb.realtime.devices import Reading
+from hapticdb.realtime.handle import Handle
+from hapticdb.realtime.loop import WITHDRAWN_NS, Loop, LoopRequest, ring_bytes, work
+from hapticdb.realtime.process import Voice
+from hapticdb.realtime.session import frames_of
+from hapticdb.realtime.table import HEARTBEAT, anonymous_memory
+from realtime.coupled import SIDE, World, punch
+from realtime.hands import at
+from realtime.worlds import block
+
+Floats = NDArray[np.float64]
+N_RING = 64
+MIDDLE = SIDE // 2
+FLOOR = block((MIDDLE - 12, MIDDLE - 12, MIDDLE - 4), (MIDDLE + 11, MIDDLE + 11, MIDDLE - 1))
+LATE = 10 * 10**9
+"""ns that a frame may wait in a test, which is never the end of it."""
+
+
+class Pressing:
+    """A hand at some height whose tests see what it is sent."""
+
+    def __init__(self, z: float) -> None:
+        self.z = z
+        self.buttons = 0
+        self.sent: list[Floats] = []
+
+    def read(self) -> Reading:
+        return Reading(at(0.0, 0.0, self.z), np.zeros(6), self.buttons)
+
+    def apply(self, wrench: Floats) -> None:
+        self.sent.append(wrench.copy())
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # a test's input may be closed
+    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # for a fetching process, which is not there
+    before = signal.getsignal(signal.SIGTERM)
+    made = World(FLOOR)
+    yield made
+    made.close()
+    signal.signal(signal.SIGTERM, before)
+
+
+def requested(world: World, hand: Pressing, **options: object) -> LoopRequest:
+    given: dict[str, object] = {"coupling": Coupling(), "is_waiting": True, "seconds": 1.0}
+    return LoopRequest(
+        descriptor=world.table.descriptor,
+        n_slots=world.table.n_slots,
+        row=world.table.join(),
+        ring=anonymous_memory("frames", ring_bytes(N_RING)),
+        n_ring=N_RING,
+        grid=world.grid,
+        shell=punch(6),
+        device=hand,
+        stiffness=1000.0,
+        handle=Handle(),
+        timing=Timing(200.0),
+        staleness=1e9,
+        **(given | options),  # type: ignore[arg-type]
+    )
+
+
+def frame(loop: Loop, hand: Pressing, dt: float = 1e-3) -> Reading:
+    """One frame that waits for its cells."""
+    reading = hand.read()
+    loop.request.handle.follow(reading, loop.hand)
+    used = loop._step_exactly(reading, dt, time.perf_counter_ns() + LATE)
+    hand.apply(loop.out[:6])
+    return used
+
+
+def pressed(world: World, hand: Pressing, **options: object) -> Loop:
+    """A loop whose tool was placed in the air, and rests on the floor."""
+    loop = Loop(requested(world, hand, **options))
+    loop.warm_up()
+    loop._place()
+    hand.z = -0.01
+    for _ in range(300):
+        frame(loop, hand)
+    assert loop.out[2] > 1.0
+    return loop
+
+
+class Summoning(Pressing):
+    """A hand that, while it is let go, moves, and after some reads has the cells come back."""
+
+    def __init__(self, z: float) -> None:
+        super().__init__(z)
+        self.keys: NDArray[np.int64] | None = None
+        self.known: NDArray[np.int64] | None = None
+        self.reads_left = 1 << 30
+
+    def take(self, keys: NDArray[np.int64]) -> None:
+        """Take all cells away."""
+        self.keys, self.known = keys, keys.copy()
+        keys[:] = -1
+
+    def apply(self, wrench: Floats) -> None:
+        super().apply(wrench)
+        if self.keys is not None and not wrench.any():
+            self.reads_left = 3
+
+    def read(self) -> Reading:
+        self.reads_left -= 1
+        if self.reads_left == 0 and self.keys is not None and self.known is not None:
+            self.keys[:] = self.known
+            self.buttons, self.z = 2, -0.02
+        return super().read()
+
+
+def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World) -> None:
+    """In no frame by more than its share, also in the next, whose period is as long as the wait."""
+    hand = Summoning(0.02)
+    loop = pressed(world, hand, coupling=Coupling(hold=1e-3))
+    full, n_before = loop.out[2], len(hand.sent)
+    hand.take(world.table.cells.keys)
+    frame(loop, hand)
+    for dt in [0.3] + [1e-3] * 20:
+        frame(loop, hand, dt)
+    sent = [float(wrench[2]) for wrench in hand.sent[n_before:]]
+    assert sent[0] == 0.0
+    assert sent[1] == pytest.approx(full / 20, rel=0.1)
+    assert max(np.diff(sent)) <= full / kernels.RISE_FRAMES * 1.01
+    assert sent[-1] == pytest.approx(full, rel=0.01)
+
+
+def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(world: World) -> None:
+    """The frame says which reading that is, so that it is the one that is recorded."""
+    hand = Summoning(0.02)
+    loop = pressed(world, hand, coupling=Coupling(hold=1e-3))
+    hand.take(world.table.cells.keys)
+    used = frame(loop, hand)
+    assert not loop.out[UNKNOWNS]
+    assert used.buttons == 2
+    assert used.pose[2, 3] == loop.hand[2] == -0.02
+
+
+def test_objects_are_no_longer_asked_for_once_the_tool_has_left_and_was_answered(
+    world: World,
+) -> None:
+    hand = Pressing(0.02)
+    loop = pressed(world, hand)
+    asked, control = loop.signal.voxels, world.table.cells.control
+    loop._ask_or_withdraw(1000)
+    assert asked[0] > 0
+    hand.z = 0.02
+    for _ in range(100):
+        frame(loop, hand)
+    control[HEARTBEAT] = 1000 + WITHDRAWN_NS  # the database may still be naming them
+    loop._ask_or_withdraw(2000)
+    assert asked[0] > 0
+    control[HEARTBEAT] += 1
+    loop._ask_or_withdraw(3000)
+    assert asked[0] == 0
+
+
+def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
+    """A whole run: a hand on the floor that leaves it, the database answering all the time."""
+
+    class Leaving(Pressing):
+        def apply(self, wrench: Floats) -> None:
+            super().apply(wrench)
+            world.table.cells.control[HEARTBEAT] = time.monotonic_ns() + 2 * WITHDRAWN_NS
+            if wrench.any():
+                self.n_asked = int(world.table.desk.voxels[:, 0].max())
+                self.z = 0.02 if len(self.sent) > 30 else self.z
+
+        @property
+        def is_over(self) -> bool:
+            return len(self.sent) > 120
+
+    hand = Leaving(-0.004)
+    work(requested(world, hand, is_waiting=False, seconds=60.0), Voice(io.BytesIO()))
+    assert hand.n_asked > 0
+    assert not hand.sent[-1].any()
+    assert not world.table.desk.voxels[:, 0].any()
+
+
+def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:
+    hand = Pressing(-0.004)
+    loop = Loop(requested(world, hand))
+    loop.warm_up()
+    assert loop.frame.any()
+    hand.z = 0.02
+    loop._place()
+    loop._step(1e-3, is_stale=True)
+    loop._note(0, 0.0, 0.0, 0.0, 0.0, 0, loop._count(is_clutch_open=False, is_stale=True))
+    (noted,) = frames_of(loop.ring[[0]])
+    assert noted["hits"] == loop.counts.hit_frames == 0
+    assert not noted["wrench"].any()
+
+
+@pytest.mark.parametrize("when", ["apply", "close"])
+def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
+    world: World, when: str
+) -> None:
+    class Ended(SystemExit):
+        pass
+
+    def end(number: int, _: object) -> None:
+        signal.signal(number, signal.SIG_IGN)
+        raise Ended
+
+    class Told(Pressing):
+        is_failing = is_closed = False
+
+        def tell(self, now: str) -> None:
+            if self.is_failing and now == when:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(1e-3)
+
+        def read(self) -> Reading:
+            if len(self.sent) > 5:
+                self.is_failing = True
+                raise DeviceError("unplugged")
+            return super().read()
+
+        def apply(self, wrench: Floats) -> None:
+            self.tell("apply")
+            super().apply(wrench)
+
+        def close(self) -> None:
+            self.tell("close")
+            self.is_closed = True
+
+    signal.signal(signal.SIGTERM, end)
+    hand = Told(0.02)
+    with pytest.raises(DeviceError, match="unplugged"):
+        work(requested(world, hand), Voice(io.BytesIO()))
+    assert hand.is_closed
+    assert not hand.sent[-1].any()

@@ -125,9 +125,12 @@ def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
         ([*PLAY, "--seconds", -1], ["-1.0 seconds"]),
         ([*PLAY, "--staleness", 0], ["staleness"]),
         ([*PLAY, "--scale", 0], ["a scale of 0.0"]),
+        ([*PLAY, "--scale", 1e300], ["a scale of 1e+300", "at most"]),
+        (["--device", "random", "--at", ABOVE, "--seed", -1], ["--seed -1: give 0 or more"]),
         ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
         ([*PLAY, "--budget", 0.5], ["--budget 0.5: give MiB"]),
         ([*PLAY, "--stiffness", -5], ["stiffness"]),
+        ([*PLAY, "--stiffness", 1e300], ["stiffness 1e+300 N/m: give a number from 0 to 1e+09"]),
         ([*PLAY, "--policy", "hope"], ["hold", "wait"]),
         ([*PLAY, "--exclude", "box"], ["--exclude 'box'", "3,4"]),
         ([*PLAY, "--exclude", 99], ["no object 99"]),
@@ -153,6 +156,24 @@ def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path
     refused(run("feel", path, "--tool", "tool.npz", *PLAY), "path.csv")
     assert run("copy", "scene.db", "lexical.db", *LEXICOGRAPHIC)[0] == 0
     refused(run("feel", "lexical.db", "--tool", "tool.npz", *PLAY), "lexicographic", "--curve z")
+
+
+def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) -> None:
+    path = scene.with_name("felt.hdbrec")
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 2000, "--seconds", 6)
+    assert run(*args, "--record", path)[0] == 0
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])
+    code, out, err = run("replay", path)
+    assert (code, out.startswith("equal: ")) == (0, True)
+    assert re.fullmatch(
+        r"hapticdb: .*felt\.hdbrec: the last [\d,]+ bytes are no whole piece.*\n", err
+    )
+    start = path.stat().st_size - len(whole) + len(whole) // 2
+    path.write_bytes(whole[:start] + b"?" * 64 + whole[start + 64 :])
+    refused(run("replay", path), "damaged at frame", "--until-damage")
+    code, out, err = run("replay", path, "--until-damage")
+    assert (code, out.startswith("equal: "), err) == (0, True, "")
 
 
 def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:

@@ -5,6 +5,7 @@
 import json
 import re
 import shutil
+import signal
 import subprocess
 import sys
 import time
@@ -268,6 +269,23 @@ def test_a_private_server_comes_and_goes_with_the_commands(made: Path, tmp_path:
     assert [process.returncode for process in both] == [0, 0], ended
     assert {out.count('"pose"') for out, _ in ended} == {len(PLACES)}
     assert not PrivateServer.at(folder).is_running
+
+
+def test_a_private_server_goes_with_a_command_that_the_system_ends(
+    made: Path, tmp_path: Path
+) -> None:
+    assert started(tmp_path, "import", PRIVATE, made / "boxes.glb", "--bits", 6).wait() == 0
+    stl = tool(tmp_path / "tool.stl")
+    many = poses(tmp_path / "many.csv", *[(0.0, 0.0, 0.3)] * 20_000)
+    args = ("touch", PRIVATE, "--tool", stl, "--poses", many, "--json")
+    with started(tmp_path, *args) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        assert PrivateServer.at(tmp_path / "server").is_running
+        process.terminate()
+        _, err = process.communicate(timeout=60)
+    assert (process.returncode, err) == (128 + signal.SIGTERM, "")
+    assert not PrivateServer.at(tmp_path / "server").is_running
 
 
 def test_reading_sets_no_server_up(run: Run, tmp_path: Path) -> None:

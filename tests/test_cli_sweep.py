@@ -158,6 +158,28 @@ def test_others_who_write_meanwhile_are_told_of(
     assert "was written meanwhile; this is of revision 3" in err
 
 
+@pytest.mark.usefixtures("free")
+@pytest.mark.parametrize("name", ["scene.db", "free.csv", "x.xyz", "", ".png"])
+def test_a_picture_that_is_none_by_its_name_overwrites_nothing(
+    run: Run, scene: Path, name: str
+) -> None:
+    before = {path.name: path.read_bytes() for path in scene.parent.iterdir()}
+    refused(run("sweep", scene, *TOOL, "--path", "free.csv", "--picture", name), "--picture")
+    assert {path.name: path.read_bytes() for path in scene.parent.iterdir()} == before
+
+
+@pytest.mark.parametrize("place", [(5000.0, 0.0, 0.0), (1e8, 1e8, 1e8)])
+def test_a_path_beside_the_environment_is_told(
+    run: Run, scene: Path, place: tuple[float, float, float]
+) -> None:
+    poses(scene.parent / "mm.csv", place, (place[0] + 0.1, *place[1:]))
+    code, out, err = run("sweep", scene, *TOOL, "--path", "mm.csv")
+    assert (code, out.startswith("comes out: ")) == (0, True)
+    (line,) = err.splitlines()
+    assert line.startswith("hapticdb: mm.csv: all of it is outside of the environment, which is")
+    assert line.endswith("are these poses in metres?")
+
+
 def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
     path = ("--path", "path.csv")
     refused(run("sweep", scene, *path), "--tool and --part")

@@ -99,6 +99,7 @@ def test_marks_line_ends_blanks_quotes_and_order_do_not_matter(
         (b"x,y,z,qw,qx,qy,qz\n1,2,,1,0,0,0\n", "line 2: z is ''"),
         (b"x,y,z,qw,qx,qy,qz\nnan,2,3,1,0,0,0\n", "line 2: x is nan"),
         (b"x,y,z,qw,qx,qy,qz\n1,2,3,inf,0,0,0\n", "line 2: qw is inf"),
+        (b"x,y,z,qw,qx,qy,qz\n1,-1e300,3,1,0,0,0\n", "line 2: y is -1e+300 m, farther than any"),
         (b"x,y,z,qw,qx,qy,qz\n1,2,3,0,0,0,0\n", "line 2: the quaternion"),
         (b"x,y,z,qw,qx,qy,qz\n1,2,3,1e300,1.7e308,1.7e308,1.7e308\n", "line 2: the quaternion"),
         (b"\x89PNG\r\n\x1a\n\x00\x00\xff\xfe", "no text file"),

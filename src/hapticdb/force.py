@@ -4,10 +4,12 @@ The arithmetic runs in `hapticdb.kernels.contact`, fused with the refinement of 
 once more inside the engine for the strategy `statement`; both share the same leaves.
 """
 
-import math
 from dataclasses import dataclass
 
 from hapticdb.errors import UsageError
+
+MOST_STIFFNESS = 1e9
+"""N/m: stiffer than any hand, device or part."""
 
 
 @dataclass(frozen=True)
@@ -22,12 +24,14 @@ class TangentPlane:
     Attributes
     ----------
     stiffness : float
-        K, N/m.
+        K, N/m, `MOST_STIFFNESS` at most.
     """
 
     stiffness: float = 1000.0
 
     def __post_init__(self) -> None:
-        if not (math.isfinite(self.stiffness) and self.stiffness >= 0):
-            raise UsageError(f"stiffness {self.stiffness} N/m: give a finite number, 0 or more")
+        if not 0.0 <= self.stiffness <= MOST_STIFFNESS:
+            raise UsageError(
+                f"stiffness {self.stiffness} N/m: give a number from 0 to {MOST_STIFFNESS:g}"
+            )
         object.__setattr__(self, "stiffness", float(self.stiffness))

@@ -18,6 +18,9 @@ from hapticdb.errors import FileError, UsageError
 
 COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
+FARTHEST = 1e9
+"""Metres of a place: beyond it, there is none."""
+
 _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
 
 
@@ -187,6 +190,8 @@ def _pose(fields: list[str], places: dict[str, int], where: str) -> list[float]:
             raise FileError(f"{where}: {name} is {fields[place][:40]!r}, not a number") from None
         if not math.isfinite(value):
             raise FileError(f"{where}: {name} is {value}, not a finite number")
+        if name in {"x", "y", "z"} and abs(value) > FARTHEST:
+            raise FileError(f"{where}: {name} is {value:g} m, farther than any place; {_HINT}")
         values.append(value)
     norm = math.hypot(*values[3:7])
     if not (norm > 1e-9 and math.isfinite(norm)):

@@ -136,6 +136,31 @@ def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
     session.close()
 
 
+def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
+    env: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first ends the start, the second what the first has begun."""
+
+    close = Session.close
+    signals = iter([KeyboardInterrupt()])
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    def cut_off(session: Session) -> None:
+        for signal in signals:
+            raise signal
+        close(session)  # by then it is dropped
+
+    path = tmp_path / "never.hdbrec"
+    monkeypatch.setattr(module, "Process", interrupted)
+    monkeypatch.setattr(Session, "close", cut_off)
+    with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
+        with pytest.raises(KeyboardInterrupt):
+            Session(cells, sphere, still(DEEP), record=path)
+        assert not path.exists()
+
+
 # -- what is misread -----------------------------------------------------------------------------
 
 

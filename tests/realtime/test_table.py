@@ -47,6 +47,11 @@ def test_the_memory_is_as_large_as_it_says_and_within_the_budget(budget: int) ->
         assert ends[-1][1] - ends[0][0] <= table.size_bytes
 
 
+def test_a_budget_beyond_the_machines_memory_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"^a budget of \d+ bytes .*: this machine has \d+$"):
+        CellTable.create(1 << 50)
+
+
 def test_a_budget_too_small_is_refused() -> None:
     with pytest.raises(UsageError, match=f"give {LEAST_BUDGET} or more"):
         CellTable.create(LEAST_BUDGET - 1)

@@ -18,7 +18,7 @@ from hapticdb.cli.granting import grant
 from hapticdb.cli.importing import import_
 from hapticdb.cli.listing import analyze, calibrate, info, objects
 from hapticdb.cli.moving import copy, diff
-from hapticdb.cli.root import Interrupted, PipeClosedError, app
+from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
 from hapticdb.cli.sampling import demo, sample
 from hapticdb.cli.sweeping import sweep
 from hapticdb.cli.touching import touch
@@ -65,7 +65,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     is_debugging = "--debug" in takewhile(lambda arg: arg.startswith("-"), args)
     _print_anything()
     try:
-        code = app(args, standalone_mode=False, prog_name="hapticdb")
+        with leaving_in_order():
+            code = app(args, standalone_mode=False, prog_name="hapticdb")
         sys.stdout.flush()
     except (BrokenPipeError, PipeClosedError):
         _close_stdout()

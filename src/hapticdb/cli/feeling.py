@@ -18,6 +18,7 @@ from hapticdb.cli.root import (
     Url,
     bytes_of,
     ids_of,
+    leave,
     numbers_of,
 )
 from hapticdb.cli.touching import shell_of
@@ -122,10 +123,7 @@ def feel(
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
     shell = shell_of(tool, tool_unit, points, None if is_for_hand_alone else seed)
-    with (
-        _leaving_in_order(),
-        ResidentCells(url, budget_bytes=budget_bytes, exclude=excluded) as cells,
-    ):
+    with ResidentCells(url, budget_bytes=budget_bytes, exclude=excluded) as cells:
         with (
             Session(
                 cells,
@@ -157,23 +155,6 @@ def feel(
 
 
 @contextmanager
-def _leaving_in_order() -> Iterator[None]:
-    """Let SIGTERM end the program by way of every clean-up."""
-    if signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:  # somebody wants it otherwise
-        yield
-        return
-    signal.signal(signal.SIGTERM, _leave)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, signal.SIG_DFL)
-
-
-def _leave(number: int, _: object) -> None:
-    raise SystemExit(128 + number)
-
-
-@contextmanager
 def _ended_by_signals(session: "Session") -> Iterator[list[int]]:
     """Let Ctrl-C or SIGTERM end the session, with its report, and a second one the program.
 
@@ -184,7 +165,7 @@ def _ended_by_signals(session: "Session") -> Iterator[list[int]]:
     before = {  # another's handler stays
         number: handler
         for number, handler in handlers.items()
-        if handler in {signal.default_int_handler, _leave}
+        if handler in {signal.default_int_handler, leave}
     }
 
     def end(number: int, _: object) -> None:
@@ -208,6 +189,9 @@ def replay(
         typer.Argument(metavar="URL", help="The environment; the recorded one without."),
     ] = None,
     *,
+    until_damage: Annotated[
+        bool, typer.Option("--until-damage", help="Take a damaged recording to end there.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Compute a recorded session's contact wrenches again, and say where they part.
@@ -224,6 +208,11 @@ def replay(
     from hapticdb.realtime.table import CellTable
 
     session = Recording(recording)
+    if session.n_torn:
+        render.note(
+            f"{recording}: the last {session.n_torn:,} bytes are no whole piece, the recorder was "
+            "cut off; what is before them is whole"
+        )
     header = session.header
     with hapticdb.open(url or header.environment, read_only=True) as env:
         felt = None
@@ -233,7 +222,7 @@ def replay(
                 env.store, CellTable.create(), [i for i in header.exclude if i in present]
             )
             felt = Frames(residency, header.shell, header.law).wrenches
-        replayed = compare(session, env, felt)
+        replayed = compare(session, env, felt, until_damage=until_damage)
     if json:
         parting = replayed.parting
         render.say_json(
@@ -269,6 +258,8 @@ def _device(
     from hapticdb.realtime.recording import Recording
     from hapticdb.realtime.simulated import SimulatedDevice
 
+    if seed < 0:
+        raise UsageError(f"--seed {seed}: give 0 or more")
     place = numbers_of(at, [3], "--at", "metres, such as 0.5,0,1.2") if at is not None else None
     if word in {"random", "tumble"} and place is None:
         raise UsageError(f"--device {word}: give --at, where the hand is")

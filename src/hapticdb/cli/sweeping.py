@@ -1,7 +1,8 @@
 """The verb sweep."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -75,6 +76,8 @@ def sweep(
         raise UsageError("give one of --tool and --part")
     if part is not None and tool_unit is not None:
         raise UsageError("--tool-unit is of a --tool; a part has the unit that it was imported in")
+    if picture is not None and Path(picture).suffix.lower() != ".png":
+        raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
     budget_bytes = bytes_of(budget)
     excluded = ids_of(exclude or (), "--exclude")
     poses = read_poses(path)
@@ -100,6 +103,12 @@ def sweep(
             )
         if env.store.revision() != found.revision:
             render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
+        if not found.cells:
+            low, high = env.grid.origin, [x + env.grid.edge for x in env.grid.origin]
+            render.note(
+                f"{path}: all of it is outside of the environment, which is from "
+                f"{_place(low)} to {_place(high)} m: are these poses in metres?"
+            )
         try:
             if json:
                 render.say_json(_record(found, shell, part, sorted(set(excluded))))
@@ -220,11 +229,14 @@ def _facts(env: "Environment", found: "Swept", shell: "PointShell") -> list[tupl
 
 
 def _deepest_text(deepest: "Deepest") -> str:
-    place = ", ".join(f"{x:.4g}" for x in deepest.point)
     return (
         f"{render.metres(deepest.depth)} at {_percent(deepest.moment.fraction)}, in "
-        f"{_names(deepest.moment.objects)}, at ({place}) m"
+        f"{_names(deepest.moment.objects)}, at {_place(deepest.point)} m"
     )
+
+
+def _place(point: "Iterable[float]") -> str:
+    return f"({', '.join(f'{x:.4g}' for x in point)})"
 
 
 def _clearance_text(clearance: "Clearance") -> str:

@@ -13,14 +13,17 @@ from hapticdb.poses import quaternion_of
 from hapticdb.realtime.devices import Reading, pose_at
 
 Floats = NDArray[np.float64]
+MOST_SCALE = 1e6
+"""More would carry any hand beyond what a reading may be."""
 
 
 class Handle:
     """Where the hand is in the scene: the handle, which the tool is pulled to.
 
     While the clutch is open the hand moves and the handle stays; when it closes the handle goes on
-    from there. A reading that is not finite leaves the handle nowhere, its x not a number, until
-    the next that is. A handle holds the state of one session.
+    from there. A reading that is not finite, or beyond 1e6 m, m/s or rad/s, leaves the handle
+    nowhere, its x not a number, until the next that is somewhere. A handle holds the state of one
+    session.
 
     Parameters
     ----------
@@ -41,8 +44,8 @@ class Handle:
     def __init__(
         self, *, scale: float = 1.0, start: ArrayLike | None = None, clutch: int | None = None
     ) -> None:
-        if not (math.isfinite(scale) and scale > 0.0):
-            raise UsageError(f"a scale of {scale}: give a number above 0")
+        if not 0.0 < scale <= MOST_SCALE:
+            raise UsageError(f"a scale of {scale}: give a number above 0, {MOST_SCALE:g} at most")
         if clutch is not None and not 0 <= clutch < 31:
             raise UsageError(f"button {clutch} for the clutch: give 0 to 30")
         self.scale = float(scale)
@@ -58,7 +61,7 @@ class Handle:
     def start(self, reading: Reading, hand: Floats) -> None:
         """Place the handle for a reading, at rest: into hand (HAND,), its `IS_STALE` left.
 
-        When the reading is not finite, the next that is places it, in `follow`.
+        When the reading is nowhere, the next that is somewhere places it, in `follow`.
         """
         self.is_open = False
         self._is_placed = is_somewhere(reading.pose, reading.velocity)

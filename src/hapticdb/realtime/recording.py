@@ -149,7 +149,7 @@ class Recording:
     def _damage(self, frame: int) -> FileError:
         return FileError(
             f"{self.path}: damaged at frame {frame}; the frames before it are whole: "
-            "read them with until_damage"
+            "read them with until_damage, or 'hapticdb replay --until-damage'"
         )
 
     def _file(self) -> io.FileIO:

@@ -140,10 +140,12 @@ class Session:
         try:
             self._begin(device, policy, staleness, seconds, record, replace_recording)
         except BaseException:
-            self.close()
-            if self._new is not None:  # nothing was recorded: the name stays free
-                with suppress(OSError):
-                    self._new.unlink()
+            try:
+                self.close()
+            finally:  # also when a second signal cuts that off
+                if self._new is not None:  # nothing was recorded: the name stays free
+                    with suppress(OSError):
+                        self._new.unlink()
             raise
 
     def _begin(

@@ -148,6 +148,11 @@ class CellTable:
     @classmethod
     def create(cls, budget_bytes: int = DEFAULT_BUDGET) -> "CellTable":
         """Make a table of at most so many bytes, in which every cell is unknown."""
+        memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+        if budget_bytes > memory:
+            raise UsageError(
+                f"a budget of {budget_bytes} bytes for resident cells: this machine has {memory}"
+            )
         n_slots = slots_within(budget_bytes)
         descriptor = anonymous_memory("hapticdb-cells", _bytes_of(n_slots))
         table = cls(descriptor, n_slots)

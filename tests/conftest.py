@@ -1,6 +1,8 @@
 """What every test shares: the folder of real CAD, a few shells, and the header."""
 
 import os
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import apsw
@@ -27,6 +29,18 @@ def pytest_report_header() -> list[str]:
     jit = "off" if numba.config.DISABLE_JIT else "on"
     servers = ", ".join(map(named, FOUND))
     return [f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, {servers}, JIT {jit}"]
+
+
+@pytest.fixture(autouse=True)
+def _signals_are_left_as_they_were() -> Iterator[None]:
+    """Or every process that a later test starts ignores them, too."""
+    numbers = signal.SIGINT, signal.SIGTERM
+    before = list(map(signal.getsignal, numbers))
+    yield
+    after = list(map(signal.getsignal, numbers))
+    for number, handler in zip(numbers, before, strict=True):
+        signal.signal(number, handler)
+    assert after == before
 
 
 @pytest.fixture(scope="session")

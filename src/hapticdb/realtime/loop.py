@@ -406,6 +406,7 @@ def work(request: LoopRequest, voice: Voice) -> None:
         voice.say("done", LoopAnswer(figures, empty, loop.counts, warm_up, loop.is_warm))
     finally:
         try:  # whoever asks for the end has it: the device is not to be left half closed for that
-            signal.signal(signal.SIGTERM, signal.SIG_IGN)
+            before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
         finally:
             loop.close()
+        signal.signal(signal.SIGTERM, before)

@@ -6,7 +6,6 @@ import pickle
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -15,6 +14,7 @@ from hapticdb import DatabaseError, HapticDBError
 from hapticdb.realtime import process as module
 from hapticdb.realtime.process import Message, Process
 from hapticdb.realtime.table import is_alive
+from realtime.sessions import until
 
 WORKERS = "realtime.workers:work"
 LONG = 60.0
@@ -110,13 +110,6 @@ def test_one_killed_is_silent_and_not_alive() -> None:
         assert not process.is_alive
 
 
-def until_gone(pid: int) -> None:
-    deadline = time.monotonic() + LONG
-    while is_alive(pid):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
 SCRIPT = f"""
 import os, time
 from hapticdb.realtime.process import Process
@@ -139,7 +132,7 @@ def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
         session.kill()
         session.wait()
         try:
-            until_gone(pid)
+            until(lambda: not Path(f"/proc/{pid}").exists())
         finally:
             if forks:
                 os.kill(forked, signal.SIGKILL)
@@ -151,4 +144,4 @@ def test_one_that_is_dropped_ends() -> None:
     pid = process.pid
     del process
     gc.collect()
-    until_gone(pid)
+    until(lambda: not is_alive(pid))

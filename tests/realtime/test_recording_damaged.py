@@ -113,7 +113,8 @@ def test_damage_in_the_middle_is_told_with_its_frame(tmp_path: Path, within: int
     assert (found.damaged_at, len(found)) == (5, 5)
     each = found.frames()
     assert next(each).tobytes() == frames[:5].tobytes()
-    with pytest.raises(FileError, match=r"s\.hdbrec: damaged at frame 5; .* until_damage, or "):
+    told = r"s\.hdbrec: damaged at frame 5; .* until_damage, or 'hapticdb replay --until-damage'$"
+    with pytest.raises(FileError, match=told):
         next(each)
     with pytest.raises(FileError, match="damaged at frame 5"):
         found.poses()

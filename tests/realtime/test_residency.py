@@ -282,12 +282,16 @@ def test_another_environment_in_the_same_place_is_refused(tmp_path: Path, table:
         residency.reopened(make(tmp_path, bits=6).store)
 
 
+def two_of_one_grid(tmp_path: Path) -> list[Environment]:
+    folders = [tmp_path / "first", tmp_path / "second"]
+    for folder in folders:
+        folder.mkdir()
+    return list(map(make, folders))
+
+
 def test_another_file_of_the_same_grid_makes_all_unknown(tmp_path: Path, table: CellTable) -> None:
     """Though its writes be of the same numbers."""
-    first, second = tmp_path / "first", tmp_path / "second"
-    for folder in (first, second):
-        folder.mkdir()
-    env, other = make(first), make(second)
+    env, other = two_of_one_grid(tmp_path)
     write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
     write_voxels(other.store, block((60, 60, 60), (70, 70, 70)))
     residency = Residency(env.store, table)
@@ -305,10 +309,7 @@ def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
 
     What is urgent is known before and after, and in no version between.
     """
-    first, second = tmp_path / "first", tmp_path / "second"
-    for folder in (first, second):
-        folder.mkdir()
-    env, other = make(first), make(second)
+    env, other = two_of_one_grid(tmp_path)
     write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
     write_voxels(other.store, block((8, 8, 8), (70, 70, 70)))
     cells = cells_of(env.grid)

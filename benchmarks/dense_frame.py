@@ -5,10 +5,11 @@ order of its sums, are those of `hapticdb.kernels.cells.felt`; only the lookup d
 """
 
 import numpy as np
+from numba import types
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, leaf
-from hapticdb.kernels.cells import CONTACTS, DEEPEST, EMPTY_SLOT, HITS, Cells
+from hapticdb.kernels._jit import FLOAT, FLOATS2, FLOATS3, INT, INTS, INTS32, WORDS32_2, entry, leaf
+from hapticdb.kernels.cells import CLUSTERS, CONTACTS, DEEPEST, EMPTY_SLOT, HITS, PLACE, Cells
 from hapticdb.kernels.contact import (
     average_into,
     center_of,
@@ -20,7 +21,7 @@ from hapticdb.kernels.contact import (
 )
 
 
-@entry
+@entry(INTS, INTS32, WORDS32_2, INT, types.uint32[::1])
 def spread_out(keys: NDArray[np.int64], slots, words, side, bitmap):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
     """Resident cells of one directory into a bitmap, zero before."""
     row = side // 32
@@ -91,7 +92,7 @@ def dense_felt(bitmap, shell, pose, place, stiffness, met, out):  # type: ignore
     out[DEEPEST] = deepest
 
 
-@entry
+@entry(types.uint32[::1], CLUSTERS, FLOATS3, PLACE, FLOAT, INTS, FLOATS2)
 def dense_feel(bitmap, shell, poses, place, stiffness, met, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
     """`dense_felt` at poses (M, 4, 4) into out (M, RESULTS), as `feel_kernel`."""
     for n in range(poses.shape[0]):

@@ -31,6 +31,7 @@ from hapticdb.cli import root
 from hapticdb.grid import CURVE_NAMES
 from hapticdb.mesh.reader import UNITS
 from hapticdb.query import STRATEGIES
+from hapticdb.store import connect
 from hapticdb.store.base import LAYOUTS
 
 VERBS = (
@@ -46,6 +47,7 @@ VERBS = (
     "diff",
     "sample",
     "demo",
+    "warm",
 )
 
 
@@ -109,19 +111,50 @@ def test_an_unforeseen_error_is_one_line_too(
     def fails(*_: object, **__: object) -> None:
         raise RuntimeError("first line\nsecond line")
 
-    monkeypatch.setattr(hapticdb, "open", fails)
+    monkeypatch.setattr(connect, "open_store", fails)
     code, out, err = run("info", scene)
     assert (code, out) == (1, "")
     assert err == "hapticdb: RuntimeError: first line; 'hapticdb --debug ...' shows where\n"
 
 
+def modules_after(program: str, *names: str) -> list[str]:
+    """Which of those modules a program has loaded at its end."""
+    done = subprocess.run(
+        [sys.executable, "-c", f"{program}\nimport sys\nprint(*sorted(sys.modules))"],
+        capture_output=True,
+        check=True,
+        text=True,
+        timeout=120,
+    )
+    return sorted({*names} & {*done.stdout.splitlines()[-1].split()})
+
+
 def test_the_library_does_without_typer_and_rich() -> None:
     program = (
-        "import sys, hapticdb, hapticdb.demo, hapticdb.picture\n"
-        "print([name for name in ('typer', 'rich') if name in sys.modules])"
+        "import hapticdb, hapticdb.demo, hapticdb.picture\n"
+        "for name in hapticdb.__all__: getattr(hapticdb, name)"
     )
-    found = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True)
-    assert found.stdout.strip() == b"[]"
+    assert modules_after(program, "typer", "rich", "numba") == ["numba"]
+
+
+SLOW_TO_LOAD = ("numba", "scipy", "matplotlib", "trimesh", "collada", "cascadio", "psycopg")
+
+
+@pytest.mark.parametrize(
+    ("args", "others"),
+    [
+        ("'--help'", ["numpy", "apsw"]),
+        ("'--version'", ["numpy", "apsw", "rich.table"]),
+        ("'touch', '--help'", ["numpy", "apsw"]),
+        ("'info', URL", ["hapticdb.environment"]),
+        ("'objects', URL", ["hapticdb.environment"]),
+    ],
+)
+def test_what_answers_at_once_loads_nothing_that_is_slow(
+    scene: Path, args: str, others: list[str]
+) -> None:
+    program = f"from hapticdb.cli import main\nURL = {str(scene)!r}\nassert main([{args}]) == 0"
+    assert modules_after(program, *SLOW_TO_LOAD, *others) == []
 
 
 # -- import ---------------------------------------------------------------------------------------

@@ -6,51 +6,55 @@
 >>> env.touch(shell, pose).force                              # doctest: +SKIP
 """
 
-from hapticdb.difference import Difference, diff_environments
-from hapticdb.environment import Environment, Touch, create, open  # noqa: A004 - as in tarfile.open
-from hapticdb.errors import (
-    AccessError,
-    BusyError,
-    ConflictError,
-    ConnectionLostError,
-    DamagedError,
-    DatabaseError,
-    DeviceError,
-    EnvironmentExistsError,
-    EnvironmentNotFoundError,
-    FileError,
-    GeometryChangedError,
-    GridError,
-    HapticDBError,
-    MissingExtraError,
-    NewerVersionError,
-    NotAnEnvironmentError,
-    ObjectNotFoundError,
-    OutsideGridError,
-    ReadOnlyError,
-    StuckError,
-    UsageError,
-)
-from hapticdb.force import TangentPlane
-from hapticdb.grid import Grid, GridOptions
-from hapticdb.ingest import FileReport, ImportOptions, import_files
-from hapticdb.pointshell import PointShell
-from hapticdb.pool import Pool
-from hapticdb.poses import read_poses, write_poses
-from hapticdb.query import Query
-from hapticdb.realtime.coupling import Coupling
-from hapticdb.realtime.handle import Handle
-from hapticdb.realtime.recording import Recording
-from hapticdb.realtime.replay import Replayed, replay
-from hapticdb.realtime.report import Report
-from hapticdb.realtime.resident import ResidentCells
-from hapticdb.realtime.session import Session
-from hapticdb.realtime.sweep import sweep
-from hapticdb.realtime.swept import Swept
-from hapticdb.statistics import CostModel, QuantileVector
-from hapticdb.store.base import Object
-from hapticdb.transfer import CopyReport, copy_environment
-from hapticdb.warm import warm_up
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hapticdb.difference import Difference, diff_environments
+    from hapticdb.environment import Environment, Touch, create, open  # noqa: A004 - as in tarfile.open
+    from hapticdb.errors import (
+        AccessError,
+        BusyError,
+        ConflictError,
+        ConnectionLostError,
+        DamagedError,
+        DatabaseError,
+        DeviceError,
+        EnvironmentExistsError,
+        EnvironmentNotFoundError,
+        FileError,
+        GeometryChangedError,
+        GridError,
+        HapticDBError,
+        MissingExtraError,
+        NewerVersionError,
+        NotAnEnvironmentError,
+        ObjectNotFoundError,
+        OutsideGridError,
+        ReadOnlyError,
+        StuckError,
+        UsageError,
+    )
+    from hapticdb.force import TangentPlane
+    from hapticdb.grid import Grid, GridOptions
+    from hapticdb.ingest import FileReport, ImportOptions, import_files
+    from hapticdb.pointshell import PointShell
+    from hapticdb.pool import Pool
+    from hapticdb.poses import read_poses, write_poses
+    from hapticdb.query import Query
+    from hapticdb.realtime.coupling import Coupling
+    from hapticdb.realtime.handle import Handle
+    from hapticdb.realtime.recording import Recording
+    from hapticdb.realtime.replay import Replayed, replay
+    from hapticdb.realtime.report import Report
+    from hapticdb.realtime.resident import ResidentCells
+    from hapticdb.realtime.session import Session
+    from hapticdb.realtime.sweep import sweep
+    from hapticdb.realtime.swept import Swept
+    from hapticdb.statistics import CostModel, QuantileVector
+    from hapticdb.store.base import Object
+    from hapticdb.transfer import CopyReport, copy_environment
+    from hapticdb.warm import warm_up
 
 __all__ = [
     "AccessError",
@@ -109,3 +113,51 @@ __all__ = [
     "write_poses",
 ]
 __version__ = "0.1.0"
+
+_HOMES = {
+    "difference": "Difference diff_environments",
+    "environment": "Environment Touch create open",
+    "errors": (
+        "AccessError BusyError ConflictError ConnectionLostError DamagedError "
+        "DatabaseError DeviceError EnvironmentExistsError EnvironmentNotFoundError "
+        "FileError GeometryChangedError GridError HapticDBError MissingExtraError "
+        "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutsideGridError "
+        "ReadOnlyError StuckError UsageError"
+    ),
+    "force": "TangentPlane",
+    "grid": "Grid GridOptions",
+    "ingest": "FileReport ImportOptions import_files",
+    "pointshell": "PointShell",
+    "pool": "Pool",
+    "poses": "read_poses write_poses",
+    "query": "Query",
+    "realtime.coupling": "Coupling",
+    "realtime.handle": "Handle",
+    "realtime.recording": "Recording",
+    "realtime.replay": "Replayed replay",
+    "realtime.report": "Report",
+    "realtime.resident": "ResidentCells",
+    "realtime.session": "Session",
+    "realtime.sweep": "sweep",
+    "realtime.swept": "Swept",
+    "statistics": "CostModel QuantileVector",
+    "store.base": "Object",
+    "transfer": "CopyReport copy_environment",
+    "warm": "warm_up",
+}
+"""Modules of the public names, which are imported when the name is first used: a program pays for
+what it uses, and ``hapticdb --help`` for nothing."""
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names.split()}
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name from its module."""
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value: object = getattr(import_module(f"hapticdb.{_HOME_OF[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -10,8 +10,7 @@ import numpy as np
 
 from hapticdb.errors import UsageError
 from hapticdb.grouping import cbgroup
-from hapticdb.kernels import contact
-from hapticdb.kernels.grouping import group_by_gap
+from hapticdb.kernels import contact, grouping
 from hapticdb.pointshell import fibonacci_sphere
 from hapticdb.statistics import CostModel, QuantileVector
 from hapticdb.store.base import (
@@ -113,7 +112,7 @@ class _Trials:
         """Ask for one shell in every form."""
         store = self._store
         for gap in (0, 1 << 9, 1 << 13, 1 << 16):
-            lows, highs = group_by_gap(probe.keys, probe.first, probe.last, gap)
+            lows, highs = grouping.group_by_gap(probe.keys, probe.first, probe.last, gap)
             rows = len(store.scan(lows, highs))
             if rows > TOO_MANY_ROWS:
                 continue

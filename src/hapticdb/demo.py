@@ -19,13 +19,13 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError, GridError, UsageError
 from hapticdb.grid import GridOptions
 from hapticdb.ingest import FileReport, ImportOptions, ProgressCallback, import_files
+from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell import PointShell
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.query import Strategy
 from hapticdb.sample import SampleFiles, slide_over_voxels, write_sample, write_wrench
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import beside, name_of, redact
-from hapticdb.warm import warm_up
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"
@@ -63,7 +63,6 @@ class Scene:
     shell: PointShell
     poses: NDArray[np.float64]
     grid_text: str
-    compile_seconds: float
 
 
 @dataclass
@@ -178,9 +177,7 @@ def prepare(
     options = GridOptions(bits=bits)
     home = Path(folder)
     files = write_sample(home, frames)
-    started = time.perf_counter()
-    warm_up()
-    compile_seconds = time.perf_counter() - started
+    compile_missing(entries_for("import", "touch"))
     shell = PointShell.from_file(files.wrench, points)
     imported = []
     first = beside(home / "demo", "car") if url is None else beside(url, f"{name_of(url)}_demo_car")
@@ -193,7 +190,7 @@ def prepare(
     with open_environment(imported[0].url, read_only=True) as env:
         grid_text = env.grid.describe()
     poses = read_poses(files.path)
-    return Scene(home, files, tuple(imported), shell, poses, grid_text, compile_seconds)
+    return Scene(home, files, tuple(imported), shell, poses, grid_text)
 
 
 def _import(

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, CELL_BITS, Grid
 from hapticdb.grouping import box_ranges
-from hapticdb.kernels.curves import Z_ORDER, decode
-from hapticdb.kernels.voxelize import count_voxels
+from hapticdb.kernels import curves, voxelize
 from hapticdb.layout import Bricks, bricks_of_rows
 from hapticdb.statistics import QuantileVector
 from hapticdb.store.base import BRICK_BYTES, Object, Store
@@ -212,7 +211,9 @@ def _boxes(
 
 def _inside(bricks: Bricks, grid: Grid, low: Corner, high: Corner) -> Bricks:
     """Those of the bricks that lie in the box: ranges of keys may cover more."""
-    corners = decode(bricks.keys, max(grid.bits - BRICK_BITS, 0), Z_ORDER) << BRICK_BITS
+    corners = (
+        curves.decode(bricks.keys, max(grid.bits - BRICK_BITS, 0), curves.Z_ORDER) << BRICK_BITS
+    )
     mine = ((corners >= low) & (corners <= high)).all(axis=1)
     return Bricks(bricks.keys[mine], bricks.occupancy[mine])
 
@@ -223,4 +224,5 @@ def _count_apart(a: Bricks, b: Bricks) -> tuple[int, int]:
     bits = np.zeros((2, len(keys), BRICK_BYTES), dtype=np.uint8)
     for side, bricks in zip(bits, (a, b), strict=True):
         side[np.searchsorted(keys, bricks.keys)] = bricks.occupancy
-    return count_voxels(bits[0] & ~bits[1]), count_voxels(bits[1] & ~bits[0])
+    count = voxelize.count_voxels
+    return count(bits[0] & ~bits[1]), count(bits[1] & ~bits[0])

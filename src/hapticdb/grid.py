@@ -13,11 +13,8 @@ from hapticdb.kernels import curves
 
 CurveName = Literal["z", "hilbert", "lexicographic"]
 CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
-CURVE_CODES = {
-    "lexicographic": curves.LEXICOGRAPHIC,
-    "z": curves.Z_ORDER,
-    "hilbert": curves.HILBERT,
-}
+CURVE_CODES = {"lexicographic": 0, "z": 1, "hilbert": 2}
+"""Numbers of the curves, as `kernels.curves` has them; written here, so that it loads later."""
 MAX_BITS = 21
 BRICK_BITS = 3
 CELL_BITS = 5

@@ -12,13 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.sides import (
-    TriangleTree,
-    enclosures,
-    normals_of,
-    side_votes,
-    triangle_tree,
-)
+from hapticdb.kernels import sides as kernels
 
 JOIN = 1e-6
 """Corners on open edges are joined up to this part of the bounding box's diagonal."""
@@ -75,7 +69,7 @@ def orient(triangles: Floats) -> Surface:
     local = triangles - origin
     faces = _join_corners(local)
     kept = _drop_repeated(faces)
-    normals, areas = normals_of(local[kept])
+    normals, areas = kernels.normals_of(local[kept])
     total = float(areas.sum())
     if not 0.0 < total < np.inf:
         raise UsageError("its triangles have no area, or more than can be counted")
@@ -218,8 +212,10 @@ def _bodies(n_faces: int, edges: _Edges) -> Ints:
 
 def _vote(sides: _Sides) -> Floats:
     """For each face (F,) 1 where its normal points inside, -1 where outside."""
-    tree = triangle_tree(sides.triangles, sides.body)
-    votes = side_votes(tree, sides.patch, sides.body, sides.areas, sides.centroids, sides.normals)
+    tree = kernels.triangle_tree(sides.triangles, sides.body)
+    votes = kernels.side_votes(
+        tree, sides.patch, sides.body, sides.areas, sides.centroids, sides.normals
+    )
     signs = np.sign(votes).astype(np.float64)[sides.patch]
     _guess(sides, signs)
     signs[_voids(sides, tree)[sides.body]] *= -1.0
@@ -255,7 +251,7 @@ def _guess(sides: _Sides, signs: Floats) -> None:
     signs[silent] = np.where(flat, np.where(is_outward, -1.0, 1.0), guess)
 
 
-def _voids(sides: _Sides, tree: TriangleTree) -> NDArray[np.bool_]:
+def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
     """Whether each body (B,) is the wall of a void: whole inside an odd number of closed bodies."""
     n_bodies = int(sides.body.max()) + 1
     low = np.full((n_bodies, 3), np.inf)
@@ -272,7 +268,7 @@ def _voids(sides: _Sides, tree: TriangleTree) -> NDArray[np.bool_]:
     is_void = np.zeros(n_bodies, dtype=bool)
     if pairs:
         nests = np.array(pairs, dtype=np.int64)
-        encloses = enclosures(tree, nests, sides.body, sides.areas, sides.centroids)
+        encloses = kernels.enclosures(tree, nests, sides.body, sides.areas, sides.centroids)
         is_void = np.bincount(nests[:, 0], encloses, n_bodies) % 2 == 1
     return is_void
 

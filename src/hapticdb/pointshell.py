@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb import mesh
 from hapticdb.errors import FileError, UsageError
-from hapticdb.kernels.curves import Z_ORDER, encode
-from hapticdb.kernels.sampling import sample_surface
+from hapticdb.kernels import curves, sampling
 from hapticdb.orientation import orient
 
 MAX_POINTS = 10_000_000
@@ -202,7 +201,7 @@ class PointShell:
     @classmethod
     def _from_triangles(cls, triangles: Floats, points: int, seed: int, link: str) -> "PointShell":
         surface = orient(triangles)
-        places, face_of = sample_surface(
+        places, face_of = sampling.sample_surface(
             surface.triangles, surface.areas, surface.normals, points, np.random.default_rng(seed)
         )
         order = _curve_order(places)
@@ -294,7 +293,7 @@ def _curve_order(points: Floats) -> NDArray[np.intp]:
     # Half a step short of all: a tool's planes lie at its box's ends, middle and quarters, where a
     # border of steps would leave the order of their points to roundings.
     steps = ((points - low) * ((2**ORDER_BITS - 0.5) / extent)).astype(np.int64)
-    return np.argsort(encode(steps, ORDER_BITS, Z_ORDER), kind="stable")
+    return np.argsort(curves.encode(steps, ORDER_BITS, curves.Z_ORDER), kind="stable")
 
 
 def fibonacci_sphere(n_points: int) -> Floats:

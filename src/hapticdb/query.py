@@ -14,7 +14,6 @@ from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.force import TangentPlane
 from hapticdb.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
 from hapticdb.kernels import contact
-from hapticdb.kernels.contact import Located
 from hapticdb.store.base import Frame, Keys, Rows, Store, SupportsStatement, row_shift
 
 if TYPE_CHECKING:
@@ -110,7 +109,9 @@ class HapticQuery:
             strategy = kept
         return self._answer(strategy, located, exclude, law, started, gap)
 
-    def _choosing(self, located: Located, exclude: Keys, law: TangentPlane, started: int) -> Answer:
+    def _choosing(
+        self, located: "contact.Located", exclude: Keys, law: TangentPlane, started: int
+    ) -> Answer:
         """The first frame of a turn: its strategy is chosen, and the rows that it reads told."""
         n_points = located.asked.shape[1]
         chooser = self._present_chooser(n_points)
@@ -123,7 +124,7 @@ class HapticQuery:
         self,
         chooser: Chooser,
         strategy: Chosen,
-        located: Located,
+        located: "contact.Located",
         exclude: Keys,
         law: TangentPlane,
         started: int,
@@ -140,7 +141,7 @@ class HapticQuery:
     def _answer(
         self,
         strategy: Strategy,
-        located: Located,
+        located: "contact.Located",
         exclude: Keys,
         law: TangentPlane,
         started: int,
@@ -171,7 +172,7 @@ class HapticQuery:
         query = Query(strategy, n_statements, n_ranges, len(row_keys), elapsed_us)
         return Answer(wrench, hits, depths, ids.tolist(), pairs, query)
 
-    def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> Located:
+    def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> "contact.Located":
         """Place a shell (N points) at a pose (4, 4), and find the row keys that it asks for."""
         if pose.shape != (4, 4):
             raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
@@ -191,7 +192,9 @@ class HapticQuery:
         except ValueError as error:
             raise UsageError(f"{error}: give finite numbers and a rotation") from error
 
-    def _fetch(self, strategy: Strategy, located: Located, gap: int) -> tuple[int, int, Rows]:
+    def _fetch(
+        self, strategy: Strategy, located: "contact.Located", gap: int
+    ) -> tuple[int, int, Rows]:
         """Statements, ranges and rows of a frame."""
         _, asked, keys = located
         if strategy == "array":
@@ -221,7 +224,7 @@ class HapticQuery:
 
     def _by_statement(
         self,
-        located: Located,
+        located: "contact.Located",
         exclude: Keys,
         law: TangentPlane,
         started: int,

@@ -6,7 +6,7 @@ from dataclasses import asdict, dataclass, field
 from functools import cached_property
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.grouping import gap_rows
+from hapticdb.kernels import grouping
 from hapticdb.store.base import Keys, Store
 
 DEFAULT_RESOLUTION = 10_000
@@ -45,7 +45,7 @@ class QuantileVector:
 
     def rows_between(self, left: int, right: int) -> float:
         """Expected rows with a key in [left, right]; of neighbouring ranges they add."""
-        return float(gap_rows(left, right, self.bounds, self.rows_per_bucket))
+        return float(grouping.gap_rows(left, right, self.bounds, self.rows_per_bucket))
 
     @classmethod
     def of(cls, store: Store, resolution: int = DEFAULT_RESOLUTION) -> "QuantileVector":

@@ -18,7 +18,7 @@ from hapticdb.errors import (
 )
 from hapticdb.grid import CurveName, Grid
 from hapticdb.grouping import Ranges, object_ranges
-from hapticdb.kernels.voxelize import count_voxels
+from hapticdb.kernels import voxelize
 from hapticdb.layout import bricks_of_rows, merged, rows_of_bricks
 from hapticdb.statistics import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Rows, Store
@@ -229,7 +229,7 @@ def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVect
     batches = _batches(source, obj, ranges, quantiles)
     if is_same_kind(source, target):
         rows = Rows(*(np.concatenate(column) for column in zip(*batches, strict=True)))
-        n_voxels = len(rows) if source.layout == "voxel" else count_voxels(rows.occupancy)
+        n_voxels = len(rows) if source.layout == "voxel" else voxelize.count_voxels(rows.occupancy)
     else:
         parts = [bricks_of_rows(batch, source.grid, source.layout) for batch in batches]
         rows, n_voxels = rows_of_bricks(merged(parts), target.grid, target.layout)

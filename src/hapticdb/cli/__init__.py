@@ -19,7 +19,7 @@ from hapticdb.cli.importing import import_
 from hapticdb.cli.listing import analyze, calibrate, info, objects
 from hapticdb.cli.moving import copy, diff
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
-from hapticdb.cli.sampling import demo, sample
+from hapticdb.cli.sampling import demo, sample, warm
 from hapticdb.cli.sweeping import sweep
 from hapticdb.cli.touching import touch
 from hapticdb.errors import HapticDBError
@@ -49,6 +49,7 @@ for verb in (
     grant,
     sample,
     demo,
+    warm,
 ):
     app.command()(verb)
 

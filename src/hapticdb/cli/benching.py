@@ -40,5 +40,6 @@ def bench(
     folder = out or Path(f"{Path(name_of(url)).stem}-bench")
     shell = PointShell.from_file(tool) if tool else None
     path = read_poses(poses) if poses else None
+    render.compile_kernels("everything")
     report = run(url, folder, quick=quick, shell=shell, poses=path, say=render.note)
     render.say(str(report))

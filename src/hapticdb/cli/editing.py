@@ -52,6 +52,7 @@ def move(
     placed = _placement(pose, matrix)
     shift = translate and numbers_of(translate, [3], "--translate", "X,Y,Z in metres")
     with hapticdb.open(url) as env:
+        render.compile_kernels("move")
         if shift:
             moved = _shifted(env, object_id, shift)
         else:

@@ -120,6 +120,7 @@ def feel(
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
     hand = _device(device, speed=speed, at=at, seed=seed or 0, loops=loop, is_simulated=simulate)
     handle = Handle(scale=scale, clutch=clutch)
+    render.compile_kernels("feel")
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
     shell = shell_of(tool, tool_unit, points, None if is_for_hand_alone else seed)
@@ -216,6 +217,7 @@ def replay(
     header = session.header
     with hapticdb.open(url or header.environment, read_only=True) as env:
         felt = None
+        render.compile_kernels("replay")
         if header.grid == env.grid:
             present = {obj.id for obj in env.objects()}
             residency = Residency(

@@ -88,8 +88,9 @@ def import_(
         layout=layout,
         jobs=jobs,
     )
-    started = time.perf_counter()
     try:
+        render.compile_kernels("import")
+        started = time.perf_counter()
         with render.import_bar() as progress:
             reports = import_files(url, files, options, progress)
     except KeyboardInterrupt:

@@ -41,11 +41,16 @@ def info(url: Url, *, json: Json = False) -> None:
 
     Example: hapticdb info car.db --json
     """
-    import hapticdb
+    from contextlib import closing
 
-    with hapticdb.open(url, read_only=True) as env:
+    from hapticdb.statistics import DEFAULT_RESOLUTION, QuantileVector
+    from hapticdb.store.connect import open_store
+
+    # the store: an Environment brings what touches and imports, a tenth of a second
+    with closing(open_store(url, read_only=True)) as env:
         grid, size, objects, layout = env.grid, env.size(), env.objects(), env.layout
-        freshness, quantiles = env.freshness(), env.quantiles()
+        freshness = env.freshness(DEFAULT_RESOLUTION)
+        quantiles = QuantileVector.of(env, DEFAULT_RESOLUTION)
     voxels = sum(obj.voxels for obj in objects)
     if json:
         render.say_json(
@@ -94,9 +99,11 @@ def objects(url: Url, *, json: Json = False) -> None:
 
     Example: hapticdb objects car.db
     """
-    import hapticdb
+    from contextlib import closing
 
-    with hapticdb.open(url, read_only=True) as env:
+    from hapticdb.store.connect import open_store
+
+    with closing(open_store(url, read_only=True)) as env:
         found, shown = env.objects(), env.url
     if json:
         for obj in found:
@@ -159,6 +166,7 @@ def calibrate(
         env = hapticdb.open(url, read_only=True)
         is_kept = False
     with env:
+        render.compile_kernels("calibrate")
         costs = env.calibrate(cold=cold)
         rows = env.size().rows
     if not is_kept:

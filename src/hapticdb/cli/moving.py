@@ -43,6 +43,7 @@ def copy(
     from hapticdb.transfer import copy_environment
 
     try:
+        render.compile_kernels("copy")
         with render.copy_bar("copying") as progress:
             report = copy_environment(source, target, layout=layout, curve=curve, progress=progress)
     except KeyboardInterrupt:
@@ -85,6 +86,7 @@ def diff(
     """
     from hapticdb.difference import diff_environments
 
+    render.compile_kernels("copy")
     with render.copy_bar("comparing") as progress:
         difference = diff_environments(a, b, progress=progress)
     if json:

@@ -123,6 +123,24 @@ def shares(counts: Mapping[str, int]) -> str:
     return ", ".join(f"{name} {100 * n / total:.3g} %" for name, n in ranked)
 
 
+def compile_kernels(*purposes: str) -> int:
+    """Compile what those purposes call, where this machine has not done so: with a bar or a line.
+
+    purposes: as `hapticdb.kernels.compiling.PURPOSES` names them. Returns how many were compiled.
+    """
+    from hapticdb.kernels.compiling import compile_missing, entries_for, missing
+
+    names = missing(entries_for(*purposes))
+    if not names:
+        return 0
+    doing = "compiling, once"
+    if not sys.stderr.isatty():
+        note(f"{doing}: {counted(len(names), 'kernel')}, some seconds ...")
+        return compile_missing(names)
+    with _bar(doing, "kernels") as advance:
+        return compile_missing(names, lambda now: advance(doing, now.done, now.total, 0))
+
+
 @contextmanager
 def import_bar() -> "Iterator[ProgressCallback | None]":
     """Show a bar with parts, voxels a second and time left; nothing where nobody looks."""
@@ -182,6 +200,6 @@ def _bar(first: str, noun: str) -> Iterator[Callable[[str, int, int, int], None]
         yield advance
 
 
-def _short(link: str, most: int = 18) -> str:
+def _short(link: str, most: int = 24) -> str:
     name = link.rsplit("/", 1)[-1]
     return name if len(name) <= most else f"{name[: most - 1]}…"

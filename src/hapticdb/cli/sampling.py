@@ -36,9 +36,31 @@ def sample(
     else:
         from hapticdb.demo import write_along
 
+        render.compile_kernels("copy", "shell")
         written = write_along(folder, along, frames)
     for path in written:
         render.say(str(path))
+
+
+def warm() -> None:
+    """Compile every kernel that this machine has not compiled yet, so that no verb has to.
+
+    Half a minute on two processors; kept in the user's cache folder until
+    another version of hapticdb or numba is installed.
+
+    Example: hapticdb warm
+    """
+    from time import perf_counter
+
+    from hapticdb.kernels.compiling import entries_for
+
+    started = perf_counter()
+    n_compiled = render.compile_kernels("everything")
+    total = len(entries_for("everything"))
+    elapsed = perf_counter() - started
+    render.say(
+        f"{render.counted(total, 'kernel')} ready: {n_compiled} compiled now, in {elapsed:.1f} s"
+    )
 
 
 def demo(
@@ -61,12 +83,13 @@ def demo(
 
     Example: hapticdb demo --url 'postgresql:///local?data=DIR'
     """
-    render.note(f"writing the sample into {folder}, compiling kernels on the first run ...")
     import numpy as np
 
     from hapticdb.demo import compare, prepare
     from hapticdb.picture import draw
 
+    render.compile_kernels("import", "touch")
+    render.note(f"writing the sample into {folder}, importing it in both layouts ...")
     with render.import_bar() as progress:
         scene = prepare(folder, url=url, bits=bits, frames=frames, points=points, progress=progress)
     _show_scene(scene)
@@ -86,7 +109,6 @@ def _show_scene(scene: "Scene") -> None:
     rows = [
         ("sample", ", ".join(str(path) for path in scene.files)),
         ("grid", scene.grid_text),
-        ("kernels", f"ready after {scene.compile_seconds:.1f} s"),
     ]
     rows += [(f"import, {one.layout}", _import_text(one)) for one in scene.imported]
     rows.append(("tool", f"{len(scene.shell)} points, {len(scene.poses):,} poses"))

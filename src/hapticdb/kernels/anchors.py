@@ -241,4 +241,5 @@ def settle_anchors(
             met[2, n] = anchor_or_loose(code, box, i, j, k, reach)
         any_loose = any_loose or met[2, n] == LOOSE
     if not any_loose:
-        box[:] = 0.0
+        for n in range(6):
+            box[n] = 0.0

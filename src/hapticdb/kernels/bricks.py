@@ -17,10 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels._jit import FLOATS2, INT, INTS, INTS2, entry, leaf
 from hapticdb.kernels.curves import compact, z_encode
 
-FIRST_CAPACITY = 256
+FIRST_CAPACITY = np.int64(256)
 RUNS_AT_ONCE = 1024
 PLACE_BITS = 18
 PLACE_MASK = (1 << PLACE_BITS) - 1
@@ -66,9 +66,12 @@ def new_bricks(capacity):
     keys = np.empty(capacity, np.int64)
     words = np.zeros((capacity, 8), np.int64)
     slots = np.empty(2 * capacity, np.int32)
-    slots[:] = -1
+    for n in range(2 * capacity):
+        slots[n] = -1
     recent = np.empty((256, 2), np.int64)
-    recent[:] = -1
+    for n in range(256):
+        recent[n, 0] = -1
+        recent[n, 1] = -1
     return Bricks(keys, words, slots, recent)
 
 
@@ -149,15 +152,16 @@ def mark_runs(bricks, n_bricks, runs, n_runs):
     A row is a voxel (i, j, k), the place of the axis along which the run goes on, and its last
     coordinate there.
     """
-    done, n_bricks = mark_while_room(bricks, n_bricks, runs, 0, n_runs)
-    while done < n_runs:
+    done = np.int64(0)
+    while True:
+        done, n_bricks = mark_while_room(bricks, n_bricks, runs, done, n_runs)
+        if done == n_runs:
+            return bricks, n_bricks
         first, last = runs[done, 2 - runs[done, 3]], runs[done, 4]
         bricks = grown(bricks, n_bricks, n_bricks + bricks_of_run(first, last))
-        done, n_bricks = mark_while_room(bricks, n_bricks, runs, done, n_runs)
-    return bricks, n_bricks
 
 
-@entry
+@entry(INTS, INTS)
 def z_keys_kernel(packed, out):
     """Z-order keys of the first B bricks. packed (C,) int64; out (B,) int64."""
     for n in range(out.shape[0]):
@@ -167,19 +171,19 @@ def z_keys_kernel(packed, out):
         )
 
 
-@entry
+@entry(FLOATS2, INT)
 def mark_points_kernel(points, bits):
     """Mark the voxels that hold points (N, 3), half-open. Returns packed keys, words, count."""
     edge = float(1 << bits)
-    bricks, n_bricks = new_bricks(FIRST_CAPACITY), 0
-    runs, n_runs = np.empty((RUNS_AT_ONCE, 5), np.int64), 0
+    bricks, n_bricks = new_bricks(FIRST_CAPACITY), np.int64(0)
+    runs, n_runs = np.empty((RUNS_AT_ONCE, 5), np.int64), np.int64(0)
     for n in range(points.shape[0]):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         if not (0.0 <= x < edge and 0.0 <= y < edge and 0.0 <= z < edge):
             continue
         if n_runs == RUNS_AT_ONCE:
             bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)
-            n_runs = 0
+            n_runs = np.int64(0)
         runs[n_runs, 0] = int(x)
         runs[n_runs, 1] = int(y)
         runs[n_runs, 2] = int(z)
@@ -199,7 +203,7 @@ def ones(x):
     return ((x * 0x01010101) >> 24) & 0xFF
 
 
-@entry
+@entry(INTS)
 def count_kernel(words):
     """Count the bits set in words (W,) int64."""
     total = 0
@@ -209,7 +213,7 @@ def count_kernel(words):
     return total
 
 
-@entry
+@entry(INTS, INTS2, INTS2)
 def brick_voxels_kernel(bricks_z, words, out):
     """Voxels of bricks. bricks_z (B,), words (B, 8) int64; out (voxels, 3) int64."""
     row = 0

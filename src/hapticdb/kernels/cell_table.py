@@ -2,9 +2,25 @@
 
 import numpy as np
 
-from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels._jit import (
+    BYTES,
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    INTS2,
+    INTS32_2,
+    READ_BYTES,
+    WORDS,
+    WORDS32_2,
+    entry,
+    leaf,
+)
 from hapticdb.kernels.cells import (
     BUFFERS,
+    PLACE,
     READER_STRIDE,
     REVISION,
     VERSION,
@@ -16,11 +32,12 @@ from hapticdb.kernels.cells import (
 from hapticdb.kernels.contact import turn
 from hapticdb.kernels.curves import compact, key_of, voxel_of
 from hapticdb.kernels.fence import fence
+from hapticdb.kernels.grouping import first_bound
 
 NEVER_AGAIN = 0x7FFFFFFFFFFFFFFF
 
 
-@entry
+@entry(INTS2, INTS32_2, INT, INTS, INTS)
 def insert_cells(keys, slots, which, new_keys, new_slots):
     """Enter cells (n,) that directory `which` lacks, or give those that it has other slots."""
     capacity = keys.shape[1]
@@ -32,7 +49,7 @@ def insert_cells(keys, slots, which, new_keys, new_slots):
         keys[which, at] = new_keys[n]
 
 
-@entry
+@entry(INTS2, INTS32_2, INT, INTS)
 def remove_cells(keys, slots, which, old_keys):
     """Take cells (n,) out of directory `which`; what followed them in their run moves up."""
     capacity = keys.shape[1]
@@ -56,7 +73,7 @@ def remove_cells(keys, slots, which, old_keys):
         keys[which, hole] = -1
 
 
-@entry
+@entry(INTS2, INTS32_2, INT, INTS, INTS)
 def slots_of_cells(keys, slots, which, asked, out):
     """Slots (n,) of cells (n,) in directory `which`, UNKNOWN where it has none."""
     for n in range(asked.shape[0]):
@@ -88,7 +105,7 @@ def fill_brick(words, slot, i, j, k, occupancy, start):
     return has_any
 
 
-@entry
+@entry(INTS, INTS, READ_BYTES, INTS, INTS, INTS, INT, INT, INT, WORDS32_2, WORDS)
 def fill_cells(
     row_keys, row_ids, occupancy, exclude, cell_keys, places, bits, curve, shift, words, masks
 ):
@@ -113,7 +130,7 @@ def fill_cells(
         if cell_keys[at] != cell:
             continue
         if n_excluded > 0:
-            found = np.searchsorted(exclude, row_ids[row])
+            found = first_bound(row_ids[row], exclude, np.int64(0))
             if found < n_excluded and exclude[found] == row_ids[row]:
                 continue
         slot = places[at]
@@ -128,7 +145,7 @@ def fill_cells(
             mark_brick(masks, slot, i, j, k)
 
 
-@entry
+@entry(INTS, INT, INT, INTS)
 def curve_keys_of_cells(cells, bits, curve, out):
     """Cells (n,), as directories name them, on the curve: their voxels' keys >> 15."""
     level = max(bits - 5, 0)
@@ -137,7 +154,7 @@ def curve_keys_of_cells(cells, bits, curve, out):
         out[n] = key_of(key >> 32, (key >> 16) & 0xFFFF, key & 0xFFFF, level, curve)
 
 
-@entry
+@entry(INTS, INT, INT, INTS)
 def cells_of_curve_keys(curve_keys, bits, curve, out):
     """Undo `curve_keys_of_cells`."""
     level = max(bits - 5, 0)
@@ -146,7 +163,7 @@ def cells_of_curve_keys(curve_keys, bits, curve, out):
         out[n] = (i << 32) | (j << 16) | k
 
 
-@entry
+@entry(INTS, INTS, BYTES, INT, INT, INT, INTS)
 def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
     """Clock eviction: slots of cells that no frame has used since the hand last passed.
 
@@ -173,7 +190,7 @@ def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
     return count, hand
 
 
-@entry
+@entry(INTS, INT, INT)
 def publish(control, version, revision):
     """Make a directory, complete in its buffer, the one that frames read from now on."""
     control[REVISION + version % BUFFERS] = revision
@@ -182,7 +199,7 @@ def publish(control, version, revision):
     fence()
 
 
-@entry
+@entry(INTS)
 def oldest_version_read(readers):
     """Lowest version that a frame is reading; the largest number when there is none."""
     fence()
@@ -193,7 +210,7 @@ def oldest_version_read(readers):
     return oldest
 
 
-@entry
+@entry(INTS, INTS, FLOATS, FLOATS, FLOAT, FLOAT, INTS, FLOATS)
 def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
     """Cells of a box that a sphere comes near on a straight way, and how urgent each is.
 
@@ -235,7 +252,7 @@ def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
     return count
 
 
-@entry
+@entry(FLOATS2, FLOATS3, PLACE, INTS, INT)
 def cells_met(points, poses, place, found, most):
     """Distinct cells that points (N, 3+) meet at the first of the poses (M, 4, 4).
 

@@ -15,7 +15,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, inlined, leaf
+from hapticdb.kernels._jit import (
+    BYTES,
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    INTS2,
+    INTS32_2,
+    WORDS,
+    WORDS32_2,
+    entry,
+    fields_of,
+    inlined,
+    leaf,
+)
 from hapticdb.kernels.contact import (
     average_into,
     center_of,
@@ -69,6 +85,9 @@ class Cells(NamedTuple):
     used: NDArray[np.uint8]
 
 
+CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES)
+
+
 class Place(NamedTuple):
     """A grid as kernels take it: origin and voxel size in metres, voxels an axis."""
 
@@ -77,6 +96,9 @@ class Place(NamedTuple):
     z: float
     size: float
     side: float
+
+
+PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
 
 
 class Clusters(NamedTuple):
@@ -96,6 +118,9 @@ class Clusters(NamedTuple):
     run: int
     columns: Floats
     scratch: Floats
+
+
+CLUSTERS = fields_of(Clusters, FLOATS2, FLOATS, FLOATS2, FLOATS2, INT, FLOATS2, FLOATS2)
 
 
 def _masks_of_runs(stride: int) -> NDArray[np.uint64]:
@@ -373,7 +398,7 @@ def felt(cells, which, shell, pose, place, stiffness, met, missed, out):
     missed[0] = n_missed
 
 
-@entry
+@entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, FLOAT, INTS, INTS, FLOATS2)
 def feel_kernel(cells, reader, shell, poses, place, stiffness, met, missed, out):
     """`felt` at poses (M, 4, 4) into out (M, RESULTS); met and missed keep the last frame's.
 
@@ -388,7 +413,7 @@ def feel_kernel(cells, reader, shell, poses, place, stiffness, met, missed, out)
     return poses.shape[0]
 
 
-@entry
+@entry(FLOATS2, INT, FLOAT, FLOATS2)
 def bounding_spheres(points, run, slack, out):
     """Sphere (C, 4) around the box of each run of points (N, 6), its radius larger by `slack`.
 

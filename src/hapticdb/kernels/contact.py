@@ -10,8 +10,21 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, leaf
-from hapticdb.kernels.curves import Z_ORDER, key_of, voxel_of, z_encode
+from hapticdb.kernels._jit import (
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    INT,
+    INTS,
+    INTS2,
+    READ_BYTES,
+    READ_FLOATS,
+    READ_FLOATS2,
+    entry,
+    leaf,
+)
+from hapticdb.kernels.curves import Z_ORDER, compact, key_of, voxel_of, z_encode
+from hapticdb.kernels.sorting import insert_distinct, sorting_order
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,6 +38,8 @@ class Located(NamedTuple):
     keys: Ints
 
 
+LARGEST = 0x7FFFFFFFFFFFFFFF
+"""Of an int64."""
 AVERAGE_FROM = 10
 """Hits from which force and torque are averaged (McNeely et al. 1999, section 4.3)."""
 
@@ -99,24 +114,20 @@ def turn(a, b, c, x, y, z):
     return a * x + b * y + c * z
 
 
-@leaf
-def sort_small_or_large(keys):
-    """Order (U,) that sorts keys (U,): insertion for the few dozen bricks of a common frame."""
-    count = keys.shape[0]
-    if count > 64:
-        return np.argsort(keys)
-    order = np.empty(count, dtype=np.int64)
-    for n in range(count):
-        key = keys[n]
-        at = n
-        while at > 0 and keys[order[at - 1]] > key:
-            order[at] = order[at - 1]
-            at -= 1
-        order[at] = n
-    return order
-
-
-@entry
+@entry(
+    READ_FLOATS2,
+    READ_FLOATS2,
+    READ_FLOATS,
+    FLOATS2,
+    FLOATS,
+    FLOAT,
+    INT,
+    INT,
+    INT,
+    FLOATS2,
+    INTS2,
+    INTS,
+)
 def locate_kernel(
     points, normals, center, pose, origin, size, bits, curve, shift, placed, asked, keys
 ):
@@ -131,7 +142,7 @@ def locate_kernel(
     placed[total, 0] = turn(a, b, c, center[0], center[1], center[2]) + u
     placed[total, 1] = turn(d, e, f, center[0], center[1], center[2]) + v
     placed[total, 2] = turn(g, h, m, center[0], center[1], center[2]) + w
-    placed[total, 3:] = 0.0
+    placed[total, 3] = placed[total, 4] = placed[total, 5] = 0.0
     ox, oy, oz = origin[0], origin[1], origin[2]
     side = float(1 << bits)
     capacity = 16
@@ -182,7 +193,7 @@ def locate_kernel(
             memo_key = row_key
             memo_slot = table[at]
         asked[1, n] = memo_slot
-    order = sort_small_or_large(found[:count])
+    order = sorting_order(found[:count])
     rank = np.empty(count, dtype=np.int32)
     for n in range(count):
         at = order[n]
@@ -248,19 +259,23 @@ def voxel_at(address, bits, curve, shift):
     if shift == 0:
         return voxel_of(address, bits, curve)
     i, j, k = voxel_of(address >> 9, max(bits - 3, 0), curve)
-    x, y, z = voxel_of(address & 511, 3, Z_ORDER)
-    return (i << 3) | x, (j << 3) | y, (k << 3) | z
+    return (
+        (i << 3) | compact((address & 511) >> 2),
+        (j << 3) | compact((address & 511) >> 1),
+        (k << 3) | compact(address & 511),
+    )
 
 
-@entry
+@entry(INTS2, INTS, INT, INT, INT)
 def spans_of_keys(asked, keys, bits, curve, shift):
     """Lowest and highest voxel key (2, U) that a shell asks for under each row key.
 
     asked, keys as `locate` returns them.
     """
     spans = np.empty((2, keys.shape[0]), dtype=np.int64)
-    spans[0] = np.iinfo(np.int64).max
-    spans[1] = -1
+    for at in range(keys.shape[0]):
+        spans[0, at] = LARGEST
+        spans[1, at] = -1
     for n in range(asked.shape[1]):
         at = asked[1, n]
         if at < 0:
@@ -299,7 +314,9 @@ def rows_of_keys(keys, row_keys):
 @leaf
 def counting_rows(row_ids, exclude):
     """Which rows count, (R,) bool: those of objects that are not excluded."""
-    counts = np.ones(row_ids.shape[0], dtype=np.bool_)
+    counts = np.empty(row_ids.shape[0], dtype=np.bool_)
+    for row in range(row_ids.shape[0]):
+        counts[row] = True
     if exclude.shape[0] > 0:
         for row in range(row_ids.shape[0]):
             for n in range(exclude.shape[0]):
@@ -308,37 +325,22 @@ def counting_rows(row_ids, exclude):
     return counts
 
 
-@leaf
-def insert_distinct(values, start, count, value):
-    """Insert a value into values[start : start + count], ascending; returns the new count.
-
-    A frame touches a handful of objects, each by many rows: from the largest downwards is soon.
-    """
-    at = start + count
-    while at > start and values[at - 1] > value:
-        at -= 1
-    if at > start and values[at - 1] == value:
-        return count
-    for n in range(start + count, at, -1):
-        values[n] = values[n - 1]
-    values[at] = value
-    return count + 1
-
-
-@entry
+@entry(FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, INTS, FLOATS, FLOAT, FLOAT, FLOATS, INTS)
 def refine_kernel(
     placed, asked, keys, row_keys, row_ids, occupancy, exclude, origin, size, stiffness, felt, met
 ):
     """`refine` into felt (6 + N,) and met (N + R,); returns H and I."""
     total = asked.shape[1]
-    touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
+    touched = np.empty(row_ids.shape[0], dtype=np.bool_)
+    for row in range(row_ids.shape[0]):
+        touched[row] = False
     starts, ends = rows_of_keys(keys, row_keys)
     counts = counting_rows(row_ids, exclude)
     has_bits = occupancy.shape[0] > 0
     ox, oy, oz = origin[0], origin[1], origin[2]
     mx, my, mz = placed[total, 0], placed[total, 1], placed[total, 2]
     fx = fy = fz = tx = ty = tz = 0.0
-    count = 0
+    count = np.int64(0)
     for n in range(total):
         at = asked[1, n]
         if at < 0:
@@ -373,7 +375,7 @@ def refine_kernel(
             ty += y
             tz += z
     average_into(felt, count, fx, fy, fz, tx, ty, tz)
-    n_ids = 0
+    n_ids = np.int64(0)
     for row in range(row_ids.shape[0]):
         if touched[row]:
             n_ids = insert_distinct(met, count, n_ids, row_ids[row])
@@ -418,7 +420,7 @@ def refine(
     return felt[:6], met[:n_hits], felt[6 : 6 + n_hits], met[n_hits : n_hits + n_ids]
 
 
-@entry
+@entry(INTS2, INTS, INTS, INTS, READ_BYTES, INTS, INTS)
 def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
     """Every (shell point, object) pair of a frame's hits, (P, 2) int64, ordered by both."""
     starts, ends = rows_of_keys(keys, row_keys)
@@ -443,7 +445,7 @@ def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
     return pairs[:count]
 
 
-@entry
+@entry(FLOATS2, INTS, INTS, FLOATS, FLOAT, INT, INT, INT, FLOAT)
 def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, shift, stiffness):
     """Wrench (6,) of hits given as ordinals (H,), ascending, and addresses (H,) int64.
 
@@ -476,7 +478,7 @@ def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, 
     return wrench
 
 
-@entry
+@entry(FLOATS2, INTS, FLOATS, FLOAT)
 def depths_of_hits(placed, hits, origin, size):
     """Depths (H,) in metres of hits (H,) int64, 0 where the point is above its tangent plane."""
     depths = np.empty(hits.shape[0])

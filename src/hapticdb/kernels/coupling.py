@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticdb.kernels._jit import entry, inlined, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS, INT, INTS, INTS2, entry, fields_of, inlined, leaf
 from hapticdb.kernels.anchors import (
     NO_ANCHOR,
     anchor_of,
@@ -25,9 +25,12 @@ from hapticdb.kernels.anchors import (
     voxel_under,
 )
 from hapticdb.kernels.cells import (
+    CELLS,
+    CLUSTERS,
     CONTACTS,
     DEEPEST,
     HITS,
+    PLACE,
     READER_STRIDE,
     RESULTS,
     REVISION,
@@ -93,6 +96,9 @@ class Body(NamedTuple):
     hold: float
     fade: float
     most_substeps: int
+
+
+BODY = fields_of(Body, *(FLOAT,) * 10, INT)
 
 
 @leaf
@@ -295,7 +301,7 @@ def slow_down(state, radius, fastest):
             state[n] *= fastest / speed
 
 
-@entry
+@entry(CELLS, INT, CLUSTERS, PLACE, BODY, FLOATS, FLOATS, FLOAT, INTS2, INTS, FLOATS, FLOATS)
 def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, frame, out):
     """Move the tool for one period of dt seconds.
 
@@ -314,6 +320,7 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
     With a hand that is not finite all is held; a state that is not is placed anew, at rest, at the
     first hand that is finite.
     """
+    # loops, not slices: a slice that is assigned costs a second of compile time
     which = begin_frame(cells, reader)
     version = float(cells.readers[reader * READER_STRIDE])
     points, center = shell.points, shell.center
@@ -331,10 +338,13 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
     is_hand = is_finite(hand, 0, HAND)
     is_held = hand[IS_STALE] != 0.0 or not is_hand
     if not is_finite(state, 0, FELT):
-        state[7:] = 0.0
-        frame[:] = 0.0
+        for n in range(VELOCITY, STATE):
+            state[n] = 0.0
+        for n in range(RESULTS):
+            frame[n] = 0.0
         if is_hand:
-            state[0:7] = hand[0:7]
+            for n in range(VELOCITY):
+                state[n] = hand[n]
     if not is_held and state[FELT] != version:
         is_first = state[FELT] == 0.0
         pose_of_quaternion(
@@ -344,14 +354,16 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         n_unknown = np.int64(next_frame[UNKNOWNS])
         if n_unknown == 0:
             if is_first:
-                met[2, :] = NO_ANCHOR
-            n_before = 0 if is_first else np.int64(frame[HITS])
+                for n in range(met.shape[1]):
+                    met[2, n] = NO_ANCHOR
+            n_before = np.int64(0) if is_first else np.int64(frame[HITS])
             n_after = np.int64(next_frame[HITS])
             settle_anchors(
                 keys, slots, words, which, points, center, place, met, n_before, n_after,
-                pose, pose, True, box, reach,
+                pose, pose, np.bool_(True), box, reach,
             )  # fmt: skip
-            frame[:] = next_frame
+            for n in range(RESULTS):
+                frame[n] = next_frame[n]
             state[FELT] = version
     left = dt if dt > 0.0 and not is_held and n_unknown == 0 else 0.0
     levers = 1.0 / body.mass + body.radius * body.radius / body.inertia
@@ -428,7 +440,8 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         left -= step
         if is_shut:
             flags |= IS_STOPPED
-            state[7:13] = 0.0
+            for n in range(VELOCITY, KEPT):
+                state[n] = 0.0
             continue
         felt(cells, which, shell, next_pose, place, body.stiffness, next_met, missed, next_frame)
         n_unknown = np.int64(next_frame[UNKNOWNS])
@@ -437,13 +450,16 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         n_after = np.int64(next_frame[HITS])
         state[0], state[1], state[2] = px, py, pz
         state[3], state[4], state[5], state[6] = qw, qx, qy, qz
-        state[7:13] = v
+        for axis in range(6):
+            state[VELOCITY + axis] = v[axis]
         settle_anchors(
             keys, slots, words, which, points, center, place, met, n_hits, n_after,
-            pose, next_pose, False, box, reach,
+            pose, next_pose, np.bool_(False), box, reach,
         )  # fmt: skip
-        pose[:, :] = next_pose
-        frame[:] = next_frame
+        for n in range(16):
+            state[_POSE + n] = state[_NEXT_POSE + n]
+        for n in range(RESULTS):
+            frame[n] = next_frame[n]
     revision = cells.control[REVISION + which]  # of what was read: later the buffer is another's
     end_frame(cells, reader)
     is_held = is_held or n_unknown > 0
@@ -451,7 +467,8 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
     kept = state[KEPT : KEPT + 6]
     faded = 0.0
     if is_held:
-        state[7:13] = 0.0
+        for n in range(VELOCITY, KEPT):
+            state[n] = 0.0
         state[HELD_FOR] += max(dt, 0.0)
         faded = faded_of(body, state[HELD_FOR])
         flags |= IS_HELD | (IS_FADING if faded > 0.0 else 0)
@@ -460,11 +477,13 @@ def advance(cells, reader, shell, place, body, state, hand, dt, met, missed, fra
         state[HELD_FOR] = 0.0
         if hand[IS_OPEN] == 0.0:
             state[RISEN] = min(state[RISEN] + min(passed, 1.0 / RISE_FRAMES), 1.0)
-        kept[:] = 0.0
+        for n in range(6):
+            kept[n] = 0.0
         if frame[HITS] > 0.0:
             push_hand(body, state, hand, pose, center, place.size, kept)
             if not is_finite(kept, 0, 6):  # the next frame heals the state
-                kept[:] = 0.0
+                for n in range(6):
+                    kept[n] = 0.0
     if hand[IS_OPEN] != 0.0:
         state[RISEN] = max(state[RISEN] - passed, 0.0)
     for axis in range(6):

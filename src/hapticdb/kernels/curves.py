@@ -10,7 +10,7 @@ same curve of one bit less.
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels._jit import INT, INTS, INTS2, entry, leaf
 
 LEXICOGRAPHIC = 0
 Z_ORDER = 1
@@ -130,14 +130,14 @@ def voxel_of(key, bits, curve):
     return (key >> (2 * bits)) & mask, (key >> bits) & mask, key & mask
 
 
-@entry
+@entry(INTS2, INT, INT, INTS)
 def encode_kernel(ijk, bits, curve, out):
     """Keys of voxels. ijk (N, 3) int64, inside the grid; out (N,) int64."""
     for n in range(ijk.shape[0]):
         out[n] = key_of(ijk[n, 0], ijk[n, 1], ijk[n, 2], bits, curve)
 
 
-@entry
+@entry(INTS, INT, INT, INTS2)
 def decode_kernel(keys, bits, curve, out):
     """Voxels of keys. keys (N,) int64, inside the curve; out (N, 3) int64."""
     for n in range(keys.shape[0]):

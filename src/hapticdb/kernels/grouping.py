@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels._jit import FLOAT, INT, INTS, entry, leaf
 from hapticdb.kernels.curves import LEXICOGRAPHIC, key_of
 
 
@@ -62,19 +62,19 @@ def rows_up_to(x, after, bounds, rows_per_bucket):
     return rows_below_bound(x + 1, after, bounds, rows_per_bucket)
 
 
-@entry
+@entry(INT, INT, INTS, FLOAT)
 def gap_rows(left, right, bounds, rows_per_bucket):
     """Expected rows with a key in [left, right]. bounds (R + 1,) int64, ascending -> float."""
     if right < left:
         return 0.0
-    at = first_bound(left, bounds, 0)
+    at = first_bound(left, bounds, np.int64(0))
     after = bound_after(right, bounds, at)
     return rows_up_to(right, after, bounds, rows_per_bucket) - rows_below_bound(
         left, at, bounds, rows_per_bucket
     )
 
 
-@entry
+@entry(INTS, INTS, INTS, INT)
 def group_by_gap(keys, first, last, maxgap):
     """MaxGap: neighbours p < q share a range if and only if q - p <= maxgap.
 
@@ -95,7 +95,7 @@ def group_by_gap(keys, first, last, maxgap):
     return lows[:count], highs[:count]
 
 
-@entry
+@entry(INTS, INTS, FLOAT, FLOAT, FLOAT, INTS, INTS)
 def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, highs):
     """CBGroup: a gap is closed if and only if scanning it costs no more than another descent.
 
@@ -132,7 +132,7 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, h
     return count, asked, scanned
 
 
-@entry
+@entry(INTS, INTS, INTS, FLOAT, FLOAT, FLOAT)
 def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
     """CBGroup over closed spans (U,) of row keys, ascending and disjoint: merged in place.
 
@@ -144,7 +144,7 @@ def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_
             left, right = highs[count - 1] + 1, lows[n] - 1
             expected = 0.0
             if left <= right:
-                at = first_bound(left, bounds, 0)
+                at = first_bound(left, bounds, np.int64(0))
                 after = bound_after(right, bounds, at)
                 expected = rows_up_to(right, after, bounds, rows_per_bucket) - rows_below_bound(
                     left, at, bounds, rows_per_bucket
@@ -163,14 +163,16 @@ def add_range(ranges, count, low, high):
     """Append a closed range, growing the array; returns both."""
     if count == ranges.shape[0]:
         larger = np.empty((2 * count, 2), dtype=np.int64)
-        larger[:count] = ranges
+        for n in range(count):
+            larger[n, 0] = ranges[n, 0]
+            larger[n, 1] = ranges[n, 1]
         ranges = larger
     ranges[count, 0] = low
     ranges[count, 1] = high
     return ranges, count + 1
 
 
-@entry
+@entry(INTS, INTS, INT, INT, INT)
 def ranges_of_box(low, high, bits, curve, finest):
     """Closed ranges of voxel keys (G, 2) that cover the voxels low .. high (3,), both inside.
 
@@ -179,7 +181,7 @@ def ranges_of_box(low, high, bits, curve, finest):
     range for each of at most 1024 runs of slabs. Not yet sorted or merged.
     """
     ranges = np.empty((64, 2), dtype=np.int64)
-    count = 0
+    count = np.int64(0)
     if curve == LEXICOGRAPHIC:
         step = (high[0] - low[0]) // 1024 + 1
         for i in range(low[0], high[0] + 1, step):
@@ -193,7 +195,7 @@ def ranges_of_box(low, high, bits, curve, finest):
         return ranges[:count]
     stack = np.empty((8 * (bits + 1), 4), dtype=np.int64)
     stack[0, 0] = bits
-    stack[0, 1:] = 0
+    stack[0, 1] = stack[0, 2] = stack[0, 3] = 0
     depth = 1
     while depth > 0:
         depth -= 1

@@ -1,6 +1,6 @@
 """How a hand carries the handle: scale, and the offset that a clutch leaves between them."""
 
-from hapticdb.kernels._jit import entry
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, entry
 from hapticdb.kernels.motion import product, quaternion_in
 
 POSITION, QUATERNION, VELOCITY = 0, 3, 7
@@ -9,7 +9,7 @@ FARTHEST = 1e6
 """Metres, m/s or rad/s: no hand is farther or faster, it is its device's numbers that are wrong."""
 
 
-@entry
+@entry(FLOATS2, FLOATS)
 def is_somewhere(pose, velocity):
     """Whether a pose (4, 4) and a velocity (6,) are all numbers, none beyond FARTHEST."""
     for row in range(3):
@@ -22,7 +22,7 @@ def is_somewhere(pose, velocity):
     return True
 
 
-@entry
+@entry(FLOATS2, FLOAT, FLOATS, FLOATS)
 def grip(pose, scale, offset, hand):
     """Set the offset (7,) so that a hand at pose (4, 4) carries the handle where `hand` has it."""
     w, x, y, z = quaternion_in(pose)
@@ -36,7 +36,7 @@ def grip(pose, scale, offset, hand):
     offset[6] = z
 
 
-@entry
+@entry(FLOATS2, FLOATS, FLOAT, FLOATS, FLOATS)
 def carry(pose, velocity, scale, offset, hand):
     """Where the handle is, and how fast, for a hand at pose (4, 4) with velocity (6,).
 

@@ -6,7 +6,12 @@ Quaternions have the scalar first. A turn is a rotation vector: its axis times i
 
 import math
 
-from hapticdb.kernels._jit import entry, leaf
+import numpy as np
+from numba import types
+
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INT, entry, leaf
+
+PAIR = types.UniTuple(FLOAT, 2)
 
 
 @leaf
@@ -87,7 +92,7 @@ def pose_of_quaternion(px, py, pz, w, x, y, z, out):
     out[3, 3] = 1.0
 
 
-@entry
+@entry(FLOATS2, FLOATS3)
 def poses_of(states, out):
     """Matrices, out (M, 4, 4), of states (M, 7): m, unit quaternion."""
     for m in range(states.shape[0]):
@@ -103,7 +108,7 @@ def poses_of(states, out):
         )
 
 
-@entry
+@entry(FLOAT, FLOATS2, FLOATS2, FLOATS)
 def play(time, knots, pose, velocity):
     """Pose and velocity at a time: linear between knots, turning about one axis (slerp).
 
@@ -174,25 +179,25 @@ def angular_velocity(x, y, z, dx, dy, dz):
     )
 
 
-@entry
+@entry(FLOAT, FLOATS3, FLOATS2, FLOATS2, FLOATS)
 def sway(time, waves, center, pose, velocity):
     """Pose and velocity at a time of a hand that sways about a pose by sums of sines.
 
     waves (6, K, 4): amplitude (m; rad for the last three axes, which are a turn), rad/s, phase, the
     phase's sine. center (4, 4). Writes pose (4, 4) and velocity (6,), exact derivatives.
     """
-    px, velocity[0] = wave(time, waves, 0)
-    py, velocity[1] = wave(time, waves, 1)
-    pz, velocity[2] = wave(time, waves, 2)
-    x, dx = wave(time, waves, 3)
-    y, dy = wave(time, waves, 4)
-    z, dz = wave(time, waves, 5)
+    px, velocity[0] = wave(time, waves, np.int64(0))
+    py, velocity[1] = wave(time, waves, np.int64(1))
+    pz, velocity[2] = wave(time, waves, np.int64(2))
+    x, dx = wave(time, waves, np.int64(3))
+    y, dy = wave(time, waves, np.int64(4))
+    z, dz = wave(time, waves, np.int64(5))
     velocity[3], velocity[4], velocity[5] = angular_velocity(x, y, z, dx, dy, dz)
     w, x, y, z = product(*quaternion_by(x, y, z), *quaternion_in(center))
     place(px + center[0, 3], py + center[1, 3], pz + center[2, 3], w, x, y, z, pose)
 
 
-@entry
+@entry(FLOATS3, FLOAT, INT)
 def survey(waves, cycle, n_samples):
     """Farthest distance, fastest speed and fastest turning over a cycle -> m, m/s, rad/s.
 
@@ -203,12 +208,12 @@ def survey(waves, cycle, n_samples):
     turning = 0.0
     for n in range(n_samples):
         time = n * cycle / n_samples
-        px, vx = wave(time, waves, 0)
-        py, vy = wave(time, waves, 1)
-        pz, vz = wave(time, waves, 2)
-        x, dx = wave(time, waves, 3)
-        y, dy = wave(time, waves, 4)
-        z, dz = wave(time, waves, 5)
+        px, vx = wave(time, waves, np.int64(0))
+        py, vy = wave(time, waves, np.int64(1))
+        pz, vz = wave(time, waves, np.int64(2))
+        x, dx = wave(time, waves, np.int64(3))
+        y, dy = wave(time, waves, np.int64(4))
+        z, dz = wave(time, waves, np.int64(5))
         wx, wy, wz = angular_velocity(x, y, z, dx, dy, dz)
         reach = max(reach, px * px + py * py + pz * pz)
         speed = max(speed, vx * vx + vy * vy + vz * vz)
@@ -216,7 +221,7 @@ def survey(waves, cycle, n_samples):
     return math.sqrt(reach), math.sqrt(speed), math.sqrt(turning)
 
 
-@entry
+@entry(INT, FLOAT, FLOAT, FLOAT, FLOATS2, FLOATS, FLOATS, PAIR, PAIR, FLOATS, FLOATS2, FLOATS)
 def pull(
     n_steps, step, ahead, rest, hand, hand_velocity, wrench, inertias, grips, body, pose, velocity
 ):

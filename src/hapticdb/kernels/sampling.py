@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS32, INTS32_3, entry, leaf
 
 Floats = NDArray[np.float64]
 
@@ -66,7 +66,7 @@ def sift_down(heap, place, weights, at, size):
     place[item] = at
 
 
-@entry
+@entry(FLOATS2, INTS32, FLOATS2, INTS32, INTS32_3, INT, FLOAT, FLOAT, FLOAT)
 def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, nearest, opposite):
     """Drop the most crowded candidate, again and again, until `n_keep` are left.
 
@@ -91,22 +91,22 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
         sift_down(heap, place, weights, at, n_points)
     size = n_points
     while size > n_keep:
-        a = heap[0]
-        place[a] = -1
+        item = np.int64(heap[0])
+        place[item] = -1
         size -= 1
         if size > 0:
             heap[0] = heap[size]
             place[heap[0]] = 0
-            sift_down(heap, place, weights, 0, size)
-        cell = cell_of[a]
+            sift_down(heap, place, weights, np.int64(0), size)
+        cell = cell_of[item]
         for row in range(9):
             for b in range(ranges[cell, row, 0], ranges[cell, row, 1]):
                 if place[b] < 0:
                     continue
-                weight = pair_weight(points, face_of, normals, a, b, reach, nearest, opposite)
+                weight = pair_weight(points, face_of, normals, item, b, reach, nearest, opposite)
                 if weight > 0.0:
                     weights[b] -= weight
-                    sift_down(heap, place, weights, place[b], size)
+                    sift_down(heap, place, weights, np.int64(place[b]), size)
     return place
 
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry
-from hapticdb.kernels.cells import CONTACTS, DEEPEST, HITS, UNKNOWNS
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, INTS, entry, fields_of
+from hapticdb.kernels.cells import CLUSTERS, CONTACTS, DEEPEST, HITS, PLACE, UNKNOWNS
 from hapticdb.kernels.contact import turn
 from hapticdb.kernels.curves import key_of
 from hapticdb.kernels.fence import fence
@@ -29,7 +29,10 @@ class Signal(NamedTuple):
     voxels: NDArray[np.int64]
 
 
-@entry
+SIGNAL = fields_of(Signal, INTS, FLOATS, INTS, INTS)
+
+
+@entry(SIGNAL, FLOATS, INTS)
 def tell(signal, told, missed):
     """Write what a session tells: `told` (TOLD,) and the unknown cells of its last frame."""
     signal.sequence[0] += 1
@@ -42,7 +45,7 @@ def tell(signal, told, missed):
     signal.sequence[0] += 1
 
 
-@entry
+@entry(SIGNAL, CLUSTERS, FLOATS2, PLACE, INT, INT, INTS, INT)
 def name_voxels(signal, shell, pose, place, bits, curve, met, n_hits):
     """Write the keys of some of the voxels that hits (n_hits,) of a placed shell are in."""
     most = signal.voxels.shape[0] - 1
@@ -65,7 +68,7 @@ def name_voxels(signal, shell, pose, place, bits, curve, met, n_hits):
     signal.voxels[0] = count
 
 
-@entry
+@entry(FLOATS2, INT, FLOAT, FLOAT, FLOAT, FLOAT, FLOATS, FLOATS, FLOATS, FLOATS, FLOAT, INT, INT)
 def note(
     ring, at, time, dt, lateness, elapsed, hand, tool, frame, applied, revision, buttons, state
 ):

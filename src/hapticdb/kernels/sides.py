@@ -12,7 +12,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels._jit import (
+    BYTES,
+    FLOAT,
+    FLOATS2,
+    FLOATS3,
+    INTS,
+    INTS2,
+    entry,
+    fields_of,
+    leaf,
+)
 from hapticdb.kernels.curves import Z_ORDER, encode
 
 Floats = NDArray[np.float64]
@@ -39,6 +49,9 @@ class TriangleTree(NamedTuple):
     boxes: Floats  # (nodes, 2, 3) lower and upper corner
     spans: Ints  # (nodes, 2) least and greatest body below
     slack: float  # what counts as no distance, metres
+
+
+TREE = fields_of(TriangleTree, FLOATS3, INTS, INTS, FLOATS3, INTS2, FLOAT)
 
 
 def triangle_tree(triangles: Floats, bodies: Ints) -> TriangleTree:
@@ -166,7 +179,7 @@ def crossings(origin, direction, body, skip, tree, stack):
     return ahead, behind, visits
 
 
-@entry
+@entry(TREE, INTS2, FLOATS2, FLOATS2, FLOATS2, INTS, INTS)
 def side_votes_kernel(tree, picks, directions, centroids, normals, body_of, out):
     """For each patch, lines that see the inside where the normals point, less those that do not.
 
@@ -201,7 +214,7 @@ def side_votes_kernel(tree, picks, directions, centroids, normals, body_of, out)
         out[p] = votes
 
 
-@entry
+@entry(TREE, INTS2, INTS2, FLOATS2, FLOATS2, BYTES)
 def nesting_kernel(tree, pairs, picks, directions, centroids, out):
     """For each pair (inner, outer) of bodies, whether the outer one encloses the inner one whole.
 
@@ -216,7 +229,7 @@ def nesting_kernel(tree, pairs, picks, directions, centroids, out):
             if face < 0:
                 continue
             ahead, behind, _ = crossings(
-                centroids[face], directions[line], pairs[q, 1], -1, tree, stack
+                centroids[face], directions[line], pairs[q, 1], np.int64(-1), tree, stack
             )
             if ahead < 0 or ahead % 2 != behind % 2:
                 continue

@@ -10,9 +10,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, inlined, leaf
+from hapticdb.kernels._jit import (
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    INTS2,
+    entry,
+    fields_of,
+    inlined,
+    leaf,
+)
 from hapticdb.kernels.cells import (
+    CELLS,
     EMPTY_SLOT,
+    PLACE,
     begin_frame,
     cell_key,
     end_frame,
@@ -20,6 +34,7 @@ from hapticdb.kernels.cells import (
     spread_key,
 )
 from hapticdb.kernels.contact import center_of, contact_depth, turn
+from hapticdb.kernels.grouping import first_bound
 from hapticdb.kernels.motion import place as write_pose
 from hapticdb.kernels.motion import product, quaternion_by
 
@@ -47,6 +62,9 @@ class Found(NamedTuple):
     voxels: NDArray[np.int64]
 
 
+FOUND = fields_of(Found, INTS, INTS, INTS, FLOATS, INTS)
+
+
 class Bounds(NamedTuple):
     """What is known about clearance, in voxels, kept from sample to sample.
 
@@ -64,11 +82,14 @@ class Bounds(NamedTuple):
     where: NDArray[np.int64]
 
 
+BOUNDS = fields_of(Bounds, FLOATS, INTS, FLOATS, FLOATS, INTS)
+
+
 SOONEST, LEAST = 0, 1
 SAMPLE, POINT, VOXEL, NEAREST, STOPPED = 0, 1, 2, 3, 4
 
 
-@entry
+@entry(FLOATS3, FLOATS2, FLOATS2, FLOATS2, INTS, FLOATS, INT, FLOATS3)
 def poses_between(poses, centers, quaternions, turns, starts, center, first, out):
     """Samples first .. first + B of a path, out (B, 4, 4): its centre on lines, turning by slerp.
 
@@ -76,7 +97,7 @@ def poses_between(poses, centers, quaternions, turns, starts, center, first, out
     (3,) of the tool is at each, metres; quaternions (M, 4); turns (M - 1, 3): from each to the
     next, rotation vectors, world frame; starts (M,) int64: which sample each pose is.
     """
-    at = np.searchsorted(starts, first, side="right") - 1
+    at = first_bound(first + 1, starts, np.int64(0)) - 1
     x, y, z = center[0], center[1], center[2]
     for n in range(out.shape[0]):
         sample = first + n
@@ -114,7 +135,7 @@ def packed(i, j, k):
     return (i << (2 * AXIS_BITS)) | (j << AXIS_BITS) | k
 
 
-@entry
+@entry(INTS, INTS2)
 def unpack(voxels, out):
     """Undo `packed` for voxels (n,) int64 into out (n, 3)."""
     for n in range(voxels.shape[0]):
@@ -123,7 +144,7 @@ def unpack(voxels, out):
         out[n, 2] = voxels[n] & AXIS_MASK
 
 
-@entry
+@entry(CELLS, INT, FLOATS2, FLOATS3, INTS, PLACE, INT, INT, FOUND)
 def find_hits(cells, reader, points, poses, samples, place, first, count, found):
     """Hits at poses[samples[first:]], appended to `found` from its entry `count` on.
 
@@ -280,7 +301,7 @@ def nearest_voxel(keys, slots, words, masks, used, which, x, y, z, square, voxel
     return square, voxel
 
 
-@entry
+@entry(CELLS, INT, FLOATS2, FLOATS3, INT, INT, FLOATS, INTS, PLACE, BOUNDS)
 def find_clearance(cells, reader, points, poses, first, base, travels, windows, place, bounds):
     """Least distance from the points to an occupied voxel's box at poses[first:], in `bounds`.
 
@@ -340,7 +361,7 @@ def find_clearance(cells, reader, points, poses, first, base, travels, windows, 
     return poses.shape[0]
 
 
-@entry
+@entry(FLOATS2, FLOATS3, PLACE, INT, INT, FLOAT, INTS, INT)
 def cells_near(points, poses, place, first, stride, reach, found, most):
     """Distinct cells within reach, metres, of points (N, 3+): at poses[0] from point `first` on.
 

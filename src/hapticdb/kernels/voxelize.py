@@ -33,7 +33,7 @@ triangle that is a line to within 1e-9 voxel in the largest grid. The others dec
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import entry, leaf
+from hapticdb.kernels._jit import FLOATS3, INT, entry, leaf
 from hapticdb.kernels.bricks import (
     FIRST_CAPACITY,
     RUNS_AT_ONCE,
@@ -57,6 +57,7 @@ THIN = 2.0**14
 """Above this edge^3 / |normal| the normal's rounding would show at 1e-11 voxel."""
 FAR = 2.0**60
 """Coordinates beyond are pulled to this: no product of three of them overflows."""
+AXIS_X, AXIS_Y, AXIS_Z = np.int64(0), np.int64(1), np.int64(2)
 OUTSIDE, CUT, WHOLE = 0, 1, 2
 """How much of a triangle's bounding box the grid has."""
 STEEP = 1e40
@@ -109,7 +110,11 @@ def minor(corners, p, q):
 @leaf
 def normal_of(corners):
     """Return the normal (x, y, z) of a triangle (3, 3), zeros where it is null."""
-    x, y, z = minor(corners, 1, 2), minor(corners, 2, 0), minor(corners, 0, 1)
+    x, y, z = (
+        minor(corners, AXIS_Y, AXIS_Z),
+        minor(corners, AXIS_Z, AXIS_X),
+        minor(corners, AXIS_X, AXIS_Y),
+    )
     longest = 0.0
     for n in range(3):
         m = (n + 1) % 3
@@ -118,9 +123,9 @@ def normal_of(corners):
         dz = corners[m, 2] - corners[n, 2]
         longest = max(longest, dx * dx + dy * dy + dz * dz)
     if longest * np.sqrt(longest) > THIN * np.sqrt(x * x + y * y + z * z):
-        x = exact_minor(corners, 1, 2)
-        y = exact_minor(corners, 2, 0)
-        z = exact_minor(corners, 0, 1)
+        x = exact_minor(corners, AXIS_Y, AXIS_Z)
+        y = exact_minor(corners, AXIS_Z, AXIS_X)
+        z = exact_minor(corners, AXIS_X, AXIS_Y)
         if np.sqrt(x * x + y * y + z * z) <= NULL_NORMAL * longest:
             return 0.0, 0.0, 0.0
     return x, y, z
@@ -345,18 +350,19 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
     return n_runs
 
 
-@entry
+@entry(FLOATS3, INT)
 def voxelize_kernel(triangles, bits):
     """Bricks of the voxels that triangles (T, 3, 3) meet: packed keys, words (C, 8), count."""
     edge = float(1 << bits)
-    bricks, n_bricks = new_bricks(FIRST_CAPACITY), 0
+    bricks, n_bricks = new_bricks(FIRST_CAPACITY), np.int64(0)
     runs = np.empty((RUNS_AT_ONCE, 5), np.int64)
     corners = np.empty((3, 3))
     box = np.empty((3, 3), np.int64)
     axes = np.empty((9, 4))
     plane = np.empty(5)
     spans = np.empty((longest_box(triangles, edge), 2))
-    resume = np.array([0, -1, 0])
+    resume = np.empty(3, np.int64)
+    resume[0], resume[1], resume[2] = 0, -1, 0
     while resume[0] < triangles.shape[0]:
         n_runs = fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs)
         bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)

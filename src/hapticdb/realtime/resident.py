@@ -9,6 +9,7 @@ from typing import NamedTuple, Self
 
 from hapticdb.errors import GridError, HapticDBError
 from hapticdb.grid import Grid
+from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.query import as_ids
 from hapticdb.realtime import prefetch
 from hapticdb.realtime.prefetch import FetchRequest, Wrap
@@ -18,8 +19,7 @@ from hapticdb.realtime.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellT
 from hapticdb.store.connect import open_store
 
 START_PATIENCE = 60.0
-"""Seconds until a fetching process must be ready: it may have to compile and, where round trips are
-short, to calibrate."""
+"""Seconds until a fetching process must be ready: it may have to calibrate."""
 RESTART_EVERY = 1.0
 SILENCE_NS = 1_000_000_000
 """Nanoseconds after which a database that was asked and has not answered counts as away."""
@@ -100,6 +100,7 @@ class ResidentCells:
         self.url = url
         self.exclude: tuple[int, ...] = tuple(as_ids(exclude).tolist())
         self.grid = self._looked_up()
+        compile_missing(entries_for("resident"))  # here: two processes would do it twice
         self.table = CellTable.create(budget_bytes)
         self.restarts = 0
         self._request = FetchRequest(

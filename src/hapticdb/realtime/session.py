@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.force import TangentPlane
+from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell import PointShell
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
@@ -157,6 +158,7 @@ class Session:
         record: str | os.PathLike[str] | None,
         replace_recording: bool,  # noqa: FBT001 - handed on
     ) -> None:
+        compile_missing(entries_for("feel"))  # here: the loop must not wait for it
         table = self.cells.table
         if record is not None:
             self._begin_recording(Path(record), replace_recording)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
-from hapticdb.kernels.contact import wrench_of_addresses
+from hapticdb.kernels import contact
 from hapticdb.store.base import Frame, Layout, row_shift
 
 WRENCH = {
@@ -86,7 +86,7 @@ class _Force:
         if self._frame is None:
             return bytes(48)
         hits = np.array(sorted(self._hits), dtype=np.int64)
-        wrench: NDArray[np.float64] = wrench_of_addresses(
+        wrench: NDArray[np.float64] = contact.wrench_of_addresses(
             self._frame.placed,
             hits[:, 0].copy(),
             hits[:, 1].copy(),

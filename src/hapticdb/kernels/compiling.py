@@ -1,0 +1,244 @@
+"""Entries compiled before their first call, side by side in processes of their own.
+
+numba compiles one function at a time in a process, whatever the threads. So each process owns
+whole modules of entries, or a single large entry: two processes that wrote the index of one entry
+would lose each other's work. What is compiled goes into the cache on disk, from which the process
+that asked, and every later one, loads it. A mark beside it tells that an entry is there, without
+numba having to look.
+"""
+
+import contextlib
+import functools
+import gc
+import hashlib
+import importlib
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Collection
+from concurrent.futures import ThreadPoolExecutor, as_completed
+from fnmatch import fnmatchcase
+from pathlib import Path
+from threading import Lock, Timer
+from typing import NamedTuple, Self
+
+import numba
+from llvmlite import binding
+
+from hapticdb.kernels import _jit
+
+MODULES = (
+    "coupling", "voxelize", "sweep", "cells", "contact", "cell_table", "sides", "motion",
+    "grouping", "sampling", "servo", "curves", "bricks", "handle",
+)  # fmt: skip
+"""Modules that have entries; those that take longest to compile come first."""
+LARGE = ("coupling.advance", "voxelize.voxelize_kernel", "cells.feel_kernel")
+"""Entries that take seconds: each is a job of its own. `feel_kernel` shares most of `advance`."""
+LONGEST_S = 600.0
+"""Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
+where it is first called."""
+
+_SHELL = ("sampling.*", "sides.*", "curves.encode_kernel")
+_VOXELIZE = ("voxelize.*", "bricks.z_keys_kernel", "bricks.count_kernel")
+_RANGES = ("grouping.ranges_of_box", "bricks.brick_voxels_kernel")
+_COST = (
+    "contact.locate_kernel", "contact.spans_of_keys", "contact.wrench_of_addresses",
+    "grouping.gap_rows", "grouping.group_by_gap", "grouping.group_by_cost", "curves.*",
+)  # fmt: skip
+_RESIDENT = ("cell_table.*", "cells.*", "grouping.group_spans_by_cost", *_COST)
+PURPOSES: dict[str, tuple[str, ...]] = {
+    "import": (*_VOXELIZE, "bricks.mark_points_kernel"),
+    "move": (*_VOXELIZE, "bricks.mark_points_kernel", *_RANGES),
+    "copy": ("bricks.*", "curves.*", "grouping.gap_rows", *_RANGES),
+    "shell": _SHELL,
+    "calibrate": _COST,
+    "touch": (*_SHELL, *_COST, "contact.*"),
+    "resident": _RESIDENT,
+    "feel": (*_SHELL, *_RESIDENT, "coupling.*", "servo.*", "handle.*", "motion.*"),
+    "replay": (*_RESIDENT, "motion.poses_of"),
+    "sweep": (*_SHELL, *_RESIDENT, "sweep.*"),
+    "everything": ("*",),
+}
+"""Entries that a purpose calls, with ``*`` for any name; `tests/test_warm.py` holds them to it."""
+
+
+class Compiled(NamedTuple):
+    """How far it is: entries that are compiled, and how many are to be."""
+
+    done: int
+    total: int
+
+
+def entry_names() -> tuple[str, ...]:
+    """Names of all entries, as `_jit.SIGNATURES` has them."""
+    for module in MODULES:
+        importlib.import_module(f"hapticdb.kernels.{module}")
+    return tuple(name for name in _jit.SIGNATURES if name.partition(".")[0] in MODULES)
+
+
+def entries_for(*purposes: str) -> list[str]:
+    """Entries that those purposes call, each once."""
+    patterns = [pattern for purpose in purposes for pattern in PURPOSES[purpose]]
+    return [n for n in entry_names() if any(fnmatchcase(n, pattern) for pattern in patterns)]
+
+
+def missing(names: Collection[str]) -> list[str]:
+    """Which of those entries this machine's cache does not have."""
+    if numba.config.DISABLE_JIT:
+        return []
+    return [name for name in names if not _mark_of(name).exists()]
+
+
+def compile_missing(
+    names: Collection[str],
+    progress: Callable[[Compiled], None] | None = None,
+    jobs: int | None = None,
+) -> int:
+    """Compile those entries that the cache does not have, and return how many they were.
+
+    Parameters
+    ----------
+    names : collection of str
+        Entries, as `entry_names` gives them.
+    progress : callable or None
+        Called from this thread, at the start and after each entry.
+    jobs : int or None
+        Processes side by side; one a processor unless given.
+    """
+    wanted = missing(names)
+    if not wanted:
+        return 0
+    total, done = len(wanted), 0
+    queue = jobs_of(wanted)
+    workers = min(jobs or os.cpu_count() or 1, len(queue))
+    tell = progress or (lambda _: None)
+    tell(Compiled(0, total))
+    pool: ThreadPoolExecutor
+    with _Workers() as started, ThreadPoolExecutor(workers, thread_name_prefix="compile") as pool:
+        try:
+            for finished in as_completed([pool.submit(started.compile, job) for job in queue]):
+                done += finished.result()
+                tell(Compiled(done, total))
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            started.end()
+            raise
+    return total
+
+
+def load(names: Collection[str]) -> None:
+    """Load those entries from the cache, or compile them here: no first call waits any more."""
+    entry_names()
+    if numba.config.DISABLE_JIT:
+        return
+    for name in names:
+        _compile_here(name)
+
+
+def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
+    """Names by job: large entries alone, others by module, so that they share their leaves."""
+    jobs: list[tuple[str, ...]] = [(name,) for name in LARGE if name in names]
+    for module in MODULES:
+        rest = [name for name in names if name.startswith(f"{module}.") and name not in LARGE]
+        if rest:
+            jobs.append(tuple(rest))
+    return jobs
+
+
+class _Workers:
+    """Processes that compile, started as threads ask for them; all are ended at the end."""
+
+    def __init__(self) -> None:
+        self._idle: list[subprocess.Popen[str]] = []
+        self._all: list[subprocess.Popen[str]] = []
+        self._lock = Lock()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    def compile(self, job: tuple[str, ...]) -> int:
+        """Let a process compile that job; returns how many entries it has, compiled or not."""
+        with self._lock:
+            worker = self._idle.pop() if self._idle else self._started()
+        if worker is not None and worker.stdin is not None and worker.stdout is not None:
+            patience = Timer(LONGEST_S, worker.kill)
+            patience.start()
+            try:
+                worker.stdin.write(" ".join(job) + "\n")
+                worker.stdin.flush()
+                if worker.stdout.readline():
+                    with self._lock:
+                        self._idle.append(worker)
+            except (OSError, ValueError):
+                pass  # it was ended: the first call compiles
+            finally:
+                patience.cancel()
+        return len(job)
+
+    def end(self) -> None:
+        """End every process, compiling or not: nothing half-written stays (numba renames)."""
+        with self._lock:
+            for worker in self._all:
+                worker.kill()
+                worker.communicate()
+            self._all.clear()
+            self._idle.clear()
+
+    def _started(self) -> "subprocess.Popen[str] | None":
+        code = "from hapticdb.kernels.compiling import serve; serve()"
+        # the package is found where this process has found it, whatever the folder
+        path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
+        try:
+            worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
+                [sys.executable, "-c", code],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env=os.environ | {_jit.IN_WORKER: "1", "PYTHONPATH": path},
+                text=True,
+                start_new_session=True,  # Ctrl-C is the parent's, which ends this one
+            )
+        except OSError:
+            return None
+        self._all.append(worker)
+        return worker
+
+
+def serve() -> None:
+    """Be a process that compiles: a line of names in, the same line out when they are compiled."""
+    gc.set_threshold(100_000, 50, 100)  # compiling makes few cycles, and many objects
+    for line in sys.stdin:
+        for name in line.split():
+            importlib.import_module(f"hapticdb.kernels.{name.partition('.')[0]}")
+            _compile_here(name)
+        sys.stdout.write(line)
+        sys.stdout.flush()
+
+
+def _compile_here(name: str) -> None:
+    """Compile an entry in this process, or load it, and mark it as compiled."""
+    module, _, function = name.partition(".")
+    compiled = getattr(sys.modules[f"hapticdb.kernels.{module}"], function)
+    compiled.compile(_jit.SIGNATURES[name])
+    mark = _mark_of(name)
+    if not mark.exists():
+        with contextlib.suppress(OSError):
+            mark.touch()
+
+
+@functools.cache
+def _target() -> str:
+    """Digest of what numba's cached code depends on beside our sources: version and processor."""
+    features = binding.get_host_cpu_features().flatten()
+    words = (
+        numba.__version__, sys.implementation.cache_tag, binding.get_host_cpu_name(), features,
+        os.environ.get("NUMBA_CPU_NAME", ""), os.environ.get("NUMBA_CPU_FEATURES", ""),
+    )  # fmt: skip
+    return hashlib.sha256("\0".join(map(str, words)).encode()).hexdigest()[:16]
+
+
+def _mark_of(name: str) -> Path:
+    return Path(_jit.CACHE_FOLDER) / f"{name}.{_target()}.compiled"

@@ -1,15 +1,26 @@
 # On a fresh machine each target sets itself up: .venv with the pinned versions, then hapticdb.
+# The demo installs what a user needs (USER), everything else the developers' tools, too (READY).
 PYTHON ?= python3
 BIN := .venv/bin
+USER := .venv/user
 READY := .venv/ready
+PIP := $(BIN)/pip install --quiet --disable-pip-version-check
+PYTEST := $(BIN)/pytest tests --numprocesses=auto --dist=worksteal
 
-.PHONY: demo test test-plain lint types bench figures peers realtime scale wheel pins clean
+.PHONY: demo test test-long test-all test-plain lint types bench figures peers realtime scale wheel pins clean
 
-demo: $(READY)
+demo: $(USER)
 	$(BIN)/hapticdb demo demo
 
+# what a person runs ten times a day: minutes
 test: $(READY)
-	$(BIN)/pytest tests
+	$(PYTEST) -m "not long" $(ARGS)
+
+# the long loops of kills, rights and recovery, and every page's commands
+test-long: $(READY)
+	HYPOTHESIS_PROFILE=thorough $(PYTEST) -m long $(ARGS)
+
+test-all: test test-long
 
 # the kernels as plain Python: what the JIT must not change
 test-plain: $(READY)
@@ -57,15 +68,23 @@ pins:
 	rm -rf .venv-pins
 	$(PYTHON) -m venv .venv-pins
 	.venv-pins/bin/pip install --upgrade "pip>=25.1"
+	.venv-pins/bin/pip install .
+	head -1 requirements/user.txt > .venv-pins/user.txt
+	.venv-pins/bin/pip freeze --exclude hapticdb >> .venv-pins/user.txt
 	.venv-pins/bin/pip install ".[step,pointcloud,postgres]" --group dev
-	echo "# Everything that make test, make demo and .ci/run install; renewed by 'make pins'." > requirements/dev.txt
-	.venv-pins/bin/pip freeze --exclude hapticdb >> requirements/dev.txt
+	head -1 requirements/dev.txt > .venv-pins/dev.txt
+	.venv-pins/bin/pip freeze --exclude hapticdb | grep -vxFf .venv-pins/user.txt >> .venv-pins/dev.txt
+	mv .venv-pins/user.txt .venv-pins/dev.txt requirements/
 	rm -rf .venv-pins
 
-$(READY): requirements/dev.txt pyproject.toml
+$(USER): requirements/user.txt pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --disable-pip-version-check --requirement requirements/dev.txt
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --no-build-isolation --editable .
+	$(PIP) --requirement requirements/user.txt
+	$(PIP) --no-deps --editable .
+	touch $(USER)
+
+$(READY): requirements/dev.txt $(USER)
+	$(PIP) --requirement requirements/dev.txt
 	touch $(READY)
 
 clean:

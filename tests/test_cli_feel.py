@@ -6,19 +6,17 @@ import json
 import os
 import re
 import signal
-import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import hapticdb
+from children import PATIENCE, child, until
 from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.realtime.recording import Recording
 from hapticdb.realtime.table import is_alive
 
-PATIENCE = 60.0
 ABOVE = "0,0,0.3"
 LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
 PLAY = ("--device", "path.csv", "--rate", 500)
@@ -204,18 +202,13 @@ def test_a_signal_ends_a_session_with_its_report(
 ) -> None:
     """And with a recording that has every frame."""
     args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
-    with subprocess.Popen(
-        command(*args, "--json"),
-        cwd=scene.parent,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        deadline = time.monotonic() + PATIENCE
-        while not frames_in(scene.with_name("cut.hdbrec")):  # the first chunk is full
-            assert time.monotonic() < deadline
+    with child(command(*args, "--json"), cwd=scene.parent) as process:
+
+        def is_recording() -> bool:  # the first chunk is full
             assert process.poll() is None
-            time.sleep(0.05)
+            return frames_in(scene.with_name("cut.hdbrec"))
+
+        until(is_recording, every=0.05)
         started = descendants(process.pid)
         process.send_signal(number)
         out, err = process.communicate(timeout=PATIENCE)
@@ -231,34 +224,22 @@ def test_a_signal_ends_a_session_with_its_report(
 
 def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
     args = feel("--device", "random", "--at", ABOVE)
-    with subprocess.Popen(
-        command(*args), cwd=scene.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        deadline = time.monotonic() + PATIENCE
-        while not descendants(process.pid):
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
+    with child(command(*args), cwd=scene.parent) as process:
+        until(lambda: descendants(process.pid), every=0.002)
         started = descendants(process.pid)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
     assert out == ""
     assert "hapticdb: interrupted" in err.splitlines()
-    while any(map(is_alive, started)):
-        assert time.monotonic() < deadline + PATIENCE
-        time.sleep(0.05)
+    until(lambda: not any(map(is_alive, started)))
 
 
 def test_sigterm_before_the_first_frame_leaves_nothing(scene: Path) -> None:
     args = feel("--device", "random", "--at", ABOVE, "--record", "never.hdbrec")
     path = scene.with_name("never.hdbrec")
-    with subprocess.Popen(
-        command(*args), cwd=scene.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        deadline = time.monotonic() + PATIENCE
-        while not path.exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
+    with child(command(*args), cwd=scene.parent) as process:
+        until(path.exists, every=0.002)
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, out, err) == (143, "", "")

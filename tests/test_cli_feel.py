@@ -5,6 +5,7 @@
 import json
 import os
 import re
+import resource
 import signal
 from pathlib import Path
 
@@ -14,12 +15,14 @@ import pytest
 import hapticdb
 from children import PATIENCE, child, until
 from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
-from hapticdb.realtime.recording import Recording
+from hapticdb.cli.root import size_of
+from hapticdb.realtime.recording import Frames, Recording
 from hapticdb.realtime.table import is_alive
 
 ABOVE = "0,0,0.3"
 LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
 PLAY = ("--device", "path.csv", "--rate", 500)
+LIMITED = (*PLAY, "--record", "felt.hdbrec", "--record-limit")
 
 
 def children() -> set[int]:
@@ -79,7 +82,7 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert (code, err) == (1, "")
     parted = re.match(r"parts at frame (\d+) \(\d+\.\d{3} s\)", out)
     assert parted
-    frames = np.concatenate(list(recording.frames()))
+    frames = recorded(scene.with_name("felt.hdbrec"))
     assert frames["hits"][int(parted[1])] > 0
     code, out, _ = run("replay", "felt.hdbrec", "--json")
     assert (code, json.loads(out)["parts_at"]) == (1, int(parted[1]))
@@ -134,6 +137,13 @@ def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
         ([*PLAY, "--exclude", 99], ["no object 99"]),
         ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),
         ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already"]),
+        ([*PLAY, "--record-limit", "1GiB"], ["--record-limit belongs to --record"]),
+        ([*LIMITED, "0"], ["--record-limit '0': give MiB, 1 to a million, or such as 4GiB"]),
+        ([*LIMITED, "-3GiB"], ["--record-limit '-3GiB': give MiB"]),
+        ([*LIMITED, "nan"], ["--record-limit 'nan': give MiB"]),
+        ([*LIMITED, "1e30"], ["--record-limit '1e30': give MiB"]),
+        ([*LIMITED, "4 parsecs"], ["--record-limit '4 parsecs': give MiB"]),
+        ([*LIMITED, "9999999G"], ["--record-limit '9999999G': give MiB"]),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_no_process(
@@ -180,6 +190,60 @@ def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
     refused(run("replay", "path.csv"), "path.csv")
 
 
+def test_a_session_goes_on_without_its_recording_at_the_limit(run: Run, scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--seconds", 4, "--json")
+    path = scene.with_name("felt.hdbrec")
+    code, out, err = run(*args, "--record", path.name, "--record-limit", "1MiB")
+    report = json.loads(out)
+    n_frames = len(recorded(path))
+    assert code == 0
+    assert report["recording_ended"] == (
+        f"felt.hdbrec: the recording ends after {n_frames:,} frames, at its limit of 1 MiB"
+    )
+    assert err == f"hapticdb: {report['recording_ended']}; the session goes on without it\n"
+    assert 1000 < n_frames == report["recorded_frames"] < report["loop"]["frames"]
+    assert path.stat().st_size <= 1 << 20
+    assert run("replay", path.name)[0] == 0
+
+
+def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
+    path = scene.with_name("cut.hdbrec")
+    with child(command(*args, "--json"), cwd=scene.parent) as process:
+        until(lambda: frames_in(path))
+        most = path.stat().st_size + 100_000
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (most, most))
+        assert process.stderr is not None
+        told = process.stderr.readline()
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=PATIENCE)
+    report = json.loads(out)
+    n_frames = len(recorded(path))
+    assert report["recording_ended"] == (
+        f"cannot write cut.hdbrec: File too large; its first {n_frames} frames are whole"
+    )
+    assert told == f"hapticdb: {report['recording_ended']}; the session goes on without it\n"
+    assert 0 < n_frames == report["recorded_frames"] < report["loop"]["frames"]
+
+
+@pytest.mark.parametrize(
+    ("text", "n_bytes"),
+    [
+        ("1", 1 << 20),
+        ("512", 512 << 20),
+        ("1.5 GiB", 3 << 29),
+        ("4g", 4 << 30),
+        ("20MIB", 20 << 20),
+    ],
+)
+def test_a_size_is_mib_or_has_its_unit(text: str, n_bytes: int) -> None:
+    assert size_of(text, "--record-limit") == n_bytes
+
+
+def recorded(path: Path) -> Frames:
+    return np.concatenate(list(Recording(path).frames()))
+
+
 def frames_in(path: Path) -> bool:
     """Whether a session has begun to record."""
     try:
@@ -215,7 +279,7 @@ def test_a_signal_ends_a_session_with_its_report(
     assert process.returncode == code
     assert re.fullmatch(rf"hapticdb: ended by {words} after [\d.]+ s\n", err)
     report = json.loads(out)
-    frames = np.concatenate(list(Recording(scene.with_name("cut.hdbrec")).frames()))
+    frames = recorded(scene.with_name("cut.hdbrec"))
     assert len(frames) == report["loop"]["frames"] == report["recorded_frames"]
     np.testing.assert_allclose(np.diff(frames["time"]), frames["dt"][1:], atol=1e-9)
     assert len(started) == 2

@@ -92,7 +92,7 @@ def test_a_full_disk_leaves_whole_chunks(tmp_path: Path) -> None:
                     recorder.append(motion(20, 20 * n))
                     recorder.flush()
             except FileError as error:
-                told = f"cannot write {path}: File too large; its first {len(recorder) - 20} frames"
+                told = f"cannot write {path}: File too large; its first {len(recorder)} frames"
                 code = 0 if str(error).startswith(told) and recorder._file.closed else 2
         finally:
             os._exit(code)

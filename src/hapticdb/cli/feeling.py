@@ -87,8 +87,8 @@ def feel(
         str | None,
         typer.Option(
             metavar="SIZE",
-            help="Where the recording ends and the session goes on: MiB, or such as 4GiB. "
-            "64 MiB of the disk stay free in any case.",
+            help="Size at which the recording ends and the session goes on: MiB, or such as 4GiB. "
+            "It also ends when its disk has 64 MiB left.",
             show_default="4GiB",
         ),
     ] = None,

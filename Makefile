@@ -8,6 +8,7 @@ READY := .venv/ready
 demo: $(READY)
 	$(BIN)/hapticdb demo demo
 
+# HYPOTHESIS_PROFILE=thorough make test: 200 examples a property instead of 25
 test: $(READY)
 	$(BIN)/pytest tests
 

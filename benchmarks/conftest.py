@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import pytest
 
 import children
+import examples
 import hapticdb
 from hapticdb import Environment, PointShell
 from hapticdb.poses import read_poses
@@ -17,6 +18,7 @@ TINY_BITS = 7
 
 
 def pytest_configure() -> None:
+    examples.choose()
     children.begin_run()
 
 

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 import children
+import examples
 from hapticdb import PointShell
 from hapticdb.pointshell import fibonacci_sphere
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 
 
 def pytest_configure() -> None:
+    examples.choose()
     children.begin_run()
 
 

@@ -12,11 +12,11 @@ PYTEST := $(BIN)/pytest tests --numprocesses=auto --dist=worksteal
 demo: $(USER)
 	$(BIN)/hapticdb demo demo
 
-# what a person runs ten times a day: minutes
+# what a person runs ten times a day: minutes, 25 examples a property
 test: $(READY)
 	$(PYTEST) -m "not long" $(ARGS)
 
-# the long loops of kills, rights and recovery, and every page's commands
+# the long loops of kills, rights and recovery, every page's commands, and 200 examples a property
 test-long: $(READY)
 	HYPOTHESIS_PROFILE=thorough $(PYTEST) -m long $(ARGS)
 

@@ -33,4 +33,4 @@ def awake() -> Iterator[None]:
     finally:
         for process in started:
             process.kill()
-            process.wait()
+            process.wait(60.0)

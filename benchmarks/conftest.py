@@ -4,6 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 
+import children
+import examples
 import hapticdb
 from hapticdb import Environment, PointShell
 from hapticdb.poses import read_poses
@@ -13,6 +15,16 @@ from scene import Scene, is_measuring
 
 PAPER_BITS = 11
 TINY_BITS = 7
+
+
+def pytest_configure() -> None:
+    examples.choose()
+    children.begin_run()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _servers_end_with_the_run(tmp_path_factory: pytest.TempPathFactory) -> None:
+    children.end_servers_below(tmp_path_factory.getbasetemp())
 
 
 @pytest.fixture(scope="session")

@@ -6,6 +6,7 @@ and again; this one looks, twice a millisecond, at the revision of the session's
 
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path as FilePath
 from typing import Any
@@ -62,6 +63,9 @@ def edits(url: str, tool: FilePath, path: FilePath, n_edits: int = EDITS) -> dic
     ):
         assert writer.stdin is not None
         assert writer.stdout is not None
+        late = threading.Timer(n_edits * PATIENCE, writer.kill)  # so that no line is waited for
+        late.daemon = True
+        late.start()
         for _ in range(n_edits):
             session.wait(PAUSE)
             before = revision_of(session)
@@ -71,6 +75,7 @@ def edits(url: str, tool: FilePath, path: FilePath, n_edits: int = EDITS) -> dic
             assert revision_of(session) == revision, "each edit is one write"
             delays.append(1e3 * (seen - committed))
             took.append(seconds)
+        late.cancel()
         report = session.stop()
     with hapticdb.open(url, read_only=True) as env:
         voxels = env.object(object_id).voxels

@@ -229,6 +229,7 @@ def run(args: argparse.Namespace, folder: Path, url: str, server: PrivateServer 
         report = session.stop()
     frames = np.concatenate(list(Recording(path).frames()))
     assert report.lost_records == 0
+    assert report.recording_ended is None, report.recording_ended
     check(course.troubles, frames)
     figures = summary(report, course.troubles, frames)
     figures["replayed"] = check_exact(path, url)

@@ -50,6 +50,8 @@ PARTS = ("body/hood", "body/door_front_left", "supply/fuel_tank", "seats/bench_c
 RUNS = {"flat": 0, "clusters": None}
 RATES = (1000, 5000, 10_000)
 LARGE = 100_000
+PATIENCE = 600.0
+"""Seconds after which a command is killed, beyond those that it was asked to last."""
 SETTINGS = {"shared_buffers": "256MB"}
 
 
@@ -116,7 +118,8 @@ def session(url: str, tool: Path, path: Path, rate: int, seconds: float) -> dict
         "--device", str(path), "--loop", "--speed", "0.2", "--rate", str(rate),
         "--seconds", str(seconds), "--json",
     ]  # fmt: skip
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    limit = seconds + PATIENCE
+    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)
     if done.returncode:
         raise SystemExit(done.stderr)
     report: dict[str, Any] = json.loads(done.stdout)
@@ -148,7 +151,8 @@ def measure(
         if model is not None:
             along = folder / "along"
             command = [str(Path(sys.executable).with_name("hapticdb")), "sample", str(along)]
-            subprocess.run([*command, "--along", str(database)], check=True, capture_output=True)
+            command += ["--along", str(database)]
+            subprocess.run(command, check=True, capture_output=True, timeout=PATIENCE)
             tool, path = along / "wrench.stl", along / "path.csv"
         with hapticdb.open(database, read_only=True) as env:
             results["object_voxels"] = sum(obj.voxels for obj in env.objects())

@@ -10,7 +10,7 @@ priority keeps each processor awake; without, times double and scatter.
 
 import contextlib
 import itertools
-import subprocess
+import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -105,7 +105,7 @@ class Served:
             env.close()
         if self._server is not None:
             self._server.stop()
-            subprocess.run(["rm", "-rf", str(self._server.folder)], check=True)
+            shutil.rmtree(self._server.folder)
 
 
 @pytest.fixture(scope="module", params=FOUND, ids=named)

@@ -10,9 +10,19 @@ import numba
 import numpy as np
 import pytest
 
+import children
+import examples
 from hapticdb import PointShell
+from hapticdb.kernels.compiling import compile_missing, entry_names
 from hapticdb.pointshell import fibonacci_sphere
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    examples.choose()
+    children.begin_run()
+    if not hasattr(config, "workerinput"):  # once, before the processes that run tests start
+        compile_missing(entry_names())
 
 
 def real_folder() -> Path | None:
@@ -41,6 +51,11 @@ def _signals_are_left_as_they_were() -> Iterator[None]:
     for number, handler in zip(numbers, before, strict=True):
         signal.signal(number, handler)
     assert after == before
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _servers_end_with_the_run(tmp_path_factory: pytest.TempPathFactory) -> None:
+    children.end_servers_below(tmp_path_factory.getbasetemp())
 
 
 @pytest.fixture(scope="session")

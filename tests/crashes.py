@@ -13,6 +13,7 @@ import pytest
 
 import hapticdb
 from assemblies import Mesh, ball, placement, write_obj
+from children import joined
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.ingest import Progress
 from hapticdb.query import Strategy
@@ -67,9 +68,11 @@ def running(template: tuple[Path, Binaries]) -> Iterator[PrivateServer]:
     shutil.copytree(template[0], place / "server", symlinks=True)
     made = PrivateServer.at(place / "server", template[1])
     made.start()
-    yield made
-    made.kill()
-    shutil.rmtree(place)
+    try:
+        yield made
+    finally:
+        made.kill()
+        shutil.rmtree(place)
 
 
 @pytest.fixture
@@ -117,7 +120,7 @@ class Killer:
         if progress.parts_done == self._n_parts:
             self._timer.start()
         elif progress.parts_done == self._n_parts + 4:
-            self._timer.join()
+            joined(self._timer)
 
 
 def crash(server: PrivateServer) -> None:

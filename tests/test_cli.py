@@ -6,7 +6,6 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
 from pathlib import Path
 from typing import get_args
@@ -14,6 +13,7 @@ from typing import get_args
 import pytest
 
 import hapticdb
+from children import PATIENCE, child, finished
 from command_line import (  # noqa: F401 - fixtures among them
     Run,
     boxes,
@@ -119,13 +119,8 @@ def test_an_unforeseen_error_is_one_line_too(
 
 def modules_after(program: str, *names: str) -> list[str]:
     """Which of those modules a program has loaded at its end."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"{program}\nimport sys\nprint(*sorted(sys.modules))"],
-        capture_output=True,
-        check=True,
-        text=True,
-        timeout=120,
-    )
+    code = f"{program}\nimport sys\nprint(*sorted(sys.modules))"
+    done = finished([sys.executable, "-c", code], check=True)
     return sorted({*names} & {*done.stdout.splitlines()[-1].split()})
 
 
@@ -270,32 +265,28 @@ def test_a_missing_environment_is_named(run: Run, verb: str) -> None:
 
 
 def test_it_runs_as_a_module(scene: Path) -> None:
-    found = subprocess.run(command("info", scene, "--json"), capture_output=True, check=True)
+    found = finished(command("info", scene, "--json"), check=True)
     assert json.loads(found.stdout)["objects"] == 3
-    assert found.stderr == b""
+    assert found.stderr == ""
 
 
 def test_a_reader_that_stops_early_is_no_error(scene: Path, tmp_path: Path) -> None:
     poses(tmp_path / "long.csv", *[(0.0, 0.0, 0.055)] * 2000)
     args = command("touch", scene, "--tool", "tool.npz", "--poses", "long.csv", "--json")
-    with subprocess.Popen(
-        args, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
+    with child(args, cwd=tmp_path) as process:
         assert process.stdout is not None
         assert process.stderr is not None
-        assert process.stdout.readline().startswith(b"{")
+        assert process.stdout.readline().startswith("{")
         process.stdout.close()
-        assert process.stderr.read() == b""
+        assert process.stderr.read() == ""
 
 
 def test_names_beyond_the_terminals_encoding_are_printed(tmp_path: Path) -> None:
     (tmp_path / "ä.obj").write_text("o é\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", encoding="utf-8")
     environment = os.environ | {"PYTHONIOENCODING": "ascii"}
     for args in (["import", "a.db", "ä.obj", "--bits", "4"], ["objects", "a.db"], ["info", "a.db"]):
-        done = subprocess.run(
-            command(*args), cwd=tmp_path, env=environment, capture_output=True, check=False
-        )
-        assert (done.returncode, done.stderr) == (0, b"")
+        done = finished(command(*args), cwd=tmp_path, env=environment)
+        assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) -> None:
@@ -303,15 +294,13 @@ def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) 
     options = ("--layout", "voxel", "--voxel-size", 0.002)
     assert run("import", "whole.db", file, *options)[0] == 0
     args = command_that_halts(30, "import", "cut.db", file, *options)
-    with subprocess.Popen(
-        args, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    ) as process:
+    with child(args, cwd=tmp_path) as process:
         cut = tmp_path / "cut.db"
         wait_for_an_object(cut, process)
         process.send_signal(signal.SIGINT)
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert err.decode().splitlines() == [
+    assert err.splitlines() == [
         "hapticdb: interrupted; what went in is whole, and the same command goes on from there"
     ]
     with hapticdb.open(cut, read_only=True) as env:

@@ -26,7 +26,7 @@ EXPERIMENTS = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_bench_writes_results_plots_and_a_report(run: Run, tmp_path: Path) -> None:
     assert run("sample", "sample", "--frames", 40)[0] == 0
     assert run("import", "car.db", "sample/car.glb", "--bits", 8)[0] == 0

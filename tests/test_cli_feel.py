@@ -5,23 +5,24 @@
 import json
 import os
 import re
+import resource
 import signal
-import subprocess
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 import hapticdb
+from children import PATIENCE, child, until
 from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
-from hapticdb.realtime.recording import Recording
+from hapticdb.cli.root import size_of
+from hapticdb.realtime.recording import Frames, Recording
 from hapticdb.realtime.table import is_alive
 
-PATIENCE = 60.0
 ABOVE = "0,0,0.3"
 LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
 PLAY = ("--device", "path.csv", "--rate", 500)
+LIMITED = (*PLAY, "--record", "felt.hdbrec", "--record-limit")
 
 
 def children() -> set[int]:
@@ -81,7 +82,7 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert (code, err) == (1, "")
     parted = re.match(r"parts at frame (\d+) \(\d+\.\d{3} s\)", out)
     assert parted
-    frames = np.concatenate(list(recording.frames()))
+    frames = recorded(scene.with_name("felt.hdbrec"))
     assert frames["hits"][int(parted[1])] > 0
     code, out, _ = run("replay", "felt.hdbrec", "--json")
     assert (code, json.loads(out)["parts_at"]) == (1, int(parted[1]))
@@ -136,6 +137,13 @@ def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
         ([*PLAY, "--exclude", 99], ["no object 99"]),
         ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),
         ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already"]),
+        ([*PLAY, "--record-limit", "1GiB"], ["--record-limit belongs to --record"]),
+        ([*LIMITED, "0"], ["--record-limit '0': give MiB, 1 to a million, or such as 4GiB"]),
+        ([*LIMITED, "-3GiB"], ["--record-limit '-3GiB': give MiB"]),
+        ([*LIMITED, "nan"], ["--record-limit 'nan': give MiB"]),
+        ([*LIMITED, "1e30"], ["--record-limit '1e30': give MiB"]),
+        ([*LIMITED, "4 parsecs"], ["--record-limit '4 parsecs': give MiB"]),
+        ([*LIMITED, "9999999G"], ["--record-limit '9999999G': give MiB"]),
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_no_process(
@@ -182,6 +190,60 @@ def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
     refused(run("replay", "path.csv"), "path.csv")
 
 
+def test_a_session_goes_on_without_its_recording_at_the_limit(run: Run, scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--seconds", 4, "--json")
+    path = scene.with_name("felt.hdbrec")
+    code, out, err = run(*args, "--record", path.name, "--record-limit", "1MiB")
+    report = json.loads(out)
+    n_frames = len(recorded(path))
+    assert code == 0
+    assert report["recording_ended"] == (
+        f"felt.hdbrec: the recording ends after {n_frames:,} frames, at its limit of 1 MiB"
+    )
+    assert err == f"hapticdb: {report['recording_ended']}; the session goes on without it\n"
+    assert 1000 < n_frames == report["recorded_frames"] < report["loop"]["frames"]
+    assert path.stat().st_size <= 1 << 20
+    assert run("replay", path.name)[0] == 0
+
+
+def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
+    path = scene.with_name("cut.hdbrec")
+    with child(command(*args, "--json"), cwd=scene.parent) as process:
+        until(lambda: frames_in(path))
+        most = path.stat().st_size + 100_000
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (most, most))
+        assert process.stderr is not None
+        told = process.stderr.readline()
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=PATIENCE)
+    report = json.loads(out)
+    n_frames = len(recorded(path))
+    assert report["recording_ended"] == (
+        f"cannot write cut.hdbrec: File too large; its first {n_frames} frames are whole"
+    )
+    assert told == f"hapticdb: {report['recording_ended']}; the session goes on without it\n"
+    assert 0 < n_frames == report["recorded_frames"] < report["loop"]["frames"]
+
+
+@pytest.mark.parametrize(
+    ("text", "n_bytes"),
+    [
+        ("1", 1 << 20),
+        ("512", 512 << 20),
+        ("1.5 GiB", 3 << 29),
+        ("4g", 4 << 30),
+        ("20MIB", 20 << 20),
+    ],
+)
+def test_a_size_is_mib_or_has_its_unit(text: str, n_bytes: int) -> None:
+    assert size_of(text, "--record-limit") == n_bytes
+
+
+def recorded(path: Path) -> Frames:
+    return np.concatenate(list(Recording(path).frames()))
+
+
 def frames_in(path: Path) -> bool:
     """Whether a session has begun to record."""
     try:
@@ -204,25 +266,20 @@ def test_a_signal_ends_a_session_with_its_report(
 ) -> None:
     """And with a recording that has every frame."""
     args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
-    with subprocess.Popen(
-        command(*args, "--json"),
-        cwd=scene.parent,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    ) as process:
-        deadline = time.monotonic() + PATIENCE
-        while not frames_in(scene.with_name("cut.hdbrec")):  # the first chunk is full
-            assert time.monotonic() < deadline
+    with child(command(*args, "--json"), cwd=scene.parent) as process:
+
+        def is_recording() -> bool:  # the first chunk is full
             assert process.poll() is None
-            time.sleep(0.05)
+            return frames_in(scene.with_name("cut.hdbrec"))
+
+        until(is_recording, every=0.05)
         started = descendants(process.pid)
         process.send_signal(number)
         out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == code
     assert re.fullmatch(rf"hapticdb: ended by {words} after [\d.]+ s\n", err)
     report = json.loads(out)
-    frames = np.concatenate(list(Recording(scene.with_name("cut.hdbrec")).frames()))
+    frames = recorded(scene.with_name("cut.hdbrec"))
     assert len(frames) == report["loop"]["frames"] == report["recorded_frames"]
     np.testing.assert_allclose(np.diff(frames["time"]), frames["dt"][1:], atol=1e-9)
     assert len(started) == 2
@@ -231,34 +288,22 @@ def test_a_signal_ends_a_session_with_its_report(
 
 def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
     args = feel("--device", "random", "--at", ABOVE)
-    with subprocess.Popen(
-        command(*args), cwd=scene.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        deadline = time.monotonic() + PATIENCE
-        while not descendants(process.pid):
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
+    with child(command(*args), cwd=scene.parent) as process:
+        until(lambda: descendants(process.pid), every=0.002)
         started = descendants(process.pid)
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
     assert out == ""
     assert "hapticdb: interrupted" in err.splitlines()
-    while any(map(is_alive, started)):
-        assert time.monotonic() < deadline + PATIENCE
-        time.sleep(0.05)
+    until(lambda: not any(map(is_alive, started)))
 
 
 def test_sigterm_before_the_first_frame_leaves_nothing(scene: Path) -> None:
     args = feel("--device", "random", "--at", ABOVE, "--record", "never.hdbrec")
     path = scene.with_name("never.hdbrec")
-    with subprocess.Popen(
-        command(*args), cwd=scene.parent, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as process:
-        deadline = time.monotonic() + PATIENCE
-        while not path.exists():
-            assert time.monotonic() < deadline
-            time.sleep(0.002)
+    with child(command(*args), cwd=scene.parent) as process:
+        until(path.exists, every=0.002)
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, out, err) == (143, "", "")

@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import signal
-import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 
 import hapticdb
+from children import PATIENCE, child
 from command_line import (  # noqa: F401 - fixtures among them
     Run,
     command,
@@ -201,11 +201,11 @@ def test_a_copy_that_is_interrupted_says_that_it_goes_on(run: Run, tmp_path: Pat
             write_voxels(env.store, blob(n, (30 + 4 * n, 100, 100), 24), f"blob {n}")
     urls = [str(source), str(target)]
     args = command_that_halts(20, "copy", *urls, "--layout", "voxel")
-    with subprocess.Popen(args, stderr=subprocess.PIPE, text=True) as child:
-        wait_for_an_object(target, child)
-        child.send_signal(signal.SIGINT)
-        _, err = child.communicate(timeout=60)
-    assert child.returncode == 130
+    with child(args) as copying:
+        wait_for_an_object(target, copying)
+        copying.send_signal(signal.SIGINT)
+        _, err = copying.communicate(timeout=PATIENCE)
+    assert copying.returncode == 130
     assert err.splitlines() == [
         "hapticdb: interrupted; what went over is whole, and the same command goes on from there"
     ]
@@ -219,13 +219,13 @@ def test_a_terminal_sees_a_bar_with_objects(run: Run, scene: Path) -> None:
     assert callable(run)
     ours, theirs = pty.openpty()
     args = command("copy", scene, "b.db")
-    with subprocess.Popen(args, stdout=subprocess.PIPE, stderr=theirs) as child:
+    with child(args, stderr=theirs) as copying:
         os.close(theirs)
         seen = b""
         while chunk := read_terminal(ours):
             seen += chunk
     os.close(ours)
-    assert child.returncode == 0
+    assert copying.returncode == 0
     assert b"objects" in seen
 
 

@@ -6,16 +6,17 @@ import json
 import re
 import shutil
 import signal
-import subprocess
 import sys
-import time
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
+from subprocess import Popen
 
 import psycopg
 import pytest
 from psycopg import sql
 
+from children import PATIENCE, child, finished, until
 from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
 from hapticdb.demo import prepare
 from hapticdb.query import STRATEGIES
@@ -202,13 +203,7 @@ def test_a_standby_is_read_and_refuses_to_be_written(
     primary, file = server.conninfo(), made / "boxes.glb"
     assert run("import", primary, file, "--bits", 6)[0] == 0
     copied = [server.binaries.path("pg_basebackup"), "--write-recovery-conf", "--checkpoint=fast"]
-    done = subprocess.run(
-        [*copied, f"--pgdata={standby / 'data'}", f"--dbname={primary}"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    finished([*copied, f"--pgdata={standby / 'data'}", f"--dbname={primary}"], check=True)
     (standby / "data").chmod(0o700)
     replica = PrivateServer.at(standby, server.binaries, SETTINGS)
     try:
@@ -225,19 +220,9 @@ def test_a_standby_is_read_and_refuses_to_be_written(
             assert felt[0].count('"pose"') == len(PLACES)
             assert re.sub('"query".*', "", felt[0]) == re.sub('"query".*', "", felt[1])
         assert run("remove", primary, 1)[0] == 0
-        assert is_followed(url, rows_of(primary))
+        until(lambda: rows_of(url) == rows_of(primary))
     finally:
         replica.stop()
-
-
-def is_followed(url: str, rows: list[tuple[object, ...]]) -> bool:
-    """Whether a standby comes to hold those rows."""
-    deadline = time.monotonic() + 30
-    while rows_of(url) != rows:
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.02)
-    return True
 
 
 # -- a first try ----------------------------------------------------------------------------------
@@ -245,28 +230,22 @@ def is_followed(url: str, rows: list[tuple[object, ...]]) -> bool:
 PRIVATE = "postgresql:///local?data=server"
 
 
-def started(tmp_path: Path, *args: object) -> "subprocess.Popen[str]":
+def started(tmp_path: Path, *args: object) -> AbstractContextManager["Popen[str]"]:
     """The command line in a process of its own: a private server is released at its end."""
-    return subprocess.Popen(
-        command(*args),
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    return child(command(*args), cwd=tmp_path)
 
 
 def test_a_private_server_comes_and_goes_with_the_commands(made: Path, tmp_path: Path) -> None:
-    process = started(tmp_path, "import", PRIVATE, made / "boxes.glb", "--bits", 6)
-    out, err = process.communicate()
-    assert (process.returncode, err) == (0, "")
-    assert f"{PRIVATE}: 3 objects" in out
+    importing = command("import", PRIVATE, made / "boxes.glb", "--bits", 6)
+    done = finished(importing, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"{PRIVATE}: 3 objects" in done.stdout
     folder = tmp_path / "server"
     assert folder.is_dir()
     args = ("touch", PRIVATE, "--tool", made / "tool.npz", "--poses", made / "path.csv", "--json")
-    both = [started(tmp_path, *args), started(tmp_path, *args)]
-    ended = [process.communicate() for process in both]
-    assert [process.returncode for process in both] == [0, 0], ended
+    with started(tmp_path, *args) as one, started(tmp_path, *args) as other:
+        ended = [process.communicate(timeout=PATIENCE) for process in (one, other)]
+    assert [one.returncode, other.returncode] == [0, 0], ended
     assert {out.count('"pose"') for out, _ in ended} == {len(PLACES)}
     assert not PrivateServer.at(folder).is_running
 
@@ -274,7 +253,8 @@ def test_a_private_server_comes_and_goes_with_the_commands(made: Path, tmp_path:
 def test_a_private_server_goes_with_a_command_that_the_system_ends(
     made: Path, tmp_path: Path
 ) -> None:
-    assert started(tmp_path, "import", PRIVATE, made / "boxes.glb", "--bits", 6).wait() == 0
+    importing = command("import", PRIVATE, made / "boxes.glb", "--bits", 6)
+    finished(importing, cwd=tmp_path, check=True)
     stl = tool(tmp_path / "tool.stl")
     many = poses(tmp_path / "many.csv", *[(0.0, 0.0, 0.3)] * 20_000)
     args = ("touch", PRIVATE, "--tool", stl, "--poses", many, "--json")
@@ -283,7 +263,7 @@ def test_a_private_server_goes_with_a_command_that_the_system_ends(
         assert process.stdout.readline()
         assert PrivateServer.at(tmp_path / "server").is_running
         process.terminate()
-        _, err = process.communicate(timeout=60)
+        _, err = process.communicate(timeout=PATIENCE)
     assert (process.returncode, err) == (128 + signal.SIGTERM, "")
     assert not PrivateServer.at(tmp_path / "server").is_running
 

@@ -5,13 +5,13 @@
 import json
 import os
 import signal
-import subprocess
 from pathlib import Path
 
 import matplotlib.image
 import pytest
 
 import hapticdb
+from children import finished
 from command_line import Run, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.realtime import sweep as sweeping
 
@@ -131,12 +131,10 @@ def test_the_picture_is_drawn_although_nobody_reads_on(scene: Path) -> None:
     reading, writing = os.pipe()
     os.close(reading)
     try:
-        done = subprocess.run(
-            args, cwd=scene.parent, stdout=writing, stderr=subprocess.PIPE, check=False
-        )
+        done = finished(args, cwd=scene.parent, stdout=writing)
     finally:
         os.close(writing)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, b"")
+    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
     assert matplotlib.image.imread(scene.parent / "out.png").shape[:2] == (1000, 1600)
 
 

@@ -5,7 +5,6 @@
 import contextlib
 import signal
 import socket
-import subprocess
 import threading
 import time
 from collections.abc import Callable
@@ -17,6 +16,7 @@ import pytest
 
 import hapticdb
 from assemblies import placement
+from children import PATIENCE, child, joined, until
 from command_line import command, command_that_halts, tool, wait_for_an_object
 from crashes import (  # noqa: F401 - fixtures among them
     EDITS,
@@ -62,7 +62,7 @@ class Proxy:
 
     def close(self) -> None:
         self._listener.shutdown(socket.SHUT_RDWR)  # a close alone would not wake the other thread
-        self._accepting.join()
+        joined(self._accepting)
         self._listener.close()
 
     def _accept(self) -> None:
@@ -229,21 +229,17 @@ def test_a_snapshot_does_not_go_on_over_another_connection(
 # --- Ctrl-C -------------------------------------------------------------------------------------
 
 
-def started(args: list[str]) -> "subprocess.Popen[str]":
-    return subprocess.Popen(args, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-
-
 def test_an_interrupted_import_is_finished_by_the_same_command(
     place: Place, undisturbed: dict[Layout, Contents], tmp_path: Path, file: Path
 ) -> None:
     where = place()
     text = file.read_text()
     args = ("import", where, file, "--bits", 7, "--layout", "voxel", "--jobs", 1)
-    with started(command_that_halts(N_PARTS // 2, *args)) as child:
-        wait_for_an_object(where, child)
-        child.send_signal(signal.SIGINT)
-        _, err = child.communicate(timeout=60)
-    assert child.returncode == 130, err
+    with child(command_that_halts(N_PARTS // 2, *args)) as importing:
+        wait_for_an_object(where, importing)
+        importing.send_signal(signal.SIGINT)
+        _, err = importing.communicate(timeout=PATIENCE)
+    assert importing.returncode == 130, err
     assert err.strip().endswith("the same command goes on from there")
     assert len(valid_contents(where)[0]) < N_PARTS
     assert main(["import", where, str(file), "--bits", "7"]) == 0
@@ -260,20 +256,16 @@ def test_an_interrupted_touch_leaves_nothing_behind(
     many = tmp_path / "path.csv"
     many.write_text("x,y,z,qw,qx,qy,qz\n" + "0,0,0,1,0,0,0\n" * 5_000)
     stl = tool(tmp_path / "tool.stl")
-    with started(command("touch", where, "--tool", stl, "--poses", many, "--json")) as child:
-        assert child.stdout is not None
+    with child(command("touch", where, "--tool", stl, "--poses", many, "--json")) as touching:
+        assert touching.stdout is not None
         for _ in range(5):
-            child.stdout.readline()
-        child.send_signal(signal.SIGINT)
-        _, err = child.communicate(timeout=60)
-    assert child.returncode == 130, err
+            touching.stdout.readline()
+        touching.send_signal(signal.SIGINT)
+        _, err = touching.communicate(timeout=PATIENCE)
+    assert touching.returncode == 130, err
     assert err.splitlines() == ["hapticdb: interrupted"]
-    for _ in range(500):
-        left = admin.execute(
-            "SELECT 1 FROM pg_stat_activity WHERE application_name = 'hapticdb'"
-            " AND query LIKE '%brick%'"
-        ).fetchall()
-        if not left:
-            break
-        time.sleep(0.01)
-    assert not left
+    left = (
+        "SELECT 1 FROM pg_stat_activity WHERE application_name = 'hapticdb'"
+        " AND query LIKE '%brick%'"
+    )
+    until(lambda: not admin.execute(left).fetchall())

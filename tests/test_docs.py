@@ -2,13 +2,13 @@
 
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import pytest
 
+from children import finished
 from hapticdb.cli import app
 from hapticdb.store import sqlite_force, sqlite_ranges
 from hapticdb.store.postgres import session, statements
@@ -18,6 +18,8 @@ from servers import FOUND, SETTINGS, named
 ROOT = Path(__file__).parent.parent
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SHOWN = re.compile(r"<!-- sql: (\w+)\.(\w+)\[\"(\w+)\"\] -->\n```sql\n(.*?)```", re.DOTALL)
+LONG = 600.0
+"""Seconds for all that a page does in one block."""
 CODE = {"sqlite_ranges": sqlite_ranges, "sqlite_force": sqlite_force, "statements": statements}
 
 
@@ -29,20 +31,12 @@ def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
     """Shell first, since Python needs the sample; then all Python in one session."""
     tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     for block in blocks("sh"):
-        done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", block],
-            cwd=tmp_path,
-            env=os.environ | {"PATH": tools},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        bash = ["bash", "-euo", "pipefail", "-c", block]
+        done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
         assert done.returncode == 0, done.stderr
     (tmp_path / "car.db").unlink()
     session = "\n".join(blocks("python"))
-    done = subprocess.run(
-        [sys.executable, "-c", session], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = finished([sys.executable, "-c", session], cwd=tmp_path, patience=LONG)
     assert done.returncode == 0, done.stderr
     assert len(done.stdout.splitlines()) >= 100
 
@@ -53,20 +47,12 @@ def test_every_block_of_the_realtime_page_runs(tmp_path: Path) -> None:
     tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     for block in blocks("sh", page):
         for line in block.splitlines():
-            done = subprocess.run(
-                ["bash", "-euo", "pipefail", "-c", line],
-                cwd=tmp_path,
-                env=os.environ | {"PATH": tools},
-                capture_output=True,
-                text=True,
-                check=False,
-            )
+            bash = ["bash", "-euo", "pipefail", "-c", line]
+            done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
             # a sweep says by 1 that the part is caught
             assert done.returncode == (1 if " sweep " in line else 0), done.stderr
     session = "\n".join(blocks("python", page))
-    done = subprocess.run(
-        [sys.executable, "-c", session], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
+    done = finished([sys.executable, "-c", session], cwd=tmp_path, patience=LONG)
     assert done.returncode == 0, done.stderr
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
 
@@ -86,14 +72,8 @@ def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binar
     try:
         found = ""
         for block in blocks("sh", "docs/postgresql.md"):
-            done = subprocess.run(
-                ["bash", "-euo", "pipefail", "-c", block],
-                cwd=tmp_path,
-                env=os.environ | variables,
-                capture_output=True,
-                text=True,
-                check=False,
-            )
+            bash = ["bash", "-euo", "pipefail", "-c", block]
+            done = finished(bash, cwd=tmp_path, env=os.environ | variables, patience=LONG)
             assert done.returncode == 0, done.stderr
             found = done.stdout
     finally:

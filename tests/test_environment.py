@@ -1,6 +1,5 @@
 """An opened environment: its objects, moving and removing them, and what others see of it."""
 
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -24,6 +23,7 @@ from assemblies import (
     voxel_set,
     write_obj,
 )
+from children import PIPE, child
 from hapticdb import Environment, PointShell, environment, ingest
 from hapticdb.grid import CurveName
 from hapticdb.mesh import MeshFile, parse_in_process
@@ -349,18 +349,11 @@ def test_edits_of_another_process_are_felt_by_the_next_touch(
     file = write_obj(tmp_path / "balls.obj", balls)
     hapticdb.import_files(tmp_path / "e.db", [file], small_options())
     env = hapticdb.open(tmp_path / "e.db")
-    editor = subprocess.Popen(
-        [sys.executable, "-c", EDIT, env.url],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        bufsize=1,
-    )
 
     def edit(line: str) -> None:
         assert editor.stdin is not None
         assert editor.stdout is not None
-        editor.stdin.write(line + "\n")
+        print(line, file=editor.stdin, flush=True)
         assert editor.stdout.readline() == "done\n"
 
     def felt() -> list[tuple[int, float]]:
@@ -371,7 +364,7 @@ def test_edits_of_another_process_are_felt_by_the_next_touch(
         return places[0]
 
     pose = placement(0.04, 0, 0)
-    try:
+    with child([sys.executable, "-c", EDIT, env.url], stdin=PIPE, stderr=None) as editor:
         assert felt() == [(1, 0.0)]
         edit("env.move(1, np.eye(4) + np.eye(4)[0][:, None] * [[0, 0, 0, -0.1]])")
         assert felt() == []
@@ -384,9 +377,6 @@ def test_edits_of_another_process_are_felt_by_the_next_touch(
         assert [o.id for o in env.objects()] == [1]
         with pytest.raises(hapticdb.ObjectNotFoundError):
             env.touch(sphere, pose, exclude=[2])
-    finally:
-        editor.kill()
-        editor.communicate()
 
 
 def test_what_comes_into_an_environment_opened_empty_is_felt(

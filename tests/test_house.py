@@ -9,7 +9,6 @@ import inspect
 import os
 import re
 import shutil
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterator
@@ -20,6 +19,7 @@ import numba
 import pytest
 
 import hapticdb
+from children import finished
 from hapticdb import errors
 from hapticdb.kernels._jit import cache_folder, sources_digest
 
@@ -233,10 +233,8 @@ def test_importing_the_package_stays_light() -> None:
 
 
 def run_python(script: str, *arguments: str, **variables: str) -> str:
-    return subprocess.run(
+    return finished(
         [sys.executable, "-c", script, *arguments],
-        capture_output=True,
-        text=True,
         check=True,
         env={k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | variables,
     ).stdout
@@ -264,13 +262,8 @@ def committed_texts() -> Iterator[tuple[str, str]]:
     """Name and text of each text file that is or would be committed."""
     paths: list[Path] = []
     if shutil.which("git") and (ROOT / ".git").exists():
-        asked = subprocess.run(
-            ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
-            cwd=ROOT,
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+        listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+        asked = finished(listing, cwd=ROOT, check=True)
         paths = [ROOT / name for name in asked.stdout.split("\0") if name]
     else:  # a source distribution
         folders = ("src", "tests", "benchmarks", "docs", "requirements")
@@ -294,6 +287,76 @@ def test_no_text_names_this_machine_or_a_package_index() -> None:
         if (match := pattern.search(text))
     ]
     assert found == []
+
+
+# --- what tests wait for -------------------------------------------------------------------------
+
+# called without any argument, they may wait for ever; deadlines and tables have such words, too
+WAITS = {"acquire", "communicate", "get", "join", "recv", "result", "wait"}
+WAITS_OF_OTHERS = {("table", "join"), ("deadlines", "wait")}
+RUNS = {"run", "call", "check_call", "check_output"}
+
+
+def endless_waits(source: str, *, is_test: bool) -> Iterator[tuple[int, str]]:
+    """Line and text of each call and loop of a source that may wait for ever.
+
+    Tests start processes by the module `children` alone; benchmarks give a timeout each time.
+    """
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.While) and _sleeps(node) and not _looks_at_clock(node):
+            yield node.lineno, f"while {ast.unparse(node.test)}"
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+            continue
+        name, owner = node.func.attr, ast.unparse(node.func.value)
+        is_limited = any(keyword.arg == "timeout" for keyword in node.keywords)
+        bare = not node.args and not node.keywords
+        starts = owner == "subprocess" and (name in RUNS or (name == "Popen" and is_test))
+        waits = name in WAITS and bare and (owner.split(".")[-1], name) not in WAITS_OF_OTHERS
+        if waits or (starts and (is_test or not is_limited)) or (owner, name) == ("os", "waitpid"):
+            yield node.lineno, ast.unparse(node)
+
+
+def _sleeps(loop: ast.While) -> bool:
+    calls = [node.func for node in ast.walk(loop) if isinstance(node, ast.Call)]
+    return any(isinstance(call, ast.Attribute) and call.attr == "sleep" for call in calls)
+
+
+def _looks_at_clock(loop: ast.While) -> bool:
+    return any(
+        isinstance(node, ast.Attribute) and node.attr == "monotonic" for node in ast.walk(loop)
+    )
+
+
+def test_nothing_is_waited_for_without_an_end() -> None:
+    """Or a test that fails hangs the run."""
+    # the latter two wait in what is ended by others: a process of a session, a thread of a fake
+    allowed = ["tests/children.py", "tests/realtime/workers.py", "tests/realtime/fake_hd.py"]
+    found: list[str] = []
+    for path in python_files():
+        folder = named(path).split("/")[0]
+        if folder in {"tests", "benchmarks"} and named(path) not in allowed:
+            waits = endless_waits(path.read_text(), is_test=folder == "tests")
+            found += [f"{named(path)}:{line}: {text}" for line, text in waits]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("line", "is_refused"),
+    [
+        ("child.wait()", True),
+        ("child.wait(5)", False),
+        ("out, _ = child.communicate()", True),
+        ("child.communicate(timeout=5)", False),
+        ("thread.join()", True),
+        ("', '.join(words)", False),
+        ("subprocess.run(command, timeout=5)", False),
+        ("subprocess.run(command, check=True)", True),
+        ("while not path.exists(): time.sleep(1)", True),
+        ("while not path.exists() and time.monotonic() < end: time.sleep(1)", False),
+    ],
+)
+def test_a_wait_without_an_end_is_seen(line: str, is_refused: bool) -> None:
+    assert bool(list(endless_waits(line, is_test=False))) == is_refused
 
 
 # --- what is public -----------------------------------------------------------------------------

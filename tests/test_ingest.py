@@ -1,6 +1,5 @@
 """Importing: what goes in, what is refused, and that nothing is left half-done."""
 
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -27,6 +26,7 @@ from assemblies import (
     voxel_set,
     write_obj,
 )
+from children import finished
 from hapticdb import FileReport, GridOptions, ImportOptions, ingest
 from hapticdb.grid import ROOM, CurveName
 from hapticdb.ingest import Progress
@@ -306,13 +306,7 @@ def test_a_cube_of_two_million_voxels_an_axis_takes_no_more_memory(tmp_path: Pat
         tmp_path / "part.obj",
         {"ball": ball((0, 0, 0), 0.08, 40), "bar": box((-0.2, 0, 0), (0.2, 0.001, 0.001))},
     )
-    printed = subprocess.run(
-        [sys.executable, "-c", MEMORY, str(tmp_path), str(part)],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=120,
-    )
+    printed = finished([sys.executable, "-c", MEMORY, str(tmp_path), str(part)], check=True)
     assert int(printed.stdout) < 32 << 20
     with hapticdb.open(tmp_path / "21.db", read_only=True) as env:
         assert env.grid.side == 2**21

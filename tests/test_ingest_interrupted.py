@@ -5,20 +5,22 @@ waits before the last of them, so that no signal comes when it has ended.
 """
 
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from subprocess import Popen
 
 import numpy as np
 import pytest
 
 import hapticdb
 from assemblies import Mesh, Rows, ball, left_behind, rows_of, small_options, write_obj
+from children import PATIENCE, child, until
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.ingest import Progress
+from hapticdb.realtime.table import is_alive
 from hapticdb.store.sqlite import SQLiteStore
 
 N_PARTS = 60
@@ -35,7 +37,7 @@ options = ImportOptions(grid=GridOptions(bits=8), layout="voxel", jobs=int(jobs)
 def say(progress):
     print(progress.parts_done, flush=True)
     if progress.parts_done == progress.parts_total - 1:
-        time.sleep(60)
+        time.sleep(600)
 
 print(0, flush=True)
 hapticdb.import_files(database, [file], options, say)
@@ -66,29 +68,21 @@ def undisturbed(folder: Path) -> Rows:
 
 
 @contextmanager
-def importing(database: Path, file: Path, jobs: int = 2) -> Iterator["subprocess.Popen[str]"]:
+def importing(database: Path, file: Path, jobs: int = 2) -> Iterator["Popen[str]"]:
     """A process that imports, and is gone afterwards."""
-    child = subprocess.Popen(
-        [sys.executable, "-c", IMPORT, str(database), str(file), str(jobs)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    try:
-        yield child
-    finally:
-        child.kill()
-        child.communicate()
+    with child([sys.executable, "-c", IMPORT, str(database), str(file), str(jobs)]) as process:
+        yield process
+        process.kill()
 
 
-def wait_for(child: "subprocess.Popen[str]", n_parts: int) -> None:
+def wait_for(process: "Popen[str]", n_parts: int) -> None:
     """Until that many parts are committed."""
-    assert child.stdout is not None
-    for line in child.stdout:
+    assert process.stdout is not None
+    for line in process.stdout:
         if int(line) >= n_parts:
             return
-    assert child.stderr is not None
-    pytest.fail(f"the import ended before {n_parts} parts: {child.stderr.read()}")
+    assert process.stderr is not None
+    pytest.fail(f"the import ended before {n_parts} parts: {process.stderr.read()}")
 
 
 def assert_finishes(database: Path, file: Path, undisturbed: Rows, jobs: int = 1) -> None:
@@ -105,11 +99,11 @@ def test_a_killed_import_run_again_ends_as_an_undisturbed_one(
     """kill -9 at ten moments: so many parts are in, and some way into the next one."""
     rng = np.random.default_rng(n_parts)
     database = tmp_path / "e.db"
-    with importing(database, folder / "balls.obj", int(rng.integers(1, 4))) as child:
-        wait_for(child, n_parts)
+    with importing(database, folder / "balls.obj", int(rng.integers(1, 4))) as process:
+        wait_for(process, n_parts)
         time.sleep(rng.uniform(0, 0.02))
-        child.kill()
-        child.wait()
+        process.kill()
+        process.wait(PATIENCE)
     left = rows_of(database, "object", "voxel", "change")
     n_left = len(left["object"])
     assert n_parts <= n_left <= N_PARTS
@@ -133,15 +127,15 @@ def test_an_import_killed_before_its_first_object_leaves_nothing_or_an_empty_dat
     folder: Path, undisturbed: Rows, tmp_path: Path, seed: int
 ) -> None:
     database = tmp_path / "e.db"
-    with importing(database, folder / "balls.obj") as child:
-        wait_for(child, 0)
+    with importing(database, folder / "balls.obj") as process:
+        wait_for(process, 0)
         # reading the file takes longest; the second waits for the database to appear
         if seed < 2:
             time.sleep(np.random.default_rng(seed).uniform(0, 0.3))
-        while seed == 2 and not left_behind(tmp_path):
-            time.sleep(0.0005)
-        child.kill()
-        child.wait()
+        if seed == 2:
+            until(lambda: left_behind(tmp_path), every=0.0005)
+        process.kill()
+        process.wait(PATIENCE)
     if database.exists():
         assert len(rows_of(database, "object")["object"]) <= 3
     assert_finishes(database, folder / "balls.obj", undisturbed)
@@ -152,11 +146,11 @@ def test_an_interrupted_import_run_again_ends_as_an_undisturbed_one(
 ) -> None:
     """Ctrl-C: the process ends soon, by the signal, and folds the log into the file."""
     database = tmp_path / "e.db"
-    with importing(database, folder / "balls.obj") as child:
-        wait_for(child, 7)
-        child.send_signal(signal.SIGINT)
-        _, words = child.communicate(timeout=30)
-        assert child.returncode == -signal.SIGINT
+    with importing(database, folder / "balls.obj") as process:
+        wait_for(process, 7)
+        process.send_signal(signal.SIGINT)
+        _, words = process.communicate(timeout=PATIENCE)
+        assert process.returncode == -signal.SIGINT
     assert words.strip().endswith("KeyboardInterrupt")
     assert left_behind(tmp_path) == ["e.db"]
     assert 7 <= len(rows_of(database, "object")["object"]) < N_PARTS
@@ -165,38 +159,21 @@ def test_an_interrupted_import_run_again_ends_as_an_undisturbed_one(
 
 def test_an_import_interrupted_while_it_reads_leaves_nothing(folder: Path, tmp_path: Path) -> None:
     """Nor does the process that parses outlive the one that is interrupted."""
-    with importing(tmp_path / "e.db", folder / "balls.obj") as child:
-        wait_for(child, 0)
-        parser = wait_for_parser(child.pid)
-        child.send_signal(signal.SIGINT)
-        child.communicate(timeout=30)
-        assert child.returncode == -signal.SIGINT
+    with importing(tmp_path / "e.db", folder / "balls.obj") as process:
+        wait_for(process, 0)
+        parser = wait_for_parser(process.pid)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE)
+        assert process.returncode == -signal.SIGINT
     assert left_behind(tmp_path) == []
-    wait_until(lambda: not is_running(parser))
+    until(lambda: not is_alive(parser))
 
 
 def wait_for_parser(pid: int) -> int:
     """Process id of the child of a child, once it is there."""
     children = Path(f"/proc/{pid}/task/{pid}/children")
-    wait_until(lambda: bool(children.read_text()))
+    until(children.read_text, every=0.001)
     return int(children.read_text().split()[0])
-
-
-def wait_until(holds: Callable[[], bool]) -> None:
-    """Until it holds; half a minute of a busy machine at most."""
-    for _ in range(30_000):
-        if holds():
-            return
-        time.sleep(0.001)
-    pytest.fail("waited in vain for half a minute")
-
-
-def is_running(pid: int) -> bool:
-    """Whether there is such a process, and it is no zombie that nobody has waited for."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except (FileNotFoundError, ProcessLookupError):
-        return False
 
 
 @pytest.mark.parametrize("n_parts", [1, 4, 9])

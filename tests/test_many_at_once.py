@@ -9,6 +9,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
@@ -23,6 +24,7 @@ import pytest
 
 import hapticdb
 from assemblies import ball, box, placement, small_options, write_obj
+from children import PATIENCE, end_forked, joined, received
 from hapticdb import Environment, PointShell
 from hapticdb.cli import main
 from hapticdb.environment import _part_of
@@ -108,12 +110,14 @@ def processes(
     made = [multiprocessing.get_context("fork").Process(target=target, args=a) for a in arguments]
     for process in made:
         process.start()
+        assert process.pid is not None
+        end_forked(process.pid)
     try:
         yield made
     finally:
         for process in made:
             process.kill()
-            process.join()
+            process.join(PATIENCE)
 
 
 def places_of(env: Environment) -> list[tuple[Object, Rows]]:
@@ -155,25 +159,27 @@ def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder
         places = places_of(env)
         for ours, theirs in pipes:
             theirs.close()
-            assert ours.recv() == "ready"
-        importer = threading.Thread(target=import_and_remove)
+            assert received(ours) == "ready"
+        importer = threading.Thread(target=import_and_remove, daemon=True)
         importer.start()
         n_moves = 0
         waiting = list(children)
+        deadline = time.monotonic() + PATIENCE
         while importer.is_alive() or waiting:
+            assert time.monotonic() < deadline
             assert all(child.is_alive() for child in children)
             n_moves += 1
             env.store.replace(*places[n_moves % 2], env._covering)
             waiting = [
                 child for (ours, _), child in zip(pipes, children, strict=True) if not ours.poll()
             ]
-        importer.join()
+        joined(importer)
         assert not failed
         for ours, _ in pipes:
             ours.send("stop")
         for (ours, _), child in zip(pipes, children, strict=True):
-            assert [ours.recv(), ours.recv()] == ["seen", "done"]
-            child.join(30)
+            assert [received(ours), received(ours)] == ["seen", "done"]
+            child.join(PATIENCE)
             assert child.exitcode == 0
         assert_valid(env)
         assert env.store.revision() == 1 + n_moves + N_IMPORTS * 2 * 8
@@ -235,13 +241,12 @@ def test_a_lock_held_too_long_is_told(url: str) -> None:
 def test_of_two_writers_of_one_object_one_waits(url: str) -> None:
     """Neither is lost: the second begins where the first has ended."""
     with unfinished_move(url) as first:
-        second = threading.Thread(target=move_once, args=(url, placement(0.18, 0, 0)))
+        second = threading.Thread(target=move_once, daemon=True, args=(url, placement(0.18, 0, 0)))
         second.start()
         second.join(0.3)
         assert second.is_alive()
         first.rollback()
-        second.join(30)
-        assert not second.is_alive()
+        joined(second)
     with hapticdb.open(url) as env:
         np.testing.assert_array_equal(env.object(1).transform, placement(0.18, 0, 0))
         assert_valid(env)
@@ -257,7 +262,7 @@ def test_translations_of_two_writers_both_count(url: str) -> None:
     n_each, step = 3, "0.001,0,0"
     with processes(shift, *((url, step, n_each) for _ in range(2))) as writers:
         for writer in writers:
-            writer.join(60)
+            writer.join(PATIENCE)
         assert [writer.exitcode for writer in writers] == [0, 0]
     with hapticdb.open(url) as env:
         assert env.object(1).transform[0, 3] == pytest.approx(0.001 * 2 * n_each)
@@ -277,7 +282,9 @@ def test_two_imports_of_one_file_and_a_remover_leave_whole_objects(url: str, fol
         processes(import_once, (url, file), (url, file)) as both,
         hapticdb.open(url) as env,
     ):
+        deadline = time.monotonic() + PATIENCE
         while any(child.is_alive() for child in both):
+            assert time.monotonic() < deadline
             for obj in env.objects()[1:]:
                 if obj.id % 2:
                     env.remove(obj.id)

@@ -1,21 +1,21 @@
 """The child process that parses: same result, bounded damage, no orphan."""
 
-import contextlib
 import os
 import signal
-import subprocess
 import sys
-import time
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import Popen
 
 import numpy as np
 import pytest
 
+from children import child, finished, until
 from hapticdb.errors import MissingExtraError
 from hapticdb.mesh import Defects, parse_in_process, read_file
 from hapticdb.mesh import reader as reader_module
 from hapticdb.mesh.child import allowance
+from hapticdb.realtime.table import is_alive
 from mesh_files import cause, gltf, names, text, threemf
 
 
@@ -108,38 +108,20 @@ def test_no_child_outlives_a_killed_parent(
     # No guard for the main module: a child by spawn would run this script again.
     script = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom hapticdb.mesh import read_file\nread_file({str(path)!r})\n"  # noqa: E501
     scratch = os.environ | {"TMPDIR": str(tmp_path)}  # a killed parent leaves its own behind
-    parent = subprocess.Popen([sys.executable, "-c", script], cwd=tmp_path, env=scratch)
-    try:
-        assert _soon(pid_file.exists)
-    finally:
-        parent.kill()
-        parent.wait()
-    child = int(pid_file.read_text())
-    assert _soon(lambda: not _is_running(child))
-
-
-def _soon(holds: Callable[[], bool]) -> bool:
-    for _ in range(600):
-        if holds():
-            return True
-        time.sleep(0.05)
-    return False
-
-
-def _is_running(pid: int) -> bool:
-    """Whether a process runs; one that ended and waits for its init to notice does not."""
-    with contextlib.suppress(OSError):
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    return False
+    with child([sys.executable, "-c", script], cwd=tmp_path, env=scratch) as parent:
+        until(pid_file.exists)
+        parser = int(pid_file.read_text())
+        parent.kill()  # it alone, not its group
+        until(lambda: not is_alive(parser))
 
 
 def test_an_interrupt_leaves_no_child(
     fake_laspy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    started: list[subprocess.Popen[bytes]] = []
+    started: list[Popen[bytes]] = []
 
-    def interrupted(child: subprocess.Popen[bytes], _request: object) -> None:
-        started.append(child)
+    def interrupted(parser: Popen[bytes], _request: object) -> None:
+        started.append(parser)
         raise KeyboardInterrupt
 
     monkeypatch.setattr(reader_module, "_talk", interrupted)
@@ -157,7 +139,5 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_importing_the_module_loads_no_parser() -> None:
     heavy = ("trimesh", "collada", "laspy", "cascadio")
     script = f"import sys, hapticdb.mesh; print([m for m in {heavy} if m in sys.modules])"
-    found = subprocess.run(
-        [sys.executable, "-c", script], check=True, capture_output=True, text=True
-    )
+    found = finished([sys.executable, "-c", script], check=True)
     assert found.stdout.strip() == "[]"

@@ -1,6 +1,5 @@
 """Wrong uses of the Python API end in one clear line, never in a silent wrong answer."""
 
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 
 import hapticdb
+from children import PATIENCE, child, joined
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.testing import floor_voxels, write_voxels
 
@@ -67,7 +67,7 @@ def test_another_thread_is_told_to_open_its_own(env: Environment, sphere: PointS
 
     thread = threading.Thread(target=use)
     thread.start()
-    thread.join()
+    joined(thread)
     assert told == ["all"]
     assert len(env.objects()) == 1
 
@@ -109,12 +109,10 @@ def test_two_imports_of_one_file_at_once_end_as_one(tmp_path: Path) -> None:
     """Neither says that the other was wrong; together they leave every part once."""
     (tmp_path / "parts.obj").write_text(BOXES)
     command = [sys.executable, "-m", "hapticdb", "import", "e.db", "parts.obj", "--bits", "7"]
-    both = [
-        subprocess.Popen(command, cwd=tmp_path, stderr=subprocess.PIPE, text=True) for _ in range(2)
-    ]
-    for process in both:
-        _, said = process.communicate(timeout=120)
-        assert process.returncode == 0, said
+    with child(command, cwd=tmp_path) as one, child(command, cwd=tmp_path) as other:
+        for process in (one, other):
+            _, said = process.communicate(timeout=PATIENCE)
+            assert process.returncode == 0, said
     with hapticdb.open(tmp_path / "e.db") as env:
         names = [obj.name for obj in env.objects()]
         assert sorted(names) == sorted(set(names))

@@ -11,6 +11,7 @@ import psycopg
 import pytest
 
 import hapticdb
+from children import PATIENCE, joined
 from hapticdb import Environment, Grid, PointShell, Pool
 from hapticdb.store.postgres.address import parse
 from hapticdb.testing import floor_voxels, write_voxels
@@ -51,7 +52,7 @@ def test_many_threads_share_few_environments(pool: Pool, sphere: PointShell) -> 
                 out.discard(id(env))
 
     with ThreadPoolExecutor(8) as threads:
-        list(threads.map(frames, range(8)))
+        list(threads.map(frames, range(8), timeout=PATIENCE))
     assert len(lent) <= 2
     assert max(most) <= 2
 
@@ -91,11 +92,11 @@ def test_who_waits_gets_what_another_gives_back(pool: Pool) -> None:
 
     with pool.environment():
         with pool.environment():
-            waiting = threading.Thread(target=borrow)
+            waiting = threading.Thread(target=borrow, daemon=True)
             waiting.start()
             time.sleep(0.05)
             assert not found
-        waiting.join(30)
+        joined(waiting)
     assert found == [1]
 
 
@@ -107,7 +108,7 @@ def test_what_was_given_back_is_no_longer_ones_own(pool: Pool, sphere: PointShel
     with pool.environment() as again, ThreadPoolExecutor(1) as thread:
         assert again is env
         with pytest.raises(hapticdb.UsageError, match="belongs to the thread"):
-            thread.submit(env.objects).result()
+            thread.submit(env.objects).result(PATIENCE)
 
 
 def test_a_member_that_was_closed_is_replaced(pool: Pool) -> None:
@@ -156,7 +157,7 @@ def test_closing_wakes_those_who_wait(url: str) -> None:
     with Pool(url, size=1) as pool, ThreadPoolExecutor(1) as thread:
 
         def borrow() -> None:
-            with pool.environment(timeout=30):
+            with pool.environment(timeout=PATIENCE):
                 pass
 
         with pool.environment():
@@ -164,7 +165,7 @@ def test_closing_wakes_those_who_wait(url: str) -> None:
             time.sleep(0.05)
             pool.close()
             with pytest.raises(hapticdb.DatabaseError, match="has been closed"):
-                waiting.result(10)
+                waiting.result(PATIENCE)
 
 
 def test_a_member_that_cannot_be_opened_takes_no_place(

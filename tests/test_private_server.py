@@ -1,20 +1,22 @@
 """A private PostgreSQL server: what becomes of it when others start, stop and kill it, too."""
 
+import contextlib
 import os
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from subprocess import STDOUT
 
 import psycopg
 import pytest
 
+from children import PATIENCE, child, finished, until
 from hapticdb.errors import DatabaseError, MissingExtraError, UsageError
+from hapticdb.realtime.table import is_alive
 from hapticdb.store import private_server
 from hapticdb.store.private_server import Binaries, PrivateServer, find_binaries
 
@@ -188,12 +190,14 @@ def test_a_half_made_folder_is_made_anew(place: Path, binaries: Binaries) -> Non
 
 def test_a_set_up_that_is_killed_is_done_by_the_next(place: Path) -> None:
     folder = place / "server"
-    first = subprocess.Popen(script(START, folder), stdout=subprocess.DEVNULL)
-    while not (folder / "data.new" / "PG_VERSION").exists():
-        assert first.poll() is None
-        time.sleep(0.001)
-    first.kill()
-    first.wait()
+    with child(script(START, folder)) as first:
+
+        def is_set_up() -> bool:
+            assert first.poll() is None
+            return (folder / "data.new" / "PG_VERSION").exists()
+
+        until(is_set_up, every=0.001)
+        first.kill()
     server = PrivateServer.at(folder, settings=UNSAFE)
     server.start()
     assert ask(server, "SELECT 1") == 1
@@ -213,9 +217,10 @@ def test_starting_twice_starts_one_server(server: PrivateServer) -> None:
 
 def test_processes_that_start_one_folder_share_one_server(place: Path) -> None:
     command = script(START, place / "server")
-    children = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(4)]
-    said = {child.communicate()[0] for child in children}
-    assert [child.returncode for child in children] == [0] * 4
+    with contextlib.ExitStack() as together:
+        four = [together.enter_context(child(command)) for _ in range(4)]
+        said = {process.communicate(timeout=PATIENCE)[0] for process in four}
+    assert [process.returncode for process in four] == [0] * 4
     assert len(said) == 1
 
 
@@ -254,14 +259,13 @@ def test_a_start_waits_for_the_children_of_a_killed_server(server: PrivateServer
     loop = b"DO 'DECLARE t timestamptz := clock_timestamp(); BEGIN WHILE clock_timestamp() < t +"
     loop += b" interval ''1 s'' LOOP NULL; END LOOP; END'"
     busy.pgconn.send_query(loop)
-    child = busy.info.backend_pid
+    backend = busy.info.backend_pid
     parent = pid_of(server)
     os.kill(parent, signal.SIGKILL)
-    while private_server._parent_of(child) == parent:
-        time.sleep(0.001)
-    assert private_server._parent_of(child) is not None
+    until(lambda: private_server._parent_of(backend) != parent, every=0.001)
+    assert private_server._parent_of(backend) is not None
     server.start()
-    assert private_server._parent_of(child) is None
+    assert private_server._parent_of(backend) is None
     assert holds(server)
     busy.close()
 
@@ -273,17 +277,16 @@ def test_a_stale_pid_file_does_not_hinder_a_start(server: PrivateServer, kind: s
     pid_file = server.folder / "data" / "postmaster.pid"
     lines = pid_file.read_text().splitlines()
     server.kill()
-    ended = subprocess.Popen(["true"])
-    os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
-    if kind == "nobody":
-        ended.wait()
-    lines[0] = str(os.getpid() if kind == "another process" else ended.pid)
-    pid_file.write_text("\n".join([*lines, ""]))
-    (server.folder / "socket" / ".s.PGSQL.5432.lock").write_text("\n".join([*lines[:5], ""]))
-    assert not server.is_running
-    server.start()
-    assert holds(server)
-    ended.wait()
+    with child(["true"]) as ended:
+        until(lambda: not is_alive(ended.pid))
+        if kind == "nobody":
+            ended.wait(PATIENCE)
+        lines[0] = str(os.getpid() if kind == "another process" else ended.pid)
+        pid_file.write_text("\n".join([*lines, ""]))
+        (server.folder / "socket" / ".s.PGSQL.5432.lock").write_text("\n".join([*lines[:5], ""]))
+        assert not server.is_running
+        server.start()
+        assert holds(server)
 
 
 def test_a_start_that_fails_says_why(server: PrivateServer) -> None:
@@ -310,19 +313,14 @@ def test_the_log_does_not_grow_without_end(
 
 def test_a_server_outlives_the_process_that_started_it(server: PrivateServer) -> None:
     """Its pipes close as it ends, and an interrupt of its group stays there."""
-    child = subprocess.Popen(
-        script(START + "import time; time.sleep(60)", server.folder),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        start_new_session=True,
-    )
-    assert child.stdout is not None
-    pid = int(child.stdout.readline().split()[0])
-    assert pid == pid_of(server)
-    assert os.getsid(pid) != os.getsid(child.pid)
-    os.killpg(child.pid, signal.SIGINT)
-    child.communicate(timeout=30)  # ends with the pipe
+    sleeping = script(START + "import time; time.sleep(600)", server.folder)
+    with child(sleeping, stderr=STDOUT) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline().split()[0])
+        assert pid == pid_of(server)
+        assert os.getsid(pid) != os.getsid(process.pid)
+        os.killpg(process.pid, signal.SIGINT)
+        process.communicate(timeout=PATIENCE)  # ends with the pipe
     assert ask(server, "SELECT 1") == 1
 
 
@@ -415,7 +413,7 @@ def test_a_release_keeps_a_server_that_others_have_joined(server: PrivateServer)
 
 
 def test_a_process_that_ends_uses_nothing_any_more(server: PrivateServer) -> None:
-    subprocess.run(script(START, server.folder), check=True, stdout=subprocess.DEVNULL)
+    finished(script(START, server.folder), check=True)
     assert server.is_running
     server.release()
     assert not server.is_running
@@ -435,7 +433,7 @@ def test_a_database_is_made_once(server: PrivateServer) -> None:
     server.start()
     names = ["plant", 'it\'s "one" %s', "plant"] * 3
     with ThreadPoolExecutor(4) as pool:
-        list(pool.map(server.create_database, names))
+        list(pool.map(server.create_database, names, timeout=PATIENCE))
     for name in names[:2]:
         with psycopg.connect(server.conninfo(name)) as connection:
             assert connection.execute("SELECT current_database()").fetchone() == (name,)

@@ -6,6 +6,7 @@ Each test has a server of its own, with all of its durability, and ends it as a 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import pytest
 
 import hapticdb
 from assemblies import placement
+from children import PATIENCE
 from command_line import Run, refused, run, tool  # noqa: F401 - a fixture
 from crashes import (  # noqa: F401 - fixtures among them
     EDITS,
@@ -155,7 +157,9 @@ def test_a_long_touch_goes_on_through_a_crash(
         killer = threading.Timer(0.01, crash, [server])
         killer.start()
         n_frames = 0
+        deadline = time.monotonic() + PATIENCE
         while killer.is_alive() or n_frames < 3 * len(path):
+            assert time.monotonic() < deadline
             for pose, wanted in zip(path, expected, strict=True):
                 strategy = STRATEGIES[n_frames % len(STRATEGIES)]
                 assert felt(env, sphere, pose, strategy) == wanted

@@ -1,7 +1,6 @@
 """The sample: closed, outward, distinct parts; a path that touches; the same bytes every time."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from children import finished
 from hapticdb.errors import FileError, UsageError
 from hapticdb.poses import read_poses
 from hapticdb.sample import (
@@ -158,11 +158,8 @@ def test_the_files_are_the_same_bytes_in_another_process(
     files: SampleFiles, tmp_path: Path
 ) -> None:
     code = "import sys; from hapticdb.sample import write_sample; write_sample(sys.argv[1])"
-    subprocess.run(
-        [sys.executable, "-c", code, str(tmp_path)],
-        check=True,
-        env={**os.environ, "PYTHONHASHSEED": "17"},
-    )
+    environment = {**os.environ, "PYTHONHASHSEED": "17"}
+    finished([sys.executable, "-c", code, str(tmp_path)], check=True, env=environment)
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(f.name for f in files)
     for path in files:
         assert (tmp_path / path.name).read_bytes() == path.read_bytes()

@@ -8,6 +8,7 @@ import psycopg
 import pytest
 
 import hapticdb
+from children import PATIENCE
 from hapticdb import Grid
 from hapticdb.query import Strategy
 from hapticdb.store.base import Keys, Layout, Store
@@ -94,7 +95,7 @@ def test_a_read_only_environment_refuses_to_be_written(url: str) -> None:
 def test_no_other_thread_may_use_it(url: str) -> None:
     env = hapticdb.open(url, read_only=True)
     with ThreadPoolExecutor(1) as pool, pytest.raises(hapticdb.UsageError, match="thread"):
-        pool.submit(env.objects).result()
+        pool.submit(env.objects).result(PATIENCE)
 
 
 def test_rows_that_come_without_an_index_are_sorted(url: str, admin: psycopg.Connection) -> None:
@@ -122,17 +123,17 @@ def test_a_left_out_index_is_made_when_it_is_opened_to_write(
 def test_two_loaders_that_end_together_both_succeed(place: Place) -> None:
     where = place()
     PostgresStore.create(where, GRID).close()
-    barrier = threading.Barrier(2, timeout=20)
+    barrier = threading.Barrier(2)
 
     def load(n: int) -> None:
         store = PostgresStore.open(where)
         with store.loading():
             write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
-            barrier.wait()
+            barrier.wait(PATIENCE)
         store.close()
 
     with ThreadPoolExecutor(2) as pool:
-        list(pool.map(load, range(2)))
+        list(pool.map(load, range(2), timeout=PATIENCE))
     store = PostgresStore.open(where)
     assert len(store.objects()) == 2
     # no loader's lock is left: the next killed one can be mended

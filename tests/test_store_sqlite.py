@@ -2,7 +2,6 @@
 
 import os
 import sqlite3
-import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 
 import hapticdb
+from children import PATIENCE, child, exit_code
 from hapticdb import Grid
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.schema import FORMAT_VERSION
@@ -144,15 +144,13 @@ def test_readers_go_on_while_a_writer_commits(path: Path) -> None:
         "while len(env.objects()) < 6: seen.add(len(env.objects()))\n"
         "print(sorted(seen | {len(env.objects())}))\n"
     )
-    reader = subprocess.Popen(
-        [sys.executable, "-c", script, str(path)], stdout=subprocess.PIPE, text=True
-    )
-    assert reader.stdout is not None
-    assert reader.stdout.readline() == "ready\n"
-    store = SQLiteStore.open(path)
-    for n in range(5):
-        write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
-    out, _ = reader.communicate(timeout=30)
+    with child([sys.executable, "-c", script, str(path)]) as reader:
+        assert reader.stdout is not None
+        assert reader.stdout.readline() == "ready\n"
+        store = SQLiteStore.open(path)
+        for n in range(5):
+            write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
+        out, _ = reader.communicate(timeout=PATIENCE)
     assert reader.returncode == 0
     assert out.strip().endswith("6]")
 
@@ -175,8 +173,8 @@ def test_an_unprivileged_reader_opens_a_read_only_folder(path: Path, tmp_path: P
     path.chmod(0o444)
     failures: list[str] = []
     read_end, write_end = os.pipe()
-    child = os.fork()
-    if child == 0:  # everything is imported, and nothing is started: safe here, as a test
+    pid = os.fork()
+    if pid == 0:  # everything is imported, and nothing is started: safe here, as a test
         try:
             if os.getuid() == 0:
                 os.setgid(65534)
@@ -188,7 +186,7 @@ def test_an_unprivileged_reader_opens_a_read_only_folder(path: Path, tmp_path: P
         finally:
             os._exit(0)
     os.close(write_end)
-    os.waitpid(child, 0)
+    assert exit_code(pid) == 0
     answer = os.read(read_end, 1000).decode()
     os.close(read_end)
     tmp_path.chmod(0o755)
@@ -231,8 +229,8 @@ def test_a_database_in_use_is_told_after_a_while(
 
 def test_an_unfinished_creation_is_swept_away(tmp_path: Path) -> None:
     """A process that dies while creating leaves a file under another name."""
-    dead = subprocess.Popen([sys.executable, "-c", ""])
-    dead.wait()
+    with child([sys.executable, "-c", ""]) as dead:
+        pass
     left = tmp_path / f".e.db.{dead.pid}.new"
     left.write_bytes(b"half")
     hapticdb.create(tmp_path / "e.db", GRID).close()

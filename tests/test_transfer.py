@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 import hapticdb
 from assemblies import index_rows, left_behind, placement, rows_of, voxel_set
+from children import child
 from hapticdb import Environment, Grid, PointShell, copy_environment, diff_environments, transfer
 from hapticdb.grid import CurveName
 from hapticdb.layout import rows_of_voxels
@@ -367,7 +368,7 @@ import hapticdb
 def say(now):
     print(now.objects_done, flush=True)
     if now.objects_done == now.objects_total - 1:  # so that no signal comes when it has ended
-        time.sleep(60)
+        time.sleep(600)
 
 source, target, layout = sys.argv[1:]
 print(0, flush=True)
@@ -393,17 +394,12 @@ def test_an_interrupted_copy_started_again_ends_as_an_undisturbed_one(
     many: Path, tmp_path: Path, how: signal.Signals, n_objects: int, layout: Layout
 ) -> None:
     target = tmp_path / "b.db"
-    child = subprocess.Popen(
-        [sys.executable, "-c", COPY, str(many), str(target), layout],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-        text=True,
-    )
-    with child:
-        assert child.stdout is not None
-        assert any(int(line) >= n_objects for line in child.stdout)
-        child.send_signal(how)
-    assert child.returncode == -how
+    command = [sys.executable, "-c", COPY, str(many), str(target), layout]
+    with child(command, stderr=subprocess.DEVNULL) as copying:
+        assert copying.stdout is not None
+        assert any(int(line) >= n_objects for line in copying.stdout)
+        copying.send_signal(how)
+    assert copying.returncode == -how
     with hapticdb.open(target, read_only=True) as env:
         left = env.objects()
         assert all(len(env.voxels(obj.id)) == obj.voxels for obj in left)

@@ -1,12 +1,13 @@
 """After `warm_up` nothing is compiled any more."""
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
 import numba
 import pytest
+
+from children import finished
 
 SCRIPT = """
 import json, sys
@@ -57,9 +58,7 @@ print(json.dumps({"before": before, "after": after}))
 
 @pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="the JIT is off: nothing compiles")
 def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SCRIPT, str(tmp_path)], capture_output=True, text=True, check=True
-    )
+    done = finished([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True)
     counted = json.loads(done.stdout)
     assert counted["after"] == counted["before"]
     assert all(counted["before"].values()), "an entry that warm_up never calls"

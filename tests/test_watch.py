@@ -4,7 +4,6 @@
 
 import contextlib
 import itertools
-import subprocess
 import sys
 import threading
 import time
@@ -19,6 +18,7 @@ from hypothesis import strategies as st
 from psycopg import sql
 
 import hapticdb
+from children import finished, joined
 from crashes import server, template  # noqa: F401 - fixtures
 from hapticdb import Grid
 from hapticdb.store import sqlite_file
@@ -80,7 +80,7 @@ def test_a_commit_of_another_process_is_noticed_by_one_that_only_watches(
         with contextlib.closing(open_store(where, read_only=True)) as reader:
             assert isinstance(reader, SupportsWatch)
             reader.watch()
-            subprocess.run([sys.executable, "-c", WRITE, where], check=True)
+            finished([sys.executable, "-c", WRITE, where], check=True)
             assert is_noticed(reader)
             assert not reader.has_changed()
 
@@ -212,14 +212,14 @@ def test_notifications_during_reads_neither_disturb_nor_get_lost(
             for _ in range(n_writes):
                 write_voxels(env.store, VOXEL, f"{next(numbers)}")
 
-    writer = threading.Thread(target=write_many)
+    writer = threading.Thread(target=write_many, daemon=True)
     writer.start()
     seen = 0
     while writer.is_alive():
         for n_found in (len(reader.lookup(key)), len(reader.objects())):
             assert n_found >= seen
             seen = n_found
-    writer.join()
+    joined(writer)
     assert len(reader.lookup(key)) == len(reader.objects()) == n_writes
     assert is_noticed(reader)
 
@@ -299,13 +299,12 @@ def test_a_standby_tells_of_the_commits_that_it_follows(
     (tmp_path / "lock").touch(mode=0o600)
     tmp_path.chmod(0o700)
     create_store(server.conninfo(), GRID).close()
-    subprocess.run(
+    finished(
         [
             *(server.binaries.path("pg_basebackup"), "--write-recovery-conf", "--checkpoint=fast"),
             *(f"--pgdata={tmp_path / 'data'}", f"--dbname={server.conninfo()}"),
         ],
         check=True,
-        capture_output=True,
     )
     replica = PrivateServer.at(tmp_path, server.binaries, {})
     try:

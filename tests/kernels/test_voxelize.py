@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from children import PATIENCE
 from hapticdb.kernels.voxelize import brick_voxels, count_voxels, mark_points, voxelize
 from naive import Voxel, bricks_of_voxels, voxels_of_points, voxels_of_triangles, z_order
 
@@ -180,7 +181,7 @@ def test_order_and_split_of_the_triangles_do_not_matter() -> None:
 def test_threads_do_not_matter() -> None:
     parts = [random_triangles(n, 200 if JIT else 8, 5, 64) for n in range(8)]
     with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda part: voxelize(part, 6), parts))
+        together = list(pool.map(lambda part: voxelize(part, 6), parts, timeout=PATIENCE))
     for part, (keys, occupancy) in zip(parts, together, strict=True):
         alone = voxelize(part, 6)
         assert np.array_equal(keys, alone[0])

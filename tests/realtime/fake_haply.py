@@ -8,6 +8,8 @@ from typing import Any, Self
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
+from children import joined
+
 IDENTITY = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
 
 
@@ -43,7 +45,7 @@ class FakeHaply:
     ) -> None:
         self.unplug()
         self._server.shutdown()
-        self._thread.join()
+        joined(self._thread)
 
     def unplug(self) -> None:
         """End every connection, as when the service stops."""

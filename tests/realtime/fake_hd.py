@@ -9,6 +9,8 @@ from types import ModuleType
 
 import pytest
 
+from children import joined
+
 INVALID_HANDLE = 0xFFFFFFFF
 Matrix = (ctypes.c_double * 4) * 4
 
@@ -47,7 +49,7 @@ class FakeHd(ModuleType):
         self.calls.append("stop_scheduler")
         self._is_running = False
         if self._thread is not None:
-            self._thread.join()
+            joined(self._thread)
 
     def close_device(self, id: int) -> None:  # noqa: A002 - the package's name
         self.calls.append(("close_device", id))

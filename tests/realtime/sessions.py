@@ -7,26 +7,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+import children
+from children import PATIENCE
 from hapticdb import Environment
 from hapticdb.realtime.recording import Recording
 from hapticdb.realtime.session import Session
 from hapticdb.testing import floor_voxels, write_voxels
 
 RATE = 500.0
-PATIENCE = 30.0
 NEVER_STALE = 1e6
 Recorded = NDArray[np.void]
 
 
 def until(claim: Callable[[], object], session: Session | None = None) -> None:
     """Wait until that is so, looking after a session meanwhile."""
+    if session is None:
+        children.until(claim)
+        return
     deadline = time.monotonic() + PATIENCE
     while not claim():
         assert time.monotonic() < deadline
-        if session is None:
-            time.sleep(0.01)
-        else:
-            assert session.wait(0.02) is None
+        assert session.wait(0.02) is None
 
 
 def floored(env: Environment) -> Environment:

@@ -13,6 +13,7 @@ import pytest
 from numpy.typing import NDArray
 
 import hapticdb
+from children import PATIENCE, joined
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import GridError
 from hapticdb.realtime import prefetch, resident
@@ -98,7 +99,7 @@ def test_another_file_is_felt_instead_that_came_while_nobody_fetched(
     side = served(cells, sphere, pose)
     before, revision = side.reader.feel(pose)[0], env.store.revision()
     os.kill(cells.pid, signal.SIGKILL)
-    assert cells._process.wait(10.0)
+    assert cells._process.wait(PATIENCE)
     other = replace(env, tmp_path / "other")
     assert other.store.revision() == revision
     naive = expected(ids_by_voxel(other), other.grid, sphere, pose)
@@ -115,8 +116,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         side = Side(table, env.grid, sphere)
         fetching = Fetching(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid))
         side.be_at(pose)
-        while not side.is_served:
-            fetching.round()
+        assert until(lambda: side.is_served, fetching.round)
         before, grid = side.reader.feel(pose)[0], env.grid
         env.close()
         remove_file(Path(env.url))
@@ -129,8 +129,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         assert naive.hits != before
         fetching.reopen()
         side.be_at(pose)
-        while not side.is_served:
-            fetching.round()
+        assert until(lambda: side.is_served, fetching.round)
         assert side.reader.feel(pose)[0] == naive.hits
         fetching.close()
 
@@ -232,7 +231,7 @@ def test_threads_that_supervise_together_start_one_process(
     cells: ResidentCells, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     os.kill(cells.pid, signal.SIGKILL)
-    assert cells._process.wait(10.0)
+    assert cells._process.wait(PATIENCE)
     started: list[Process] = []
     barrier = threading.Barrier(4)
 
@@ -241,7 +240,7 @@ def test_threads_that_supervise_together_start_one_process(
         return started[-1]
 
     def supervise() -> None:
-        barrier.wait()
+        barrier.wait(PATIENCE)
         cells.supervise()
 
     monkeypatch.setattr(resident, "Process", noted)
@@ -250,7 +249,7 @@ def test_threads_that_supervise_together_start_one_process(
     for thread in threads:
         thread.start()
     for thread in threads:
-        thread.join()
+        joined(thread)
     assert len(started) == cells.restarts == 1
     cells.close()
     cells.supervise()

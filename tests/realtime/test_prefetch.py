@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
+from children import PATIENCE
 from hapticdb import DatabaseError, Environment, Grid, HapticDBError, PointShell
 from hapticdb.kernels import servo
 from hapticdb.kernels.cells import cell_key
@@ -37,8 +38,6 @@ from hapticdb.testing import write_voxels
 from realtime.troubled import refuse, refuse_strangely, troubled
 from realtime.worlds import Reader, block, expected, ids_by_voxel, make, move, scatter
 
-PATIENCE = 60.0
-"""Seconds for what takes a moment, on a machine that does much else."""
 RADIUS_M = 0.012
 Pose = NDArray[np.float64]
 
@@ -293,8 +292,7 @@ def test_the_heartbeat_waits_for_an_answer(
         return revision()
 
     monkeypatch.setattr(step.fetching.store, "revision", counted, raising=False)
-    while not asked:
-        step.round()
+    assert until(lambda: bool(asked), step.round)
     heard = int(control[HEARTBEAT])
     step.run(0.5 * CONFIRM_EVERY)
     assert (len(asked), int(control[HEARTBEAT])) == (1, heard)

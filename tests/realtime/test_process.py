@@ -4,12 +4,12 @@ import gc
 import os
 import pickle
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from children import PATIENCE, child, finished
 from hapticdb import DatabaseError, HapticDBError
 from hapticdb.realtime import process as module
 from hapticdb.realtime.process import Message, Process
@@ -17,7 +17,7 @@ from hapticdb.realtime.table import is_alive
 from realtime.sessions import until
 
 WORKERS = "realtime.workers:work"
-LONG = 60.0
+LONG = PATIENCE
 
 
 @pytest.fixture(autouse=True)
@@ -90,15 +90,14 @@ def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
-def test_a_request_that_is_cut_ends_it_quietly(share: float) -> None:
+def test_a_request_that_is_cut_ends_it_quietly(share: float, tmp_path: Path) -> None:
     content = pickle.dumps(sys.path) + pickle.dumps(("echo", list(range(1000))))
-    done = subprocess.run(
-        [sys.executable, "-c", f"from {module.__name__} import serve; serve({WORKERS!r}, 1)"],
-        input=content[: round(share * len(content))],
-        capture_output=True,
-        check=False,
-    )
-    assert (done.returncode, done.stdout, done.stderr) == (0, b"", b"")
+    request = tmp_path / "request"
+    request.write_bytes(content[: round(share * len(content))])
+    script = f"from {module.__name__} import serve; serve({WORKERS!r}, 1)"
+    with request.open("rb") as cut:
+        done = finished([sys.executable, "-c", script], stdin=cut.fileno())
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
 def test_one_killed_is_silent_and_not_alive() -> None:
@@ -126,11 +125,11 @@ time.sleep(1000)
 def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
     """Though a process that was forked from it holds the line to it open."""
     args = [sys.executable, "-c", SCRIPT.format(forks=forks)]
-    with subprocess.Popen(args, stdout=subprocess.PIPE) as session:
+    with child(args, stderr=None) as session:
         assert session.stdout is not None
         pid, forked = map(int, session.stdout.readline().split())
         session.kill()
-        session.wait()
+        session.wait(PATIENCE)
         try:
             until(lambda: not Path(f"/proc/{pid}").exists())
         finally:

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from children import exit_code
 from hapticdb import FileError
 from hapticdb.realtime.chunks import HEAD, MOST_FRAMES, Chunk
 from hapticdb.realtime.recording import Recorder, Recording
@@ -69,7 +70,7 @@ def test_a_killed_recorder_leaves_whole_chunks(tmp_path: Path) -> None:
                 os._exit(1)
         time.sleep(rng.uniform(0.02, 0.1))
         os.kill(child, signal.SIGKILL)
-        assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == -signal.SIGKILL
+        assert exit_code(child) == -signal.SIGKILL
         n_frames = len(Recording(path))
         assert n_frames >= n_before
         assert Recording(path).damaged_at is None
@@ -91,11 +92,11 @@ def test_a_full_disk_leaves_whole_chunks(tmp_path: Path) -> None:
                     recorder.append(motion(20, 20 * n))
                     recorder.flush()
             except FileError as error:
-                told = f"cannot write {path}: File too large; its first {len(recorder) - 20} frames"
+                told = f"cannot write {path}: File too large; its first {len(recorder)} frames"
                 code = 0 if str(error).startswith(told) and recorder._file.closed else 2
         finally:
             os._exit(code)
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0
+    assert exit_code(child) == 0
     found = Recording(path)
     assert (found.n_torn, found.damaged_at) == (0, None)
     assert len(found) > 20

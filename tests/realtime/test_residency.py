@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
+from children import joined
 from hapticdb import Environment, PointShell, UsageError
 from hapticdb.errors import GridError
 from hapticdb.kernels.cells import BUFFERS, READER_STRIDE, UNKNOWN, cell_key
@@ -410,7 +411,7 @@ def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) ->
                 seen.add(tuple(count == 4 for count in met))
             table.leave(reader.row)
 
-        thread = threading.Thread(target=hammer)
+        thread = threading.Thread(target=hammer, daemon=True)
         thread.start()
         wanted = np.unique([cell_key(*v) for v in probes.tolist()])
         cells = cells_of(env.grid)
@@ -427,7 +428,7 @@ def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) ->
             others = rng.permutation(cells)[:60]
             residency.load(others[residency.slots_of(others) == UNKNOWN])
         done.set()
-        thread.join()
+        joined(thread)
         check(residency, voxels_by_cell(env))
     assert wrong == []
     assert residency.evicted > 0

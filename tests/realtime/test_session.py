@@ -5,7 +5,6 @@ import math
 import os
 import re
 import signal
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from children import PATIENCE, child, finished
 from hapticdb import Environment, PointShell
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
 from hapticdb.realtime.devices import Player
@@ -28,7 +28,7 @@ from hapticdb.realtime.session import Session
 from hapticdb.realtime.table import is_alive
 from hapticdb.testing import write_voxels
 from realtime.hands import Beckoned, Talking, Unplugged, at, still, stroking
-from realtime.sessions import NEVER_STALE, PATIENCE, RATE, Recorded, floored, recorded, until
+from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until
 from realtime.worlds import block, make
 
 
@@ -64,7 +64,7 @@ def played(
         cells, sphere, stroking(0.010), rate=RATE, record=path, staleness=NEVER_STALE
     ) as session:
         pid = session.pid
-        report = session.wait()
+        report = session.wait(PATIENCE)
     assert report is not None
     recording = Recording(path)
     return Played(report, np.concatenate(list(recording.frames())), recording, pid)
@@ -154,7 +154,7 @@ def test_a_session_is_waited_for_in_steps_and_stopped(
         until(lambda: session.objects == (1,), session)
         report = session.stop()
         assert report.loop.frames >= 100
-        assert session.wait() == session.stop()  # said again
+        assert session.wait(PATIENCE) == session.stop()  # said again
     for closed in (session.stop, session.wait, session.last):
         with pytest.raises(UsageError, match="the session is closed"):
             closed()
@@ -165,7 +165,7 @@ def test_a_session_lasts_its_seconds_however_slow_it_is(
 ) -> None:
     """20,000 Hz are more than a machine that does much else can do."""
     with Session(cells, sphere, still(0.03), rate=20_000.0, seconds=0.5) as session:
-        report = session.wait()
+        report = session.wait(PATIENCE)
     assert report is not None
     loop = report.loop
     assert loop.frames + loop.missed >= 10_000
@@ -185,7 +185,7 @@ def test_a_loop_that_is_killed_is_one_clear_error(
     n_frames = sum(map(len, Recording(path).frames()))
     assert n_frames > 50
     with Session(cells, sphere, still(0.010), rate=RATE, seconds=0.1) as session:
-        report = session.wait()  # the cells are none the worse for it
+        report = session.wait(PATIENCE)  # the cells are none the worse for it
     assert report is not None
     assert report.hit_frames == report.loop.frames
 
@@ -299,7 +299,7 @@ def test_other_exclusions_need_cells_of_their_own(env: Environment, sphere: Poin
     with Session(
         env.url, sphere, still(0.010), rate=RATE, seconds=0.2, exclude=[1], budget_bytes=1 << 20
     ) as session:
-        report = session.wait()
+        report = session.wait(PATIENCE)
         pid = session.cells.pid
     assert report is not None
     assert report.hit_frames == 0
@@ -319,7 +319,7 @@ points = hapticdb.PointShell.load(sys.argv[2])
 with Session(sys.argv[1], points, still(0.010), rate=100.0, policy=sys.argv[3]) as session:
     session.wait(0.2)
     print(session.pid, session.cells.pid, flush=True)
-    session.wait()
+    session.wait(600.0)
 """
 
 
@@ -330,12 +330,12 @@ def test_processes_end_with_the_one_that_started_them(
     sphere.save(tmp_path / "sphere.npz")
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
     args = [sys.executable, "-c", SCRIPT, env.url, str(tmp_path / "sphere.npz"), policy]
-    with subprocess.Popen(args, stdout=subprocess.PIPE, text=True, env=environment) as child:
-        assert child.stdout is not None
-        pids = list(map(int, child.stdout.readline().split()))
+    with child(args, stderr=None, env=environment) as starter:
+        assert starter.stdout is not None
+        pids = list(map(int, starter.stdout.readline().split()))
         assert len(pids) == 2
         assert all(map(is_alive, pids))
-        child.kill()
+        starter.kill()
     until(lambda: not any(map(is_alive, pids)))
 
 
@@ -360,7 +360,7 @@ def test_a_device_of_the_script_itself_is_refused_with_the_way_out(
     sphere.save(tmp_path / "sphere.npz")
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent.parent)}
     args = [sys.executable, "-c", OWN_DEVICE, env.url, str(tmp_path / "sphere.npz")]
-    done = subprocess.run(args, capture_output=True, text=True, env=environment, check=True)
+    done = finished(args, env=environment, check=True)
     assert done.stderr == ""
     assert re.fullmatch(r".*Mine.*: define devices in a module .*\n", done.stdout)
 
@@ -445,7 +445,7 @@ def test_unknown_cells_hold_and_fade_for_one_session_and_are_waited_for_by_anoth
                     time.sleep(0.2)
                 finally:
                     os.kill(cells.pid, signal.SIGCONT)
-                reports = [session.wait() for session in (holding, waiting)]
+                reports = [session.wait(PATIENCE) for session in (holding, waiting)]
         for report, name in zip(reports, "ab", strict=True):
             assert report is not None
             replayed = replay(Recording(tmp_path / name), env)

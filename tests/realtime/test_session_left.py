@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from children import exit_code
 from hapticdb import Environment, PointShell
 from hapticdb.errors import FileError, HapticDBError, UsageError
 from hapticdb.realtime import resident
@@ -92,7 +93,7 @@ def in_a_fork(work: Callable[[], object]) -> int:
             status = 0
         finally:
             os._exit(status)
-    return os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    return exit_code(pid)
 
 
 def test_a_forked_copy_that_leaves_a_session_does_not_end_it(

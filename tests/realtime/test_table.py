@@ -2,7 +2,6 @@
 
 import itertools
 import os
-import subprocess
 import sys
 import threading
 from typing import Any
@@ -12,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from children import child, joined, until
 from hapticdb import UsageError
 from hapticdb.kernels.cells import READER_STRIDE
 from hapticdb.realtime.table import (
@@ -79,7 +79,7 @@ def test_sixteen_readers_have_rows_of_their_own_and_the_next_is_refused() -> Non
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join()
+            joined(thread)
         assert sorted(rows) == list(range(MOST_READERS))
         with pytest.raises(UsageError, match="16 readers at most"):
             table.join()
@@ -105,12 +105,8 @@ def test_a_row_says_nothing_of_who_had_it_before() -> None:
 
 def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
     """Also while nobody has asked for its status; the living keep what they hold."""
-    gone = subprocess.Popen([sys.executable, "-c", "pass"], stdout=subprocess.PIPE)
-    assert gone.stdout is not None
-    gone.stdout.read()  # it ends, and is a zombie from then on
-    while is_alive(gone.pid):
-        pass
-    with CellTable.create(LEAST_BUDGET) as table:
+    with child([sys.executable, "-c", "pass"]) as gone, CellTable.create(LEAST_BUDGET) as table:
+        until(lambda: not is_alive(gone.pid))  # a zombie
         dead, alive = table.join(), table.join()
         table.desk.pids[dead] = gone.pid
         table.cells.readers[[dead * READER_STRIDE, alive * READER_STRIDE]] = 9
@@ -119,7 +115,6 @@ def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
         assert np.flatnonzero(table.cells.readers).tolist() == [alive * READER_STRIDE]
         assert np.flatnonzero(table.desk.state[:, ACTIVE]).tolist() == [alive]
         assert table.join() not in {dead, alive}
-    gone.wait()
     assert not is_alive(gone.pid)
     assert is_alive(os.getpid())
     assert is_alive(1)

@@ -10,6 +10,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from children import PATIENCE
 from hapticdb import DeviceError, MissingExtraError, UsageError
 from hapticdb.realtime.devices import Device, SupportsClose, SupportsOpen
 from hapticdb.realtime.vendors import VelocityWindow, load
@@ -44,7 +45,7 @@ def haply() -> Iterator[FakeHaply]:
 
 
 def eventually(claim: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + 10.0
+    deadline = time.monotonic() + PATIENCE
     while not claim():
         if time.monotonic() > deadline:
             return False
@@ -326,7 +327,7 @@ def test_haply_is_told_forces_capped_and_nothing_else(haply: FakeHaply) -> None:
         device.apply(PUSH)
     device.read()
     device.close()
-    assert haply.is_over.wait(10.0)
+    assert haply.is_over.wait(PATIENCE)
     push = {"x": pytest.approx(4.2), "y": 0.0, "z": pytest.approx(5.6)}
     assert haply.forces == [vector(0, 0, 0), push, push, push, vector(0, 0, 0)]
     assert all(message["inverse3"][0]["device_id"] == "049D" for message in haply.told)

@@ -20,6 +20,7 @@ from hapticdb.cli.root import (
     ids_of,
     leave,
     numbers_of,
+    size_of,
 )
 from hapticdb.cli.touching import shell_of
 
@@ -33,6 +34,8 @@ PolicyName = Literal["hold", "wait"]
 MOST_NAMED = 8
 TERMINATED = 128 + signal.SIGTERM
 DEFAULT_SPEED = 0.3
+LOOK_EVERY = 0.25
+"""Seconds between looks whether the recording goes on."""
 VENDORS = {
     "force-dimension": ("hapticdb.realtime.vendors.force_dimension", "ForceDimensionDevice"),
     "openhaptics": ("hapticdb.realtime.vendors.openhaptics", "OpenHapticsDevice"),
@@ -80,6 +83,15 @@ def feel(
     record: Annotated[
         str | None, typer.Option(metavar="FILE", help="Record the session: a new .hdbrec.")
     ] = None,
+    record_limit: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE",
+            help="Size at which the recording ends and the session goes on: MiB, or such as 4GiB. "
+            "It also ends when its disk has 64 MiB left.",
+            show_default="4GiB",
+        ),
+    ] = None,
     budget: Budget = 256.0,
     policy: Annotated[
         PolicyName,
@@ -110,11 +122,15 @@ def feel(
     import hapticdb
     from hapticdb.errors import UsageError
     from hapticdb.realtime.handle import Handle
+    from hapticdb.realtime.recording import DEFAULT_LIMIT
     from hapticdb.realtime.resident import ResidentCells
     from hapticdb.realtime.session import Session
 
     law = hapticdb.TangentPlane(stiffness)
     budget_bytes = bytes_of(budget)
+    limit_bytes = DEFAULT_LIMIT if record_limit is None else size_of(record_limit, "--record-limit")
+    if record_limit is not None and record is None:
+        raise UsageError("--record-limit belongs to --record: give it, too, or leave both out")
     excluded = ids_of(exclude or (), "--exclude")
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
@@ -137,13 +153,13 @@ def feel(
                 policy=policy,
                 staleness=staleness,
                 record=record,
+                record_limit_bytes=limit_bytes,
                 is_fifo=fifo,
                 processor=processor,
             ) as session,
             _ended_by_signals(session) as signals,
         ):
-            report = session.wait()
-        assert report is not None  # noqa: S101 - waited for without a limit
+            report = _waited_for(session)
         if json:
             render.say_json(report.figures())
         else:
@@ -153,6 +169,17 @@ def feel(
         raise typer.Exit(TERMINATED)
     if signals:
         raise Interrupted(f"ended by Ctrl-C after {report.loop.seconds:.3g} s")
+
+
+def _waited_for(session: "Session") -> "Report":
+    """Wait for a session's end; of a recording that ends before, tell at once."""
+    report, is_told = None, False
+    while report is None:
+        report = session.wait(LOOK_EVERY)
+        if session.recording_ended is not None and not is_told:
+            render.note(f"{session.recording_ended}; the session goes on without it")
+            is_told = True
+    return report
 
 
 @contextmanager
@@ -371,6 +398,7 @@ def _show(report: "Report", cells: "ResidentCells", record: str | None) -> None:
         )
     if record is not None:
         lost = f", {report.lost_records:,} lost" if report.lost_records else ""
+        lost += ", not to the end" if report.recording_ended else ""
         facts.append(("recorded", f"{report.recorded_frames:,} frames in {record}{lost}"))
     facts += sorted(report.conditions.items())
     render.show(render.facts(facts))

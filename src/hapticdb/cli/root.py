@@ -1,5 +1,6 @@
 """The typer application, its global options, and the options that several verbs share."""
 
+import re
 import signal
 import threading
 from collections.abc import Iterable, Iterator
@@ -33,6 +34,7 @@ Exclude = Annotated[
     list[str] | None,
     typer.Option(metavar="ID", help="Objects that are not felt; again, or 3,4, for more."),
 ]
+SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
 Budget = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, an object a line.")]
 
@@ -158,6 +160,24 @@ def bytes_of(budget: float) -> int:
     if not 1.0 <= budget <= 1e6:
         raise UsageError(f"--budget {budget}: give MiB, 1 to a million")
     return int(budget * (1 << 20))
+
+
+def size_of(text: str, option: str) -> int:
+    """Bytes of a size in MiB, or with its unit.
+
+    Raises
+    ------
+    UsageError
+        When it is none, or beyond sense.
+    """
+    from hapticdb.errors import UsageError
+
+    match = SIZE.fullmatch(text.strip())
+    unit = (match[2] or "M")[0].upper() if match else "M"
+    mib = float(match[1]) * (1024.0 if unit == "G" else 1.0) if match else 0.0
+    if not 1.0 <= mib <= 1e6:
+        raise UsageError(f"{option} {text[:80]!r}: give MiB, 1 to a million, or such as 4GiB")
+    return int(mib * (1 << 20))
 
 
 def ids_of(words: Iterable[str], option: str) -> list[int]:

@@ -1,7 +1,8 @@
 """Sessions on disk: one file (.hdbrec), a header and chunks of frames, bit for bit.
 
 docs/format.md describes the bytes. A file that was cut off anywhere is read up to its last whole
-chunk, and a recorder that goes on with it removes the rest first.
+chunk, and a recorder that goes on with it removes the rest first. A recorder ends by itself at its
+limit, and before the disk is full.
 """
 
 import contextlib
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels.motion import poses_of
-from hapticdb.realtime.chunks import MOST_FRAMES, Chunk, Scan, read_bytes, scan
+from hapticdb.realtime.chunks import HEAD, MOST_FRAMES, Chunk, Scan, read_bytes, scan
 from hapticdb.realtime.packing import pack, unpack
 from hapticdb.realtime.recorded import FRAME, Frames, State
 from hapticdb.realtime.recording_header import Header
@@ -29,6 +30,10 @@ __all__ = ["FRAME", "MOST_FRAMES", "Frames", "Header", "Recorder", "Recording", 
 
 CHUNK = 4096
 """Frames that a recorder packs together: 1.3 MB in memory."""
+DEFAULT_LIMIT = 4 << 30
+"""Bytes that a recording may have unless told otherwise: six hours at 1 kHz, one at 5 kHz."""
+LEFT_FREE = 64 << 20
+"""Bytes of the disk that a recorder leaves free; others write there, too, such as the database."""
 
 
 class Recording:
@@ -189,14 +194,17 @@ class Recorder:
         has the start that they count from.
     replace : bool
         Begin anew in a file that is there.
+    limit_bytes : int or None
+        Greatest size of the file; none but the disk's free space, less `LEFT_FREE`, with None. The
+        frame that would exceed it is left out, and all after it: see `ended`.
 
     Raises
     ------
     UsageError
-        When a file is there and neither is asked for, another header is given to append, or
-        another recorder is at it.
+        When a file is there and neither is asked for, another header is given to append, another
+        recorder is at it, or the limit leaves no room for a frame.
     FileError
-        When it cannot be written, or cannot be gone on with.
+        When it cannot be written, or cannot be gone on with, or the disk has no room.
 
     Attributes
     ----------
@@ -204,6 +212,9 @@ class Recorder:
         The file.
     header : Header
         As it stands in the file.
+    ended : str or None
+        Why it takes no more frames although nobody has closed it, in a line; None while it does.
+        The file is whole then, and closed.
     """
 
     def __init__(
@@ -213,11 +224,16 @@ class Recorder:
         *,
         append: bool = False,
         replace: bool = False,
+        limit_bytes: int | None = DEFAULT_LIMIT,
     ) -> None:
         if append and replace:
             raise UsageError("a recording is either appended to or replaced: choose one")
+        if limit_bytes is not None and not limit_bytes > 0:
+            raise UsageError(f"a recording of {limit_bytes} bytes at most: give 1 or more")
         self.path = Path(path)
         self.header = header
+        self.ended: str | None = None
+        self._limit = limit_bytes
         self._buffer: Frames = np.empty(CHUNK, dtype=FRAME)
         self._n_waiting = self._n_written = self._end = 0
         self._file = self._open(may_exist=append or replace)
@@ -225,6 +241,8 @@ class Recorder:
             self._begin(append=append)
         except BaseException:
             self._file.close()
+            if not (append or replace):  # made just now
+                self.path.unlink(missing_ok=True)
             raise
 
     def __enter__(self) -> Self:
@@ -243,7 +261,7 @@ class Recorder:
         return self._n_written + self._n_waiting
 
     def append(self, frames: Frames) -> None:
-        """Add frames (n,) of `FRAME`; each full chunk is written.
+        """Add frames (n,) of `FRAME`; each full chunk is written. Left out once it has `ended`.
 
         Raises
         ------
@@ -253,11 +271,12 @@ class Recorder:
             When the disk is full, or fails; the recorder is closed then, and what was written
             before stays whole.
         """
-        self._check_open()
+        if self.ended is None:
+            self._check_open()
         if frames.dtype != FRAME or frames.ndim != 1:
             raise UsageError(f"frames of {frames.dtype} {frames.shape}: give (n,) of FRAME")
         at = 0
-        while at < len(frames):
+        while at < len(frames) and self.ended is None:
             n = min(len(frames) - at, CHUNK - self._n_waiting)
             self._buffer[self._n_waiting : self._n_waiting + n] = frames[at : at + n]
             self._n_waiting += n
@@ -266,14 +285,25 @@ class Recorder:
                 self.flush()
 
     def flush(self) -> None:
-        """Write the frames that wait, in a chunk of their own."""
+        """Write the frames that wait, in a chunk of their own; as many as there is room for."""
+        if self.ended is not None:
+            return
         self._check_open()
-        if self._n_waiting:
-            payload = pack(self._buffer[: self._n_waiting])
-            chunk = Chunk(self._n_written, self._n_waiting, len(payload), zlib.crc32(payload))
-            self._write(chunk.packed() + payload)
-            self._n_written += self._n_waiting
-            self._n_waiting = 0
+        n = self._n_waiting
+        room, reason = self._room() if n else (0, "")
+        content = self._packed(n)
+        while n and len(content) > room:
+            n //= 2
+            content = self._packed(n)
+        is_full, self._n_waiting = n < self._n_waiting, 0
+        if n:
+            self._write(content)
+            self._n_written += n
+        if is_full:
+            self.ended = (
+                f"{self.path}: the recording ends after {self._n_written:,} frames, {reason}"
+            )
+            self._finish()
 
     def close(self) -> None:
         """Write what waits and the mark of the end, and have all of it on the disk."""
@@ -281,11 +311,34 @@ class Recorder:
             return
         try:
             self.flush()
+            if self.ended is None:
+                self._finish()
+        finally:
+            self._file.close()
+
+    def _finish(self) -> None:
+        """Write the mark of the end, have all on the disk, and close."""
+        try:
             self._write(Chunk(self._n_written, 0, 0, 0).packed())
             with self._told():
                 os.fsync(self._file.fileno())
         finally:
             self._file.close()
+
+    def _packed(self, n: int) -> bytes:
+        """Chunk of the first n frames that wait; nothing for none."""
+        if not n:
+            return b""
+        payload = pack(self._buffer[:n])
+        return Chunk(self._n_written, n, len(payload), zlib.crc32(payload)).packed() + payload
+
+    def _room(self) -> tuple[int, str]:
+        """Bytes that a chunk may have, the mark of the end after it; and what bounds them."""
+        free = free_bytes(self._file) - LEFT_FREE
+        limit = free if self._limit is None else self._limit - self._end
+        if limit <= free and self._limit is not None:
+            return limit - HEAD.size, f"at its limit of {_size(self._limit)}"
+        return free - HEAD.size, f"since its disk has no more than {_size(LEFT_FREE)} left"
 
     def _open(self, *, may_exist: bool) -> io.FileIO:
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | (0 if may_exist else os.O_EXCL)
@@ -308,9 +361,11 @@ class Recorder:
         """Write the header, or stand at the end of what is to be gone on with."""
         size = os.fstat(self._file.fileno()).st_size
         if not (append and size):
+            content = self.header.packed()
+            self._check_room(len(content), freed=size)
             with self._told():
                 self._file.truncate(0)
-            self._write(self.header.packed())
+            self._write(content)
             return
         given, (self.header, start) = self.header, Header.read(self._file, str(self.path))
         if differing := self.header.differing(given):
@@ -320,10 +375,26 @@ class Recorder:
         found = scan(self._file, start, size)
         if found.damaged >= 0:
             raise FileError(f"{self.path}: damaged at frame {found.damaged}; give another name")
+        self._check_room(found.end, freed=size)
         with self._told():
             self._file.truncate(found.end)
             self._file.seek(found.end)
         self._n_written, self._end = found.n_frames, found.end
+
+    def _check_room(self, n_bytes: int, freed: int) -> None:
+        """Refuse to begin where no frame would fit behind so many bytes of the file."""
+        least = n_bytes + 2 * HEAD.size + FRAME.itemsize
+        if self._limit is not None and least > self._limit:
+            raise UsageError(
+                f"{self.path}: a recording of {self._limit:,} bytes at most, and {n_bytes:,} come "
+                "before the first new frame: give a higher limit"
+            )
+        free = free_bytes(self._file) + freed
+        if free < LEFT_FREE + least:
+            raise FileError(
+                f"cannot write {self.path}: its disk has {_size(free)} left, of which a recording "
+                f"leaves {_size(LEFT_FREE)}: make room, or record elsewhere"
+            )
 
     def _write(self, content: bytes) -> None:
         """Write all of it, or none and close."""
@@ -335,6 +406,7 @@ class Recorder:
             with contextlib.suppress(OSError):
                 self._file.truncate(self._end)
             self._file.close()
+            self._n_waiting = 0
             raise FileError(
                 f"cannot write {self.path}: {error.strerror}; its first {self._n_written} frames "
                 "are whole"
@@ -351,3 +423,15 @@ class Recorder:
     def _check_open(self) -> None:
         if self._file.closed:
             raise UsageError(f"{self.path}: the recorder is closed")
+
+
+def free_bytes(file: io.FileIO) -> int:
+    """Bytes that we may still write on the disk that an open file is on."""
+    found = os.fstatvfs(file.fileno())
+    return found.f_bavail * found.f_frsize
+
+
+def _size(n_bytes: int) -> str:
+    return (
+        f"{n_bytes / (1 << 30):.4g} GiB" if n_bytes >= 1 << 30 else f"{n_bytes / (1 << 20):.4g} MiB"
+    )

@@ -132,6 +132,10 @@ class Report:
         What the fetching process did.
     objects : tuple of int
         Ids of objects touched, as far as they were asked for: a hundred times a second.
+    recorded_frames, lost_records : int
+        Frames in the recording, and frames that nobody took out of memory in time.
+    recording_ended : str or None
+        Why the recording ended before the session, in a line; None when it did not.
     conditions : dict
         Points, scheduling, processor: what the figures hold for.
     """
@@ -158,6 +162,7 @@ class Report:
     objects: tuple[int, ...] = ()
     recorded_frames: int = 0
     lost_records: int = 0
+    recording_ended: str | None = None
     conditions: dict[str, str] = field(default_factory=dict)
 
     @property

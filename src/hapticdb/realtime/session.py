@@ -2,8 +2,8 @@
 
 import os
 import time
-from collections.abc import Iterable
-from contextlib import ExitStack, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import Literal, Self, get_args
@@ -11,7 +11,7 @@ from typing import Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.errors import FileError, HapticDBError, UsageError
 from hapticdb.force import TangentPlane
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell import PointShell
@@ -23,7 +23,7 @@ from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
 from hapticdb.realtime.prefetch import ASKED_TO_END, DONE
 from hapticdb.realtime.process import Process
 from hapticdb.realtime.recorded import FRAME, Frames
-from hapticdb.realtime.recording import Header, Recorder
+from hapticdb.realtime.recording import DEFAULT_LIMIT, Header, Recorder
 from hapticdb.realtime.report import LoopAnswer, Report
 from hapticdb.realtime.resident import ResidentCells, never_began
 from hapticdb.realtime.table import DEFAULT_BUDGET, anonymous_memory
@@ -77,6 +77,10 @@ class Session:
         A file for the recording; see `hapticdb.realtime.recording.Recorder`.
     replace_recording : bool
         Begin it anew in a file that is there.
+    record_limit_bytes : int or None
+        Greatest size of the recording, 4 GiB unless given; with None, and in any case, 64 MiB of
+        the disk stay free. There the recording ends, whole, and the session goes on without it;
+        likewise where the disk fails: see `recording_ended`.
     is_fifo, processor
         As `hapticdb.realtime.deadlines.Timing` has them.
 
@@ -108,6 +112,7 @@ class Session:
         exclude: Iterable[int] = (),
         record: str | os.PathLike[str] | None = None,
         replace_recording: bool = False,
+        record_limit_bytes: int | None = DEFAULT_LIMIT,
         is_fifo: bool = False,
         processor: int | None = None,
     ) -> None:
@@ -133,6 +138,8 @@ class Session:
         self._process: Process | None = None
         self._recorder: Recorder | None = None
         self._new: Path | None = None
+        self._record_limit = record_limit_bytes
+        self._recording_ended: str | None = None
         self._is_recording = False
         self._flushed = 0.0
         self._drained = self._lost = 0
@@ -194,7 +201,9 @@ class Session:
         # noted before the file is made: a signal may end the making at any moment
         self._new = None if is_replaced or os.path.lexists(path) else path
         try:
-            self._recorder = Recorder(path, self._header(), replace=is_replaced)
+            self._recorder = Recorder(
+                path, self._header(), replace=is_replaced, limit_bytes=self._record_limit
+            )
         except UsageError:  # another has made it meanwhile
             self._new = None
             raise
@@ -243,6 +252,11 @@ class Session:
     def objects(self) -> tuple[int, ...]:
         """Ids of the objects touched so far; asked for a hundred times a second."""
         return tuple(sorted(self._objects))
+
+    @property
+    def recording_ended(self) -> str | None:
+        """Why the recording has ended before the session, in a line; None while it goes on."""
+        return self._recording_ended
 
     def last(self) -> Frames | None:
         """Latest frame, (1,) of `FRAME`; None before the first."""
@@ -297,22 +311,34 @@ class Session:
             self._lost += done - self._drained - size // 2
             self._drained = done - size // 2
         rows = self._ring[np.arange(self._drained, done) % size]
-        self._recorder.append(frames_of(rows))
+        with self._going_on():
+            self._recorder.append(frames_of(rows))
+            if time.monotonic() - self._flushed >= FLUSH_EVERY:
+                self._recorder.flush()
+                self._flushed = time.monotonic()
         self._drained = done
-        if time.monotonic() - self._flushed >= FLUSH_EVERY:
-            self._recorder.flush()
-            self._flushed = time.monotonic()
-        self._is_recording = True
+        self._is_recording = self._recording_ended is None
+
+    @contextmanager
+    def _going_on(self) -> Iterator[None]:
+        """Note why the recording has ended, if it has: a full disk does not take the hand away."""
+        assert self._recorder is not None  # noqa: S101 - asked before
+        try:
+            yield
+        except FileError as error:
+            self._recording_ended = str(error)
+        else:
+            self._recording_ended = self._recording_ended or self._recorder.ended
 
     def _report(self) -> Report:
         answer = self._answer
         assert answer is not None  # noqa: S101 - asked before
         counts = asdict(answer.counts)
         n_frames, conditions = counts.pop("frames"), counts.pop("conditions")
-        n_recorded = len(self._recorder) if self._recorder else 0
         if self._recorder is not None:
             self._is_recording = False
-            self._recorder.close()
+            with self._going_on():
+                self._recorder.close()
         return Report(
             rate=self.timing.rate,
             loop=answer.loop,
@@ -322,7 +348,8 @@ class Session:
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
             objects=self.objects,
-            recorded_frames=n_recorded,
+            recorded_frames=len(self._recorder) if self._recorder is not None else 0,
+            recording_ended=self._recording_ended,
             lost_records=self._lost,
             conditions={"points": str(len(self.shell)), **conditions},
             **counts,

@@ -1,0 +1,191 @@
+"""Child processes of tests, and all else that they wait for: nothing is waited for without an end.
+
+`child` and `finished` start processes; each is killed after `PATIENCE`, with its group. The script
+`watchdog` ends what outlives the run, however that ends.
+"""
+
+import atexit
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import IO, Any
+
+import pytest
+
+PATIENCE = 300.0
+"""Seconds after which a child is killed, and whoever waits gives up: many times what any test takes
+on a busy machine, and less than the 20 minutes after which pytest itself ends (pyproject.toml)."""
+RUN = "HAPTICDB_TEST_RUN"
+"""Variable that names the run's folder in all processes that it starts."""
+PIPE = subprocess.PIPE
+_line: list[IO[bytes]] = []
+"""What the watchdog listens to, once there is one."""
+
+
+def begin_run() -> None:
+    """Have all processes, servers and files of this run end with it; before anything is started.
+
+    A run that was started with SIGINT ignored (``make test &`` in a script, cron) hears it from now
+    on, as one in the foreground does: children inherit what is ignored, and `feel` asks which
+    handler there is. So Ctrl-C in that script's terminal ends the run, too; ``setsid`` keeps it
+    away.
+    """
+    if _line:
+        return
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    # pytest's own folders stay where they were: a person looks into them after the run
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
+    folder = Path(tempfile.mkdtemp(prefix="hapticdb-run-")).resolve()
+    folder.chmod(0o711)  # servers of another account pass through
+    os.environ[RUN] = os.environ["TMPDIR"] = str(folder)
+    tempfile.tempdir = None  # found anew
+    script = str(Path(__file__).with_name("watchdog.py"))
+    dog = subprocess.Popen(
+        [sys.executable, "-I", "-S", script, str(os.getpid()), str(folder)],
+        stdin=PIPE,
+        start_new_session=True,  # neither Ctrl-C nor a kill of pytest's group reaches it
+    )
+    assert dog.stdin is not None
+    _line.append(dog.stdin)
+    atexit.register(_end_run, dog, os.getpid())
+
+
+def _end_run(dog: "subprocess.Popen[bytes]", pid: int) -> None:
+    if os.getpid() == pid:  # not in a copy that was forked
+        assert dog.stdin is not None
+        dog.stdin.close()
+        dog.wait(PATIENCE)
+
+
+def end_servers_below(folder: Path) -> None:
+    """Have servers that run below a folder end with this run."""
+    _tell(f"folder {folder}")
+
+
+def end_forked(pid: int) -> None:
+    """Have a process that was forked without `exec` end with this run."""
+    _tell(f"process {pid}")
+
+
+def _tell(words: str) -> None:
+    line = _line[0]
+    line.write(os.fsencode(words) + b"\n")
+    line.flush()
+
+
+@contextlib.contextmanager
+def child(
+    command: Sequence[str],
+    *,
+    stdin: int | None = subprocess.DEVNULL,
+    stdout: int | None = PIPE,
+    stderr: int | None = PIPE,
+    cwd: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    patience: float = PATIENCE,
+) -> Iterator["subprocess.Popen[str]"]:
+    """A child process, in a group of its own; its end is waited for at the end of the block.
+
+    It is killed, with its group, when the block fails, and after `patience`: all its pipes close
+    then, so that no read of them waits for ever.
+    """
+    process = subprocess.Popen(
+        command,
+        stdin=stdin,
+        stdout=stdout,
+        stderr=stderr,
+        cwd=cwd,
+        env=env,
+        text=True,
+        process_group=0,
+    )
+    late = threading.Event()
+
+    def give_up() -> None:
+        late.set()
+        _kill(process)
+
+    timer = threading.Timer(patience, give_up)
+    timer.daemon = True
+    timer.start()
+    try:
+        with process:
+            try:
+                yield process
+            except BaseException:
+                _kill(process)
+                raise
+    finally:
+        timer.cancel()
+        _kill(process)
+    if late.is_set():
+        pytest.fail(f"killed, since it did not end within {patience:g} s: {command}")
+
+
+def _kill(process: "subprocess.Popen[str]") -> None:
+    with contextlib.suppress(ProcessLookupError):
+        os.killpg(process.pid, signal.SIGKILL)
+
+
+def finished(
+    command: Sequence[str],
+    *,
+    stdin: int | None = subprocess.DEVNULL,
+    stdout: int | None = PIPE,
+    stderr: int | None = PIPE,
+    cwd: Path | None = None,
+    env: Mapping[str, str] | None = None,
+    check: bool = False,
+    patience: float = PATIENCE,
+) -> "subprocess.CompletedProcess[str]":
+    """A child process, run to its end: its exit code and what it has printed."""
+    keywords: dict[str, Any] = {"cwd": cwd, "env": env, "patience": patience}
+    with child(command, stdin=stdin, stdout=stdout, stderr=stderr, **keywords) as process:
+        out, err = process.communicate(timeout=patience)
+    if check:
+        assert process.returncode == 0, err
+    return subprocess.CompletedProcess(command, process.returncode, out, err)
+
+
+def exit_code(pid: int) -> int:
+    """Wait for the end of a process that was forked: its exit code, or less than 0 by a signal."""
+    end_forked(pid)
+    found: list[int] = []
+
+    def has_ended() -> bool:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            found.append(os.waitstatus_to_exitcode(status))
+        return bool(ended)
+
+    until(has_ended)
+    return found[0]
+
+
+def until(claim: Callable[[], object], every: float = 0.01, patience: float = PATIENCE) -> None:
+    """Wait until a claim holds."""
+    deadline = time.monotonic() + patience
+    while not claim():
+        assert time.monotonic() < deadline, f"it does not hold after {patience:g} s"
+        time.sleep(every)
+
+
+def joined(thread: threading.Thread) -> None:
+    """Wait for a thread's end."""
+    thread.join(PATIENCE)
+    assert not thread.is_alive(), f"it did not end within {PATIENCE:g} s"
+
+
+def received(connection: Connection) -> Any:  # noqa: ANN401 - whatever was sent
+    """Next message of another process."""
+    assert connection.poll(PATIENCE), f"no word within {PATIENCE:g} s"
+    return connection.recv()

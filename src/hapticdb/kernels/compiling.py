@@ -37,6 +37,8 @@ LARGE = ("coupling.advance", "voxelize.voxelize_kernel", "cells.feel_kernel")
 LONGEST_S = 600.0
 """Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
 where it is first called."""
+SERVE = "from hapticdb.kernels.compiling import serve; serve()"
+"""What a process that compiles runs."""
 
 _SHELL = ("sampling.*", "sides.*", "curves.encode_kernel")
 _VOXELIZE = ("voxelize.*", "bricks.z_keys_kernel", "bricks.count_kernel")
@@ -157,7 +159,13 @@ class _Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
+        """End them, when no thread speaks with one any more."""
         self.end()
+        for worker in self._all:
+            for pipe in (worker.stdin, worker.stdout):
+                with contextlib.suppress(OSError):  # what was to be sent to one that is gone
+                    if pipe is not None:
+                        pipe.close()
 
     def compile(self, job: tuple[str, ...]) -> int:
         """Let a process compile that job; returns how many entries it has, compiled or not."""
@@ -181,19 +189,17 @@ class _Workers:
     def end(self) -> None:
         """End every process, compiling or not: nothing half-written stays (numba renames)."""
         with self._lock:
+            self._idle.clear()
             for worker in self._all:
                 worker.kill()
-                worker.communicate()
-            self._all.clear()
-            self._idle.clear()
+                worker.wait()
 
     def _started(self) -> "subprocess.Popen[str] | None":
-        code = "from hapticdb.kernels.compiling import serve; serve()"
         # the package is found where this process has found it, whatever the folder
         path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
         try:
             worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
-                [sys.executable, "-c", code],
+                [sys.executable, "-c", SERVE],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,

@@ -44,7 +44,9 @@ def begin_run() -> None:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     # pytest's own folders stay where they were: a person looks into them after the run
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
-    folder = Path(tempfile.mkdtemp(prefix="hapticdb-run-")).resolve()
+    # beside that of a run that started this one: the path of a socket has room for 107 bytes
+    root = os.environ["PYTEST_DEBUG_TEMPROOT"]
+    folder = Path(tempfile.mkdtemp(prefix="hapticdb-run-", dir=root)).resolve()
     folder.chmod(0o711)  # servers of another account pass through
     os.environ[RUN] = os.environ["TMPDIR"] = str(folder)
     tempfile.tempdir = None  # found anew

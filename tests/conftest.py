@@ -13,7 +13,7 @@ import pytest
 import children
 import examples
 from hapticdb import PointShell
-from hapticdb.kernels.compiling import compile_missing, entry_names
+from hapticdb.kernels.compiling import NAMES, compile_missing
 from hapticdb.pointshell import fibonacci_sphere
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 
@@ -22,7 +22,17 @@ def pytest_configure(config: pytest.Config) -> None:
     examples.choose()
     children.begin_run()
     if not hasattr(config, "workerinput"):  # once, before the processes that run tests start
-        compile_missing(entry_names())
+        compile_missing(NAMES)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Add the mark `long` to what runs on every PostgreSQL, but on the newest; not the contract."""
+    older = set(map(named, FOUND[1:]))
+    for item in items:
+        params = getattr(getattr(item, "callspec", None), "id", "").split("-")
+        is_contract = item.path.name.startswith("test_store_postgres")
+        if not is_contract and not older.isdisjoint(params):
+            item.add_marker(pytest.mark.long)
 
 
 def real_folder() -> Path | None:

@@ -52,6 +52,7 @@ def test_bench_writes_results_plots_and_a_report(run: Run, tmp_path: Path) -> No
     assert not list(folder.glob(".*"))
 
 
+@pytest.mark.long
 def test_bench_refuses_what_it_cannot_measure_in_one_line(run: Run, tmp_path: Path) -> None:
     refused(run("bench", "none.db"), "no environment at none.db", "hapticdb import")
     hapticdb.create(tmp_path / "empty.db", hapticdb.Grid(0.01, (0, 0, 0), 6)).close()
@@ -68,6 +69,7 @@ def test_bench_finds_out_before_it_measures_that_it_cannot_write(
     assert (tmp_path / "taken").read_text() == "a file"
 
 
+@pytest.mark.long
 def test_bench_takes_a_tool_along_its_path(run: Run, scene: Path, tmp_path: Path) -> None:
     file = tool(tmp_path / "tool.stl")
     write_poses(tmp_path / "path.csv", hapticdb.read_poses(path_over(tmp_path)))

@@ -166,6 +166,7 @@ def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path
     refused(run("feel", "lexical.db", "--tool", "tool.npz", *PLAY), "lexicographic", "--curve z")
 
 
+@pytest.mark.long
 def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) -> None:
     path = scene.with_name("felt.hdbrec")
     args = feel("--device", "random", "--at", ABOVE, "--rate", 2000, "--seconds", 6)
@@ -190,6 +191,7 @@ def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
     refused(run("replay", "path.csv"), "path.csv")
 
 
+@pytest.mark.long
 def test_a_session_goes_on_without_its_recording_at_the_limit(run: Run, scene: Path) -> None:
     args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--seconds", 4, "--json")
     path = scene.with_name("felt.hdbrec")
@@ -206,6 +208,7 @@ def test_a_session_goes_on_without_its_recording_at_the_limit(run: Run, scene: P
     assert run("replay", path.name)[0] == 0
 
 
+@pytest.mark.long
 def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Path) -> None:
     args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
     path = scene.with_name("cut.hdbrec")

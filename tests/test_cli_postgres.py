@@ -194,6 +194,7 @@ def test_a_wrong_password_and_a_missing_role_are_one_line(run: Run, server: Priv
     refused(run("info", f"{url}locked&password=right"), "no environment")
 
 
+@pytest.mark.long
 def test_a_standby_is_read_and_refuses_to_be_written(
     run: Run, server: PrivateServer, made: Path, tmp_path: Path
 ) -> None:
@@ -235,6 +236,7 @@ def started(tmp_path: Path, *args: object) -> AbstractContextManager["Popen[str]
     return child(command(*args), cwd=tmp_path)
 
 
+@pytest.mark.long
 def test_a_private_server_comes_and_goes_with_the_commands(made: Path, tmp_path: Path) -> None:
     importing = command("import", PRIVATE, made / "boxes.glb", "--bits", 6)
     done = finished(importing, cwd=tmp_path)
@@ -250,6 +252,7 @@ def test_a_private_server_comes_and_goes_with_the_commands(made: Path, tmp_path:
     assert not PrivateServer.at(folder).is_running
 
 
+@pytest.mark.long
 def test_a_private_server_goes_with_a_command_that_the_system_ends(
     made: Path, tmp_path: Path
 ) -> None:
@@ -288,6 +291,7 @@ def test_a_private_server_has_no_host(run: Run, tmp_path: Path) -> None:
 # -- the demo -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_demo_stands_beside_an_environment_and_joins_its_own(
     run: Run, scene: str, admin: psycopg.Connection, tmp_path: Path
 ) -> None:

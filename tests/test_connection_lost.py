@@ -109,6 +109,7 @@ class Proxy:
         client.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["forwarded", "not forwarded", "late"])
 def test_a_write_whose_commit_is_not_answered_counts_once(
     server: PrivateServer, file: Path, edited: list[Contents], how: str
@@ -229,6 +230,7 @@ def test_a_snapshot_does_not_go_on_over_another_connection(
 # --- Ctrl-C -------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_an_interrupted_import_is_finished_by_the_same_command(
     place: Place, undisturbed: dict[Layout, Contents], tmp_path: Path, file: Path
 ) -> None:

@@ -88,6 +88,7 @@ def test_the_picture_shows_the_scene(
     assert scenery.std() > 0.05
 
 
+@pytest.mark.long
 def test_a_second_demo_finds_its_environments_there(
     scene: demo.Scene, capfd: pytest.CaptureFixture[str]
 ) -> None:

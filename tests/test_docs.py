@@ -27,6 +27,7 @@ def blocks(kind: str, page: str = "README.md") -> list[str]:
     return [text for name, text in BLOCK.findall((ROOT / page).read_text()) if name == kind]
 
 
+@pytest.mark.long
 def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
     """Shell first, since Python needs the sample; then all Python in one session."""
     tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
@@ -41,6 +42,7 @@ def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
     assert len(done.stdout.splitlines()) >= 100
 
 
+@pytest.mark.long
 def test_every_block_of_the_realtime_page_runs(tmp_path: Path) -> None:
     """As one reads it: what the shell has made, Python goes on with."""
     page = "docs/realtime.md"
@@ -57,6 +59,7 @@ def test_every_block_of_the_realtime_page_runs(tmp_path: Path) -> None:
     assert (tmp_path / "sweep.png").stat().st_size > 10_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("binaries", [b for b in FOUND if not isinstance(b, str)], ids=named)
 def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
     """On a private server that libpq's environment variables lead to, by its own pg_dump."""

@@ -21,7 +21,7 @@ import pytest
 import hapticdb
 from children import finished
 from hapticdb import errors
-from hapticdb.kernels._jit import cache_folder, sources_digest
+from hapticdb.kernels._cache import cache_folder, sources_digest
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "src" / "hapticdb"

@@ -92,6 +92,7 @@ def assert_finishes(database: Path, file: Path, undisturbed: Rows, jobs: int = 1
     assert rows_of(database) == undisturbed
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("n_parts", MOMENTS)
 def test_a_killed_import_run_again_ends_as_an_undisturbed_one(
     folder: Path, undisturbed: Rows, tmp_path: Path, n_parts: int

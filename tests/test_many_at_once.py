@@ -136,6 +136,7 @@ def places_of(env: Environment) -> list[tuple[Object, Rows]]:
     return found
 
 
+@pytest.mark.long
 def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder: Path) -> None:
     """One moves the shuttle back and forth, one imports and removes: no frame sees a mixture."""
     assert len(STRATEGIES) <= N_READERS
@@ -275,6 +276,7 @@ def shift(url: str, step: str, n_times: int) -> None:
         assert main(["move", url, "1", "--translate", step, "--json"]) == 0
 
 
+@pytest.mark.long
 def test_two_imports_of_one_file_and_a_remover_leave_whole_objects(url: str, folder: Path) -> None:
     n_removed = 0
     file = folder / "balls.obj"
@@ -330,6 +332,7 @@ def stopped(pid: int) -> Iterator[None]:
             os.kill(pid, signal.SIGCONT)
 
 
+@pytest.mark.long
 def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:

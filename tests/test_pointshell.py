@@ -9,9 +9,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
+from hapticdb import orientation
 from hapticdb.errors import FileError, UsageError
 from hapticdb.pointshell import PointShell
 
@@ -436,3 +439,20 @@ def test_a_file_without_a_surface_is_named(tmp_path: Path) -> None:
         PointShell.from_file(cloud)
     with pytest.raises(FileError, match=r"missing\.stl"):
         PointShell.from_file(tmp_path / "missing.stl")
+
+
+@given(
+    n=st.integers(1, 40),
+    ends=st.lists(st.tuples(st.integers(0, 39), st.integers(0, 39)), max_size=60),
+)
+def test_components_are_those_of_scipy(n: int, ends: list[tuple[int, int]]) -> None:
+    pairs = np.array(ends, dtype=np.int64).reshape(-1, 2) % n
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    wanted = connected_components(graph, directed=False)[1]
+    assert orientation._components(pairs, n).tolist() == wanted.tolist()
+
+
+def test_the_components_of_a_long_chain_are_one() -> None:
+    order = np.random.default_rng(1).permutation(20_000)
+    pairs = np.stack([order[:-1], order[1:]], axis=1)
+    assert not orientation._components(pairs, len(order)).any()

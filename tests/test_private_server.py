@@ -188,6 +188,7 @@ def test_a_half_made_folder_is_made_anew(place: Path, binaries: Binaries) -> Non
     assert not (folder / "data.new").exists()
 
 
+@pytest.mark.long
 def test_a_set_up_that_is_killed_is_done_by_the_next(place: Path) -> None:
     folder = place / "server"
     with child(script(START, folder)) as first:
@@ -251,6 +252,7 @@ def test_what_was_written_outlives_a_kill(server: PrivateServer) -> None:
     assert holds(server)
 
 
+@pytest.mark.long
 def test_a_start_waits_for_the_children_of_a_killed_server(server: PrivateServer) -> None:
     server.start()
     write(server)
@@ -270,6 +272,7 @@ def test_a_start_waits_for_the_children_of_a_killed_server(server: PrivateServer
     busy.close()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["nobody", "another process", "a zombie"])
 def test_a_stale_pid_file_does_not_hinder_a_start(server: PrivateServer, kind: str) -> None:
     server.start()
@@ -311,6 +314,7 @@ def test_the_log_does_not_grow_without_end(
     assert b"shut down" in log.read_bytes()[:10_000]
 
 
+@pytest.mark.long
 def test_a_server_outlives_the_process_that_started_it(server: PrivateServer) -> None:
     """Its pipes close as it ends, and an interrupt of its group stays there."""
     sleeping = script(START + "import time; time.sleep(600)", server.folder)
@@ -327,6 +331,7 @@ def test_a_server_outlives_the_process_that_started_it(server: PrivateServer) ->
 # --- where it is --------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "name",
     [

@@ -49,6 +49,7 @@ from validity import Contents, assert_valid, contents, valid_contents
 # --- imports ------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
 def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
@@ -73,6 +74,7 @@ def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
     assert valid_contents(url) == undisturbed[layout]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
 def test_an_import_goes_on_by_itself_when_the_server_comes_back(
     server: PrivateServer,
@@ -95,6 +97,7 @@ def test_an_import_goes_on_by_itself_when_the_server_comes_back(
 # --- single writes ------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
 def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
     server: PrivateServer, url: str, file: Path, edited: list[Contents]
@@ -166,6 +169,7 @@ def test_a_long_touch_goes_on_through_a_crash(
                 n_frames += 1
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
 def test_a_touch_tells_in_one_line_that_the_server_stays_away_and_is_usable_afterwards(
     server: PrivateServer, url: str, file: Path, sphere: PointShell
@@ -182,6 +186,7 @@ def test_a_touch_tells_in_one_line_that_the_server_stays_away_and_is_usable_afte
         assert felt(env, sphere, np.eye(4)) == expected
 
 
+@pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
 def test_the_command_line_says_in_one_line_that_the_server_stays_away(
     server: PrivateServer,

@@ -121,6 +121,7 @@ def test_root_keeps_the_folder_where_unshare_is_allowed(place: Path, binaries: B
         assert account.uid
 
 
+@pytest.mark.long
 @root_only
 @pytest.mark.parametrize("unshare", ["false", "no-such-program"])
 def test_where_unshare_is_not_allowed_an_account_gets_the_folder(

@@ -388,6 +388,7 @@ def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=str)
 @pytest.mark.parametrize(("n_objects", "layout"), [(1, "voxel"), (17, "brick"), (33, "voxel")])
 def test_an_interrupted_copy_started_again_ends_as_an_undisturbed_one(

@@ -15,15 +15,15 @@ import pytest
 
 from children import finished
 from command_line import command
-from hapticdb.kernels import _jit, compiling
-from hapticdb.kernels.compiling import PURPOSES, entries_for, entry_names, jobs_of
+from hapticdb.kernels import compiling
+from hapticdb.kernels.compiling import NAMES, PURPOSES, entries_for, jobs_of
 
 SCRIPT = """
 import json, sys
 from pathlib import Path
 import numpy as np
 import hapticdb
-from hapticdb.kernels import _jit
+from hapticdb.kernels import _jit, compiling
 from hapticdb.query import STRATEGIES
 from hapticdb.realtime.frames import Frames
 from hapticdb.realtime.residency import Residency
@@ -69,6 +69,7 @@ for n, (layout, curve) in enumerate(KINDS):
                 frames = Frames(Residency(env.store, table), shell, run=4)
                 frames.feel(np.eye(4)[None])
                 frames.close()
+assert set(_jit.SIGNATURES) == set(compiling.NAMES)
 found = {name(entry): [tuple(s) == _jit.SIGNATURES[name(entry)] for s in entry.signatures]
          for entry in _jit.ENTRIES}
 print(json.dumps(found))
@@ -86,17 +87,16 @@ def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
     """
     done = finished([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True)
     found = json.loads(done.stdout)
-    assert set(found) == set(entry_names())
+    assert set(found) == set(NAMES)
     assert {name: declared for name, declared in found.items() if declared != [True]} == {}
 
 
 def test_a_purpose_names_entries_that_exist() -> None:
-    names = entry_names()
     for purpose, patterns in PURPOSES.items():
         for pattern in patterns:
-            assert fnmatch.filter(names, pattern), (purpose, pattern)
-    assert entries_for("everything") == list(names)
-    assert sorted(name for job in jobs_of(names) for name in job) == sorted(names)
+            assert fnmatch.filter(NAMES, pattern), (purpose, pattern)
+    assert entries_for("everything") == list(NAMES)
+    assert sorted(name for job in jobs_of(NAMES) for name in job) == sorted(NAMES)
 
 
 VERBS: tuple[tuple[str, str], ...] = (
@@ -105,7 +105,7 @@ VERBS: tuple[tuple[str, str], ...] = (
     ("touch", "touch a.db --tool s/wrench.stl --poses s/path.csv"),
     ("feel", "feel a.db --tool s/wrench.stl --device s/path.csv --seconds 0.5 --record a.hdbrec"),
     ("replay", "replay a.hdbrec a.db"),
-    ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --profile"),
+    ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --picture s.png"),
     ("move", "move a.db 12 --translate 0,0,0.001"),
     ("copy", "copy a.db b.db --layout voxel --curve hilbert"),
     ("copy", "diff a.db b.db"),
@@ -129,8 +129,8 @@ def test_a_verb_compiles_its_own_kernels_once_and_says_so(tmp_path: Path) -> Non
         assert found == wanted, words
         so_far = wanted
     done = finished(command("warm"), env=env)
-    ready = f"{len(entry_names())} kernels ready:"
-    assert done.stdout.startswith(f"{ready} {len(entry_names()) - len(so_far)} compiled now")
+    ready = f"{len(NAMES)} kernels ready:"
+    assert done.stdout.startswith(f"{ready} {len(NAMES) - len(so_far)} compiled now")
     assert finished(command("warm"), env=env).stdout.startswith(f"{ready} 0 compiled now")
 
 
@@ -139,7 +139,7 @@ def test_a_verb_compiles_its_own_kernels_once_and_says_so(tmp_path: Path) -> Non
 def test_a_process_that_cannot_compile_leaves_it_to_the_first_call(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fault: str
 ) -> None:
-    monkeypatch.setattr(_jit, "CACHE_FOLDER", str(tmp_path))
+    monkeypatch.setattr(compiling, "CACHE_FOLDER", str(tmp_path))
     monkeypatch.setattr(sys, "executable", "/bin/false" if fault == "dies" else "/no/such/python")
     told: list[compiling.Compiled] = []
     names = entries_for("import")
@@ -152,7 +152,7 @@ def test_a_process_that_cannot_compile_leaves_it_to_the_first_call(
 def test_compiling_that_is_interrupted_ends_its_processes(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(_jit, "CACHE_FOLDER", str(tmp_path))
+    monkeypatch.setattr(compiling, "CACHE_FOLDER", str(tmp_path))
     monkeypatch.setattr(compiling, "SERVE", "import time; time.sleep(600)")
     started: list[int] = []
     real = subprocess.Popen

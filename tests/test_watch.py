@@ -293,6 +293,7 @@ def test_a_server_that_refuses_to_be_listened_to_is_asked_instead(
     reader.close()
 
 
+@pytest.mark.long
 def test_a_standby_tells_of_the_commits_that_it_follows(
     server: PrivateServer, tmp_path: Path
 ) -> None:

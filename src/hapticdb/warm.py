@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 
-from hapticdb.kernels.compiling import Compiled, compile_missing, entry_names, load
+from hapticdb.kernels.compiling import NAMES, Compiled, compile_missing, load
 
 
 def warm_up(progress: Callable[[Compiled], None] | None = None) -> None:
@@ -18,5 +18,5 @@ def warm_up(progress: Callable[[Compiled], None] | None = None) -> None:
         Called with the number of kernels that are compiled and the number of those that were
         missing: at the start and after each few; not at all when none was missing.
     """
-    compile_missing(entry_names(), progress)
-    load(entry_names())
+    compile_missing(NAMES, progress)
+    load(NAMES)

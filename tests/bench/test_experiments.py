@@ -67,6 +67,7 @@ def by_strategy(cells: list[Cell]) -> dict[str, Cell]:
     return {cell["strategy"]: cell for cell in cells}
 
 
+@pytest.mark.long
 def test_figure_8_measures_every_resolution_with_its_grouping_apart(
     subject: Subject, work: Workload
 ) -> None:
@@ -166,6 +167,7 @@ def test_a_cache_is_named_by_what_it_holds(env: Environment) -> None:
     assert limited(env, 4 << 20) in {"4 MB", "all cached"}
 
 
+@pytest.mark.long
 def test_a_loop_in_the_server_finds_the_same(place: Place, car: Path) -> None:
     """On every server and both layouts; its ranges are scanned one at a time."""
     for layout in LAYOUTS:
@@ -187,6 +189,7 @@ def test_a_loop_in_the_server_finds_the_same(place: Place, car: Path) -> None:
     assert {cell["form"] for cell in cells} == {ONE_STATEMENT, IN_THE_SERVER}
 
 
+@pytest.mark.long
 def test_a_file_has_no_loop_in_a_server(subject: Subject) -> None:
     assert subject.looping is None
     assert subject.looping_query is None

@@ -83,6 +83,7 @@ def test_regions_grow_in_density_and_their_poses_stay_in_them(env: Environment) 
         assert np.ptp(middles, axis=0).max() <= reach
 
 
+@pytest.mark.long
 def test_layouts_of_one_scene_have_the_same_regions(tmp_path: Path) -> None:
     densities = []
     for layout in LAYOUTS:

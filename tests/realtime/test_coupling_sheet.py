@@ -68,6 +68,7 @@ def directions() -> st.SearchStrategy[Floats]:
     )
 
 
+@pytest.mark.long
 @given(
     normal=directions(),
     distance=st.floats(-3.0, 3.0),

@@ -134,6 +134,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         fetching.close()
 
 
+@pytest.mark.long
 def test_an_environment_of_a_server_made_anew_is_felt_instead(
     place: Place, sphere: PointShell
 ) -> None:

@@ -442,6 +442,7 @@ def test_a_database_that_goes_away_silences_the_heartbeat_until_it_is_back(
     assert resident.figures().losses >= 1
 
 
+@pytest.mark.long
 def test_a_process_killed_at_any_moment_is_replaced_and_frames_are_right_again(
     world: Environment, resident: ResidentCells, away: Path, sphere: PointShell
 ) -> None:

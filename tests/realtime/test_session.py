@@ -172,6 +172,7 @@ def test_a_session_lasts_its_seconds_however_slow_it_is(
     assert loop.frames + loop.missed == pytest.approx(20_000 * loop.seconds, abs=2)
 
 
+@pytest.mark.long
 def test_a_loop_that_is_killed_is_one_clear_error(
     cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
@@ -323,6 +324,7 @@ with Session(sys.argv[1], points, still(0.010), rate=100.0, policy=sys.argv[3]) 
 """
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("policy", ["hold", "wait"])
 def test_processes_end_with_the_one_that_started_them(
     env: Environment, sphere: PointShell, tmp_path: Path, policy: str
@@ -390,6 +392,7 @@ def check_falling(frames: Recorded) -> None:
             assert sizes[n] <= sizes[n - 1]
 
 
+@pytest.mark.long
 def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
     env: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 import hapticdb
@@ -35,6 +36,7 @@ def test_edits_are_felt_and_no_frame_mixes_two_revisions(
         check_edits(env, sphere, tmp_path, record_property)
 
 
+@pytest.mark.long
 def test_edits_on_a_server_are_felt_and_no_frame_mixes_two_revisions(
     place: Place, sphere: PointShell, tmp_path: Path, record_property: Callable[..., None]
 ) -> None:

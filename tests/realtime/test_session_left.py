@@ -37,6 +37,7 @@ def force_in(path: Path) -> float:
     return float(np.abs(np.frombuffer(path.read_bytes())).sum())
 
 
+@pytest.mark.long
 def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
     env: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
@@ -66,6 +67,7 @@ def n_memories() -> int:
     return sum("hapticdb-" in name.name for name in found)
 
 
+@pytest.mark.long
 def test_dropped_sessions_leave_their_rows_to_others(env: Environment, sphere: PointShell) -> None:
     with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
         for _ in range(2):
@@ -96,6 +98,7 @@ def in_a_fork(work: Callable[[], object]) -> int:
     return exit_code(pid)
 
 
+@pytest.mark.long
 def test_a_forked_copy_that_leaves_a_session_does_not_end_it(
     env: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
@@ -182,6 +185,7 @@ def test_cells_that_are_closed_are_refused(env: Environment, sphere: PointShell)
         Session(cells, sphere, still(0.03))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("place", "name"), [(resident, "fetching"), (module, "loop's")])
 def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
     env: Environment,

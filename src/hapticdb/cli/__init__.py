@@ -8,7 +8,7 @@ import contextlib
 import os
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import takewhile
 
 from hapticdb.cli.benching import bench
@@ -31,27 +31,29 @@ UNFORESEEN = 1
 INTERRUPTED = 130
 PIPE_CLOSED = 141
 
-app.command("import")(import_)
-for verb in (
-    info,
-    objects,
-    touch,
-    feel,
-    replay,
-    sweep,
-    move,
-    remove,
-    copy,
-    diff,
-    calibrate,
-    analyze,
-    bench,
-    grant,
-    sample,
-    demo,
-    warm,
-):
-    app.command()(verb)
+VERBS: dict[Callable[..., None], str] = {
+    import_: "Import CAD files and point clouds.",
+    info: "Show engine, grid, layout, size and statistics.",
+    objects: "List the objects of an environment.",
+    touch: "Touch with a tool along a path: force, torque, objects.",
+    feel: "Feel in real time with a device.",
+    replay: "Compute a recorded session's wrenches again.",
+    sweep: "Say whether a tool or part comes out along a path.",
+    move: "Place an object anew.",
+    remove: "Remove objects.",
+    copy: "Copy to another engine, layout or curve.",
+    diff: "Say whether two environments hold the same.",
+    calibrate: "Measure what queries cost on this machine.",
+    analyze: "Renew the statistics of the keys.",
+    bench: "Measure the paper's experiments, with a report.",
+    grant: "Say what a role may do, on PostgreSQL.",
+    sample: "Write a sample: a car, a wrench and its path.",
+    demo: "Make, import, touch and draw the sample.",
+    warm: "Compile every kernel now, so that no verb has to.",
+}
+"""The verbs, and what the list of them says of each in one line."""
+for verb, summary in VERBS.items():
+    app.command(verb.__name__.rstrip("_"), short_help=summary)(verb)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

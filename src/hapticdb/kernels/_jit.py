@@ -1,23 +1,20 @@
 """How kernels are compiled: the numba options of this package, here and nowhere else.
 
-An entry, which Python calls, names the types that it is called with: `_compile` can so compile it
+An entry, which Python calls, names the types that it is called with: `compiling` can so compile it
 before its first call, in another process. A leaf is called by kernels only.
 
-numba's on-disk cache watches only the file of the entry itself, by time stamp and size. A leaf
-edited in another file, or a wheel whose files all carry one fixed time stamp, would leave stale
-machine code behind. So the cache folder's name carries a digest of every source in this folder;
-users' own kernels keep the folder that they configured.
+Machine code goes into a folder of its own (`_cache`); users' own kernels keep the folder that they
+configured.
 """
 
-import hashlib
 import os
-import tempfile
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numba
 from numba import config, types
+
+from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 INT, FLOAT = types.int64, types.float64
 INTS, INTS2 = INT[::1], INT[:, ::1]
@@ -36,38 +33,6 @@ ENTRIES: list[Any] = []
 """Every compiled entry, in order of definition."""
 SIGNATURES: dict[str, tuple[Any, ...]] = {}
 """Types of the arguments of every entry, by its module and name: ``curves.encode_kernel``."""
-IN_WORKER = "HAPTICDB_COMPILING"
-"""Set in the environment of a process that only compiles."""
-
-
-def sources_digest(folder: Path) -> str:
-    """Digest of the names and contents of the Python sources in `folder`, 16 hex digits."""
-    digest = hashlib.sha256()
-    for source in sorted(folder.glob("*.py")):
-        content = source.read_bytes()
-        digest.update(f"{source.name}\0{len(content)}\0".encode())
-        digest.update(content)
-    return digest.hexdigest()[:16]
-
-
-def cache_folder() -> str:
-    """Folder for this version's machine code: under NUMBA_CACHE_DIR or the user's cache."""
-    root = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
-    base = Path(root) if root else Path.home() / ".cache"
-    name = f"hapticdb/kernels-{sources_digest(Path(__file__).parent)}"
-    for candidate in (base, Path(tempfile.gettempdir()) / f"hapticdb-{os.getuid()}"):
-        folder = candidate / name
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError:
-            continue
-        if os.access(folder, os.W_OK):
-            return str(folder)
-    return tempfile.mkdtemp(prefix="hapticdb-kernels-")
-
-
-CACHE_FOLDER = cache_folder()
-"""Where this process keeps and finds machine code."""
 
 
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped

@@ -18,20 +18,39 @@ import sys
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from fnmatch import fnmatchcase
+from importlib.metadata import version
 from pathlib import Path
 from threading import Lock, Timer
+from types import ModuleType
 from typing import NamedTuple, Self
 
-import numba
-from llvmlite import binding
+from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
-from hapticdb.kernels import _jit
-
-MODULES = (
-    "coupling", "voxelize", "sweep", "cells", "contact", "cell_table", "sides", "motion",
-    "grouping", "sampling", "servo", "curves", "bricks", "handle",
-)  # fmt: skip
-"""Modules that have entries; those that take longest to compile come first."""
+ENTRIES = {
+    "coupling": "advance",
+    "voxelize": "voxelize_kernel",
+    "sweep": "poses_between unpack find_hits find_clearance cells_near",
+    "cells": "feel_kernel bounding_spheres",
+    "contact": (
+        "locate_kernel spans_of_keys refine_kernel pairs_of_hits wrench_of_addresses depths_of_hits"
+    ),
+    "cell_table": (
+        "insert_cells remove_cells slots_of_cells fill_cells curve_keys_of_cells "
+        "cells_of_curve_keys slots_to_free publish oldest_version_read cells_ahead "
+        "cells_met"
+    ),
+    "sides": "side_votes_kernel nesting_kernel",
+    "motion": "poses_of play sway survey pull",
+    "grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
+    "sampling": "eliminate_kernel",
+    "servo": "tell name_voxels note",
+    "curves": "encode_kernel decode_kernel",
+    "bricks": "z_keys_kernel mark_points_kernel count_kernel brick_voxels_kernel",
+    "handle": "is_somewhere grip carry",
+}
+"""Entries by module, those that take longest to compile first. They are named here so that nobody
+loads numba to see that they are compiled."""
+NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 LARGE = ("coupling.advance", "voxelize.voxelize_kernel", "cells.feel_kernel")
 """Entries that take seconds: each is a job of its own. `feel_kernel` shares most of `advance`."""
 LONGEST_S = 600.0
@@ -58,7 +77,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "resident": _RESIDENT,
     "feel": (*_SHELL, *_RESIDENT, "coupling.*", "servo.*", "handle.*", "motion.*"),
     "replay": (*_RESIDENT, "motion.poses_of"),
-    "sweep": (*_SHELL, *_RESIDENT, "sweep.*"),
+    "sweep": (*_SHELL, *_RESIDENT, "sweep.*", *_RANGES),
     "everything": ("*",),
 }
 """Entries that a purpose calls, with ``*`` for any name; `tests/test_warm.py` holds them to it."""
@@ -71,22 +90,15 @@ class Compiled(NamedTuple):
     total: int
 
 
-def entry_names() -> tuple[str, ...]:
-    """Names of all entries, as `_jit.SIGNATURES` has them."""
-    for module in MODULES:
-        importlib.import_module(f"hapticdb.kernels.{module}")
-    return tuple(name for name in _jit.SIGNATURES if name.partition(".")[0] in MODULES)
-
-
 def entries_for(*purposes: str) -> list[str]:
     """Entries that those purposes call, each once."""
     patterns = [pattern for purpose in purposes for pattern in PURPOSES[purpose]]
-    return [n for n in entry_names() if any(fnmatchcase(n, pattern) for pattern in patterns)]
+    return [n for n in NAMES if any(fnmatchcase(n, pattern) for pattern in patterns)]
 
 
 def missing(names: Collection[str]) -> list[str]:
     """Which of those entries this machine's cache does not have."""
-    if numba.config.DISABLE_JIT:
+    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}:
         return []
     return [name for name in names if not _mark_of(name).exists()]
 
@@ -118,7 +130,10 @@ def compile_missing(
     pool: ThreadPoolExecutor
     with _Workers() as started, ThreadPoolExecutor(workers, thread_name_prefix="compile") as pool:
         try:
-            for finished in as_completed([pool.submit(started.compile, job) for job in queue]):
+            waiting = [pool.submit(started.compile, job) for job in queue]
+            for name in wanted:  # meanwhile: this process will call them
+                _module_of(name)
+            for finished in as_completed(waiting):
                 done += finished.result()
                 tell(Compiled(done, total))
         except BaseException:
@@ -130,9 +145,6 @@ def compile_missing(
 
 def load(names: Collection[str]) -> None:
     """Load those entries from the cache, or compile them here: no first call waits any more."""
-    entry_names()
-    if numba.config.DISABLE_JIT:
-        return
     for name in names:
         _compile_here(name)
 
@@ -140,7 +152,7 @@ def load(names: Collection[str]) -> None:
 def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
     """Names by job: large entries alone, others by module, so that they share their leaves."""
     jobs: list[tuple[str, ...]] = [(name,) for name in LARGE if name in names]
-    for module in MODULES:
+    for module in ENTRIES:
         rest = [name for name in names if name.startswith(f"{module}.") and name not in LARGE]
         if rest:
             jobs.append(tuple(rest))
@@ -203,7 +215,7 @@ class _Workers:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                env=os.environ | {_jit.IN_WORKER: "1", "PYTHONPATH": path},
+                env=os.environ | {IN_WORKER: "1", "PYTHONPATH": path},
                 text=True,
                 start_new_session=True,  # Ctrl-C is the parent's, which ends this one
             )
@@ -218,17 +230,22 @@ def serve() -> None:
     gc.set_threshold(100_000, 50, 100)  # compiling makes few cycles, and many objects
     for line in sys.stdin:
         for name in line.split():
-            importlib.import_module(f"hapticdb.kernels.{name.partition('.')[0]}")
             _compile_here(name)
         sys.stdout.write(line)
         sys.stdout.flush()
 
 
+def _module_of(name: str) -> ModuleType:
+    """Module of an entry, loaded."""
+    return importlib.import_module(f"hapticdb.kernels.{name.partition('.')[0]}")
+
+
 def _compile_here(name: str) -> None:
     """Compile an entry in this process, or load it, and mark it as compiled."""
-    module, _, function = name.partition(".")
-    compiled = getattr(sys.modules[f"hapticdb.kernels.{module}"], function)
-    compiled.compile(_jit.SIGNATURES[name])
+    compiled = getattr(_module_of(name), name.partition(".")[2])
+    if not hasattr(compiled, "compile"):
+        return  # the JIT is off
+    compiled.compile(importlib.import_module("hapticdb.kernels._jit").SIGNATURES[name])
     mark = _mark_of(name)
     if not mark.exists():
         with contextlib.suppress(OSError):
@@ -238,13 +255,15 @@ def _compile_here(name: str) -> None:
 @functools.cache
 def _target() -> str:
     """Digest of what numba's cached code depends on beside our sources: version and processor."""
+    from llvmlite import binding  # noqa: PLC0415 - where it is not needed, nobody waits for it
+
     features = binding.get_host_cpu_features().flatten()
     words = (
-        numba.__version__, sys.implementation.cache_tag, binding.get_host_cpu_name(), features,
+        version("numba"), sys.implementation.cache_tag, binding.get_host_cpu_name(), features,
         os.environ.get("NUMBA_CPU_NAME", ""), os.environ.get("NUMBA_CPU_FEATURES", ""),
     )  # fmt: skip
     return hashlib.sha256("\0".join(map(str, words)).encode()).hexdigest()[:16]
 
 
 def _mark_of(name: str) -> Path:
-    return Path(_jit.CACHE_FOLDER) / f"{name}.{_target()}.compiled"
+    return Path(CACHE_FOLDER) / f"{name}.{_target()}.compiled"

@@ -32,7 +32,9 @@ from hapticdb.grid import ROOM, CurveName
 from hapticdb.ingest import Progress
 from hapticdb.kernels.voxelize import brick_voxels, voxelize
 from hapticdb.mesh import MeshFile, Part, parse_in_process, read_file
-from hapticdb.store.base import Layout
+from hapticdb.store import base
+from hapticdb.store.base import Layout, Object, present_already
+from hapticdb.store.sqlite import SQLiteStore
 from hapticdb.testing import KINDS
 from mesh_files import gltf
 from naive import Voxel, voxels_of_points
@@ -446,3 +448,36 @@ def test_a_name_that_is_no_text_is_refused(
     assert "is no text" in str(report.error)
     str(report.error).encode()  # the message itself can be printed
     assert not (tmp_path / "e.db").exists()
+
+
+def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
+    tmp_path: Path, file: Path, parts: list[Part], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The engine says that the part is there, and it is gone before the import looks for it."""
+    calls: list[str] = []
+    add = SQLiteStore.add
+
+    def overtaken(store: SQLiteStore, record: Object, rows: base.Rows) -> int:
+        calls.append(record.name)
+        if len(calls) == 2:
+            raise present_already(record, store.url)
+        return add(store, record, rows)
+
+    monkeypatch.setattr(SQLiteStore, "add", overtaken)
+    report = import_one(tmp_path / "a.db", file)
+    names = [part.name for part in parts]
+    assert calls == [names[0], names[1], *names[1:]]
+    assert [obj.name for obj in report.added] == names
+    assert report.present == 0
+
+
+def test_a_part_that_stays_in_the_way_is_told(
+    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(store: SQLiteStore, record: Object, rows: base.Rows) -> int:
+        assert rows
+        raise present_already(record, store.url)
+
+    monkeypatch.setattr(SQLiteStore, "add", refused)
+    with pytest.raises(hapticdb.EnvironmentExistsError, match="remove it first"):
+        import_one(tmp_path / "a.db", file)

@@ -33,6 +33,8 @@ from hapticdb.statistics import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Rows, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
 
+MOST_ATTEMPTS = 100
+"""To add a part that others add and remove meanwhile."""
 AT_BORDER = 1e-6
 """Voxels by which rounding may carry a part across the grid's border without an error."""
 
@@ -232,12 +234,10 @@ def ingest_file(
     voxels = 0
     jobs = options.jobs or os.cpu_count() or 1
     for obj, rows in _voxelized(missing, mesh_file.link, store, options.unit, jobs):
-        try:
-            added.add(store.add(obj, rows))
-        except EnvironmentExistsError:
-            if not _is_present(store, obj):
-                raise
+        if (new_id := _added_or_present(store, obj, rows)) is None:
             n_present += 1  # another process imports the same file
+        else:
+            added.add(new_id)
         voxels += obj.voxels
         if progress is not None:
             done = n_present + len(added)
@@ -251,12 +251,29 @@ def ingest_file(
     )
 
 
-def _is_present(store: Store, part: Object) -> bool:
-    """Whether the environment holds that part with that geometry."""
-    return any(
-        (obj.link, obj.name, obj.digest) == (part.link, part.name, part.digest)
-        for obj in store.objects()
-    )
+def _added_or_present(store: Store, part: Object, rows: Rows) -> int | None:
+    """Id of a part that is added now, or None where another has added the same one meanwhile.
+
+    Raises
+    ------
+    EnvironmentExistsError
+        When the environment holds a part of that name with another geometry.
+    """
+    for attempt in range(MOST_ATTEMPTS):
+        try:
+            return store.add(part, rows)
+        except EnvironmentExistsError:
+            digests = {
+                obj.digest
+                for obj in store.objects()
+                if (obj.link, obj.name) == (part.link, part.name)
+            }
+            if digests == {part.digest}:
+                return None
+            if digests or attempt == MOST_ATTEMPTS - 1:
+                raise
+            # a third has removed it since: its name is free again
+    raise AssertionError  # the last attempt returns or raises
 
 
 def _voxelized(

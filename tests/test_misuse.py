@@ -1,7 +1,9 @@
 """Wrong uses of the Python API end in one clear line, never in a silent wrong answer."""
 
+import os
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from children import PATIENCE, child, joined
+from children import PATIENCE, child, exit_code, joined
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.testing import floor_voxels, write_voxels
 
@@ -118,3 +120,90 @@ def test_two_imports_of_one_file_at_once_end_as_one(tmp_path: Path) -> None:
         assert sorted(names) == sorted(set(names))
         assert len(names) == 40
         assert sum(obj.voxels for obj in env.objects()) == 40 * env.objects()[0].voxels
+
+
+@pytest.mark.parametrize(
+    ("wrong", "told"),
+    [
+        (np.eye(4) * 1j, "complex128"),
+        (np.ma.masked_array(np.eye(4), mask=np.eye(4) == 1.0), "masked"),
+        ([[1, 2], [3]], "object"),
+        (np.eye(4) == 1.0, "bool"),
+        (np.full((4, 4), "1"), "<U1"),
+    ],
+)
+def test_what_is_no_array_of_real_numbers_is_no_pose(
+    env: Environment,
+    sphere: PointShell,
+    wrong: Any,  # noqa: ANN401
+    told: str,
+) -> None:
+    asked: tuple[Callable[[], object], ...] = (
+        lambda: env.touch(sphere, wrong),
+        lambda: env.move(1, wrong),
+        lambda: hapticdb.sweep(env, sphere, wrong),
+        lambda: hapticdb.write_poses("p.csv", wrong),
+        lambda: PointShell.from_mesh(wrong, [[0, 1, 2]]),
+    )
+    for ask in asked:
+        with pytest.raises(hapticdb.UsageError, match=told):
+            ask()
+
+
+def test_integers_and_lists_are_poses(env: Environment, sphere: PointShell) -> None:
+    wanted = env.touch(sphere, np.eye(4)).force
+    for pose in (np.eye(4, dtype=np.int32), np.eye(4).tolist(), np.asfortranarray(np.eye(4))):
+        assert (env.touch(sphere, pose).force == wanted).all()
+
+
+def test_what_only_looks_like_ids_excludes_nothing(env: Environment, sphere: PointShell) -> None:
+    for wrong in ([True], b"\x01", bytearray(b"\x01"), memoryview(b"\x01"), [np.True_]):
+        with pytest.raises(hapticdb.UsageError, match=r"give an int|give ids"):
+            env.touch(sphere, np.eye(4), exclude=wrong)  # type: ignore[arg-type]
+    with pytest.raises(hapticdb.UsageError, match="give an int"):
+        env.object(True)
+
+
+def test_keys_are_integers(env: Environment) -> None:
+    for wrong in ([1.5], ["1"], [1j], [True]):
+        with pytest.raises(hapticdb.GridError, match="keys of type"):
+            env.grid.decode(wrong)
+    with pytest.raises(hapticdb.GridError, match="outside the curve"):
+        env.grid.decode(np.array([2**63], dtype=np.uint64))
+    assert env.grid.decode([]).shape == (0, 3)
+
+
+def test_a_grid_ends_somewhere() -> None:
+    with pytest.raises(hapticdb.GridError, match="far end"):
+        Grid(1e308, (0, 0, 0), 4)
+    with pytest.raises(hapticdb.GridError, match="far end"):
+        Grid(1e300, (1.79e308, 0, 0), 20)
+
+
+@pytest.mark.parametrize("wrong", [1.5, "12", True, None, np.float64(3)])
+def test_points_and_seeds_are_whole_numbers(wrong: Any) -> None:  # noqa: ANN401
+    with pytest.raises(hapticdb.UsageError, match="whole number"):
+        PointShell.sphere(0.5, wrong)
+    with pytest.raises(hapticdb.UsageError, match="whole number"):
+        PointShell.from_mesh(np.eye(3), [[0, 1, 2]], seed=wrong)
+    assert len(PointShell.sphere(0.5, np.int64(12))) == 12  # type: ignore[arg-type]
+
+
+def test_a_forked_process_is_told_to_open_its_own(env: Environment, sphere: PointShell) -> None:
+    """Two processes on one SQLite connection would damage the file."""
+    answer, question = os.pipe()
+    pid = os.fork()
+    if not pid:
+        try:
+            env.touch(sphere, np.eye(4))
+            told = "nothing was refused"
+        except hapticdb.UsageError as error:
+            told = str(error)
+        os.write(question, told.encode())
+        os._exit(0)
+    os.close(question)
+    with os.fdopen(answer, "rb") as heard:
+        told = heard.read().decode()
+    assert exit_code(pid) == 0
+    assert "belongs to the thread that opened it, in its own process" in told
+    assert len(env.touch(sphere, np.eye(4)).hits) > 0

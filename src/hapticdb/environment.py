@@ -31,6 +31,7 @@ from hapticdb.ingest import (
 from hapticdb.layout import voxels_of_rows
 from hapticdb.mesh import Part, read_file
 from hapticdb.pointshell import PointShell
+from hapticdb.poses import as_floats
 from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Query, Strategy, as_id, as_ids
 from hapticdb.statistics import DEFAULT_RESOLUTION, CostModel, QuantileVector, machine_name
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
@@ -444,7 +445,7 @@ def create(url: str | os.PathLike[str], grid: Grid, *, layout: Layout = "brick")
 
 
 def _as_transform(transform: ArrayLike) -> NDArray[np.float64]:
-    placed = np.array(transform, dtype=np.float64)
+    placed = as_floats(transform, "a transform").copy()
     if placed.shape != (4, 4) or not np.isfinite(placed).all() or (placed[3] != (0, 0, 0, 1)).any():
         raise UsageError("a transform that is no placement: give a finite 4 x 4 matrix in metres")
     if np.linalg.matrix_rank(placed[:3, :3]) < 3:

@@ -57,6 +57,8 @@ class Grid:
             raise GridError(f"curve {self.curve!r}: choose one of {', '.join(CURVE_NAMES)}")
         if len(self.origin) != 3 or not all(math.isfinite(x) for x in self.origin):
             raise GridError(f"origin {self.origin}: give three finite coordinates in metres")
+        if not all(math.isfinite(x + self.voxel_size * 2.0**self.bits) for x in self.origin):
+            raise GridError(f"voxels of {self.voxel_size} m: the grid's far end is no number")
         object.__setattr__(self, "voxel_size", float(self.voxel_size))
         object.__setattr__(self, "origin", tuple(float(x) for x in self.origin))
 
@@ -134,7 +136,12 @@ class Grid:
         GridError
             When a key lies outside ``[0, 8^bits)``.
         """
-        values = np.asarray(keys, dtype=np.int64).reshape(-1)
+        given = np.asarray(keys)
+        if given.dtype.kind not in "iu" and given.size:
+            raise GridError(f"keys of type {given.dtype}: give integers, as encode returns")
+        if given.dtype == np.uint64 and given.size and int(given.max()) >= 1 << 63:
+            raise GridError(f"a key lies outside the curve of {self.bits} bits an axis")
+        values = given.astype(np.int64).reshape(-1)
         if values.size and (values.min() < 0 or int(values.max()) >> (3 * self.bits)):
             raise GridError(f"a key lies outside the curve of {self.bits} bits an axis")
         return curves.decode(values, self.bits, self.curve_code)

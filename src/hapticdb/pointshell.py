@@ -18,6 +18,7 @@ from hapticdb import mesh
 from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels import curves, sampling
 from hapticdb.orientation import orient
+from hapticdb.poses import as_floats
 
 MAX_POINTS = 10_000_000
 ORDER_BITS = 10
@@ -261,6 +262,9 @@ class PointShell:
 
 
 def _check_request(points: int, seed: int) -> None:
+    for number, what in ((points, "points"), (seed, "a seed")):
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
+            raise UsageError(f"{what} {number!r}: give a whole number")
     if not 1 <= points <= MAX_POINTS:
         raise UsageError(f"{points} points: a shell has 1 to {MAX_POINTS}")
     if seed < 0:
@@ -274,10 +278,7 @@ def _check_format(saved: object, path: str | PathLike[str]) -> None:
 
 def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:
     """Copy an array as C-contiguous float64."""
-    try:
-        floats = np.array(array, dtype=np.float64, order="C")
-    except (TypeError, ValueError):
-        raise UsageError(f"{name} are no array of numbers") from None
+    floats = as_floats(array, name).copy()
     if finite and not np.isfinite(floats).all():
         raise UsageError(f"{name} hold values that are not finite")
     return floats

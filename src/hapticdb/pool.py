@@ -4,13 +4,14 @@ import contextlib
 import os
 import time
 from collections.abc import Iterator
-from threading import Condition, get_ident
+from threading import Condition
 from types import TracebackType
 from typing import Protocol, Self, cast
 
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import BusyError, ConnectionLostError, DatabaseError, UsageError
+from hapticdb.store.base import this_thread
 
 NOBODY = 0
 """No thread has this number."""
@@ -142,7 +143,7 @@ class Pool:
             while not self._is_closed:
                 if self._free:
                     env = self._free.pop()
-                    self._give(env, get_ident())
+                    self._give(env, this_thread())
                     return env
                 if self._n_members < self._size:
                     self._n_members += 1
@@ -188,5 +189,5 @@ def _store_of(env: Environment) -> SupportsHandOver:
 
 
 def _close(env: Environment) -> None:
-    _store_of(env).give_to(get_ident())
+    _store_of(env).give_to(this_thread())
     env.close()

@@ -24,6 +24,28 @@ FARTHEST = 1e9
 _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
 
 
+def as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
+    """Values as a C-contiguous array of float64; itself where they are one.
+
+    Raises
+    ------
+    UsageError
+        Where converting them would invent or lose something: complex numbers, masked arrays, text,
+        lists of unequal lengths.
+    """
+    if type(values) is np.ndarray and values.dtype == np.float64:
+        return np.ascontiguousarray(values)
+    if isinstance(values, np.ma.MaskedArray):
+        raise UsageError(f"{name} that is a masked array: give numbers, or fill it first")
+    try:
+        given = np.asarray(values)
+    except (TypeError, ValueError):
+        given = np.empty(0, dtype=object)
+    if given.dtype.kind not in "iuf":
+        raise UsageError(f"{name} of {given.dtype} values: give an array of real numbers")
+    return np.ascontiguousarray(given, dtype=np.float64)
+
+
 def rotation_of(quaternions: ArrayLike) -> NDArray[np.float64]:
     """Rotation matrices (M, 3, 3) of unit quaternions (M, 4), the scalar first."""
     w, x, y, z = np.asarray(quaternions, dtype=np.float64).reshape(-1, 4).T
@@ -69,7 +91,7 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
     poses : array_like
         (M, 4, 4) rigid transforms `world_from_tool`, metres.
     """
-    matrices = np.asarray(poses, dtype=np.float64)
+    matrices = as_floats(poses, "poses")
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
         raise UsageError(f"poses must have the shape (M, 4, 4), not {matrices.shape}")
     if not np.isfinite(matrices).all():

@@ -14,6 +14,7 @@ from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.force import TangentPlane
 from hapticdb.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
 from hapticdb.kernels import contact
+from hapticdb.poses import as_floats
 from hapticdb.store.base import Frame, Keys, Rows, Store, SupportsStatement, row_shift
 
 if TYPE_CHECKING:
@@ -95,7 +96,7 @@ class HapticQuery:
             raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
         if gap < 0:
             raise UsageError(f"MAXGAP {gap}: give 0 or more")
-        pose = np.ascontiguousarray(world_from_tool, dtype=np.float64)
+        pose = as_floats(world_from_tool, "a pose")
         located = self.locate(shell, pose)
         if strategy == "auto" and not located.keys.size:
             strategy = "array"  # nothing to ask: the tool is beside the grid
@@ -251,6 +252,8 @@ class HapticQuery:
 def as_id(object_id: int) -> int:
     """An object's id as a plain int; refuses what is none."""
     try:
+        if isinstance(object_id, bool):
+            raise TypeError  # noqa: TRY301 - no id, though Python counts it among the integers
         plain = operator.index(object_id)
     except TypeError as error:
         raise UsageError(
@@ -263,6 +266,6 @@ def as_id(object_id: int) -> int:
 
 def as_ids(exclude: Iterable[int]) -> NDArray[np.int64]:
     """Ids of objects, ascending and distinct, as kernels take them."""
-    if not isinstance(exclude, Iterable):
+    if not isinstance(exclude, Iterable) or isinstance(exclude, (bytes, bytearray, memoryview)):
         raise UsageError(f"exclude {exclude!r}: give ids in a list")
     return np.array(sorted({as_id(i) for i in exclude}), dtype=np.int64)

@@ -23,6 +23,7 @@ from hapticdb.kernels.cells import (
     feel_kernel,
 )
 from hapticdb.pointshell import PointShell
+from hapticdb.poses import as_floats
 from hapticdb.realtime.residency import Residency
 
 RUN = 64
@@ -119,7 +120,7 @@ class Frames:
         UsageError
             When a pose is not rigid.
         """
-        matrices = np.ascontiguousarray(poses, dtype=np.float64).reshape(-1, 4, 4)
+        matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
         out = np.zeros((len(matrices), RESULTS))
         done = 0
         while done < len(matrices):

@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import UsageError
 from hapticdb.kernels import sweep as kernels
 from hapticdb.pointshell import PointShell
-from hapticdb.poses import quaternion_of, rotation_of
+from hapticdb.poses import as_floats, quaternion_of, rotation_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -125,10 +125,7 @@ class Path:
 
 def _checked(poses: ArrayLike) -> Floats:
     """Poses (M, 4, 4), each a rigid transform."""
-    try:
-        given = np.ascontiguousarray(poses, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise UsageError("a path that is no array of numbers: give poses (M, 4, 4)") from None
+    given = as_floats(poses, "a path")
     if given.ndim != 3 or given.shape[1:] != (4, 4) or not len(given):
         raise UsageError(f"a path of shape {given.shape}: give poses (M, 4, 4), one at least")
     rotations = given[:, :3, :3]

@@ -1,5 +1,6 @@
 """What an engine does for an environment: the Store protocol and the rows that cross it."""
 
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
@@ -119,10 +120,29 @@ def present_already(record: Object, url: str) -> EnvironmentExistsError:
     )
 
 
+_forked_as = 0
+"""Process id of a process that was forked since this module was loaded, else 0."""
+
+
+def _note_fork() -> None:
+    global _forked_as  # noqa: PLW0603 - one number a process, read in every call
+    _forked_as = os.getpid()
+
+
+os.register_at_fork(after_in_child=_note_fork)
+
+
+def this_thread() -> int:
+    """Number of the calling thread; a forked copy of a thread has another one."""
+    return get_ident() + _forked_as
+
+
 def check_thread(owner: int, url: str) -> None:
-    """Refuse a call from another thread than the one that a store belongs to."""
-    if get_ident() != owner:
-        raise UsageError(f"{url} belongs to the thread that opened it: open it here, too")
+    """Refuse a call from another thread, or process, than the one that a store belongs to."""
+    if this_thread() != owner:
+        raise UsageError(
+            f"{url} belongs to the thread that opened it, in its own process: open it here, too"
+        )
 
 
 def check_outside(depth: int, url: str) -> None:

@@ -10,7 +10,6 @@ import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from threading import get_ident
 from typing import Any, cast
 
 import apsw
@@ -41,6 +40,7 @@ from hapticdb.store.base import (
     no_object,
     present_already,
     row_shift,
+    this_thread,
     touched_ranges,
 )
 from hapticdb.store.quantiles import exact_quantiles
@@ -91,7 +91,7 @@ class SQLiteStore:
         self.identity = self._file.identity
         self._depth = 0
         self._noticed = -1
-        self._thread = get_ident()
+        self._thread = this_thread()
         self.is_closed = False
         self.grid, self.layout = self._read_environment()
         self._shift = row_shift(self.layout)

@@ -10,7 +10,6 @@ import re
 import select
 import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from threading import get_ident
 from typing import Any, Self, TypeVar, cast
 
 import psycopg
@@ -18,7 +17,7 @@ from psycopg import pq, sql
 from psycopg.errors import error_from_result
 
 from hapticdb.errors import ConnectionLostError, DatabaseError, StuckError
-from hapticdb.store.base import check_outside, check_thread
+from hapticdb.store.base import check_outside, check_thread, this_thread
 from hapticdb.store.postgres import failures
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.wire import Parameter
@@ -76,7 +75,7 @@ class Session:
         self.shown = address.shown
         self.is_read_only = read_only
         self._conninfo = conninfo
-        self._thread = get_ident()
+        self._thread = this_thread()
         self._depth = 0
         self._leisure = 0
         self.is_loading = False

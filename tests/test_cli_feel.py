@@ -42,6 +42,16 @@ def feel(*args: object) -> tuple[object, ...]:
     return ("feel", "scene.db", "--tool", "tool.npz", *args)
 
 
+def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    wish = feel("--device", "path.csv", "--seconds", 0.2)
+    code, out, err = run(*wish)
+    assert (code, err) == (0, "")
+    assert re.search(r"^ *played at +0\.1 m/s: the path has no times", out, re.MULTILINE)
+    assert json.loads(run(*wish, "--json")[1])["path_speed"] == 0.1
+    assert json.loads(run(*wish, "--json", "--speed", 0.2)[1])["path_speed"] is None
+
+
 def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) -> None:
     """And told to differ once an object has moved."""
     before = children()

@@ -126,6 +126,7 @@ def test_frames_that_were_unknown_or_held_are_skipped(
     frames["unknown"] = 1
     found = replay(record(tmp_path / "none.hdbrec", env, sphere, frames), env)
     assert found.describe() == "nothing to compare: 60 skipped (unknown or held)"
+    assert not found.is_equal
 
 
 @pytest.mark.parametrize("column", ["wrench", "hits"])

@@ -34,6 +34,9 @@ PolicyName = Literal["hold", "wait"]
 MOST_NAMED = 8
 TERMINATED = 128 + signal.SIGTERM
 DEFAULT_SPEED = 0.3
+"""Fastest of a random hand, m/s."""
+PATH_SPEED = 0.1
+"""Of a path that has no times, m/s."""
 LOOK_EVERY = 0.25
 """Seconds between looks whether the recording goes on."""
 VENDORS = {
@@ -134,7 +137,15 @@ def feel(
     excluded = ids_of(exclude or (), "--exclude")
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
-    hand = _device(device, speed=speed, at=at, seed=seed or 0, loops=loop, is_simulated=simulate)
+    assumed = _assumed_speed(device, speed)
+    hand = _device(
+        device,
+        speed=speed if assumed is None else assumed,
+        at=at,
+        seed=seed or 0,
+        loops=loop,
+        is_simulated=simulate,
+    )
     handle = Handle(scale=scale, clutch=clutch)
     render.compile_kernels("feel")
     # a saved shell takes no seed, and a random hand does
@@ -161,9 +172,9 @@ def feel(
         ):
             report = _waited_for(session)
         if json:
-            render.say_json(report.figures())
+            render.say_json(report.figures() | {"path_speed": assumed})
         else:
-            _show(report, cells, record)
+            _show(report, cells, record, assumed)
     if signal.SIGTERM in signals:
         render.note(f"ended by SIGTERM after {report.loop.seconds:.3g} s")
         raise typer.Exit(TERMINATED)
@@ -224,7 +235,8 @@ def replay(
 ) -> None:
     """Compute a recorded session's contact wrenches again, and say where they part.
 
-    Ends with exit code 0 when all are equal bit for bit, 1 when some differ.
+    Ends with exit code 0 when all are equal bit for bit, 1 when some differ
+    or there was none to compare.
 
     Example: hapticdb replay session.hdbrec car.db
     """
@@ -324,7 +336,18 @@ def _device(
     return SimulatedDevice(hand) if is_simulated else hand
 
 
-def _show(report: "Report", cells: "ResidentCells", record: str | None) -> None:
+def _assumed_speed(device: str, speed: float | None) -> float | None:
+    """Speed, m/s, at which a path of poses without times is played when none is asked for."""
+    from hapticdb.poses import read_timed_poses
+
+    if speed is not None or not device.lower().endswith(".csv"):
+        return None
+    return PATH_SPEED if read_timed_poses(device)[0] is None else None
+
+
+def _show(
+    report: "Report", cells: "ResidentCells", record: str | None, assumed: float | None
+) -> None:
     """Print what a session was like, the empty loop beside it."""
     columns = ("", "session>", "empty loop>")
     loops = (report.loop, report.empty)
@@ -396,6 +419,8 @@ def _show(report: "Report", cells: "ResidentCells", record: str | None) -> None:
                 ),
             )
         )
+    if assumed is not None:
+        facts.append(("played at", f"{assumed} m/s: the path has no times (column t); --speed"))
     if record is not None:
         lost = f", {report.lost_records:,} lost" if report.lost_records else ""
         lost += ", not to the end" if report.recording_ended else ""

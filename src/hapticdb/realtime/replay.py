@@ -76,8 +76,8 @@ class Replayed:
 
     @property
     def is_equal(self) -> bool:
-        """Whether no frame differs."""
-        return self.parting is None
+        """Whether frames were compared and none differs."""
+        return self.n_compared > 0 and self.parting is None
 
     def describe(self) -> str:
         """One line for people."""

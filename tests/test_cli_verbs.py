@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 import hapticdb
-from command_line import PLACES, Run, boxes, made, refused, rows_of, run, scene, tool  # noqa: F401 - fixtures
+from command_line import PLACES, Run, boxes, made, poses, refused, rows_of, run, scene, tool  # noqa: F401 - fixtures
 from hapticdb.query import STRATEGIES
 
 Scene = Path | str
@@ -272,3 +272,43 @@ def test_a_touch_that_cannot_be_is_one_line(
 def test_bad_poses_are_named(run: Run, scene: Scene, tmp_path: Path, text: str) -> None:
     (tmp_path / "bad.csv").write_text(text)
     refused(touch(run, scene, "--poses", "bad.csv"), "bad.csv")
+
+
+# -- names from elsewhere --------------------------------------------------------------------------
+
+UNWANTED = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
+SPITEFUL = ("bell\x07\x1b[2J\x1b]0;owned", "gnp.\u202eexe", "\x9b31mred", "isolated\u2066\u2069")
+
+
+def test_no_name_from_elsewhere_moves_the_cursor_or_turns_the_writing(
+    run: Run, tmp_path: Path
+) -> None:
+    """Of parts in a file and in a database, of the file itself, in results and in errors."""
+    lines = []
+    for n, name in enumerate(SPITEFUL):
+        corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+        lines += [f"o {name}", *(f"v {x + 2 * n} {y} {z}" for x, y, z in corners)]
+        lines += [f"f {a + 4 * n} {b + 4 * n} {c + 4 * n}" for a, b, c in ((1, 3, 2), (1, 2, 4))]
+    file = tmp_path / "pa\x1b[31mrts.obj"
+    file.write_text("\n".join([*lines, ""]))
+    tool(tmp_path / "tool.stl")
+    poses(tmp_path / "path.csv", (0.02, 0.02, 0.0))
+    said = []
+    for args in (
+        ("import", "a.db", file, "--bits", 6),
+        ("import", "a.db", file, "no\x1b[31m.obj"),
+        ("objects", "a.db"),
+        ("objects", "a.db", "--json"),
+        ("touch", "a.db", "--tool", "tool.stl", "--poses", "path.csv"),
+        ("move", "a.db", 1, "--translate", "0.1,0,0"),
+        ("remove", "a.db", 1),
+        ("info", "no\x1b[31m\u202e.db"),
+        ("--debug", "info", "no\x1b[31m\u202e.db"),
+        ("touch", "a.db", "--\x1b[31m"),
+    ):
+        _, out, err = run(*args)
+        assert not UNWANTED.search(out + err)
+        said.append(out + err)
+    for shown in (r"gnp.\u202eexe", r"isolated\u2066\u2069", r"pa\x1b[31mrts.obj"):
+        assert shown in said[2]
+    assert said[6].startswith("removed 1 (bell")

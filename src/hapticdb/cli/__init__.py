@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from itertools import takewhile
 
+from hapticdb.cli import render
 from hapticdb.cli.benching import bench
 from hapticdb.cli.editing import move, remove
 from hapticdb.cli.feeling import feel, replay
@@ -90,9 +91,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _fail(message: str, code: int, *, show_trace: bool = False) -> int:
     if show_trace:
-        traceback.print_exc()
+        sys.stderr.write(render.printable(traceback.format_exc()))
     with contextlib.suppress(BrokenPipeError):
-        print(f"hapticdb: {' '.join(message.splitlines())}", file=sys.stderr)
+        render.note(message)
     return code
 
 

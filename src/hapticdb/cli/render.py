@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -9,22 +10,44 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
+    from rich.text import Text
 
     from hapticdb import transfer
     from hapticdb.ingest import ProgressCallback
 
+_UNPRINTABLE = re.compile(
+    "[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"
+)
+"""Controls of a terminal, and of the direction of writing; a line's end is neither."""
+NEW_LINE = "\n"
 PIPED_WIDTH = 10_000
 """Columns where nobody looks: what reads a pipe wants whole lines."""
 
 
+def printable(text: str) -> str:
+    r"""Text from anywhere, names of parts and files among it, as a terminal may have it.
+
+    What would move the cursor, change colours or turn the direction of writing is shown as an
+    escape, such as ``\x1b``.
+    """
+    return _UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text)
+
+
 def note(text: str) -> None:
     """Say something on standard error, in a line."""
-    print(f"hapticdb: {' '.join(text.splitlines())}", file=sys.stderr)
+    print(f"hapticdb: {printable(' '.join(text.split(NEW_LINE)))}", file=sys.stderr)
 
 
 def say(text: str = "") -> None:
     """Print a line of a result."""
-    print(text)
+    print(printable(text))
+
+
+def _cell(text: str) -> "Text":
+    """Text of one cell of a table, in one line."""
+    from rich.text import Text
+
+    return Text(printable(text).replace(NEW_LINE, "\\n"))
 
 
 def say_json(record: Mapping[str, Any]) -> None:
@@ -71,20 +94,19 @@ def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> "RenderableT
             overflow="fold",
         )
     for row in rows:
-        laid.add_row(*(Text(cell) for cell in row))
+        laid.add_row(*map(_cell, row))
     return laid
 
 
 def facts(rows: Iterable[tuple[str, str]]) -> "RenderableType":
     """Lay out names and values, a pair a line."""
     from rich.table import Table
-    from rich.text import Text
 
     laid = Table.grid(padding=(0, 2))
     laid.add_column(no_wrap=True, style="dim")
     laid.add_column(overflow="fold")
     for name, value in rows:
-        laid.add_row(Text(name), Text(value))
+        laid.add_row(_cell(name), _cell(value))
     return laid
 
 
@@ -202,4 +224,4 @@ def _bar(first: str, noun: str) -> Iterator[Callable[[str, int, int, int], None]
 
 def _short(link: str, most: int = 24) -> str:
     name = link.rsplit("/", 1)[-1]
-    return name if len(name) <= most else f"{name[: most - 1]}…"
+    return printable(name if len(name) <= most else f"{name[: most - 1]}…")

@@ -171,3 +171,19 @@ def test_compiling_that_is_interrupted_ends_its_processes(
     for pid in started:
         with pytest.raises(ProcessLookupError):
             os.kill(pid, 0)
+
+
+@NEEDS_JIT
+@pytest.mark.parametrize(
+    "words", ["import a.db none.stl", "feel a.db --tool none.stl --device p.csv"]
+)
+def test_nobody_waits_for_kernels_to_hear_that_a_file_is_missing(
+    tmp_path: Path, words: str
+) -> None:
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    (tmp_path / "p.csv").write_text("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n0,0,1,1,0,0,0\n")
+    done = finished(command(*words.split()), cwd=tmp_path, env=env)
+    assert done.returncode == 2
+    assert "compiling" not in done.stderr
+    assert "none.stl" in done.stderr
+    assert not list((tmp_path / "cache").rglob("*.nbi"))

@@ -147,7 +147,7 @@ def feel(
         is_simulated=simulate,
     )
     handle = Handle(scale=scale, clutch=clutch)
-    render.compile_kernels("feel")
+    render.compile_kernels("feel", files=[tool])
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
     shell = shell_of(tool, tool_unit, points, None if is_for_hand_alone else seed)

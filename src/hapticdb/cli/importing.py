@@ -89,7 +89,7 @@ def import_(
         jobs=jobs,
     )
     try:
-        render.compile_kernels("import")
+        render.compile_kernels("import", files=files)
         started = time.perf_counter()
         with render.import_bar() as progress:
             reports = import_files(url, files, options, progress)

@@ -82,7 +82,7 @@ def sweep(
     excluded = ids_of(exclude or (), "--exclude")
     poses = read_poses(path)
     with hapticdb.open(url, read_only=True) as env:
-        render.compile_kernels("sweep")
+        render.compile_kernels("sweep", files=[tool] if tool else [])
         if tool is not None:
             shell = shell_of(tool, tool_unit, points, seed)
         else:

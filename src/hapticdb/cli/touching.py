@@ -51,7 +51,7 @@ def touch(
     path = read_poses(poses)
     summary = _Summary()
     with hapticdb.open(url, read_only=True) as env:
-        render.compile_kernels("touch")
+        render.compile_kernels("touch", files=[tool])
         shell = shell_of(tool, tool_unit, points, seed)
 
         def felt(index: int) -> "Touch":

@@ -22,7 +22,7 @@ import math
 
 import numpy as np
 
-from hapticdb.kernels._jit import inlined, leaf
+from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.cells import UNKNOWN, cell_key, slot_of
 from hapticdb.kernels.contact import turn
 
@@ -32,7 +32,7 @@ CLEARLY = 0.8
 """Of the cosine to the best of two sides: below it lies the other."""
 
 
-@inlined
+@leaf
 def state_of(keys, slots, words, which, side, i, j, k):
     """1 where voxel (i, j, k) is occupied, 0 where it is free or outside the grid, or UNKNOWN."""
     if not (0 <= i < side and 0 <= j < side and 0 <= k < side):
@@ -43,7 +43,7 @@ def state_of(keys, slots, words, which, side, i, j, k):
     return np.int64((words[slot, ((i & 31) << 5) | (j & 31)] >> np.uint32(k & 31)) & 1)
 
 
-@inlined
+@leaf
 def voxel_under(points, n, pose, place):
     """Voxel of point n under a pose, as `felt` finds it; outside the grid, too."""
     x, y, z = points[n, 0], points[n, 1], points[n, 2]
@@ -57,7 +57,7 @@ def voxel_under(points, n, pose, place):
     )
 
 
-@inlined
+@leaf
 def lever_of(points, n, pose, center):
     """Lever of point n about the centre, world frame."""
     x, y, z = points[n, 0] - center[0], points[n, 1] - center[1], points[n, 2] - center[2]

@@ -1,7 +1,7 @@
 """Entries compiled before their first call, side by side in processes of their own.
 
 numba compiles one function at a time in a process, whatever the threads. So each process owns
-whole modules of entries, or a single large entry: two processes that wrote the index of one entry
+whole modules of entries: two processes that wrote the index of one entry
 would lose each other's work. What is compiled goes into the cache on disk, from which the process
 that asked, and every later one, loads it. A mark beside it tells that an entry is there, without
 numba having to look.
@@ -51,8 +51,8 @@ ENTRIES = {
 """Entries by module, those that take longest to compile first. They are named here so that nobody
 loads numba to see that they are compiled."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
-LARGE = ("coupling.advance", "voxelize.voxelize_kernel", "cells.feel_kernel")
-"""Entries that take seconds: each is a job of its own. `feel_kernel` shares most of `advance`."""
+TOGETHER = {"cells": "coupling"}
+"""Modules that are compiled after another in one process, since they share its leaves."""
 LONGEST_S = 600.0
 """Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
 where it is first called."""
@@ -66,7 +66,9 @@ _COST = (
     "contact.locate_kernel", "contact.spans_of_keys", "contact.wrench_of_addresses",
     "grouping.gap_rows", "grouping.group_by_gap", "grouping.group_by_cost", "curves.*",
 )  # fmt: skip
-_RESIDENT = ("cell_table.*", "cells.*", "grouping.group_spans_by_cost", *_COST)
+_RESIDENT = (
+    "cell_table.*", "cells.bounding_spheres", "grouping.group_spans_by_cost", *_COST,
+)  # fmt: skip
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": (*_VOXELIZE, "bricks.mark_points_kernel"),
     "move": (*_VOXELIZE, "bricks.mark_points_kernel", *_RANGES),
@@ -76,8 +78,8 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "touch": (*_SHELL, *_COST, "contact.*"),
     "resident": _RESIDENT,
     "feel": (*_SHELL, *_RESIDENT, "coupling.*", "servo.*", "handle.*", "motion.*"),
-    "replay": (*_RESIDENT, "motion.poses_of"),
-    "sweep": (*_SHELL, *_RESIDENT, "sweep.*", *_RANGES),
+    "replay": (*_RESIDENT, "cells.*", "motion.poses_of"),
+    "sweep": (*_SHELL, *_RESIDENT, "cells.*", "sweep.*", *_RANGES),
     "everything": ("*",),
 }
 """Entries that a purpose calls, with ``*`` for any name; `tests/test_warm.py` holds them to it."""
@@ -150,13 +152,12 @@ def load(names: Collection[str]) -> None:
 
 
 def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
-    """Names by job: large entries alone, others by module, so that they share their leaves."""
-    jobs: list[tuple[str, ...]] = [(name,) for name in LARGE if name in names]
-    for module in ENTRIES:
-        rest = [name for name in names if name.startswith(f"{module}.") and name not in LARGE]
-        if rest:
-            jobs.append(tuple(rest))
-    return jobs
+    """Names by job: entries of one module, and of one that goes with it, share their leaves."""
+    jobs: dict[str, list[str]] = {}
+    for name in sorted(names, key=NAMES.index):
+        module = name.partition(".")[0]
+        jobs.setdefault(TOGETHER.get(module, module), []).append(name)
+    return list(map(tuple, jobs.values()))
 
 
 class _Workers:

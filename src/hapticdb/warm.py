@@ -8,7 +8,7 @@ from hapticdb.kernels.compiling import NAMES, Compiled, compile_missing, load
 def warm_up(progress: Callable[[Compiled], None] | None = None) -> None:
     """Compile every kernel that this machine has not compiled yet, and load all of them.
 
-    Half a minute on two processors where nothing is compiled yet, a process for each; under a
+    Half a minute on two processors where nothing is compiled yet, a process for each; about a
     second later. Afterwards no import, touch, session or sweep of this process compiles anything
     (`tests/test_warm.py`).
 

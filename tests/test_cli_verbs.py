@@ -274,6 +274,15 @@ def test_bad_poses_are_named(run: Run, scene: Scene, tmp_path: Path, text: str) 
     refused(touch(run, scene, "--poses", "bad.csv"), "bad.csv")
 
 
+def test_a_few_poses_are_touched_without_measuring_costs_first(run: Run, scene: Path) -> None:
+    args = ("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", "--json")
+    used = {json.loads(line)["query"]["strategy"] for line in run(*args)[1].splitlines()}
+    assert used == {"array"}
+    assert run("calibrate", scene)[0] == 0
+    used = {json.loads(line)["query"]["strategy"] for line in run(*args)[1].splitlines()}
+    assert used <= set(STRATEGIES)
+
+
 # -- names from elsewhere --------------------------------------------------------------------------
 
 UNWANTED = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")

@@ -10,12 +10,15 @@ from hapticdb.cli import render
 from hapticdb.cli.root import Exclude, Json, Points, Seed, StrategyName, ToolUnit, Url, ids_of
 
 if TYPE_CHECKING:
-    from hapticdb.environment import Touch
+    from hapticdb.environment import Environment, Touch
     from hapticdb.pointshell import PointShell
+    from hapticdb.query import Strategy
     from hapticdb.store.base import Object
 
 DEFAULT_POINTS = 300
 MOST_TOUCHED = 8
+FEW_POSES = 500
+"""Poses of a path for which measuring the database's costs, most of a second, does not pay."""
 
 
 def touch(
@@ -53,9 +56,10 @@ def touch(
     with hapticdb.open(url, read_only=True) as env:
         render.compile_kernels("touch", files=[tool])
         shell = shell_of(tool, tool_unit, points, seed)
+        asked = _strategy_of(strategy, env, len(path))
 
         def felt(index: int) -> "Touch":
-            return env.touch(shell, path[index], strategy, exclude=excluded, maxgap=maxgap, law=law)
+            return env.touch(shell, path[index], asked, exclude=excluded, maxgap=maxgap, law=law)
 
         felt(0)  # compiles kernels and reads statistics, which belong to no frame's time
         for index in range(len(path)):
@@ -66,6 +70,15 @@ def touch(
                 summary.add(touched)
     if not json:
         summary.show()
+
+
+def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strategy":
+    """`array` for `auto` on a short path, where the costs that `auto` decides by are not kept."""
+    from hapticdb.statistics import machine_name
+
+    if wanted == "auto" and n_poses < FEW_POSES and not env.store.costs(machine_name()):
+        return "array"
+    return wanted
 
 
 def shell_of(tool: str, unit: str | None, points: int | None, seed: int | None) -> "PointShell":

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from hapticdb import Grid
 from hapticdb.errors import GridError, UsageError
-from hapticdb.grid import CURVE_NAMES, MAX_BITS, ROOM, CurveName, GridOptions
+from hapticdb.grid import CURVE_CODES, CURVE_NAMES, MAX_BITS, ROOM, CurveName, GridOptions
+from hapticdb.kernels import curves
 
 few = settings(max_examples=200, deadline=None)
 BOUNDS = np.array([[-1.0, 0.5, 2.0], [3.0, 1.5, 4.0]])  # sides 4, 1 and 2 m
@@ -305,3 +306,8 @@ def test_the_options_of_a_grid_match_it_again(extent: float) -> None:
     """The same command run again finishes an import: extent and voxel size together, too."""
     options = GridOptions(voxel_size=0.01, extent=extent)
     options.check_matches(options.fit(BOUNDS), BOUNDS)
+
+
+def test_the_numbers_of_the_curves_are_those_of_the_kernels() -> None:
+    named = {"lexicographic": curves.LEXICOGRAPHIC, "z": curves.Z_ORDER, "hilbert": curves.HILBERT}
+    assert named == CURVE_CODES

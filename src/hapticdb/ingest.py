@@ -263,8 +263,8 @@ def ingest_file(
 class _KnownParts:
     """Parts of a file that an environment holds, brought up to date by its log of changes.
 
-    A listing of all objects for each part that another import has added took 443 s of an import
-    of 4,000 parts.
+    Of two imports of one file of 1,500 parts at once, the second took 33 s with a listing of all
+    objects for each part that the other had added, and 4.6 s so.
     """
 
     def __init__(self, store: Store, link: str) -> None:

@@ -60,7 +60,9 @@ SERVE = "from hapticdb.kernels.compiling import serve; serve()"
 """What a process that compiles runs."""
 
 _SHELL = ("sampling.*", "sides.*", "curves.encode_kernel")
-_VOXELIZE = ("voxelize.*", "bricks.z_keys_kernel", "bricks.count_kernel")
+_VOXELIZE = (
+    "voxelize.*", "bricks.z_keys_kernel", "bricks.mark_points_kernel", "bricks.count_kernel",
+)  # fmt: skip
 _RANGES = ("grouping.ranges_of_box", "bricks.brick_voxels_kernel")
 _COST = (
     "contact.locate_kernel", "contact.spans_of_keys", "contact.wrench_of_addresses",
@@ -70,8 +72,8 @@ _RESIDENT = (
     "cell_table.*", "cells.bounding_spheres", "grouping.group_spans_by_cost", *_COST,
 )  # fmt: skip
 PURPOSES: dict[str, tuple[str, ...]] = {
-    "import": (*_VOXELIZE, "bricks.mark_points_kernel"),
-    "move": (*_VOXELIZE, "bricks.mark_points_kernel", *_RANGES),
+    "import": _VOXELIZE,
+    "move": (*_VOXELIZE, *_RANGES),
     "copy": ("bricks.*", "curves.*", "grouping.gap_rows", *_RANGES),
     "shell": _SHELL,
     "calibrate": _COST,
@@ -115,7 +117,7 @@ def compile_missing(
     Parameters
     ----------
     names : collection of str
-        Entries, as `entry_names` gives them.
+        Entries, as `NAMES` has them.
     progress : callable or None
         Called from this thread, at the start and after each entry.
     jobs : int or None
@@ -167,6 +169,7 @@ class _Workers:
         self._idle: list[subprocess.Popen[str]] = []
         self._all: list[subprocess.Popen[str]] = []
         self._lock = Lock()
+        self._has_ended = False
 
     def __enter__(self) -> Self:
         return self
@@ -183,6 +186,8 @@ class _Workers:
     def compile(self, job: tuple[str, ...]) -> int:
         """Let a process compile that job; returns how many entries it has, compiled or not."""
         with self._lock:
+            if self._has_ended:
+                return 0
             worker = self._idle.pop() if self._idle else self._started()
         if worker is not None and worker.stdin is not None and worker.stdout is not None:
             patience = Timer(LONGEST_S, worker.kill)
@@ -202,6 +207,7 @@ class _Workers:
     def end(self) -> None:
         """End every process, compiling or not: nothing half-written stays (numba renames)."""
         with self._lock:
+            self._has_ended = True
             self._idle.clear()
             for worker in self._all:
                 worker.kill()

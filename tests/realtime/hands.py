@@ -1,7 +1,9 @@
 """Hands that misbehave, for the loop's process to import, and those of the tests of sessions."""
 
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -117,3 +119,27 @@ class Beckoned(Slow):
             self.hand.rewind()
         reading = super().read()
         return reading if self.is_called else reading._replace(velocity=np.zeros(6))
+
+
+class Odd(Slow):
+    """A hand whose reads from the n-th on, so many, are changed."""
+
+    def __init__(
+        self,
+        hand: Player,
+        change: Callable[[Reading], object],
+        first: int = 0,
+        n_reads: int = 1 << 30,
+    ) -> None:
+        super().__init__(hand, 1 << 30, 0.0)
+        self.change, self.first, self.last = change, first, first + n_reads
+        self.pushed: list[Floats] = []
+
+    def read(self) -> Reading:
+        reading = super().read()
+        if not self.first <= self.reads < self.last:
+            return reading
+        return cast("Reading", self.change(reading))
+
+    def apply(self, wrench: Floats) -> None:
+        self.pushed.append(wrench.copy())

@@ -3,6 +3,7 @@
 import dataclasses
 import io
 import pickle
+import re
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -28,7 +29,8 @@ from hapticdb.realtime.resident import ResidentCells
 from hapticdb.realtime.session import frames_of
 from hapticdb.realtime.table import anonymous_memory
 from hapticdb.testing import floor_voxels, write_voxels
-from realtime.hands import Clutched, Lost, Slow, Talking, Unplugged, still, stroking
+from realtime.hands import Clutched, Lost, Odd, Slow, Talking, Unplugged, still, stroking
+from realtime.readings import FAULTS, FORMS, MOMENTS, Change
 from realtime.worlds import make
 
 N_RING = 4096
@@ -193,6 +195,49 @@ def test_a_hand_that_never_knows_its_place_is_an_error(
     monkeypatch.setattr(subject, "WARM_PATIENCE", 0.05)
     with pytest.raises(DeviceError, match=r"has not said where it is within 0.05 s.*calibration$"):
         run(Lost(still(0.010), 1 << 30, 0.0))
+
+
+@pytest.mark.parametrize(("change", "told"), FAULTS)
+def test_a_reading_of_the_wrong_kind_ends_the_loop_without_force(
+    run: Run, change: Change, told: str
+) -> None:
+    hand = Odd(still(0.010), change, first=100)
+    with pytest.raises(DeviceError, match=rf"^Odd\.read\(\) returned {told}.*; expected [^\n]+$"):
+        run(hand)
+    assert any(wrench.any() for wrench in hand.pushed)
+    assert not hand.pushed[-1].any()
+
+
+@pytest.mark.parametrize(("change", "told"), MOMENTS)
+def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(
+    run: Run, change: Change, told: str
+) -> None:
+    hand = Odd(still(0.010), change, first=60, n_reads=50)
+    answer, frames = run(hand, seconds=0.5)
+    counts = answer.counts
+    assert counts.nowhere_frames == 50
+    assert counts.bad_reading is not None
+    assert re.match(rf"Odd\.read\(\) returned {told}; expected ", counts.bad_reading)
+    assert np.isfinite(frames["tool"]).all()
+    forces = np.linalg.norm(frames["applied"][:, :3], axis=1)
+    assert forces[-1] > 0.0
+    assert (forces == 0.0).any()
+    assert counts.frames == len(frames)
+
+
+def test_a_hand_that_is_never_a_rotation_does_not_begin(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.05)
+    with pytest.raises(DeviceError, match=r"within 0.05 s: Odd.*no rigid transform.*calibration$"):
+        run(Odd(still(0.010), lambda reading: reading._replace(pose=2.0 * np.eye(4))))
+
+
+@pytest.mark.parametrize("change", FORMS)
+def test_a_reading_of_another_form_is_felt_as_it_is(run: Run, change: Change) -> None:
+    answer, frames = run(Odd(still(0.015625), change))  # a number that single precision has, too
+    assert answer.counts.nowhere_frames == 0
+    assert (frames["hand"] == (0.0, 0.0, 0.015625, 1.0, 0.0, 0.0, 0.0)).all()
 
 
 def test_a_start_without_cells_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:

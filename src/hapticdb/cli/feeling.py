@@ -409,6 +409,9 @@ def _show(
         ),
         ("objects", _named(report, cells)),
     ]
+    if report.bad_reading is not None:
+        held = render.counted(report.nowhere_frames, "frame")
+        facts.append(("hand nowhere", f"{held}: {report.bad_reading}"))
     if cache.losses or cache.restarts:
         facts.append(
             (

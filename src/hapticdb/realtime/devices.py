@@ -1,7 +1,4 @@
-"""Devices: what a hand holds, read and pushed once a period; and those that follow a script.
-
-A device is two methods. What only some can do is a small Protocol of its own, and a device is
-pickled into the process of the loop before it is opened there.
+"""Devices that follow a script; what any device is, is in `hapticdb.realtime.readings`.
 
 Scripted devices need no hardware. They read the time from a clock and start at their first read.
 What a read of theirs returns holds until the next read: its arrays are written anew each time.
@@ -11,7 +8,6 @@ import math
 import os
 import time
 from collections.abc import Callable
-from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +15,32 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import UsageError
 from hapticdb.kernels.motion import play, survey, sway
 from hapticdb.poses import quaternion_of, read_timed_poses
+from hapticdb.realtime.readings import (
+    Device,
+    Reading,
+    SupportsClose,
+    SupportsEnd,
+    SupportsOpen,
+    SupportsRewind,
+)
+
+__all__ = [
+    "Circle",
+    "Clock",
+    "Device",
+    "Line",
+    "Path",
+    "Player",
+    "RandomHand",
+    "Reading",
+    "SupportsClose",
+    "SupportsEnd",
+    "SupportsOpen",
+    "SupportsRewind",
+    "Tumble",
+    "capped",
+    "pose_at",
+]
 
 Clock = Callable[[], float]
 """Seconds since some instant, never going back."""
@@ -31,84 +53,6 @@ CYCLE = 20.0
 
 SLOWEST, FASTEST = 0.3, 8.0
 """Frequencies (Hz) of a hand's motion."""
-
-
-class Reading(NamedTuple):
-    """What a device reports."""
-
-    pose: NDArray[np.float64]
-    """(4, 4) rigid transform `world_from_hand`, metres, in the device's frame."""
-
-    velocity: NDArray[np.float64]
-    """(6,) of the hand's origin in m/s, then angular in rad/s, in the device's frame."""
-
-    buttons: int
-    """A bit for each button held down, the first button the least significant."""
-
-
-class Device(Protocol):
-    """What a hand holds."""
-
-    def read(self) -> Reading:
-        """Where the hand is now.
-
-        Raises
-        ------
-        DeviceError
-            If the device does not answer or was unplugged.
-        """
-
-    def apply(self, wrench: NDArray[np.float64]) -> None:
-        """Push the hand with a wrench (6,), N and N m in the device's frame, until the next call.
-
-        The device caps it to what it can do.
-
-        Raises
-        ------
-        DeviceError
-            If the device does not answer or was unplugged.
-        """
-
-
-@runtime_checkable
-class SupportsOpen(Protocol):
-    """A device that is opened, once, in the process that uses it."""
-
-    def open(self) -> None:
-        """Take hold of the hardware.
-
-        Raises
-        ------
-        DeviceError
-            If there is no such device.
-        MissingExtraError
-            If the package that speaks to it is not installed.
-        """
-
-
-@runtime_checkable
-class SupportsClose(Protocol):
-    """A device that wants to know when the session ends."""
-
-    def close(self) -> None:
-        """Take the force away and let go of the hardware; a second call does nothing."""
-
-
-@runtime_checkable
-class SupportsEnd(Protocol):
-    """A device that comes to an end: a path that is over."""
-
-    @property
-    def is_over(self) -> bool:
-        """Whether the last reading was at the end, where the hand rests from then on."""
-
-
-@runtime_checkable
-class SupportsRewind(Protocol):
-    """A device with a script, which can be begun again."""
-
-    def rewind(self) -> None:
-        """Begin anew at the next read."""
 
 
 def capped(wrench: NDArray[np.float64], force: float, torque: float) -> NDArray[np.float64]:

@@ -28,19 +28,11 @@ from hapticdb.kernels.cells import (
     UNKNOWNS,
     Place,
 )
-from hapticdb.kernels.handle import FARTHEST, is_somewhere
+from hapticdb.kernels.handle import is_somewhere
 from hapticdb.kernels.motion import poses_of
 from hapticdb.pointshell import PointShell
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
-from hapticdb.realtime.devices import (
-    Device,
-    Reading,
-    SupportsClose,
-    SupportsEnd,
-    SupportsOpen,
-    SupportsRewind,
-)
 from hapticdb.realtime.frames import clusters_of
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.prefetch import (
@@ -54,6 +46,15 @@ from hapticdb.realtime.prefetch import (
     VELOCITY,
 )
 from hapticdb.realtime.process import Voice, parent_is_gone
+from hapticdb.realtime.readings import (
+    Device,
+    Reader,
+    Reading,
+    SupportsClose,
+    SupportsEnd,
+    SupportsOpen,
+    SupportsRewind,
+)
 from hapticdb.realtime.recorded import State
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
 from hapticdb.realtime.table import ACTIVE, HEARTBEAT, STOP, CellTable
@@ -105,6 +106,7 @@ class Loop:
     def __init__(self, request: LoopRequest) -> None:
         self.request = request
         self.device = request.device
+        self.reader = Reader(request.device)
         self.table = CellTable(request.descriptor, request.n_slots)
         self.cells = self.table.cells
         grid, row, desk = request.grid, request.row, self.table.desk
@@ -163,15 +165,15 @@ class Loop:
     def _read(self) -> Reading:
         """Read where the hand is: a device that has just been opened may not know at once."""
         until = time.monotonic() + WARM_PATIENCE
-        reading = self.device.read()
+        reading = self.reader.read()
         while not is_somewhere(reading.pose, reading.velocity):
             if time.monotonic() > until or self._is_left():
                 raise DeviceError(
-                    f"the device has not said where it is within {WARM_PATIENCE:g} s, its numbers "
-                    f"are none or beyond {FARTHEST:g}: check its connection and calibration"
+                    f"the device has not said where it is within {WARM_PATIENCE:g} s: "
+                    f"{self.reader.complaint()}; check its connection and calibration"
                 )
             time.sleep(1e-3)
-            reading = self.device.read()
+            reading = self.reader.read()
         return reading
 
     def warm_up(self) -> None:
@@ -222,7 +224,7 @@ class Loop:
             self._tell()
             time.sleep(2e-4)
             if is_let_go:
-                reading = self.device.read()
+                reading = self.reader.read()
                 self.request.handle.follow(reading, self.hand)
             self._step(dt, is_stale=False)
         if is_let_go and self.out[UNKNOWNS]:
@@ -288,7 +290,7 @@ class Loop:
     def run(self) -> LoopFigures:
         """Frames on time, for as long as was asked, or until the device ends or all shall stop."""
         request, control = self.request, self.cells.control
-        clock, device = time.perf_counter_ns, self.device
+        clock, device, reader = time.perf_counter_ns, self.device, self.reader
         rate = request.timing.rate
         n_deadlines = max(round(request.seconds * rate), 1)
         tell_every, ask_every, look_every = (
@@ -301,7 +303,7 @@ class Loop:
         while deadlines.passed < n_deadlines:
             at = deadlines.frames
             begun = deadlines.wait()
-            reading = device.read()
+            reading = reader.read()
             request.handle.follow(reading, self.hand)
             is_stale = begun - control[HEARTBEAT] > staleness
             if request.is_waiting:
@@ -361,6 +363,9 @@ class Loop:
             counts.cut_frames += 1
         if is_stale:
             counts.stale_frames += 1
+        if math.isnan(self.hand[0]):
+            counts.nowhere_frames += 1
+            counts.bad_reading = counts.bad_reading or self.reader.complaint() or None
         if is_clutch_open:
             state |= State.CLUTCH_OPEN
         return int(state)

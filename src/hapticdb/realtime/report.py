@@ -83,6 +83,8 @@ class Counts:
     substeps: int = 0
     dropped_frames: int = 0
     cut_frames: int = 0
+    nowhere_frames: int = 0
+    bad_reading: str | None = None
     peak_force: float = 0.0
     peak_torque: float = 0.0
     deepest: float = 0.0
@@ -121,6 +123,10 @@ class Report:
         Frames whose period was too long to be simulated to its end.
     cut_frames : int
         Frames in which the tool was held back at surfaces: a step was cut back, or not made.
+    nowhere_frames : int
+        Frames whose reading was no place: its numbers not finite, too large, or no rotation.
+    bad_reading : str or None
+        The first of them in a line: which device, what it returned, what was expected.
     peak_force, peak_torque, deepest : float
         Greatest norm sent to the device, N and N m; deepest contact, metres.
     warm_up : float
@@ -163,6 +169,8 @@ class Report:
     recorded_frames: int = 0
     lost_records: int = 0
     recording_ended: str | None = None
+    nowhere_frames: int = 0
+    bad_reading: str | None = None
     conditions: dict[str, str] = field(default_factory=dict)
 
     @property

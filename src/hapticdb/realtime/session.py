@@ -17,11 +17,11 @@ from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell import PointShell
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
-from hapticdb.realtime.devices import Device
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
 from hapticdb.realtime.prefetch import ASKED_TO_END, DONE
 from hapticdb.realtime.process import Process
+from hapticdb.realtime.readings import Device, check_device
 from hapticdb.realtime.recorded import FRAME, Frames
 from hapticdb.realtime.recording import DEFAULT_LIMIT, Header, Recorder
 from hapticdb.realtime.report import LoopAnswer, Report
@@ -87,7 +87,9 @@ class Session:
     Raises
     ------
     UsageError
-        When a number is out of its range, or options contradict one another.
+        When a number is out of its range, options contradict one another, or the device is none.
+    DeviceError
+        When the device fails, or what it returns is of the wrong kind; here or in `wait`.
     DatabaseError
         When the environment cannot be opened.
     """
@@ -116,6 +118,7 @@ class Session:
         is_fifo: bool = False,
         processor: int | None = None,
     ) -> None:
+        check_device(device)
         _check_times(rate, seconds, staleness)
         if policy not in get_args(Policy):
             raise UsageError(f"policy {policy!r}: give 'hold' or 'wait'")

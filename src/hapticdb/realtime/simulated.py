@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.handle import is_somewhere
 from hapticdb.kernels.motion import pull
 from hapticdb.poses import quaternion_of
 from hapticdb.realtime.devices import Clock, Device, Reading, SupportsEnd, SupportsRewind, capped
+from hapticdb.realtime.readings import Reader, check_device
 
 STEP = 1e-4
 """Seconds of one step of the integration."""
@@ -44,7 +46,8 @@ class SimulatedDevice:
     Raises
     ------
     UsageError
-        If a number is out of its range, or the grip too stiff for steps of 0.1 ms.
+        If a number is out of its range, the grip too stiff for steps of 0.1 ms, or the hand no
+        device.
     """
 
     def __init__(
@@ -66,7 +69,9 @@ class SimulatedDevice:
         stiffest = max(grip / mass, turn_grip / inertia)
         if STEP * math.sqrt(stiffest) > 0.5:
             raise UsageError("the grip is too stiff for so light a device; soften it or add mass")
+        check_device(hand)
         self.hand = hand
+        self._reader = Reader(hand)
         self.clock = clock
         self.max_force, self.max_torque, self.latency = max_force, max_torque, latency
         self._inertias = (float(mass), float(inertia))
@@ -102,9 +107,16 @@ class SimulatedDevice:
         self._pending.append((self.clock() + self.latency, self._last))
 
     def read(self) -> Reading:
-        """Pose and velocity of the device now; its arrays are written anew by the next read."""
-        hand = self.hand.read()
+        """Pose and velocity of the device now; its arrays are written anew by the next read.
+
+        While the hand is nowhere the device is, too; it rests meanwhile.
+        """
+        hand = self._reader.read()
         now = self.clock()
+        if not is_somewhere(hand.pose, hand.velocity):
+            if self._time is not None:
+                self._time = now
+            return hand
         if self._time is None:
             self._time = now
             self._body[:3] = hand.pose[:3, 3]

@@ -110,7 +110,7 @@ def test_a_part_moves_by_displacements_from_where_it_sits(run: Run, scene: Path)
     found = json.loads(out)
     assert code == 1
     assert [one["name"] for one in found["objects"]] == ["box2"]
-    assert found["tool"] == {"points": 300, "part": 2, "excluded": [2]}
+    assert found["tool"] == {"points": 300, "parts": [2], "excluded": [2]}
     more = ("--exclude", 3)
     assert run("sweep", scene, "--part", 2, "--path", "aside.csv", *more)[0] == 0
 

@@ -33,7 +33,16 @@ FLOORS: list[set[str]] = [
     {"bench", "demo", "picture", "server", "sweep_picture"},
     {"pool", "warm"},
     {"environment", "realtime", "sample", "splat", "testing"},
-    {"choice", "difference", "ingest", "query", "transfer"},
+    {
+        "choice",
+        "difference",
+        "finding",
+        "ingest",
+        "originals",
+        "placing",
+        "query",
+        "transfer",
+    },
     {
         "calibration",
         "grouping",

@@ -27,8 +27,8 @@ from assemblies import ball, box, placement, small_options, write_obj
 from children import PATIENCE, end_forked, joined, received
 from hapticdb import Environment, PointShell
 from hapticdb.cli import main
-from hapticdb.environment import _part_of
 from hapticdb.ingest import rows_of_part
+from hapticdb.originals import parts_of
 from hapticdb.query import STRATEGIES
 from hapticdb.store.base import Object, Rows
 from hapticdb.store.postgres import session
@@ -122,7 +122,7 @@ def processes(
 
 def places_of(env: Environment) -> list[tuple[Object, Rows]]:
     """The shuttle as it stands left and as it stands right, and its rows there."""
-    part = _part_of(env.object(1))
+    ((_, part),) = parts_of([env.object(1)], "moved", "")
     found: list[tuple[Object, Rows]] = []
     for x in (0.0, 0.18):
         placed = placement(x, 0, 0)

@@ -11,12 +11,10 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.calibration import calibrate
 from hapticdb.errors import (
     ConnectionLostError,
-    FileError,
-    GeometryChangedError,
     ObjectNotFoundError,
     ReadOnlyError,
-    UsageError,
 )
+from hapticdb.finding import find_objects
 from hapticdb.force import TangentPlane
 from hapticdb.grid import Grid
 from hapticdb.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
@@ -24,14 +22,13 @@ from hapticdb.ingest import (
     FileReport,
     ImportOptions,
     ProgressCallback,
-    check_placed_inside,
     ingest_file,
-    rows_of_part,
 )
 from hapticdb.layout import voxels_of_rows
-from hapticdb.mesh import Part, read_file
+from hapticdb.mesh import read_file
+from hapticdb.originals import shell_of_objects
+from hapticdb.placing import move_object, shift_objects
 from hapticdb.pointshell import PointShell
-from hapticdb.poses import as_floats
 from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Query, Strategy, as_id, as_ids
 from hapticdb.statistics import DEFAULT_RESOLUTION, CostModel, QuantileVector, machine_name
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
@@ -173,6 +170,39 @@ class Environment:
         """
         return self._store.object(as_id(object_id))
 
+    def find(self, *words: int | str) -> list[Object]:
+        """Objects that ids, names and patterns choose, each once, ordered by id.
+
+        ``env.find(7, "wheel*", "body/door_*")``: the rules, and the errors, are those of
+        `hapticdb.finding.find_objects`. A sub-assembly's name chooses all that is below it.
+        """
+        return find_objects(self._store, words)
+
+    def shell(self, *words: int | str, points: int = 300, seed: int = 0) -> PointShell:
+        """Make objects one rigid tool, where they sit: their surfaces, read from their files again.
+
+        The shell is in the world's frame, metres, so that its own pose is the identity, and the
+        poses of a path are displacements. Leave the objects out of what is felt:
+        ``exclude=[obj.id for obj in env.find(*words)]``.
+
+        Parameters
+        ----------
+        words : int or str
+            As for `find`.
+        points, seed : int
+            As for `PointShell.from_file`, spread over all surfaces together.
+
+        Raises
+        ------
+        ObjectNotFoundError
+            When a word chooses nothing.
+        GeometryChangedError
+            When an object's file is gone or holds another geometry.
+        UsageError
+            When no word is given, or an object is a point cloud, which has no surface.
+        """
+        return shell_of_objects(self.find(*words), points, seed)
+
     def add(
         self,
         file: str | os.PathLike[str],
@@ -237,25 +267,30 @@ class Environment:
             When it would leave the grid.
         """
         self._check_writable()
-        placed = _as_transform(transform)
         old = self.object(object_id)
-        part = _part_of(old)
-        bounds = check_placed_inside(part, old.link, self.grid, placed)
-        rows, n_voxels = rows_of_part(part, self.grid, self.layout, placed)
-        new = Object(
-            id=old.id,
-            name=old.name,
-            link=old.link,
-            digest=old.digest,
-            transform=placed,
-            voxels=n_voxels,
-            bounds=bounds,
-            attributes=old.attributes,
-            revision=revision or 0,
-        )
-        self._store.replace(new, rows, self._covering)
+        move_object(self._store, old, transform, revision, self._covering)
         self._forget()
         return self.object(object_id)
+
+    def shift(self, object_ids: Iterable[int], way: ArrayLike) -> list[Object]:
+        """Shift objects alike from where each is, in a transaction each; files are read once.
+
+        Parameters
+        ----------
+        object_ids : iterable of int
+            Which objects; `find` chooses them by name.
+        way : (3,) array
+            Metres, world frame. Where another moves an object meanwhile, it counts from there.
+
+        Raises
+        ------
+        GeometryChangedError, OutsideGridError
+            As for `move`; then none is shifted.
+        """
+        self._check_writable()
+        shifted = shift_objects(self._store, object_ids, way, self._covering)
+        self._forget()
+        return shifted
 
     def voxels(self, object_id: int) -> NDArray[np.int64]:
         """Voxels (n, 3) that an object's surface touches, in the order of their keys."""
@@ -442,30 +477,3 @@ def create(url: str | os.PathLike[str], grid: Grid, *, layout: Layout = "brick")
         When bricks are asked for in lexicographic order.
     """
     return Environment(create_store(url, grid, layout))
-
-
-def _as_transform(transform: ArrayLike) -> NDArray[np.float64]:
-    placed = as_floats(transform, "a transform").copy()
-    if placed.shape != (4, 4) or not np.isfinite(placed).all() or (placed[3] != (0, 0, 0, 1)).any():
-        raise UsageError("a transform that is no placement: give a finite 4 x 4 matrix in metres")
-    if np.linalg.matrix_rank(placed[:3, :3]) < 3:
-        raise UsageError("a transform that flattens the object: give one that can be undone")
-    return placed
-
-
-def _part_of(obj: Object) -> Part:
-    """Geometry of an object, from its file, checked to be the one that was imported."""
-    unit = obj.attributes.get("unit")
-    try:
-        parts = read_file(obj.link, unit=unit if isinstance(unit, str) else None).parts
-    except FileError as error:
-        raise GeometryChangedError(
-            f"object {obj.id} ({obj.name}) cannot be moved, its file cannot be read: {error}"
-        ) from error
-    for part in parts:
-        if part.name == obj.name and part.digest == obj.digest:
-            return part
-    raise GeometryChangedError(
-        f"object {obj.id} ({obj.name}) cannot be moved: {obj.link} no longer holds the geometry "
-        "that was imported; restore the file, or remove the object and import it again"
-    )

@@ -20,7 +20,7 @@ from hapticdb.layout import rows_of_voxels
 from hapticdb.pointshell import fibonacci_sphere
 from hapticdb.poses import rotation_of
 from hapticdb.realtime import sweep as sweeping
-from hapticdb.realtime.sweep import shell_of_object, sweep
+from hapticdb.realtime.sweep import sweep
 from hapticdb.realtime.sweep_path import Path as Way
 from hapticdb.realtime.swept import Swept
 from hapticdb.store.base import Layout
@@ -441,7 +441,7 @@ def boxes(tmp_path: Path) -> Iterator[Environment]:
 
 def test_an_object_becomes_the_tool_where_it_sits(boxes: Environment) -> None:
     part = next(obj for obj in boxes.objects() if obj.name == "small")
-    shell = shell_of_object(boxes, part.id, 500)
+    shell = boxes.shell(part.id, points=500)
     assert (shell.points >= part.bounds[0] - 1e-9).all()
     assert (shell.points <= part.bounds[1] + 1e-9).all()
     itself = sweep(boxes, shell, [np.eye(4)])
@@ -461,10 +461,10 @@ def test_an_object_whose_file_has_changed_is_no_tool(boxes: Environment) -> None
     obj = boxes.objects()[0]
     Path(obj.link).write_bytes(trimesh.creation.box((1, 1, 1)).export(file_type="glb"))
     with pytest.raises(GeometryChangedError, match="no longer holds"):
-        shell_of_object(boxes, obj.id)
+        boxes.shell(obj.id)
     Path(obj.link).unlink()
     with pytest.raises(GeometryChangedError, match="cannot be read"):
-        shell_of_object(boxes, obj.id)
+        boxes.shell(obj.id)
 
 
 @pytest.mark.parametrize("far", [1e7, 1e30, 1e200, 1e307])

@@ -1,25 +1,22 @@
 """The verbs that edit an environment: move, remove."""
 
-import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Json, Url, ids_of, numbers_of
+from hapticdb.cli.choosing import Chosen, chosen
+from hapticdb.cli.root import Json, Url, numbers_of
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb.environment import Environment
-    from hapticdb.store.base import Object
-
 
 def move(
     url: Url,
-    object_id: Annotated[int, typer.Argument(metavar="ID", help="As 'hapticdb objects' lists it.")],
+    objects: Chosen,
     *,
     translate: Annotated[
         str | None,
@@ -38,9 +35,15 @@ def move(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Place an object anew; its geometry is read from its file again.
+    """Place objects anew; their geometry is read from their files again.
+
+    --translate shifts all that are chosen, or none where one would leave the
+    grid; --pose and --matrix place one. 'hapticdb objects --help' says how
+    names choose objects.
 
     Example: hapticdb move car.db 17 --translate 0,0,0.25
+
+    Example: hapticdb move car.db 'body/door_*' --translate 0,0,0.25
     """
     import hapticdb
     from hapticdb.cli.listing import record_of
@@ -52,30 +55,25 @@ def move(
     placed = _placement(pose, matrix)
     shift = translate and numbers_of(translate, [3], "--translate", "X,Y,Z in metres")
     with hapticdb.open(url) as env:
+        found = chosen(env, objects, "ID|NAME")
+        if not shift and len(found) > 1:
+            raise UsageError(
+                f"--pose and --matrix place one object, and {len(found)} are chosen: give one, or "
+                "--translate"
+            )
         render.compile_kernels("move")
         if shift:
-            moved = _shifted(env, object_id, shift)
+            moved = env.shift([obj.id for obj in found], shift)
         else:
             if pose is not None:
-                _check_unscaled(env.object(object_id).transform)
-            moved = env.move(object_id, placed)
-    if json:
-        render.say_json(record_of(moved))
-    else:
-        low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in moved.bounds.tolist())
-        render.say(f"moved {moved.id} ({moved.name}): now from ({low}) to ({high}) m")
-
-
-def _shifted(env: "Environment", object_id: int, shift: list[float]) -> "Object":
-    """Shift an object from where it is, wherever another puts it meanwhile."""
-    from hapticdb.errors import ConflictError
-
-    while True:
-        old = env.object(object_id)
-        placed = old.transform.copy()
-        placed[:3, 3] += shift
-        with contextlib.suppress(ConflictError):
-            return env.move(object_id, placed, revision=old.revision)
+                _check_unscaled(found[0].transform)
+            moved = [env.move(found[0].id, placed)]
+    for obj in moved:
+        if json:
+            render.say_json(record_of(obj))
+        else:
+            low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in obj.bounds.tolist())
+            render.say(f"moved {obj.id} ({obj.name}): now from ({low}) to ({high}) m")
 
 
 def _check_unscaled(transform: "NDArray[np.float64]") -> None:
@@ -128,21 +126,22 @@ def _matrix_text(matrix: str) -> str:
         raise FileError(f"--matrix: cannot read {matrix}: {error}") from None
 
 
-def remove(
-    url: Url,
-    ids: Annotated[
-        list[str], typer.Argument(metavar="ID...", help="As 'hapticdb objects' lists them.")
-    ],
-) -> None:
+def remove(url: Url, objects: Chosen, *, json: Json = False) -> None:
     """Remove objects, each in a transaction of its own.
 
+    'hapticdb objects --help' says how names choose objects.
+
     Example: hapticdb remove car.db 17 18
+
+    Example: hapticdb remove car.db 'wheel_bolt_*'
     """
     import hapticdb
+    from hapticdb.cli.listing import record_of
 
-    wanted = list(dict.fromkeys(ids_of(ids, "ID")))
     with hapticdb.open(url) as env:
-        found = [env.object(i) for i in wanted]  # all or an error before anything is removed
-        for obj in found:
+        for obj in chosen(env, objects, "ID|NAME"):  # all, or an error before any is removed
             env.remove(obj.id)
-            render.say(f"removed {obj.id} ({obj.name})")
+            if json:
+                render.say_json(record_of(obj))
+            else:
+                render.say(f"removed {obj.id} ({obj.name})")

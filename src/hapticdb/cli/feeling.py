@@ -8,16 +8,15 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hapticdb.cli import render
+from hapticdb.cli.choosing import Exclude, ids_of
 from hapticdb.cli.root import (
     Budget,
-    Exclude,
     Interrupted,
     Json,
     Points,
     ToolUnit,
     Url,
     bytes_of,
-    ids_of,
     leave,
     numbers_of,
     size_of,
@@ -134,7 +133,6 @@ def feel(
     limit_bytes = DEFAULT_LIMIT if record_limit is None else size_of(record_limit, "--record-limit")
     if record_limit is not None and record is None:
         raise UsageError("--record-limit belongs to --record: give it, too, or leave both out")
-    excluded = ids_of(exclude or (), "--exclude")
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
     assumed = _assumed_speed(device, speed)
@@ -147,6 +145,10 @@ def feel(
         is_simulated=simulate,
     )
     handle = Handle(scale=scale, clutch=clutch)
+    excluded: list[int] = []
+    if exclude:
+        with hapticdb.open(url, read_only=True) as env:
+            excluded = ids_of(env, exclude, "--exclude")
     render.compile_kernels("feel", files=[tool])
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")

@@ -30,10 +30,6 @@ Points = Annotated[
 Seed = Annotated[
     int | None, typer.Option(metavar="N", help="Seed of their places.", show_default="0")
 ]
-Exclude = Annotated[
-    list[str] | None,
-    typer.Option(metavar="ID", help="Objects that are not felt; again, or 3,4, for more."),
-]
 SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
 Budget = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
 Json = Annotated[bool, typer.Option("--json", help="Print JSON, an object a line.")]
@@ -179,16 +175,3 @@ def size_of(text: str, option: str) -> int:
     if not 1.0 <= mib <= 1e6:
         raise UsageError(f"{option} {text[:80]!r}: give MiB, 1 to a million, or such as 4GiB")
     return int(mib * (1 << 20))
-
-
-def ids_of(words: Iterable[str], option: str) -> list[int]:
-    """Ids of objects from words such as ``7`` and ``3,4``."""
-    from hapticdb.errors import UsageError
-
-    ids = []
-    for word in words:
-        for text in word.split(","):
-            if not text.strip().isdecimal():
-                raise UsageError(f"{option} {word!r}: give ids of objects, such as 3 or 3,4")
-            ids.append(int(text))
-    return ids

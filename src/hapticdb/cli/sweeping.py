@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Budget, Exclude, Json, Points, Seed, ToolUnit, Url, bytes_of, ids_of
+from hapticdb.cli.choosing import Exclude, Parts, ids_of
+from hapticdb.cli.root import Budget, Json, Points, Seed, ToolUnit, Url, bytes_of
 from hapticdb.cli.touching import DEFAULT_POINTS, shell_of
 
 if TYPE_CHECKING:
@@ -27,10 +28,7 @@ def sweep(
     tool: Annotated[
         str | None, typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
     ] = None,
-    part: Annotated[
-        int | None,
-        typer.Option(metavar="ID", help="Instead of --tool: the object that moves."),
-    ] = None,
+    part: Parts = None,
     path: Annotated[
         str,
         typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header, metres."),
@@ -59,8 +57,10 @@ def sweep(
     it, in steps in which no point moves more than half a voxel. Segment 0 leads
     from pose 0 to pose 1.
 
-    With --part, that object is the tool, left out of what is felt, and the
-    poses are displacements from where it sits: x,y,z 0 and qw 1 is its place.
+    With --part, objects are the tool: all of them together, rigid, left out of
+    what is felt. The poses are displacements from where they sit: x,y,z 0 and
+    qw 1 is their place. A sub-assembly's name means all that is below it;
+    'hapticdb objects --help' says how names choose objects.
 
     The exit code is 0 when nothing is hit, 1 when anything is.
 
@@ -69,28 +69,26 @@ def sweep(
     import hapticdb
     from hapticdb.errors import UsageError
     from hapticdb.poses import read_poses
-    from hapticdb.realtime.sweep import shell_of_object
     from hapticdb.realtime.sweep import sweep as swept_by
 
-    if (tool is None) == (part is None):
+    if (tool is None) == (not part):
         raise UsageError("give one of --tool and --part")
-    if part is not None and tool_unit is not None:
+    if part and tool_unit is not None:
         raise UsageError("--tool-unit is of a --tool; a part has the unit that it was imported in")
     if picture is not None and Path(picture).suffix.lower() != ".png":
         raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
     budget_bytes = bytes_of(budget)
-    excluded = ids_of(exclude or (), "--exclude")
     poses = read_poses(path)
     with hapticdb.open(url, read_only=True) as env:
+        parts = ids_of(env, part, "--part")
+        excluded = sorted({*parts, *ids_of(env, exclude, "--exclude")})
         render.compile_kernels("sweep", files=[tool] if tool else [])
         if tool is not None:
             shell = shell_of(tool, tool_unit, points, seed)
         else:
-            assert part is not None  # noqa: S101 - one of the two is given
-            shell = shell_of_object(
-                env, part, DEFAULT_POINTS if points is None else points, seed=seed or 0
+            shell = env.shell(
+                *parts, points=DEFAULT_POINTS if points is None else points, seed=seed or 0
             )
-            excluded.append(part)
         with _bar() as progress:
             found = swept_by(
                 env,
@@ -112,7 +110,7 @@ def sweep(
             )
         try:
             if json:
-                render.say_json(_record(found, shell, part, sorted(set(excluded))))
+                render.say_json(_record(found, shell, parts, excluded))
             else:
                 _show(env, found, shell)
         finally:  # also when who reads, such as head, has enough
@@ -267,7 +265,7 @@ def _spacing(shell: "PointShell") -> float:
 
 
 def _record(
-    found: "Swept", shell: "PointShell", part: int | None, excluded: list[int]
+    found: "Swept", shell: "PointShell", parts: list[int], excluded: list[int]
 ) -> dict[str, Any]:
     deepest, clearance = found.deepest, found.clearance
     return {
@@ -308,7 +306,7 @@ def _record(
             "voxel": None if clearance.voxel is None else clearance.voxel.tolist(),
             "moment": _moment(clearance.moment),
         },
-        "tool": {"points": len(shell), "part": part, "excluded": excluded},
+        "tool": {"points": len(shell), "parts": parts, "excluded": excluded},
         "revision": found.revision,
         "elapsed": found.elapsed,
         "cells": found.cells,

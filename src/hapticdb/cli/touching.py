@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Exclude, Json, Points, Seed, StrategyName, ToolUnit, Url, ids_of
+from hapticdb.cli.choosing import Exclude, ids_of
+from hapticdb.cli.root import Json, Points, Seed, StrategyName, ToolUnit, Url
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment, Touch
@@ -50,10 +51,10 @@ def touch(
     from hapticdb.poses import read_poses
 
     law = hapticdb.TangentPlane(stiffness)
-    excluded = ids_of(exclude or (), "--exclude")
     path = read_poses(poses)
     summary = _Summary()
     with hapticdb.open(url, read_only=True) as env:
+        excluded = ids_of(env, exclude, "--exclude")
         render.compile_kernels("touch", files=[tool])
         shell = shell_of(tool, tool_unit, points, seed)
         asked = _strategy_of(strategy, env, len(path))

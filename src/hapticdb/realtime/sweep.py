@@ -14,13 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.environment import Environment
 from hapticdb.errors import (
     ConnectionLostError,
-    FileError,
-    GeometryChangedError,
     ObjectNotFoundError,
     UsageError,
 )
 from hapticdb.kernels import sweep as kernels
-from hapticdb.mesh import read_file
 from hapticdb.pointshell import PointShell
 from hapticdb.query import as_ids
 from hapticdb.realtime.frames import Felt, Frames
@@ -99,43 +96,6 @@ def sweep(
         return run.swept(excluded, budget_bytes)
     except ConnectionLostError:  # in the middle of a snapshot: once more, from its start
         return run.swept(excluded, budget_bytes)
-
-
-def shell_of_object(
-    env: Environment, object_id: int, points: int = 300, *, seed: int = 0
-) -> PointShell:
-    """Make an object of the environment a tool, where it sits: its own pose is the identity.
-
-    Its geometry is read from its file again; the shell is in the world's frame, so that poses of a
-    path are displacements from where the object is. Exclude it from the sweep.
-
-    Raises
-    ------
-    ObjectNotFoundError
-        When there is none of that id.
-    GeometryChangedError
-        When the object's file is gone or holds another geometry.
-    UsageError
-        When the object is a point cloud, which has no surface.
-    """
-    obj = env.object(object_id)
-    unit = obj.attributes.get("unit")
-    try:
-        parts = read_file(obj.link, unit=unit if isinstance(unit, str) else None).parts
-    except FileError as error:
-        raise GeometryChangedError(
-            f"object {obj.id} ({obj.name}) cannot be swept, its file cannot be read: {error}"
-        ) from error
-    for part in parts:
-        if part.name == obj.name and part.digest == obj.digest:
-            if part.faces is None:
-                raise UsageError(f"object {obj.id} ({obj.name}) is a point cloud: sweep a mesh")
-            placed = part.world_points(obj.transform)
-            return PointShell.from_mesh(placed, part.faces, points, seed=seed)
-    raise GeometryChangedError(
-        f"object {obj.id} ({obj.name}) cannot be swept: {obj.link} no longer holds the geometry "
-        "that was imported; give its mesh as a tool"
-    )
 
 
 class _Run:

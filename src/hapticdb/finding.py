@@ -1,0 +1,106 @@
+"""Objects by their ids, names and patterns."""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
+from fnmatch import translate
+from operator import index
+
+from hapticdb.errors import ObjectNotFoundError, UsageError
+from hapticdb.store.base import Object, Store, no_object
+
+MOST_IDS = 1 << 63
+
+
+def find_objects(store: Store, words: Iterable[int | str]) -> list[Object]:
+    """Objects that ids, names and patterns choose, each once, ordered by id.
+
+    Parameters
+    ----------
+    store : Store
+        Where they are; objects are listed once, and only for names.
+    words : iterable of int or str
+        An int, or a text of digits, is an id; ``3,4`` is several. Any other text is a name or a
+        pattern as of `fnmatch`: ``*`` stands for any characters, ``?`` for one, ``[ab]`` for one of
+        those; case counts. Names are paths, such as ``body/door/handle``: a text without ``/`` is
+        compared with every element of the path, one with ``/`` with the path from its beginning.
+        Where that ends at a sub-assembly, everything below it is chosen. A text that is a name as
+        it stands is no pattern, and one with commas is several unless it fits as a whole.
+
+    Raises
+    ------
+    ObjectNotFoundError
+        When a word chooses nothing.
+    UsageError
+        When a word is neither an int nor a text.
+    """
+    listed: list[Object] = []
+
+    def chosen(word: int | str) -> list[Object]:
+        if isinstance(word, int):
+            if not -MOST_IDS <= word < MOST_IDS:
+                raise no_object(word, store.url)
+            return [store.object(word)]
+        pieces = [piece.strip() for piece in word.split(",")]
+        if all(piece.isascii() and piece.isdecimal() for piece in pieces):
+            return [obj for piece in pieces for obj in chosen(_id_of(piece, store.url))]
+        listed.extend([] if listed else store.objects())
+        if found := named_like(listed, word):
+            return found
+        if len(pieces) > 1:
+            return [obj for piece in pieces for obj in chosen(piece)]
+        raise _nothing_like(word, listed, store.url)
+
+    found = {obj.id: obj for word in _checked(words) for obj in chosen(word)}
+    return [found[i] for i in sorted(found)]
+
+
+def named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
+    """Those objects that a name or pattern chooses, as `find_objects` says, in their order."""
+    pattern = pattern.rstrip("/") or pattern
+    branches = [_branches(obj.name, is_path="/" in pattern) for obj in objects]
+    as_it_stands = [obj for obj, some in zip(objects, branches, strict=True) if pattern in some]
+    if as_it_stands:
+        return as_it_stands
+    fits: Callable[[str], object] = re.compile(translate(pattern)).match
+    return [obj for obj, some in zip(objects, branches, strict=True) if any(map(fits, some))]
+
+
+def _branches(name: str, *, is_path: bool) -> list[str]:
+    """What of an object's path a pattern is compared with: elements, or the ways down to it."""
+    elements = name.split("/")
+    if not is_path:
+        return elements
+    return ["/".join(elements[: n + 1]) for n in range(len(elements))]
+
+
+def _checked(words: Iterable[int | str]) -> list[int | str]:
+    """Ids and texts; refuses what is neither before anything is looked up."""
+    if isinstance(words, (str, bytes)) or not isinstance(words, Iterable):
+        raise UsageError(f"objects {words!r}: give ids, names and patterns in a list")
+    checked: list[int | str] = []
+    for word in words:
+        try:
+            if isinstance(word, bool):
+                raise TypeError  # noqa: TRY301 - no id, though Python counts it among the integers
+            checked.append(word if isinstance(word, str) else index(word))
+        except TypeError:
+            raise UsageError(f"object {word!r}: give an id, a name or a pattern") from None
+    return checked
+
+
+def _id_of(digits: str, url: str) -> int:
+    if len(digits.lstrip("0")) > len(str(MOST_IDS)):  # Python refuses numbers of 4,300 digits
+        raise ObjectNotFoundError(f"no object {digits[:40]}... in {url}")
+    return int(digits)
+
+
+def _nothing_like(word: str, objects: Sequence[Object], url: str) -> ObjectNotFoundError:
+    """Build the error for a name or pattern that fits nothing."""
+    folded = [replace(obj, name=obj.name.casefold()) for obj in objects]
+    alike = named_like(folded, word.casefold())
+    names = {obj.id: obj.name for obj in objects}
+    hint = f", where case counts: there is {names[alike[0].id]!r}" if alike else ""
+    return ObjectNotFoundError(
+        f"no object {word[:80]!r} in {url}{hint}; 'hapticdb objects {url}' lists the names"
+    )

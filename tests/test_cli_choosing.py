@@ -1,0 +1,73 @@
+"""Every option that takes objects takes several, by id, name and pattern."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+from pathlib import Path
+
+import pytest
+
+import hapticdb
+from command_line import Run, made, poses, refused, run, scene  # noqa: F401 - fixtures
+
+TOUCH = ("--tool", "tool.npz", "--poses", "path.csv")
+
+
+def ids_in(scene: Path) -> list[int]:
+    with hapticdb.open(scene, read_only=True) as env:
+        return [obj.id for obj in env.objects()]
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("--exclude", "box*"), ("--exclude", "box[01],3"), ("--exclude", "box1", "--exclude", "1,3")],
+)
+def test_exclude_takes_names_and_patterns(run: Run, scene: Path, words: tuple[str, ...]) -> None:
+    out = run("touch", scene, *TOUCH, "--json", *words)[1]
+    assert [json.loads(line)["hits"] for line in out.splitlines()] == [0, 0, 0]
+
+
+def test_feel_excludes_by_name(run: Run, scene: Path) -> None:
+    hand = ("--tool", "tool.npz", "--device", "path.csv", "--policy", "wait", "--rate", 200)
+    code, out, err = run("feel", scene, *hand, "--json", "--exclude", "box*")
+    assert (code, json.loads(out)["hit_frames"]) == (0, 0), err
+    refused(run("feel", scene, *hand, "--exclude", "ball"), "--exclude", "no object 'ball'")
+
+
+@pytest.mark.parametrize(
+    "parts", [("1", "--part", "3"), ("1,3",), ("box[02]",), ("box0", "--part", "box2")]
+)
+def test_several_parts_are_one_tool(run: Run, scene: Path, parts: tuple[str, ...]) -> None:
+    """Boxes 0 and 2, left and right of box 1, which is in the way of one of them."""
+    up = poses(scene.parent / "up.csv", (0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
+    aside = poses(scene.parent / "aside.csv", (0.0, 0.0, 0.0), (0.15, 0.0, 0.0))
+    code, out, err = run("sweep", scene, "--part", *parts, "--path", up, "--json")
+    found = json.loads(out)
+    assert (code, err) == (0, "")
+    assert (found["tool"]["parts"], found["tool"]["excluded"]) == ([1, 3], [1, 3])
+    code, out, _ = run("sweep", scene, "--part", *parts, "--path", aside, "--json")
+    assert (code, [one["id"] for one in json.loads(out)["objects"]]) == (1, [2])
+    # each alone: the last one, which nothing is in the way of, does not stand for all
+    assert run("sweep", scene, "--part", "3", "--path", aside)[0] == 0
+
+
+def test_move_and_remove_take_several(run: Run, scene: Path) -> None:
+    code, out, err = run("move", scene, "box[01]", 3, "--translate", "0,0,0.01", "--json")
+    assert (code, err) == (0, "")
+    assert [json.loads(line)["id"] for line in out.splitlines()] == [1, 2, 3]
+    refused(run("move", scene, "box*", "--pose", "0,0,0,1,0,0,0"), "3 are chosen")
+    refused(run("remove", scene, "box1", "cone*"), "no object 'cone*'")
+    assert ids_in(scene) == [1, 2, 3]
+    code, out, err = run("remove", scene, "box1", "2,3", "--json")
+    assert (code, err) == (0, "")
+    assert [json.loads(line)["name"] for line in out.splitlines()] == ["box1", "box2"]
+    assert ids_in(scene) == [1]
+
+
+@pytest.mark.parametrize("word", ["cone", "9", "1,9", "BOX1"])
+def test_what_chooses_nothing_is_one_line(run: Run, scene: Path, word: str) -> None:
+    refused(run("touch", scene, *TOUCH, "--exclude", word), "--exclude: no object")
+    refused(run("sweep", scene, "--part", word, "--path", "path.csv"), "--part: no object")
+    refused(run("move", scene, word, "--translate", "0,0,0"), "ID|NAME: no object")
+    refused(run("remove", scene, word), "ID|NAME: no object")
+    assert ids_in(scene) == [1, 2, 3]

@@ -1,0 +1,151 @@
+"""Objects are chosen by ids, names and patterns; a shell is made of all that were chosen."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+import hapticdb
+from hapticdb import Environment, ObjectNotFoundError, UsageError
+
+NAMES = (
+    "wheels/front/tyre",
+    "wheels/front/wheel_bolt_1",
+    "wheels/rear/tyre",
+    "wheels/rear/wheel_bolt_1",
+    "Body/hood",
+    "Body/door",
+    "Body/door/handle",
+    "Body/handle[1]",
+    "Body/handle1",
+    "Body/left,right",
+    "7",
+)
+
+
+@pytest.fixture(scope="module")
+def car(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    """Cubes of 10 cm in a row along x, 20 cm apart; the name of one is the id of another."""
+    folder = tmp_path_factory.mktemp("car")
+    lines = []
+    for n, name in enumerate(NAMES):
+        box = trimesh.creation.box((0.1, 0.1, 0.1))
+        lines.append(f"o {name}")
+        lines += [f"v {x + 0.2 * n} {y} {z}" for x, y, z in box.vertices]
+        lines += ["f " + " ".join(str(v + 8 * n + 1) for v in face) for face in box.faces]
+    (folder / "car.obj").write_text("\n".join([*lines, ""]))
+    options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6))
+    (report,) = hapticdb.import_files(folder / "car.db", [folder / "car.obj"], options)
+    assert tuple(obj.name for obj in report.added) == NAMES
+    with hapticdb.open(folder / "car.db") as env:
+        yield env
+
+
+@pytest.mark.parametrize(
+    ("words", "ids"),
+    [
+        ([7], [7]),
+        (["7"], [7]),
+        ([np.int64(2), " 2 , 1"], [1, 2]),
+        (["3,4", 3, "5"], [3, 4, 5]),
+        ([], []),
+        # an element of the path, whichever; below a sub-assembly everything
+        (["tyre"], [1, 3]),
+        (["wheel*"], [1, 2, 3, 4]),
+        (["*bolt*"], [2, 4]),
+        (["front"], [1, 2]),
+        (["Body"], [5, 6, 7, 8, 9, 10]),
+        # from the start of the path
+        (["wheels/front"], [1, 2]),
+        (["wheels/front/"], [1, 2]),
+        (["wheels/*/tyre"], [1, 3]),
+        (["Body/door"], [6, 7]),
+        (["Body/h*"], [5, 8, 9]),
+        # a name as it stands is no pattern, and may hold a comma
+        (["handle[1]"], [8]),
+        (["handle[12]"], [9]),
+        (["left,right"], [10]),
+        (["left?right"], [10]),
+        (["[7]"], [11]),
+        (["hood,tyre,7"], [1, 3, 5, 7]),
+        (["[t-z]*,hood"], [1, 2, 3, 4, 5]),
+    ],
+)
+def test_words_choose_objects(car: Environment, words: list[int | str], ids: list[int]) -> None:
+    assert [obj.id for obj in car.find(*words)] == ids
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        (12, "no object 12 in"),
+        (-1, "no object -1 in"),
+        (1 << 80, "no object"),
+        ("9" * 5000, "no object 9999"),
+        ("door_left", "no object 'door_left' in"),
+        ("front/tyre", "no object 'front/tyre' in"),  # not the start of a path
+        ("hood,boot", "no object 'boot' in"),
+        ("body", "case counts: there is 'Body/hood'"),
+        ("", "no object ''"),
+        ("1,", "no object ''"),
+        ("[", "no object"),
+    ],
+)
+def test_a_word_that_chooses_nothing_is_told(car: Environment, word: int | str, said: str) -> None:
+    with pytest.raises(ObjectNotFoundError) as told:
+        car.find("tyre", word)
+    assert said in str(told.value)
+    assert len(str(told.value)) < 400
+
+
+@pytest.mark.parametrize("word", [True, 1.0, None, b"tyre", ["tyre"]])
+def test_what_is_no_word_is_refused(car: Environment, word: object) -> None:
+    with pytest.raises(UsageError, match="give an id, a name or a pattern"):
+        car.find(word)  # type: ignore[arg-type]
+
+
+def test_a_shell_of_several_objects_lies_on_all_of_them_where_they_sit(car: Environment) -> None:
+    shell = car.shell("wheels/rear", 5, points=600, seed=3)
+    cubes = np.array([0.4, 0.6, 0.8])  # their centres on x
+    nearest = np.abs(shell.points[:, 0, None] - cubes).argmin(axis=1)
+    assert np.allclose(np.bincount(nearest), 200, atol=30)
+    off = shell.points - np.stack([cubes[nearest], *np.zeros((2, len(shell)))], axis=1)
+    assert np.allclose(np.abs(off).max(axis=1), 0.05)
+    assert (np.einsum("nk,nk->n", off, shell.normals) < 0).all()
+    assert np.allclose(shell.center, (0.6, 0, 0))
+    assert shell.is_closed
+    again = car.shell(5, "wheels/rear/*", points=600, seed=3)
+    assert np.array_equal(again.points, shell.points)
+
+
+def test_a_shell_of_nothing_or_of_points_is_refused(car: Environment, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="name at least one"):
+        car.shell()
+    cloud = trimesh.PointCloud(np.random.default_rng(0).random((50, 3)))
+    (tmp_path / "cloud.ply").write_bytes(cloud.export(file_type="ply"))
+    hapticdb.import_files(tmp_path / "cloud.db", [tmp_path / "cloud.ply"])
+    with (
+        hapticdb.open(tmp_path / "cloud.db", read_only=True) as env,
+        pytest.raises(UsageError, match="point cloud, which has no surface"),
+    ):
+        env.shell("*")
+
+
+def test_a_shift_moves_all_of_them_or_none(car: Environment) -> None:
+    ids = [obj.id for obj in car.find("wheels")]
+    before = [obj.transform for obj in car.find("wheels")]
+    with pytest.raises(hapticdb.OutsideGridError):
+        car.shift([*ids, 11], (2.0, 0, 0))  # the first ones would stay inside
+    assert all(
+        np.array_equal(a.transform, b) for a, b in zip(car.find("wheels"), before, strict=True)
+    )
+    shifted = car.shift(ids, (0.05, 0, 0.1))
+    assert [obj.id for obj in shifted] == ids
+    for obj, old in zip(shifted, before, strict=True):
+        assert np.allclose(obj.transform[:3, 3] - old[:3, 3], (0.05, 0, 0.1))
+    car.shift(ids, (-0.05, 0, -0.1))
+    for way in ((1, 2), (1, 2, np.nan), "up"):
+        with pytest.raises(UsageError):
+            car.shift(ids, way)

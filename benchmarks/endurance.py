@@ -194,6 +194,7 @@ def summary(report: Report, troubles: list[Trouble], frames: Frames) -> dict[str
     """What to print."""
     ends = [trouble.begun for trouble in troubles[1:]] + [math.inf]
     outages = [outage(*pair, frames) for pair in zip(troubles, ends, strict=True)]
+    assert report.empty is not None  # it was asked for
     return {
         "frames": report.loop.frames,
         "missed": report.loop.missed,

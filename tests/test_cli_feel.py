@@ -98,6 +98,17 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert (code, json.loads(out)["parts_at"]) == (1, int(parted[1]))
 
 
+def test_without_a_baseline_no_empty_loop_is_run(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    wish = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.2)
+    code, out, err = run(*wish, "--no-baseline")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[0].split() == ["session"]
+    assert re.search(r"^ *empty loop +not measured", out, re.MULTILINE)
+    assert json.loads(run(*wish, "--no-baseline", "--json")[1])["empty"] is None
+    assert json.loads(run(*wish, "--json")[1])["empty"]["frames"] > 0
+
+
 def test_what_is_excluded_is_not_felt(run: Run, scene: Path) -> None:
     assert scene.exists()
     code, out, _ = run(*feel(*PLAY, "--seconds", 0.3, "--exclude", "1,2", "--exclude", 3, "--json"))
@@ -131,6 +142,7 @@ def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
         (["--device", "random", "--at", ABOVE, "--loop"], ["--loop", "random has no end"]),
         ([*PLAY, "--processor", -1], ["processor -1", "0 to 4095"]),
         ([*PLAY, "--processor", 10**30], ["processor 1e+30", "0 to 4095"]),
+        ([*PLAY, "--processor", 4095], ["processor 4095 is not granted", "may run on"]),
         (["--device", "haply", "--policy", "wait"], ["cannot wait"]),
         ([*PLAY, "--rate", 5], ["a rate of 5.0 Hz: give 10 to 20,000"]),
         ([*PLAY, "--seconds", -1], ["-1.0 seconds"]),

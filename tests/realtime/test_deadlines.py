@@ -180,8 +180,23 @@ def test_a_processor_that_cannot_be_is_refused(processor: int) -> None:
         Timing(processor=processor)
 
 
-def test_a_processor_that_is_not_there_is_told_and_nothing_breaks() -> None:
-    before = settings()
-    with undisturbed(Timing(processor=1023)) as granted:
-        assert granted["processor"].startswith(("processor 1023 not granted", "not on this"))
+def test_a_processor_that_is_not_there_is_refused_and_nothing_breaks() -> None:
+    before, told = (
+        settings(),
+        r"^processor 4095 is not granted: this process may run on \d[\d to,]*$",
+    )
+    with pytest.raises(UsageError, match=told), undisturbed(Timing(processor=4095)):
+        pass
+    with pytest.raises(UsageError, match=told):
+        Timing(processor=4095).check_granted()
+    Timing().check_granted()
     assert settings() == before
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="Linux binds processes to processors")
+def test_the_processors_that_are_granted_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those of a cpuset, which need not follow one another."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {2, 3, 4, 7})
+    with pytest.raises(UsageError, match=r"^processor 5 is not .* may run on 2 to 4, 7$"):
+        Timing(processor=5).check_granted()
+    Timing(processor=7).check_granted()

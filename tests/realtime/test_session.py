@@ -123,6 +123,7 @@ def test_the_report_survives_json_and_is_finite(played: Played) -> None:
     assert again == json.loads(json.dumps(again))
     assert again["loop"]["frames"] == played.report.loop.frames
     assert again["loop"]["lateness"]["p99"] == played.report.loop.lateness.p99
+    assert played.report.empty is not None
     assert again["empty"]["frames"] == played.report.empty.frames > 0
     assert again["cache"]["budget_bytes"] <= 4 << 20
 

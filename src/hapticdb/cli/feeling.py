@@ -115,6 +115,10 @@ def feel(
     processor: Annotated[
         int | None, typer.Option(metavar="N", help="Bind the loop to that processor.")
     ] = None,
+    no_baseline: Annotated[
+        bool,
+        typer.Option("--no-baseline", help="Skip the empty loop that is run before, 2 s at most."),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Feel an environment in real time with a device; report how well frames kept their time.
@@ -123,6 +127,7 @@ def feel(
     """
     import hapticdb
     from hapticdb.errors import UsageError
+    from hapticdb.realtime.deadlines import Timing
     from hapticdb.realtime.handle import Handle
     from hapticdb.realtime.recording import DEFAULT_LIMIT
     from hapticdb.realtime.resident import ResidentCells
@@ -133,6 +138,7 @@ def feel(
     limit_bytes = DEFAULT_LIMIT if record_limit is None else size_of(record_limit, "--record-limit")
     if record_limit is not None and record is None:
         raise UsageError("--record-limit belongs to --record: give it, too, or leave both out")
+    Timing(processor=processor).check_granted()  # before a kernel is compiled
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
     assumed = _assumed_speed(device, speed)
@@ -169,6 +175,7 @@ def feel(
                 record_limit_bytes=limit_bytes,
                 is_fifo=fifo,
                 processor=processor,
+                has_baseline=not no_baseline,
             ) as session,
             _ended_by_signals(session) as signals,
         ):
@@ -351,8 +358,8 @@ def _show(
     report: "Report", cells: "ResidentCells", record: str | None, assumed: float | None
 ) -> None:
     """Print what a session was like, the empty loop beside it."""
-    columns = ("", "session>", "empty loop>")
-    loops = (report.loop, report.empty)
+    loops = [loop for loop in (report.loop, report.empty) if loop is not None]
+    columns = ("", "session>", "empty loop>")[: 1 + len(loops)]
     rows = [
         ("frames", *(f"{loop.frames:,}" for loop in loops)),
         ("rate, Hz", *(f"{loop.rate:,.1f}" for loop in loops)),
@@ -411,6 +418,8 @@ def _show(
         ),
         ("objects", _named(report, cells)),
     ]
+    if report.empty is None:
+        facts.append(("empty loop", "not measured (--no-baseline)"))
     if report.bad_reading is not None:
         held = render.counted(report.nowhere_frames, "frame")
         facts.append(("hand nowhere", f"{held}: {report.bad_reading}"))

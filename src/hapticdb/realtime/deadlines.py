@@ -5,6 +5,7 @@ import ctypes
 import gc
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -32,7 +33,7 @@ class Timing:
     is_fifo : bool
         Ask for `SCHED_FIFO`, where the system allows it.
     processor : int or None
-        Number of the processor that the loop is bound to, where the system allows it.
+        Number of the processor that the loop is bound to.
 
     Raises
     ------
@@ -49,6 +50,17 @@ class Timing:
             raise UsageError(
                 f"processor {self.processor:.10g}: give its number, 0 to {MOST_PROCESSORS - 1}"
             )
+
+    def check_granted(self) -> None:
+        """Refuse a processor that the system does not let this process run on; names those it does.
+
+        Raises
+        ------
+        UsageError
+            When it is not there, or not among those of this container or cpuset.
+        """
+        if self.processor is not None and self.processor not in (allowed := _allowed()):
+            raise _not_granted(self.processor, allowed)
 
 
 class Deadlines:
@@ -142,7 +154,8 @@ def empty_loop(timing: Timing, seconds: float) -> LoopFigures:
 def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
     """No garbage collection, quick thread switches, exact sleeps, and what `timing` asks for.
 
-    Yields what was granted, in words. All is as before afterwards.
+    Yields what was granted, in words. All is as before afterwards. A processor that is not granted
+    is a UsageError; SCHED_FIFO is asked for, and what is yielded says whether it was granted.
     """
     granted: dict[str, str] = {}
     switch, was_enabled = sys.getswitchinterval(), gc.isenabled()
@@ -173,13 +186,45 @@ def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
 
 
 def _bind(processor: int) -> str:
-    if not hasattr(os, "sched_setaffinity"):
-        return "not on this system"
     try:
-        os.sched_setaffinity(0, {processor})
+        if hasattr(os, "sched_setaffinity"):
+            os.sched_setaffinity(0, {processor})
+            return f"bound to processor {processor}"
     except OSError as error:
-        return f"processor {processor} not granted: {error.strerror}"
-    return f"bound to processor {processor}"
+        raise _not_granted(processor, _allowed()) from error
+    raise _not_granted(processor, set())
+
+
+def _allowed() -> set[int]:
+    """Processors that a thread of this process may be bound to; none where none can be."""
+    if not hasattr(os, "sched_setaffinity"):
+        return set()
+    found: set[int] = set()
+
+    def ask() -> None:  # of a thread of its own, whose processors end with it
+        with contextlib.suppress(OSError):  # refused where a sandbox forbids it
+            os.sched_setaffinity(0, range(MOST_PROCESSORS))
+        found.update(os.sched_getaffinity(0))
+
+    asking = threading.Thread(target=ask)
+    asking.start()
+    asking.join()
+    return found
+
+
+def _not_granted(processor: int, allowed: set[int]) -> UsageError:
+    if not allowed:
+        return UsageError(
+            f"processor {processor}: this system binds no process to a processor; leave it out"
+        )
+    runs: list[list[int]] = []
+    for number in sorted(allowed):
+        if runs and number == runs[-1][1] + 1:
+            runs[-1][1] = number
+        else:
+            runs.append([number, number])
+    shown = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in runs)
+    return UsageError(f"processor {processor} is not granted: this process may run on {shown}")
 
 
 def _ask_for_fifo(granted: dict[str, str]) -> tuple[int, os.sched_param] | None:

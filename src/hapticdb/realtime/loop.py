@@ -92,6 +92,7 @@ class LoopRequest:
     seconds: float
     staleness: float
     is_waiting: bool
+    has_baseline: bool = True
 
 
 class Loop:
@@ -400,7 +401,9 @@ def work(request: LoopRequest, voice: Voice) -> None:
     try:
         loop.warm_up()
         with undisturbed(request.timing) as granted:
-            empty = empty_loop(request.timing, min(EMPTY_SECONDS, request.seconds))
+            empty = None
+            if request.has_baseline:
+                empty = empty_loop(request.timing, min(EMPTY_SECONDS, request.seconds))
             warm_up = loop.prepare()
             compiled = n_compiled()
             voice.say("running", warm_up)

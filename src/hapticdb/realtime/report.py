@@ -95,7 +95,7 @@ class LoopAnswer(NamedTuple):
     """What a loop's process says at its end."""
 
     loop: LoopFigures
-    empty: LoopFigures
+    empty: LoopFigures | None
     counts: Counts
     warm_up: float
     is_warm: bool
@@ -111,7 +111,7 @@ class Report:
         Asked for, Hz.
     loop, empty : LoopFigures
         The session's loop, and one of the same rate that did nothing, on this machine just before:
-        a shared machine is late by itself.
+        a shared machine is late by itself. The latter is None where none was measured.
     hit_frames, contact_frames, unknown_frames, held_frames, stale_frames : int
         Frames with a point in a voxel, below its tangent plane, in a cell that was not resident;
         those that kept an earlier wrench; those in which the database had been silent for too long.
@@ -148,7 +148,7 @@ class Report:
 
     rate: float
     loop: LoopFigures
-    empty: LoopFigures
+    empty: LoopFigures | None
     hit_frames: int
     contact_frames: int
     unknown_frames: int
@@ -183,6 +183,8 @@ class Report:
         plain = asdict(self)
         for name in ("loop", "empty"):
             part = getattr(self, name)
+            if part is None:
+                continue
             plain[name] = asdict(part) | {"rate": part.rate}
             for times in ("lateness", "elapsed"):
                 plain[name][times] = getattr(part, times)._asdict()

@@ -83,6 +83,9 @@ class Session:
         likewise where the disk fails: see `recording_ended`.
     is_fifo, processor
         As `hapticdb.realtime.deadlines.Timing` has them.
+    has_baseline : bool
+        Run an empty loop of the same rate before the first frame, for 2 s at most, so that the
+        report can tell how late the machine is by itself; without, `Report.empty` is None.
 
     Raises
     ------
@@ -117,6 +120,7 @@ class Session:
         record_limit_bytes: int | None = DEFAULT_LIMIT,
         is_fifo: bool = False,
         processor: int | None = None,
+        has_baseline: bool = True,
     ) -> None:
         check_device(device)
         _check_times(rate, seconds, staleness)
@@ -126,6 +130,8 @@ class Session:
         self.coupling = coupling or Coupling()
         self.handle = handle or Handle()
         self.timing = Timing(rate, is_fifo, processor)
+        self.timing.check_granted()
+        self._has_baseline = has_baseline
         self._is_own = isinstance(cells, str)
         if isinstance(cells, str):
             budget_bytes = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
@@ -192,6 +198,7 @@ class Session:
             seconds=FOREVER if seconds is None else seconds,
             staleness=staleness,
             is_waiting=policy == "wait",
+            has_baseline=self._has_baseline,
         )
         self._process = Process(
             "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory]

@@ -29,10 +29,10 @@ from command_line import (  # noqa: F401 - fixtures among them
 )
 from hapticdb.cli import root
 from hapticdb.grid import CURVE_NAMES
-from hapticdb.mesh.reader import UNITS
 from hapticdb.query import STRATEGIES
 from hapticdb.store import connect
 from hapticdb.store.base import LAYOUTS
+from hapticdb.units import UNITS
 
 VERBS = (
     "import",
@@ -176,7 +176,10 @@ def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
     code, out, err = run("import", "a.db", file, "none.stl", "--json", "--bits", 5)
     assert code == 2
     good, bad = map(json.loads, out.splitlines())
-    assert set(good) == {"file", "status", "objects", "present", "voxels", "defects", "error"}
+    assert set(good) == {
+        *("file", "status", "objects", "present", "voxels", "is_unit_assumed", "defects", "error"),
+        "scene",
+    }
     assert (good["status"], good["objects"], good["error"]) == ("imported", 3, None)
     assert bad["status"] == "failed"
     assert "none.stl" in bad["error"]

@@ -57,6 +57,7 @@ FLOORS: list[set[str]] = [
     {"store"},
     {"grid"},
     {"kernels"},
+    {"units"},
     {"errors"},
 ]
 LEVELS = {name: level for level, floor in enumerate(FLOORS) for name in floor}
@@ -65,8 +66,8 @@ NARROW: dict[str, set[str]] = {
     "kernels": set(),
     "errors": set(),
     "force": {"errors"},
-    "poses": {"errors"},
-    "mesh": {"errors"},
+    "poses": {"errors", "units"},
+    "mesh": {"errors", "units"},
     "orientation": {"errors", "kernels"},
     "sample": {"poses", "errors"},
     "splat": set(),

@@ -217,8 +217,8 @@ class Environment:
         ----------
         file : path
             Mesh, CAD or point-cloud file; see `hapticdb.mesh.read_file`.
-        unit : {"mm", "cm", "m", "in"} or None
-            Of a file that carries none; metres unless given.
+        unit : str or None
+            One of `hapticdb.mesh.UNITS`, of a file that carries none; metres unless given.
         jobs : int or None
             Threads that voxelize; one a processor unless given.
         progress : callable or None

@@ -70,6 +70,9 @@ class FileReport:
         What was wrong in the file.
     error : HapticDBError or None
         Why the file was skipped.
+    is_unit_assumed : bool
+        Whether neither the file nor the options say a unit, so that its numbers are taken as
+        metres.
     """
 
     link: str
@@ -78,6 +81,7 @@ class FileReport:
     present: int = 0
     defects: Defects = field(default_factory=Defects)
     error: HapticDBError | None = None
+    is_unit_assumed: bool = False
 
 
 @dataclass(frozen=True)
@@ -86,8 +90,8 @@ class ImportOptions:
 
     Attributes
     ----------
-    unit : {"mm", "cm", "m", "in"} or None
-        Of files that carry none; metres unless given.
+    unit : str or None
+        One of `hapticdb.mesh.UNITS`, of files that carry none; metres unless given.
     grid : GridOptions
         For a new environment; must agree with an existing one.
     layout : {"voxel", "brick"} or None
@@ -244,7 +248,7 @@ def ingest_file(
             else:
                 yield part
 
-    for obj, rows in _voxelized(still_missing(), mesh_file.link, store, options.unit, jobs):
+    for obj, rows in _voxelized(still_missing(), mesh_file, store, options.unit, jobs):
         n_done += 1
         if (new_id := _added_or_present(store, obj, rows, known)) is not None:
             added.add(new_id)
@@ -257,6 +261,7 @@ def ingest_file(
         tuple(obj for obj in store.objects() if obj.id in added) if added else (),
         n_parts - len(added),
         mesh_file.defects,
+        is_unit_assumed=options.unit is None and not mesh_file.names_unit,
     )
 
 
@@ -318,22 +323,23 @@ def _added_or_present(store: Store, part: Object, rows: Rows, known: _KnownParts
 
 
 def _voxelized(
-    parts: Iterable[Part], link: str, store: Store, unit: str | None, jobs: int
+    parts: Iterable[Part], file: MeshFile, store: Store, unit: str | None, jobs: int
 ) -> Iterator[tuple[Object, Rows]]:
     """Objects and rows of parts, in their order, a few parts ahead of the writer."""
+    attributes = {"unit": unit, "up": file.up}
+    known = {name: value for name, value in attributes.items() if value}
 
     def work(part: Part) -> tuple[Object, Rows]:
         rows, n_voxels = rows_of_part(part, store.grid, store.layout)
-        attributes = {"unit": unit} if unit else {}
         return (
             Object(
                 name=part.name,
-                link=link,
+                link=file.link,
                 digest=part.digest,
                 transform=part.world_from_part,
                 voxels=n_voxels,
                 bounds=part.bounds,
-                attributes=attributes,
+                attributes=known,
             ),
             rows,
         )

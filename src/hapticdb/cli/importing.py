@@ -17,6 +17,9 @@ from hapticdb.cli.root import (
 )
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from hapticdb.ingest import FileReport
 
 
@@ -98,9 +101,10 @@ def import_(
             "interrupted; what went in is whole, and the same command goes on from there"
         ) from None
     elapsed = time.perf_counter() - started
+    scene = _scene(url) if json and any(report.error is None for report in reports) else None
     for file, report in zip(files, reports, strict=True):
         if json:
-            render.say_json(_record(report))
+            render.say_json(_record(report) | {"scene": render.box_record(scene)})
         elif report.error is None:
             _say(file, report)
         if report.error is not None:
@@ -118,6 +122,7 @@ def _record(report: "FileReport") -> dict[str, object]:
         "objects": len(report.added),
         "present": report.present,
         "voxels": sum(obj.voxels for obj in report.added),
+        "is_unit_assumed": report.is_unit_assumed,
         "defects": report.defects.as_dict(),
         "error": None if report.error is None else str(report.error),
     }
@@ -136,17 +141,35 @@ def _say(file: str, report: "FileReport") -> None:
         if report.present:
             line += f"; {report.present} were there already"
         render.say(line)
+    if report.is_unit_assumed:
+        render.say("  it names no unit, so its numbers are taken as metres; --unit says another")
     if report.defects:
         render.say(f"  found in the file: {report.defects.describe()}")
 
 
 def _say_total(url: str, elapsed: float) -> None:
     import hapticdb
+    from hapticdb.store.base import scene_bounds
 
     with hapticdb.open(url, read_only=True) as env:
         size = env.size()
-        objects = len(env.objects())
+        objects = env.objects()
         render.say(
-            f"{env.url}: {render.counted(objects, 'object')}, {render.counted(size.rows, 'row')}, "
+            f"{env.url}: {render.counted(len(objects), 'object')}, "
+            f"{render.counted(size.rows, 'row')}, "
             f"{render.bytes_text(size.bytes)}; {env.grid.describe()}; {elapsed:.1f} s"
         )
+        scene = scene_bounds(objects)
+    if scene is not None:
+        render.say(f"the scene: {render.box(scene)}")
+
+
+def _scene(url: str) -> "NDArray[np.float64] | None":
+    """Bounds of all that an environment holds now."""
+    from contextlib import closing
+
+    from hapticdb.store.base import scene_bounds
+    from hapticdb.store.connect import open_store
+
+    with closing(open_store(url, read_only=True)) as store:
+        return scene_bounds(store.objects())

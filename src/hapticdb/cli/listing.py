@@ -37,13 +37,14 @@ SOURCES = {
 
 
 def info(url: Url, *, json: Json = False) -> None:
-    """Show an environment's engine, grid, layout, size and statistics.
+    """Show an environment's engine, grid, layout, scene, size and statistics.
 
     Example: hapticdb info car.db --json
     """
     from contextlib import closing
 
     from hapticdb.statistics import DEFAULT_RESOLUTION, QuantileVector
+    from hapticdb.store.base import scene_bounds
     from hapticdb.store.connect import open_store
 
     # the store: an Environment brings what touches and imports, a tenth of a second
@@ -52,6 +53,7 @@ def info(url: Url, *, json: Json = False) -> None:
         freshness = env.freshness(DEFAULT_RESOLUTION)
         quantiles = QuantileVector.of(env, DEFAULT_RESOLUTION)
     voxels = sum(obj.voxels for obj in objects)
+    scene = scene_bounds(objects)
     if json:
         render.say_json(
             {
@@ -63,6 +65,7 @@ def info(url: Url, *, json: Json = False) -> None:
                 "curve": grid.curve,
                 "layout": layout,
                 "objects": len(objects),
+                "scene": render.box_record(scene),
                 "voxels": voxels,
                 "rows": size.rows,
                 "bytes": size.bytes,
@@ -85,6 +88,7 @@ def info(url: Url, *, json: Json = False) -> None:
                 ("curve", grid.curve),
                 ("layout", layout),
                 ("objects", f"{len(objects):,}"),
+                ("scene", "nothing in it" if scene is None else render.box(scene)),
                 ("voxels", f"{voxels:,}"),
                 ("rows", f"{size.rows:,}"),
                 ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),

@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from rich.console import RenderableType
     from rich.text import Text
 
@@ -137,6 +139,21 @@ def metres(length: float) -> str:
         if length >= 0.1 * size or word == "µm":
             return f"{length / size:.4g} {word}"
     return f"{length:.4g} m"
+
+
+def box(bounds: "NDArray[np.float64]") -> str:
+    """Put a box (2, 3), metres, in words: ``4.28 x 1.9 x 1.4 m, from (0, 0, 0) to (4.28, ...)``."""
+    low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in bounds.tolist())
+    sides = " x ".join(f"{side:.4g}" for side in (bounds[1] - bounds[0]).tolist())
+    return f"{sides} m, from {low} to {high} m"
+
+
+def box_record(bounds: "NDArray[np.float64] | None") -> dict[str, list[float]] | None:
+    """Put a box (2, 3), metres, in JSON; null for none."""
+    if bounds is None:
+        return None
+    low, high = bounds.tolist()
+    return {"low": low, "high": high, "extent": (bounds[1] - bounds[0]).tolist()}
 
 
 def shares(counts: Mapping[str, int]) -> str:

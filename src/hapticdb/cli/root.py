@@ -13,7 +13,7 @@ import typer.core
 StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 CurveName = Literal["z", "hilbert", "lexicographic"]
 LayoutName = Literal["brick", "voxel"]
-UnitName = Literal["mm", "cm", "m", "in"]
+UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
 
 Url = Annotated[
     str,

@@ -91,6 +91,8 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
             for part in cleaned.parts
         ],
         "defects": cleaned.defects.as_dict(),
+        "names_unit": cleaned.names_unit,
+        "up": cleaned.up,
     }
     out.write(json.dumps(head).encode() + b"\n")
     out.writelines(array.data if array.flags.c_contiguous else array.tobytes() for array in arrays)

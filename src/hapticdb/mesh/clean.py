@@ -29,24 +29,30 @@ class CleanPart:
 
 @dataclass(frozen=True)
 class Cleaned:
-    """Sound parts of a file in metres, the arrays that they share, and what was wrong in all."""
+    """Sound parts of a file in metres, the arrays that they share, and what was wrong in all.
+
+    names_unit : whether the file says its unit; up : the axis that it says points up, or None.
+    """
 
     geometries: list[Geometry]
     parts: list[CleanPart]
     defects: Defects
+    names_unit: bool = False
+    up: str | None = None
 
 
-def clean(parsed: Parsed, metres: float) -> Cleaned:
+def clean(parsed: Parsed, metres: float | None) -> Cleaned:
     """Refuse and count what cannot be used; bring the rest to metres.
 
     Parameters
     ----------
     parsed : Parsed
         Contents of a file.
-    metres : float
-        Length of the unit of a file that carries none.
+    metres : float or None
+        Length of the unit of a file that carries none; None where nobody said.
     """
-    scale = metres if parsed.metres is None else parsed.metres
+    said = (parsed.metres, metres, parsed.likely_metres)
+    scale = next((length for length in said if length is not None), 1.0)
     if not (np.isfinite(scale) and scale > 0):
         raise UnreadableError(f"its unit of length is {scale} metres")
     checked = [_checked(shape, scale) for shape in parsed.shapes]
@@ -75,6 +81,8 @@ def clean(parsed: Parsed, metres: float) -> Cleaned:
         [checked[old][0] for old in used],
         [replace(part, geometry=number[part.geometry]) for part in parts],
         total,
+        names_unit=not (parsed.metres is None and parsed.likely_metres is None),
+        up=parsed.up,
     )
 
 

@@ -14,9 +14,11 @@ from numpy.typing import NDArray
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, fan, walk
 
+_UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
+
 
 def read(path: Path) -> Parsed:
-    """Parts of the document's scene, in its unit; its up axis is left as it is."""
+    """Parts of the document's scene, in its unit; its axes left as they are."""
     # A missing texture or an unknown effect must not cost the geometry.
     lenient = [collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
     document = collada.Collada(str(path), ignore=lenient)
@@ -39,6 +41,7 @@ def read(path: Path) -> Parsed:
         [_shape(geometry) for geometry in geometries],
         placements,
         metres=1.0 if unit is None else float(unit),
+        up=_UP_AXES.get(str(getattr(document.assetInfo, "upaxis", None))),
     )
 
 

@@ -43,7 +43,15 @@ def read(path: Path) -> Parsed:
         placements=[Placement(p.name, number[p.shape], p.world_from_part) for p in placements],
         metres=1.0,
         defects=Defects(empty=empty),
+        up=_up_axis(tree),
     )
+
+
+def _up_axis(tree: dict[str, Any]) -> str:
+    """Axis that points up: y by the specification, unless the file says that it differs."""
+    extras = tree.get("asset", {}).get("extras") if isinstance(tree.get("asset"), dict) else None
+    up = extras.get("up_axis") if isinstance(extras, dict) else None
+    return up if isinstance(up, str) and up in {"x", "y", "z"} else "y"
 
 
 def load_tree(content: bytes, suffix: str) -> dict[str, Any]:

@@ -34,15 +34,15 @@ def reader_of(path: Path) -> Callable[[Path], Parsed]:
     return reader
 
 
-def parse(path: Path, metres: float) -> Cleaned:
+def parse(path: Path, metres: float | None) -> Cleaned:
     """Sound parts of a file, read in this process.
 
     Parameters
     ----------
     path : Path
         A file with one of the suffixes in `READERS`.
-    metres : float
-        Length of the unit of a file that carries none.
+    metres : float or None
+        Length of the unit of a file that carries none; None where nobody said.
 
     Raises
     ------

@@ -149,11 +149,17 @@ class MeshFile:
         At least one; each has at least one triangle or point.
     defects : Defects
         Sum over the parts, and over what was refused or empty and became no part.
+    names_unit : bool
+        Whether the file says which unit its lengths are in.
+    up : {'x', 'y', 'z'} or None
+        Which axis points up, None where neither the format nor the file says.
     """
 
     link: str
     parts: list[Part]
     defects: Defects
+    names_unit: bool = False
+    up: str | None = None
 
     @property
     def bounds(self) -> NDArray[np.float64]:

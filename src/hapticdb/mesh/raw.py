@@ -52,13 +52,17 @@ class Placement:
 class Parsed:
     """A file's contents before any check.
 
-    `metres` is the length of the file's unit, None where the format carries none.
+    `metres` is the length of the file's unit, None where the format carries none; `likely_metres`
+    that of one which the file names beside its lengths, and which an option overrides. `up` is the
+    axis that points up, None where nothing says.
     """
 
     shapes: list[Shape]
     placements: list[Placement]
     metres: float | None = None
     defects: Defects = field(default_factory=Defects)
+    likely_metres: float | None = None
+    up: str | None = None
 
 
 def placed_once(named: Iterable[tuple[str, Shape]], defects: Defects | None = None) -> Parsed:

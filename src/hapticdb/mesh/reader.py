@@ -18,14 +18,12 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import FileError, MissingExtraError, UsageError
+from hapticdb.errors import FileError, MissingExtraError
 from hapticdb.mesh.clean import Cleaned, CleanPart
 from hapticdb.mesh.parse import READERS, parse
 from hapticdb.mesh.part import Defects, MeshFile, Part
 from hapticdb.mesh.raw import UnreadableError
-
-UNITS = {"mm": 1e-3, "cm": 1e-2, "m": 1.0, "in": 0.0254}
-"""Units of length that `unit` takes, in metres."""
+from hapticdb.units import metres_of
 
 _EXTRAS = {"las": ("pointcloud", ("laspy", "lazrs")), "step": ("step", ("cascadio",))}
 _CHILD = Path(__file__).with_name("child.py")
@@ -51,9 +49,10 @@ def read_file(
     path : str or path
         GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); LAS, LAZ (extra
         `pointcloud`). The suffix says which.
-    unit : {'mm', 'cm', 'm', 'in'}, optional
-        Unit of a file whose format carries none (OBJ, STL, PLY, OFF, LAS, LAZ); metres if not
-        given. A glTF, 3MF, DAE or STEP file carries its own, and that one holds.
+    unit : str, optional
+        One of `hapticdb.mesh.UNITS`: of a file whose format carries none (OBJ, STL, PLY, OFF, LAS,
+        LAZ). If not given, that of the reference system which a LAS or LAZ file names, else metres.
+        A glTF, 3MF, DAE or STEP file carries its own, and that one holds.
     memory_limit : int, optional
         Bytes that parsing may take; by default 512 MiB and a multiple of the file's size, and
         three quarters of the machine's free memory at most.
@@ -102,10 +101,9 @@ def parse_in_process(path: str | os.PathLike[str], *, unit: str | None = None) -
         raise FileError(_one_line(path, error)) from None
 
 
-def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float, Path]:
-    """Length of the unit, and the file as far as it can be judged from outside."""
-    if unit is not None and unit not in UNITS:
-        raise UsageError(f"unknown unit '{unit}'; choose one of {', '.join(UNITS)}")
+def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | None, Path]:
+    """Length of the unit that is given, and the file as far as it can be judged from outside."""
+    metres = None if unit is None else metres_of(unit)
     file = Path(path)
     try:
         file = file.resolve()
@@ -115,7 +113,7 @@ def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float, Pat
     if refusal is not None:
         raise FileError(_one_line(path, refusal))
     _require_extra(READERS[file.suffix.lower()], file.suffix)
-    return UNITS[unit or "m"], file
+    return metres, file
 
 
 def _refusal(file: Path) -> str | None:
@@ -231,7 +229,7 @@ def _received(head: dict[str, Any], stream: IO[bytes]) -> Cleaned:
         CleanPart(name, geometry, np.array(transform, dtype=np.float64), Defects(**defects))
         for name, geometry, transform, defects in head["parts"]
     ]
-    return Cleaned(geometries, parts, Defects(**head["defects"]))
+    return Cleaned(geometries, parts, Defects(**head["defects"]), head["names_unit"], head["up"])
 
 
 def _fill(array: NDArray[Any], stream: IO[bytes]) -> None:
@@ -274,4 +272,4 @@ def _mesh_file(file: Path, cleaned: Cleaned) -> MeshFile:
         )
         for part in cleaned.parts
     ]
-    return MeshFile(str(file), parts, cleaned.defects)
+    return MeshFile(str(file), parts, cleaned.defects, cleaned.names_unit, cleaned.up)

@@ -1,6 +1,7 @@
 """STEP through cascadio (OpenCASCADE): tessellated to GLB, in metres, names kept."""
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 
 import cascadio
@@ -22,4 +23,4 @@ def read(path: Path) -> Parsed:
         cascadio.step_to_glb(str(path), str(glb))
         if not glb.is_file() or glb.stat().st_size == 0:
             raise UnreadableError("OpenCASCADE finds nothing in it that it can tessellate")
-        return gltf.read(glb)
+        return replace(gltf.read(glb), up=None)  # the solids keep their axes, whatever they mean

@@ -63,7 +63,7 @@ def read(path: Path) -> Parsed:
         names = [model.objects[key].name for key in keys]
         number = shapes.setdefault(keys[-1], len(shapes))
         placements.append(Placement("/".join(names), number, world_from_object))
-    return Parsed([_shape(model.objects[key]) for key in shapes], placements, model.metres)
+    return Parsed([_shape(model.objects[key]) for key in shapes], placements, model.metres, up="z")
 
 
 def _read_archive(archive: zipfile.ZipFile) -> _Model:

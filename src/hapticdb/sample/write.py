@@ -2,7 +2,7 @@
 
 import os
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import trimesh
@@ -68,6 +68,11 @@ def _geometry(part: SamplePart) -> trimesh.Trimesh:
     )
 
 
+def _say_up(tree: dict[str, Any]) -> None:
+    """Say in the file that z is up, where the format's y is expected."""
+    tree["asset"]["extras"] = {"up_axis": "z"}
+
+
 def _write(path: Path, content: bytes) -> None:
     """Write a file whole or not at all."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -99,7 +104,8 @@ def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFil
     except OSError as error:
         raise FileError(f"cannot make the folder {target}: {error.strerror}") from error
     parts = build_car()
-    _write(target / "car.glb", car_scene(parts).export(file_type="glb"))
+    car = car_scene(parts).export(file_type="glb", tree_postprocessor=_say_up)
+    _write(target / "car.glb", car)
     wrench = write_wrench(target)
     write_poses(target / "path.csv", slide_path(parts, build_wrench().vertices, count))
     return SampleFiles(target / "car.glb", wrench, target / "path.csv")

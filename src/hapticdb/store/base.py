@@ -90,7 +90,8 @@ class Object:
     bounds : (2, 3) float64
         Lower and upper corner, metres, world frame.
     attributes : mapping
-        What else is known, as JSON: ``unit`` is the unit its file was read in.
+        What else is known, as JSON: ``unit`` is the unit its file was read in, ``up`` the
+        axis that the file says points up: ``x``, ``y`` or ``z``.
     revision : int
         Of the environment, when the object was last written.
     """
@@ -104,6 +105,12 @@ class Object:
     attributes: Mapping[str, object] = field(default_factory=dict)
     id: int = 0
     revision: int = 0
+
+
+def scene_bounds(objects: Iterable[Object]) -> NDArray[np.float64] | None:
+    """Lower and upper corner (2, 3) of all objects, metres, world frame; None without any."""
+    boxes = np.array([obj.bounds for obj in objects])
+    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]) if len(boxes) else None
 
 
 def no_object(object_id: int, url: str) -> ObjectNotFoundError:

@@ -1,0 +1,40 @@
+"""Units of length, by the words that options and parameters take."""
+
+from hapticdb.errors import UsageError
+
+UNITS = {
+    "um": 1e-6,
+    "mm": 1e-3,
+    "cm": 1e-2,
+    "m": 1.0,
+    "km": 1e3,
+    "in": 0.0254,
+    "ft": 0.3048,
+    "us-ft": 1200.0 / 3937.0,
+    "yd": 0.9144,
+}
+"""Length of each, metres; `us-ft` is the US survey foot, which point clouds are measured in."""
+NAMES = {
+    "um": "micrometres",
+    "mm": "millimetres",
+    "cm": "centimetres",
+    "m": "metres",
+    "km": "kilometres",
+    "in": "inches",
+    "ft": "feet",
+    "us-ft": "US survey feet",
+    "yd": "yards",
+}
+
+
+def metres_of(unit: str) -> float:
+    """Length of a unit, metres.
+
+    Raises
+    ------
+    UsageError
+        When it is none of `UNITS`.
+    """
+    if unit not in UNITS:
+        raise UsageError(f"unknown unit '{unit}'; choose one of {', '.join(UNITS)}")
+    return UNITS[unit]

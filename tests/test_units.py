@@ -1,0 +1,144 @@
+"""Lengths are in the unit that is said, and a user sees which one and how large the scene is."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+import trimesh
+from laspy.vlrs.known import WktCoordinateSystemVlr
+
+import hapticdb
+from command_line import Run, boxes, refused, run  # noqa: F401 - fixtures
+from command_line import tool as stl
+from hapticdb.mesh import parse_in_process, read_file
+from hapticdb.store.base import scene_bounds
+from hapticdb.units import NAMES, UNITS
+
+FEET = 1200.0 / 3937.0
+PROJECTED = 'PROJCS["somewhere",GEOGCS["g",UNIT["degree",0.0174532925199433]],UNIT["{}",{}]]'
+COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
+<asset><unit name="metre" meter="1"/><up_axis>{}</up_axis></asset>
+<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="9">
+0 0 0 1 0 0 0 1 0</float_array><technique_common><accessor source="#a" count="3" stride="3">
+<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
+</vertices><triangles count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p>
+</triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s">
+<node name="n"><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
+<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
+
+
+def cloud(path: Path, wkt: str = "") -> Path:
+    """Points of a LAS file, 100 apart at most."""
+    las = laspy.create(point_format=6, file_version="1.4")
+    las.header.scales, las.header.offsets = np.full(3, 0.001), np.zeros(3)
+    las.x, las.y, las.z = np.random.default_rng(1).uniform(0, 100, (3, 500))
+    las.x[:2] = (0.0, 100.0)
+    if wkt:
+        las.header.vlrs.append(WktCoordinateSystemVlr(wkt))
+    las.write(path)
+    return path
+
+
+def test_every_unit_has_a_name() -> None:
+    assert set(NAMES) == set(UNITS)
+    assert pytest.approx(UNITS["ft"]) == 12 * UNITS["in"] == pytest.approx(UNITS["yd"] / 3)
+
+
+def test_feet_are_taken_wherever_a_unit_is(run: Run, tmp_path: Path) -> None:
+    trimesh.creation.box(extents=(2, 2, 2)).export(tmp_path / "tool.stl")
+    (tmp_path / "path.csv").write_text("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n")
+    assert run("import", "a.db", "tool.stl", "--unit", "ft", "--bits", 6)[0] == 0
+    tool = ["a.db", "--tool", "tool.stl", "--tool-unit", "ft"]
+    assert run("touch", *tool, "--poses", "path.csv")[0] == 0
+    assert run("sweep", *tool, "--path", "path.csv")[0] in {0, 1, 3}
+    assert run("feel", *tool, "--device", "path.csv", "--seconds", 0.1, "--rate", 200)[0] == 0
+
+
+def test_the_scene_is_told_in_metres(run: Run, tmp_path: Path) -> None:
+    box = trimesh.creation.box(bounds=[(10, 20, 30), (14, 22, 31)])
+    box.export(tmp_path / "a.stl")
+    code, out, _ = run("import", "a.db", "a.stl", "--unit", "ft", "--bits", 6)
+    assert code == 0
+    words = "1.219 x 0.6096 x 0.3048 m, from (3.048, 6.096, 9.144) to (4.2672, 6.7056, 9.4488) m"
+    assert words in out
+    assert words in run("info", "a.db")[1]
+    found = json.loads(run("info", "a.db", "--json")[1])["scene"]
+    np.testing.assert_allclose(found["low"], [3.048, 6.096, 9.144], rtol=1e-6)
+    np.testing.assert_allclose(found["extent"], [1.2192, 0.6096, 0.3048], rtol=1e-6)
+    again = json.loads(run("import", "a.db", "a.stl", "--unit", "ft", "--json")[1])
+    assert again["scene"] == found
+
+
+def test_an_empty_scene_has_no_extent(run: Run, tmp_path: Path) -> None:
+    hapticdb.create(tmp_path / "a.db", hapticdb.Grid(0.01, (0, 0, 0), 5)).close()
+    assert json.loads(run("info", "a.db", "--json")[1])["scene"] is None
+    assert "nothing in it" in run("info", "a.db")[1]
+    assert scene_bounds([]) is None
+
+
+@pytest.mark.parametrize("name", ["a.las", "a.stl", "a.glb"])
+def test_an_import_says_when_it_took_metres(run: Run, tmp_path: Path, name: str) -> None:
+    made: dict[str, Callable[[Path], Path]] = {"a.las": cloud, "a.stl": stl, "a.glb": boxes}
+    file = made[name](tmp_path / name)
+    told = "it names no unit, so its numbers are taken as metres; --unit says another"
+    is_told = name != "a.glb"
+    assert (told in run("import", "a.db", file, "--bits", 6)[1]) == is_told
+    assert told not in run("import", "b.db", file, "--bits", 6, "--unit", "m")[1]
+    found = json.loads(run("import", "c.db", file, "--bits", 6, "--json")[1])
+    assert found["is_unit_assumed"] == is_told
+
+
+@pytest.mark.parametrize(
+    ("wkt", "unit", "metres", "names_unit"),
+    [
+        ("", None, 1.0, False),
+        ("", "ft", 0.3048, False),
+        (PROJECTED.format("US survey foot", 0.304800609601219), None, FEET, True),
+        (PROJECTED.format("US survey foot", 0.304800609601219), "m", 1.0, True),
+        ('COMPD_CS["c",' + PROJECTED.format("metre", 1) + ',VERT_CS["v",UNIT["foot",0.3048]]]',
+         None, 1.0, True),
+        ('GEOGCS["g",UNIT["degree",0.0174532925199433]]', None, 1.0, False),
+        (PROJECTED.format("broken", "1e999"), None, 1.0, False),
+    ],
+)  # fmt: skip
+def test_a_point_cloud_is_in_the_unit_of_its_reference_system(
+    tmp_path: Path, wkt: str, unit: str | None, metres: float, names_unit: bool
+) -> None:
+    file = read_file(cloud(tmp_path / "a.las", wkt), unit=unit)
+    assert file.bounds[1, 0] - file.bounds[0, 0] == pytest.approx(100 * metres)
+    assert file.names_unit == names_unit
+
+
+@pytest.mark.parametrize(
+    ("name", "said", "up"),
+    [("a.glb", None, "y"), ("b.glb", "z", "z"), ("a.stl", None, None), ("a.dae", "X_UP", "x")],
+)
+def test_which_axis_points_up_comes_from_the_file(
+    tmp_path: Path, name: str, said: str | None, up: str | None
+) -> None:
+    file = tmp_path / name
+    mesh = trimesh.creation.box()
+    if name.endswith(".dae"):
+        file.write_text(COLLADA.format(said))
+    elif said is None:
+        mesh.export(file)
+    else:
+        mesh.scene().export(
+            file, tree_postprocessor=lambda tree: tree["asset"].update(extras={"up_axis": said})
+        )
+    assert parse_in_process(file).up == read_file(file).up == up
+    with hapticdb.create(tmp_path / "a.db", hapticdb.Grid(0.1, (-2, -2, -2), 6)) as env:
+        env.add(file)
+        assert env.object(1).attributes.get("up") == up
+
+
+def test_an_unknown_unit_names_those_known(run: Run, tmp_path: Path) -> None:
+    with pytest.raises(hapticdb.UsageError, match=r"furlong.*ft"):
+        read_file(stl(tmp_path / "a.stl"), unit="furlong")
+    refused(run("import", "a.db", "a.stl", "--unit", "furlong"), "--unit")

@@ -88,6 +88,7 @@ def test_words_choose_objects(car: Environment, words: list[int | str], ids: lis
         ("front/tyre", "no object 'front/tyre' in"),  # not the start of a path
         ("hood,boot", "no object 'boot' in"),
         ("body", "case counts: there is 'Body/hood'"),
+        ("bolt", "but 'wheels/front/wheel_bolt_1' and 1 more"),
         ("", "no object ''"),
         ("1,", "no object ''"),
         ("[", "no object"),

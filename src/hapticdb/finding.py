@@ -98,9 +98,13 @@ def _id_of(digits: str, url: str) -> int:
 def _nothing_like(word: str, objects: Sequence[Object], url: str) -> ObjectNotFoundError:
     """Build the error for a name or pattern that fits nothing."""
     folded = [replace(obj, name=obj.name.casefold()) for obj in objects]
-    alike = named_like(folded, word.casefold())
     names = {obj.id: obj.name for obj in objects}
-    hint = f", where case counts: there is {names[alike[0].id]!r}" if alike else ""
+    if alike := named_like(folded, word.casefold()):
+        hint = f", where case counts: there is {names[alike[0].id]!r}"
+    elif word.strip("*/ ") and (alike := named_like(folded, f"*{word.strip('*/ ').casefold()}*")):
+        hint = f", but {names[alike[0].id]!r}" + (f" and {len(alike) - 1} more" * (len(alike) > 1))
+    else:
+        hint = ""
     return ObjectNotFoundError(
         f"no object {word[:80]!r} in {url}{hint}; 'hapticdb objects {url}' lists the names"
     )

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
+from hapticdb.cli.columns import Columns
+from hapticdb.cli.pages import PAGE, Corners, Order, page_of, selected
 from hapticdb.cli.root import Json, Url
 
 if TYPE_CHECKING:
-    from rich.console import RenderableType
-
     from hapticdb.statistics import CostModel
     from hapticdb.store.base import Freshness, Object
 
@@ -98,26 +98,77 @@ def info(url: Url, *, json: Json = False) -> None:
     )
 
 
-def objects(url: Url, *, json: Json = False) -> None:
+def objects(
+    url: Url,
+    *,
+    name: Annotated[
+        list[str] | None,
+        typer.Option(metavar="ID|NAME", help="Only these: 7 or 3,4 or 'wheel*'; again for more."),
+    ] = None,
+    box: Annotated[
+        Corners | None,
+        typer.Option(
+            metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only those whose bounds meet this box, metres."
+        ),
+    ] = None,
+    sort: Annotated[
+        Order, typer.Option(help="By name; or by voxels or longest side, the largest first.")
+    ] = "id",
+    reverse: Annotated[bool, typer.Option("--reverse", help="The other way round.")] = False,
+    limit: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N",
+            help="Objects on a page; 0: all.",
+            show_default=f"{PAGE} on a terminal, all in a pipe",
+        ),
+    ] = None,
+    page: Annotated[int | None, typer.Option(metavar="N", help="Which page, from 1.")] = None,
+    json: Json = False,
+) -> None:
     """List the objects of an environment.
 
+    Verbs take objects by id, by name and by pattern. A name is a path, such as
+    body/door/handle. One without / fits any element of a path, one with / the
+    path from its start; where it ends at a sub-assembly, it means all below.
+    In a pattern * stands for anything, ? for one character, [ab] for a or b;
+    case counts.
+
     Example: hapticdb objects car.db
+
+    Example: hapticdb objects car.db --name 'wheel*' --sort voxels --limit 10
     """
     from contextlib import closing
 
+    from hapticdb.errors import ObjectNotFoundError
     from hapticdb.store.connect import open_store
 
     with closing(open_store(url, read_only=True)) as env:
-        found, shown = env.objects(), env.url
+        shown = env.url
+        try:
+            found = selected(env, name, box, sort, reverse=reverse)
+        except ObjectNotFoundError as error:
+            raise ObjectNotFoundError(f"--name: {error}") from None
+    is_whole = json and limit is None and page is None
+    part = page_of(found, 0 if is_whole else limit, page)
     if json:
-        for obj in found:
+        for obj in part.objects:
             render.say_json(record_of(obj))
         return
     if not found:
-        render.note(f"{shown} is empty; 'hapticdb import URL FILE' fills it")
+        nothing = f"{shown} is empty; 'hapticdb import URL FILE' fills it"
+        render.note(nothing if box is None else f"{shown}: no object meets the box")
         return
-    rows = [(str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in found]
+    rows = [
+        (str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in part.objects
+    ]
     render.show(render.table(("id>", "name", "voxels>", "size, mm>", "file"), rows))
+    last = part.first + len(rows) - 1
+    if len(rows) < part.total:
+        more = "" if last == part.total else f"; --page {last // len(rows) + 1} goes on"
+        render.note(
+            f"objects {part.first:,} to {last:,} of {part.total:,}{more}, --limit 0 shows all"
+        )
 
 
 def record_of(obj: "Object") -> dict[str, object]:
@@ -226,7 +277,7 @@ def _age(freshness: "Freshness") -> str:
     return f"{render.counted(freshness.changes, 'write')} behind"
 
 
-def _costs_table(costs: "CostModel") -> "RenderableType":
+def _costs_table(costs: "CostModel") -> Columns:
     rows = []
     for name, meaning in MEANINGS.items():
         spread = costs.spread.get(name)

@@ -1,19 +1,19 @@
 """What people see: tables and notes; bars on a terminal only."""
 
-import io
 import json
 import os
 import re
+import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
+from hapticdb.cli.columns import Columns
+
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-    from rich.console import RenderableType
-    from rich.text import Text
 
     from hapticdb import transfer
     from hapticdb.ingest import ProgressCallback
@@ -23,8 +23,6 @@ _UNPRINTABLE = re.compile(
 )
 """Controls of a terminal, and of the direction of writing; a line's end is neither."""
 NEW_LINE = "\n"
-PIPED_WIDTH = 10_000
-"""Columns where nobody looks: what reads a pipe wants whole lines."""
 
 
 def printable(text: str) -> str:
@@ -46,11 +44,9 @@ def say(text: str = "") -> None:
     print(printable(text))
 
 
-def _cell(text: str) -> "Text":
+def _cell(text: str) -> str:
     """Text of one cell of a table, in one line."""
-    from rich.text import Text
-
-    return Text(printable(text).replace(NEW_LINE, "\\n"))
+    return printable(text).replace(NEW_LINE, "\\n")
 
 
 def say_json(record: Mapping[str, Any]) -> None:
@@ -58,59 +54,25 @@ def say_json(record: Mapping[str, Any]) -> None:
     print(json.dumps(record, allow_nan=False))
 
 
-def show(renderable: "RenderableType") -> None:
-    """Print a table to standard output: as wide as the terminal, or whole into a pipe."""
-    from rich.console import Console
-
+def show(columns: Columns) -> None:
+    """Print a table or facts to standard output: as wide as the terminal, or whole into a pipe."""
     is_terminal = sys.stdout.isatty()
-    page = io.StringIO()
-    width = None if is_terminal else PIPED_WIDTH
-    screen = Console(file=sys.stdout)
-    console = Console(
-        file=page,
-        width=width or screen.width,
-        force_terminal=is_terminal,
-        no_color=screen.no_color,
-        highlight=False,
-        markup=False,
-        emoji=False,
-    )
-    console.print(renderable)
-    # by way of a string, so that a closed pipe is met where every other print meets it
-    lines = [line.rstrip() for line in page.getvalue().splitlines()]
-    sys.stdout.write("\n".join(lines).strip("\n") + "\n")
+    width = shutil.get_terminal_size().columns if is_terminal else None
+    is_styled = is_terminal and os.environ.get("TERM", "") not in {"", "dumb", "unknown"}
+    lines = columns.lines(width, is_styled=is_styled)
+    sys.stdout.write("\n".join([*lines, ""]))
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> "RenderableType":
+def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Columns:
     """Lay out rows under headings; a heading that ends in ``>`` is of a column of numbers."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
-    laid = Table(box=box.SIMPLE_HEAD, pad_edge=False, header_style="bold")
-    for column in columns:
-        is_number = column.endswith(">")
-        laid.add_column(
-            Text(column.rstrip(">")),
-            justify="right" if is_number else "left",
-            no_wrap=is_number,
-            overflow="fold",
-        )
-    for row in rows:
-        laid.add_row(*map(_cell, row))
-    return laid
+    numbers = frozenset(i for i, column in enumerate(columns) if column.endswith(">"))
+    laid = [[_cell(text) for text in row] for row in rows]
+    return Columns(laid, [column.rstrip(">") for column in columns], numbers)
 
 
-def facts(rows: Iterable[tuple[str, str]]) -> "RenderableType":
+def facts(rows: Iterable[tuple[str, str]]) -> Columns:
     """Lay out names and values, a pair a line."""
-    from rich.table import Table
-
-    laid = Table.grid(padding=(0, 2))
-    laid.add_column(no_wrap=True, style="dim")
-    laid.add_column(overflow="fold")
-    for name, value in rows:
-        laid.add_row(_cell(name), _cell(value))
-    return laid
+    return Columns([(_cell(name), _cell(value)) for name, value in rows])
 
 
 def counted(n: float, noun: str = "") -> str:

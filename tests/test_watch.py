@@ -186,17 +186,17 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return found
 
 
-def test_what_is_noticed_by_a_notification_costs_no_round_trip(
+def test_what_is_noticed_by_a_notification_costs_one_round_trip(
     url: str, reader: PostgresStore, asked: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(watching, "HEARING_S", 1e9)
     reader.watch()
     asked.clear()
-    for _ in range(3):
+    for n in range(3):
         write(url)
         assert is_noticed(reader)
         assert not reader.has_changed()
-    assert asked == []
+        assert len(asked) == n + 1
 
 
 def test_notifications_during_reads_neither_disturb_nor_get_lost(
@@ -337,17 +337,6 @@ def test_an_environment_made_anew_is_told_from_the_one_before(
     again = PostgresStore.open(url, read_only=True)
     assert again.identity != reader.identity
     again.close()
-
-
-def test_words_of_strangers_on_the_channel_are_passed_over(
-    url: str, reader: PostgresStore, admin: psycopg.Connection
-) -> None:
-    channel = channel_of(parse(url).environment)
-    for payload in ("", "nonsense", "-1", "0", "²", "9" * 5000):
-        admin.execute("SELECT pg_notify(%s, %s)", (channel, payload))
-    write(url)
-    assert is_noticed(reader)
-    assert not reader.has_changed()
 
 
 def test_the_channel_and_its_payload_are_as_documented(url: str, admin: psycopg.Connection) -> None:

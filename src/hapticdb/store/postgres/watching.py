@@ -2,12 +2,13 @@
 
 Each write notifies the environment's channel, with its revision as payload, in its transaction
 (PostgreSQL's manual: NOTIFY). The server sends that to whoever listens, once it is committed; to
-look whether it has come costs no round trip. A server that refuses LISTEN, as a standby does, and
+look whether it has come costs no round trip. Any role of the database may notify the channel, with
+any payload: a notification is a hint to ask for the revision, which only editors can raise, and
+nothing more; its payload is not read here. A server that refuses LISTEN, as a standby does, and
 writers that do not notify are found out by asking for the revision now and then. So is an
 environment that somebody has dropped and made anew: its table has another oid.
 """
 
-import contextlib
 import hashlib
 import time
 
@@ -24,6 +25,8 @@ HEARING_S = 1.0
 """How long a writer that does not notify may go unnoticed where LISTEN works."""
 DEAF_S = 0.02
 """How long any writer may, where it does not."""
+HINTED_S = 0.005
+"""Between two round trips that notifications lead to, at least: 200 a second in a flood."""
 
 
 def channel_of(environment: str) -> str:
@@ -43,9 +46,9 @@ class Watch:
         self._identity = identity
         self._connection: psycopg.Connection[tuple[object, ...]] | None = None
         self._revision = -1
-        self._heard = -1
+        self._is_hinted = False
         self._is_deaf = True
-        self._due = 0.0
+        self._due = self._asked = 0.0
 
     def begin(self) -> None:
         """Notice commits from now on."""
@@ -56,18 +59,17 @@ class Watch:
     def has_changed(self) -> bool:
         """Whether something was committed since `begin` or the last call.
 
-        A round trip only when the revision has to be asked for, and after a lost connection: then
-        the answer is yes, since what came meanwhile was not heard. Raises ConnectionLostError when
-        the environment was made anew.
+        A round trip only after a notification, when the revision has not been asked for in a while,
+        and after a lost connection: then the answer is yes, since what came meanwhile was not
+        heard. Raises ConnectionLostError when the environment was made anew.
         """
         self._session.check_outside()
         if self._session.again(self._listen):
             self._ask()
             return True
-        if self._heard > self._revision:
-            self._revision = self._heard
-            return True
-        return time.monotonic() >= self._due and self._ask()
+        now = time.monotonic()
+        is_hinted = self._is_hinted and now >= self._asked + HINTED_S
+        return (is_hinted or now >= self._due) and self._ask()
 
     def _listen(self) -> bool:
         """Take in what has come; on a connection that does not listen yet, begin, and say so."""
@@ -88,18 +90,18 @@ class Watch:
         self._due = 0.0  # should asking right after this fail, the next call asks
         return True
 
-    def _hear(self, notify: psycopg.Notify) -> None:
-        with contextlib.suppress(ValueError):  # anybody may notify anything
-            self._heard = max(self._heard, int(notify.payload))
+    def _hear(self, _: psycopg.Notify) -> None:
+        self._is_hinted = True
 
     def _ask(self) -> bool:
         """Whether the revision is another than the one known."""
-        before = self._revision
+        before, self._is_hinted = self._revision, False  # before: what comes meanwhile may be newer
         found, identity = self._session.fetch(REVISION)
         if wire.read_int8(identity or b"") != self._identity:
             raise ConnectionLostError(
                 f"{self._session.shown} is another environment than before: open it again"
             )
-        self._revision = self._heard = wire.read_int8(found or b"")
-        self._due = time.monotonic() + (DEAF_S if self._is_deaf else HEARING_S)
+        self._revision = wire.read_int8(found or b"")
+        self._asked = time.monotonic()
+        self._due = self._asked + (DEAF_S if self._is_deaf else HEARING_S)
         return self._revision != before

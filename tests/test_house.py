@@ -58,13 +58,14 @@ FLOORS: list[set[str]] = [
     {"grid"},
     {"kernels"},
     {"units"},
-    {"errors"},
+    {"errors", "interrupting"},
 ]
 LEVELS = {name: level for level, floor in enumerate(FLOORS) for name in floor}
 # what may import less than its floor allows
 NARROW: dict[str, set[str]] = {
     "kernels": set(),
     "errors": set(),
+    "interrupting": set(),
     "force": {"errors"},
     "poses": {"errors", "units"},
     "mesh": {"errors", "units"},

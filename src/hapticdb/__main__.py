@@ -2,6 +2,21 @@
 
 import sys
 
-from hapticdb.cli import main
+from hapticdb import interrupting
 
-sys.exit(main())
+
+def main() -> int:
+    """Run the process's command line and return its exit code."""
+    interrupting.begin()
+    from hapticdb.cli import main as run  # noqa: PLC0415 - most of a start; Ctrl-C may come before
+
+    try:
+        return run()
+    except KeyboardInterrupt:  # once more, while the first was being answered
+        return interrupting.EXIT_CODE
+    finally:
+        interrupting.leave()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

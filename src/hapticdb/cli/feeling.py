@@ -22,6 +22,7 @@ from hapticdb.cli.root import (
     size_of,
 )
 from hapticdb.cli.touching import shell_of
+from hapticdb.interrupting import interrupt
 
 if TYPE_CHECKING:
     from hapticdb.realtime.devices import Device
@@ -213,7 +214,7 @@ def _ended_by_signals(session: "Session") -> Iterator[list[int]]:
     before = {  # another's handler stays
         number: handler
         for number, handler in handlers.items()
-        if handler in {signal.default_int_handler, leave}
+        if handler in {signal.default_int_handler, interrupt, leave}
     }
 
     def end(number: int, _: object) -> None:

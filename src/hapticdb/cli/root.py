@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal
 import typer
 import typer.core
 
+from hapticdb import interrupting
+
 StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 CurveName = Literal["z", "hilbert", "lexicographic"]
 LayoutName = Literal["brick", "voxel"]
@@ -50,6 +52,7 @@ class Verbs(typer.core.TyperGroup):
         return list(self.commands)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401, D102
+        interrupting.work()
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:

@@ -1,0 +1,109 @@
+"""Ctrl-C at any moment of the command line is one line and exit code 130."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import contextlib
+import signal
+import sys
+from pathlib import Path
+from subprocess import TimeoutExpired
+
+import pytest
+
+from children import PATIENCE, child, finished
+from command_line import Run, command, made, run, scene  # noqa: F401 - fixtures
+
+AT_IMPORT = """
+import os, signal, sys, runpy
+
+at, how = int(sys.argv[1]), sys.argv[2]
+sys.argv[:] = ["hapticdb", *sys.argv[3:]]
+left = None
+
+def interrupt_within(event, args):
+    global left
+    if event == "import":
+        if left is None and args[0] == "hapticdb.cli":
+            left = at
+        elif left is not None:
+            left -= 1
+            if left == 0:
+                os.kill(os.getpid(), signal.SIGINT)
+
+sys.addaudithook(interrupt_within)
+if how == "module":
+    runpy.run_module("hapticdb", run_name="__main__", alter_sys=True)
+else:
+    from hapticdb.__main__ import main
+    sys.exit(main())
+"""
+"""A command line that is interrupted within its n-th import after the command line's own."""
+
+
+@pytest.mark.parametrize("at", [1, 2, 5, 12, 40, 90, 150, 220, 300, 380, 450, 520])
+def test_ctrl_c_within_any_import_is_one_line(scene: Path, at: int) -> None:
+    how = "module" if at % 2 else "script"
+    done = finished([sys.executable, "-c", AT_IMPORT, str(at), how, "objects", str(scene)])
+    if done.returncode == 0:  # so many imports there are not
+        assert at > 150
+        assert done.stderr == ""
+    else:
+        assert (done.returncode, done.stderr) == (130, "hapticdb: interrupted\n")
+
+
+@pytest.mark.parametrize("at", [100, 400, 700, 1000])
+def test_ctrl_c_within_an_import_of_a_touch_is_one_line(scene: Path, at: int) -> None:
+    touch = ("touch", str(scene), "--tool", "tool.npz", "--poses", "path.csv")
+    done = finished([sys.executable, "-c", AT_IMPORT, str(at), "module", *touch], cwd=scene.parent)
+    if done.returncode == 0:
+        assert at > 400
+    else:
+        assert (done.returncode, done.stderr) == (130, "hapticdb: interrupted\n")
+
+
+@pytest.mark.long
+def test_ctrl_c_after_any_delay_leaves_no_traceback_of_ours(scene: Path) -> None:
+    """Before our first line Python itself answers; that traceback names no file of ours."""
+    codes = set()
+    for n in range(30):
+        with child(command("info", scene)) as process:
+            with contextlib.suppress(TimeoutExpired):
+                process.wait(timeout=0.02 + 0.03 * n)
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            _, err = process.communicate(timeout=PATIENCE)
+        codes.add(process.returncode)
+        assert "hapticdb/cli" not in err
+        if process.returncode == 130:
+            assert err == "hapticdb: interrupted\n"
+    assert codes <= {0, 130, -signal.SIGINT, 1}
+
+
+def test_who_ignores_ctrl_c_goes_on_ignoring_it(scene: Path) -> None:
+    script = f"import signal; signal.signal(2, signal.SIG_IGN)\n{AT_IMPORT}"
+    done = finished([sys.executable, "-c", script, "40", "module", "objects", str(scene)])
+    assert (done.returncode, done.stderr) == (0, "")
+
+
+FINALIZED = """
+import os, signal, sys, time
+from hapticdb import interrupting
+
+class Slow:
+    def __del__(self):
+        os.kill(os.getpid(), signal.SIGINT)
+        time.sleep(0)
+
+interrupting.begin()
+interrupting.work()
+try:
+    Slow()
+    time.sleep(30)
+except KeyboardInterrupt:
+    print("raised")
+"""
+
+
+def test_ctrl_c_within_a_finalizer_is_not_lost() -> None:
+    done = finished([sys.executable, "-c", FINALIZED])
+    assert (done.stdout, done.stderr) == ("raised\n", "")

@@ -15,8 +15,9 @@ import hapticdb
 from children import PATIENCE, child, exit_code
 from hapticdb import Grid
 from hapticdb.store.base import Layout, Store
-from hapticdb.store.schema import FORMAT_VERSION
+from hapticdb.store.schema import CHECKED_VERSION, FORMAT_VERSION
 from hapticdb.store.sqlite import SQLiteStore
+from hapticdb.store.sqlite_pages import LAYER
 from hapticdb.testing import StoreContract, blob, floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 6)
@@ -46,7 +47,9 @@ def path(tmp_path: Path) -> Path:
 def test_the_file_is_marked_as_ours(path: Path) -> None:
     with closing(sqlite3.connect(path)) as plain, plain:
         assert plain.execute("PRAGMA application_id").fetchone() == (0x48415054,)
-        assert plain.execute("PRAGMA user_version").fetchone() == (FORMAT_VERSION,)
+        assert plain.execute("PRAGMA user_version").fetchone() == (
+            CHECKED_VERSION + FORMAT_VERSION,
+        )
         assert plain.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
@@ -70,7 +73,7 @@ def write_other_database(path: Path) -> None:
 
 def write_newer_version(path: Path) -> None:
     with closing(sqlite3.connect(path)) as plain, plain:
-        plain.execute(f"PRAGMA user_version = {FORMAT_VERSION + 1}")
+        plain.execute(f"PRAGMA user_version = {CHECKED_VERSION + FORMAT_VERSION + 1}")
 
 
 def cut_off(path: Path) -> None:
@@ -82,8 +85,8 @@ def cut_header(path: Path) -> None:
 
 
 def drop_table(path: Path) -> None:
-    with closing(sqlite3.connect(path)) as plain, plain:
-        plain.execute("DROP TABLE environment")
+    with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
+        connection.execute("DROP TABLE environment")
 
 
 def empty(path: Path) -> None:

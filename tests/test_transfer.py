@@ -25,6 +25,7 @@ from hapticdb.layout import rows_of_voxels
 from hapticdb.statistics import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite import SQLiteStore
+from hapticdb.store.sqlite_pages import LAYER
 from hapticdb.testing import KINDS, blob, voxel_object, write_voxels
 from hapticdb.transfer import CopyReport, Progress
 
@@ -53,7 +54,7 @@ def add(env: Environment, ijk: NDArray[np.int64], name: str, **fields: Any) -> i
 
 def change(path: Path, *statements: str) -> None:
     """Write past the library."""
-    with closing(apsw.Connection(str(path))) as connection:
+    with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
         for sql in statements:
             connection.execute(sql)
 

@@ -10,6 +10,9 @@ from typing import NamedTuple
 
 SQLITE_APPLICATION_ID = 0x48415054  # "HAPT"
 
+CHECKED_VERSION = 1000
+"""Added to the version of a file whose pages carry checksums: who writes none must refuse it."""
+
 
 class Migration(NamedTuple):
     """One step of the format: a name and its statements for each engine."""

@@ -20,13 +20,17 @@ from hapticdb.errors import (
     NotAnEnvironmentError,
     ReadOnlyError,
 )
-from hapticdb.store.schema import FORMAT_VERSION, MIGRATIONS, SQLITE_APPLICATION_ID
+from hapticdb.store import sqlite_pages
+from hapticdb.store.schema import (
+    CHECKED_VERSION,
+    FORMAT_VERSION,
+    MIGRATIONS,
+    SQLITE_APPLICATION_ID,
+)
 
 BUSY_TIMEOUT_MS = 10_000
 CACHE_KIB = 256 * 1024
 """Page cache of one connection: the bricks of a large car; memory is taken as it is filled."""
-PAGE_BYTES = 8192
-"""The paper's block."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
 LOOK_SECONDS = 0.25
@@ -83,10 +87,13 @@ def check_kind(path: Path) -> None:
         raise NotAnEnvironmentError(f"{path} is not a file, so it is no environment")
     try:
         with path.open("rb") as file:
-            header = file.read(HEADER_BYTES)
+            first = file.read(sqlite_pages.PAGE_BYTES)
     except OSError as error:
         raise DatabaseError(f"{path} cannot be read: {error.strerror}") from error
-    foreign = NotAnEnvironmentError(f"{path} is no hapticdb environment; give another path")
+    header = first[:HEADER_BYTES]
+    foreign: DatabaseError = _foreign(path)
+    if sqlite_pages.is_marked(first):
+        foreign = damaged(str(path), "its header is not what was written")
     if not header:
         raise NotAnEnvironmentError(f"{path} is empty; remove it, or give another path")
     if header[:16] != MAGIC[: len(header[:16])]:
@@ -98,6 +105,7 @@ def check_kind(path: Path) -> None:
         return  # the header may be older than the log: the engine decides
     if int.from_bytes(header[68:72], "big") != SQLITE_APPLICATION_ID:
         raise foreign
+    _check_known(path, int.from_bytes(header[60:64], "big"))
     page = int.from_bytes(header[16:18], "big")
     expected = int.from_bytes(header[28:32], "big") * (65536 if page == 1 else page)
     if path.stat().st_size < expected:
@@ -131,9 +139,12 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
     _sweep_unfinished(path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
-        with named_errors(str(path)), contextlib.closing(apsw.Connection(str(unfinished))) as new:
-            new.execute(f"PRAGMA page_size = {PAGE_BYTES}")
+        made = apsw.Connection(str(unfinished), vfs=sqlite_pages.LAYER)
+        with named_errors(str(path)), contextlib.closing(made) as new:
+            new.execute(f"PRAGMA page_size = {sqlite_pages.PAGE_BYTES}")
+            new.reserve_bytes(reserve=sqlite_pages.TAIL_BYTES)
             new.execute("PRAGMA journal_mode = OFF").fetchall()
+            new.execute(f"PRAGMA user_version = {CHECKED_VERSION}")
             migrate(new, 0)
             fill(new)
             new.execute("PRAGMA journal_mode = WAL").fetchall()
@@ -174,11 +185,12 @@ def migrate(connection: apsw.Connection, version: int) -> None:
     for number, migration in enumerate(MIGRATIONS[version:], start=version + 1):
         connection.execute("BEGIN IMMEDIATE")
         try:
-            if _pragma(connection, "user_version") < number:  # another process may have been faster
+            marked, done = divmod(_pragma(connection, "user_version"), CHECKED_VERSION)
+            if done < number:  # another process may have been faster
                 for statement in migration.sqlite:
                     connection.execute(statement)
                 connection.execute(f"PRAGMA application_id = {SQLITE_APPLICATION_ID}")
-                connection.execute(f"PRAGMA user_version = {number}")
+                connection.execute(f"PRAGMA user_version = {marked * CHECKED_VERSION + number}")
             connection.execute("COMMIT")
         except BaseException:
             connection.execute("ROLLBACK")
@@ -242,6 +254,7 @@ def _connect_to_read(path: Path) -> apsw.Connection:
     connection = apsw.Connection(
         path.resolve().as_uri() + options,
         flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI | apsw.SQLITE_OPEN_NOMUTEX,
+        vfs=_layer_of(path),
     )
     _settle(connection)
     return connection
@@ -251,9 +264,19 @@ def _connect_to_write(path: Path) -> apsw.Connection:
     if not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
         raise ReadOnlyError(f"{path} can only be read: open a copy that you may write to")
     flags = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_NOMUTEX
-    connection = apsw.Connection(str(path), flags=flags)
+    connection = apsw.Connection(str(path), flags=flags, vfs=_layer_of(path))
     _settle(connection)
     return connection
+
+
+def is_checked(path: Path) -> bool:
+    """Whether the pages of a file carry checksums."""
+    with path.open("rb") as file:
+        return sqlite_pages.is_checked(file.read(sqlite_pages.PAGE_BYTES))
+
+
+def _layer_of(path: Path) -> str | None:
+    return sqlite_pages.LAYER if is_checked(path) else None
 
 
 def _pragma(connection: apsw.Connection, name: str) -> int:
@@ -273,14 +296,10 @@ def _settle(connection: apsw.Connection) -> None:
 
 def _check_version(connection: apsw.Connection, path: Path, *, read_only: bool) -> None:
     with named_errors(str(path)):
-        version = _pragma(connection, "user_version")
+        found = _pragma(connection, "user_version")
         if _pragma(connection, "application_id") != SQLITE_APPLICATION_ID:
-            raise NotAnEnvironmentError(f"{path} is no hapticdb environment; give another path")
-        if version > FORMAT_VERSION:
-            raise NewerVersionError(
-                f"{path} has format {version}, newer than the {FORMAT_VERSION} known here: "
-                "install a newer hapticdb"
-            )
+            raise _foreign(path)
+        version = _check_known(path, found)
         if version < 1:
             raise damaged(str(path), f"format {version}")
         if version < FORMAT_VERSION:
@@ -290,3 +309,18 @@ def _check_version(connection: apsw.Connection, path: Path, *, read_only: bool) 
                     "and it is brought up to date"
                 )
             migrate(connection, version)
+
+
+def _check_known(path: Path, found: int) -> int:
+    """Version of a file's tables, from its user version; refuses one that is newer."""
+    version = found - CHECKED_VERSION if found >= CHECKED_VERSION else found
+    if version > FORMAT_VERSION:
+        raise NewerVersionError(
+            f"{path} has format {version}, newer than the {FORMAT_VERSION} known here: "
+            "install a newer hapticdb"
+        )
+    return version
+
+
+def _foreign(path: Path) -> NotAnEnvironmentError:
+    return NotAnEnvironmentError(f"{path} is no hapticdb environment; give another path")

@@ -1,0 +1,221 @@
+"""Checksums of pages: a file system layer below SQLite that believes no page unread.
+
+Each page of a checked file ends with `TAIL_BYTES` that SQLite leaves alone: a mark, a number drawn
+for the file, and a CRC-32 over the page's number, its content and the other two. They are written
+when a page goes into the file, and compared when one is read from it: a page that was altered,
+zeroed, moved to another place or taken from another file is told, whatever it holds. Pages in the
+write-ahead log are compared with the checksum that SQLite itself keeps of each frame and looks at
+only after a crash. See docs/decisions/0011.
+"""
+
+import os
+import struct
+import zlib
+from typing import Any
+
+import apsw
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import DamagedError
+from hapticdb.store.schema import CHECKED_VERSION
+
+LAYER = "hapticdb"
+"""Name under which SQLite knows the layer."""
+PAGE_BYTES = 8192
+"""The paper's block."""
+MARK = b"HapC"
+NONCE_BYTES = 8
+TAIL_BYTES = 16
+CONTENT_BYTES = PAGE_BYTES - TAIL_BYTES
+CRC_AT = PAGE_BYTES - 4
+PENDING_PAGE = (1 << 30) // PAGE_BYTES + 1
+"""SQLite locks bytes of this page and never writes it."""
+# https://sqlite.org/fileformat2.html, section 4: the write-ahead log
+LOG_HEADER = 32
+FRAME_HEADER = 24
+FRAME_BYTES = FRAME_HEADER + PAGE_BYTES
+_SUMS = struct.Struct(">2I")
+NEVER = 1 << 62
+"""No log is so long."""
+
+
+def tail_of(content: bytes | memoryview, number: int, nonce: bytes) -> bytes:
+    """Last 16 bytes of a page, from the others, its number from 1, and its file's nonce."""
+    start = MARK + nonce
+    crc = zlib.crc32(content, zlib.crc32(start + number.to_bytes(4, "big")))
+    return start + crc.to_bytes(4, "big")
+
+
+def is_whole(page: bytes, number: int, nonce: bytes) -> bool:
+    """Whether a page holds what was written as that page of that file."""
+    return page[CONTENT_BYTES:] == tail_of(memoryview(page)[:CONTENT_BYTES], number, nonce)
+
+
+def is_checked(first: bytes) -> bool:
+    """Whether the pages of a file carry checksums, by its first one.
+
+    Three places say so, and each alone is believed: damage to one does not end the checking.
+    """
+    version = int.from_bytes(first[60:64], "big")
+    return is_marked(first) or first[20:21] == bytes([TAIL_BYTES]) or version >= CHECKED_VERSION
+
+
+def is_marked(first: bytes) -> bool:
+    """Whether a page ends as those do that carry a checksum."""
+    return first[CONTENT_BYTES : CONTENT_BYTES + len(MARK)] == MARK
+
+
+def nonce_of(first: bytes) -> bytes:
+    """Nonce of a file, from its first page."""
+    return first[CONTENT_BYTES + len(MARK) : CRC_AT]
+
+
+class _PageFile(apsw.VFSFile):
+    """The database itself: tails are written with its pages and compared when they are read."""
+
+    def __init__(self, name: Any, flags: list[int]) -> None:  # noqa: ANN401 - apsw's own kinds of names
+        super().__init__("", name, flags)
+        self._path = name.filename() if isinstance(name, apsw.URIFilename) else name
+        self._nonce = b""
+        self._is_read_only = bool(flags[1] & apsw.SQLITE_OPEN_READONLY)
+
+    def _nonce_known(self) -> bytes:
+        """Nonce of the file; drawn when it is new."""
+        if not self._nonce:
+            self._nonce = (
+                super().xRead(NONCE_BYTES, CONTENT_BYTES + len(MARK))
+                if super().xFileSize() >= PAGE_BYTES
+                else os.urandom(NONCE_BYTES)
+            )
+        return self._nonce
+
+    def xRead(self, amount: int, offset: int) -> bytes:  # noqa: N802 - SQLite's name
+        page: bytes = super().xRead(amount, offset)
+        if amount != PAGE_BYTES:
+            return page  # the header alone, before SQLite reads all of the first page
+        number = offset // PAGE_BYTES + 1
+        if len(page) < PAGE_BYTES:
+            if super().xFileSize() == 0:
+                return page
+            raise damaged_page(self._path, f"page {number} is cut off")
+        if not is_whole(page, number, self._nonce or self._nonce_known()):
+            raise damaged_page(self._path, f"page {number} is not what was written")
+        return page
+
+    def xWrite(self, data: Any, offset: int) -> None:  # noqa: ANN401, N802 - a buffer; SQLite's name
+        if len(data) != PAGE_BYTES:
+            raise apsw.IOError("a write of less than a page")
+        content = bytes(memoryview(data)[:CONTENT_BYTES])
+        tail = tail_of(content, offset // PAGE_BYTES + 1, self._nonce or self._nonce_known())
+        super().xWrite(content + tail, offset)
+
+    def xLock(self, level: int) -> None:  # noqa: N802 - SQLite's name
+        """The last reader that closes a file asks for it alone, and does without when refused."""
+        if self._is_read_only and level > apsw.SQLITE_LOCK_SHARED:
+            raise apsw.BusyError("opened to read")
+        super().xLock(level)
+
+    def xDeviceCharacteristics(self) -> int:  # noqa: N802 - SQLite's name
+        """Without reads of parts of pages, which could not be compared."""
+        return super().xDeviceCharacteristics() & ~apsw.SQLITE_IOCAP_SUBPAGE_READ
+
+
+class _LogFile(apsw.VFSFile):
+    """The write-ahead log: a page read from it is compared with its frame's checksum."""
+
+    def __init__(self, name: Any, flags: list[int]) -> None:  # noqa: ANN401 - apsw's own kinds of names
+        super().__init__("", name, flags)
+        self._path = name.filename() if isinstance(name, apsw.URIFilename) else name
+        self._order = ""
+        self._header_end = 0
+        self._unsettled = NEVER
+
+    def xRead(self, amount: int, offset: int) -> bytes:  # noqa: N802 - SQLite's name
+        start = offset - FRAME_HEADER
+        if amount != PAGE_BYTES or start >= self._unsettled:
+            return bytes(super().xRead(amount, offset))
+        frame: bytes = super().xRead(FRAME_BYTES, start)
+        if not self._is_whole(frame, start):
+            number = (start - LOG_HEADER) // FRAME_BYTES + 1
+            raise damaged_page(
+                self._path.removesuffix("-wal"), f"frame {number} of its -wal is not as written"
+            )
+        return frame[FRAME_HEADER:]
+
+    def _is_whole(self, frame: bytes, start: int) -> bool:
+        """Whether a frame has the checksum that follows from the one before it."""
+        at = start - FRAME_BYTES + 16 if start > LOG_HEADER else LOG_HEADER - 8
+        before = super().xRead(8, at)
+        if len(frame) < FRAME_BYTES or len(before) < 8:
+            return False
+        self._order = self._order or (">" if super().xRead(4, 0)[3] & 1 else "<")
+        words = np.frombuffer(frame, f"{self._order}u4")
+        sums = log_checksum(words, *_SUMS.unpack(before))
+        return sums == _SUMS.unpack_from(frame, 16)
+
+    def xWrite(self, data: Any, offset: int) -> None:  # noqa: ANN401, N802 - a buffer; SQLite's name
+        """A page written again inside a transaction; its checksums then follow at the commit."""
+        super().xWrite(data, offset)
+        if len(data) == FRAME_HEADER:
+            self._header_end = offset + FRAME_HEADER
+            if any(memoryview(data)[4:8]):  # it commits
+                self._unsettled = NEVER
+        elif len(data) == PAGE_BYTES and offset != self._header_end:
+            self._unsettled = min(self._unsettled, offset - FRAME_HEADER)
+
+
+class _Layer(apsw.VFS):
+    """The layer itself, above the engine's own file system."""
+
+    def __init__(self) -> None:
+        super().__init__(LAYER, "")
+
+    def xFullPathname(self, name: str) -> str:  # noqa: N802 - SQLite's name
+        """Links followed, as the engine's own does; the binding takes its word for that amiss."""
+        return os.path.realpath(name)
+
+    def xOpen(self, name: Any, flags: list[int]) -> apsw.VFSFile:  # noqa: ANN401, N802 - apsw's own kinds of names; SQLite's name
+        if flags[0] & apsw.SQLITE_OPEN_MAIN_DB:
+            return _PageFile(name, flags)
+        if flags[0] & apsw.SQLITE_OPEN_WAL:
+            return _LogFile(name, flags)
+        return apsw.VFSFile("", name, flags)
+
+
+def damaged_page(path: str, cause: str) -> DamagedError:
+    """Build the error for a page that is not as it was written."""
+    return DamagedError(f"{path} is damaged ({cause}): restore a copy or import the files again")
+
+
+def log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:
+    """Both sums after a frame's words (2054,), from those before it, modulo 2^32.
+
+    SQLite adds the page's number and size and then its content, word after word: s1 += word + s2,
+    s2 += the next + s1. Both are linear in the words, with Fibonacci's numbers for weights.
+    """
+    number, size = int(frame[0]), int(frame[1])
+    s1 += number + s2
+    s2 += size + s1
+    page = frame[6:].astype(np.uint32, copy=False)
+    return (
+        (int(_WEIGHTS[0].dot(page)) + _PAST[0] * s1 + _PAST[1] * s2) & 0xFFFFFFFF,
+        (int(_WEIGHTS[1].dot(page)) + _PAST[1] * s1 + _PAST[2] * s2) & 0xFFFFFFFF,
+    )
+
+
+def _weights() -> tuple[tuple[NDArray[np.uint32], NDArray[np.uint32]], list[int]]:
+    """Of a page's words in both sums, and of the sums before it."""
+    n_words = PAGE_BYTES // 4
+    numbers = [0, 1]
+    while len(numbers) < n_words + 2:
+        numbers.append((numbers[-1] + numbers[-2]) & 0xFFFFFFFF)
+    fibonacci = np.array(numbers, np.uint32)
+    of_words = fibonacci[n_words - 1 :: -1].copy(), fibonacci[n_words:0:-1].copy()
+    return of_words, numbers[n_words - 1 :]
+
+
+_WEIGHTS, _PAST = _weights()
+
+
+_LAYER = _Layer()

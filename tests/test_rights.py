@@ -211,7 +211,7 @@ def test_a_role_that_no_right_can_hold_back_is_refused(
 
 
 def test_a_role_that_is_not_there_is_told(url: str) -> None:
-    for name in ("nobody here", "public", "x" * 99, '"; DROP ROLE "'):
+    for name in ("nobody here", "public", '"; DROP ROLE "'):
         with pytest.raises(UsageError, match="createuser"):
             grant(url, name, "viewer")
 

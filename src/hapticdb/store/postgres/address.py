@@ -47,9 +47,11 @@ def parse(url: str) -> Address:
     Raises
     ------
     UsageError
-        When the environment's name cannot be a schema's, or is given twice; when the URL is none.
+        When the environment's name cannot be a schema's, or is given twice; when the URL is none,
+        or names a user or a database that no server has.
     """
     parts = _split(url)
+    _check_login(parts, url)
     named: list[str] = []
     data: list[str] = []
     others: list[str] = []
@@ -105,6 +107,7 @@ def _split(url: str) -> SplitResult:
 
 def with_environment(url: str, name: str) -> str:
     """Rewrite a URL so that it names another environment of the same database."""
+    check_name(name, "an environment's name")
     head, _, query = url.partition("?")
     kept = [pair for pair in query.split("&") if pair and not pair.startswith("environment=")]
     for n, pair in enumerate(kept):
@@ -131,6 +134,45 @@ def redact(url: str) -> str:
         for key, equals, value in (pair.partition("=") for pair in query.split("&") if pair)
     ]
     return head + mark + "&".join(pairs)
+
+
+def check_name(name: str, what: str) -> None:
+    """Refuse what the server would not take as a name, or would cut off and take for another.
+
+    Raises
+    ------
+    UsageError
+        When it is no text, empty, or longer than 63 bytes in UTF-8.
+    """
+    if not isinstance(name, str):
+        raise UsageError(f"{what} {name!r}: give a str, not {type(name).__name__}")
+    try:
+        n_bytes = len(name.encode())
+    except UnicodeEncodeError:  # bytes of a command line that are no UTF-8, or half a character
+        raise UsageError(f"{what} {name!r} is no text: give it in UTF-8") from None
+    if "\0" in name or not name:
+        raise UsageError(f"{what} {name!r}: give one that is not empty, without a byte 0")
+    if n_bytes > LONGEST_NAME:
+        raise UsageError(
+            f"{what} {name!r} has {n_bytes} bytes, and PostgreSQL's have {LONGEST_NAME} at most: "
+            "give it as the server lists it"
+        )
+
+
+def _check_login(parts: SplitResult, url: str) -> None:
+    """Refuse names of a user or a database that the server would cut off and take for another."""
+    pairs = [pair.partition("=") for pair in parts.query.split("&")]
+    user = parts.netloc.rpartition("@")[0].partition(":")[0]
+    names = [("a user's name", user), ("a database's name", parts.path.removeprefix("/"))]
+    names += [("a user's name", value) for key, _, value in pairs if unquote(key) == "user"]
+    names += [("a database's name", value) for key, _, value in pairs if unquote(key) == "dbname"]
+    for what, quoted in names:
+        name = unquote(quoted)
+        if len(name.encode("utf-8", "surrogateescape")) > LONGEST_NAME:
+            raise UsageError(
+                f"{redact(url)}: {what} {name!r} is longer than the {LONGEST_NAME} bytes that "
+                "PostgreSQL allows: give it as the server lists it"
+            )
 
 
 def _check_name(name: str, url: str) -> None:

@@ -9,6 +9,7 @@ from typing import Literal
 from psycopg import sql
 
 from hapticdb.errors import AccessError, UsageError
+from hapticdb.store.postgres.address import check_name
 from hapticdb.store.postgres.session import Session, identifier
 
 Right = Literal["viewer", "toucher", "editor", "nobody"]
@@ -73,8 +74,10 @@ def grant(session: Session, role: str, right: Right) -> None:
     AccessError
         When the session's user does not own the environment.
     UsageError
-        When there is no such role, or none that the server would hold back.
+        When there is no such role, none that the server would hold back, or no role can have that
+        name: the server would cut it off at 63 bytes, and mean another.
     """
+    check_name(role, "a role's name")
     if right not in GRANTED:
         raise UsageError(f"right {right!r}: choose one of {', '.join(GRANTED)}")
     if not session.is_owner():

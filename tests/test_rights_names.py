@@ -1,0 +1,129 @@
+"""Names of roles, users, databases and environments that the server would take for others."""
+
+import os
+import sys
+from collections.abc import Iterator
+from urllib.parse import quote
+
+import psycopg
+import pytest
+from psycopg import sql
+
+from children import finished
+from hapticdb import Grid, UsageError
+from hapticdb.store.connect import create_store, grant
+from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment
+from servers import Place
+
+GRID = Grid(0.005, (0, 0, 0), 7)
+LONG = "r" * 64
+
+
+def of_bytes(start: str, letter: str) -> str:
+    """A name of as many bytes as a name may have, or one less."""
+    return start + letter * ((LONGEST_NAME - len(start.encode())) // len(letter.encode()))
+
+
+@pytest.fixture(params=["r", "é", "語"])
+def role(request: pytest.FixtureRequest, admin: psycopg.Connection) -> Iterator[str]:
+    """A role whose name is as long as one may be."""
+    name = of_bytes(f"{os.getpid()}", request.param)
+    quoted = sql.Identifier(name)
+    admin.execute(sql.SQL("CREATE ROLE {}").format(quoted))
+    yield name
+    admin.execute(sql.SQL("DROP OWNED BY {}").format(quoted))
+    admin.execute(sql.SQL("DROP ROLE {}").format(quoted))
+
+
+def may_read(admin: psycopg.Connection, role: str, url: str) -> bool:
+    row = admin.execute(
+        "SELECT has_schema_privilege(%s, %s, 'USAGE')", (role, parse(url).environment)
+    ).fetchone()
+    assert row is not None
+    return bool(row[0])
+
+
+def test_a_role_name_that_is_too_long_is_not_granted_to_its_beginning(
+    place: Place, role: str, admin: psycopg.Connection
+) -> None:
+    url = place()
+    create_store(url, GRID).close()
+    for longer in (role + "語", role + "r" * 10_000):
+        n_bytes = len(longer.encode())
+        with pytest.raises(
+            UsageError, match=rf"^a role's name .* has {n_bytes} bytes.* 63 at most"
+        ):
+            grant(url, longer, "viewer")
+    assert not may_read(admin, role, url)
+    grant(url, role, "viewer")
+    assert may_read(admin, role, url)
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("\udcff", r"'\\udcff' is no text: give it in UTF-8"),
+        ("\ud800", "is no text"),
+        ("a\0b", "without a byte 0"),
+        ("", "not empty"),
+        (b"anna", "give a str, not bytes"),
+        (None, "give a str, not NoneType"),
+    ],
+)
+def test_a_role_name_that_is_no_text_is_refused_in_a_line(
+    place: Place, name: str, told: str
+) -> None:
+    url = place()
+    create_store(url, GRID).close()
+    with pytest.raises(UsageError, match=rf"^a role's name [^\n]*{told}[^\n]*$"):
+        grant(url, name, "viewer")
+
+
+def test_bytes_of_a_command_line_that_are_no_text_are_refused_in_a_line(place: Place) -> None:
+    url = place()
+    create_store(url, GRID).close()
+    command = [
+        sys.executable,
+        "-m",
+        "hapticdb",
+        "grant",
+        url,
+        os.fsdecode(b"an\xffna"),
+        "--as",
+        "viewer",
+    ]
+    done = finished(command)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1
+    assert "is no text" in done.stderr
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        f"postgresql://{LONG}@localhost/db",
+        f"postgresql://{LONG}:secret@localhost/db",
+        f"postgresql://localhost/{LONG}",
+        f"postgresql://localhost/{'%C3%A9' * 32}",
+        f"postgresql:///?user={LONG}",
+        f"postgresql:///?dbname={LONG}",
+        f"postgresql:///?%75ser={LONG}",
+    ],
+)
+def test_a_login_that_the_server_would_cut_off_is_refused(url: str) -> None:
+    with pytest.raises(UsageError, match=r"'s name '\S+' is longer than the 63 bytes") as error:
+        parse(url)
+    assert "secret" not in str(error.value)
+    assert parse(url.replace(LONG, LONG[:63]).replace("%C3%A9" * 32, "%C3%A9" * 31))
+
+
+@pytest.mark.parametrize("letter", ["r", "é", "語"])
+def test_an_environment_name_is_measured_in_bytes(letter: str) -> None:
+    name = of_bytes("", letter)
+    assert parse(with_environment("postgresql:///db", name)).environment == name
+    for wrong in (name + letter, "\udcff", "\ud800", "a\0b"):
+        with pytest.raises(UsageError, match=r"^an environment's name [^\n]+$"):
+            with_environment("postgresql:///db", wrong)
+    with pytest.raises(UsageError, match=r"cannot be an environment's name; give one of 1 to 63"):
+        parse(f"postgresql:///db?environment={quote(name + letter)}")

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from hapticdb.bench import experiments, records
 from hapticdb.bench.evaluation.plots import draw
@@ -103,7 +104,7 @@ def bench(
     shell: PointShell | None = None,
     poses: Poses | None = None,
     say: Say = lambda _: None,
-) -> Path:
+) -> tuple[Path, dict[str, dict[str, Any]]]:
     """Run the experiments on an environment, and write JSON, plots and a report.
 
     Parameters
@@ -121,8 +122,8 @@ def bench(
 
     Returns
     -------
-    Path
-        The report.
+    report, results : Path and dict
+        The report's file, and each experiment by its name, as its own file holds it.
     """
     budget = QUICK if quick else Budget()
     warm_up()
@@ -146,7 +147,7 @@ def bench(
     say("plots and report")
     draw(results, folder)
     write_report(results, folder / REPORT, ".")
-    return folder / REPORT
+    return folder / REPORT, results
 
 
 def caches_of(env: Environment) -> Iterator[tuple[str, bool]]:

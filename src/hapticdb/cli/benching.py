@@ -6,7 +6,7 @@ from typing import Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Url
+from hapticdb.cli.root import Json, Url
 from hapticdb.errors import UsageError
 
 
@@ -25,8 +25,11 @@ def bench(
     poses: Annotated[
         str | None, typer.Option(metavar="CSV", help="Its path, as for 'hapticdb touch'.")
     ] = None,
+    json: Json = False,
 ) -> None:
     """Measure the paper's experiments on an environment: JSON, plots and a written report.
+
+    With --json, every experiment's results are printed, too, as in its file.
 
     Example: hapticdb bench car.db --quick
     """
@@ -41,5 +44,9 @@ def bench(
     shell = PointShell.from_file(tool) if tool else None
     path = read_poses(poses) if poses else None
     render.compile_kernels("everything")
-    report = run(url, folder, quick=quick, shell=shell, poses=path, say=render.note)
-    render.say(str(report))
+    report, results = run(url, folder, quick=quick, shell=shell, poses=path, say=render.note)
+    if not json:
+        render.say(str(report))
+        return
+    for found in results.values():
+        render.say_json(found)

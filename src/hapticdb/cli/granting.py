@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Url
+from hapticdb.cli.root import Json, Url
 
 RightName = Literal["viewer", "toucher", "editor", "nobody"]
 MEANINGS: dict[RightName, str] = {
@@ -23,6 +23,7 @@ def grant(
     right: Annotated[
         RightName, typer.Option("--as", help="What ROLE may do from now on; replaces the former.")
     ],
+    json: Json = False,
 ) -> None:
     """Say what a role may do with an environment on PostgreSQL; the server holds it to that.
 
@@ -36,4 +37,7 @@ def grant(
     from hapticdb.store.connect import redact
 
     grant_right(url, role, right)
-    render.say(f"{redact(url)}: {role} {MEANINGS[right]}")
+    if json:
+        render.say_json({"environment": redact(url), "role": role, "right": right})
+    else:
+        render.say(f"{redact(url)}: {role} {MEANINGS[right]}")

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
+from hapticdb.cli.root import Json
 
 if TYPE_CHECKING:
-    from hapticdb.demo import Imported, Measured, Scene
+    from hapticdb.demo import Comparison, Imported, Measured, Scene
 
 Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
 Frames = Annotated[int, typer.Option(metavar="N", help="Poses of the path.")]
@@ -22,6 +23,7 @@ def sample(
         typer.Option(metavar="URL", help="Slide over this environment instead of the sample."),
     ] = None,
     frames: Frames = 1000,
+    json: Json = False,
 ) -> None:
     """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
 
@@ -38,11 +40,14 @@ def sample(
 
         render.compile_kernels("copy", "shell")
         written = write_along(folder, along, frames)
+    if json:
+        render.say_json({"files": [str(path) for path in written], "poses": frames})
+        return
     for path in written:
         render.say(str(path))
 
 
-def warm() -> None:
+def warm(*, json: Json = False) -> None:
     """Compile every kernel that this machine has not compiled yet, so that no verb has to.
 
     Half a minute on two processors; kept in the user's cache folder until
@@ -58,6 +63,9 @@ def warm() -> None:
     n_compiled = render.compile_kernels("everything")
     total = len(entries_for("everything"))
     elapsed = perf_counter() - started
+    if json:
+        render.say_json({"kernels": total, "compiled": n_compiled, "elapsed": elapsed})
+        return
     render.say(
         f"{render.counted(total, 'kernel')} ready: {n_compiled} compiled now, in {elapsed:.1f} s"
     )
@@ -76,6 +84,7 @@ def demo(
     bits: Annotated[int, typer.Option(metavar="1..21", help="Bits an axis of the grid.")] = 10,
     frames: Frames = 1000,
     points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
+    json: Json = False,
 ) -> None:
     """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
 
@@ -92,17 +101,53 @@ def demo(
     render.note(f"writing the sample into {folder}, importing it in both layouts ...")
     with render.import_bar() as progress:
         scene = prepare(folder, url=url, bits=bits, frames=frames, points=points, progress=progress)
-    _show_scene(scene)
+    if not json:
+        _show_scene(scene)
     comparison = compare(scene)
-    for measured in comparison.layouts:
-        _show_layout(measured, scene, float(np.median(comparison.trace.hits)))
-    render.say(f"\n{comparison.against_paper()}")
-    render.say(comparison.verdict)
     picture = folder / "demo.png"
+    if not json:
+        for measured in comparison.layouts:
+            _show_layout(measured, scene, float(np.median(comparison.trace.hits)))
+        render.say(f"\n{comparison.against_paper()}")
+        render.say(comparison.verdict)
     draw(picture, scene, comparison)
-    render.say(f"picture: {picture}")
+    if json:
+        render.say_json(_record(scene, comparison, picture))
+    else:
+        render.say(f"picture: {picture}")
     if comparison.disagreed:
         raise typer.Exit(1)
+
+
+def _record(scene: "Scene", comparison: "Comparison", picture: Path) -> dict[str, object]:
+    from hapticdb.store.connect import redact
+
+    return {
+        "files": [str(path) for path in scene.files],
+        "points": len(scene.shell),
+        "poses": len(scene.poses),
+        "layouts": [
+            {
+                **measured.imported._asdict(),
+                "url": redact(measured.imported.url),
+                "strategies": {
+                    name: {
+                        "median_us": felt.median_us,
+                        "p99_us": felt.p99_us,
+                        "statements": sum(felt.statements),
+                        "ranges": sum(felt.ranges),
+                        "rows": sum(felt.rows),
+                        "used": dict(felt.used),
+                    }
+                    for name, felt in measured.felt.items()
+                },
+            }
+            for measured in comparison.layouts
+        ],
+        "frames_compared": comparison.compared,
+        "frames_disagreed": len(comparison.disagreed),
+        "picture": str(picture),
+    }
 
 
 def _show_scene(scene: "Scene") -> None:

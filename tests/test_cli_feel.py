@@ -158,7 +158,11 @@ def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
         ([*PLAY, "--exclude", "nobody"], ["--exclude", "nobody"]),
         ([*PLAY, "--exclude", 99], ["no object 99"]),
         ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),
-        ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already"]),
+        ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already", "--append", "--replace"]),
+        ([*PLAY, "--record", "tool.npz", "--replace"], ["tool.npz is no recording"]),
+        ([*PLAY, "--record", "tool.npz", "--append"], ["tool.npz is no recording"]),
+        ([*PLAY, "--record", "x.hdbrec", "--append", "--replace"], ["choose one"]),
+        ([*PLAY, "--append"], ["--append and --replace belong to --record"]),
         ([*PLAY, "--record-limit", "1GiB"], ["--record-limit belongs to --record"]),
         ([*LIMITED, "0"], ["--record-limit '0': give MiB, 1 to a million, or such as 4GiB"]),
         ([*LIMITED, "-3GiB"], ["--record-limit '-3GiB': give MiB"]),
@@ -186,6 +190,22 @@ def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path
     refused(run("feel", path, "--tool", "tool.npz", *PLAY), "path.csv")
     assert run("copy", "scene.db", "lexical.db", *LEXICOGRAPHIC)[0] == 0
     refused(run("feel", "lexical.db", "--tool", "tool.npz", *PLAY), "lexicographic", "--curve z")
+
+
+def test_a_recording_is_gone_on_with_or_replaced(run: Run, scene: Path) -> None:
+    path = scene.with_name("felt.hdbrec")
+    args = (*feel(*PLAY, "--seconds", 0.2), "--record", path)
+    assert run(*args)[0] == 0
+    first = len(Recording(path))
+    refused(run(*args), "is there already", "--append", "--replace")
+    assert run(*args, "--append")[0] == 0
+    both = len(Recording(path))
+    assert both > first > 0
+    assert run("replay", path)[0] == 0
+    refused(run(*args, "--replace", "--processor", 4095), "processor 4095")
+    assert len(Recording(path)) == both
+    assert run(*args, "--replace")[0] == 0
+    assert 0 < len(Recording(path)) < both
 
 
 @pytest.mark.long

@@ -152,13 +152,40 @@ def test_the_file_is_as_the_format_says(tmp_path: Path) -> None:
 def test_a_file_is_not_replaced_unasked(tmp_path: Path) -> None:
     path = tmp_path / "s.hdbrec"
     path.write_text("a letter")
-    with pytest.raises(UsageError, match="is there already: append to it, replace it"):
+    with pytest.raises(
+        UsageError, match=r"is there already: append to it \(--append\), replace it"
+    ):
         Recorder(path, header())
     with pytest.raises(FileError, match="is no recording of hapticdb"):
         Recorder(path, header(), append=True)
     assert path.read_text() == "a letter"
-    Recorder(path, header(), replace=True).close()
-    assert len(Recording(path)) == 0
+    with pytest.raises(FileError, match="is no recording of hapticdb"):
+        Recorder(path, header(), replace=True)
+    assert path.read_text() == "a letter"
+    path.write_bytes(b"")
+    with Recorder(path, header(), replace=True) as recorder:
+        recorder.append(motion(3))
+    assert len(Recording(path)) == 3
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
+
+
+def test_a_recording_is_replaced_by_the_first_frames_of_another(tmp_path: Path) -> None:
+    path = tmp_path / "s.hdbrec"
+    write(path, motion(10))
+    before = path.read_bytes()
+    Recorder(path, header(), replace=True).close()  # nothing came
+    assert path.read_bytes() == before
+    with Recorder(path, header(), replace=True) as recorder:
+        recorder.append(motion(4))
+        assert path.read_bytes() == before
+        with pytest.raises(UsageError, match="is being recorded"):
+            Recorder(path, header(), replace=True)
+        recorder.flush()
+        assert len(Recording(path)) == 4
+        with pytest.raises(UsageError, match="is being recorded"):
+            Recorder(path, header(), replace=True)
+    assert read(path) == motion(4).tobytes()
+    assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
 def test_a_recording_goes_on(tmp_path: Path) -> None:

@@ -86,6 +86,13 @@ def feel(
     record: Annotated[
         str | None, typer.Option(metavar="FILE", help="Record the session: a new .hdbrec.")
     ] = None,
+    append: Annotated[
+        bool, typer.Option("--append", help="Go on with a recording that is there.")
+    ] = False,
+    replace: Annotated[
+        bool,
+        typer.Option("--replace", help="Record anew in its place, once there is a first frame."),
+    ] = False,
     record_limit: Annotated[
         str | None,
         typer.Option(
@@ -137,6 +144,10 @@ def feel(
     law = hapticdb.TangentPlane(stiffness)
     budget_bytes = bytes_of(budget)
     limit_bytes = DEFAULT_LIMIT if record_limit is None else size_of(record_limit, "--record-limit")
+    if (append or replace) and record is None:
+        raise UsageError(
+            "--append and --replace belong to --record: give it, too, or leave both out"
+        )
     if record_limit is not None and record is None:
         raise UsageError("--record-limit belongs to --record: give it, too, or leave both out")
     Timing(processor=processor).check_granted()  # before a kernel is compiled
@@ -173,6 +184,8 @@ def feel(
                 policy=policy,
                 staleness=staleness,
                 record=record,
+                append_recording=append,
+                replace_recording=replace,
                 record_limit_bytes=limit_bytes,
                 is_fifo=fifo,
                 processor=processor,

@@ -24,7 +24,7 @@ from hapticdb.kernels.motion import poses_of
 from hapticdb.realtime.chunks import HEAD, MOST_FRAMES, Chunk, Scan, read_bytes, scan
 from hapticdb.realtime.packing import pack, unpack
 from hapticdb.realtime.recorded import FRAME, Frames, State
-from hapticdb.realtime.recording_header import Header
+from hapticdb.realtime.recording_header import MAGIC, Header
 
 __all__ = ["FRAME", "MOST_FRAMES", "Frames", "Header", "Recorder", "Recording", "State"]
 
@@ -193,7 +193,8 @@ class Recorder:
         version and the start. Its frames stay; a torn end goes. Times are the caller's: `header`
         has the start that they count from.
     replace : bool
-        Begin anew in a file that is there.
+        Begin anew where a recording is there, which stays as it is until the first frames of the
+        new one are written: until then those go to a file ``.NAME.new`` beside it.
     limit_bytes : int or None
         Greatest size of the file; none but the disk's free space, less `LEFT_FREE`, with None. The
         frame that would exceed it is left out, and all after it: see `ended`.
@@ -204,7 +205,8 @@ class Recorder:
         When a file is there and neither is asked for, another header is given to append, another
         recorder is at it, or the limit leaves no room for a frame.
     FileError
-        When it cannot be written, or cannot be gone on with, or the disk has no room.
+        When it cannot be written, or cannot be gone on with, or the disk has no room; or when what
+        is to be replaced is no recording.
 
     Attributes
     ----------
@@ -236,13 +238,14 @@ class Recorder:
         self._limit = limit_bytes
         self._buffer: Frames = np.empty(CHUNK, dtype=FRAME)
         self._n_waiting = self._n_written = self._end = 0
+        self._beside = self._beside_old() if replace else None
         self._file = self._open(may_exist=append or replace)
         try:
             self._begin(append=append)
         except BaseException:
             self._file.close()
-            if not (append or replace):  # made just now
-                self.path.unlink(missing_ok=True)
+            if self._beside is not None or not (append or replace):  # made just now
+                (self._beside or self.path).unlink(missing_ok=True)
             raise
 
     def __enter__(self) -> Self:
@@ -299,6 +302,7 @@ class Recorder:
         if n:
             self._write(content)
             self._n_written += n
+            self._take_the_name()
         if is_full:
             self.ended = (
                 f"{self.path}: the recording ends after {self._n_written:,} frames, {reason}"
@@ -324,6 +328,31 @@ class Recorder:
                 os.fsync(self._file.fileno())
         finally:
             self._file.close()
+            self._leave_old()
+
+    def _beside_old(self) -> Path | None:
+        """Where a recording begins that replaces one; None where there is none."""
+        try:
+            with io.FileIO(self.path, "rb") as old:
+                if os.fstat(old.fileno()).st_size and old.read(len(MAGIC)) != MAGIC:
+                    raise FileError(f"{self.path} is no recording of hapticdb: give another name")
+                self._lock(old)
+        except FileNotFoundError:
+            return None
+        except OSError as error:
+            raise FileError(f"cannot replace {self.path}: {error.strerror}") from error
+        return self.path.with_name(f".{self.path.name}.new")
+
+    def _leave_old(self) -> None:
+        """Leave the recording that was to be replaced: no frame came."""
+        if self._beside is not None:
+            self._beside.unlink(missing_ok=True)
+
+    def _take_the_name(self) -> None:
+        if self._beside is not None:
+            with self._told():
+                self._beside.replace(self.path)
+            self._beside = None
 
     def _packed(self, n: int) -> bytes:
         """Chunk of the first n frames that wait; nothing for none."""
@@ -343,19 +372,23 @@ class Recorder:
     def _open(self, *, may_exist: bool) -> io.FileIO:
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | (0 if may_exist else os.O_EXCL)
         try:
-            file = io.FileIO(os.open(self.path, flags, 0o666), "r+b")
+            file = io.FileIO(os.open(self._beside or self.path, flags, 0o666), "r+b")
         except FileExistsError:
             raise UsageError(
-                f"{self.path} is there already: append to it, replace it, or give another name"
+                f"{self.path} is there already: append to it (--append), replace it (--replace), "
+                "or give another name"
             ) from None
         except OSError as error:
             raise FileError(f"cannot write {self.path}: {error.strerror}") from error
+        self._lock(file)
+        return file
+
+    def _lock(self, file: io.FileIO) -> None:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             file.close()
             raise UsageError(f"{self.path} is being recorded: give another name") from error
-        return file
 
     def _begin(self, *, append: bool) -> None:
         """Write the header, or stand at the end of what is to be gone on with."""
@@ -406,6 +439,7 @@ class Recorder:
             with contextlib.suppress(OSError):
                 self._file.truncate(self._end)
             self._file.close()
+            self._leave_old()
             self._n_waiting = 0
             raise FileError(
                 f"cannot write {self.path}: {error.strerror}; its first {self._n_written} frames "

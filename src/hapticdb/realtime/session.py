@@ -75,8 +75,9 @@ class Session:
         As `ResidentCells` takes them; only with a URL: who shares cells feels the same objects.
     record : path or None
         A file for the recording; see `hapticdb.realtime.recording.Recorder`.
-    replace_recording : bool
-        Begin it anew in a file that is there.
+    append_recording, replace_recording : bool
+        Go on with the recording that is there, of the same tool, scene and law; or begin anew in
+        its place, once there is a frame to record.
     record_limit_bytes : int or None
         Greatest size of the recording, 4 GiB unless given; with None, and in any case, 64 MiB of
         the disk stay free. There the recording ends, whole, and the session goes on without it;
@@ -116,6 +117,7 @@ class Session:
         budget_bytes: int | None = None,
         exclude: Iterable[int] = (),
         record: str | os.PathLike[str] | None = None,
+        append_recording: bool = False,
         replace_recording: bool = False,
         record_limit_bytes: int | None = DEFAULT_LIMIT,
         is_fifo: bool = False,
@@ -154,8 +156,9 @@ class Session:
         self._drained = self._lost = 0
         self._objects: set[int] = set()
         self._answer: LoopAnswer | None = None
+        how = {"append": append_recording, "replace": replace_recording}
         try:
-            self._begin(device, policy, staleness, seconds, record, replace_recording)
+            self._begin(device, policy, staleness, seconds, record, how)
         except BaseException:
             try:
                 self.close()
@@ -172,12 +175,12 @@ class Session:
         staleness: float,
         seconds: float | None,
         record: str | os.PathLike[str] | None,
-        replace_recording: bool,  # noqa: FBT001 - handed on
+        how: dict[str, bool],
     ) -> None:
         compile_missing(entries_for("feel"))  # here: the loop must not wait for it
         table = self.cells.table
         if record is not None:
-            self._begin_recording(Path(record), replace_recording)
+            self._begin_recording(Path(record), how)
         n_ring = max(int(RING_SECONDS * self.timing.rate), 1024)
         self._memory = anonymous_memory("hapticdb-frames", ring_bytes(n_ring))
         self._ring = ring_of(self._memory, n_ring)
@@ -207,13 +210,11 @@ class Session:
         if self._process.receive(START_PATIENCE) is None:
             raise never_began(self._process, "loop's", START_PATIENCE)
 
-    def _begin_recording(self, path: Path, is_replaced: bool) -> None:  # noqa: FBT001
+    def _begin_recording(self, path: Path, how: dict[str, bool]) -> None:
         # noted before the file is made: a signal may end the making at any moment
-        self._new = None if is_replaced or os.path.lexists(path) else path
+        self._new = None if os.path.lexists(path) else path
         try:
-            self._recorder = Recorder(
-                path, self._header(), replace=is_replaced, limit_bytes=self._record_limit
-            )
+            self._recorder = Recorder(path, self._header(), limit_bytes=self._record_limit, **how)
         except UsageError:  # another has made it meanwhile
             self._new = None
             raise

@@ -15,6 +15,7 @@ import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.store import sqlite_pages
 from hapticdb.store.base import Layout
+from hapticdb.store.schema import FORMAT_VERSION
 from hapticdb.store.sqlite import SQLiteStore
 from hapticdb.store.sqlite_pages import LAYER, PAGE_BYTES
 from hapticdb.testing import floor_voxels, write_voxels
@@ -176,7 +177,7 @@ def without_checksums(path: Path) -> Path:
         plain.execute(f"PRAGMA page_size = {PAGE_BYTES}")
         plain.execute("PRAGMA journal_mode = WAL").fetchall()
         plain.execute("PRAGMA application_id = 0x48415054")
-        plain.execute("PRAGMA user_version = 1")
+        plain.execute(f"PRAGMA user_version = {FORMAT_VERSION}")
         for statement in script:
             plain.execute(statement)
         for name, rows in tables.items():

@@ -21,7 +21,7 @@ import hapticdb
 from children import finished, joined
 from crashes import server, template  # noqa: F401 - fixtures
 from hapticdb import Grid
-from hapticdb.store import sqlite_file
+from hapticdb.store import sqlite_place
 from hapticdb.store.base import SupportsWatch
 from hapticdb.store.connect import create_store, grant, open_store
 from hapticdb.store.postgres import watching
@@ -130,7 +130,7 @@ def test_an_immutable_reader_is_told_by_the_files_stamp(
 def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
     file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_replaced: bool
 ) -> None:
-    monkeypatch.setattr(sqlite_file, "LOOK_SECONDS", 0.0)
+    monkeypatch.setattr(sqlite_place, "LOOK_SECONDS", 0.0)
     reader = SQLiteStore.open(file, read_only=True)
     reader.watch()
     assert not reader.has_changed()

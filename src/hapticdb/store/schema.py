@@ -15,11 +15,15 @@ CHECKED_VERSION = 1000
 
 
 class Migration(NamedTuple):
-    """One step of the format: a name and its statements for each engine."""
+    """One step of the format: a name and its statements for each engine.
+
+    `readers_need_it`: whether a file without this step is refused to who may only read it.
+    """
 
     name: str
     sqlite: tuple[str, ...]
     postgres: tuple[str, ...]
+    readers_need_it: bool = True
 
 
 ENVIRONMENT = """
@@ -85,6 +89,11 @@ CREATE TABLE cost (
   machine TEXT PRIMARY KEY,
   figures TEXT NOT NULL
 ) STRICT"""
+
+LINEAGE = (
+    "ALTER TABLE environment ADD COLUMN lineage BLOB CHECK (length(lineage) = 32)",
+    "UPDATE environment SET lineage = CAST(randomblob(16) || zeroblob(16) AS BLOB)",
+)
 
 POSTGRES_ENVIRONMENT = """
 CREATE TABLE environment (
@@ -248,5 +257,7 @@ MIGRATIONS = (
             *POSTGRES_FORCE,
         ),
     ),
+    # a mark of each commit, and of the one before: store/sqlite_log.py
+    Migration("lineage", LINEAGE, (), readers_need_it=False),
 )
 FORMAT_VERSION = len(MIGRATIONS)

@@ -16,9 +16,8 @@ import apsw
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import BusyError
 from hapticdb.grid import CurveName, Grid
-from hapticdb.store import sqlite_file, sqlite_force
+from hapticdb.store import sqlite_bytes, sqlite_file, sqlite_force, sqlite_log, sqlite_place
 from hapticdb.store.base import (
     BRICK_BYTES,
     LAYOUTS,
@@ -76,7 +75,14 @@ class SQLiteStore:
     every call checks that it comes from the thread that opened it.
     """
 
-    def __init__(self, connection: apsw.Connection, path: Path, *, read_only: bool) -> None:
+    def __init__(
+        self,
+        connection: apsw.Connection,
+        path: Path,
+        file: sqlite_place.OpenedFile,
+        *,
+        read_only: bool,
+    ) -> None:
         self._connection = connection
         self._cursor = connection.cursor()
         self.path = path
@@ -84,13 +90,10 @@ class SQLiteStore:
         self.name = path.name
         self.engine = f"SQLite {apsw.sqlite_lib_version()}"
         self.is_read_only = read_only
-        self._stamp = (
-            sqlite_file.stamp(path) if read_only and sqlite_file.needs_immutable(path) else None
-        )
-        self._file = sqlite_file.OpenedFile(path)
+        self._file = file
         self.identity = self._file.identity
         self._depth = 0
-        self._noticed = -1
+        self._noticed = self._seen = -1
         self._thread = this_thread()
         self.is_closed = False
         self.grid, self.layout = self._read_environment()
@@ -102,29 +105,30 @@ class SQLiteStore:
     def open(cls, path: str | Path, *, read_only: bool = False) -> "SQLiteStore":
         """Open an existing environment."""
         where = Path(path)
-        connection = sqlite_file.open_file(where, read_only=read_only)
+        connection, file = sqlite_file.open_file(where, read_only=read_only)
         try:
             with sqlite_file.named_errors(str(where)):
-                return cls(connection, where, read_only=read_only)
+                return cls(connection, where, file, read_only=read_only)
         except BaseException:
-            connection.close()
+            file.close()
             raise
 
     @classmethod
     def create(cls, path: str | Path, grid: Grid, layout: Layout = "brick") -> "SQLiteStore":
         """Make a new environment with its grid; its file appears whole or not at all."""
-        row = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout)
+        lineage = sqlite_log.first_lineage()
+        row = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout, lineage)
 
         def fill(connection: apsw.Connection) -> None:
-            connection.execute("INSERT INTO environment VALUES (1, ?, ?, ?, ?, ?, ?, ?)", row)
+            connection.execute("INSERT INTO environment VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)", row)
 
         sqlite_file.create_file(Path(path), fill)
         return cls.open(path)
 
     def close(self) -> None:
-        """Close the connection; the last one folds the write-ahead log into the file."""
+        """Close the connection; the last one folds the write-ahead log into its file, no other."""
         self.is_closed = True
-        self._connection.close()
+        self._file.close()
 
     def give_to(self, thread: int) -> None:
         """Belong to another thread from now on, or to none (0); only while nobody uses it."""
@@ -132,6 +136,7 @@ class SQLiteStore:
 
     def discard(self) -> None:
         """Close and delete an environment that nothing went into."""
+        self._file.look()  # another's file is not to be deleted
         self.close()
         sqlite_file.remove_file(self.path)
 
@@ -141,17 +146,12 @@ class SQLiteStore:
         """Run one statement to its end."""
         check_thread(self._thread, self.url)
         try:
-            if self._stamp is not None:
-                self._check_unchanged()
+            if self._file.stamp is not None:
+                self._file.check_stamp()
             return self._cursor.execute(sql, bindings).fetchall()
         except apsw.Error:
             with sqlite_file.named_errors(self.url):
                 raise
-
-    def _check_unchanged(self) -> None:
-        """Refuse to answer once somebody else has written: an immutable opening takes no locks."""
-        if sqlite_file.stamp(self.path) != self._stamp:
-            raise BusyError(f"{self.url} has been written since it was opened: open it again")
 
     def _read_environment(self) -> tuple[Grid, Layout]:
         rows = self._fetch(
@@ -177,10 +177,17 @@ class SQLiteStore:
 
     def version(self) -> int:
         """SQLite's data version: changes when another connection's commit has been seen."""
-        return self._connection.data_version()
+        seen = self._connection.data_version()
+        if seen == self._seen:
+            self._file.check()
+        else:  # by whom? Connections of two files that had one path share the log between them
+            self._file.look()
+            self._seen = seen
+        return seen
 
     def revision(self) -> int:
         """Number of the last committed write; 0 for an empty environment."""
+        self._file.check()
         return int(self._fetch("SELECT coalesce(max(revision), 0) FROM change")[0][0])
 
     # -- the haptic query --------------------------------------------------------------------
@@ -262,6 +269,7 @@ class SQLiteStore:
         return found[0]
 
     def _objects(self, condition: str, *bindings: int) -> list[Object]:
+        self._file.check()
         return [
             Object(
                 id=row[0],
@@ -288,11 +296,14 @@ class SQLiteStore:
         with sqlite_file.named_errors(self.url):
             self._connection.execute("BEGIN IMMEDIATE")
             try:
+                self._file.look()
+                self._connection.execute(sqlite_log.RENEW_LINEAGE)
                 yield
             except BaseException:
                 self._connection.execute("ROLLBACK")
                 raise
             self._connection.execute("COMMIT")
+            self._file.look(has_committed=True)
 
     def loading(self) -> contextlib.AbstractContextManager[None]:
         """Nothing is put off here: rows go into the tree in which they stay."""
@@ -384,9 +395,9 @@ class SQLiteStore:
         ConnectionLostError when the path leads to another file than the one that was opened.
         """
         check_outside(self._depth, self.url)
-        if self._stamp is not None:
+        if self._file.stamp is not None:
             check_thread(self._thread, self.url)
-            return sqlite_file.stamp(self.path) != self._stamp
+            return self._file.has_new_stamp()
         self._file.check()
         before = self._noticed
         self._noticed = self._fetch("PRAGMA data_version")[0][0]
@@ -402,7 +413,7 @@ class SQLiteStore:
         """Forget all pages: the connection's, and the file's in the operating system's cache."""
         check_thread(self._thread, self.url)
         self._connection.release_memory()
-        sqlite_file.forget_pages(self.path)
+        sqlite_bytes.forget_pages(self.path)
 
     # -- statistics --------------------------------------------------------------------------
 

@@ -2,7 +2,6 @@
 
 import contextlib
 import os
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import cast
@@ -11,7 +10,6 @@ import apsw
 
 from hapticdb.errors import (
     BusyError,
-    ConnectionLostError,
     DamagedError,
     DatabaseError,
     EnvironmentExistsError,
@@ -20,21 +18,20 @@ from hapticdb.errors import (
     NotAnEnvironmentError,
     ReadOnlyError,
 )
-from hapticdb.store import sqlite_pages
+from hapticdb.store import sqlite_bytes, sqlite_pages
 from hapticdb.store.schema import (
     CHECKED_VERSION,
     FORMAT_VERSION,
     MIGRATIONS,
     SQLITE_APPLICATION_ID,
 )
+from hapticdb.store.sqlite_place import OpenedFile
 
 BUSY_TIMEOUT_MS = 10_000
 CACHE_KIB = 256 * 1024
 """Page cache of one connection: the bricks of a large car; memory is taken as it is filled."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
-LOOK_SECONDS = 0.25
-"""How long it may go unnoticed that a path leads to another file than before."""
 
 
 @contextlib.contextmanager
@@ -86,8 +83,7 @@ def check_kind(path: Path) -> None:
     if not path.is_file():
         raise NotAnEnvironmentError(f"{path} is not a file, so it is no environment")
     try:
-        with path.open("rb") as file:
-            first = file.read(sqlite_pages.PAGE_BYTES)
+        first = sqlite_bytes.read_bytes(path, sqlite_pages.PAGE_BYTES)
     except OSError as error:
         raise DatabaseError(f"{path} cannot be read: {error.strerror}") from error
     header = first[:HEADER_BYTES]
@@ -100,29 +96,34 @@ def check_kind(path: Path) -> None:
         raise foreign
     if len(header) < HEADER_BYTES:
         raise damaged(str(path), "its header is cut off")
-    wal = Path(f"{path}-wal")
-    if wal.exists() and wal.stat().st_size:
-        return  # the header may be older than the log: the engine decides
     if int.from_bytes(header[68:72], "big") != SQLITE_APPLICATION_ID:
         raise foreign
     _check_known(path, int.from_bytes(header[60:64], "big"))
+    wal = Path(f"{path.resolve()}-wal")
+    if wal.exists() and wal.stat().st_size:
+        return  # the size may be older than the log: the engine decides
     page = int.from_bytes(header[16:18], "big")
     expected = int.from_bytes(header[28:32], "big") * (65536 if page == 1 else page)
     if path.stat().st_size < expected:
         raise damaged(str(path), f"{path.stat().st_size} bytes of {expected}")
 
 
-def open_file(path: Path, *, read_only: bool) -> apsw.Connection:
+def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFile]:
     """Open an existing environment; migrate it when it is older and may be written."""
     check_kind(path)
+    file = OpenedFile(path)
+    is_immutable = read_only and needs_immutable(path)
     with named_errors(str(path)):
         connection = _connect_to_read(path) if read_only else _connect_to_write(path)
-    try:
-        _check_version(connection, path, read_only=read_only)
-    except BaseException:
-        connection.close()
-        raise
-    return connection
+        try:
+            version = _version(connection, path)
+            file.settle(connection, is_immutable=is_immutable)
+            _bring_up_to_date(connection, path, version, read_only=read_only)
+        except BaseException:
+            connection.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
+            connection.close()
+            raise
+    return connection, file
 
 
 def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
@@ -165,13 +166,6 @@ def remove_file(path: Path) -> None:
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
 
-def forget_pages(path: Path) -> None:
-    """Ask the operating system to drop what it caches of a file; what is not yet on disk stays."""
-    with path.open("rb") as file:
-        os.fsync(file.fileno())
-        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
-
-
 def _sweep_unfinished(path: Path) -> None:
     """Remove what a process that was killed while making this file left behind."""
     for left in path.parent.glob(f".{path.name}.*.new"):
@@ -197,55 +191,15 @@ def migrate(connection: apsw.Connection, version: int) -> None:
             raise
 
 
-def stamp(path: Path) -> tuple[int, int, bool]:
-    """What changes when somebody writes or removes a file that was opened as immutable."""
-    try:
-        status = path.stat()
-    except FileNotFoundError:
-        return 0, 0, False
-    return status.st_mtime_ns, status.st_size, Path(f"{path}-wal").exists()
-
-
-class OpenedFile:
-    """The file that a path led to when it was opened; its engine keeps reading that one."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-        self._due = 0.0
-        self.identity = self._found()
-
-    def check(self) -> None:
-        """Refuse to go on, now and then, when the path leads elsewhere.
-
-        Raises
-        ------
-        ConnectionLostError
-            When the file was moved, deleted or replaced.
-        """
-        if time.monotonic() < self._due:
-            return
-        if self._found() != self.identity:
-            raise ConnectionLostError(f"{self._path} is another file than before: open it again")
-        self._due = time.monotonic() + LOOK_SECONDS
-
-    def _found(self) -> tuple[int, int]:
-        try:
-            status = self._path.stat()
-        except OSError as error:
-            raise ConnectionLostError(
-                f"{self._path} cannot be reached any more ({error.strerror}): put it back"
-            ) from error
-        return status.st_dev, status.st_ino
-
-
 def needs_immutable(path: Path) -> bool:
     """Whether only an immutable opening can read this file: nobody here can write its folder.
 
     A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, and no log is
     there whose pages would be missed, SQLite can still read the file alone.
     """
-    return not os.access(path.parent, os.W_OK) and not any(
-        Path(f"{path}{suffix}").exists() for suffix in ("-wal", "-shm")
+    real = path.resolve()
+    return not os.access(real.parent, os.W_OK) and not any(
+        Path(f"{real}{suffix}").exists() for suffix in ("-wal", "-shm")
     )
 
 
@@ -271,8 +225,7 @@ def _connect_to_write(path: Path) -> apsw.Connection:
 
 def is_checked(path: Path) -> bool:
     """Whether the pages of a file carry checksums."""
-    with path.open("rb") as file:
-        return sqlite_pages.is_checked(file.read(sqlite_pages.PAGE_BYTES))
+    return sqlite_pages.is_checked(sqlite_bytes.read_bytes(path, sqlite_pages.PAGE_BYTES))
 
 
 def _layer_of(path: Path) -> str | None:
@@ -294,21 +247,28 @@ def _settle(connection: apsw.Connection) -> None:
     connection.config(apsw.SQLITE_DBCONFIG_DQS_DDL, 0)
 
 
-def _check_version(connection: apsw.Connection, path: Path, *, read_only: bool) -> None:
-    with named_errors(str(path)):
-        found = _pragma(connection, "user_version")
-        if _pragma(connection, "application_id") != SQLITE_APPLICATION_ID:
-            raise _foreign(path)
-        version = _check_known(path, found)
-        if version < 1:
-            raise damaged(str(path), f"format {version}")
-        if version < FORMAT_VERSION:
-            if read_only:
-                raise ReadOnlyError(
-                    f"{path} has the older format {version}: open it once to write, "
-                    "and it is brought up to date"
-                )
-            migrate(connection, version)
+def _version(connection: apsw.Connection, path: Path) -> int:
+    """Version of a file's tables; refuses what is no environment, or newer."""
+    found = _pragma(connection, "user_version")
+    if _pragma(connection, "application_id") != SQLITE_APPLICATION_ID:
+        raise _foreign(path)
+    version = _check_known(path, found)
+    if version < 1:
+        raise damaged(str(path), f"format {version}")
+    return version
+
+
+def _bring_up_to_date(
+    connection: apsw.Connection, path: Path, version: int, *, read_only: bool
+) -> None:
+    """Run the migrations that an older file lacks; a reader does without some of them."""
+    if not read_only:
+        migrate(connection, version)
+    elif any(migration.readers_need_it for migration in MIGRATIONS[version:]):
+        raise ReadOnlyError(
+            f"{path} has the older format {version}: open it once to write, "
+            "and it is brought up to date"
+        )
 
 
 def _check_known(path: Path, found: int) -> int:

@@ -132,7 +132,7 @@ def check(session: Session) -> None:
             f"{shown} has format {version}, newer than the {FORMAT_VERSION} known here: "
             "install a newer hapticdb"
         )
-    if version < FORMAT_VERSION:
+    if any(migration.postgres for migration in MIGRATIONS[version:]):
         if session.is_read_only or not session.is_owner():
             raise ReadOnlyError(
                 f"{shown} has the older format {version}: its owner has to open it once to "

@@ -1,0 +1,78 @@
+"""A database file's bytes, reached without the engine's knowledge of them.
+
+Never by `open`: where a process closes any descriptor of a file, it loses all POSIX locks that it
+holds on that file, those of its other connections too (https://sqlite.org/howtocorrupt.html,
+section 2.2). The engine's own file object waits with closing until they have let go.
+"""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from pathlib import Path
+
+import apsw
+
+READ_MAIN = apsw.SQLITE_OPEN_MAIN_DB | apsw.SQLITE_OPEN_READONLY
+DESCRIPTORS = Path("/proc/self/fd")
+
+
+@contextlib.contextmanager
+def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
+    """Give access to the bytes of a database file, for as long as the block lasts.
+
+    Raises
+    ------
+    OSError
+        When the file is not there or may not be read.
+    """
+    os.stat(path)  # noqa: PTH116 - for the error's own words: the engine's would not say why
+    if not os.access(path, os.R_OK):
+        raise PermissionError(13, "permission denied", str(path))
+    file = apsw.VFSFile("", str(path.resolve()), [flags, 0])
+    try:
+        yield file
+    finally:
+        file.xClose()
+
+
+def read_bytes(path: Path, amount: int, offset: int = 0) -> bytes:
+    """Bytes of a database file, fewer where it ends before."""
+    with opened_bytes(path) as file:
+        return read_from(file, amount, offset)
+
+
+def read_from(file: apsw.VFSFile, amount: int, offset: int = 0) -> bytes:
+    """Bytes of an opened file, fewer where it ends before."""
+    there = max(min(amount, file.xFileSize() - offset), 0)
+    return file.xRead(there, offset) if there else b""
+
+
+def descriptor_of(identity: tuple[int, int]) -> int | None:
+    """A descriptor that this process has of the file with that device and inode, if any."""
+    for entry in DESCRIPTORS.iterdir():
+        with contextlib.suppress(OSError):  # closed since it was listed
+            status = os.fstat(int(entry.name))
+            if (status.st_dev, status.st_ino) == identity:
+                return int(entry.name)
+    return None
+
+
+def forget_pages(path: Path) -> None:
+    """Ask the operating system to drop what it caches of an open database.
+
+    What is not yet on disk stays. Does nothing when this process does not have the file open.
+    """
+    status = path.stat()
+    descriptor = descriptor_of((status.st_dev, status.st_ino))
+    if descriptor is not None:
+        os.fsync(descriptor)
+        os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
+
+
+def sync_folder(path: Path) -> None:
+    """Have the names in a file's folder on disk: a renaming is safe from then on."""
+    descriptor = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)

@@ -41,6 +41,7 @@ FLOORS: list[set[str]] = [
         "originals",
         "placing",
         "query",
+        "touches",
         "transfer",
     },
     {
@@ -117,6 +118,7 @@ PUBLIC = [
     "Swept",
     "TangentPlane",
     "Touch",
+    "Touches",
     "UsageError",
     "copy_environment",
     "create",

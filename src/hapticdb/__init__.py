@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from hapticdb.difference import Difference, diff_environments
-    from hapticdb.environment import Environment, Touch, create, open  # noqa: A004 - as in tarfile.open
+    from hapticdb.environment import Environment, create, open  # noqa: A004 - as in tarfile.open
     from hapticdb.errors import (
         AccessError,
         BusyError,
@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from hapticdb.realtime.swept import Swept
     from hapticdb.statistics import CostModel, QuantileVector
     from hapticdb.store.base import Object
+    from hapticdb.touches import Touch, Touches
     from hapticdb.transfer import CopyReport, copy_environment
     from hapticdb.warm import warm_up
 
@@ -100,6 +101,7 @@ __all__ = [
     "Swept",
     "TangentPlane",
     "Touch",
+    "Touches",
     "UsageError",
     "copy_environment",
     "create",
@@ -116,7 +118,7 @@ __version__ = "0.1.0"
 
 _HOMES = {
     "difference": "Difference diff_environments",
-    "environment": "Environment Touch create open",
+    "environment": "Environment create open",
     "errors": (
         "AccessError BusyError ConflictError ConnectionLostError DamagedError "
         "DatabaseError DeviceError EnvironmentExistsError EnvironmentNotFoundError "
@@ -142,6 +144,7 @@ _HOMES = {
     "realtime.swept": "Swept",
     "statistics": "CostModel QuantileVector",
     "store.base": "Object",
+    "touches": "Touch Touches",
     "transfer": "CopyReport copy_environment",
     "warm": "warm_up",
 }

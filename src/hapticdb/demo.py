@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.environment import Environment, Touch
+from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError, GridError, UsageError
 from hapticdb.grid import GridOptions
@@ -26,6 +26,7 @@ from hapticdb.query import Strategy
 from hapticdb.sample import SampleFiles, slide_over_voxels, write_sample, write_wrench
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import beside, name_of, redact
+from hapticdb.touches import Touch
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"

@@ -1,7 +1,8 @@
 """Environment: an opened database."""
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from time import perf_counter_ns
 from types import TracebackType
 from typing import Self
 
@@ -29,63 +30,13 @@ from hapticdb.mesh import read_file
 from hapticdb.originals import shell_of_objects
 from hapticdb.placing import move_object, shift_objects
 from hapticdb.pointshell import PointShell
-from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Query, Strategy, as_id, as_ids
+from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Strategy, as_id, as_ids, as_poses
 from hapticdb.statistics import DEFAULT_RESOLUTION, CostModel, QuantileVector, machine_name
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
+from hapticdb.touches import Touch, Touches
 
 _NOBODY: tuple[int, ...] = ()
-
-
-class Touch:
-    """What a tool felt in one frame.
-
-    Attributes
-    ----------
-    force : (3,) float64
-        N, world frame, on the tool.
-    torque : (3,) float64
-        N m about the tool's centre of mass, world frame.
-    hits : (H,) int64
-        Indices of the shell's points inside a voxel, ascending.
-    depths : (H,) float64
-        Metres below each hit's tangent plane; 0 above it.
-    query : Query
-        How the database was asked.
-    """
-
-    __slots__ = ("_answer", "_known", "depths", "force", "hits", "query", "torque")
-
-    def __init__(self, answer: Answer, known: Mapping[int, Object]) -> None:
-        self._answer = answer
-        self._known = known
-        self.force: NDArray[np.float64] = answer.wrench[:3]
-        self.torque: NDArray[np.float64] = answer.wrench[3:]
-        self.hits: NDArray[np.int64] = answer.hits
-        self.depths: NDArray[np.float64] = answer.depths
-        self.query: Query = answer.query
-
-    @property
-    def contacts(self) -> NDArray[np.int64]:
-        """Indices (C,) of the shell's points whose depth is above 0, ascending."""
-        return self.hits[self.depths > 0]
-
-    @property
-    def objects(self) -> list[Object]:
-        """Objects of all hits, ordered by id."""
-        return [self._known[i] for i in self._answer.ids]
-
-    @property
-    def pairs(self) -> NDArray[np.int64]:
-        """Every hit with every object in its voxel, (P, 2): index of the point, id."""
-        return self._answer.pairs()
-
-    def __repr__(self) -> str:
-        x, y, z = self.force
-        return (
-            f"Touch(force=({x:.4g}, {y:.4g}, {z:.4g}) N, {len(self.hits)} hits, "
-            f"{len(self.contacts)} contacts, objects {self._answer.ids})"
-        )
 
 
 class Environment:
@@ -364,12 +315,18 @@ class Environment:
         answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
         if self._store.version() != self._known_at:
             with self._store.snapshot():
-                self._known = {obj.id: obj for obj in self._store.objects()}
                 answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
-                self._known_at = self._store.version()
-            if self._quantiles is not None and not self._quantiles.n_rows:
-                self._quantiles = None  # it was empty when it was opened
+                self._learn_objects()
         return answer
+
+    def _learn_objects(self) -> None:
+        """Know the objects of the revision that this snapshot sees."""
+        if self._store.version() == self._known_at:
+            return
+        self._known = {obj.id: obj for obj in self._store.objects()}
+        self._known_at = self._store.version()
+        if self._quantiles is not None and not self._quantiles.n_rows:
+            self._quantiles = None  # it was empty when it was opened
 
     def _check_known(self, ids: Keys) -> None:
         if not set(ids.tolist()) <= set(self._known):  # a frame that asked nothing saw nothing new
@@ -380,6 +337,56 @@ class Environment:
                     f"no object {i} in {self.url} to exclude; 'hapticdb objects {self.url}' "
                     "lists them"
                 )
+
+    def touch_many(
+        self,
+        shell: PointShell,
+        poses: ArrayLike,
+        strategy: Strategy = "auto",
+        *,
+        exclude: Iterable[int] = _NOBODY,
+        maxgap: int = DEFAULT_MAXGAP,
+        law: TangentPlane | None = None,
+        contacts: bool = False,
+    ) -> Touches:
+        """Force and torque at many poses, as `touch` gives them one by one, bit for bit.
+
+        Parameters
+        ----------
+        poses : (n, 4, 4) array
+            Each a world_from_tool, rigid, metres.
+        strategy : str
+            ``auto`` asks for the rows of neighbouring poses in one statement; any other asks pose
+            by pose, as `touch` does.
+        contacts : bool
+            Whether to list every contact, too.
+        shell, exclude, maxgap, law
+            As for `touch`.
+
+        Raises
+        ------
+        UsageError, ObjectNotFoundError
+            As for `touch`; nothing is returned then.
+        """
+        ids = NOTHING_EXCLUDED if exclude is _NOBODY else as_ids(exclude)
+        where, started = as_poses(poses), perf_counter_ns()
+
+        def felt() -> Touches:
+            answers = self._query.run_many(shell, where, strategy, maxgap, ids, law or _DEFAULT_LAW)
+            with self._store.snapshot():
+                touches = Touches(len(where), has_contacts=contacts).gather(answers)
+                self._learn_objects()
+            return touches
+
+        if strategy == "cbgroup":
+            self._statistics()  # measured outside the snapshot
+        try:
+            touches = felt()
+        except ConnectionLostError:  # once more, from its start
+            touches = felt()
+        if ids.size:
+            self._check_known(ids)
+        return touches.name(self._known, (perf_counter_ns() - started) / 1000)
 
     # -- statistics --------------------------------------------------------------------------
 

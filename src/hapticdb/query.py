@@ -2,7 +2,7 @@
 
 import operator
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
@@ -25,6 +25,11 @@ Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 MOST_SHELLS = 64
 """Sizes of shells for which `auto` remembers what it has learned."""
+MOST_KEYS = 2048
+"""Row keys of neighbouring poses that one statement asks for: each pose goes over the rows found
+between its first key and its last, so that more would save statements and cost time."""
+MOST_POINTS = 1 << 17
+"""Points of poses that are placed before the database is asked: 12 MB."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
 
@@ -92,10 +97,7 @@ class HapticQuery:
     ) -> Answer:
         """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
         started = time.perf_counter_ns()
-        if strategy not in STRATEGIES:
-            raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
-        if gap < 0:
-            raise UsageError(f"MAXGAP {gap}: give 0 or more")
+        _check_options(strategy, gap)
         pose = as_floats(world_from_tool, "a pose")
         located = self.locate(shell, pose)
         if strategy == "auto" and not located.keys.size:
@@ -152,6 +154,19 @@ class HapticQuery:
         if strategy == "statement":
             return self._by_statement(located, exclude, law, started)
         n_statements, n_ranges, rows = self._fetch(strategy, located, gap)
+        query = Query(strategy, n_statements, n_ranges, len(rows[0]), 0.0)
+        return self._refined(located, rows, exclude, law, query, started)
+
+    def _refined(
+        self,
+        located: "contact.Located",
+        rows: Rows,
+        exclude: Keys,
+        law: TangentPlane,
+        query: Query,
+        started: int,
+    ) -> Answer:
+        """What a frame found in rows that were fetched for it, and perhaps for others."""
         placed, asked, keys = located
         row_keys, row_ids, occupancy = rows
         wrench, hits, depths, ids = contact.refine(
@@ -169,9 +184,56 @@ class HapticQuery:
         pairs = partial(
             contact.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
         )
-        elapsed_us = (time.perf_counter_ns() - started) / 1000
-        query = Query(strategy, n_statements, n_ranges, len(row_keys), elapsed_us)
+        query = query._replace(elapsed_us=(time.perf_counter_ns() - started) / 1000)
         return Answer(wrench, hits, depths, ids.tolist(), pairs, query)
+
+    def run_many(
+        self,
+        shell: "PointShell",
+        poses: NDArray[np.float64],
+        strategy: Strategy,
+        gap: int,
+        exclude: Keys,
+        law: TangentPlane,
+    ) -> Iterator[Answer]:
+        """Answers at poses (n, 4, 4), in their order; see `Environment.touch_many`.
+
+        A statement that serves several poses is counted with the first of them.
+        """
+        _check_options(strategy, gap)
+        batch: list[contact.Located] = []
+        n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
+        for n, pose in enumerate(poses):
+            try:
+                if strategy != "auto":
+                    yield self.run(shell, pose, strategy, gap, exclude, law)
+                    continue
+                batch.append(self.locate(shell, pose))
+            except UsageError as error:
+                raise UsageError(f"pose {n}: {error}") from error
+            n_keys += len(batch[-1].keys)
+            if n_keys >= MOST_KEYS or len(batch) >= most:
+                yield from self._together(batch, exclude, law)
+                batch, n_keys = [], 0
+        if batch:
+            yield from self._together(batch, exclude, law)
+
+    def _together(
+        self, batch: "list[contact.Located]", exclude: Keys, law: TangentPlane
+    ) -> Iterator[Answer]:
+        """Answers of poses whose rows are fetched by one statement."""
+        started = time.perf_counter_ns()
+        keys = np.unique(np.concatenate([located.keys for located in batch]))
+        row_keys, row_ids, occupancy = self._store.lookup(keys)
+        query = Query("array", 1, len(keys), len(row_keys), 0.0)
+        for located in batch:
+            low = high = 0
+            if located.keys.size:
+                low = int(np.searchsorted(row_keys, located.keys[0], "left"))
+                high = int(np.searchsorted(row_keys, located.keys[-1], "right"))
+            rows = Rows(row_keys[low:high], row_ids[low:high], occupancy[64 * low : 64 * high])
+            yield self._refined(located, rows, exclude, law, query, started)
+            query, started = Query("array", 0, 0, 0, 0.0), time.perf_counter_ns()
 
     def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> "contact.Located":
         """Place a shell (N points) at a pose (4, 4), and find the row keys that it asks for."""
@@ -247,6 +309,26 @@ class HapticQuery:
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
         order = np.lexsort((ids, ordinals))
         return Answer(wrench, hits, depths, touched, lambda: pairs[order], query)
+
+
+def _check_options(strategy: Strategy, gap: int) -> None:
+    if strategy not in STRATEGIES:
+        raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
+    if gap < 0:
+        raise UsageError(f"MAXGAP {gap}: give 0 or more")
+
+
+def as_poses(poses: ArrayLike) -> NDArray[np.float64]:
+    """Poses as an array (n, 4, 4) of float64; refuses other shapes."""
+    given = as_floats(poses, "poses")
+    if given.size == 0 and given.ndim < 3:  # an empty list
+        given = given.reshape(0, 4, 4)
+    if given.ndim != 3 or given.shape[1:] != (4, 4):
+        raise UsageError(
+            f"poses of shape {given.shape}: give (n, 4, 4) matrices, world_from_tool; touch takes "
+            "a single one"
+        )
+    return given
 
 
 def as_id(object_id: int) -> int:

@@ -11,10 +11,11 @@ from hapticdb.cli.choosing import Exclude, ids_of
 from hapticdb.cli.root import Json, Points, Seed, StrategyName, ToolUnit, Url
 
 if TYPE_CHECKING:
-    from hapticdb.environment import Environment, Touch
+    from hapticdb.environment import Environment
     from hapticdb.pointshell import PointShell
     from hapticdb.query import Strategy
     from hapticdb.store.base import Object
+    from hapticdb.touches import Touch
 
 DEFAULT_POINTS = 300
 MOST_TOUCHED = 8

@@ -53,6 +53,7 @@ if TYPE_CHECKING:
     from hapticdb.realtime.swept import Swept
     from hapticdb.statistics import CostModel, QuantileVector
     from hapticdb.store.base import Object
+    from hapticdb.store.connect import backup_environment, restore_environment
     from hapticdb.touches import Touch, Touches
     from hapticdb.transfer import CopyReport, copy_environment
     from hapticdb.warm import warm_up
@@ -103,6 +104,7 @@ __all__ = [
     "Touch",
     "Touches",
     "UsageError",
+    "backup_environment",
     "copy_environment",
     "create",
     "diff_environments",
@@ -110,6 +112,7 @@ __all__ = [
     "open",
     "read_poses",
     "replay",
+    "restore_environment",
     "sweep",
     "warm_up",
     "write_poses",
@@ -144,6 +147,7 @@ _HOMES = {
     "realtime.swept": "Swept",
     "statistics": "CostModel QuantileVector",
     "store.base": "Object",
+    "store.connect": "backup_environment restore_environment",
     "touches": "Touch Touches",
     "transfer": "CopyReport copy_environment",
     "warm": "warm_up",

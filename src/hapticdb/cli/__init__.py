@@ -17,6 +17,7 @@ from hapticdb.cli.editing import move, remove
 from hapticdb.cli.feeling import feel, replay
 from hapticdb.cli.granting import grant
 from hapticdb.cli.importing import import_
+from hapticdb.cli.keeping import backup, restore
 from hapticdb.cli.listing import analyze, calibrate, info, objects
 from hapticdb.cli.moving import copy, diff
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
@@ -44,6 +45,8 @@ VERBS: dict[Callable[..., None], str] = {
     remove: "Remove objects.",
     copy: "Copy to another engine, layout or curve.",
     diff: "Say whether two environments hold the same.",
+    backup: "Copy an SQLite environment into a file, whole.",
+    restore: "Put such a copy in an environment's place.",
     calibrate: "Measure what queries cost on this machine.",
     analyze: "Renew the statistics of the keys.",
     bench: "Measure the paper's experiments, with a report.",

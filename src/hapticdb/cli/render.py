@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
     from hapticdb import transfer
     from hapticdb.ingest import ProgressCallback
+    from hapticdb.store import sqlite_backup
 
 _UNPRINTABLE = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"
@@ -164,6 +165,16 @@ def copy_bar(doing: str) -> "Iterator[transfer.ProgressCallback | None]":
         return
     with _bar(doing, "objects") as advance:
         yield lambda now: advance(doing, now.objects_done, now.objects_total, now.voxels)
+
+
+@contextmanager
+def file_bar(doing: str) -> "Iterator[sqlite_backup.ProgressCallback | None]":
+    """Show a bar with megabytes and time left; nothing where nobody looks."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    with _bar(doing, "MB") as advance:
+        yield lambda now: advance(doing, now.bytes_done // 10**6, now.bytes_total // 10**6, 0)
 
 
 @contextmanager

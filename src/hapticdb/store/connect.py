@@ -14,8 +14,10 @@ from hapticdb.store.sqlite import SQLiteStore
 
 if TYPE_CHECKING:
     from hapticdb.store.postgres.rights import Right
+    from hapticdb.store.sqlite_backup import BackupReport, ProgressCallback
 
 __all__ = [
+    "backup_environment",
     "beside",
     "check_curve",
     "create_store",
@@ -24,6 +26,7 @@ __all__ = [
     "name_of",
     "open_store",
     "redact",
+    "restore_environment",
 ]
 
 SQLITE_SCHEME = "sqlite:///"
@@ -85,6 +88,88 @@ def grant(url: str | os.PathLike[str], role: str, right: "Right") -> None:
     with schema_of.connected(os.fspath(url)) as session:
         schema_of.check(session)
         rights.grant(session, role, right)
+
+
+def backup_environment(
+    url: str | os.PathLike[str],
+    file: str | os.PathLike[str],
+    *,
+    replace: bool = False,
+    progress: "ProgressCallback | None" = None,
+) -> "BackupReport":
+    """Copy an SQLite environment whole, as of one moment, while others go on reading and writing.
+
+    Parameters
+    ----------
+    url : str or path
+        The environment: a path or ``sqlite:///path``.
+    file : path
+        Where the copy goes: an environment of its own, which can be opened. It appears whole, on
+        disk, or not at all.
+    replace : bool
+        Replace an environment that is there, unless somebody has it open.
+    progress : callable or None
+        Called after each 4 MiB with `bytes_done` and `bytes_total`.
+
+    Raises
+    ------
+    EnvironmentExistsError
+        When `file` is there and `replace` is false.
+    BusyError
+        When the file that is to be replaced is open.
+    DamagedError
+        When a page is not what was written: nothing is left then.
+    UsageError
+        When either is on PostgreSQL, or both are one file.
+    """
+    from hapticdb.store.sqlite_backup import back_up  # noqa: PLC0415 - seldom needed
+
+    _refuse_server(url, "pg_dump copies it")
+    _refuse_server(file, "give a path")
+    return back_up(_path_of(url), _path_of(file), replace=replace, progress=progress)
+
+
+def restore_environment(
+    file: str | os.PathLike[str],
+    url: str | os.PathLike[str],
+    *,
+    progress: "ProgressCallback | None" = None,
+) -> "BackupReport":
+    """Put a copy of an SQLite environment in its place, and remove the log of what was there.
+
+    The former file stays until the copy is whole beside it. `file` stays as it is.
+
+    Parameters
+    ----------
+    file : path
+        A copy that `backup_environment` made, or any other environment's file.
+    url : str or path
+        Where it goes: a path or ``sqlite:///path``, whether something is there or not.
+    progress : callable or None
+        Called after each 4 MiB with `bytes_done` and `bytes_total`.
+
+    Raises
+    ------
+    BusyError
+        When the environment that is to be replaced is open, where that can be known: a reader in a
+        folder that it cannot write leaves no sign.
+    NotAnEnvironmentError
+        When a file of another kind is in the place.
+    DamagedError
+        When a page of `file` is not what was written: nothing has changed then.
+    UsageError
+        When either is on PostgreSQL, or both are one file.
+    """
+    from hapticdb.store.sqlite_backup import back_up  # noqa: PLC0415 - seldom needed
+
+    _refuse_server(file, "give a path")
+    _refuse_server(url, "pg_restore puts a copy into it")
+    return back_up(_path_of(file), _path_of(url), replace=True, progress=progress)
+
+
+def _refuse_server(url: str | os.PathLike[str], what_next: str) -> None:
+    if isinstance(url, str) and address.is_postgres(url):
+        raise UsageError(f"{redact(url)} is on PostgreSQL, not a file: {what_next}")
 
 
 def name_of(url: str | os.PathLike[str]) -> str:

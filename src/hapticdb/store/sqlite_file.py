@@ -63,7 +63,7 @@ def named_errors(path: str) -> Iterator[None]:
 
 def damaged(path: str, cause: str) -> DamagedError:
     """Build the error for an environment whose contents are broken."""
-    return DamagedError(f"{path} is damaged ({cause}): restore a copy or import the files again")
+    return sqlite_pages.damaged_page(path, cause)
 
 
 def check_kind(path: Path) -> None:
@@ -131,15 +131,9 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
 
     The file appears at its path whole or not at all: it is made under another name beside it.
     """
-    if path.exists():
-        raise EnvironmentExistsError(f"{path} exists already; open it, or give another path")
-    if not path.parent.is_dir():
-        raise EnvironmentNotFoundError(f"folder {path.parent} does not exist; make it first")
-    if not os.access(path.parent, os.W_OK):
-        raise ReadOnlyError(f"folder {path.parent} cannot be written to; give another path")
-    _sweep_unfinished(path)
-    unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
-    try:
+    check_free(path)
+    check_folder(path)
+    with unfinished_beside(path) as unfinished:
         made = apsw.Connection(str(unfinished), vfs=sqlite_pages.LAYER)
         with named_errors(str(path)), contextlib.closing(made) as new:
             new.execute(f"PRAGMA page_size = {sqlite_pages.PAGE_BYTES}")
@@ -149,15 +143,49 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
             migrate(new, 0)
             fill(new)
             new.execute("PRAGMA journal_mode = WAL").fetchall()
-        try:
-            os.link(unfinished, path)  # unlike a renaming, it never replaces another's file
-        except FileExistsError as error:
-            raise EnvironmentExistsError(f"{path} exists already; open it") from error
-        except OSError:
-            unfinished.rename(path)  # a file system without hard links
+        publish(unfinished, path)
+
+
+def check_free(path: Path) -> None:
+    """Refuse a path where a file is, or the log of one that is gone."""
+    if path.exists():
+        raise EnvironmentExistsError(f"{path} exists already; open it, or give another path")
+    log = Path(f"{path}-wal")
+    if log.exists() and log.stat().st_size:
+        raise EnvironmentExistsError(
+            f"{log} was left by a {path.name} that is gone: put that file back, or remove "
+            f"{log.name} and {path.name}-shm"
+        )
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a path whose folder is missing, or takes no file."""
+    if not path.parent.is_dir():
+        raise EnvironmentNotFoundError(f"folder {path.parent} does not exist; make it first")
+    if not os.access(path.parent, os.W_OK):
+        raise ReadOnlyError(f"folder {path.parent} cannot be written to; give another path")
+
+
+@contextlib.contextmanager
+def unfinished_beside(path: Path) -> Iterator[Path]:
+    """Name for a file that will have that path when it is whole; removed when it has not."""
+    _sweep_unfinished(path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        yield unfinished
     finally:
         for suffix in ("", "-wal", "-shm", "-journal"):
             Path(f"{unfinished}{suffix}").unlink(missing_ok=True)
+
+
+def publish(unfinished: Path, path: Path) -> None:
+    """Give a finished file its path, unless another has taken it."""
+    try:
+        os.link(unfinished, path)  # unlike a renaming, it never replaces another's file
+    except FileExistsError as error:
+        raise EnvironmentExistsError(f"{path} exists already; open it") from error
+    except OSError:
+        unfinished.rename(path)  # a file system without hard links
 
 
 def remove_file(path: Path) -> None:
@@ -208,7 +236,7 @@ def _connect_to_read(path: Path) -> apsw.Connection:
     connection = apsw.Connection(
         path.resolve().as_uri() + options,
         flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI | apsw.SQLITE_OPEN_NOMUTEX,
-        vfs=_layer_of(path),
+        vfs=layer_of(path),
     )
     _settle(connection)
     return connection
@@ -218,7 +246,7 @@ def _connect_to_write(path: Path) -> apsw.Connection:
     if not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
         raise ReadOnlyError(f"{path} can only be read: open a copy that you may write to")
     flags = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_NOMUTEX
-    connection = apsw.Connection(str(path), flags=flags, vfs=_layer_of(path))
+    connection = apsw.Connection(str(path), flags=flags, vfs=layer_of(path))
     _settle(connection)
     return connection
 
@@ -228,7 +256,8 @@ def is_checked(path: Path) -> bool:
     return sqlite_pages.is_checked(sqlite_bytes.read_bytes(path, sqlite_pages.PAGE_BYTES))
 
 
-def _layer_of(path: Path) -> str | None:
+def layer_of(path: Path) -> str | None:
+    """Name of the file system layer through which a file is to be opened."""
     return sqlite_pages.LAYER if is_checked(path) else None
 
 
@@ -271,9 +300,14 @@ def _bring_up_to_date(
         )
 
 
+def tables_version(found: int) -> int:
+    """Version of a file's tables, from its user version."""
+    return found - CHECKED_VERSION if found >= CHECKED_VERSION else found
+
+
 def _check_known(path: Path, found: int) -> int:
     """Version of a file's tables, from its user version; refuses one that is newer."""
-    version = found - CHECKED_VERSION if found >= CHECKED_VERSION else found
+    version = tables_version(found)
     if version > FORMAT_VERSION:
         raise NewerVersionError(
             f"{path} has format {version}, newer than the {FORMAT_VERSION} known here: "

@@ -185,7 +185,10 @@ class _Layer(apsw.VFS):
 
 def damaged_page(path: str, cause: str) -> DamagedError:
     """Build the error for a page that is not as it was written."""
-    return DamagedError(f"{path} is damaged ({cause}): restore a copy or import the files again")
+    return DamagedError(
+        f"{path} is damaged ({cause}): restore a copy with 'hapticdb restore COPY {path}', or "
+        "import the files again"
+    )
 
 
 def log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:

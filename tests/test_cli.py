@@ -177,7 +177,18 @@ def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
     assert code == 2
     good, bad = map(json.loads, out.splitlines())
     assert set(good) == {
-        *("file", "status", "objects", "present", "voxels", "is_unit_assumed", "defects", "error"),
+        *(
+            "file",
+            "status",
+            "objects",
+            "present",
+            "restored",
+            "kept_removed",
+            "voxels",
+            "is_unit_assumed",
+            "defects",
+            "error",
+        ),
         "scene",
     }
     assert (good["status"], good["objects"], good["error"]) == ("imported", 3, None)

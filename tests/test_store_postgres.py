@@ -78,6 +78,21 @@ def test_a_newer_format_is_refused(url: str, admin: psycopg.Connection) -> None:
         hapticdb.open(url)
 
 
+def test_an_environment_of_format_2_is_read_as_it_is_and_brought_up_to_date_by_its_owner(
+    url: str, admin: psycopg.Connection
+) -> None:
+    name = parse(url).environment
+    for what in ("TABLE {0}.removed", "FUNCTION {0}.note_removed", "FUNCTION {0}.removed_parts"):
+        admin.execute(f"DROP {what.format(name)} CASCADE")
+    admin.execute(f"UPDATE {name}.environment SET format = 2")
+    with hapticdb.open(url, read_only=True) as env:
+        (obj,) = env.objects()
+        assert env.store.removed(obj.link) == set()
+    with hapticdb.open(url) as env:
+        env.remove(obj.id)
+        assert env.store.removed(obj.link) == {obj.name}
+
+
 def test_a_dropped_table_is_damage(url: str, admin: psycopg.Connection) -> None:
     admin.execute(f"DROP TABLE {parse(url).environment}.brick")
     with pytest.raises(hapticdb.DamagedError, match="is damaged"):

@@ -160,6 +160,7 @@ class Environment:
         *,
         unit: str | None = None,
         jobs: int | None = None,
+        keep_removed: bool = False,
         progress: ProgressCallback | None = None,
     ) -> FileReport:
         """Import a file's parts on this environment's grid, each in a transaction of its own.
@@ -172,6 +173,8 @@ class Environment:
             One of `hapticdb.mesh.UNITS`, of a file that carries none; metres unless given.
         jobs : int or None
             Threads that voxelize; one a processor unless given.
+        keep_removed : bool
+            Leave parts out that were removed; they come in again otherwise.
         progress : callable or None
             Called after each part with a `hapticdb.ingest.Progress`.
 
@@ -181,7 +184,7 @@ class Environment:
             When the file cannot be used, or a part lies outside the grid: nothing is written then.
         """
         self._check_writable()
-        options = ImportOptions(unit=unit, jobs=jobs, layout=self.layout)
+        options = ImportOptions(unit=unit, jobs=jobs, layout=self.layout, keep_removed=keep_removed)
         mesh_file = read_file(file, unit=unit)
         with self._store.loading():
             report = ingest_file(self._store, mesh_file, options, progress)

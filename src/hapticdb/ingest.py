@@ -66,6 +66,10 @@ class FileReport:
         Objects written now, in the file's order.
     present : int
         Objects that were there already.
+    restored : int
+        Of those written now, parts that had been removed from the environment.
+    kept_removed : int
+        Parts that were removed, and stay so: `ImportOptions.keep_removed`.
     defects : Defects
         What was wrong in the file.
     error : HapticDBError or None
@@ -79,6 +83,8 @@ class FileReport:
     status: Literal["imported", "complete", "failed"]
     added: tuple[Object, ...] = ()
     present: int = 0
+    restored: int = 0
+    kept_removed: int = 0
     defects: Defects = field(default_factory=Defects)
     error: HapticDBError | None = None
     is_unit_assumed: bool = False
@@ -98,12 +104,15 @@ class ImportOptions:
         For a new environment (bricks unless given); must agree with an existing one.
     jobs : int or None
         Threads that voxelize; one a processor unless given.
+    keep_removed : bool
+        Leave parts out that were removed from the environment; they come in again otherwise.
     """
 
     unit: str | None = None
     grid: GridOptions = field(default_factory=GridOptions)
     layout: Layout | None = None
     jobs: int | None = None
+    keep_removed: bool = False
 
     def __post_init__(self) -> None:
         if self.jobs is not None and self.jobs < 1:
@@ -227,6 +236,9 @@ def ingest_file(
     _check_names(mesh_file)
     known = _KnownParts(store, mesh_file.link)
     missing = [part for part in mesh_file.parts if known.digest_of(part.name) is None]
+    removed = {part.name for part in missing} & store.removed(mesh_file.link)
+    if options.keep_removed:
+        missing = [part for part in missing if part.name not in removed]
     for part in mesh_file.parts:
         if known.digest_of(part.name) not in {None, part.digest}:
             raise GeometryChangedError(
@@ -236,6 +248,7 @@ def ingest_file(
     _check_inside(mesh_file, store.grid, missing)
     added: set[int] = set()
     n_parts = len(mesh_file.parts)
+    n_kept = len(removed) if options.keep_removed else 0
     n_done = n_parts - len(missing)
     voxels = 0
     jobs = options.jobs or os.cpu_count() or 1
@@ -255,12 +268,15 @@ def ingest_file(
         voxels += obj.voxels
         if progress is not None:
             progress(Progress(mesh_file.link, n_done, n_parts, voxels))
+    written = tuple(obj for obj in store.objects() if obj.id in added) if added else ()
     return FileReport(
         mesh_file.link,
         "imported" if added else "complete",
-        tuple(obj for obj in store.objects() if obj.id in added) if added else (),
-        n_parts - len(added),
-        mesh_file.defects,
+        written,
+        n_parts - len(added) - n_kept,
+        restored=sum(obj.name in removed for obj in written),
+        kept_removed=n_kept,
+        defects=mesh_file.defects,
         is_unit_assumed=options.unit is None and not mesh_file.names_unit,
     )
 

@@ -257,6 +257,17 @@ class StoreContract:
         with pytest.raises(ObjectNotFoundError):
             store.remove(2, _covering(store))
 
+    def test_removed_parts_are_known_until_they_are_there_again(self, store: Store) -> None:
+        """By the name of their file; of another file none."""
+        link = store.object(1).link
+        assert store.removed(link) == set()
+        store.remove(1, _covering(store))
+        store.remove(2, _covering(store))
+        assert store.removed(link) == {"one", "two"}
+        assert store.removed(f"{link}.other") == set()
+        write_voxels(store, blob(1, (20, 20, 20)), "one")
+        assert store.removed(link) == {"two"}
+
     def test_replace_moves_the_rows(self, store: Store) -> None:
         """Old rows go, new ones come, the id stays."""
         ijk = blob(7, (44, 30, 10))

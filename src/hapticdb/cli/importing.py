@@ -67,13 +67,17 @@ def import_(
     jobs: Annotated[
         int | None, typer.Option(metavar="N", help="Threads.", show_default="one a processor")
     ] = None,
+    keep_removed: Annotated[
+        bool, typer.Option("--keep-removed", help="Leave parts out that were removed.")
+    ] = False,
     json: Json = False,
 ) -> None:
     """Import files into an environment, which is made when it does not exist.
 
     Every part becomes an object, in a transaction of its own: run the same
     command again to go on with what was interrupted. A file that cannot be
-    used is named and skipped, and the others go in.
+    used is named and skipped, and the others go in. Parts that were removed
+    come in again, and are counted, unless --keep-removed leaves them out.
 
     Example: hapticdb import car.db car.glb --bits 11 --extent 1.6
 
@@ -90,6 +94,7 @@ def import_(
         ),
         layout=layout,
         jobs=jobs,
+        keep_removed=keep_removed,
     )
     try:
         render.compile_kernels("import", files=files)
@@ -121,6 +126,8 @@ def _record(report: "FileReport") -> dict[str, object]:
         "status": report.status,
         "objects": len(report.added),
         "present": report.present,
+        "restored": report.restored,
+        "kept_removed": report.kept_removed,
         "voxels": sum(obj.voxels for obj in report.added),
         "is_unit_assumed": report.is_unit_assumed,
         "defects": report.defects.as_dict(),
@@ -131,7 +138,7 @@ def _record(report: "FileReport") -> dict[str, object]:
 def _say(file: str, report: "FileReport") -> None:
     if report.status == "complete":
         there = render.counted(report.present, "object")
-        render.say(f"{file}: complete already ({there}), nothing to do")
+        line = f"{file}: complete already ({there}), nothing to do"
     else:
         voxels = sum(obj.voxels for obj in report.added)
         line = (
@@ -140,7 +147,14 @@ def _say(file: str, report: "FileReport") -> None:
         )
         if report.present:
             line += f"; {report.present} were there already"
-        render.say(line)
+        if report.restored:
+            line += (
+                f"; {report.restored} of them had been removed and are back: --keep-removed leaves "
+                "such parts out"
+            )
+    if report.kept_removed:
+        line += f"; {render.counted(report.kept_removed, 'removed part')} left out"
+    render.say(line)
     if report.is_unit_assumed:
         render.say("  it names no unit, so its numbers are taken as metres; --unit says another")
     if report.defects:

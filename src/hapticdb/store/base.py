@@ -278,6 +278,9 @@ class Store(Protocol):
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""
 
+    def removed(self, link: str) -> set[str]:
+        """Names of a file's parts that were removed and are not there again."""
+
     def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
         """Rows of one object with a key in any closed range, ascending and disjoint."""
 

@@ -240,6 +240,49 @@ CREATE AGGREGATE force(hit) (
 )""",
 )
 
+# names of removed parts, for who imports their file again: kept by triggers, whoever removes
+REMOVED = (
+    """
+CREATE TABLE removed (
+  link TEXT NOT NULL,
+  name TEXT NOT NULL,
+  PRIMARY KEY (link, name)
+) STRICT, WITHOUT ROWID""",
+    """
+CREATE TRIGGER part_removed AFTER DELETE ON object BEGIN
+  INSERT OR IGNORE INTO removed VALUES (old.link, old.name);
+END""",
+    """
+CREATE TRIGGER part_added AFTER INSERT ON object BEGIN
+  DELETE FROM removed WHERE link = new.link AND name = new.name;
+END""",
+)
+# as the owner: roles that were granted rights before the table was there write it, too
+POSTGRES_REMOVED = (
+    "CREATE TABLE removed (link text NOT NULL, name text NOT NULL)",
+    "CREATE UNIQUE INDEX removed_part ON removed (md5(link), md5(name))",
+    """
+CREATE FUNCTION note_removed() RETURNS trigger
+LANGUAGE plpgsql SECURITY DEFINER SET search_path = {schema}, pg_temp AS $$
+BEGIN
+  IF TG_OP = 'DELETE' THEN
+    INSERT INTO {schema}.removed VALUES (OLD.link, OLD.name) ON CONFLICT DO NOTHING;
+  ELSE
+    DELETE FROM {schema}.removed
+     WHERE md5(link) = md5(NEW.link) AND md5(name) = md5(NEW.name);
+  END IF;
+  RETURN NULL;
+END $$""",
+    """
+CREATE TRIGGER part_removed AFTER INSERT OR DELETE ON object
+FOR EACH ROW EXECUTE FUNCTION note_removed()""",
+    """
+CREATE FUNCTION removed_parts(of_link text) RETURNS SETOF text
+LANGUAGE sql STABLE SECURITY DEFINER SET search_path = {schema}, pg_temp AS $$
+  SELECT name FROM {schema}.removed WHERE md5(link) = md5(of_link)
+$$""",
+)
+
 MIGRATIONS = (
     Migration(
         "tables",
@@ -259,5 +302,6 @@ MIGRATIONS = (
     ),
     # a mark of each commit, and of the one before: store/sqlite_log.py
     Migration("lineage", LINEAGE, (), readers_need_it=False),
+    Migration("removed parts", REMOVED, POSTGRES_REMOVED, readers_need_it=False),
 )
 FORMAT_VERSION = len(MIGRATIONS)

@@ -289,6 +289,10 @@ class SQLiteStore:
             )
         ]
 
+    def removed(self, link: str) -> set[str]:
+        """Names of a file's parts that were removed and are not there again."""
+        return {row[0] for row in self._fetch("SELECT name FROM removed WHERE link = ?", (link,))}
+
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
         """One transaction that begins by taking the write lock."""
@@ -369,10 +373,8 @@ class SQLiteStore:
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
         """Record which keys a write touched."""
         ranges = touched_ranges(self.grid, self.layout, row_keys)
-        self._connection.execute(
-            "INSERT INTO change VALUES (?, ?, ?, ?)",
-            (revision, action, object_id, ranges.astype("<i8").tobytes()),
-        )
+        row = (revision, action, object_id, ranges.astype("<i8").tobytes())
+        self._connection.execute("INSERT INTO change VALUES (?, ?, ?, ?)", row)
 
     def changes(self, since: int = 0) -> Iterator[Change]:
         """Committed writes after that revision, oldest first."""

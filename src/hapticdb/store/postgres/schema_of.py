@@ -132,13 +132,14 @@ def check(session: Session) -> None:
             f"{shown} has format {version}, newer than the {FORMAT_VERSION} known here: "
             "install a newer hapticdb"
         )
-    if any(migration.postgres for migration in MIGRATIONS[version:]):
-        if session.is_read_only or not session.is_owner():
-            raise ReadOnlyError(
-                f"{shown} has the older format {version}: its owner has to open it once to "
-                "write, and it is brought up to date"
-            )
+    missing = [migration for migration in MIGRATIONS[version:] if migration.postgres]
+    if missing and not session.is_read_only and session.is_owner():
         session.write(lambda: _migrate_once(session))
+    elif any(migration.readers_need_it for migration in missing):
+        raise ReadOnlyError(
+            f"{shown} has the older format {version}: its owner has to open it once to "
+            "write, and it is brought up to date"
+        )
 
 
 def _check_writable(session: Session) -> None:

@@ -219,6 +219,12 @@ class PostgresStore:
             raise no_object(object_id, self.url)
         return records.object_of(rows[0])
 
+    def removed(self, link: str) -> set[str]:
+        """Names of a file's parts that were removed and are not there again."""
+        if self._session.rows("SELECT to_regprocedure('removed_parts(text)')") == [(None,)]:
+            return set()  # of format 2 or older, and not ours to bring up to date
+        return {row[0] for row in self._session.rows("SELECT removed_parts(%s)", (link,))}
+
     def loading(self) -> contextlib.AbstractContextManager[None]:
         """Inside, an empty table has no index."""
         return self._loading

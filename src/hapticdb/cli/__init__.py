@@ -14,12 +14,13 @@ from itertools import takewhile
 from hapticdb.cli import render
 from hapticdb.cli.benching import bench
 from hapticdb.cli.editing import move, remove
-from hapticdb.cli.feeling import feel, replay
+from hapticdb.cli.feeling import feel
 from hapticdb.cli.granting import grant
 from hapticdb.cli.importing import import_
 from hapticdb.cli.keeping import backup, restore
 from hapticdb.cli.listing import analyze, calibrate, info, objects
 from hapticdb.cli.moving import copy, diff
+from hapticdb.cli.replaying import replay
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
 from hapticdb.cli.sampling import demo, sample, warm
 from hapticdb.cli.sweeping import sweep

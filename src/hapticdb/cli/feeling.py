@@ -1,4 +1,4 @@
-"""The verbs feel and replay."""
+"""The verb feel."""
 
 import signal
 from collections.abc import Iterator
@@ -242,67 +242,6 @@ def _ended_by_signals(session: "Session") -> Iterator[list[int]]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-
-
-def replay(
-    recording: Annotated[str, typer.Argument(metavar="FILE", help="A session's .hdbrec.")],
-    url: Annotated[
-        str | None,
-        typer.Argument(metavar="URL", help="The environment; the recorded one without."),
-    ] = None,
-    *,
-    until_damage: Annotated[
-        bool, typer.Option("--until-damage", help="Take a damaged recording to end there.")
-    ] = False,
-    json: Json = False,
-) -> None:
-    """Compute a recorded session's contact wrenches again, and say where they part.
-
-    Ends with exit code 0 when all are equal bit for bit, 1 when some differ
-    or there was none to compare.
-
-    Example: hapticdb replay session.hdbrec car.db
-    """
-    import hapticdb
-    from hapticdb.realtime.frames import Frames
-    from hapticdb.realtime.recording import Recording
-    from hapticdb.realtime.replay import replay as compare
-    from hapticdb.realtime.residency import Residency
-    from hapticdb.realtime.table import CellTable
-
-    session = Recording(recording)
-    if session.n_torn:
-        render.note(
-            f"{recording}: the last {session.n_torn:,} bytes are no whole piece, the recorder was "
-            "cut off; what is before them is whole"
-        )
-    header = session.header
-    with hapticdb.open(url or header.environment, read_only=True) as env:
-        felt = None
-        render.compile_kernels("replay")
-        if header.grid == env.grid:
-            present = {obj.id for obj in env.objects()}
-            residency = Residency(
-                env.store, CellTable.create(), [i for i in header.exclude if i in present]
-            )
-            felt = Frames(residency, header.shell, header.law).wrenches
-        replayed = compare(session, env, felt, until_damage=until_damage)
-    if json:
-        parting = replayed.parting
-        render.say_json(
-            {
-                "compared": replayed.n_compared,
-                "skipped": replayed.n_skipped,
-                "differing": replayed.n_differing,
-                "revision": replayed.revision,
-                "is_same_revision": replayed.is_same_revision,
-                "parts_at": None if parting is None else parting.frame,
-            }
-        )
-    else:
-        render.say(replayed.describe())
-    if not replayed.is_equal:
-        raise typer.Exit(1)
 
 
 def _device(

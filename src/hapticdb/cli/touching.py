@@ -8,6 +8,15 @@ import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.choosing import Exclude, ids_of
+from hapticdb.cli.csv_files import (
+    CONTACTS,
+    STDOUT,
+    TOUCHED,
+    CsvFile,
+    row_of_pose,
+    rows_of_contacts,
+    sheet,
+)
 from hapticdb.cli.root import Json, Points, Seed, StrategyName, ToolUnit, Url
 
 if TYPE_CHECKING:
@@ -42,6 +51,11 @@ def touch(
     ] = 500,
     exclude: Exclude = None,
     stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")] = 1000.0,
+    csv: CsvFile = None,
+    contacts_csv: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Write every contact as CSV: a new file; - is stdout."),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Touch an environment with a tool along a path: force, torque and objects of every pose.
@@ -49,12 +63,20 @@ def touch(
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
     import hapticdb
+    from hapticdb.errors import UsageError
     from hapticdb.poses import read_poses
 
     law = hapticdb.TangentPlane(stiffness)
     path = read_poses(poses)
     summary = _Summary()
-    with hapticdb.open(url, read_only=True) as env:
+    to_stdout = [csv == STDOUT, contacts_csv == STDOUT, json]
+    if sum(to_stdout) > 1:
+        raise UsageError("--csv -, --contacts-csv - and --json: only one may be standard output")
+    with (
+        sheet(csv, "--csv", TOUCHED) as rows,
+        sheet(contacts_csv, "--contacts-csv", CONTACTS) as contact_rows,
+        hapticdb.open(url, read_only=True) as env,
+    ):
         excluded = ids_of(env, exclude, "--exclude")
         render.compile_kernels("touch", files=[tool])
         shell = shell_of(tool, tool_unit, points, seed)
@@ -66,11 +88,15 @@ def touch(
         felt(0)  # compiles kernels and reads statistics, which belong to no frame's time
         for index in range(len(path)):
             touched = felt(index)
+            if rows is not None:
+                rows.write([row_of_pose(index, touched)])
+            if contact_rows is not None:
+                contact_rows.write(rows_of_contacts(index, touched, shell, path[index]))
             if json:
                 render.say_json(_record(index, touched))
-            else:
+            elif not any(to_stdout):
                 summary.add(touched)
-    if not json:
+    if not any(to_stdout):
         summary.show()
 
 

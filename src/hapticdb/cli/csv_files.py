@@ -1,0 +1,176 @@
+"""Results as CSV: into a file, whole or not at all, or to standard output.
+
+Numbers are written so that they are read back bit for bit. A name that a spreadsheet would take for
+a formula gets an apostrophe in front, which is how spreadsheets themselves mark text.
+"""
+
+import csv
+import os
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, TextIO
+
+import typer
+
+from hapticdb.cli import render
+from hapticdb.errors import FileError, UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hapticdb.pointshell import PointShell
+    from hapticdb.realtime.recorded import Frames
+    from hapticdb.touches import Touch
+
+STDOUT = "-"
+FORMULAS = ("=", "+", "-", "@")
+"""What a cell begins with that a spreadsheet computes instead of showing it."""
+AXES = ("x", "y", "z")
+WRENCH = tuple(
+    f"{of}_{axis}_{unit}" for of, unit in (("force", "N"), ("torque", "Nm")) for axis in AXES
+)
+TOUCHED = ("pose", *WRENCH, "hits", "contacts", "deepest_m", "object_ids", "object_names")
+"""Columns of `touch --csv`: a row for each pose."""
+CONTACTS = ("pose", "point", "x_m", "y_m", "z_m", "depth_m", "object_id", "object_name")
+"""Columns of `touch --contacts-csv`: a row for each contact with each object in its voxel."""
+_PLACE = (*(f"{axis}_m" for axis in AXES), "qw", "qx", "qy", "qz")
+_SPEED = (*(f"v{axis}_m_per_s" for axis in AXES), *(f"w{axis}_rad_per_s" for axis in AXES))
+FRAME_COLUMNS: dict[str, tuple[str, ...]] = {
+    "time": ("time_s",),
+    "dt": ("dt_s",),
+    "lateness": ("lateness_s",),
+    "elapsed": ("elapsed_s",),
+    "hand": tuple(f"hand_{name}" for name in _PLACE),
+    "hand_velocity": tuple(f"hand_{name}" for name in _SPEED),
+    "tool": tuple(f"tool_{name}" for name in _PLACE),
+    "wrench": tuple(f"contact_{name}" for name in WRENCH),
+    "applied": tuple(f"applied_{name}" for name in WRENCH),
+    "hits": ("hits",),
+    "contacts": ("contacts",),
+    "unknown": ("unknown",),
+    "deepest": ("deepest_m",),
+    "revision": ("revision",),
+    "buttons": ("buttons",),
+    "state": ("state",),
+}
+"""Columns of `replay --csv`, by the fields of a recorded frame: a row for each frame."""
+
+CsvFile = Annotated[
+    str | None,
+    typer.Option("--csv", metavar="FILE", help="Write it as CSV: a new file; - is stdout."),
+]
+
+
+class Sheet:
+    """Rows that are written as CSV.
+
+    Parameters
+    ----------
+    stream : TextIO
+        Opened without translating ends of lines.
+    columns : sequence of str
+        The header.
+    """
+
+    def __init__(self, stream: TextIO, columns: Sequence[str]) -> None:
+        self._writer = csv.writer(stream, lineterminator="\n")
+        self._columns: Sequence[str] | None = columns
+
+    def write(self, rows: Iterable[Sequence[object]]) -> None:
+        """Add rows; a float as the shortest text that is read back as the same float64."""
+        self.begin()
+        self._writer.writerows(rows)
+
+    def begin(self) -> None:
+        """Write the header, unless it is there: not before there is something to say."""
+        if self._columns is not None:
+            self._writer.writerow(self._columns)
+            self._columns = None
+
+
+@contextmanager
+def sheet(target: str | None, option: str, columns: Sequence[str]) -> Iterator[Sheet | None]:
+    """Open a sheet; what went wrong within leaves no file. None where no target is given.
+
+    Raises
+    ------
+    UsageError
+        When a file is there already.
+    FileError
+        When it cannot be written.
+    """
+    if target is None:
+        yield None
+    elif target == STDOUT:
+        made = Sheet(sys.stdout, columns)
+        yield made
+        made.begin()
+    else:
+        yield from _in_a_file(Path(target), option, columns)
+
+
+def _in_a_file(target: Path, option: str, columns: Sequence[str]) -> Iterator[Sheet]:
+    if not target.name or os.path.lexists(target):
+        raise UsageError(f"{option} '{target}': give the name of a file that is not there yet")
+    part = target.with_name(f".{target.name}.{os.getpid()}.part")
+    try:
+        with part.open("x", encoding="utf-8", newline="") as stream:
+            made = Sheet(stream, columns)
+            yield made
+            made.begin()
+        part.replace(target)
+    except BrokenPipeError:  # of standard output
+        raise
+    except OSError as error:
+        if error.filename not in {None, str(part)}:
+            raise
+        raise FileError(f"{option}: cannot write {target}: {error.strerror}") from error
+    finally:
+        with suppress(OSError):
+            part.unlink(missing_ok=True)
+
+
+def text_cell(text: str) -> str:
+    """A name as a cell: printable, and no formula."""
+    shown = render.printable(text).replace("\n", "\\n")
+    return f"'{shown}" if shown.startswith(FORMULAS) else shown
+
+
+def row_of_pose(index: int, touched: "Touch") -> list[object]:
+    """Row of `TOUCHED`; objects ordered by id, their ids with a space between."""
+    objects = touched.objects
+    return [
+        index,
+        *touched.force.tolist(),
+        *touched.torque.tolist(),
+        len(touched.hits),
+        len(touched.contacts),
+        float(touched.depths.max(initial=0.0)),
+        " ".join(str(obj.id) for obj in objects),
+        text_cell("; ".join(obj.name for obj in objects)),
+    ]
+
+
+def rows_of_contacts(
+    index: int, touched: "Touch", shell: "PointShell", pose: "NDArray[np.float64]"
+) -> Iterator[list[object]]:
+    """Rows of `CONTACTS`, ordered by point and id; points at their places in the world."""
+    depths = dict(zip(touched.hits.tolist(), touched.depths.tolist(), strict=True))
+    names = {obj.id: text_cell(obj.name) for obj in touched.objects}
+    for point, i in touched.pairs.tolist():
+        if depths[point] > 0.0:
+            place = pose[:3, :3] @ shell.points[point] + pose[:3, 3]
+            yield [index, point, *place.tolist(), depths[point], i, names[i]]
+
+
+def rows_of_frames(frames: "Frames") -> Iterator[list[object]]:
+    """Rows of recorded frames; those in single precision as that is read back."""
+    columns: list[list[object]] = []
+    for name, headings in FRAME_COLUMNS.items():
+        values = frames[name].reshape(len(frames), len(headings)).T
+        is_single = values.dtype.itemsize == 4 and values.dtype.kind == "f"
+        columns += [list(map(str, column)) if is_single else column.tolist() for column in values]
+    yield from map(list, zip(*columns, strict=True))

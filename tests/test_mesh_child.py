@@ -2,6 +2,7 @@
 
 import os
 import signal
+import struct
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -15,6 +16,7 @@ from hapticdb.errors import MissingExtraError
 from hapticdb.mesh import Defects, parse_in_process, read_file
 from hapticdb.mesh import reader as reader_module
 from hapticdb.mesh.child import allowance
+from hapticdb.mesh.gltf import bytes_beside
 from hapticdb.realtime.table import is_alive
 from mesh_files import cause, gltf, names, text, threemf
 
@@ -33,14 +35,6 @@ def test_the_child_hands_back_what_this_process_reads(tmp_path: Path) -> None:
         np.testing.assert_array_equal(a.triangles(), b.triangles())
 
 
-def test_a_file_that_eats_memory_ends_in_one_line(tmp_path: Path) -> None:
-    tree = {
-        "accessors": [{"componentType": 5126, "count": 2_000_000_000, "type": "VEC3"}],
-        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
-    }
-    assert "memory" in cause(gltf(tree, tmp_path / "greedy.gltf"), read_file)
-
-
 def test_a_zip_bomb_does_not_unpack_into_memory(tmp_path: Path) -> None:
     filler = " " * (64 << 20)
     path = threemf(tmp_path / "bomb.3mf", f'<object id="1">{filler}</object>', "")
@@ -51,11 +45,17 @@ def test_a_zip_bomb_does_not_unpack_into_memory(tmp_path: Path) -> None:
 def test_the_allowance_goes_with_the_file(tmp_path: Path) -> None:
     small, large = text(tmp_path / "a.obj", "v"), text(tmp_path / "b.obj", "v" * 1_000_000)
     assert allowance(small) < allowance(large) < allowance(small) + (128 << 20)
-    beside = tmp_path / "a.bin"
+
+
+def test_files_that_a_glTF_refers_to_count_once(tmp_path: Path) -> None:  # noqa: N802
+    beside = tmp_path / "a b.bin"
     beside.write_bytes(b"\0" * 1_000_000)
-    lone = gltf({}, tmp_path / "c.gltf")
-    whole = gltf({"buffers": [{"byteLength": 1_000_000, "uri": "a.bin"}]}, tmp_path / "d.gltf")
-    assert allowance(whole) > allowance(lone) + 1_000_000
+    (tmp_path / "link.bin").symlink_to(beside)
+    named = ["a b.bin", "a%20b.bin", "link.bin", "./a b.bin", "gone.bin"] * 100
+    tree = {"buffers": [{"byteLength": 1_000_000, "uri": name} for name in named]}
+    path = gltf(tree, tmp_path / "d.gltf")
+    assert bytes_beside(path) == 1_000_000
+    assert allowance(path, bytes_beside(path)) > allowance(path) + 1_000_000
 
 
 @pytest.fixture
@@ -63,17 +63,35 @@ def fake_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str
     """A LAS file whose parser does whatever a test wants."""
 
     def make(body: str) -> Path:
-        text(tmp_path / "laspy.py", f"import os, signal, time\ndef open(path):\n    {body}\n")
+        (tmp_path / "laspy" / "vlrs").mkdir(parents=True)
+        classes = "class GeoKeyDirectoryVlr: ...\nclass WktCoordinateSystemVlr: ...\n"
+        text(tmp_path / "laspy" / "vlrs" / "known.py", classes)
+        source = f"import os, signal, time\nclass LasHeader: ...\ndef open(path):\n    {body}\n"
+        text(tmp_path / "laspy" / "__init__.py", source)
         text(tmp_path / "lazrs.py", "")
         monkeypatch.syspath_prepend(str(tmp_path))
-        return text(tmp_path / "a.las", "LASF")
+        header = bytearray(227)
+        header[:4] = b"LASF"
+        struct.pack_into("<HI", header, 94, 227, 227)
+        path = tmp_path / "a.las"
+        path.write_bytes(header)
+        return path
 
     return make
 
 
 def test_a_parser_that_crashes_ends_in_one_line(fake_laspy: Callable[[str], Path]) -> None:
     path = fake_laspy("os.kill(os.getpid(), signal.SIGSEGV)")
-    assert "SIGSEGV" in cause(path, read_file)
+    line = cause(path, read_file)
+    assert "lazrs" in line
+    assert "SIGSEGV" in line
+    assert "unpack it to LAS" in line
+
+
+def test_a_parser_that_eats_memory_ends_in_one_line(fake_laspy: Callable[[str], Path]) -> None:
+    line = cause(fake_laspy("bytearray(2 << 30)"), read_file, memory_limit=64 << 20)
+    assert "more memory" in line
+    assert "--memory-limit" in line
 
 
 def test_a_parser_that_leaves_ends_in_one_line(fake_laspy: Callable[[str], Path]) -> None:
@@ -85,7 +103,9 @@ def test_a_parser_that_leaves_ends_in_one_line(fake_laspy: Callable[[str], Path]
 
 def test_a_parser_that_hangs_is_ended(fake_laspy: Callable[[str], Path]) -> None:
     path = fake_laspy("time.sleep(600)")
-    assert "longer than 2 s" in cause(path, read_file, time_limit=2)
+    line = cause(path, read_file, time_limit=2)
+    assert "longer than 2 s" in line
+    assert "--time-limit" in line
 
 
 def test_what_a_parser_prints_does_not_mix_with_its_answer(
@@ -101,7 +121,7 @@ def test_no_child_outlives_a_killed_parent(
 ) -> None:
     pid_file = tmp_path / "pid"
     path = fake_laspy(f"os.rename(_note(), {str(pid_file)!r}); time.sleep(600)")
-    module = tmp_path / "laspy.py"
+    module = tmp_path / "laspy" / "__init__.py"
     note = "def _note():\n    f = os.open('note', os.O_WRONLY | os.O_CREAT)\n"
     note += "    os.write(f, str(os.getpid()).encode()); os.close(f); return 'note'\n"
     module.write_text(module.read_text() + note)

@@ -106,6 +106,9 @@ class ImportOptions:
         Threads that voxelize; one a processor unless given.
     keep_removed : bool
         Leave parts out that were removed from the environment; they come in again otherwise.
+    time_limit, memory_limit : float, int or None
+        Seconds and bytes that reading one file may take; in proportion to the file unless given,
+        see `hapticdb.mesh.read_file`.
     """
 
     unit: str | None = None
@@ -113,8 +116,13 @@ class ImportOptions:
     layout: Layout | None = None
     jobs: int | None = None
     keep_removed: bool = False
+    time_limit: float | None = None
+    memory_limit: int | None = None
 
     def __post_init__(self) -> None:
+        for name, limit in (("seconds", self.time_limit), ("bytes", self.memory_limit)):
+            if limit is not None and not 0 < limit < np.inf:
+                raise UsageError(f"a limit of {limit} {name}: give a number above 0")
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"{self.jobs} jobs: give 1 or more")
         if self.layout is not None and self.grid.curve is not None:
@@ -176,7 +184,12 @@ def import_files(
         with contextlib.ExitStack() as loading:
             for n, file in enumerate(files):
                 try:
-                    mesh_file = read_file(file, unit=chosen.unit)
+                    mesh_file = read_file(
+                        file,
+                        unit=chosen.unit,
+                        memory_limit=chosen.memory_limit,
+                        time_limit=chosen.time_limit,
+                    )
                     if store is None:
                         grid = chosen.grid.fit(mesh_file.bounds)
                         _check_inside(mesh_file, grid)

@@ -7,9 +7,12 @@ a frame that takes the points in turn finds the same brick many times in a row, 
 holds many points.
 """
 
+import math
+import zipfile
 from dataclasses import dataclass, replace
-from os import PathLike
+from os import SEEK_END, PathLike
 from pathlib import Path
+from typing import IO, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,6 +28,9 @@ ORDER_BITS = 10
 """The curve that orders the points has 2^10 steps along the longest side of their bounding box."""
 
 FORMAT = "hapticdb.pointshell 1"
+MOST_INFLATION, INFLATED_ANYWAY = 10, 1 << 20
+"""A saved shell may unpack to so many times its size, and so many bytes on top. `save` packs
+nothing; numbers of a surface pack to two thirds."""
 
 Floats = NDArray[np.float64]
 
@@ -242,7 +248,10 @@ class PointShell:
             The file is missing, damaged, or no saved shell.
         """
         try:
-            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as saved:
+            with Path(path).open("rb") as file:
+                _check_members(file, path)
+                file.seek(0)
+                saved = np.load(file, allow_pickle=False)
                 _check_format(saved, path)
                 return cls(
                     saved["points"],
@@ -269,6 +278,39 @@ def _check_request(points: int, seed: int) -> None:
         raise UsageError(f"{points} points: a shell has 1 to {MAX_POINTS}")
     if seed < 0:
         raise UsageError(f"seed {seed}: give 0 or more")
+
+
+def _check_members(file: BinaryIO, path: str | PathLike[str]) -> None:
+    """Refuse an archive by its headers, before any of it is unpacked."""
+    n_bytes = file.seek(0, SEEK_END)
+    most = INFLATED_ANYWAY + MOST_INFLATION * n_bytes
+    with zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        unpacked = sum(member.file_size for member in members)
+        if unpacked > most:
+            raise FileError(
+                f"{path}: no saved shell: its {n_bytes:,} bytes unpack to {unpacked:,}, more than "
+                f"{MOST_INFLATION} times as many; save the shell anew"
+            )
+        for member in members:
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise FileError(f"{path}: no saved shell: packed by another method than deflate")
+            with archive.open(member) as stream:
+                promised = _promised_bytes(stream)
+            if promised > member.file_size:
+                raise FileError(
+                    f"{path}: not a saved shell, or damaged: {member.filename!a} promises "
+                    f"{promised:,} bytes and has {member.file_size:,}"
+                )
+
+
+def _promised_bytes(stream: IO[bytes]) -> int:
+    """Bytes of the array that a .npy member's header describes."""
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"an array of version {version[0]}.{version[1]}")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    return math.prod(shape) * int(dtype.itemsize)
 
 
 def _check_format(saved: object, path: str | PathLike[str]) -> None:

@@ -70,6 +70,22 @@ def import_(
     keep_removed: Annotated[
         bool, typer.Option("--keep-removed", help="Leave parts out that were removed.")
     ] = False,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="That reading one file may take.",
+            show_default="20 and more by its size",
+        ),
+    ] = None,
+    memory_limit: Annotated[
+        int | None,
+        typer.Option(
+            metavar="MIB",
+            help="Memory that reading one file may take.",
+            show_default="512 and more by its size",
+        ),
+    ] = None,
     json: Json = False,
 ) -> None:
     """Import files into an environment, which is made when it does not exist.
@@ -95,6 +111,8 @@ def import_(
         layout=layout,
         jobs=jobs,
         keep_removed=keep_removed,
+        time_limit=time_limit,
+        memory_limit=None if memory_limit is None else memory_limit << 20,
     )
     try:
         render.compile_kernels("import", files=files)

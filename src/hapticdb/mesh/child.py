@@ -71,8 +71,11 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
     before = None
     try:
         reader_of(path)  # its libraries are no part of what the file may use
-        before = limit_memory(path, request["memory_limit"])
+        before = limit_memory(allowance(path), request["memory_limit"])
         limit_time(request["time_limit"])
+        if path.suffix.lower() == ".gltf" and request["memory_limit"] is None:
+            # which files it refers to is asked under the limit of the file alone
+            limit_memory(allowance(path, _bytes_beside(path)), None)
         cleaned = parse(path, request["metres"])
     except (UnreadableError, MemoryError, ImportError) as error:
         if before is not None:
@@ -121,23 +124,32 @@ def _bytes_available() -> int:
     return 1 << 62
 
 
-def allowance(path: Path) -> int:
-    """Bytes that parsing a file may take: in proportion to it, and to what the machine has."""
-    suffix = path.suffix.lower()
-    n_bytes = path.stat().st_size
-    if suffix == ".gltf":
-        from hapticdb.mesh.gltf import external_bytes  # noqa: PLC0415 - imports trimesh
+def allowance(path: Path, n_beside: int = 0) -> int:
+    """Bytes that parsing may take: in proportion to a file, and to what the machine has.
 
-        n_bytes += external_bytes(path)
-    factor = BYTES_PER_PACKED_BYTE if suffix in _PACKED else BYTES_PER_BYTE
+    n_beside: bytes of the files that it refers to.
+    """
+    n_bytes = path.stat().st_size + n_beside
+    factor = BYTES_PER_PACKED_BYTE if path.suffix.lower() in _PACKED else BYTES_PER_BYTE
     return min(BASE_BYTES + factor * n_bytes, _bytes_available() * 3 // 4)
 
 
-def limit_memory(path: Path, limit: int | None) -> tuple[int, int]:
+def _bytes_beside(path: Path) -> int:
+    """Bytes of the files that a glTF file refers to; 0 where parsing will say what is wrong."""
+    from hapticdb.mesh.gltf import bytes_beside  # noqa: PLC0415 - a reader
+    from hapticdb.mesh.raw import UnreadableError  # noqa: PLC0415
+
+    try:
+        return bytes_beside(path)
+    except (UnreadableError, ValueError, RecursionError):
+        return 0
+
+
+def limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
     """Set the limit of memory on top of what is held already; returns the limit before."""
     kind = _memory_kind()
     before = resource.getrlimit(kind)
-    wanted = _bytes_now() + (allowance(path) if limit is None else limit)
+    wanted = _bytes_now() + (allowed if limit is None else limit)
     hard = before[1]
     resource.setrlimit(kind, (wanted if hard < 0 else min(wanted, hard), hard))
     return before

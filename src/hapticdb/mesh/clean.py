@@ -59,13 +59,19 @@ def clean(parsed: Parsed, metres: float | None) -> Cleaned:
     parts: list[CleanPart] = []
     total = parsed.defects
     names = _Names()
-    for placement in parsed.placements:
-        geometry, defects = checked[placement.shape]
-        n_found = len(geometry[0] if geometry[1] is None else geometry[1])
-        part = _placed(placement, geometry, defects, scale) if n_found else None
-        if part is not None:
-            parts.append(replace(part, name=names.unique(part.name)))
-            total += part.defects
+    worlds, is_near = _worlds(parsed.placements, [geometry for geometry, _ in checked], scale)
+    is_flat = _are_flat(worlds)
+    for n, placement in enumerate(parsed.placements):
+        (vertices, faces), defects = checked[placement.shape]
+        n_found = len(vertices if faces is None else faces)
+        if n_found and is_near[n]:
+            if faces is not None and is_flat[n]:
+                flattened = _count_degenerate(vertices, faces, worlds[n, :3, :3])
+                defects = replace(defects, degenerate=flattened)
+            name = names.unique(_printable(placement.name))
+            parts.append(CleanPart(name, placement.shape, worlds[n], defects))
+            if defects:
+                total += defects
         elif n_found:
             total += replace(defects, degenerate=0, non_finite=defects.non_finite + n_found)
         else:
@@ -158,29 +164,39 @@ def _squares(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(np.einsum("ij,ij->i", rows, rows), dtype=np.float64)
 
 
-def _placed(
-    placement: Placement, geometry: Geometry, defects: Defects, scale: float
-) -> CleanPart | None:
-    """Part where the file puts it; None where no point of it would be finite."""
-    vertices, faces = geometry
-    world = np.array(placement.world_from_part, dtype=np.float64)
-    if np.isfinite(world).all() and not np.array_equal(world[3], [0, 0, 0, 1]):
-        raise UnreadableError(f"the transform of '{_printable(placement.name)}' is not affine")
-    world[:3, 3] *= scale
+def _worlds(
+    placements: list[Placement], geometries: list[Geometry], scale: float
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Transforms (P, 4, 4) in metres, and whether all points of a placement are finite there."""
+    worlds = np.array([p.world_from_part for p in placements], dtype=np.float64).reshape(-1, 4, 4)
+    is_finite = np.isfinite(worlds).all(axis=(1, 2))
+    bent = np.flatnonzero(is_finite & (worlds[:, 3] != [0, 0, 0, 1]).any(axis=1))
+    if len(bent):
+        name = _printable(placements[bent[0]].name)
+        raise UnreadableError(f"the transform of '{name}' is not affine")
+    # of each geometry once, however many placements share it
+    farthest = np.array([np.abs(v).max(axis=0, initial=0.0) for v, _ in geometries]).reshape(-1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
+        worlds[:, :3, 3] *= scale
+        corners = farthest[[placement.shape for placement in placements]]
+        reach = np.einsum("pij,pj->pi", np.abs(worlds[:, :3, :3]), corners)
+        reach += np.abs(worlds[:, :3, 3])
         # Squares of lengths must be finite as well, for areas and separations.
-        reach = np.abs(world[:3, :3]) @ np.abs(vertices).max(axis=0) + np.abs(world[:3, 3])
-        if not np.isfinite(reach @ reach):
-            return None
-        linear = world[:3, :3]
-        if faces is not None and abs(np.linalg.det(linear)) <= 1e-9 * np.linalg.norm(linear) ** 3:
-            flattened = _count_degenerate(vertices, faces, linear)
-            defects = replace(defects, degenerate=flattened)
-    return CleanPart(_printable(placement.name), placement.shape, world, defects)
+        return worlds, np.isfinite(_squares(reach))
+
+
+def _are_flat(worlds: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Whether a transform flattens what it places, so that triangles may lose their areas."""
+    linear = worlds[:, :3, :3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        lengths = np.sqrt(np.einsum("pij,pij->p", linear, linear))
+        return np.asarray(np.abs(np.linalg.det(linear)) <= 1e-9 * lengths**3)
 
 
 def _printable(name: str) -> str:
     """Name that any terminal, database and JSON reader takes: no controls, no half characters."""
+    if name.isascii() and name.isprintable():
+        return name.strip() or "part"
     whole = name.encode("utf-8", "replace").decode("utf-8")
     return "".join(" " if unicodedata.category(c) == "Cc" else c for c in whole).strip() or "part"
 

@@ -1,24 +1,21 @@
-"""glTF and GLB: meshes through trimesh's loader, nodes by our own walk.
+"""glTF and GLB: one part a placed mesh, its pieces joined, named along its nodes.
 
-trimesh's scene graph names the pieces of one mesh at random, drops what hangs under a camera, and
-keeps one of several placements of a node. So trimesh gets the file's meshes alone, renamed by
-number, and the node tree is read here: one part a placed mesh, its pieces joined.
+Read here and not through trimesh, whose scene graph names the pieces of one mesh at random, drops
+what hangs under a camera, and keeps one of several placements of a node; `accessors` says why not
+even for the numbers.
 """
 
-import io
 import json
 import struct
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
-from trimesh.exchange.gltf import load_glb, load_gltf
-from trimesh.resolvers import FilePathResolver
 
+from hapticdb.mesh.accessors import Accessors, chunks_of, external_bytes, item, objects_of, whole
 from hapticdb.mesh.part import Defects
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, walk
+from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableError, walk
 
 _MAGIC = b"glTF"
 _POINTS, _TRIANGLES, _STRIP = 0, 4, 5
@@ -33,13 +30,15 @@ def read(path: Path) -> Parsed:
     """Parts of the file's default scene, in metres."""
     content = path.read_bytes()
     tree = load_tree(content, path.suffix.lower())
-    _refuse_unreadable(tree)
-    shapes = _shapes(tree, content, path)
-    placements, empty = _placements(tree, shapes)
+    chunks = chunks_of(content) if content[:4] == _MAGIC else []
+    accessors = Accessors(tree, chunks, path.parent)
+    _refuse_unreadable(tree, accessors)
+    meshes = objects_of(tree, "meshes")
+    placements, empty = _placements(tree, meshes)
     used = sorted({placement.shape for placement in placements})
     number = {mesh: i for i, mesh in enumerate(used)}
     return Parsed(
-        shapes=[shapes[mesh] for mesh in used],
+        shapes=[_shape(meshes[mesh], mesh, accessors) for mesh in used],
         placements=[Placement(p.name, number[p.shape], p.world_from_part) for p in placements],
         metres=1.0,
         defects=Defects(empty=empty),
@@ -77,137 +76,125 @@ def load_tree(content: bytes, suffix: str) -> dict[str, Any]:
         tree = json.loads(text.decode("utf-8-sig"))
     except ValueError:
         raise UnreadableError("it is no glTF file, or damaged: its text is not JSON") from None
-    if not isinstance(tree, dict) or "asset" not in tree:
+    if not isinstance(tree, dict) or not isinstance(tree.get("asset"), dict):
         raise UnreadableError("it is no glTF file: its JSON has no 'asset'")
+    version = str(tree["asset"].get("version", "2.0"))
+    if not version.startswith("2"):
+        raise UnreadableError(f"it is of glTF version {version[:9]}; version 2 can be read")
     return tree
 
 
-def external_bytes(path: Path) -> int:
-    """Size of the files that a glTF file refers to, as far as they are there."""
-    total = 0
-    for buffer in load_tree(path.read_bytes(), path.suffix.lower()).get("buffers", []):
-        file = path.parent / unquote(_external_name(buffer) or "")
-        if file.is_file():
-            total += file.stat().st_size
-    return total
+def bytes_beside(path: Path) -> int:
+    """Size of the files that a glTF file refers to, as far as they are there, each once."""
+    return external_bytes(load_tree(path.read_bytes(), path.suffix.lower()), path.parent)
 
 
-def _external_name(buffer: dict[str, Any]) -> str | None:
-    """File that a buffer is kept in, None where the glTF holds it."""
-    name = buffer.get("uri")
-    return None if name is None or name.startswith("data:") else str(name)
-
-
-def _refuse_unreadable(tree: dict[str, Any]) -> None:
-    """Say what trimesh would read wrongly in silence: packed, sparse or scaled positions."""
-    for extension in tree.get("extensionsRequired", []):
+def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:
+    """Say what would be read wrongly in silence: packed, sparse or scaled positions."""
+    required = tree.get("extensionsRequired", [])
+    for extension in required if isinstance(required, list) else [required]:
         if not str(extension).startswith(_HARMLESS):
             raise UnreadableError(f"it requires the glTF extension {extension}, which is not read")
-    accessors = tree.get("accessors", [])
-    for number, mesh in enumerate(tree.get("meshes", [])):
-        if not isinstance(mesh.get("primitives"), list):
+    for number, mesh in enumerate(objects_of(tree, "meshes")):
+        pieces = mesh.get("primitives")
+        if not isinstance(pieces, list) or not all(isinstance(piece, dict) for piece in pieces):
             raise UnreadableError(f"it is damaged: the primitives of its mesh {number} are no list")
-        for primitive in mesh["primitives"]:
-            position = primitive.get("attributes", {}).get("POSITION")
-            if position is None:
+        for piece in pieces:
+            attributes = piece.get("attributes", {})
+            if not isinstance(attributes, dict):
+                raise UnreadableError(f"it is damaged: its mesh {number} has no 'attributes'")
+            if attributes.get("POSITION") is None:
                 continue
-            accessor = accessors[position]
-            if "KHR_draco_mesh_compression" in primitive.get("extensions", {}):
+            accessor = accessors.entry(attributes["POSITION"])
+            if "KHR_draco_mesh_compression" in (piece.get("extensions") or {}):
                 raise UnreadableError("its meshes are packed with Draco, which is not read")
             if "sparse" in accessor or accessor.get("normalized"):
                 raise UnreadableError("its positions are sparse or normalized, which is not read")
 
 
-def _shapes(tree: dict[str, Any], content: bytes, path: Path) -> list[Shape]:
-    """Geometry of every mesh, its pieces joined, in the order of the file."""
-    meshes = tree.get("meshes", [])
-    pieces = []
-    for i, mesh in enumerate(meshes):
-        for j, piece in enumerate(mesh["primitives"]):
-            if piece.get("mode", _TRIANGLES) in {_POINTS, _TRIANGLES, _STRIP}:
-                kept = {key: piece[key] for key in ("mode", "indices") if key in piece}
-                kept["attributes"] = {"POSITION": piece["attributes"]["POSITION"]}
-                pieces.append({"name": f"{i}.{j}", "primitives": [kept]})
-    loaded = _load(tree | {"meshes": pieces}, content, path) if pieces else {}
-    return [_joined(mesh["primitives"], i, loaded) for i, mesh in enumerate(meshes)]
-
-
-def _load(tree: dict[str, Any], content: bytes, path: Path) -> dict[str, dict[str, Any]]:
-    """Vertices and faces of the meshes of `tree`, by name, through trimesh."""
-    kept = ("asset", "buffers", "bufferViews", "accessors", "meshes")
-    reduced = {key: tree[key] for key in kept if key in tree}
-    for buffer in reduced.get("buffers", []):
-        name = _external_name(buffer)
-        if name is not None and not (path.parent / name).is_file():
-            if not (path.parent / unquote(name)).is_file():
-                raise UnreadableError(f"it refers to {name}, which is not beside it")
-            buffer["uri"] = unquote(name)
-    text = json.dumps(reduced).encode()
-    resolver = FilePathResolver(str(path))
-    if content[:4] != _MAGIC:
-        stream = io.BytesIO(text)
-        return dict(load_gltf(stream, resolver=resolver, skip_materials=True)["geometry"])
-    chunks = content[20 + struct.unpack("<I", content[12:16])[0] :]
-    head = struct.pack("<4s2I2I", _MAGIC, 2, 20 + len(text) + len(chunks), len(text), 0x4E4F534A)
-    stream = io.BytesIO(b"".join((head, text, chunks)))
-    return dict(load_glb(stream, resolver=resolver, skip_materials=True)["geometry"])
-
-
-def _joined(pieces: list[dict[str, Any]], mesh: int, loaded: dict[str, dict[str, Any]]) -> Shape:
+def _shape(mesh: dict[str, Any], number: int, accessors: Accessors) -> Shape:
     """One shape of a mesh's pieces; vertices that pieces share are kept once."""
-    vertices: list[NDArray[np.generic]] = []
+    vertices: dict[int, NDArray[np.generic]] = {}
+    offsets: dict[int, int] = {}
     faces: list[NDArray[np.int64]] = []
     points: list[NDArray[np.generic]] = []
-    offsets: dict[int, int] = {}
     n_vertices = unsupported = 0
-    for j, piece in enumerate(pieces):
-        geometry = loaded.get(f"{mesh}.{j}")
-        if geometry is None:
+    for piece in mesh["primitives"]:
+        mode = piece.get("mode", _TRIANGLES)
+        if mode not in (_POINTS, _TRIANGLES, _STRIP):
             unsupported += 1
-        elif geometry.get("faces") is None:
-            points.append(geometry["vertices"])
-        else:
-            accessor = piece["attributes"]["POSITION"]
-            if accessor not in offsets:
-                offsets[accessor] = n_vertices
-                vertices.append(geometry["vertices"])
-                n_vertices += len(geometry["vertices"])
-            # An index out of its own piece must not reach into the next one's vertices.
-            corners = np.asarray(geometry["faces"], dtype=np.int64)
-            inside = (corners >= 0) & (corners < len(geometry["vertices"]))
-            faces.append(np.where(inside, corners + offsets[accessor], -1))
+            continue
+        position = piece.get("attributes", {}).get("POSITION")
+        if position is None:
+            raise UnreadableError(f"it is damaged: a piece of its mesh {number} has no positions")
+        corners = accessors.array(position)
+        if corners.shape[1] != 3:
+            raise UnreadableError("its vertices do not have three coordinates each")
+        if mode == _POINTS:
+            points.append(corners)
+            continue
+        if position not in offsets:
+            offsets[position], vertices[position] = n_vertices, corners
+            n_vertices += len(corners)
+        # An index out of its own piece must not reach into the next one's vertices.
+        found = _corners(piece, mode, len(corners), accessors, number)
+        inside = (found >= 0) & (found < len(corners))
+        faces.append(np.where(inside, found + offsets[position], -1))
     defects = Defects(unsupported=unsupported)
     if faces:
         lost = Defects(unsupported=len(points))
-        return Shape(np.concatenate(vertices), np.concatenate(faces), defects + lost)
+        return Shape(_one(list(vertices.values())), _one(faces), defects + lost)
     if points:
-        return Shape(np.concatenate(points), None, defects)
+        return Shape(_one(points), None, defects)
     return Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), defects)
 
 
-def _placements(tree: dict[str, Any], shapes: list[Shape]) -> tuple[list[Placement], int]:
+def _one(arrays: list[Any]) -> NDArray[Any]:
+    """Arrays as one: without a copy where there is one, which meshes by the thousand may share."""
+    return np.asarray(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
+
+
+def _corners(
+    piece: dict[str, Any], mode: int, n_vertices: int, accessors: Accessors, number: int
+) -> NDArray[np.int64]:
+    """Corners (F, 3) of a piece's triangles: listed, or the vertices in turn."""
+    if "indices" in piece:
+        listed = accessors.array(whole(piece["indices"], "the 'indices' of a mesh"))
+        if listed.dtype.kind == "f":
+            raise UnreadableError(f"it is damaged: the indices of its mesh {number} are fractions")
+        flat = np.ascontiguousarray(listed).reshape(-1).astype(np.int64)
+    else:
+        flat = np.arange(n_vertices, dtype=np.int64)
+    if mode == _STRIP:
+        strip = np.stack([flat[:-2], flat[1:-1], flat[2:]], axis=1)
+        strip[1::2] = strip[1::2, ::-1]  # every other triangle of a strip is wound the other way
+        return strip
+    if flat.size % 3:
+        raise UnreadableError(f"it is damaged: mesh {number} ends within a triangle")
+    return flat.reshape(-1, 3)
+
+
+def _placements(tree: dict[str, Any], meshes: list[dict[str, Any]]) -> tuple[list[Placement], int]:
     """Placed meshes of the default scene, and how many nodes hold nothing at all."""
-    nodes = tree.get("nodes", [])
-    links = [(node, _parent_from_node(node)) for node in nodes]
-    roots = _roots(tree, nodes)
+    nodes = objects_of(tree, "nodes")
+    links = [_parent_from_node(node) for node in nodes]
+    budget = NameBudget()
     placements: list[Placement] = []
     empty = 0
-    for path, world_from_node in walk(
-        ((i, links[_checked(i, nodes)][1]) for i in roots),
-        lambda i: [
-            (child, links[_checked(child, nodes)][1])
-            for child in dict.fromkeys(nodes[i].get("children", []))
-        ],
-    ):
+
+    def below(number: int) -> list[tuple[int, NDArray[np.float64]]]:
+        return [(child, links[child]) for child in _numbers(nodes[number], "children", len(nodes))]
+
+    for path, world_from_node in walk(((i, links[i]) for i in _roots(tree, nodes)), below):
         node = nodes[path[-1]]
         if "mesh" in node:
-            mesh = node["mesh"]
-            if not 0 <= mesh < len(shapes):
-                raise UnreadableError(f"one of its nodes refers to mesh {mesh} of {len(shapes)}")
+            mesh = whole(node["mesh"], "the 'mesh' of a node")
+            if mesh >= len(meshes):
+                raise UnreadableError(f"one of its nodes refers to mesh {mesh} of {len(meshes)}")
             names = [_name(nodes[i], i) for i in path]
-            if "name" not in node and tree["meshes"][mesh].get("name"):
-                names[-1] = str(tree["meshes"][mesh]["name"])
-            placements.append(Placement("/".join(names), mesh, world_from_node))
+            if "name" not in node and meshes[mesh].get("name"):
+                names[-1] = str(meshes[mesh]["name"])
+            placements.append(Placement(budget.joined(names), mesh, world_from_node))
         elif not node.get("children") and "camera" not in node and "extensions" not in node:
             empty += 1
     return placements, empty
@@ -215,18 +202,22 @@ def _placements(tree: dict[str, Any], shapes: list[Shape]) -> tuple[list[Placeme
 
 def _roots(tree: dict[str, Any], nodes: list[dict[str, Any]]) -> list[int]:
     """Nodes without a parent, of the default scene or else of the file."""
-    scenes = tree.get("scenes", [])
+    scenes = objects_of(tree, "scenes")
     if scenes:
-        return list(dict.fromkeys(scenes[tree.get("scene", 0)].get("nodes", [])))
-    below = {child for node in nodes for child in node.get("children", [])}
+        return _numbers(item(scenes, tree.get("scene", 0), "scene"), "nodes", len(nodes))
+    below = {child for node in nodes for child in _numbers(node, "children", len(nodes))}
     return [i for i in range(len(nodes)) if i not in below]
 
 
-def _checked(node: int, nodes: list[dict[str, Any]]) -> int:
-    """Refuse the number of a node that is not there."""
-    if not 0 <= node < len(nodes):
-        raise UnreadableError(f"its scene refers to node {node} of {len(nodes)}")
-    return node
+def _numbers(holder: dict[str, Any], key: str, n_nodes: int) -> list[int]:
+    """Nodes that a node or scene names, each once; refuses those that are not there."""
+    found = holder.get(key, [])
+    if not isinstance(found, list):
+        raise UnreadableError(f"it is damaged: the '{key}' of a node or scene are no list")
+    for number in found:
+        if whole(number, "the number of a node") >= n_nodes:
+            raise UnreadableError(f"its scene refers to node {number} of {n_nodes}")
+    return list(dict.fromkeys(found))
 
 
 def _name(node: dict[str, Any], number: int) -> str:

@@ -1,6 +1,7 @@
 """LAS and LAZ through laspy: one point cloud named after the file."""
 
 import re
+import struct
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import laspy
 import numpy as np
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
+from numpy.typing import NDArray
 
 from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once
 
@@ -16,19 +18,38 @@ _PROJECTED = 1
 _CODES = {9001: 1.0, 9002: 0.3048, 9003: 1200.0 / 3937.0}
 """Of GeoTIFF keys: a projected system's unit of length, metres."""
 _WKT_UNIT = re.compile(r'(?:LENGTH)?UNIT\["[^"]*",\s*([0-9.eE+-]+)')
+_HEADER = 227
+_HEADER_1_4 = 375
+_RECORD, _LONG_RECORD = 54, 60
+"""Bytes of the header of a variable-length record, and of an extended one."""
+_VARIABLE = 0xFFFFFFFF
+"""Stands for chunks of any size."""
+_POINTS_AT_ONCE = 50_000, 1_000_000
+"""At least and at most; between them a point for each byte of the file. laspy takes the memory for
+all before it reads the first."""
 
 
 def read(path: Path) -> Parsed:
     """Points of a LAS or LAZ file, in the unit of its coordinates, z up."""
+    _check_header(path)
+    pieces: list[NDArray[np.float64]] = []
     with laspy.open(path) as reader:
         promised = reader.header.point_count
+        _check_chunks(reader.header)
         unit = _unit_of(reader.header.vlrs)
-        points = reader.read()
-    if len(points) != promised:
+        least, most = _POINTS_AT_ONCE
+        for points in reader.chunk_iterator(min(most, max(least, path.stat().st_size))):
+            if not len(points):
+                break
+            axes = [np.asarray(axis, dtype=np.float64) for axis in (points.x, points.y, points.z)]
+            pieces.append(np.stack(axes, axis=1))
+    found = sum(map(len, pieces))
+    if found != promised:
         raise UnreadableError(
-            f"it is cut short: its header promises {promised:,} points, {len(points):,} are there"
+            f"it is cut short: its header promises {promised:,} points, {found:,} are there"
         )
-    parsed = placed_once([(path.stem, Shape(np.asarray(points.xyz), None))])
+    whole = np.concatenate(pieces) if pieces else np.empty((0, 3))
+    parsed = placed_once([(path.stem, Shape(whole, None))])
     return replace(parsed, likely_metres=unit, up="z")
 
 
@@ -56,3 +77,43 @@ def _unit_of_wkt(text: str) -> float | None:
     except (IndexError, ValueError):
         return None
     return metres if 1e-3 <= metres <= 1e3 else None
+
+
+def _check_chunks(header: laspy.LasHeader) -> None:
+    """Refuse chunks far beyond the points of a packed file: lazrs takes memory for whole ones."""
+    for record in header.vlrs.get("LasZipVlr"):
+        (n_points,) = struct.unpack_from("<I", record.record_data, 12)
+        if n_points != _VARIABLE and n_points > max(_POINTS_AT_ONCE[1], header.point_count):
+            raise UnreadableError(
+                f"it is damaged: its chunks have {n_points:,} points, and it has "
+                f"{header.point_count:,}; unpack it to LAS with another program"
+            )
+
+
+def _check_header(path: Path) -> None:
+    """Refuse counts that the file cannot hold: laspy reads record after record behind its end."""
+    n_bytes = path.stat().st_size
+    with path.open("rb") as stream:
+        header = stream.read(_HEADER_1_4)
+    if header[:4] != b"LASF":
+        raise UnreadableError("it is no LAS file: it does not start with 'LASF'")
+    if len(header) < _HEADER:
+        raise UnreadableError("it is cut short: it ends within its header")
+    size, points_at, n_records = struct.unpack_from("<HII", header, 94)
+    if not _HEADER <= size <= points_at <= n_bytes:
+        raise UnreadableError(
+            f"it is damaged or cut short: its points begin at byte {points_at:,}, its header has "
+            f"{size:,} bytes, and the file {n_bytes:,}"
+        )
+    if n_records * _RECORD > points_at - size:
+        raise UnreadableError(
+            f"it is damaged: its header promises {n_records:,} records, and "
+            f"{points_at - size:,} bytes stand before the points"
+        )
+    if (header[24], header[25]) >= (1, 4) and len(header) == _HEADER_1_4:
+        start, n_long = struct.unpack_from("<QI", header, 235)
+        if n_long and start + n_long * _LONG_RECORD > n_bytes:
+            raise UnreadableError(
+                f"it is damaged or cut short: its header promises {n_long:,} extended records "
+                f"from byte {start:,} on, and the file has {n_bytes:,}"
+            )

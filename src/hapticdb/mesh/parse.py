@@ -64,7 +64,10 @@ def cause_of(error: BaseException) -> str:
     """Why a library gave up, in words for whoever has the file and not the library's source."""
     detail = " ".join(str(error).split())
     if isinstance(error, MemoryError):
-        return "reading it takes more memory than a file of its size may use"
+        return (
+            "reading it takes more memory than a file of its size may use; "
+            "if it is sound, give more: import --memory-limit, read_file(memory_limit=...)"
+        )
     if isinstance(error, RecursionError):
         return "it is nested too deeply"
     if isinstance(error, ImportError):

@@ -1,7 +1,7 @@
 """What a mesh file holds once read: parts, where they stand, and what was wrong with them."""
 
 import hashlib
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -46,21 +46,22 @@ class Defects:
 
     def __add__(self, other: "Defects") -> "Defects":
         """Sum, count by count."""
-        return Defects(
-            **{f.name: getattr(self, f.name) + getattr(other, f.name) for f in fields(self)}
-        )
+        return Defects(**{name: getattr(self, name) + getattr(other, name) for name in _WORDS})
 
     def __bool__(self) -> bool:
         """Whether anything was wrong."""
-        return any(self.as_dict().values())
+        return self != _NONE
 
     def as_dict(self) -> dict[str, int]:
         """All counts by name."""
-        return asdict(self)
+        return {name: getattr(self, name) for name in _WORDS}
 
     def describe(self) -> str:
         """Put the counts above zero in words, '12 degenerate, 3 non-finite'; '' when clean."""
         return ", ".join(f"{n} {_WORDS[name]}" for name, n in self.as_dict().items() if n)
+
+
+_NONE = Defects()
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,6 +14,8 @@ Node = TypeVar("Node", bound=Hashable)
 
 MAX_NODES = 2_000_000
 """Placements that one file may ask for: assemblies nested in assemblies multiply."""
+MOST_CHARACTERS = 50_000_000
+"""Of the names of all placements: along nodes nested deeply, they grow as the depth squared."""
 
 
 class UnreadableError(Exception):
@@ -63,6 +65,24 @@ class Parsed:
     defects: Defects = field(default_factory=Defects)
     likely_metres: float | None = None
     up: str | None = None
+
+
+class NameBudget:
+    """Joins names of nodes to names of parts, until they are too long together."""
+
+    def __init__(self) -> None:
+        self._left = MOST_CHARACTERS
+
+    def joined(self, names: Sequence[str]) -> str:
+        """Name of a part: those of the nodes that lead to it, joined by '/'."""
+        name = "/".join(names)
+        self._left -= len(name)
+        if self._left < 0:
+            raise UnreadableError(
+                f"the names of its parts have more than {MOST_CHARACTERS:,} characters: "
+                "it nests its nodes too deeply"
+            )
+        return name
 
 
 def placed_once(named: Iterable[tuple[str, Shape]], defects: Defects | None = None) -> Parsed:

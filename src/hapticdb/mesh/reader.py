@@ -27,9 +27,18 @@ from hapticdb.units import metres_of
 
 _EXTRAS = {"las": ("pointcloud", ("laspy", "lazrs")), "step": ("step", ("cascadio",))}
 _CHILD = Path(__file__).with_name("child.py")
-_SECONDS = 60.0
-_SECONDS_PER_MIB = 20.0
+_SECONDS = 20.0
+_SECONDS_PER_MIB = 5.0
+_SECONDS_PER_MIB_OF = {"step": 20.0, "threemf": 10.0}
+"""Time for a file: so much, and so much for each MiB of it; ten times what honest files take, and
+more. A STEP file is tessellated, and a 3MF file unpacks to a multiple of its size."""
+_LIBRARIES = {
+    "step": ("OpenCASCADE", "save it anew as STEP AP214 or AP242, or as glTF or STL"),
+    "las": ("lazrs, its decompressor,", "unpack it to LAS with another program, or save it anew"),
+}
+"""What may crash, and what helps then."""
 _LONGEST_CAUSE = 300
+_MORE_TIME = "if it is sound, give more: import --time-limit, read_file(time_limit=...)"
 
 
 def read_file(
@@ -54,10 +63,12 @@ def read_file(
         LAZ). If not given, that of the reference system which a LAS or LAZ file names, else metres.
         A glTF, 3MF, DAE or STEP file carries its own, and that one holds.
     memory_limit : int, optional
-        Bytes that parsing may take; by default 512 MiB and a multiple of the file's size, and
-        three quarters of the machine's free memory at most.
+        Bytes that parsing may take; by default 512 MiB and a multiple of the file's size (that of
+        the files it refers to included, each once), and three quarters of the machine's free memory
+        at most.
     time_limit : float, optional
-        Seconds that parsing may take; by default 60 and 20 for each MiB of the file.
+        Seconds that parsing may take; by default 20 and 5 for each MiB of the file, of a 3MF file
+        10, of a STEP file 20.
 
     Returns
     -------
@@ -75,9 +86,7 @@ def read_file(
         If the unit is unknown.
     """
     metres, file = _checked(path, unit)
-    seconds = time_limit
-    if seconds is None:
-        seconds = _SECONDS + _SECONDS_PER_MIB * file.stat().st_size / (1 << 20)
+    seconds = _seconds_for(file) if time_limit is None else time_limit
     request = {
         "path": str(file),
         "metres": metres,
@@ -99,6 +108,12 @@ def parse_in_process(path: str | os.PathLike[str], *, unit: str | None = None) -
         return _mesh_file(file, parse(file, metres))
     except UnreadableError as error:
         raise FileError(_one_line(path, error)) from None
+
+
+def _seconds_for(file: Path) -> float:
+    """Seconds that parsing a file may take."""
+    each = _SECONDS_PER_MIB_OF.get(READERS[file.suffix.lower()], _SECONDS_PER_MIB)
+    return _SECONDS + each * file.stat().st_size / (1 << 20)
 
 
 def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | None, Path]:
@@ -185,8 +200,8 @@ def _ask_child(request: dict[str, Any], seconds: float) -> Cleaned:
                     pipe.close()
         if cleaned is None:
             if late.is_set():
-                raise UnreadableError(f"reading it took longer than {seconds:g} s")
-            raise UnreadableError(_why_ended(child.returncode, words))
+                raise UnreadableError(f"reading it took longer than {seconds:.3g} s; {_MORE_TIME}")
+            raise UnreadableError(_why_ended(child.returncode, words, request["path"]))
         return cleaned
 
 
@@ -242,13 +257,18 @@ def _fill(array: NDArray[Any], stream: IO[bytes]) -> None:
         view = view[n_read:]
 
 
-def _why_ended(returncode: int, words: IO[bytes]) -> str:
+def _why_ended(returncode: int, words: IO[bytes], path: str) -> str:
     """Why a child ended without an answer."""
     if returncode == -signal.SIGXCPU:
-        return "reading it took too long"
+        return f"reading it took too long; {_MORE_TIME}"
     if returncode < 0:
         name = signal.Signals(-returncode).name
-        return f"its parser crashed ({name}), perhaps for want of memory; the file may be damaged"
+        reader = READERS[Path(path).suffix.lower()]
+        library, advice = _LIBRARIES.get(reader, ("its parser", "save it anew"))
+        return (
+            f"{library} crashed on it ({name}): it is damaged, or asks for more memory than a file "
+            f"of its size may use; {advice}"
+        )
     words.seek(0)
     lines = words.read()[-4096:].decode("utf-8", "replace").split("\n")
     last = next((line for line in reversed(lines) if line.strip()), "no word of why")

@@ -13,7 +13,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, numbers, walk
+from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableError, numbers, walk
 
 _METRES = {
     "micron": 1e-6,
@@ -23,6 +23,10 @@ _METRES = {
     "foot": 0.3048,
     "meter": 1.0,
 }
+_PIECE = 1 << 20
+_UNPACKED, _INFLATION = 32 << 20, 40
+"""Bytes that models may unpack to: so many, and so many for each byte of the file. Meshes pack to a
+fifth or an eighth of their text."""
 Key = tuple[str, str]
 """An object: the model file inside the archive, and its id there."""
 Link = tuple[Key, NDArray[np.float64]]
@@ -45,34 +49,37 @@ class _Model:
     objects: dict[Key, _Object] = field(default_factory=dict)
     items: list[Link] = field(default_factory=list)
     metres: float = 1e-3
+    packed: int = 0
+    unpacked: int = 0
 
 
 def read(path: Path) -> Parsed:
     """Parts of a 3MF file's build, in the unit that it names (millimetres if none)."""
     try:
         with zipfile.ZipFile(path) as archive:
-            model = _read_archive(archive)
+            model = _read_archive(archive, path.stat().st_size)
     except zipfile.BadZipFile:
         raise UnreadableError("it is no 3MF file, or cut short: not a ZIP archive") from None
     shapes: dict[Key, int] = {}
     placements: list[Placement] = []
+    budget = NameBudget()
     for keys, world_from_object in walk(model.items, lambda key: model.objects[key].components):
         thing = model.objects[keys[-1]]
         if thing.components:
             continue
         names = [model.objects[key].name for key in keys]
         number = shapes.setdefault(keys[-1], len(shapes))
-        placements.append(Placement("/".join(names), number, world_from_object))
+        placements.append(Placement(budget.joined(names), number, world_from_object))
     return Parsed([_shape(model.objects[key]) for key in shapes], placements, model.metres, up="z")
 
 
-def _read_archive(archive: zipfile.ZipFile) -> _Model:
+def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
     """Root model, and those that its components lie in."""
     members = {name.lower().strip("/"): name for name in archive.namelist()}
     root = next((name for name in members if name.endswith("3d/3dmodel.model")), None)
     if root is None:
         raise UnreadableError("it is no 3MF file: no 3D/3dmodel.model in it")
-    model = _Model()
+    model = _Model(packed=n_bytes)
     waiting, seen = [root], {root}
     while waiting:
         member = waiting.pop()
@@ -120,10 +127,20 @@ def _read_model(
     parser.StartElementHandler = start
     # Entities can multiply without bound, and 3MF forbids a DOCTYPE, their only source.
     parser.StartDoctypeDeclHandler = _refuse_doctype
+    if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise UnreadableError("its model is packed by another method than deflate: save it anew")
     # A stream and no tree: memory goes with the geometry, whatever the archive unpacks to.
     with archive.open(name) as stream:
         try:
-            parser.ParseFile(stream)
+            while piece := stream.read(_PIECE):
+                model.unpacked += len(piece)
+                if model.unpacked > _UNPACKED + _INFLATION * model.packed:
+                    raise UnreadableError(
+                        f"its models unpack to more than {_UNPACKED >> 20} MiB and {_INFLATION} "
+                        "times its size: save it with less compression"
+                    )
+                parser.Parse(piece)
+            parser.Parse(b"", True)  # noqa: FBT003 - the parser's own
         except expat.ExpatError as error:
             raise UnreadableError(f"its model is damaged or cut short: {error}") from None
 

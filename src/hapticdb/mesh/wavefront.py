@@ -25,6 +25,7 @@ from hapticdb.mesh.raw import (
 
 _TEXTURE_AND_NORMAL = re.compile(r"/[^\s]*")
 _NO_SURFACE = {"l", "p", "curv", "curv2", "surf"}
+_NUMBERS = {"v", "f"}
 _OUTSIDE = -1
 
 
@@ -45,6 +46,8 @@ def read(path: Path) -> Parsed:
     key = ("", "")
     for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
         word, _, rest = line.strip().replace("\t", " ").partition(" ")
+        if word in _NUMBERS and "#" in rest:  # names may hold one
+            rest = rest.partition("#")[0]
         if word == "v":
             vertex_lines.append(rest)
         elif word == "f":

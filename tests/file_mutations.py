@@ -163,9 +163,10 @@ def _json_changed(random: Random, content: bytes) -> bytes:
 
 def _place(random: Random, tree: Any) -> tuple[Any, Any]:  # noqa: ANN401 - JSON
     """List or object anywhere in a tree, and an index or key of it."""
-    holder, key = {"": tree}, ""
+    holder: Any = {"": tree}
+    key: Any = ""
     while isinstance(holder[key], (dict, list)) and holder[key] and random.random() < 0.8:
-        holder = holder[key]  # type: ignore[assignment]
+        holder = holder[key]
         key = random.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
     return holder, key
 

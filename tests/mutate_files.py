@@ -1,8 +1,8 @@
 """Damages sound files and reads them as an import does: ``python tests/mutate_files.py 50000``.
 
 Every file must be read, or be refused in one line: no traceback, no hang, no memory beyond ten
-times the file and its result, no geometry that is not sound. A table says what became of the files; the
-exit code is 1 where one of these fell. File number n of a seed is the same on every run, and
+times the file and its result, no geometry that is not sound. A table says what became of the files;
+the exit code is 1 where one of these fell. File number n of a seed is the same on every run:
 ``--only n`` makes it again and says what became of it.
 
 Meshes go through `hapticdb.mesh.read_file` itself, but that its child is forked from this process,
@@ -31,6 +31,7 @@ from typing import IO, Any
 
 import numpy as np
 
+from children import finished
 from file_mutations import mutated
 from file_seeds import OTHERS, seeds
 from hapticdb.errors import FileError, UsageError
@@ -211,7 +212,7 @@ def run(
     else:
         reader_of(path)
     popen, counts = subprocess.Popen, Counter[str]()
-    reader.subprocess.Popen = Forked  # type: ignore[misc, assignment, attr-defined]
+    reader.subprocess.Popen = Forked  # type: ignore[attr-defined]
     try:
         for n in numbers:
             path.write_bytes(make(n, seed, known))
@@ -223,7 +224,7 @@ def run(
                 if kept is not None:
                     (kept / f"{n}{suffix}").write_bytes(path.read_bytes())
     finally:
-        reader.subprocess.Popen = popen  # type: ignore[misc, attr-defined]
+        reader.subprocess.Popen = popen  # type: ignore[attr-defined]
     return counts
 
 
@@ -233,7 +234,7 @@ def _run_apart(n_format: int, given: argparse.Namespace) -> Counter[str]:
     command += [f"--seed={given.seed}", *([f"--keep={given.keep}"] if given.keep else [])]
     # an end for a run that hangs, far beyond what the slowest files may take
     limit = 60 + SLOWEST * given.files
-    ended = subprocess.run(command, stdout=subprocess.PIPE, text=True, timeout=limit, check=False)
+    ended = finished(command, stderr=None, patience=limit)
     *lines, last = ended.stdout.splitlines() or [""]
     print(*lines, sep="\n", end="\n" if lines else "", flush=True)
     if ended.returncode:

@@ -65,12 +65,15 @@ def _die_with_parent(parent: int) -> None:
 
 def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
     """Parse and write: a line of JSON that describes the arrays, then the arrays."""
-    from hapticdb.mesh.parse import cause_of, parse, reader_of  # noqa: PLC0415 - after sys.path
+    import numpy as np  # noqa: PLC0415 - after sys.path
+
+    from hapticdb.mesh.parse import cause_of, parse, reader_of  # noqa: PLC0415
     from hapticdb.mesh.raw import UnreadableError  # noqa: PLC0415
 
     before = None
     try:
         reader_of(path)  # its libraries are no part of what the file may use
+        np.linalg.det(np.eye(3))  # OpenBLAS takes its buffers now, and gives up where it cannot
         before = limit_memory(allowance(path), request["memory_limit"])
         limit_time(request["time_limit"])
         if path.suffix.lower() == ".gltf" and request["memory_limit"] is None:

@@ -146,7 +146,7 @@ def _json_changed(random: Random, content: bytes) -> bytes:
         length = int.from_bytes(content[12:16], "little") if is_binary else len(content)
         start = 20 if is_binary else 0
         tree = json.loads(content[start : start + length])
-    except ValueError:
+    except (ValueError, RecursionError):
         return _bytes_changed(random, content)
     holder, key = _place(random, tree)
     _change(random, holder, key)

@@ -22,6 +22,7 @@ from hapticdb import Grid, backup_environment, restore_environment
 from hapticdb.store import sqlite_backup, sqlite_log
 from hapticdb.store.sqlite import SQLiteStore
 from hapticdb.testing import blob, floor_voxels, write_voxels
+from old_formats import make_old
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 
@@ -144,6 +145,27 @@ def test_what_was_not_finished_is_left_out(path: Path, copy: Path) -> None:
     with pytest.raises(KeyboardInterrupt):
         restore_environment(copy, path, progress=fail)
     assert files(path.parent) == before
+
+
+def test_a_copy_is_made_of_a_file_in_a_folder_that_cannot_be_written(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticdb.store.sqlite_file.needs_immutable", lambda _: True)
+    backup_environment(path, tmp_path / "copy.db")
+    monkeypatch.undo()
+    assert names(tmp_path / "copy.db") == ["floor", "blob 1"]
+    assert not Path(f"{path}-shm").exists()
+
+
+def test_a_copy_of_a_file_of_format_1_is_of_the_newest(path: Path, tmp_path: Path) -> None:
+    make_old(path)
+    before = path.read_bytes()
+    backup_environment(path, tmp_path / "copy.db")
+    assert path.read_bytes() == before
+    assert sqlite_log.file_mark(tmp_path / "copy.db") not in {None, sqlite_log.NO_MARK}
+    assert names(tmp_path / "copy.db") == ["floor", "blob 1"]
+    restore_environment(tmp_path / "copy.db", path)
+    assert names(path) == ["floor", "blob 1"]
 
 
 def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:

@@ -157,6 +157,24 @@ def test_what_was_committed_goes_into_the_file_though_the_logs_name_is_gone(
     assert names(path) == ["floor", "blob 1"]
 
 
+@pytest.mark.parametrize("read_only", [False, True])
+def test_nobody_opens_a_file_whose_log_was_taken_from_who_has_it_open(
+    path: Path, read_only: bool
+) -> None:
+    script = (
+        "import sys, hapticdb\n"
+        "try: hapticdb.open(sys.argv[1], read_only=sys.argv[2] == 'True')\n"
+        "except hapticdb.BusyError as error: print(error)\n"
+    )
+    store = SQLiteStore.open(path)
+    write(store, 1)
+    log_deleted(path)
+    told = finished([sys.executable, "-c", script, str(path), str(read_only)])
+    assert "q.db-wal was removed while another has" in told.stdout
+    store.close()
+    assert names(path) == ["floor", "blob 1"]
+
+
 @pytest.mark.parametrize("is_dropped", [False, True])
 def test_a_copy_put_in_place_by_hand_is_not_written_into_by_the_log_that_was_removed(
     path: Path, tmp_path: Path, is_dropped: bool

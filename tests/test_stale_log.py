@@ -18,9 +18,10 @@ import hapticdb
 from children import child, exit_code, finished
 from hapticdb import Grid
 from hapticdb.store import sqlite_log
-from hapticdb.store.schema import MIGRATIONS, SQLITE_APPLICATION_ID
+from hapticdb.store.schema import MIGRATIONS
 from hapticdb.store.sqlite import SQLiteStore
 from hapticdb.testing import blob, floor_voxels, write_voxels
+from old_formats import make_old
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 ALL = np.array([0]), np.array([2**62])
@@ -152,27 +153,6 @@ def test_a_file_copied_over_one_that_is_being_written_is_noticed_by_the_next_wri
 
 
 # --- a file with its own log ----------------------------------------------------------------------
-
-
-def make_old(path: Path) -> None:
-    """Make a file as format 1 had it of this one: no lineage, no checksums of pages."""
-    with closing(SQLiteStore.open(path, read_only=True)) as new:
-        tables = {
-            name: new._fetch(f"SELECT * FROM {name}")
-            for name in ("environment", "object", "voxel", "brick", "change")
-        }
-    path.unlink()
-    with closing(apsw.Connection(str(path))) as old:
-        old.execute("PRAGMA page_size = 8192")
-        for statement in MIGRATIONS[0].sqlite:
-            old.execute(statement)
-        tables["environment"] = [row[:8] for row in tables["environment"]]
-        for name, rows in tables.items():
-            for row in rows:
-                old.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
-        old.execute(f"PRAGMA application_id = {SQLITE_APPLICATION_ID}")
-        old.execute("PRAGMA user_version = 1")
-        old.execute("PRAGMA journal_mode = WAL").fetchall()
 
 
 def test_a_file_of_format_1_is_read_as_it_is_and_brought_up_to_date_by_a_writer(path: Path) -> None:

@@ -6,6 +6,7 @@ section 2.2). The engine's own file object waits with closing until they have le
 """
 
 import contextlib
+import errno
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,8 +28,11 @@ def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
     """
     os.stat(path)  # noqa: PTH116 - for the error's own words: the engine's would not say why
     if not os.access(path, os.R_OK):
-        raise PermissionError(13, "permission denied", str(path))
-    file = apsw.VFSFile("", str(path.resolve()), [flags, 0])
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
+    try:
+        file = apsw.VFSFile("", str(path.resolve()), [flags, 0])
+    except apsw.Error as error:
+        raise OSError(errno.EIO, str(error), str(path)) from error
     try:
         yield file
     finally:
@@ -43,8 +47,11 @@ def read_bytes(path: Path, amount: int, offset: int = 0) -> bytes:
 
 def read_from(file: apsw.VFSFile, amount: int, offset: int = 0) -> bytes:
     """Bytes of an opened file, fewer where it ends before."""
-    there = max(min(amount, file.xFileSize() - offset), 0)
-    return file.xRead(there, offset) if there else b""
+    try:
+        there = max(min(amount, file.xFileSize() - offset), 0)
+        return file.xRead(there, offset) if there else b""
+    except apsw.IOError as error:  # or cut off since its size was asked
+        raise OSError(errno.EIO, os.strerror(errno.EIO), str(error)) from error
 
 
 def descriptor_of(identity: tuple[int, int]) -> int | None:

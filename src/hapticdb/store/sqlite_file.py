@@ -43,7 +43,8 @@ def named_errors(path: str) -> Iterator[None]:
         raise damaged(path, str(error)) from error
     except (apsw.ReadOnlyError, apsw.PermissionsError) as error:
         raise ReadOnlyError(
-            f"{path} can only be read: open a copy that you may write to ({error})"
+            f"{path} can only be read: 'hapticdb backup {path} COPY' makes one to write to "
+            f"({error})"
         ) from error
     except (apsw.BusyError, apsw.LockedError) as error:
         raise BusyError(f"{path} is being written by another process: try again later") from error
@@ -113,15 +114,22 @@ def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFi
     check_kind(path)
     file = OpenedFile(path)
     is_immutable = read_only and needs_immutable(path)
+    has_log = os.path.exists(f"{path.resolve()}-wal")  # noqa: PTH110 - before the engine makes one
     with named_errors(str(path)):
         connection = _connect_to_read(path) if read_only else _connect_to_write(path)
         try:
             version = _version(connection, path)
+            connection.execute("SELECT id FROM environment").fetchall()  # a page of every log
             file.settle(connection, is_immutable=is_immutable)
             _bring_up_to_date(connection, path, version, read_only=read_only)
-        except BaseException:
+        except BaseException as error:
             connection.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
             connection.close()
+            if isinstance(error, DamagedError) and "-wal" in str(error) and not has_log:
+                raise BusyError(
+                    f"{path}-wal was removed while another has {path} open: end all that has it "
+                    "open, which puts what was committed into the file, then open it again"
+                ) from error
             raise
     return connection, file
 
@@ -244,7 +252,9 @@ def _connect_to_read(path: Path) -> apsw.Connection:
 
 def _connect_to_write(path: Path) -> apsw.Connection:
     if not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
-        raise ReadOnlyError(f"{path} can only be read: open a copy that you may write to")
+        raise ReadOnlyError(
+            f"{path} can only be read: 'hapticdb backup {path} COPY' makes one to write to"
+        )
     flags = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_NOMUTEX
     connection = apsw.Connection(str(path), flags=flags, vfs=layer_of(path))
     _settle(connection)

@@ -191,11 +191,14 @@ class _Log:
             return True
         if self._page != PAGE_BYTES:  # of no file of ours
             return False
+        is_marked = False
         for number, _, at in self._frames():
             # one that is not committed cannot have its mark in any file, so no checksum is needed
-            if number == LINEAGE_PAGE and mark in (self._lineage(at) or ()):
-                return True
-        return not self._has_commit_of_ours()
+            if number == LINEAGE_PAGE and (lineage := self._lineage(at)):
+                if mark in lineage:
+                    return True
+                is_marked = True
+        return not (is_marked and self._has_commit_of_ours())
 
     def _frames(self) -> Iterator[tuple[int, int, int]]:
         """Page number, pages after a commit or 0, and place of each frame."""

@@ -39,6 +39,7 @@ class OpenedFile:
         self._path = path
         self._real = path.resolve()
         """Beside which the engine keeps its log, when the path is a link."""
+        self._log = f"{self._real}-wal"
         self._due = 0.0
         self._connection: apsw.Connection | None = None
         self._beside: dict[str, Identity] = {}
@@ -58,10 +59,10 @@ class OpenedFile:
         if is_immutable:
             self.stamp = _stamp(self._path)
         else:
-            for suffix in ("-wal", "-shm"):
-                found = _identity(Path(f"{self._real}{suffix}"))
+            for beside in (self._log, f"{self._real}-shm"):
+                found = _identity(beside)
                 if found:
-                    self._beside[suffix] = found
+                    self._beside[beside] = found
         self.look()
 
     def check(self) -> None:
@@ -83,8 +84,7 @@ class OpenedFile:
         if self._found() != self.identity:
             what = lost if has_committed else "open it again"
             raise ConnectionLostError(f"{self._path} is another file than before: {what}")
-        for suffix, identity in self._beside.items():
-            beside = Path(f"{self._real}{suffix}")
+        for beside, identity in self._beside.items():
             if _identity(beside) != identity:
                 what = "what was written last may be lost; " if has_committed else ""
                 raise ConnectionLostError(
@@ -135,8 +135,8 @@ class OpenedFile:
 
     def _owns_its_log(self) -> bool:
         """Whether only names beside the file are gone, and the log can still go into it."""
-        descriptor = sqlite_bytes.descriptor_of(self._beside.get("-wal", (0, 0)))
-        if _identity(self._path) != self.identity or descriptor is None:
+        descriptor = sqlite_bytes.descriptor_of(self._beside.get(self._log, (0, 0)))
+        if _identity(str(self._path)) != self.identity or descriptor is None:
             return False
         try:
             sqlite_log.check_log(self._real, sqlite_bytes.DESCRIPTORS / str(descriptor))
@@ -166,9 +166,9 @@ class OpenedFile:
         return status.st_dev, status.st_ino
 
 
-def _identity(path: Path) -> Identity | None:
+def _identity(path: str) -> Identity | None:
     try:
-        status = os.stat(path)  # noqa: PTH116 - a third of Path.stat, and once for each write
+        status = os.stat(path)  # noqa: PTH116 - a tenth of making a Path, twice for each write
     except OSError:
         return None
     return status.st_dev, status.st_ino

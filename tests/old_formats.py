@@ -1,0 +1,30 @@
+"""Environments as earlier formats had them."""
+
+from contextlib import closing
+from pathlib import Path
+
+import apsw
+
+from hapticdb.store.schema import MIGRATIONS, SQLITE_APPLICATION_ID
+from hapticdb.store.sqlite import SQLiteStore
+
+
+def make_old(path: Path) -> None:
+    """Make a file as format 1 had it of this one: no lineage, no checksums of pages."""
+    with closing(SQLiteStore.open(path, read_only=True)) as new:
+        tables = {
+            name: new._fetch(f"SELECT * FROM {name}")
+            for name in ("environment", "object", "voxel", "brick", "change")
+        }
+    path.unlink()
+    with closing(apsw.Connection(str(path))) as old:
+        old.execute("PRAGMA page_size = 8192")
+        for statement in MIGRATIONS[0].sqlite:
+            old.execute(statement)
+        tables["environment"] = [row[:8] for row in tables["environment"]]
+        for name, rows in tables.items():
+            for row in rows:
+                old.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
+        old.execute(f"PRAGMA application_id = {SQLITE_APPLICATION_ID}")
+        old.execute("PRAGMA user_version = 1")
+        old.execute("PRAGMA journal_mode = WAL").fetchall()

@@ -38,6 +38,7 @@ FLOORS: list[set[str]] = [
         "difference",
         "finding",
         "ingest",
+        "known_parts",
         "originals",
         "placing",
         "query",

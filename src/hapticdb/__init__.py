@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from hapticdb.pointshell import PointShell
     from hapticdb.pool import Pool
     from hapticdb.poses import read_poses, write_poses
+    from hapticdb.proportions import Proportions, compare_proportions
     from hapticdb.query import Query
     from hapticdb.realtime.coupling import Coupling
     from hapticdb.realtime.handle import Handle
@@ -90,6 +91,7 @@ __all__ = [
     "OutsideGridError",
     "PointShell",
     "Pool",
+    "Proportions",
     "QuantileVector",
     "Query",
     "ReadOnlyError",
@@ -105,6 +107,7 @@ __all__ = [
     "Touches",
     "UsageError",
     "backup_environment",
+    "compare_proportions",
     "copy_environment",
     "create",
     "diff_environments",
@@ -135,6 +138,7 @@ _HOMES = {
     "pointshell": "PointShell",
     "pool": "Pool",
     "poses": "read_poses write_poses",
+    "proportions": "Proportions compare_proportions",
     "query": "Query",
     "realtime.coupling": "Coupling",
     "realtime.handle": "Handle",

@@ -26,6 +26,16 @@ NAMES = {
     "yd": "yards",
 }
 
+_READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
+
+
+def length_text(length: float) -> str:
+    """Put a length, metres, in the unit that reads best: ``3.3 mm``, ``4.21 m``, ``12.5 km``."""
+    for size, word, least in _READABLE:
+        if length >= least * size:
+            return f"{length / size:.4g} {word}"
+    return f"{length / 1e-6:.4g} µm"
+
 
 def metres_of(unit: str) -> float:
     """Length of a unit, metres.

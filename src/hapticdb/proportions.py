@@ -200,7 +200,8 @@ class _Look(NamedTuple):
             apart = np.maximum(
                 np.maximum(boxes[:, 0] - high[some, None], low[some, None] - boxes[:, 1]), 0.0
             )
-            nearest = float(np.sqrt((apart**2).sum(axis=2).min()))
+            with np.errstate(over="ignore"):
+                nearest = float(np.sqrt((apart**2).sum(axis=2).min()))
             least = min(least, max(nearest - self.tool.radius - self.margin, 0.0))
             if least == 0.0:
                 break

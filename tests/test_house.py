@@ -31,6 +31,7 @@ FLOORS: list[set[str]] = [
     {"__main__"},
     {"cli"},
     {"bench", "demo", "picture", "server", "sweep_picture"},
+    {"lettering"},
     {"pool", "warm"},
     {"environment", "realtime", "sample", "splat", "testing"},
     {

@@ -16,6 +16,7 @@ StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgrou
 CurveName = Literal["z", "hilbert", "lexicographic"]
 LayoutName = Literal["brick", "voxel"]
 UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
+UpName = Literal["x", "y", "z"]
 
 Url = Annotated[
     str,

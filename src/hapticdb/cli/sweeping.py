@@ -9,7 +9,7 @@ import typer
 
 from hapticdb.cli import fitting, render
 from hapticdb.cli.choosing import Exclude, Parts, ids_of
-from hapticdb.cli.root import Budget, Json, PathUnit, Points, Seed, ToolUnit, Url, bytes_of
+from hapticdb.cli.root import Budget, Json, PathUnit, Points, Seed, ToolUnit, UpName, Url, bytes_of
 from hapticdb.cli.touching import DEFAULT_POINTS, shell_of
 
 if TYPE_CHECKING:
@@ -57,6 +57,10 @@ def sweep(
     ] = False,
     picture: Annotated[
         str | None, typer.Option(metavar="PNG", help="Draw the path, its hits and clearance.")
+    ] = None,
+    up: Annotated[
+        UpName | None,
+        typer.Option(help="Axis that points up in the picture.", show_default="the files'"),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -128,7 +132,9 @@ def sweep(
             if picture is not None:
                 from hapticdb.sweep_picture import draw_sweep
 
-                draw_sweep(picture, env, shell, found, exclude=excluded, verdict=_verdict(found))
+                draw_sweep(
+                    picture, env, shell, found, exclude=excluded, verdict=_verdict(found), up=up
+                )
     if not json and picture is not None:
         render.say(f"picture: {picture}")
     if not found.comes_out:

@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from hapticdb.check import CheckReport, check_environment
     from hapticdb.difference import Difference, diff_environments
     from hapticdb.environment import Environment, create, open  # noqa: A004 - as in tarfile.open
     from hapticdb.errors import (
@@ -41,7 +42,6 @@ if TYPE_CHECKING:
     from hapticdb.pointshell import PointShell
     from hapticdb.pool import Pool
     from hapticdb.poses import read_poses, write_poses
-    from hapticdb.proportions import Proportions, compare_proportions
     from hapticdb.query import Query
     from hapticdb.realtime.coupling import Coupling
     from hapticdb.realtime.handle import Handle
@@ -62,6 +62,7 @@ if TYPE_CHECKING:
 __all__ = [
     "AccessError",
     "BusyError",
+    "CheckReport",
     "ConflictError",
     "ConnectionLostError",
     "CopyReport",
@@ -91,7 +92,6 @@ __all__ = [
     "OutsideGridError",
     "PointShell",
     "Pool",
-    "Proportions",
     "QuantileVector",
     "Query",
     "ReadOnlyError",
@@ -107,7 +107,7 @@ __all__ = [
     "Touches",
     "UsageError",
     "backup_environment",
-    "compare_proportions",
+    "check_environment",
     "copy_environment",
     "create",
     "diff_environments",
@@ -123,6 +123,7 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
+    "check": "CheckReport check_environment",
     "difference": "Difference diff_environments",
     "environment": "Environment create open",
     "errors": (
@@ -138,7 +139,6 @@ _HOMES = {
     "pointshell": "PointShell",
     "pool": "Pool",
     "poses": "read_poses write_poses",
-    "proportions": "Proportions compare_proportions",
     "query": "Query",
     "realtime.coupling": "Coupling",
     "realtime.handle": "Handle",

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.calibration import calibrate
 from hapticdb.errors import (
     ConnectionLostError,
+    DamagedError,
     ObjectNotFoundError,
     ReadOnlyError,
 )
@@ -161,7 +162,6 @@ class Environment:
         unit: str | None = None,
         jobs: int | None = None,
         keep_removed: bool = False,
-        replace: bool = False,
         progress: ProgressCallback | None = None,
     ) -> FileReport:
         """Import a file's parts on this environment's grid, each in a transaction of its own.
@@ -176,8 +176,6 @@ class Environment:
             Threads that voxelize; one a processor unless given.
         keep_removed : bool
             Leave parts out that were removed; they come in again otherwise.
-        replace : bool
-            Replace objects of the file that it holds otherwise now, and remove those it lacks.
         progress : callable or None
             Called after each part with a `hapticdb.ingest.Progress`.
 
@@ -187,13 +185,11 @@ class Environment:
             When the file cannot be used, or a part lies outside the grid: nothing is written then.
         """
         self._check_writable()
-        options = ImportOptions(
-            unit=unit, jobs=jobs, layout=self.layout, keep_removed=keep_removed, replace=replace
-        )
+        options = ImportOptions(unit=unit, jobs=jobs, layout=self.layout, keep_removed=keep_removed)
         mesh_file = read_file(file, unit=unit)
         with self._store.loading():
             report = ingest_file(self._store, mesh_file, options, progress)
-        if report.status == "imported":
+        if report.added:
             self._store.analyze(DEFAULT_RESOLUTION)
             self._forget()
         return report
@@ -308,6 +304,12 @@ class Environment:
             answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
         if ids.size:
             self._check_known(ids)
+        for object_id in answer.ids:
+            if object_id not in self._known:
+                raise DamagedError(
+                    f"{self.url} is damaged (rows of object {object_id}, which is not there): "
+                    "restore a copy or import the files again"
+                )
         return Touch(answer, self._known)
 
     def _felt(

@@ -7,7 +7,8 @@ from functools import cached_property
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels import grouping
-from hapticdb.store.base import Keys, Store
+from hapticdb.store.base import Keys, Store, row_shift
+from hapticdb.store.believed import damaged
 
 DEFAULT_RESOLUTION = 10_000
 """Buckets of the quantile vector: the paper's best."""
@@ -52,7 +53,11 @@ class QuantileVector:
         """Quantile vector of all rows of an environment."""
         if not 1 <= resolution <= MAX_RESOLUTION:
             raise UsageError(f"{resolution} quantiles: give 1 to {MAX_RESOLUTION}")
-        return cls(*store.quantiles(resolution))
+        found = store.quantiles(resolution)
+        key_end = 1 << max(3 * store.grid.bits - row_shift(store.layout), 0)
+        if found.n_rows and not 0 <= found.bounds[0] <= found.bounds[-1] < key_end:
+            raise damaged(store.url, "rows outside the grid")
+        return cls(*found)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from itertools import takewhile
 
 from hapticdb.cli import render
 from hapticdb.cli.benching import bench
+from hapticdb.cli.checking import check
 from hapticdb.cli.editing import move, remove
 from hapticdb.cli.feeling import feel
 from hapticdb.cli.granting import grant
@@ -46,6 +47,7 @@ VERBS: dict[Callable[..., None], str] = {
     remove: "Remove objects.",
     copy: "Copy to another engine, layout or curve.",
     diff: "Say whether two environments hold the same.",
+    check: "Say whether an environment is sound.",
     backup: "Copy an SQLite environment into a file, whole.",
     restore: "Put such a copy in an environment's place.",
     calibrate: "Measure what queries cost on this machine.",

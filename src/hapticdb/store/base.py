@@ -94,6 +94,8 @@ class Object:
         axis that the file says points up: ``x``, ``y`` or ``z``.
     revision : int
         Of the environment, when the object was last written.
+    rows_crc : int or None
+        Checksum of its rows as they were written; None of objects written before there was one.
     """
 
     name: str
@@ -105,6 +107,7 @@ class Object:
     attributes: Mapping[str, object] = field(default_factory=dict)
     id: int = 0
     revision: int = 0
+    rows_crc: int | None = None
 
 
 def scene_bounds(objects: Iterable[Object]) -> NDArray[np.float64] | None:
@@ -313,6 +316,9 @@ class Store(Protocol):
     def size(self) -> "Size":
         """Rows, bytes and leaf blocks."""
 
+    def checker(self) -> "Checker":
+        """What `hapticdb check` asks beside the rest."""
+
     def quantiles(self, resolution: int) -> Histogram:
         """Equi-count histogram of all row keys, of R buckets."""
 
@@ -371,6 +377,19 @@ class SupportsCaches(Protocol):
 
     def drop_caches(self) -> None:
         """Forget all pages: the connection's, and the file's in the operating system's cache."""
+
+
+class Checker(Protocol):
+    """What `hapticdb check` asks an engine: what is wrong below and beside the rows."""
+
+    def has_page_checksums(self) -> bool:
+        """Whether pages carry checksums that are compared when they are read."""
+
+    def findings(self) -> Iterator[str]:
+        """What is wrong with pages, indexes and kept statistics, a line each."""
+
+    def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
+        """At most that many rows after (key, id), ascending by both; from the start by (-1, 0)."""
 
 
 @runtime_checkable

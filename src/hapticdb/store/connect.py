@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from hapticdb.errors import MissingExtraError, UsageError
 from hapticdb.grid import Grid
+from hapticdb.store import sqlite_check
 from hapticdb.store.base import LAYOUTS, Layout, Store
 from hapticdb.store.postgres import address
 from hapticdb.store.postgres.address import redact
@@ -22,6 +23,7 @@ __all__ = [
     "check_curve",
     "create_store",
     "exists",
+    "findings_before_opening",
     "grant",
     "name_of",
     "open_store",
@@ -62,6 +64,13 @@ def exists(url: str | os.PathLike[str]) -> bool:
 
         return schema_of.exists(os.fspath(url))
     return _path_of(url).exists()
+
+
+def findings_before_opening(url: str | os.PathLike[str]) -> list[str]:
+    """What is wrong with an environment's file, as far as that shows before it is opened."""
+    if _is_postgres(url):
+        return []
+    return sqlite_check.first_findings(_path_of(url))
 
 
 def beside(url: str | os.PathLike[str], name: str) -> str:

@@ -10,18 +10,25 @@ import contextlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import apsw
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.grid import CurveName, Grid
-from hapticdb.store import sqlite_bytes, sqlite_file, sqlite_force, sqlite_log, sqlite_place
+from hapticdb.grid import Grid
+from hapticdb.store import (
+    believed,
+    sqlite_bytes,
+    sqlite_check,
+    sqlite_file,
+    sqlite_force,
+    sqlite_log,
+    sqlite_place,
+    sqlite_rows,
+)
 from hapticdb.store.base import (
     BRICK_BYTES,
-    LAYOUTS,
-    NO_OCCUPANCY,
     NO_ROWS,
     Change,
     Covering,
@@ -154,13 +161,11 @@ class SQLiteStore:
                 raise
 
     def _read_environment(self) -> tuple[Grid, Layout]:
+        believed.check_tables(self.url, dict(self._fetch(sqlite_rows.KINDS)))
         rows = self._fetch(
             "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout FROM environment"
         )
-        if len(rows) != 1 or rows[0][6] not in LAYOUTS:
-            raise sqlite_file.damaged(self.url, "no grid")
-        size, x, y, z, bits, curve, layout = rows[0]
-        return Grid(size, (x, y, z), bits, cast("CurveName", curve)), layout
+        return believed.grid_of(self.url, rows)
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
@@ -188,26 +193,13 @@ class SQLiteStore:
     def revision(self) -> int:
         """Number of the last committed write; 0 for an empty environment."""
         self._file.check()
-        return int(self._fetch("SELECT coalesce(max(revision), 0) FROM change")[0][0])
+        found = self._fetch("SELECT coalesce(max(revision), 0) FROM change")
+        return believed.number_of(self.url, found[0][0], "the revision")
 
     # -- the haptic query --------------------------------------------------------------------
 
     def _rows(self, found: list[Any]) -> Rows:
-        if not found:
-            return NO_ROWS
-        if self._shift == 0:
-            pairs = np.array(found, dtype=np.int64)
-            return Rows(pairs[:, 0].copy(), pairs[:, 1].copy(), NO_OCCUPANCY)
-        keys, ids, bricks = zip(*found, strict=True)
-        joined = b"".join(bricks)
-        count = len(keys)
-        if len(joined) != BRICK_BYTES * count:
-            raise sqlite_file.damaged(self.url, "a brick of the wrong length")
-        return Rows(
-            np.fromiter(keys, np.int64, count),
-            np.fromiter(ids, np.int64, count),
-            np.frombuffer(joined, np.uint8),
-        )
+        return sqlite_rows.rows_of(self.url, found, has_bricks=self._shift > 0)
 
     def lookup(self, keys: Keys) -> Rows:
         """Rows of distinct ascending keys (U,), in one statement."""
@@ -252,7 +244,7 @@ class SQLiteStore:
     def statement_hits(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
         found = self._fetch(*sqlite_force.hits_statement(self.layout, frame))
-        pairs = np.array(found, dtype=np.int64).reshape(-1, 2)
+        pairs = sqlite_rows.pairs_of(self.url, found)
         return pairs[:, 0] - 1, pairs[:, 1].copy()
 
     # -- objects -----------------------------------------------------------------------------
@@ -271,17 +263,7 @@ class SQLiteStore:
     def _objects(self, condition: str, *bindings: int) -> list[Object]:
         self._file.check()
         return [
-            Object(
-                id=row[0],
-                name=row[1],
-                link=row[2],
-                digest=row[3],
-                transform=np.frombuffer(row[4], dtype="<f8").reshape(4, 4),
-                voxels=row[5],
-                bounds=np.frombuffer(row[6], dtype="<f8").reshape(2, 3),
-                attributes=json.loads(row[7]),
-                revision=row[8],
-            )
+            believed.object_of(self.url, row)
             for row in self._fetch(
                 "SELECT id, name, link, digest, transform, voxels, bounds, attributes, revision "
                 f"FROM object WHERE {condition} ORDER BY id",
@@ -320,7 +302,13 @@ class SQLiteStore:
             try:
                 self._connection.execute(
                     INSERT_OBJECT,
-                    (record.name, record.link, *_contents(record), revision, record.id),
+                    (
+                        record.name,
+                        record.link,
+                        *sqlite_rows.contents(record, rows),
+                        revision,
+                        record.id,
+                    ),
                 )
             except apsw.ConstraintError as error:
                 raise present_already(record, self.url) from error
@@ -338,7 +326,7 @@ class SQLiteStore:
             self._connection.execute(
                 "UPDATE object SET digest = ?, transform = ?, voxels = ?, bounds = ?,"
                 " attributes = ?, revision = ? WHERE id = ?",
-                (*_contents(record), revision, record.id),
+                (*sqlite_rows.contents(record, rows), revision, record.id),
             )
             self._insert(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
@@ -378,12 +366,11 @@ class SQLiteStore:
 
     def changes(self, since: int = 0) -> Iterator[Change]:
         """Committed writes after that revision, oldest first."""
-        for revision, action, object_id, ranges in self._fetch(
+        for row in self._fetch(
             "SELECT revision, action, id, ranges FROM change WHERE revision > ? ORDER BY revision",
             (since,),
         ):
-            pairs = np.frombuffer(ranges, dtype="<i8").reshape(-1, 2)
-            yield Change(revision, action, object_id, pairs.astype(np.int64))
+            yield believed.change_of(self.url, row)
 
     def watch(self) -> None:
         """Begin to notice commits from now on; may be called again."""
@@ -404,6 +391,10 @@ class SQLiteStore:
         before = self._noticed
         self._noticed = self._fetch("PRAGMA data_version")[0][0]
         return self._noticed != before
+
+    def checker(self) -> sqlite_check.SQLiteChecker:
+        """What `hapticdb check` asks beside the rest."""
+        return sqlite_check.SQLiteChecker(self.path, self.layout, self._fetch, self._rows)
 
     # -- caches ------------------------------------------------------------------------------
 
@@ -438,8 +429,7 @@ class SQLiteStore:
         with self.snapshot():
             kept = self._kept_quantiles(resolution)
             if kept:
-                bounds = np.frombuffer(kept[0][0], dtype="<i8").astype(np.int64)
-                return Histogram(bounds, int(kept[0][1]), "kept")
+                return believed.histogram_of(self.url, *kept[0])
             bounds, n_rows = exact_quantiles(self._connection, self.layout, resolution)
             return Histogram(bounds, n_rows, "computed")
 
@@ -479,7 +469,7 @@ class SQLiteStore:
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""
         kept = self._fetch("SELECT figures FROM cost WHERE machine = ?", (machine,))
-        return cast("Mapping[str, float]", json.loads(kept[0][0])) if kept else None
+        return believed.figures_of(self.url, kept[0][0]) if kept else None
 
     def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
         """Keep the fitted cost figures of a machine."""
@@ -487,14 +477,3 @@ class SQLiteStore:
             self._connection.execute(
                 "INSERT OR REPLACE INTO cost VALUES (?, ?)", (machine, json.dumps(dict(figures)))
             )
-
-
-def _contents(record: Object) -> tuple[Any, ...]:
-    """Bindings of an object's columns from digest to attributes."""
-    return (
-        record.digest,
-        np.ascontiguousarray(record.transform, dtype="<f8").tobytes(),
-        int(record.voxels),
-        np.ascontiguousarray(record.bounds, dtype="<f8").tobytes(),
-        json.dumps(dict(record.attributes), sort_keys=True),
-    )

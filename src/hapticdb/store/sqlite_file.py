@@ -56,10 +56,9 @@ def named_errors(path: str) -> Iterator[None]:
         raise DatabaseError(f"{path} has been closed: open it again") from error
     except apsw.CantOpenError as error:
         raise DatabaseError(f"{path} cannot be opened: check its folder's rights") from error
-    except apsw.SQLError as error:
-        if str(error).startswith(("no such table", "no such column")):
-            raise damaged(path, str(error)) from error
-        raise
+    except (apsw.SQLError, apsw.MismatchError, apsw.ConstraintError) as error:
+        # our statements fit our tables: these are others
+        raise damaged(path, str(error)) from error
 
 
 def damaged(path: str, cause: str) -> DamagedError:

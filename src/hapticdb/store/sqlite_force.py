@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
 from hapticdb.kernels import contact
-from hapticdb.store.base import Frame, Layout, row_shift
+from hapticdb.store import believed
+from hapticdb.store.base import BRICK_BYTES, Frame, Layout, row_shift
 
 WRENCH = {
     "voxel": """
@@ -59,8 +60,13 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
     def force() -> _Force:
         return _Force(grid, layout)
 
+    def get_bit(occupancy: bytes, bit: int) -> int:
+        if not isinstance(occupancy, bytes) or len(occupancy) != BRICK_BYTES:
+            raise believed.damaged(connection.filename, "a brick of the wrong length")
+        return occupancy[bit >> 3] >> (bit & 7) & 1  # as PostgreSQL's function of that name
+
     connection.create_aggregate_function("force", cast("Any", force), 3)
-    connection.create_scalar_function("get_bit", cast("Any", _get_bit), 2, deterministic=True)
+    connection.create_scalar_function("get_bit", cast("Any", get_bit), 2, deterministic=True)
 
 
 class _Force:
@@ -98,11 +104,6 @@ class _Force:
             self._frame.stiffness,
         )
         return wrench.tobytes()
-
-
-def _get_bit(occupancy: bytes, bit: int) -> int:
-    """Bit of a blob, least significant first: as PostgreSQL's function of that name."""
-    return occupancy[bit >> 3] >> (bit & 7) & 1
 
 
 def _without_excluded(

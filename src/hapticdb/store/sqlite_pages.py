@@ -197,14 +197,20 @@ def log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:
     SQLite adds the page's number and size and then its content, word after word: s1 += word + s2,
     s2 += the next + s1. Both are linear in the words, with Fibonacci's numbers for weights.
     """
-    number, size = int(frame[0]), int(frame[1])
-    s1 += number + s2
-    s2 += size + s1
+    s1, s2 = words_checksum(frame[:2].tolist(), s1, s2)
     page = frame[6:].astype(np.uint32, copy=False)
     return (
         (int(_WEIGHTS[0].dot(page)) + _PAST[0] * s1 + _PAST[1] * s2) & 0xFFFFFFFF,
         (int(_WEIGHTS[1].dot(page)) + _PAST[1] * s1 + _PAST[2] * s2) & 0xFFFFFFFF,
     )
+
+
+def words_checksum(words: list[int], s1: int = 0, s2: int = 0) -> tuple[int, int]:
+    """Both sums after an even number of words, one by one."""
+    for even, odd in zip(words[::2], words[1::2], strict=True):
+        s1 = (s1 + even + s2) & 0xFFFFFFFF
+        s2 = (s2 + odd + s1) & 0xFFFFFFFF
+    return s1, s2
 
 
 def _weights() -> tuple[tuple[NDArray[np.uint32], NDArray[np.uint32]], list[int]]:

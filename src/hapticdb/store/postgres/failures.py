@@ -19,6 +19,7 @@ from hapticdb.errors import (
     StuckError,
     UsageError,
 )
+from hapticdb.store.believed import damaged
 
 
 @contextlib.contextmanager
@@ -128,11 +129,6 @@ def no_editor(shown: str) -> ReadOnlyError:
         f"{shown}: this user may not change objects; its owner can allow it with "
         "'hapticdb grant URL ROLE --as editor'"
     )
-
-
-def damaged(shown: str, cause: str) -> DamagedError:
-    """Build the error for an environment whose contents are broken."""
-    return DamagedError(f"{shown} is damaged ({cause}): restore a copy or import the files again")
 
 
 def _line(error: psycopg.Error) -> str:

@@ -1,11 +1,11 @@
-"""Objects as rows of the table `object`, there and back."""
+"""Objects as rows of the table `object`; `believed` reads them back."""
 
-import json
 from typing import Any
 
 import numpy as np
 
-from hapticdb.store.base import Object
+from hapticdb.store import believed
+from hapticdb.store.base import Object, Rows
 
 OBJECTS = (
     "SELECT id, name, link, digest, transform, voxels, bounds, attributes::text, revision"
@@ -24,22 +24,7 @@ UPDATE object SET digest = %(digest)s, transform = %(transform)s, voxels = %(vox
  WHERE id = %(id)s"""
 
 
-def object_of(row: tuple[Any, ...]) -> Object:
-    """Read an object from its row."""
-    return Object(
-        id=row[0],
-        name=row[1],
-        link=row[2],
-        digest=row[3],
-        transform=np.array(row[4], dtype=np.float64).reshape(4, 4),
-        voxels=row[5],
-        bounds=np.array(row[6], dtype=np.float64).reshape(2, 3),
-        attributes=json.loads(row[7]),
-        revision=row[8],
-    )
-
-
-def contents(record: Object, revision: int) -> dict[str, Any]:
+def contents(record: Object, rows: Rows, revision: int) -> dict[str, Any]:
     """Bindings of an object's columns."""
     return {
         "id": record.id,
@@ -49,6 +34,6 @@ def contents(record: Object, revision: int) -> dict[str, Any]:
         "transform": np.asarray(record.transform, dtype=np.float64).reshape(-1).tolist(),
         "voxels": int(record.voxels),
         "bounds": np.asarray(record.bounds, dtype=np.float64).reshape(-1).tolist(),
-        "attributes": json.dumps(dict(record.attributes), sort_keys=True),
+        "attributes": believed.attributes_text(record, rows),
         "revision": revision,
     }

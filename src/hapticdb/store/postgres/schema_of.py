@@ -3,7 +3,6 @@
 import atexit
 import re
 from pathlib import Path
-from typing import cast
 from urllib.parse import unquote, urlsplit
 
 from psycopg import errors, sql
@@ -17,8 +16,9 @@ from hapticdb.errors import (
     ReadOnlyError,
     UsageError,
 )
-from hapticdb.grid import CurveName, Grid
-from hapticdb.store.base import LAYOUTS, Layout
+from hapticdb.grid import Grid
+from hapticdb.store import believed
+from hapticdb.store.base import Layout
 from hapticdb.store.postgres import failures
 from hapticdb.store.postgres.address import Address, parse
 from hapticdb.store.postgres.session import Session, identifier
@@ -126,7 +126,7 @@ def check(session: Session) -> None:
     found = session.rows("SELECT format FROM environment")
     version = int(found[0][0]) if found else 0
     if not version >= 1:
-        raise failures.damaged(shown, f"format {version}")
+        raise believed.damaged(shown, f"format {version}")
     if version > FORMAT_VERSION:
         raise NewerVersionError(
             f"{shown} has format {version}, newer than the {FORMAT_VERSION} known here: "
@@ -159,17 +159,23 @@ def _check_writable(session: Session) -> None:
         )
 
 
+TABLE_KINDS = """
+SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'v' THEN 'view'
+                      WHEN 'm' THEN 'materialized view' ELSE 'relation ' || relkind::text END
+  FROM pg_class JOIN pg_namespace n ON n.oid = relnamespace
+ WHERE nspname = %s AND relkind <> 'i'"""
+
+
 def read_environment(session: Session) -> tuple[Grid, Layout, int]:
     """Grid and layout of an environment, and what tells it from another in its place."""
     rows = session.rows(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, tableoid::bigint"
         " FROM environment"
     )
-    if len(rows) != 1 or rows[0][6] not in LAYOUTS:
-        raise failures.damaged(session.shown, "no grid")
-    size, x, y, z, bits, curve, layout, identity = rows[0]
-    grid = Grid(size, (x, y, z), bits, cast("CurveName", curve))
-    return grid, cast("Layout", layout), identity
+    grid, layout = believed.grid_of(session.shown, rows)
+    kinds = session.rows(TABLE_KINDS, (session.address.environment,))
+    believed.check_tables(session.shown, dict(kinds))
+    return grid, layout, rows[0][7]
 
 
 def created(url: str, grid: Grid, layout: Layout) -> None:

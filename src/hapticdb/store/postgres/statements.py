@@ -34,6 +34,14 @@ SELECT {PACKED[layout]}, {SEEN}
     ON z_val BETWEEN range.low AND range.high"""
     for layout in LAYOUTS
 }
+AFTER = {
+    layout: f"""
+SELECT {PACKED[layout]}, {SEEN}
+  FROM (SELECT * FROM {layout}
+         WHERE (z_val, id) > ($1, $2)
+         ORDER BY z_val, id LIMIT $3) AS found"""
+    for layout in LAYOUTS
+}
 # the planner takes ranges for wide, and would read the whole index by id: range by range instead
 ROWS_OF = {
     layout: f"""

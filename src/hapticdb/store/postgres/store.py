@@ -3,13 +3,14 @@
 import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from psycopg import errors, sql
 
 from hapticdb.grid import Grid
+from hapticdb.store import believed
 from hapticdb.store.base import (
     NO_OCCUPANCY,
     NO_ROWS,
@@ -30,6 +31,7 @@ from hapticdb.store.base import (
     touched_ranges,
 )
 from hapticdb.store.postgres import records, schema_of, statements, wire
+from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.histogram import (
     ENOUGH_ROWS,
     SERVER_RESOLUTION,
@@ -209,7 +211,8 @@ class PostgresStore:
         """All objects, ordered by id."""
         self.revision()  # before: what is written in between is then noticed later, not never
         return [
-            records.object_of(row) for row in self._session.rows(f"{records.OBJECTS} ORDER BY id")
+            believed.object_of(self.url, row)
+            for row in self._session.rows(f"{records.OBJECTS} ORDER BY id")
         ]
 
     def object(self, object_id: int) -> Object:
@@ -217,7 +220,7 @@ class PostgresStore:
         rows = self._session.rows(f"{records.OBJECTS} WHERE id = %s", (object_id,))
         if not rows:
             raise no_object(object_id, self.url)
-        return records.object_of(rows[0])
+        return believed.object_of(self.url, rows[0])
 
     def removed(self, link: str) -> set[str]:
         """Names of a file's parts that were removed and are not there again."""
@@ -235,7 +238,7 @@ class PostgresStore:
         def work() -> int:
             revision = self._next_revision()
             try:
-                new = {"new_id": self._new_id(revision), **records.contents(record, revision)}
+                new = {"new_id": self._new_id(revision), **records.contents(record, rows, revision)}
                 object_id = self._execute(records.INSERT_OBJECT, new)[0][0]
             except errors.UniqueViolation as error:
                 raise present_already(record, self.url) from error
@@ -253,7 +256,7 @@ class PostgresStore:
             known = self.object(record.id)
             check_unwritten(record, known, self.url)
             gone = self._delete(known, covering)
-            self._execute(records.UPDATE_OBJECT, records.contents(record, revision))
+            self._execute(records.UPDATE_OBJECT, records.contents(record, rows, revision))
             self._copy(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
@@ -333,12 +336,11 @@ class PostgresStore:
 
     def changes(self, since: int = 0) -> Iterator[Change]:
         """Committed writes after that revision, oldest first."""
-        for revision, action, object_id, ranges in self._session.rows(
+        for row in self._session.rows(
             "SELECT revision, action, id, ranges FROM change WHERE revision > %s ORDER BY revision",
             (since,),
         ):
-            pairs = np.array(ranges, dtype=np.int64).reshape(-1, 2)
-            yield Change(revision, action, object_id, pairs)
+            yield believed.change_of(self.url, row)
 
     def watch(self) -> None:
         """Begin to notice commits from now on; may be called again."""
@@ -347,6 +349,10 @@ class PostgresStore:
     def has_changed(self) -> bool:
         """Whether something was committed since `watch` or the last call; see `watching`."""
         return self._watch.has_changed()
+
+    def checker(self) -> PostgresChecker:
+        """What `hapticdb check` asks beside the rest."""
+        return PostgresChecker(self._session, self.layout, self._rows)
 
     # -- statistics --------------------------------------------------------------------------
 
@@ -385,7 +391,7 @@ class PostgresStore:
             (resolution,),
         )
         if kept:
-            return Histogram(np.array(kept[0][0], dtype=np.int64), int(kept[0][1]), "kept")
+            return believed.histogram_of(self.url, *kept[0])
         return Histogram(*exact_histogram(self._session, self.layout, resolution), "computed")
 
     def freshness(self, resolution: int) -> Freshness:
@@ -431,7 +437,7 @@ class PostgresStore:
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""
         kept = self._session.rows("SELECT figures::text FROM cost WHERE machine = %s", (machine,))
-        return cast("Mapping[str, float]", json.loads(kept[0][0])) if kept else None
+        return believed.figures_of(self.url, kept[0][0]) if kept else None
 
     def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
         """Keep the fitted cost figures of a machine."""

@@ -1,0 +1,304 @@
+"""Whether an environment is sound: pages, rows, objects, the log of changes."""
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import DamagedError
+from hapticdb.grid import BRICK_BITS, Grid
+from hapticdb.kernels import curves
+from hapticdb.store.base import (
+    BRICK_BYTES,
+    Change,
+    Keys,
+    Object,
+    Rows,
+    Store,
+    row_shift,
+)
+from hapticdb.store.believed import RowsChecksum
+from hapticdb.store.connect import findings_before_opening, open_store
+
+ROWS_AT_ONCE = 1 << 17
+MOST_FINDINGS = 1000
+"""Kept in a report; all are counted."""
+BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
+
+
+class Progress(NamedTuple):
+    """How far a check is: rows read of those there are."""
+
+    done: int
+    total: int
+
+
+ProgressCallback = Callable[[Progress], None]
+
+
+@dataclass
+class CheckReport:
+    """What a check found.
+
+    Attributes
+    ----------
+    url : str
+        The environment, as messages name it.
+    findings : list of str
+        What is wrong, a line each, the first `MOST_FINDINGS` of them.
+    n_findings : int
+        All of them.
+    objects, voxels, rows : int
+        What was read.
+    has_page_checksums : bool
+        Whether the engine's pages carry checksums that are compared when they are read.
+    without_row_checksums : int
+        Objects that were written before there were checksums of their rows.
+    """
+
+    url: str
+    findings: list[str] = field(default_factory=list)
+    n_findings: int = 0
+    objects: int = 0
+    voxels: int = 0
+    rows: int = 0
+    has_page_checksums: bool = False
+    without_row_checksums: int = 0
+
+    @property
+    def is_sound(self) -> bool:
+        """Whether nothing was found."""
+        return self.n_findings == 0
+
+    def add(self, finding: str) -> None:
+        """Keep one more, once."""
+        if finding in self.findings:
+            return
+        self.n_findings += 1
+        if len(self.findings) < MOST_FINDINGS:
+            self.findings.append(finding)
+
+
+def check_environment(
+    url: str | os.PathLike[str], *, progress: ProgressCallback | None = None
+) -> CheckReport:
+    """Read all of an environment and say what is wrong with it.
+
+    All pages that carry checksums are compared (SQLite), the engine's own check is run; every row
+    must belong to an object, lie in order, in the grid and within its object's bounds, and its
+    bricks hold a voxel and none outside the grid; every object must have its count of voxels, and
+    its rows the checksum that was written with them; the log of changes must be without gaps and
+    agree with the objects. Rows are read in batches: memory does not grow with them.
+
+    Parameters
+    ----------
+    url : str or path
+        The environment; it is only read.
+    progress : callable or None
+        Called after each batch of rows with a `Progress`.
+
+    Raises
+    ------
+    DatabaseError
+        When it cannot be read for another reason than damage.
+    """
+    report = CheckReport(os.fspath(url))
+    for finding in findings_before_opening(url):
+        report.add(finding)
+    try:
+        with closing(open_store(url, read_only=True)) as store:
+            report.url = store.url
+            _check(store, report, progress)
+    except DamagedError as error:
+        report.add(_cause(error))
+    return report
+
+
+def _check(store: Store, report: CheckReport, progress: ProgressCallback | None) -> None:
+    with store.snapshot():
+        checker = store.checker()
+        report.has_page_checksums = checker.has_page_checksums()
+        try:
+            for finding in checker.findings():
+                report.add(finding)
+            objects = {obj.id: obj for obj in store.objects()}
+        except DamagedError as error:
+            report.add(_cause(error))
+            return
+        report.objects = len(objects)
+        report.without_row_checksums = sum(obj.rows_crc is None for obj in objects.values())
+        for finding in _log_findings(store, objects):
+            report.add(finding)
+        for finding in _row_findings(store, objects, report, progress):
+            report.add(finding)
+
+
+# -- the log of changes --------------------------------------------------------------------------
+
+
+def _log_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
+    """Gaps in the log, and objects that it tells otherwise."""
+    last: dict[int, Change] = {}
+    expected = 1
+    key_end = 1 << 3 * store.grid.bits
+    for change in store.changes():
+        if change.revision != expected:
+            yield f"changes {expected} to {change.revision - 1} are missing from the log"
+        expected = change.revision + 1
+        if change.ranges.size and int(change.ranges.max()) >= max(key_end, 1 << 15):
+            yield f"change {change.revision} tells of keys outside the grid"
+        last[change.id] = change
+    if store.revision() != expected - 1:
+        yield f"the revision is {store.revision()}, the log ends with {expected - 1}"
+    for object_id, change in last.items():
+        obj = objects.get(object_id)
+        if change.action == "remove" and obj is not None:
+            yield f"object {object_id} is there, though change {change.revision} removed it"
+        if change.action != "remove" and obj is None:
+            yield f"object {object_id} is gone, though nothing removed it"
+        if change.action != "remove" and obj is not None and obj.revision != change.revision:
+            yield (
+                f"object {object_id} is of revision {obj.revision}, its last change of "
+                f"{change.revision}"
+            )
+    for object_id in objects.keys() - last.keys():
+        yield f"object {object_id} is there, though nothing added it"
+
+
+# -- rows ----------------------------------------------------------------------------------------
+
+
+class _Sums:
+    """What was read of each object so far."""
+
+    def __init__(self) -> None:
+        self.voxels: dict[int, int] = {}
+        self.checksums: dict[int, RowsChecksum] = {}
+
+    def add(self, rows: Rows) -> None:
+        """Count a batch, and go on with its objects' checksums."""
+        if rows.occupancy.size:
+            counts = BITS[rows.occupancy].reshape(-1, BRICK_BYTES).sum(axis=1, dtype=np.int64)
+        else:
+            counts = np.ones(len(rows), np.int64)
+        order = np.argsort(rows.ids, kind="stable")
+        ids = rows.ids[order]
+        starts = np.flatnonzero(np.diff(ids, prepend=ids[0] - 1))
+        sums = np.add.reduceat(counts[order], starts)
+        bricks = rows.occupancy.reshape(-1, BRICK_BYTES) if rows.occupancy.size else None
+        for start, end, total in zip(
+            starts.tolist(), [*starts[1:].tolist(), len(ids)], sums.tolist(), strict=True
+        ):
+            object_id, own = int(ids[start]), order[start:end]
+            self.voxels[object_id] = self.voxels.get(object_id, 0) + total
+            checksum = self.checksums.setdefault(object_id, RowsChecksum())
+            checksum.update(rows.keys[own], rows.occupancy if bricks is None else bricks[own])
+
+
+def _row_findings(
+    store: Store,
+    objects: dict[int, Object],
+    report: CheckReport,
+    progress: ProgressCallback | None,
+) -> Iterator[str]:
+    checker = store.checker()
+    sums = _Sums()
+    places = _Places(store, objects)
+    total = store.size().rows
+    key, object_id = -1, 0
+    while len(rows := checker.rows_after(key, object_id, ROWS_AT_ONCE)):
+        if not _is_ascending(rows, key, object_id):
+            yield f"rows after key {key} are not in order"
+            return
+        key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
+        report.rows += len(rows)
+        sums.add(rows)
+        yield from places.findings(rows)
+        if progress is not None:
+            progress(Progress(min(report.rows, total), total))
+    report.voxels = sum(sums.voxels.values())
+    if report.rows != total:
+        yield f"{report.rows:,} rows were read, and {total:,} counted"
+    for missing in sorted(sums.voxels.keys() - objects.keys()):
+        yield f"rows of object {missing}, which is not there"
+    for obj in objects.values():
+        found = sums.voxels.get(obj.id, 0)
+        if found != obj.voxels:
+            yield f"object {obj.id} ({obj.name}) has {found:,} voxels instead of {obj.voxels:,}"
+        checksum = sums.checksums.get(obj.id, RowsChecksum()).value()
+        if obj.rows_crc is not None and checksum != obj.rows_crc:
+            yield f"object {obj.id} ({obj.name}): its rows are not those that were written"
+
+
+def _is_ascending(rows: Rows, key: int, object_id: int) -> bool:
+    keys, ids = np.append(key, rows.keys), np.append(object_id, rows.ids)
+    later = (keys[1:] > keys[:-1]) | ((keys[1:] == keys[:-1]) & (ids[1:] > ids[:-1]))
+    return bool(later.all())
+
+
+class _Places:
+    """Where rows may lie: in the grid, and within the bounds of their objects."""
+
+    def __init__(self, store: Store, objects: dict[int, Object]) -> None:
+        grid = store.grid
+        self._grid, self._is_brick = grid, store.layout == "brick"
+        self._key_end = 1 << max(3 * grid.bits - row_shift(store.layout), 0)
+        self._ids = np.array(sorted(objects), dtype=np.int64)
+        boxes = [_voxel_box(grid, objects[i]) for i in self._ids.tolist()]
+        self._boxes = np.array(boxes, dtype=np.int64).reshape(-1, 2, 3)
+
+    def findings(self, rows: Rows) -> Iterator[str]:
+        """What is wrong with the places of a batch, the first row of each kind."""
+        outside = (rows.keys < 0) | (rows.keys >= self._key_end)
+        if outside.any():
+            yield f"key {int(rows.keys[outside][0])} lies outside the grid"
+        if self._is_brick:
+            yield from self._brick_findings(rows)
+        at = np.searchsorted(self._ids, rows.ids).clip(max=max(len(self._ids) - 1, 0))
+        known = ~outside & (self._ids[at] == rows.ids) if len(self._ids) else outside & False
+        low = self._voxels(rows.keys[known])
+        box = self._boxes[at[known]]
+        size = (1 << BRICK_BITS) - 1 if self._is_brick else 0
+        beside = ((low > box[:, 1]) | (low + size < box[:, 0])).any(axis=1)
+        for object_id in np.unique(rows.ids[known][beside]).tolist():
+            yield f"object {object_id}: rows of it lie outside its bounds"
+
+    def _brick_findings(self, rows: Rows) -> Iterator[str]:
+        bricks = rows.occupancy.reshape(-1, BRICK_BYTES)
+        empty = ~bricks.any(axis=1)
+        if empty.any():
+            yield f"brick {int(rows.keys[empty][0])} holds no voxel"
+        if self._grid.bits < BRICK_BITS:  # the grid is smaller than a brick: its first voxels
+            held = np.unpackbits(bricks, axis=1, bitorder="little")
+            if held[:, 1 << 3 * self._grid.bits :].any():
+                yield "a brick holds voxels outside the grid"
+
+    def _voxels(self, keys: Keys) -> NDArray[np.int64]:
+        """Lowest voxels (n, 3) of rows."""
+        grid = self._grid
+        if not self._is_brick:
+            voxels: NDArray[np.int64] = grid.decode(keys)
+            return voxels
+        level = max(grid.bits - BRICK_BITS, 0)
+        bricks: NDArray[np.int64] = curves.decode(keys, level, grid.curve_code)
+        return bricks << BRICK_BITS
+
+
+def _voxel_box(grid: Grid, obj: Object) -> NDArray[np.int64]:
+    """Lowest and highest voxel (2, 3) of an object's bounds, a voxel wider on each side."""
+    with np.errstate(invalid="ignore", over="ignore"):
+        places = (obj.bounds - np.array(grid.origin)) / grid.voxel_size
+    box: NDArray[np.int64] = np.floor(places.clip(-1.0, grid.side)).astype(np.int64)
+    box += np.array([[-1], [1]])
+    return box
+
+
+def _cause(error: DamagedError) -> str:
+    """What is between the brackets of a message: the place is the report's."""
+    text = str(error)
+    start, end = text.find("is damaged ("), text.rfind("): ")
+    return text[start + len("is damaged (") : end] if 0 <= start < end else text

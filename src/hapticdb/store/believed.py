@@ -1,0 +1,230 @@
+"""The wall between what is stored and what is believed, the same for every engine.
+
+An environment may have been damaged, or made by somebody who means harm. Whatever is read from its
+tables, but for the rows of the index, passes through here: it comes out as a value of the right
+type within its bounds, or as one DamagedError that names the place.
+"""
+
+import contextlib
+import json
+import math
+import zlib
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from typing import Any, NoReturn, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import DamagedError, GridError
+from hapticdb.grid import CurveName, Grid
+from hapticdb.store.base import LAYOUTS, Change, Histogram, Keys, Layout, Object, Rows
+
+KEY_END = 1 << 63
+ROWS_CRC = "rows_crc"
+"""Among an object's attributes as they are stored: the checksum of its rows, not the user's."""
+ACTIONS = ("add", "move", "remove")
+TABLES = ("brick", "change", "cost", "environment", "object", "quantile", "voxel")
+Floats = NDArray[np.float64]
+
+
+def damaged(url: str, cause: str) -> DamagedError:
+    """Build the error for an environment whose contents are broken."""
+    return DamagedError(f"{url} is damaged ({cause}): restore a copy or import the files again")
+
+
+class RowsChecksum:
+    """CRC-32 of an object's keys and of its bricks, over its rows in ascending order of keys."""
+
+    __slots__ = ("_bricks", "_keys")
+
+    def __init__(self) -> None:
+        self._keys = self._bricks = 0
+
+    def update(self, keys: Keys, occupancy: NDArray[np.uint8]) -> None:
+        """Go on with more rows."""
+        self._keys = zlib.crc32(np.ascontiguousarray(keys, "<i8").data, self._keys)
+        if occupancy.size:
+            self._bricks = zlib.crc32(np.ascontiguousarray(occupancy).data, self._bricks)
+
+    def value(self) -> int:
+        """The checksum of all rows so far."""
+        return self._keys << 32 | self._bricks
+
+
+def rows_crc(rows: Rows) -> int:
+    """Checksum of all rows of an object."""
+    checksum = RowsChecksum()
+    checksum.update(rows.keys, rows.occupancy)
+    return checksum.value()
+
+
+def attributes_text(record: Object, rows: Rows) -> str:
+    """An object's attributes as they are stored, with the checksum of the rows stored beside."""
+    kept = {**record.attributes, ROWS_CRC: f"{rows_crc(rows):016x}"}
+    return json.dumps(kept, sort_keys=True)
+
+
+def grid_of(url: str, rows: Sequence[Sequence[Any]]) -> tuple[Grid, Layout]:
+    """Grid and layout, from (voxel_size, x, y, z, bits, curve, layout) of `environment`."""
+    if len(rows) != 1:
+        raise damaged(url, "no grid" if not rows else f"{len(rows)} grids")
+    size, x, y, z, bits, curve, layout = rows[0][:7]
+    if layout not in LAYOUTS:
+        raise damaged(url, f"no grid of layout {layout!r:.40}")
+    if layout == "brick" and curve == "lexicographic":
+        raise damaged(url, "bricks in lexicographic order")
+    if type(bits) is not int or not all(type(a) in {int, float} for a in (size, x, y, z)):
+        raise damaged(url, "a grid that is no numbers")
+    try:
+        return Grid(size, (x, y, z), bits, cast("CurveName", curve)), cast("Layout", layout)
+    except (GridError, TypeError, OverflowError) as error:
+        raise damaged(url, f"a grid that cannot be: {error}") from error
+
+
+def check_tables(url: str, kinds: Mapping[str, str]) -> None:
+    """Refuse what is no table where one belongs: a view answers what it likes.
+
+    `kinds` : by name, ``table`` or what it is instead.
+    """
+    for name in TABLES:
+        kind = kinds.get(name)
+        if kind is None:
+            raise damaged(url, f"no such table: {name}")
+        if kind != "table":
+            raise damaged(url, f"{name} is a {kind} and no table")
+
+
+def object_of(url: str, row: Sequence[Any]) -> Object:
+    """Read an object: id, name, link, digest, transform, voxels, bounds, attributes, revision.
+
+    Doubles come as bytes, little-endian, or as a list.
+    """
+    object_id, name, link, digest, transform, voxels, bounds, attributes, revision = row
+
+    def refuse(what: str) -> NoReturn:
+        raise damaged(url, f"object {object_id!s:.40}: {what}")
+
+    if not _is_count(object_id) or object_id < 1:
+        refuse("its id is no number above 0")
+    if not all(isinstance(text, str) for text in (name, link, digest)):
+        refuse("its name, link or digest is no text")
+    if not _is_count(voxels) or not _is_count(revision):
+        refuse("its voxels or its revision is no count")
+    placed = _doubles(transform, 16)
+    if placed is None:
+        refuse("its transform is no 16 finite numbers")
+    corners = _doubles(bounds, 6)
+    if corners is None or (corners[:3] > corners[3:]).any():
+        refuse("its bounds are no box")
+    known = _json_of(attributes)
+    if known is None:
+        refuse("its attributes are no JSON object")
+    return Object(
+        id=object_id,
+        name=name,
+        link=link,
+        digest=digest,
+        transform=placed.reshape(4, 4),
+        voxels=voxels,
+        bounds=corners.reshape(2, 3),
+        attributes={key: value for key, value in known.items() if key != ROWS_CRC},
+        revision=revision,
+        rows_crc=_crc_of(known.get(ROWS_CRC)),
+    )
+
+
+def change_of(url: str, row: Sequence[Any]) -> Change:
+    """Read a committed write from (revision, action, id, ranges); ranges as bytes or as a list."""
+    revision, action, object_id, ranges = row
+    place = f"change {revision!s:.40}"
+    if not _is_count(revision) or not _is_count(object_id) or action not in ACTIONS:
+        raise damaged(url, f"{place}: its number, action or object is none")
+    pairs = _int64s(ranges)
+    if pairs is None or len(pairs) % 2 or (np.diff(pairs) < 0).any() or (pairs < 0).any():
+        raise damaged(url, f"{place}: its ranges are no ascending pairs of keys")
+    return Change(revision, action, object_id, pairs.reshape(-1, 2))
+
+
+def histogram_of(url: str, bounds: object, n_rows: object) -> Histogram:
+    """Read a kept histogram; bounds as bytes or as a list."""
+    keys = _int64s(bounds)
+    if keys is None or len(keys) < 2 or (np.diff(keys) < 0).any() or not _is_count(n_rows):
+        raise damaged(url, "kept statistics that are no ascending keys; 'hapticdb analyze' renews")
+    return Histogram(keys, cast("int", n_rows), "kept")
+
+
+def figures_of(url: str, text: object) -> Mapping[str, float]:
+    """Read the kept figures of a cost model: finite numbers by name."""
+    figures = _json_of(text)
+    if figures is None or not all(_is_finite(value) for value in figures.values()):
+        raise damaged(url, "kept costs that are no numbers; 'hapticdb calibrate' renews")
+    return cast("Mapping[str, float]", figures)
+
+
+def findings_of_kept(
+    url: str, histograms: Iterable[Sequence[Any]], costs: Iterable[Sequence[Any]]
+) -> Iterator[str]:
+    """What is wrong with kept histograms (bounds, n_rows) and cost figures (text,)."""
+    for row in histograms:
+        with contextlib.suppress(DamagedError):
+            histogram_of(url, *row)
+            continue
+        yield "kept statistics are no ascending keys; 'hapticdb analyze' renews them"
+    for row in costs:
+        with contextlib.suppress(DamagedError):
+            figures_of(url, *row)
+            continue
+        yield "kept costs are no numbers; 'hapticdb calibrate' renews them"
+
+
+def number_of(url: str, value: object, what: str) -> int:
+    """Read a count, such as a revision."""
+    if not _is_count(value):
+        raise damaged(url, f"{what} is no count")
+    return cast("int", value)
+
+
+def _is_count(value: object) -> bool:
+    return type(value) is int and 0 <= value < KEY_END
+
+
+def _is_finite(value: object) -> bool:
+    return type(value) in {int, float} and math.isfinite(cast("float", value))
+
+
+def _doubles(stored: object, count: int) -> Floats | None:
+    """That many finite float64, from bytes or a list of numbers; None when they are not."""
+    if isinstance(stored, bytes) and len(stored) == 8 * count:
+        found = np.frombuffer(stored, dtype="<f8")
+    elif isinstance(stored, list) and all(_is_finite(value) for value in stored):
+        found = np.array(stored, dtype=np.float64)
+    else:
+        return None
+    return found if len(found) == count and np.isfinite(found).all() else None
+
+
+def _int64s(stored: object) -> Keys | None:
+    """Int64s from bytes or a list of numbers; None when they are none."""
+    if isinstance(stored, bytes) and len(stored) % 8 == 0:
+        return np.frombuffer(stored, dtype="<i8").astype(np.int64)
+    if isinstance(stored, list) and all(type(value) is int for value in stored):
+        return np.array(stored, dtype=np.int64)
+    return None
+
+
+def _json_of(stored: object) -> dict[str, Any] | None:
+    """A JSON object, or None when it is none."""
+    if not isinstance(stored, str):
+        return None
+    try:
+        found = json.loads(stored)
+    except (ValueError, RecursionError):
+        return None
+    return found if isinstance(found, dict) else None
+
+
+def _crc_of(stored: object) -> int | None:
+    try:
+        return int(stored, 16) if isinstance(stored, str) and len(stored) == 16 else None
+    except ValueError:
+        return None

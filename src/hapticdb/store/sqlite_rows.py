@@ -1,0 +1,55 @@
+"""Rows and objects as the binding hands them over, and as it takes them."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.store import believed
+from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, NO_ROWS, Object, Rows
+
+KINDS = """
+SELECT name, CASE WHEN sql LIKE 'CREATE VIRTUAL%' THEN 'virtual table' ELSE type END
+  FROM sqlite_master"""
+
+
+def rows_of(url: str, found: list[Any], *, has_bricks: bool) -> Rows:
+    """Rows from what a statement returned: (key, id), or (key, id, occupancy)."""
+    if not found:
+        return NO_ROWS
+    if not has_bricks:
+        pairs = pairs_of(url, found)
+        return Rows(pairs[:, 0].copy(), pairs[:, 1].copy(), NO_OCCUPANCY)
+    keys, ids, bricks = zip(*found, strict=True)
+    count = len(keys)
+    try:
+        joined = b"".join(bricks)
+        rows = Rows(
+            np.fromiter(keys, np.int64, count),
+            np.fromiter(ids, np.int64, count),
+            np.frombuffer(joined, np.uint8),
+        )
+    except (TypeError, ValueError, OverflowError) as error:
+        raise believed.damaged(url, f"a row of another kind: {error}") from error
+    if len(joined) != BRICK_BYTES * count:
+        raise believed.damaged(url, "a brick of the wrong length")
+    return rows
+
+
+def pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:
+    """Pairs (n, 2) of whole numbers that a statement returned."""
+    try:
+        return np.array(found, dtype=np.int64).reshape(-1, 2)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise believed.damaged(url, f"a row of another kind: {error}") from error
+
+
+def contents(record: Object, rows: Rows) -> tuple[Any, ...]:
+    """Bindings of an object's columns from digest to attributes."""
+    return (
+        record.digest,
+        np.ascontiguousarray(record.transform, dtype="<f8").tobytes(),
+        int(record.voxels),
+        np.ascontiguousarray(record.bounds, dtype="<f8").tobytes(),
+        believed.attributes_text(record, rows),
+    )

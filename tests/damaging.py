@@ -1,0 +1,345 @@
+"""Damage to copies of small environments, and what is answered then: run it, or see test_damaged.
+
+Each case takes one environment, damages a copy of it, and asks the copy all that a user asks: to
+open it, its facts, its objects, touches by every strategy, and `check`. Run it for many cases:
+
+    python tests/damaging.py 10000 --seed 0
+"""
+
+import argparse
+import json
+import resource
+import shutil
+import signal
+import sys
+import tempfile
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterator
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Grid, PointShell
+from hapticdb.grid import CurveName
+from hapticdb.query import STRATEGIES, Strategy
+from hapticdb.store.base import Layout
+from hapticdb.store.sqlite_pages import PAGE_BYTES
+from hapticdb.testing import KINDS, write_voxels
+
+PLACES: tuple[tuple[tuple[float, float, float], tuple[Strategy, ...]], ...] = (
+    ((0.03, 0.03, 0.03), STRATEGIES),
+    ((0.045, 0.02, 0.04), ("array", "cbgroup")),
+    ((0.015, 0.04, 0.045), ("maxgap",)),
+)
+"""Where tools are, metres, and how the database is asked there."""
+LIMIT_S = 30
+MEMORY_BYTES = 4 << 30
+"""Of address space, most of which a process with numba takes before it begins."""
+Content = dict[str, bytes]
+"""Files by what follows the environment's path: "" and "-wal"."""
+
+
+class Sample(NamedTuple):
+    """An environment to damage: its files, what it answers, and what it answered before."""
+
+    name: str
+    content: Content
+    other: bytes
+    truths: list[str]
+
+
+class Outcome(NamedTuple):
+    """What came of a case: of reading and of check, each right, told, silent or worse."""
+
+    damage: str
+    sample: str
+    read: str
+    check: str
+    words: str
+
+
+# -- what is asked -------------------------------------------------------------------------------
+
+
+def answers(path: Path) -> str:
+    """All that a user sees of an environment, as text; raises what is told."""
+    shell = PointShell.sphere(0.012, 60)
+    with hapticdb.open(path, read_only=True) as env:
+        told: list[Any] = [env.layout, env.grid.describe(), env.size().rows]
+        told += [(o.id, o.name, o.voxels, o.bounds.tolist(), o.revision) for o in env.objects()]
+        for place, strategies in PLACES:
+            pose = np.eye(4)
+            pose[:3, 3] = place
+            for strategy in strategies:
+                touch = env.touch(shell, pose, strategy)
+                told.append((touch.force.tolist(), touch.torque.tolist(), touch.pairs.tolist()))
+        for obj in env.objects():
+            told.append(int(env.voxels(obj.id).sum()))
+    return json.dumps(told)
+
+
+def made(folder: Path, layout: Layout, curve: CurveName, *, in_log: bool) -> Sample:
+    """An environment of three objects, in its file alone or with the last ones in its log."""
+    grid = Grid(0.001, (0, 0, 0), 6, curve)
+    path = folder / f"{layout}-{curve}-{'log' if in_log else 'file'}.db"
+    other = folder / f"other-{path.name}"
+    with hapticdb.create(other, grid, layout=layout) as env:
+        for name in "abc":
+            write_voxels(env.store, _lump(ord(name)), name)
+    truths: list[str] = []
+    with hapticdb.create(path, grid, layout=layout) as env:
+        write_voxels(env.store, _lump(1), "a")
+        write_voxels(env.store, _lump(2), "b")
+        env.analyze()
+        env.calibrate()
+    truths.append(answers(path))
+    env = hapticdb.open(path)
+    for number, name in ((3, "c"), (4, "d")):
+        write_voxels(env.store, _lump(number), name)
+        truths.append(answers(path))
+    content = _files(path) if in_log else {}
+    env.close()
+    return Sample(path.stem, content or _files(path), other.read_bytes(), truths)
+
+
+def _lump(seed: int) -> NDArray[np.int64]:
+    rng = np.random.default_rng(seed)
+    low = rng.integers(0, 30, 3)
+    ijk = np.argwhere(np.ones((24, 24, 24), bool)) + low
+    return ijk[rng.random(len(ijk)) < 0.4]
+
+
+def _files(path: Path) -> Content:
+    log = Path(f"{path}-wal")
+    return {"": path.read_bytes()} | ({"-wal": log.read_bytes()} if log.exists() else {})
+
+
+# -- how it is damaged ---------------------------------------------------------------------------
+
+
+def _pages(content: bytes | bytearray) -> int:
+    return len(content) // PAGE_BYTES
+
+
+def _page(number: int) -> slice:
+    return slice(number * PAGE_BYTES, (number + 1) * PAGE_BYTES)
+
+
+def _bit(data: bytearray, _: Sample, rng: np.random.Generator) -> None:
+    data[rng.integers(len(data))] ^= 1 << rng.integers(8)
+
+
+def _run(data: bytearray, _: Sample, rng: np.random.Generator) -> None:
+    start, length = int(rng.integers(len(data))), int(rng.integers(1, 600))
+    part = data[start : start + length]
+    data[start : start + length] = rng.bytes(len(part))
+
+
+def _zeroed_run(data: bytearray, _: Sample, rng: np.random.Generator) -> None:
+    start, length = int(rng.integers(len(data))), int(rng.integers(1, 600))
+    part = data[start : start + length]
+    data[start : start + length] = bytes(len(part))
+
+
+def _zeroed_page(data: bytearray, _: Sample, rng: np.random.Generator) -> None:
+    data[_page(int(rng.integers(_pages(data))))] = bytes(PAGE_BYTES)
+
+
+def _swapped(data: bytearray, _: Sample, rng: np.random.Generator) -> None:
+    a, b = rng.choice(np.arange(1, _pages(data)), 2, replace=False).tolist()
+    data[_page(a)], data[_page(b)] = data[_page(b)], data[_page(a)]
+
+
+def _duplicated(data: bytearray, _: Sample, rng: np.random.Generator) -> None:
+    a, b = rng.choice(np.arange(1, _pages(data)), 2, replace=False).tolist()
+    data[_page(a)] = data[_page(b)]
+
+
+def _foreign(data: bytearray, sample: Sample, rng: np.random.Generator) -> None:
+    number = int(rng.integers(1, min(_pages(data), _pages(sample.other))))
+    data[_page(number)] = sample.other[_page(number)]
+
+
+def _truncated(data: bytearray, _: Sample, rng: np.random.Generator) -> None:
+    del data[int(rng.integers(len(data))) :]
+
+
+def _missing_pages(data: bytearray, _: Sample, rng: np.random.Generator) -> None:
+    del data[int(rng.integers(1, _pages(data))) * PAGE_BYTES :]
+
+
+DAMAGES: dict[str, Callable[[bytearray, Sample, np.random.Generator], None]] = {
+    "flipped bit": _bit,
+    "noise": _run,
+    "zeroed bytes": _zeroed_run,
+    "zeroed page": _zeroed_page,
+    "swapped pages": _swapped,
+    "duplicated page": _duplicated,
+    "page of another environment": _foreign,
+    "cut at a byte": _truncated,
+    "cut at a page": _missing_pages,
+}
+OF_LOGS = ("flipped bit", "noise", "zeroed bytes", "cut at a byte")
+
+
+def damage(sample: Sample, path: Path, rng: np.random.Generator) -> str:
+    """Write a damaged copy; returns what was done to it."""
+    content = dict(sample.content)
+    part = "-wal" if "-wal" in content and rng.random() < 0.5 else ""
+    kinds = OF_LOGS if part else tuple(DAMAGES)
+    kind = kinds[rng.integers(len(kinds))]
+    data = bytearray(content[part])
+    while data == content[part]:
+        DAMAGES[kind](data, sample, rng)
+    content[part] = bytes(data)
+    for suffix in ("", "-wal", "-shm"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
+    for suffix, written in content.items():
+        Path(f"{path}{suffix}").write_bytes(written)
+    return f"{kind}{' of the log' if part else ''}"
+
+
+# -- what comes of it ----------------------------------------------------------------------------
+
+
+def _reading(sample: Sample, path: Path) -> tuple[str, str]:
+    try:
+        answer = answers(path)
+    except hapticdb.HapticDBError as error:
+        return ("told", "") if "\n" not in str(error) else ("traceback", str(error))
+    except Exception:  # noqa: BLE001 - that is what is looked for
+        return "traceback", traceback.format_exc()
+    if answer == sample.truths[-1]:
+        return "right", ""
+    return ("earlier" if answer in sample.truths else "silent"), ""
+
+
+def _work(samples: list[Sample], folder: str, pipe: Connection) -> None:
+    """Child process: damage and judge case after case."""
+    resource.setrlimit(resource.RLIMIT_AS, (MEMORY_BYTES, MEMORY_BYTES))
+    path = Path(folder) / "e.db"
+    pipe.send(None)
+    while (case := pipe.recv()) is not None:
+        rng = np.random.default_rng(case)
+        sample = samples[int(rng.integers(len(samples)))]
+        kind = damage(sample, path, rng)
+        # check looks before anything is opened, as a user would who mistrusts the file
+        copy = Path(folder) / "checked.db"
+        for suffix in ("", "-wal", "-shm"):
+            Path(f"{copy}{suffix}").unlink(missing_ok=True)
+            if Path(f"{path}{suffix}").exists():
+                shutil.copyfile(f"{path}{suffix}", f"{copy}{suffix}")
+        pipe.send((kind, sample.name))
+        read, words = _reading(sample, path)
+        check, more = _checked(copy)
+        pipe.send(Outcome(kind, sample.name, read, check, words or more))
+
+
+def _checked(path: Path) -> tuple[str, str]:
+    try:
+        report = hapticdb.check_environment(path)
+    except hapticdb.HapticDBError:
+        return "found", ""
+    except Exception:  # noqa: BLE001 - that is what is looked for
+        return "traceback", traceback.format_exc()
+    return ("sound" if report.is_sound else "found"), ""
+
+
+def samples_in(folder: Path) -> list[Sample]:
+    """Both layouts on every curve, each in its file alone and with a log."""
+    return [
+        made(folder, layout, curve, in_log=in_log)
+        for layout, curve in KINDS
+        for in_log in (False, True)
+    ]
+
+
+def outcomes(samples: list[Sample], folder: Path, cases: range, seed: int) -> Iterator[Outcome]:
+    """One outcome a case; a child that hangs or dies is one, too, and another goes on."""
+    context = get_context("forkserver")
+    left = list(cases)
+    while left:
+        ours, theirs = context.Pipe()
+        child = context.Process(target=_work, args=(samples, str(folder), theirs))
+        child.start()
+        theirs.close()
+        kind = name = ""
+        try:
+            _received(ours)
+            while left:
+                ours.send([seed, left[0]])
+                kind, name = _received(ours)
+                yield _received(ours)
+                left.pop(0)
+            ours.send(None)
+        except TimeoutError:
+            yield Outcome(kind, name, "hang", "hang", f"case {left.pop(0)}")
+        except EOFError:
+            yield Outcome(kind, name, "crash", "crash", f"case {left.pop(0)}")
+        finally:
+            child.join(5)
+            child.kill()
+            child.join(5)
+
+
+def _received(pipe: Connection) -> Any:  # noqa: ANN401 - what the child sent
+    if not pipe.poll(LIMIT_S):
+        raise TimeoutError
+    return pipe.recv()
+
+
+_is_stopped: list[bool] = []
+
+
+def _stop(*_: object) -> None:
+    """Print what came of the cases so far: a handler."""
+    _is_stopped.append(True)
+
+
+def main() -> int:
+    """Run many cases and print what came of them; 1 when one was silent or worse."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("cases", type=int)
+    parser.add_argument("--seed", type=int, default=0)
+    args = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        samples = samples_in(Path(folder))
+        counts: Counter[tuple[str, str, str, str]] = Counter()
+        bad = 0
+        signal.signal(signal.SIGTERM, _stop)
+        for found in outcomes(samples, Path(folder), range(args.cases), args.seed):
+            if _is_stopped:
+                break
+            counts[found.sample.split("-")[0], found.damage, found.read, found.check] += 1
+            if found.read in WRONG or found.check in WRONG or is_missed(found):
+                bad += 1
+                last_line = found.words.strip().rpartition("\n")[2]
+                sys.stderr.write(" ".join([*found[:4], last_line]) + "\n")
+    for line, count in sorted(counts.items()):
+        sys.stdout.write("\t".join([f"{count:6}", *line]) + "\n")
+    for which in (2, 3):
+        totals: Counter[str] = Counter()
+        for line, count in counts.items():
+            totals[line[which]] += count
+        sys.stdout.write(f"{('reading', 'check')[which - 2]} {dict(totals)}\n")
+    return int(bad > 0)
+
+
+WRONG = ("silent", "traceback", "hang", "crash")
+
+
+def is_missed(found: Outcome) -> bool:
+    """Whether check calls sound what is not: all but ends of files that hold nothing needed."""
+    may_end = found.damage.startswith("cut") or found.damage.endswith("of the log")
+    harmless = found.read == "right" or (found.read == "earlier" and may_end)
+    return found.check == "sound" and not (may_end and harmless)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

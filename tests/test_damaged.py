@@ -1,0 +1,17 @@
+"""A short run of `damaging`: no damaged environment answers wrongly, and `check` finds each."""
+
+from pathlib import Path
+
+import pytest
+
+from damaging import WRONG, is_missed, outcomes, samples_in
+
+
+@pytest.mark.parametrize(
+    "cases", [40, pytest.param(1000, marks=pytest.mark.long)], ids=["short", "long"]
+)
+def test_damage_is_told_or_harmless_and_found_by_check(tmp_path: Path, cases: int) -> None:
+    found = list(outcomes(samples_in(tmp_path), tmp_path, range(cases), seed=1))
+    assert len(found) == cases
+    assert [o for o in found if o.read in WRONG or o.check in WRONG or is_missed(o)] == []
+    assert {o.read for o in found} >= {"told", "right"}

@@ -184,6 +184,8 @@ def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
             "present",
             "restored",
             "kept_removed",
+            "replaced",
+            "dropped",
             "voxels",
             "is_unit_assumed",
             "defects",

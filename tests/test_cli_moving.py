@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import hapticdb
+from assemblies import voxel_set
 from children import PATIENCE, child
 from command_line import (  # noqa: F401 - fixtures among them
     Run,
@@ -78,7 +79,7 @@ def test_other_ids_are_told(run: Run, scene: Path) -> None:
     assert out.endswith("; 1 under another id, since their own was taken\n")
     code, out, _ = run("diff", scene, "b.db")
     assert code == 1
-    assert out.splitlines()[0] == "only in b.db: object 2 (x) of made"
+    assert out.splitlines()[2].split() == ["2", "x", "only", "in", "B", "1", "made"]
 
 
 def test_copy_json_has_the_documented_keys(run: Run, scene: Path) -> None:
@@ -134,17 +135,30 @@ def test_differences_are_told_a_line_each(run: Run, scene: Path) -> None:
         link = env.object(1).link
     code, out, err = run("diff", scene, "b.db")
     assert (code, err) == (1, "")
-    assert out.splitlines() == [
-        f"only in {scene}: object 3 (box2) of {link}",
-        f"another place: object 2 (box1) of {link}",
-        "2 differences",
-    ]
+    head, _, gone, moved, sides, total = out.splitlines()
+    assert head.split()[:2] == ["id", "name"]
+    with hapticdb.open(scene) as env, hapticdb.open("b.db") as other:
+        before, after = voxel_set(env.voxels(2)), voxel_set(other.voxels(2))
+        n_gone, n_same = env.object(3).voxels, env.object(1).voxels
+    shared = len(before & after)
+    assert gone.split() == ["3", "box2", "only", "in", "A", str(n_gone), link]
+    counts = (str(len(before - after)), str(len(after - before)))
+    share = f"{100 * shared / len(before | after):.3g}"
+    assert moved.split()[:8] == ["2", "box1", "another", "place", *counts, share, "%"]
+    assert "10 mm (0.8 voxels)" in moved
+    assert sides == f"A: {scene}; B: b.db"
+    assert total.startswith(f"2 differences; {n_gone + len(before - after):,} voxels only in A, ")
+    assert f"{n_same + shared:,} voxels shared" in total
     code, out, _ = run("diff", scene, "b.db", "--json")
     found = json.loads(out)
     assert code == 1
     assert (found["equal"], found["same_grid"], found["objects_compared"]) == (False, True, 1)
-    assert found["only_in_a"] == [{"id": 3, "name": "box2", "link": link}]
-    assert found["moved"] == [{"id": 2, "name": "box1", "link": link}]
+    assert found["only_in_a"] == [{"id": 3, "name": "box2", "link": link, "voxels": n_gone}]
+    (record,) = found["moved"]
+    assert (record["id"], record["shared"]) == (2, shared)
+    np.testing.assert_allclose(record["moved_by"], [0, 0, 0.01], atol=1e-12)
+    assert record["farthest_corner_voxels"] == pytest.approx(0.8)
+    assert found["totals"]["shared"] == n_same + shared
     assert found["only_in_b"] == found["changed"] == found["voxels"] == []
 
 
@@ -159,10 +173,9 @@ def test_voxels_that_differ_are_counted(run: Run, tmp_path: Path) -> None:
             assert obj == 1
     code, out, _ = run("diff", "a.db", "b.db")
     assert code == 1
-    assert out.splitlines() == [
-        "other voxels: object 1 (voxels): 2 only in a.db, 3 only in b.db",
-        "1 difference",
-    ]
+    _, _, row, _, total = out.splitlines()
+    assert row.split()[:6] == ["1", "voxels", "other", "voxels", "2", "3"]
+    assert total.startswith("1 difference; 2 voxels only in A, 3 voxels only in B, ")
 
 
 def test_many_differences_are_cut_and_counted(run: Run, scene: Path) -> None:
@@ -173,8 +186,9 @@ def test_many_differences_are_cut_and_counted(run: Run, scene: Path) -> None:
     code, out, _ = run("diff", scene, "b.db")
     lines = out.splitlines()
     assert code == 1
-    assert len(lines) == moving.MOST_LINES + 1
-    assert lines[-1] == f"{2 * moving.MOST_LINES} differences, {moving.MOST_LINES} of them shown"
+    assert len(lines) == moving.MOST_LINES + 4
+    cut = f"{2 * moving.MOST_LINES} differences, {moving.MOST_LINES} of them shown; "
+    assert lines[-1].startswith(cut)
 
 
 def test_other_grids_are_a_difference(run: Run, scene: Path) -> None:

@@ -78,7 +78,7 @@ def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
     assert list(found) == [
         "comes_out", "verdict", "poses", "samples", "hits", "contacts", "first_hit",
         "first_contact", "deepest", "objects", "hit_intervals", "contact_intervals", "clearance",
-        "tool", "revision", "elapsed", "cells",
+        "tool", "revision", "elapsed", "cells", "proportions",
     ]  # fmt: skip
     assert list(found["first_contact"]) == ["sample", "fraction", "segment", "pose", "objects"]
     assert list(found["deepest"]) == ["depth", "point", "moment"]
@@ -172,10 +172,9 @@ def test_a_path_beside_the_environment_is_told(
 ) -> None:
     poses(scene.parent / "mm.csv", place, (place[0] + 0.1, *place[1:]))
     code, out, err = run("sweep", scene, *TOOL, "--path", "mm.csv")
-    assert (code, out.startswith("comes out: ")) == (0, True)
+    assert (code, out.startswith("comes out: ")) == (3, True)
     (line,) = err.splitlines()
-    assert line.startswith("hapticdb: mm.csv: all of it is outside of the environment, which is")
-    assert line.endswith("are these poses in metres?")
+    assert line.startswith("hapticdb: the path never comes within ")
 
 
 def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:

@@ -169,7 +169,7 @@ def test_touch_json_has_a_line_a_pose(run: Run, scene: Scene) -> None:
     assert (code, err) == (0, "")
     found = [json.loads(line) for line in out.splitlines()]
     assert [frame["pose"] for frame in found] == [0, 1, 2]
-    keys = ["pose", "force", "torque", "hits", "contacts", "objects", "query"]
+    keys = ["pose", "force", "torque", "hits", "contacts", "objects", "query", "misfits"]
     assert all(list(frame) == keys for frame in found)
     asked = ["strategy", "statements", "ranges", "rows", "elapsed_us"]
     assert all(list(frame["query"]) == asked for frame in found)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 import hapticdb
 from assemblies import placement, voxel_set
 from hapticdb import Environment, Grid, diff_environments, transfer
+from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
 from hapticdb.layout import rows_of_voxels
 from hapticdb.store.base import Layout
@@ -61,6 +62,13 @@ def test_every_voxel_that_differs_is_counted(
         assert found.is_equal == (in_a == in_b)
         assert [(v.a.id, v.only_in_a, v.only_in_b) for v in found.voxels] == (
             [] if in_a == in_b else [(2, len(in_a - in_b), len(in_b - in_a))]
+        )
+        assert [v.shared for v in found.voxels] == ([] if in_a == in_b else [len(in_a & in_b)])
+        assert found.totals == (
+            len(in_a - in_b),
+            len(in_b - in_a),
+            len(every) + len(in_a & in_b),
+            int(in_a != in_b),
         )
         assert found.compared == 2
 
@@ -115,6 +123,11 @@ def test_parts_are_told_apart_by_what_differs(tmp_path: Path) -> None:
     assert (found.voxels, found.compared) == ((), 3)
     assert not found.is_equal
     assert found.n_voxels == 3 * len(ijk)
+    assert [(one.a.name, one.only_in_a, one.shared) for one in found.elsewhere] == [
+        ("changed", 0, len(ijk)),
+        ("moved", 0, len(ijk)),
+    ]
+    assert found.totals == (len(ijk), 2 * len(ijk), 5 * len(ijk), 5)
 
 
 def test_ids_and_attributes_are_felt_by_nobody(tmp_path: Path) -> None:
@@ -132,3 +145,33 @@ def test_an_environment_equals_itself(tmp_path: Path) -> None:
     with make(tmp_path / "a.db") as env:
         write(env, blob(1, PLACE), "part")
     assert diff_environments(tmp_path / "a.db", tmp_path / "a.db").is_equal
+
+
+def test_how_far_a_part_has_moved_is_told(tmp_path: Path) -> None:
+    """In metres, by its bounding box, and by the voxels that it left and took."""
+    ijk = blob(1, PLACE)
+    shift = np.array([3, 0, -2])
+    for name, voxels, transform in (
+        ("a", ijk, placement(0, 0, 0)),
+        ("b", ijk + shift, placement(0.03, 0, -0.02)),
+    ):
+        with make(tmp_path / f"{name}.db") as env:
+            write(env, voxels, "part", transform=transform)
+    found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
+    ((a, b),) = found.moved
+    np.testing.assert_allclose(moved_by(a, b), 0.01 * shift, atol=1e-12)
+    assert farthest_corner(a, b) == pytest.approx(0.01 * 13**0.5)
+    (one,) = found.elsewhere
+    here, there = voxel_set(ijk), voxel_set(ijk + shift)
+    assert one[2:] == (len(here - there), len(there - here), len(here & there))
+    assert one.share == pytest.approx(len(here & there) / len(here | there))
+    assert found.voxels == ()
+
+
+def test_other_grids_have_no_totals(tmp_path: Path) -> None:
+    for name, bits in (("a", 5), ("b", 6)):
+        with make(tmp_path / f"{name}.db", bits=bits) as env:
+            write(env, blob(1, PLACE), "part", digest=name)
+    found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
+    assert (found.totals, found.elsewhere) == (None, ())
+    assert len(found.changed) == 1

@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from hapticdb.pointshell import PointShell
     from hapticdb.pool import Pool
     from hapticdb.poses import read_poses, write_poses
+    from hapticdb.proportions import Proportions, compare_proportions
     from hapticdb.query import Query
     from hapticdb.realtime.coupling import Coupling
     from hapticdb.realtime.handle import Handle
@@ -92,6 +93,7 @@ __all__ = [
     "OutsideGridError",
     "PointShell",
     "Pool",
+    "Proportions",
     "QuantileVector",
     "Query",
     "ReadOnlyError",
@@ -108,6 +110,7 @@ __all__ = [
     "UsageError",
     "backup_environment",
     "check_environment",
+    "compare_proportions",
     "copy_environment",
     "create",
     "diff_environments",
@@ -139,6 +142,7 @@ _HOMES = {
     "pointshell": "PointShell",
     "pool": "Pool",
     "poses": "read_poses write_poses",
+    "proportions": "Proportions compare_proportions",
     "query": "Query",
     "realtime.coupling": "Coupling",
     "realtime.handle": "Handle",

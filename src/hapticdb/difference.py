@@ -31,12 +31,41 @@ BRICK_EDGE = 1 << BRICK_BITS
 
 
 class VoxelDifference(NamedTuple):
-    """An object that is the same part at the same place, of other voxels: how many each lacks."""
+    """One part in both environments: voxels that only one of them has, and those of both."""
 
     a: Object
     b: Object
     only_in_a: int
     only_in_b: int
+    shared: int
+
+    @property
+    def share(self) -> float:
+        """Share of all voxels of either that both have, 0 .. 1; 1 without any."""
+        total = self.only_in_a + self.only_in_b + self.shared
+        return self.shared / total if total else 1.0
+
+
+class Totals(NamedTuple):
+    """Voxels of all objects that only a has, only b, and both; of two objects in one, both count.
+
+    n_changed : objects that only one has, or that both have otherwise.
+    """
+
+    only_in_a: int
+    only_in_b: int
+    shared: int
+    n_changed: int
+
+
+def moved_by(a: Object, b: Object) -> NDArray[np.float64]:
+    """Metres (3,) from the middle of an object's bounding box to that of the other."""
+    return np.asarray(b.bounds.mean(axis=0) - a.bounds.mean(axis=0))
+
+
+def farthest_corner(a: Object, b: Object) -> float:
+    """Metres by which a corner of the bounding box has moved at most: more, where it has turned."""
+    return float(np.linalg.norm(np.abs(b.bounds - a.bounds).max(axis=0)))
 
 
 @dataclass(frozen=True)
@@ -57,11 +86,16 @@ class Difference:
         The same geometry in another place (`transform`).
     voxels : tuple of VoxelDifference
         The same geometry at the same place, of other voxels.
+    elsewhere : tuple of VoxelDifference
+        The voxels of those that are changed or moved; empty where the grids are not the same.
     renumbered, described : tuple of pairs of Object
         The same part with another id, or with other attributes or another bounding box:
         differences that nobody feels.
     compared, n_voxels : int
-        Objects whose voxels were compared, and those voxels.
+        Objects of the same geometry at the same place, whose voxels were compared, and those
+        voxels.
+    n_shared : int
+        Voxels, of all objects that were compared, which both have.
     """
 
     a: str
@@ -72,15 +106,31 @@ class Difference:
     changed: tuple[Pair, ...]
     moved: tuple[Pair, ...]
     voxels: tuple[VoxelDifference, ...]
+    elsewhere: tuple[VoxelDifference, ...]
     renumbered: tuple[Pair, ...]
     described: tuple[Pair, ...]
     compared: int
     n_voxels: int
+    n_shared: int
 
     @property
     def is_same_grid(self) -> bool:
         """Whether both divide space into the same voxels; their order may differ."""
         return is_same_grid(*self.grids)
+
+    @property
+    def totals(self) -> Totals | None:
+        """By how much they differ in all; None where the grids are not the same."""
+        if not self.is_same_grid:
+            return None
+        both = (*self.voxels, *self.elsewhere)
+        lone = [sum(obj.voxels for obj in objects) for objects in (self.only_in_a, self.only_in_b)]
+        return Totals(
+            lone[0] + sum(one.only_in_a for one in both),
+            lone[1] + sum(one.only_in_b for one in both),
+            self.n_shared,
+            len(self.only_in_a) + len(self.only_in_b) + len(both),
+        )
 
     @property
     def is_equal(self) -> bool:
@@ -119,22 +169,27 @@ def diff_environments(
         both = [(obj, in_b[part]) for part, obj in in_a.items() if part in in_b]
         same = [pair for pair in both if pair[0].digest == pair[1].digest]
         moved = [pair for pair in same if (pair[0].transform != pair[1].transform).any()]
+        changed = [pair for pair in both if pair[0].digest != pair[1].digest]
         still = [pair for pair in same if (pair[0].transform == pair[1].transform).all()]
-        compared = still if is_same_grid(a.grid, b.grid) else []
-        voxels = _differing_voxels(a, b, compared, progress)
+        is_alike = is_same_grid(a.grid, b.grid)
+        compared = still if is_alike else []
+        found = _compared(a, b, [*compared, *(changed + moved if is_alike else [])], progress)
+        voxels, elsewhere = found[: len(compared)], found[len(compared) :]
         return Difference(
             a=a.url,
             b=b.url,
             grids=(a.grid, b.grid),
             only_in_a=tuple(obj for part, obj in in_a.items() if part not in in_b),
             only_in_b=tuple(obj for part, obj in in_b.items() if part not in in_a),
-            changed=tuple(pair for pair in both if pair[0].digest != pair[1].digest),
+            changed=tuple(changed),
             moved=tuple(moved),
-            voxels=tuple(voxels),
+            voxels=tuple(one for one in voxels if one.only_in_a or one.only_in_b),
+            elsewhere=tuple(elsewhere),
             renumbered=tuple(pair for pair in both if pair[0].id != pair[1].id),
             described=tuple(pair for pair in both if _is_described_otherwise(*pair)),
             compared=len(compared),
             n_voxels=sum(obj.voxels for obj, _ in compared),
+            n_shared=sum(one.shared for one in found),
         )
 
 
@@ -142,7 +197,7 @@ def _is_described_otherwise(a: Object, b: Object) -> bool:
     return a.attributes != b.attributes or not np.array_equal(a.bounds, b.bounds)
 
 
-def _differing_voxels(
+def _compared(
     a: Store, b: Store, pairs: Sequence[Pair], progress: ProgressCallback | None
 ) -> list[VoxelDifference]:
     found = []
@@ -150,9 +205,7 @@ def _differing_voxels(
     stores = (a, b)
     vectors = [QuantileVector.of(store) for store in stores] if pairs else []
     for done, pair in enumerate(pairs, start=1):
-        difference = _compare_voxels(stores, vectors, pair)
-        if difference.only_in_a or difference.only_in_b:
-            found.append(difference)
+        found.append(_compare_voxels(stores, vectors, pair))
         n_voxels += pair[0].voxels
         if progress is not None:
             progress(Progress(done, len(pairs), n_voxels))
@@ -167,7 +220,7 @@ def _compare_voxels(
     corners = np.concatenate([grid.voxels_of(obj.bounds) for obj in pair])
     low = np.clip(corners.min(axis=0) - 1, 0, grid.side - 1) & -BRICK_EDGE
     high = np.clip(corners.max(axis=0) + 1, 0, grid.side - 1) | (BRICK_EDGE - 1)
-    lacking = np.zeros(2, dtype=np.int64)
+    counts = np.zeros(3, dtype=np.int64)
     for box in _boxes(stores, vectors, low, high):
         rows_a, rows_b = (
             store.rows_of(obj.id, *box_ranges(store.grid, store.layout, *box))
@@ -178,14 +231,16 @@ def _compare_voxels(
             and np.array_equal(rows_a.keys, rows_b.keys)
             and np.array_equal(rows_a.occupancy, rows_b.occupancy)
         ):
+            alike = _inside(bricks_of_rows(rows_a, grid, stores[0].layout), grid, *box)
+            counts[2] += voxelize.count_voxels(alike.occupancy)
             continue
-        lacking += _count_apart(
+        counts += _count_apart(
             *(
                 _inside(bricks_of_rows(rows, store.grid, store.layout), grid, *box)
                 for rows, store in zip((rows_a, rows_b), stores, strict=True)
             )
         )
-    return VoxelDifference(*pair, *lacking.tolist())
+    return VoxelDifference(*pair, *counts.tolist())
 
 
 def _boxes(
@@ -218,11 +273,11 @@ def _inside(bricks: Bricks, grid: Grid, low: Corner, high: Corner) -> Bricks:
     return Bricks(bricks.keys[mine], bricks.occupancy[mine])
 
 
-def _count_apart(a: Bricks, b: Bricks) -> tuple[int, int]:
-    """How many voxels are only in a, and only in b."""
+def _count_apart(a: Bricks, b: Bricks) -> tuple[int, int, int]:
+    """How many voxels are only in a, only in b, and in both."""
     keys = np.union1d(a.keys, b.keys)
     bits = np.zeros((2, len(keys), BRICK_BYTES), dtype=np.uint8)
     for side, bricks in zip(bits, (a, b), strict=True):
         side[np.searchsorted(keys, bricks.keys)] = bricks.occupancy
     count = voxelize.count_voxels
-    return count(bits[0] & ~bits[1]), count(bits[1] & ~bits[0])
+    return count(bits[0] & ~bits[1]), count(bits[1] & ~bits[0]), count(bits[0] & bits[1])

@@ -162,6 +162,7 @@ class Environment:
         unit: str | None = None,
         jobs: int | None = None,
         keep_removed: bool = False,
+        replace: bool = False,
         progress: ProgressCallback | None = None,
     ) -> FileReport:
         """Import a file's parts on this environment's grid, each in a transaction of its own.
@@ -176,6 +177,8 @@ class Environment:
             Threads that voxelize; one a processor unless given.
         keep_removed : bool
             Leave parts out that were removed; they come in again otherwise.
+        replace : bool
+            Replace objects of the file that it holds otherwise now, and remove those it lacks.
         progress : callable or None
             Called after each part with a `hapticdb.ingest.Progress`.
 
@@ -185,11 +188,13 @@ class Environment:
             When the file cannot be used, or a part lies outside the grid: nothing is written then.
         """
         self._check_writable()
-        options = ImportOptions(unit=unit, jobs=jobs, layout=self.layout, keep_removed=keep_removed)
+        options = ImportOptions(
+            unit=unit, jobs=jobs, layout=self.layout, keep_removed=keep_removed, replace=replace
+        )
         mesh_file = read_file(file, unit=unit)
         with self._store.loading():
             report = ingest_file(self._store, mesh_file, options, progress)
-        if report.added:
+        if report.status == "imported":
             self._store.analyze(DEFAULT_RESOLUTION)
             self._forget()
         return report

@@ -22,20 +22,18 @@ from hapticdb.errors import (
     GeometryChangedError,
     HapticDBError,
     MissingExtraError,
-    ObjectNotFoundError,
     OutsideGridError,
     UsageError,
 )
 from hapticdb.grid import Grid, GridOptions
 from hapticdb.kernels import voxelize
+from hapticdb.known_parts import KnownParts, added_or_present, drop_others, replace_changed
 from hapticdb.layout import Bricks, rows_of_bricks
 from hapticdb.mesh import Defects, MeshFile, Part, read_file
 from hapticdb.statistics import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Rows, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
 
-MOST_ATTEMPTS = 100
-"""To add a part that others add and remove meanwhile."""
 AT_BORDER = 1e-6
 """Voxels by which rounding may carry a part across the grid's border without an error."""
 
@@ -70,6 +68,8 @@ class FileReport:
         Of those written now, parts that had been removed from the environment.
     kept_removed : int
         Parts that were removed, and stay so: `ImportOptions.keep_removed`.
+    replaced, dropped : int
+        Objects that are another now, and that are gone: `ImportOptions.replace`.
     defects : Defects
         What was wrong in the file.
     error : HapticDBError or None
@@ -85,6 +85,8 @@ class FileReport:
     present: int = 0
     restored: int = 0
     kept_removed: int = 0
+    replaced: int = 0
+    dropped: int = 0
     defects: Defects = field(default_factory=Defects)
     error: HapticDBError | None = None
     is_unit_assumed: bool = False
@@ -109,6 +111,9 @@ class ImportOptions:
     time_limit, memory_limit : float, int or None
         Seconds and bytes that reading one file may take; in proportion to the file unless given,
         see `hapticdb.mesh.read_file`.
+    replace : bool
+        Make the environment hold what the file holds now: its objects that have another geometry,
+        placement or unit there are replaced, under their ids, and those that it lacks are removed.
     """
 
     unit: str | None = None
@@ -118,6 +123,7 @@ class ImportOptions:
     keep_removed: bool = False
     time_limit: float | None = None
     memory_limit: int | None = None
+    replace: bool = False
 
     def __post_init__(self) -> None:
         for name, limit in (("seconds", self.time_limit), ("bytes", self.memory_limit)):
@@ -244,27 +250,31 @@ def ingest_file(
     OutsideGridError
         When a part leaves the grid; then no part of the file is written.
     GeometryChangedError
-        When the environment holds a part of that name with another geometry.
+        When the environment holds a part of that name with another geometry, unless it is to be
+        replaced.
     """
     _check_names(mesh_file)
-    known = _KnownParts(store, mesh_file.link)
+    known = KnownParts(store, mesh_file.link)
     missing = [part for part in mesh_file.parts if known.digest_of(part.name) is None]
     removed = {part.name for part in missing} & store.removed(mesh_file.link)
     if options.keep_removed:
         missing = [part for part in missing if part.name not in removed]
     for part in mesh_file.parts:
-        if known.digest_of(part.name) not in {None, part.digest}:
+        if known.digest_of(part.name) not in {None, part.digest} and not options.replace:
             raise GeometryChangedError(
                 f"{mesh_file.link}: part {part.name!r} has changed since it was imported, or was "
-                "read with another --unit; remove that object, then import again"
+                "read with another --unit; --replace puts the file's in its place"
             )
-    _check_inside(mesh_file, store.grid, missing)
+    jobs = options.jobs or os.cpu_count() or 1
+    changed = known.changed(mesh_file.parts, options.unit) if options.replace else {}
+    _check_inside(mesh_file, store.grid, [*missing, *changed.values()])
+    anew = _voxelized(changed.values(), mesh_file, store, options.unit, jobs)
+    n_replaced = replace_changed(store, anew, {part.name: i for i, part in changed.items()})
     added: set[int] = set()
     n_parts = len(mesh_file.parts)
     n_kept = len(removed) if options.keep_removed else 0
     n_done = n_parts - len(missing)
     voxels = 0
-    jobs = options.jobs or os.cpu_count() or 1
 
     def still_missing() -> Iterator[Part]:
         nonlocal n_done
@@ -276,79 +286,25 @@ def ingest_file(
 
     for obj, rows in _voxelized(still_missing(), mesh_file, store, options.unit, jobs):
         n_done += 1
-        if (new_id := _added_or_present(store, obj, rows, known)) is not None:
+        if (new_id := added_or_present(store, obj, rows, known)) is not None:
             added.add(new_id)
         voxels += obj.voxels
         if progress is not None:
             progress(Progress(mesh_file.link, n_done, n_parts, voxels))
+    n_dropped = drop_others(store, mesh_file) if options.replace else 0
     written = tuple(obj for obj in store.objects() if obj.id in added) if added else ()
     return FileReport(
         mesh_file.link,
-        "imported" if added else "complete",
+        "imported" if added or n_replaced or n_dropped else "complete",
         written,
-        n_parts - len(added) - n_kept,
+        n_parts - len(added) - n_kept - n_replaced,
         restored=sum(obj.name in removed for obj in written),
         kept_removed=n_kept,
+        replaced=n_replaced,
+        dropped=n_dropped,
         defects=mesh_file.defects,
         is_unit_assumed=options.unit is None and not mesh_file.names_unit,
     )
-
-
-class _KnownParts:
-    """Parts of a file that an environment holds, brought up to date by its log of changes.
-
-    Of two imports of one file of 1,500 parts at once, the second took 33 s with a listing of all
-    objects for each part that the other had added, and 4.6 s so.
-    """
-
-    def __init__(self, store: Store, link: str) -> None:
-        self._store, self._link = store, link
-        self._revision = store.revision()  # first: what is written meanwhile is looked at again
-        self._name_of: dict[int, str] = {}
-        self._digest_of: dict[str, str] = {}
-        for obj in store.objects():
-            self._enter(obj)
-
-    def digest_of(self, name: str) -> str | None:
-        """Digest of the part's geometry, or None where the environment lacks that part."""
-        return self._digest_of.get(name)
-
-    def refresh(self) -> None:
-        """Look at what was written since the last look."""
-        changes = list(self._store.changes(self._revision))
-        for object_id in {change.id for change in changes}:
-            self._digest_of.pop(self._name_of.pop(object_id, ""), None)
-            with contextlib.suppress(ObjectNotFoundError):
-                self._enter(self._store.object(object_id))
-        if changes:
-            self._revision = changes[-1].revision
-
-    def _enter(self, obj: Object) -> None:
-        if obj.link == self._link:
-            self._name_of[obj.id] = obj.name
-            self._digest_of[obj.name] = obj.digest
-
-
-def _added_or_present(store: Store, part: Object, rows: Rows, known: _KnownParts) -> int | None:
-    """Id of a part that is added now, or None where another has added the same one meanwhile.
-
-    Raises
-    ------
-    EnvironmentExistsError
-        When the environment holds a part of that name with another geometry.
-    """
-    for attempt in range(MOST_ATTEMPTS):
-        try:
-            return store.add(part, rows)
-        except EnvironmentExistsError:
-            known.refresh()
-            digest = known.digest_of(part.name)
-            if digest == part.digest:
-                return None
-            if digest is not None or attempt == MOST_ATTEMPTS - 1:
-                raise
-            # a third has removed it since: its name is free again
-    raise AssertionError  # the last attempt returns or raises
 
 
 def _voxelized(

@@ -1,6 +1,7 @@
 """The picture of a demo: the environment's voxels, the path, the hits by object, the force."""
 
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,7 +18,9 @@ from numpy.typing import NDArray
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError
+from hapticdb.lettering import shortened
 from hapticdb.splat import Camera, Depths, shade, splat
+from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
     from hapticdb.demo import Comparison, Scene, Trace
@@ -36,8 +39,11 @@ BODY = "#6f7b89"
 REST = "#b9c2cc"
 COLORS = ("#ffb000", "#35c6f4", "#ff5d73", "#7ee081", "#c792ff", "#ff8f4d")
 """Of the objects touched most, which are told apart by it; the rest is `REST`."""
+AXES = ("x", "y", "z")
 TOOLS_SHOWN = 9
 HITS_SHOWN = 30_000
+LEGEND = 1480.0
+"""Pixels that the names of objects may take in all, in a line above the force."""
 TOWARDS = (0.50, 0.76, 0.44)
 """From the scene to the eye: ahead, to the left, above."""
 
@@ -87,11 +93,25 @@ def _palette(env: Environment, trace: "Trace") -> Palette:
     return Palette(dict(zip(most, COLORS, strict=False)), names)
 
 
+def up_axis(objects: Iterable[Object]) -> int:
+    """Axis that points up in a scene, 0 to 2, by most voxels; z where files do not say."""
+    votes = np.zeros(3)
+    for obj in objects:
+        said = obj.attributes.get("up")
+        votes["xyz".find(said) if isinstance(said, str) and said in AXES else 2] += obj.voxels
+    return 2 - int(np.argmax(votes[::-1]))
+
+
 def _camera(env: Environment) -> Camera:
-    boxes = np.array([obj.bounds for obj in env.objects()])
+    objects = env.objects()
+    boxes = np.array([obj.bounds for obj in objects])
     window = SAMPLES * np.array(WINDOW, dtype=np.float64)
     return Camera.looking_at(
-        boxes, np.array(TOWARDS), (SCENE[0] * SAMPLES, SCENE[1] * SAMPLES), window
+        boxes,
+        np.array(TOWARDS),
+        (SCENE[0] * SAMPLES, SCENE[1] * SAMPLES),
+        window,
+        up_axis(objects),
     )
 
 
@@ -210,8 +230,17 @@ def _draw_force(axes: Axes, trace: "Trace", palette: Palette) -> None:
         axes.spines[side].set_visible(False)
     for side in ("left", "bottom"):
         axes.spines[side].set_color("#39424d")
+    room = LEGEND / (len(palette.names) + 1) - 45.0
     marks = [
-        Line2D([], [], marker="s", linestyle="", markersize=8, color=palette.colors[i], label=name)
+        Line2D(
+            [],
+            [],
+            marker="s",
+            linestyle="",
+            markersize=8,
+            color=palette.colors[i],
+            label=shortened(axes.figure, name, 11, room),
+        )
         for i, name in palette.names.items()
     ]
     if len(set(trace.ids.tolist())) > len(marks):

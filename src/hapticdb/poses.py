@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import FileError, UsageError
+from hapticdb.units import metres_of
 
 COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
@@ -109,9 +110,20 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
         partial.unlink(missing_ok=True)
 
 
-def read_poses(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Poses (M, 4, 4) `world_from_tool` of a file, in its order."""
-    return _poses_of(_read_rows(Path(path)))
+def read_poses(path: str | os.PathLike[str], *, unit: str = "m") -> NDArray[np.float64]:
+    """Poses (M, 4, 4) `world_from_tool` of a file, in its order, in metres.
+
+    Parameters
+    ----------
+    path : path
+        The file.
+    unit : str
+        Of its positions, one of `hapticdb.mesh.UNITS`.
+    """
+    metres = metres_of(unit)
+    poses = _poses_of(_read_rows(Path(path)))
+    poses[:, :3, 3] *= metres
+    return poses
 
 
 def read_timed_poses(

@@ -14,6 +14,8 @@ FAR = np.iinfo(np.int64).max
 NUMBER_BITS = 20
 """Bits of a buffer's entry that name the object; the depth is above them."""
 DEPTH_STEPS = 1 << 40
+SUN, SIDE = (0.30, 0.45, 0.84), (0.95, 0.1, 0.2)
+"""Where light comes from: ahead, left, up."""
 CHUNK = 1_000_000
 """Voxels splatted at a time."""
 
@@ -23,7 +25,8 @@ class Camera:
     """A pinhole camera.
 
     eye (3,) metres, world frame; axes (3, 3), rows right, down, ahead; focal length and middle (2,)
-    in pixels; size (width, height); near and far, metres ahead of the eye.
+    in pixels; size (width, height); near and far, metres ahead of the eye; up: which axis of the
+    world points up, 0 to 2.
     """
 
     eye: Floats
@@ -33,19 +36,20 @@ class Camera:
     size: tuple[int, int]
     near: float
     far: float
+    up: int = 2
 
     @classmethod
     def looking_at(
-        cls, boxes: Floats, towards: Floats, size: tuple[int, int], window: Floats
+        cls, boxes: Floats, towards: Floats, size: tuple[int, int], window: Floats, up: int = 2
     ) -> "Camera":
-        """Camera that has boxes (B, 2, 3), metres, in view, from a direction (3,).
+        """Camera that has boxes (B, 2, 3), metres, in view, from a direction (3,): ahead, left, up.
 
         They fill the window (2, 2), corners in pixels, along one of its sides.
         """
         low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
         center, radius = 0.5 * (low + high), 0.5 * float(np.linalg.norm(high - low))
-        ahead = -towards / np.linalg.norm(towards)
-        right = np.cross(ahead, np.array([0.0, 0.0, 1.0]))
+        ahead = -turned(towards, up) / np.linalg.norm(towards)
+        right = np.cross(ahead, np.eye(3)[up])
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(ahead, right), ahead])
         eye = center - 5.5 * radius * ahead
@@ -56,7 +60,7 @@ class Camera:
         left, right_most = flat.min(axis=0), flat.max(axis=0)
         focal = float(((window[1] - window[0]) / (right_most - left)).min())
         middle = window.mean(axis=0) - focal * 0.5 * (left + right_most)
-        return cls(eye, axes, focal, middle, size, 4.0 * radius, 7.0 * radius)
+        return cls(eye, axes, focal, middle, size, 4.0 * radius, 7.0 * radius, up)
 
     def project(self, points: Floats) -> Floats:
         """Pixels across and down, and metres ahead, of points (N, 3) in metres -> (N, 3)."""
@@ -148,16 +152,40 @@ def shade(depths: Depths, camera: Camera, tints: Floats, paper: Floats, size: fl
     normals = np.stack([across, down, np.full_like(smooth, -pixel)], axis=-1)
     normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
     world = normals @ camera.axes.astype(np.float32)
-    light = 0.26 + 0.70 * _lit(world, (0.30, 0.45, 0.84)) + 0.22 * _lit(world, (0.95, 0.1, 0.2))
-    light *= _unoccluded(metres, 40, 0.25) * _unoccluded(metres, 8, 0.06)
+    sun, side = (turned(np.array(light), camera.up) for light in (SUN, SIDE))
+    light = 0.26 + 0.70 * _lit(world, sun) + 0.22 * _lit(world, side)
+    radius = (camera.far - camera.near) / 3.0
+    light *= _unoccluded(metres, 40, 0.1 * radius) * _unoccluded(metres, 8, 0.024 * radius)
     rim = 0.10 * (1.0 + normals[..., 2]) ** 3
     lit = tints.astype(np.float32)[number] * light[..., None] + rim[..., None]
     image[seen] = np.where(is_hit[..., None], lit, image[seen])
     return image
 
 
-def _lit(normals: Image, towards: tuple[float, float, float]) -> Image:
-    direction = (np.array(towards) / np.linalg.norm(towards)).astype(np.float32)
+def turned(direction: Floats, up: int) -> Floats:
+    """Direction (3,), ahead, left and up, in a world whose axis `up` points up.
+
+    The axes are turned about, none is mirrored: with y up, z is ahead and x is left, as in glTF.
+    """
+    return np.roll(direction, up - 2)
+
+
+def faded(image: Image, camera: Camera, paper: Floats, margin: int) -> Image:
+    """Image (height, width, 3) that goes over into the backdrop within so many pixels of its edges.
+
+    So that a scene that goes on beyond the picture is not cut.
+    """
+    height, width = image.shape[:2]
+    across = np.minimum(np.arange(width), np.arange(width)[::-1])
+    down = np.minimum(np.arange(height), np.arange(height)[::-1])
+    near = np.clip(np.minimum(down[:, None], across[None]) / margin, 0.0, 1.0)
+    weight = (near * near * (3.0 - 2.0 * near)).astype(np.float32)[..., None]
+    backdrop = _backdrop(camera, paper)
+    return np.asarray(backdrop + weight * (image - backdrop))
+
+
+def _lit(normals: Image, towards: Floats) -> Image:
+    direction = (towards / np.linalg.norm(towards)).astype(np.float32)
     return np.asarray(np.clip(normals @ direction, 0, 1))
 
 

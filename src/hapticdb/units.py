@@ -26,6 +26,22 @@ NAMES = {
     "yd": "yards",
 }
 
+_READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
+
+
+def length_text(length: float) -> str:
+    """Put a length, metres, in the unit that reads best: ``3.3 mm``, ``4.21 m``, ``12.5 km``."""
+    size, word = readable_unit(length)
+    return f"{length / size:.4g} {word}"
+
+
+def readable_unit(length: float) -> tuple[float, str]:
+    """Metres of the unit in which a length, metres, reads best, and its sign."""
+    for size, sign, least in _READABLE:
+        if length >= least * size:
+            return size, sign
+    return 1e-6, "µm"
+
 
 def metres_of(unit: str) -> float:
     """Length of a unit, metres.

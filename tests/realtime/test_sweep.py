@@ -469,5 +469,5 @@ def test_an_object_whose_file_has_changed_is_no_tool(boxes: Environment) -> None
 
 @pytest.mark.parametrize("far", [1e7, 1e30, 1e200, 1e307])
 def test_a_path_of_absurd_length_is_refused_in_one_line_before_work(far: float) -> None:
-    with pytest.raises(UsageError, match=r"^the path moves \S+ m in voxels of 0.01 m: check its"):
+    with pytest.raises(UsageError, match=r"^the path moves \S+ m, and turns a tool"):
         Way.of(line((0, 0, 0), (far, far, 0)), ball(), SIZE)

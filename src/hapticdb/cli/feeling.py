@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
-from hapticdb.cli import render
+from hapticdb.cli import fitting, render
 from hapticdb.cli.choosing import Exclude, ids_of
 from hapticdb.cli.root import (
     Budget,
@@ -193,6 +193,7 @@ def feel(
             ) as session,
             _ended_by_signals(session) as signals,
         ):
+            fitting.tell(session.proportions, tool, "--scale")
             report = _waited_for(session)
         if json:
             render.say_json(report.figures() | {"path_speed": assumed})

@@ -86,6 +86,12 @@ def import_(
             show_default="512 and more by its size",
         ),
     ] = None,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace", help="Replace objects of these files by what the files hold now."
+        ),
+    ] = False,
     json: Json = False,
 ) -> None:
     """Import files into an environment, which is made when it does not exist.
@@ -94,6 +100,11 @@ def import_(
     command again to go on with what was interrupted. A file that cannot be
     used is named and skipped, and the others go in. Parts that were removed
     come in again, and are counted, unless --keep-removed leaves them out.
+
+    Into an environment that is there, files are added. With --replace it holds
+    what they hold now: objects of another geometry, place or unit are replaced
+    under their ids, moved ones go back, and those that the file lacks are
+    removed; each in a transaction, so that an interruption loses none.
 
     Example: hapticdb import car.db car.glb --bits 11 --extent 1.6
 
@@ -113,6 +124,7 @@ def import_(
         keep_removed=keep_removed,
         time_limit=time_limit,
         memory_limit=None if memory_limit is None else memory_limit << 20,
+        replace=replace,
     )
     try:
         render.compile_kernels("import", files=files)
@@ -132,7 +144,7 @@ def import_(
             _say(file, report)
         if report.error is not None:
             render.note(str(report.error))
-    if not json and any(report.added for report in reports):
+    if not json and any(report.status == "imported" for report in reports):
         _say_total(url, elapsed)
     if any(report.error for report in reports):
         raise typer.Exit(2)
@@ -146,6 +158,8 @@ def _record(report: "FileReport") -> dict[str, object]:
         "present": report.present,
         "restored": report.restored,
         "kept_removed": report.kept_removed,
+        "replaced": report.replaced,
+        "dropped": report.dropped,
         "voxels": sum(obj.voxels for obj in report.added),
         "is_unit_assumed": report.is_unit_assumed,
         "defects": report.defects.as_dict(),
@@ -165,6 +179,10 @@ def _say(file: str, report: "FileReport") -> None:
         )
         if report.present:
             line += f"; {report.present} were there already"
+        if report.replaced:
+            line += f"; {report.replaced} replaced"
+        if report.dropped:
+            line += f"; {report.dropped} removed, which the file has no more"
         if report.restored:
             line += (
                 f"; {report.restored} of them had been removed and are back: --keep-removed leaves "

@@ -77,10 +77,12 @@ def diff(
     *,
     json: Json = False,
 ) -> None:
-    """Say whether two environments hold the same objects and voxels.
+    """Say whether two environments hold the same objects and voxels, and by how much they differ.
 
-    The exit code is 0 when they do, 1 when they differ. Engine, layout and
-    curve make no difference.
+    For each object that differs: voxels that only A has, only B, the share that
+    both have, and how far a corner of its bounding box has moved at most. The
+    exit code is 0 when they hold the same, 1 when they differ. Engine, layout
+    and curve make no difference.
 
     Example: hapticdb diff car.db hilbert.db
     """
@@ -94,36 +96,44 @@ def diff(
     elif difference.is_equal:
         render.say(_equal(difference))
     else:
-        lines = list(_lines(difference))
-        for line in lines[:MOST_LINES]:
-            render.say(line)
-        count = render.counted(len(lines), "difference")
-        render.say(count if len(lines) <= MOST_LINES else f"{count}, {MOST_LINES} of them shown")
+        _show(difference)
     if not difference.is_equal:
         raise typer.Exit(1)
 
 
 def _record(difference: "Difference") -> dict[str, object]:
+    from hapticdb.difference import farthest_corner, moved_by
+
+    size = difference.grids[0].voxel_size
+    apart = {one.a.id: one for one in (*difference.voxels, *difference.elsewhere)}
+
     def named(obj: "Object") -> dict[str, object]:
         return {"id": obj.id, "name": obj.name, "link": obj.link}
 
+    def amount(a: "Object", b: "Object") -> dict[str, object]:
+        one, farthest = apart.get(a.id), farthest_corner(a, b)
+        counts = {"only_in_a": None, "only_in_b": None, "shared": None, "share": None}
+        if one is not None:
+            counts = {name: getattr(one, name) for name in counts}
+        moved = {"moved_by": moved_by(a, b).tolist(), "farthest_corner": farthest}
+        return named(a) | counts | moved | {"farthest_corner_voxels": farthest / size}
+
+    totals = difference.totals
     return {
         "equal": difference.is_equal,
         "a": difference.a,
         "b": difference.b,
         "same_grid": difference.is_same_grid,
-        "only_in_a": [named(obj) for obj in difference.only_in_a],
-        "only_in_b": [named(obj) for obj in difference.only_in_b],
-        "changed": [named(obj) for obj, _ in difference.changed],
-        "moved": [named(obj) for obj, _ in difference.moved],
-        "voxels": [
-            named(found.a) | {"only_in_a": found.only_in_a, "only_in_b": found.only_in_b}
-            for found in difference.voxels
-        ],
+        "only_in_a": [named(obj) | {"voxels": obj.voxels} for obj in difference.only_in_a],
+        "only_in_b": [named(obj) | {"voxels": obj.voxels} for obj in difference.only_in_b],
+        "changed": [amount(*pair) for pair in difference.changed],
+        "moved": [amount(*pair) for pair in difference.moved],
+        "voxels": [amount(one.a, one.b) for one in difference.voxels],
         "renumbered": [named(obj) | {"id_in_b": other.id} for obj, other in difference.renumbered],
         "described": [named(obj) for obj, _ in difference.described],
         "objects_compared": difference.compared,
         "voxels_compared": difference.n_voxels,
+        "totals": None if totals is None else totals._asdict(),
     }
 
 
@@ -141,21 +151,68 @@ def _equal(difference: "Difference") -> str:
     return line
 
 
-def _lines(difference: "Difference") -> Iterator[str]:
-    """Differences, most important first, a line each."""
+def _show(difference: "Difference") -> None:
+    """Print differences, most important first, a row each, and their totals."""
     a, b = difference.a, difference.b
     if not difference.is_same_grid:
         grid_a, grid_b = (grid.describe() for grid in difference.grids)
-        yield f"other grids, so that voxels cannot be compared: {grid_a} in {a}; {grid_b} in {b}"
-    for url, objects in ((a, difference.only_in_a), (b, difference.only_in_b)):
-        for obj in objects:
-            yield f"only in {url}: object {obj.id} ({obj.name}) of {obj.link}"
-    for obj, _ in difference.changed:
-        yield f"other geometry: object {obj.id} ({obj.name}) of {obj.link}"
-    for obj, _ in difference.moved:
-        yield f"another place: object {obj.id} ({obj.name}) of {obj.link}"
-    for obj, _, only_a, only_b in difference.voxels:
-        yield (
-            f"other voxels: object {obj.id} ({obj.name}): "
-            f"{only_a:,} only in {a}, {only_b:,} only in {b}"
+        render.say(
+            f"other grids, so that voxels cannot be compared: {grid_a} in {a}; {grid_b} in {b}"
         )
+    rows = list(_rows(difference))
+    if rows:
+        columns = (
+            "id>",
+            "name",
+            "what",
+            "only in A>",
+            "only in B>",
+            "shared>",
+            "moved by>",
+            "file",
+        )
+        render.show(render.table(columns, rows[:MOST_LINES]))
+        render.say(f"A: {a}; B: {b}")
+    count = render.counted(len(rows) + (not difference.is_same_grid), "difference")
+    cut = "" if len(rows) <= MOST_LINES else f", {MOST_LINES} of them shown"
+    if (totals := difference.totals) is None:
+        render.say(f"{count}{cut}")
+        return
+    in_all = totals.only_in_a + totals.only_in_b + totals.shared
+    share = render.percent(totals.shared / in_all if in_all else 1.0)
+    render.say(
+        f"{count}{cut}; {render.counted(totals.only_in_a, 'voxel')} only in A, "
+        f"{render.counted(totals.only_in_b, 'voxel')} only in B, "
+        f"{render.counted(totals.shared, 'voxel')} shared, {share}"
+    )
+
+
+def _rows(difference: "Difference") -> Iterator[tuple[str, ...]]:
+    """Rows of the table of differences."""
+    for n, objects in enumerate((difference.only_in_a, difference.only_in_b)):
+        for obj in objects:
+            lone = ["", ""]
+            lone[n] = f"{obj.voxels:,}"
+            yield str(obj.id), obj.name, f"only in {'AB'[n]}", *lone, "", "", obj.link
+    apart = {one.a.id: one for one in (*difference.voxels, *difference.elsewhere)}
+    size = difference.grids[0].voxel_size
+    for what, pairs in (
+        ("other geometry", difference.changed),
+        ("another place", difference.moved),
+        ("other voxels", [(one.a, one.b) for one in difference.voxels]),
+    ):
+        for obj, other in pairs:
+            counts = ("", "", "")
+            if (one := apart.get(obj.id)) is not None:
+                counts = (
+                    f"{one.only_in_a:,}", f"{one.only_in_b:,}", render.percent(one.share)
+                )  # fmt: skip
+            yield str(obj.id), obj.name, what, *counts, _moved_text(obj, other, size), obj.link
+
+
+def _moved_text(a: "Object", b: "Object", voxel_size: float) -> str:
+    """How far an object is from where it was: ``12.5 mm (3.2 voxels)``."""
+    from hapticdb.difference import farthest_corner
+
+    way = farthest_corner(a, b)
+    return f"{render.metres(way)} ({way / voxel_size:.3g} voxels)" if way > 0.0 else ""

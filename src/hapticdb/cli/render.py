@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from hapticdb.cli.columns import Columns
+from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -98,10 +99,7 @@ def bytes_text(n: float) -> str:
 
 def metres(length: float) -> str:
     """Put a length in the unit that reads best: ``3.3 mm``, ``4.21 m``."""
-    for size, word in ((1.0, "m"), (1e-3, "mm"), (1e-6, "µm")):
-        if length >= 0.1 * size or word == "µm":
-            return f"{length / size:.4g} {word}"
-    return f"{length:.4g} m"
+    return length_text(length)
 
 
 def box(bounds: "NDArray[np.float64]") -> str:
@@ -117,6 +115,14 @@ def box_record(bounds: "NDArray[np.float64] | None") -> dict[str, list[float]] |
         return None
     low, high = bounds.tolist()
     return {"low": low, "high": high, "extent": (bounds[1] - bounds[0]).tolist()}
+
+
+def percent(share: float) -> str:
+    """Put a share in words; one that is not all is never rounded to all, nor some to nothing."""
+    text = f"{100 * share:.3g}"
+    if share < 1.0 and text == "100":
+        text = ">99.9"
+    return f"{text} %"
 
 
 def shares(counts: Mapping[str, int]) -> str:

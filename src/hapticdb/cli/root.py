@@ -16,6 +16,7 @@ StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgrou
 CurveName = Literal["z", "hilbert", "lexicographic"]
 LayoutName = Literal["brick", "voxel"]
 UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
+UpName = Literal["x", "y", "z"]
 
 Url = Annotated[
     str,
@@ -25,6 +26,10 @@ Url = Annotated[
 ]
 ToolUnit = Annotated[
     UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
+]
+PathUnit = Annotated[
+    UnitName | None,
+    typer.Option(help="Unit of the positions of the poses.", show_default="m"),
 ]
 Points = Annotated[
     int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from hapticdb.cli import render
+from hapticdb.cli import fitting, render
 from hapticdb.cli.choosing import Exclude, Parts, ids_of
-from hapticdb.cli.root import Budget, Json, Points, Seed, ToolUnit, Url, bytes_of
+from hapticdb.cli.root import Budget, Json, PathUnit, Points, Seed, ToolUnit, UpName, Url, bytes_of
 from hapticdb.cli.touching import DEFAULT_POINTS, shell_of
 
 if TYPE_CHECKING:
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 MOST_OBJECTS = 20
 MOST_NAMED = 3
+DOUBTFUL = 3
+"""Exit code of "comes out" where tool, path and scene do not fit."""
 
 
 def sweep(
@@ -31,7 +33,7 @@ def sweep(
     part: Parts = None,
     path: Annotated[
         str,
-        typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header, metres."),
+        typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header."),
     ],
     exclude: Exclude = None,
     clearance: Annotated[
@@ -44,10 +46,21 @@ def sweep(
     ] = None,
     budget: Budget = 256.0,
     tool_unit: ToolUnit = None,
+    path_unit: PathUnit = None,
     points: Points = None,
     seed: Seed = None,
+    as_given: Annotated[
+        bool,
+        typer.Option(
+            "--as-given", help="Sizes and places are as they should be: exit code 0 or 1."
+        ),
+    ] = False,
     picture: Annotated[
         str | None, typer.Option(metavar="PNG", help="Draw the path, its hits and clearance.")
+    ] = None,
+    up: Annotated[
+        UpName | None,
+        typer.Option(help="Axis that points up in the picture.", show_default="the files'"),
     ] = None,
     json: Json = False,
 ) -> None:
@@ -62,7 +75,9 @@ def sweep(
     qw 1 is their place. A sub-assembly's name means all that is below it;
     'hapticdb objects --help' says how names choose objects.
 
-    The exit code is 0 when nothing is hit, 1 when anything is.
+    The exit code is 0 when nothing is hit, 1 when anything is, and 3 when
+    nothing is hit, but the sizes or places of tool, path and scene do not fit,
+    as a line then says: --as-given if they are meant so.
 
     Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
     """
@@ -78,7 +93,7 @@ def sweep(
     if picture is not None and Path(picture).suffix.lower() != ".png":
         raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
     budget_bytes = bytes_of(budget)
-    poses = read_poses(path)
+    poses = read_poses(path, unit=path_unit or "m")
     with hapticdb.open(url, read_only=True) as env:
         parts = ids_of(env, part, "--part")
         excluded = sorted({*parts, *ids_of(env, exclude, "--exclude")})
@@ -89,6 +104,10 @@ def sweep(
             shell = env.shell(
                 *parts, points=DEFAULT_POINTS if points is None else points, seed=seed or 0
             )
+        fit = fitting.compare(
+            env, shell, poses, exclude=excluded, tool=tool, tool_unit=tool_unit,
+            path_unit=path_unit, is_moving=True,
+        )  # fmt: skip
         with _bar() as progress:
             found = swept_by(
                 env,
@@ -102,26 +121,26 @@ def sweep(
             )
         if env.store.revision() != found.revision:
             render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
-        if not found.cells:
-            low, high = env.grid.origin, [x + env.grid.edge for x in env.grid.origin]
-            render.note(
-                f"{path}: all of it is outside of the environment, which is from "
-                f"{_place(low)} to {_place(high)} m: are these poses in metres?"
-            )
         try:
             if json:
-                render.say_json(_record(found, shell, parts, excluded))
+                render.say_json(
+                    _record(found, shell, parts, excluded) | {"proportions": fit.record()}
+                )
             else:
                 _show(env, found, shell)
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
                 from hapticdb.sweep_picture import draw_sweep
 
-                draw_sweep(picture, env, shell, found, exclude=excluded, verdict=_verdict(found))
+                draw_sweep(
+                    picture, env, shell, found, exclude=excluded, verdict=_verdict(found), up=up
+                )
     if not json and picture is not None:
         render.say(f"picture: {picture}")
     if not found.comes_out:
         raise typer.Exit(1)
+    if fit.misfits and not as_given:
+        raise typer.Exit(DOUBTFUL)
 
 
 @contextmanager

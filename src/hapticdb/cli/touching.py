@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hapticdb.cli import render
+from hapticdb.cli import fitting, render
 from hapticdb.cli.choosing import Exclude, ids_of
 from hapticdb.cli.csv_files import (
     CONTACTS,
@@ -17,7 +17,7 @@ from hapticdb.cli.csv_files import (
     rows_of_contacts,
     sheet,
 )
-from hapticdb.cli.root import Json, Points, Seed, StrategyName, ToolUnit, Url
+from hapticdb.cli.root import Json, PathUnit, Points, Seed, StrategyName, ToolUnit, Url
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
@@ -40,9 +40,10 @@ def touch(
     ],
     poses: Annotated[
         str,
-        typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header, metres."),
+        typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header."),
     ],
     tool_unit: ToolUnit = None,
+    path_unit: PathUnit = None,
     points: Points = None,
     seed: Seed = None,
     strategy: Annotated[StrategyName, typer.Option(help="How the database is asked.")] = "auto",
@@ -60,6 +61,9 @@ def touch(
 ) -> None:
     """Touch an environment with a tool along a path: force, torque and objects of every pose.
 
+    Where tool, path and scene do not fit in size or place, a line says what is
+    off and by which factor: then no hit says little.
+
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
     import hapticdb
@@ -67,7 +71,7 @@ def touch(
     from hapticdb.poses import read_poses
 
     law = hapticdb.TangentPlane(stiffness)
-    path = read_poses(poses)
+    path = read_poses(poses, unit=path_unit or "m")
     summary = _Summary()
     to_stdout = [csv == STDOUT, contacts_csv == STDOUT, json]
     if sum(to_stdout) > 1:
@@ -80,6 +84,11 @@ def touch(
         excluded = ids_of(env, exclude, "--exclude")
         render.compile_kernels("touch", files=[tool])
         shell = shell_of(tool, tool_unit, points, seed)
+        fit = fitting.compare(
+            env, shell, path, exclude=excluded, tool=tool, tool_unit=tool_unit,
+            path_unit=path_unit, is_moving=False,
+        )  # fmt: skip
+        misfits = [misfit._asdict() for misfit in fit.misfits]
         asked = _strategy_of(strategy, env, len(path))
 
         def felt(index: int) -> "Touch":
@@ -93,7 +102,7 @@ def touch(
             if contact_rows is not None:
                 contact_rows.write(rows_of_contacts(index, touched, shell, path[index]))
             if json:
-                render.say_json(_record(index, touched))
+                render.say_json(_record(index, touched) | {"misfits": misfits})
             elif not any(to_stdout):
                 summary.add(touched)
     if not any(to_stdout):

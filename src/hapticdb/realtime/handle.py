@@ -58,6 +58,11 @@ class Handle:
         self._is_placed = False
         self._x = 0.0  # where the handle was before it was nowhere
 
+    @property
+    def starts_elsewhere(self) -> bool:
+        """Whether it starts where it was told to, and not where the hand is."""
+        return self._start is not None
+
     def start(self, reading: Reading, hand: Floats) -> None:
         """Place the handle for a reading, at rest: into hand (HAND,), its `IS_STALE` left.
 

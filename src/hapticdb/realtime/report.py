@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.proportions import Proportions
 from hapticdb.realtime.resident import CacheFigures
 
 BINS = 200_000
@@ -142,6 +143,8 @@ class Report:
         Frames in the recording, and frames that nobody took out of memory in time.
     recording_ended : str or None
         Why the recording ended before the session, in a line; None when it did not.
+    proportions : Proportions or None
+        Sizes and places of tool, path and scene at the start, and what of them did not fit.
     conditions : dict
         Points, scheduling, processor: what the figures hold for.
     """
@@ -169,6 +172,7 @@ class Report:
     recorded_frames: int = 0
     lost_records: int = 0
     recording_ended: str | None = None
+    proportions: Proportions | None = None
     nowhere_frames: int = 0
     bad_reading: str | None = None
     conditions: dict[str, str] = field(default_factory=dict)
@@ -191,4 +195,5 @@ class Report:
         plain["cache"] = self.cache._asdict()
         plain["hit_rate"] = self.hit_rate
         plain["objects"] = list(self.objects)
+        plain["proportions"] = None if self.proportions is None else self.proportions.record()
         return plain

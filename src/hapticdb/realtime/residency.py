@@ -236,7 +236,7 @@ class Residency:
             missing = self.missing(cells)
         raise UsageError(
             f"the tool and its surroundings meet {len(cells)} cells at once, more than fit into "
-            f"{self.table.size_bytes} bytes: give a larger budget"
+            f"{self.table.size_bytes} bytes: check the tool's unit, or give a larger budget"
         )
 
     def warm_up(self) -> None:

@@ -121,6 +121,7 @@ class ResidentCells:
         store = open_store(self.url, read_only=True)
         try:
             check_cells(store)
+            self.first_objects = tuple(store.objects())
             for object_id in self.exclude:
                 store.object(object_id)
             return store.grid

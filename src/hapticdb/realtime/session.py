@@ -15,6 +15,7 @@ from hapticdb.errors import FileError, HapticDBError, UsageError
 from hapticdb.force import TangentPlane
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell import PointShell
+from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
@@ -27,6 +28,7 @@ from hapticdb.realtime.recording import DEFAULT_LIMIT, Header, Recorder
 from hapticdb.realtime.report import LoopAnswer, Report
 from hapticdb.realtime.resident import ResidentCells, never_began
 from hapticdb.realtime.table import DEFAULT_BUDGET, anonymous_memory
+from hapticdb.realtime.way import way_of
 
 Policy = Literal["hold", "wait"]
 RING_SECONDS = 4.0
@@ -144,6 +146,7 @@ class Session:
             raise UsageError("these cells are closed: make others")
         else:
             self.cells = cells
+        self.proportions = self._compared(device)
         self._pid = os.getpid()
         self._row = self._memory = -1
         self._process: Process | None = None
@@ -167,6 +170,14 @@ class Session:
                     with suppress(OSError):
                         self._new.unlink()
             raise
+
+    def _compared(self, device: Device) -> Proportions:
+        poses, sway = way_of(device, self.handle)
+        cells = self.cells
+        return compare_proportions(
+            cells.first_objects, cells.grid.voxel_size, self.shell, poses,
+            exclude=cells.exclude, margin=sway,
+        )  # fmt: skip
 
     def _begin(
         self,
@@ -362,6 +373,7 @@ class Session:
             recorded_frames=len(self._recorder) if self._recorder is not None else 0,
             recording_ended=self._recording_ended,
             lost_records=self._lost,
+            proportions=self.proportions,
             conditions={"points": str(len(self.shell)), **conditions},
             **counts,
         )

@@ -19,6 +19,7 @@ from hapticdb.errors import (
 )
 from hapticdb.kernels import sweep as kernels
 from hapticdb.pointshell import PointShell
+from hapticdb.proportions import compare_proportions
 from hapticdb.query import as_ids
 from hapticdb.realtime.frames import Felt, Frames
 from hapticdb.realtime.residency import Residency
@@ -270,6 +271,13 @@ class _Run:
             revision=frames.residency.revision,
             elapsed=elapsed,
             cells=frames.residency.loaded,
+            proportions=compare_proportions(
+                self.known.values(),
+                self.grid.voxel_size,
+                self.shell,
+                path.poses,
+                exclude=frames.residency.exclude.tolist(),
+            ),
         )
 
 

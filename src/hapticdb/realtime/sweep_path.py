@@ -77,7 +77,8 @@ class Path:
             if steps.sum() > MOST_SAMPLES:
                 way = np.hypot.reduce(np.diff(centers, axis=0), axis=1).sum()
                 raise UsageError(
-                    f"the path moves {way:.4g} m in voxels of {voxel_size:.4g} m: check its unit"
+                    f"the path moves {way:.4g} m, and turns a tool {2.0 * radius:.4g} m across, in "
+                    f"voxels of {voxel_size:.4g} m: check the units of path and tool"
                 )
         counts = steps.astype(np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])

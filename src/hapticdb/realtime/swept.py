@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.proportions import Proportions
 from hapticdb.realtime.sweep_path import Path
 from hapticdb.store.base import Object
 
@@ -117,6 +118,9 @@ class Swept:
         Seconds, those included in which cells were fetched.
     cells : int
         Fetched from the database.
+    proportions : Proportions
+        Sizes and places of tool, path and scene beside one another; where something does not fit,
+        "no hit" says nothing.
     """
 
     path: Path
@@ -134,6 +138,7 @@ class Swept:
     revision: int
     elapsed: float
     cells: int
+    proportions: Proportions
 
     @property
     def comes_out(self) -> bool:

@@ -1,0 +1,48 @@
+"""Words in pictures: as wide as they are drawn, shortened where they would run over others."""
+
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import FigureBase
+from matplotlib.text import Text
+from matplotlib.transforms import Bbox
+
+ELLIPSIS = "…"
+
+
+def extent_of(text: Text) -> Bbox:
+    """Box of a text as it is drawn, pixels from the lower left corner."""
+    figure = text.get_figure(root=True)
+    assert figure is not None  # noqa: S101 - it was drawn on one
+    canvas = figure.canvas
+    if not isinstance(canvas, FigureCanvasAgg):
+        canvas = FigureCanvasAgg(figure)
+    return text.get_window_extent(canvas.get_renderer())  # type: ignore[no-untyped-call]
+
+
+def width_of(figure: FigureBase, words: str, size: float) -> float:
+    """Pixels that a line of words takes in a font of that size, points."""
+    text = figure.text(0.0, 0.0, words, fontsize=size)
+    try:
+        return float(extent_of(text).width)
+    finally:
+        text.remove()
+
+
+def shortened(figure: FigureBase, words: str, size: float, most: float) -> str:
+    """Words in at most so many pixels: what is too long loses its middle."""
+    if width_of(figure, words, size) <= most:
+        return words
+    low, high = 0, len(words) - 1  # letters that are kept: low fits, or nothing does
+    while low < high:
+        kept = (low + high + 1) // 2
+        if width_of(figure, without_middle(words, kept), size) <= most:
+            low = kept
+        else:
+            high = kept - 1
+    return without_middle(words, low)
+
+
+def without_middle(words: str, kept: int) -> str:
+    """Words with so many of their letters, half from either end, and an ellipsis between."""
+    head = (kept + 1) // 2
+    tail = kept - head
+    return words[:head].rstrip() + ELLIPSIS + (words[len(words) - tail :].lstrip() if tail else "")

@@ -1,0 +1,288 @@
+"""Sizes and places of a tool, its path and the scene compared: what does not fit, by which factor.
+
+A length in a wrong unit makes an answer that looks like any other: nothing is hit. Only what is off
+beyond doubt is told: a tool larger than the whole scene, or smaller than a voxel; a path that stays
+farther from the scene than the scene or the tool is long, or is a hundred times as long as both.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.pointshell import PointShell
+from hapticdb.poses import as_floats
+from hapticdb.store.base import Object, scene_bounds
+from hapticdb.units import NAMES, UNITS, length_text, metres_of
+
+Floats = NDArray[np.float64]
+What = Literal["tool", "path", "scene"]
+
+LARGE_TOOL = 5.0
+"""Metres; a shorter tool may be larger than a scene, which may be one small part."""
+LONG_PATH = 100.0
+"""Lengths of scene and tool that a path may span: it may begin far away."""
+PAIRS = 2_000_000
+"""Boxes of the path against boxes of objects; where there are more, the path's are joined."""
+LIKELY = ("mm", "in", "cm", "ft", "m", "um", "yd", "km")
+"""Units in the order in which they are suspected."""
+
+
+class Misfit(NamedTuple):
+    """One thing that does not fit the others.
+
+    what : which; factor : by which its lengths are too large (below 1: too small) if its numbers
+    are in another unit than they were taken for, and unit : that one; None where no unit explains
+    it; text : all of it in a line.
+    """
+
+    what: What
+    factor: float | None
+    unit: str | None
+    text: str
+
+
+@dataclass(frozen=True)
+class Proportions:
+    """How large tool, path and scene are beside one another, and how near they come.
+
+    Attributes
+    ----------
+    scene : (2, 3) float64 or None
+        Lower and upper corner of what can be hit, metres; None when nothing can.
+    tool : float
+        Longest side of the tool's box, metres.
+    path : (2, 3) float64 or None
+        Corners of the box that the tool's middle moves in, metres; None where it is not known.
+    gap : float or None
+        The tool comes no nearer than that to the box of any object, metres; 0 where boxes meet, and
+        None where path or scene are not there.
+    misfits : tuple of Misfit
+        What is off; empty where nothing is, or nothing is known.
+    """
+
+    scene: Floats | None
+    tool: float
+    path: Floats | None
+    gap: float | None
+    misfits: tuple[Misfit, ...]
+
+    @property
+    def text(self) -> str:
+        """All that is off, in one line; empty when nothing is."""
+        return "; ".join(misfit.text for misfit in self.misfits)
+
+    def record(self) -> dict[str, Any]:
+        """All of it for JSON: metres."""
+        return {
+            "scene": None if self.scene is None else self.scene.tolist(),
+            "tool": self.tool,
+            "path": None if self.path is None else self.path.tolist(),
+            "gap": self.gap,
+            "misfits": [misfit._asdict() for misfit in self.misfits],
+        }
+
+
+def compare_proportions(
+    objects: Iterable[Object],
+    voxel_size: float,
+    shell: PointShell,
+    poses: ArrayLike | None = None,
+    *,
+    exclude: Iterable[int] = (),
+    tool_unit: str = "m",
+    path_unit: str = "m",
+    is_moving: bool = True,
+    margin: float = 0.0,
+) -> Proportions:
+    """Compare the sizes and places of a tool, its path and a scene, from their boxes alone.
+
+    Parameters
+    ----------
+    objects : iterable of Object
+        Of the environment.
+    voxel_size : float
+        Its voxels' edge, metres.
+    shell : PointShell
+        The tool, metres.
+    poses : (M, 4, 4) array or None
+        `world_from_tool`, metres; None where nobody knows them before.
+    exclude : iterable of int
+        Ids of objects that are not felt.
+    tool_unit, path_unit : str
+        Of `hapticdb.mesh.UNITS`: what the numbers of either were taken for.
+    is_moving : bool
+        Whether the tool moves from pose to pose, in straight lines; else it is at the poses alone.
+    margin : float
+        Metres by which the tool may leave them.
+
+    Raises
+    ------
+    UsageError
+        When poses have another shape, or are none, or a unit is unknown.
+    """
+    left_out = set(exclude)
+    felt = [obj for obj in objects if obj.id not in left_out]
+    scene = scene_bounds(felt)
+    tool = _Tool.of(shell)
+    centers = None if poses is None else _centers(poses, tool)
+    path = None if centers is None else np.stack([centers.min(axis=0), centers.max(axis=0)])
+    if scene is None:
+        empty = Misfit("scene", None, None, "the scene holds nothing that could be hit")
+        return Proportions(None, tool.length, path, None, (empty,))
+    boxes = np.array([obj.bounds for obj in felt])
+    look = _Look(boxes, scene, voxel_size, tool, centers, is_moving, margin)
+    gap = None if centers is None else look.gap()
+    misfits = [*_tool_misfits(look, tool_unit), *_path_misfits(look, gap, path_unit)]
+    scenes = [misfit for misfit in misfits if misfit.what == "scene"]
+    # what the scene explains is not the tool's or the path's fault as well
+    return Proportions(scene, tool.length, path, gap, tuple(scenes[:1] or misfits))
+
+
+class _Tool(NamedTuple):
+    """Middle of a tool's box (3,), tool frame, its reach from there, and its longest side."""
+
+    middle: Floats
+    radius: float
+    length: float
+
+    @classmethod
+    def of(cls, shell: PointShell) -> "_Tool":
+        low, high = shell.points.min(axis=0), shell.points.max(axis=0)
+        middle = 0.5 * (low + high)
+        radius = float(np.sqrt(((shell.points - middle) ** 2).sum(axis=1).max()))
+        return cls(middle, radius, float((high - low).max()))
+
+
+class _Look(NamedTuple):
+    """What is compared: objects' boxes (O, 2, 3), all of them (2, 3), tool and way (M, 3)."""
+
+    boxes: Floats
+    scene: Floats
+    voxel_size: float
+    tool: _Tool
+    centers: Floats | None
+    is_moving: bool
+    margin: float
+
+    @property
+    def extent(self) -> float:
+        """Longest side of the scene, metres."""
+        return float((self.scene[1] - self.scene[0]).max())
+
+    @property
+    def way(self) -> float:
+        """Longest side of the box that the tool's middle moves in; 0 where it is not known."""
+        return 0.0 if self.centers is None else float(np.ptp(self.centers, axis=0).max())
+
+    def gap(self, path_factor: float = 1.0, scene_factor: float = 1.0) -> float:
+        """Metres that the tool stays away from all boxes, if lengths were so many times as large.
+
+        From the box of each straight piece of the way, widened by the tool's reach: no tool comes
+        nearer, whatever its shape.
+        """
+        assert self.centers is not None  # noqa: S101 - asked for paths alone
+        at = self.centers * path_factor
+        low, high = at, at
+        if self.is_moving and len(at) > 1:
+            low, high = np.minimum(at[:-1], at[1:]), np.maximum(at[:-1], at[1:])
+        joined = -(-len(low) * len(self.boxes) // PAIRS)
+        starts = np.arange(0, len(low), joined)
+        low, high = np.minimum.reduceat(low, starts), np.maximum.reduceat(high, starts)
+        boxes = self.boxes * scene_factor
+        least = np.inf
+        per_block = max(1, PAIRS // 4 // len(boxes))
+        for start in range(0, len(low), per_block):
+            some = slice(start, start + per_block)
+            apart = np.maximum(
+                np.maximum(boxes[:, 0] - high[some, None], low[some, None] - boxes[:, 1]), 0.0
+            )
+            with np.errstate(over="ignore"):
+                nearest = float(np.sqrt((apart**2).sum(axis=2).min()))
+            least = min(least, max(nearest - self.tool.radius - self.margin, 0.0))
+            if least == 0.0:
+                break
+        return least
+
+
+def _centers(poses: ArrayLike, tool: _Tool) -> Floats:
+    """Places (M, 3) of the tool's middle at poses."""
+    given = as_floats(poses, "a path")
+    if given.ndim != 3 or given.shape[1:] != (4, 4) or not len(given):
+        raise UsageError(f"a path of shape {given.shape}: give poses (M, 4, 4), one at least")
+    return np.asarray(given[:, :3, :3] @ tool.middle + given[:, :3, 3])
+
+
+def _tool_misfits(look: _Look, unit: str) -> list[Misfit]:
+    """What the tool's size beside the scene and its voxels says."""
+    length, extent = look.tool.length, look.extent
+    if length > max(extent, LARGE_TOOL):
+        is_off = f"{length / extent:.3g} times as long as the scene, {length_text(extent)}"
+    elif length < look.voxel_size:
+        is_off = f"smaller than a voxel ({length_text(look.voxel_size)})"
+        if look.centers is not None and 0.0 < look.way < 0.01 * extent:
+            return [_scene_misfit(look, is_off)]
+    else:
+        return []
+    text = f"the tool is {length_text(length)} long, {is_off}"
+    for other, factor in _suspects(unit):
+        if look.voxel_size <= length * factor <= extent:
+            return [_explained("tool", text, "it would fit", other, unit)]
+    return [Misfit("tool", None, None, text)]
+
+
+def _scene_misfit(look: _Look, is_off: str) -> Misfit:
+    """Tool and path agree, and the scene is large beyond both."""
+    extent, tool, way = map(length_text, (look.extent, look.tool.length, look.way))
+    text = f"the scene is {extent} long, but the tool {tool}, {is_off}, and its path {way}"
+    for other, factor in _suspects("m"):
+        fits = look.voxel_size * factor <= look.tool.length <= look.extent * factor
+        if factor < 1.0 and fits and look.way >= 0.01 * look.extent * factor:
+            return _explained("scene", text, "it would fit", other, "m")
+    return Misfit("scene", None, None, text)
+
+
+def _path_misfits(look: _Look, gap: float | None, unit: str) -> list[Misfit]:
+    """What the path's place and length beside the scene and the tool say."""
+    if gap is None:
+        return []
+    extent, way = look.extent, look.way
+    larger, long = max(extent, look.tool.length), length_text(extent)
+    # a tool that touches is meant to meet the scene; one that is swept may pass on purpose
+    is_far = gap > (larger if look.is_moving else 0.25 * extent)
+    if is_far:
+        text = f"the path never comes within {length_text(gap)} of the scene, {long} long"
+    elif way > LONG_PATH * larger:
+        text = f"the path is {way / extent:.3g} times as long as the scene, {long}"
+    else:
+        return []
+    if is_far and 5.0 * extent < min(look.tool.length, way) and look.tool.length < LARGE_TOOL:
+        # tool and path agree
+        for other, factor in _suspects("m"):
+            if look.tool.length <= extent * factor and look.gap(1.0, factor) == 0.0:
+                return [_explained("scene", text, "the scene would fit", other, "m")]
+    for other, factor in _suspects(unit):
+        # shrunk towards the origin, any path meets a scene that is there: it must keep a length
+        is_likely = way * factor >= 0.1 * extent or gap > LONG_PATH * larger
+        if is_likely and way * factor <= 10.0 * larger and look.gap(factor) == 0.0:
+            return [_explained("path", text, "it would meet it", other, unit)]
+    return [Misfit("path", None, None, text)]
+
+
+def _suspects(unit: str) -> list[tuple[str, float]]:
+    """Other units, and by which factor a length changes that is in them and not in `unit`."""
+    own = metres_of(unit)
+    return [(other, UNITS[other] / own) for other in LIKELY if UNITS[other] != own]
+
+
+def _explained(what: What, text: str, outcome: str, other: str, unit: str) -> Misfit:
+    """Misfit that goes away where numbers are in another unit than they were taken for."""
+    factor = UNITS[other] / UNITS[unit]
+    by = 1.0 / factor if factor < 1.0 else factor
+    if other == "km":  # which nobody draws in: lengths were made metres twice
+        return Misfit(what, 1.0 / factor, None, f"{text}: {outcome} {by:.4g} times as large")
+    guess = f"{outcome} if its numbers were {NAMES[other]}, not {NAMES[unit]} (factor {by:.4g})"
+    return Misfit(what, 1.0 / factor, other, f"{text}: {guess}")

@@ -44,7 +44,9 @@ class Device(Protocol):
     """What a hand holds."""
 
     def read(self) -> Reading:
-        """Where the hand is now.
+        """Where the hand is now; a pose of NaN while the device does not know.
+
+        Checked in every frame, see `Reader`: a reading of another kind ends the session.
 
         Raises
         ------

@@ -158,6 +158,13 @@ def test_honest_work_raises_no_alarm(
     assert found(scene, shell, path).misfits == ()
 
 
+def test_a_part_larger_than_what_is_left_is_no_misfit() -> None:
+    """A hull that is lifted off what stands in it has the scene's own unit."""
+    hull, path = wrench(20.0), along((0, 0, 0), (0, 0, 2))
+    assert [misfit.what for misfit in found(car(), hull, path).misfits] == ["tool"]
+    assert found(car(), hull, path, tool_unit=None).misfits == ()
+
+
 # -- the gap is a bound ----------------------------------------------------------------------------
 
 

@@ -93,7 +93,7 @@ def compare_proportions(
     poses: ArrayLike | None = None,
     *,
     exclude: Iterable[int] = (),
-    tool_unit: str = "m",
+    tool_unit: str | None = "m",
     path_unit: str = "m",
     is_moving: bool = True,
     margin: float = 0.0,
@@ -113,7 +113,8 @@ def compare_proportions(
     exclude : iterable of int
         Ids of objects that are not felt.
     tool_unit, path_unit : str
-        Of `hapticdb.mesh.UNITS`: what the numbers of either were taken for.
+        Of `hapticdb.mesh.UNITS`: what the numbers of either were taken for. None for a tool that is
+        a part of the same scene, whose size is not in question.
     is_moving : bool
         Whether the tool moves from pose to pose, in straight lines; else it is at the poses alone.
     margin : float
@@ -136,7 +137,8 @@ def compare_proportions(
     boxes = np.array([obj.bounds for obj in felt])
     look = _Look(boxes, scene, voxel_size, tool, centers, is_moving, margin)
     gap = None if centers is None else look.gap()
-    misfits = [*_tool_misfits(look, tool_unit), *_path_misfits(look, gap, path_unit)]
+    misfits = [] if tool_unit is None else _tool_misfits(look, tool_unit)
+    misfits += _path_misfits(look, gap, path_unit)
     scenes = [misfit for misfit in misfits if misfit.what == "scene"]
     # what the scene explains is not the tool's or the path's fault as well
     return Proportions(scene, tool.length, path, gap, tuple(scenes[:1] or misfits))

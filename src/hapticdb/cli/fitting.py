@@ -42,7 +42,7 @@ def compare(
         shell,
         poses,
         exclude=exclude,
-        tool_unit=tool_unit or "m",
+        tool_unit=None if tool is None else tool_unit or "m",
         path_unit=path_unit or "m",
         is_moving=is_moving,
     )

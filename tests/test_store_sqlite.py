@@ -234,8 +234,9 @@ def test_an_unfinished_creation_is_swept_away(tmp_path: Path) -> None:
     """A process that dies while creating leaves a file under another name."""
     with child([sys.executable, "-c", ""]) as dead:
         pass
-    left = tmp_path / f".e.db.{dead.pid}.new"
-    left.write_bytes(b"half")
+    lefts = [tmp_path / f".e.db.{dead.pid}.new{suffix}" for suffix in ("", "-wal", "-shm")]
+    for left in lefts:
+        left.write_bytes(b"half")
     hapticdb.create(tmp_path / "e.db", GRID).close()
-    assert not left.exists()
+    assert not any(left.exists() for left in lefts)
     assert len(hapticdb.open(tmp_path / "e.db").objects()) == 0

@@ -19,6 +19,7 @@ from hapticdb.errors import (
     BusyError,
     DamagedError,
     DatabaseError,
+    EnvironmentExistsError,
     NotAnEnvironmentError,
     ReadOnlyError,
     UsageError,
@@ -79,6 +80,10 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
     """Refuse a place that a copy cannot be put into, before anything is copied."""
     if target == source.resolve():
         raise UsageError(f"{source} cannot be copied onto itself: give another path")
+    if not replace and target.exists():
+        raise EnvironmentExistsError(
+            f"{target} exists already: give another path, or --replace to have the new copy there"
+        )
     if not replace:
         sqlite_file.check_free(target)
     elif target.exists():

@@ -1,6 +1,7 @@
 """Opening and creating SQLite files: what is told apart, and how an engine's error is named."""
 
 import contextlib
+import glob
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -203,7 +204,7 @@ def remove_file(path: Path) -> None:
 
 def _sweep_unfinished(path: Path) -> None:
     """Remove what a process that was killed while making this file left behind."""
-    for left in path.parent.glob(f".{path.name}.*.new"):
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.new*"):
         pid = left.name.split(".")[-2]
         if pid.isdigit() and not Path(f"/proc/{pid}").exists():
             left.unlink(missing_ok=True)

@@ -12,7 +12,6 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.calibration import calibrate
 from hapticdb.errors import (
     ConnectionLostError,
-    DamagedError,
     ObjectNotFoundError,
     ReadOnlyError,
 )
@@ -34,6 +33,7 @@ from hapticdb.pointshell import PointShell
 from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Strategy, as_id, as_ids, as_poses
 from hapticdb.statistics import DEFAULT_RESOLUTION, CostModel, QuantileVector, machine_name
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
+from hapticdb.store.believed import damaged
 from hapticdb.store.connect import create_store, open_store
 from hapticdb.touches import Touch, Touches
 
@@ -311,10 +311,7 @@ class Environment:
             self._check_known(ids)
         for object_id in answer.ids:
             if object_id not in self._known:
-                raise DamagedError(
-                    f"{self.url} is damaged (rows of object {object_id}, which is not there): "
-                    "restore a copy or import the files again"
-                )
+                raise damaged(self.url, f"rows of object {object_id}, which is not there")
         return Touch(answer, self._known)
 
     def _felt(

@@ -427,8 +427,7 @@ class Environment:
         keep : bool
             Write the figures into the database, when it can be written.
         cold : bool
-            Measure with empty caches, where this process can empty them: for environments much
-            larger than memory, that nobody goes over twice.
+            With empty caches, where this process can empty them: for what is beyond memory.
         """
         costs = calibrate(self._store, seed=seed, cold=cold)
         if keep and not self._store.is_read_only:

@@ -21,6 +21,7 @@ from hapticdb.store.base import Layout
 from hapticdb.store.sqlite import SQLiteStore
 from hapticdb.store.sqlite_pages import PAGE_BYTES
 from hapticdb.testing import KINDS, floor_voxels, write_voxels
+from test_store_sqlite_pages import without_checksums
 
 LAYOUTS: tuple[Layout, ...] = ("brick", "voxel")
 CASES = [(layout, name) for layout in LAYOUTS for name in CRAFTED] + [
@@ -188,6 +189,15 @@ def test_whatever_a_row_holds_it_is_an_object_or_one_error(row: list[object]) ->
     ):
         said = told(ask)
         assert said == "" or said.startswith("e.db is damaged")
+
+
+def test_info_tells_of_checksums(tmp_path: Path, run: Run) -> None:
+    path = made(tmp_path / "e.db", "brick")
+    assert "checksums" in run("info", path)[1]
+    assert json.loads(run("info", path, "--json")[1])["page_checksums"] is True
+    old = without_checksums(path)
+    assert "none of pages; 'hapticdb copy'" in run("info", old)[1].replace("\n", " ")
+    assert "its pages carry no checksums" in run("check", old)[1]
 
 
 def test_a_store_says_how_to_get_checksums(tmp_path: Path, run: Run) -> None:

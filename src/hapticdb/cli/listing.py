@@ -35,6 +35,8 @@ SOURCES = {
     "computed": "computed when needed",
 }
 
+NO_CHECKSUMS = "none of pages; 'hapticdb copy' makes an environment that has them"
+
 
 def info(url: Url, *, json: Json = False) -> None:
     """Show an environment's engine, grid, layout, scene, size and statistics.
@@ -52,6 +54,7 @@ def info(url: Url, *, json: Json = False) -> None:
         grid, size, objects, layout = env.grid, env.size(), env.objects(), env.layout
         freshness = env.freshness(DEFAULT_RESOLUTION)
         quantiles = QuantileVector.of(env, DEFAULT_RESOLUTION)
+        has_checksums = env.checker().has_page_checksums()
     voxels = sum(obj.voxels for obj in objects)
     scene = scene_bounds(objects)
     if json:
@@ -69,6 +72,7 @@ def info(url: Url, *, json: Json = False) -> None:
                 "voxels": voxels,
                 "rows": size.rows,
                 "bytes": size.bytes,
+                "page_checksums": has_checksums,
                 "statistics": {"source": quantiles.source, **freshness._asdict()},
             }
         )
@@ -92,6 +96,7 @@ def info(url: Url, *, json: Json = False) -> None:
                 ("voxels", f"{voxels:,}"),
                 ("rows", f"{size.rows:,}"),
                 ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
+                ("checksums", "of pages" if has_checksums else NO_CHECKSUMS),
                 ("statistics", f"{SOURCES[quantiles.source]}; {_age(freshness)}"),
             ]
         )

@@ -40,7 +40,10 @@ def test_what_comes_out_is_said_with_its_clearance(run: Run, scene: Path) -> Non
     assert lines[0].startswith("comes out: no hit in ")
     # voxels of 12.5 mm: those of a box end at 62.5, the tool begins at 90
     assert lines[0].endswith(", least clearance 27.5 mm from box0")
-    assert any(line.startswith("clearance") and "its surface is" in line for line in lines)
+    assert any(line.startswith("clearance") and "the surfaces are" in line for line in lines)
+    assert any(
+        line.startswith("tool") and "none of its surface more than" in line for line in lines
+    )
 
 
 @pytest.mark.usefixtures("through")
@@ -62,6 +65,46 @@ def test_what_touches_only_at_its_start_is_said_to(run: Run, scene: Path) -> Non
     assert out.startswith("touches box0 where it starts; no hit after ")
 
 
+def test_what_is_left_at_once_is_told_apart_from_what_is_in_the_way(run: Run, scene: Path) -> None:
+    poses(
+        scene.parent / "on.csv",
+        (0.0, 0.0, 0.055),
+        (0.0, 0.0, 0.1),
+        (0.2, 0.0, 0.1),
+        (0.2, 0.0, 0.0),
+    )
+    code, out, _ = run("sweep", scene, *TOOL, "--path", "on.csv")
+    assert code == 1
+    verdict = out.splitlines()[0]
+    assert verdict.startswith("is caught: first contact at ")
+    assert " with box1; touches box0 where it starts, until " in verdict
+
+
+def test_what_is_not_decided_has_a_code_of_its_own(run: Run, scene: Path) -> None:
+    """The tool ends 5 mm above the voxels of a box; its 40 points lie farther apart than that."""
+    poses(scene.parent / "near.csv", (0.0, 0.0, 0.0775), (0.005, 0.0, 0.0775))
+    few = ("--points", 40)
+    code, out, err = run("sweep", scene, *TOOL, "--path", "near.csv", *few)
+    assert (code, err) == (3, "")
+    verdict = out.splitlines()[0]
+    assert verdict.startswith("not decided: no hit in ")
+    assert "a voxel of box0 comes within 5 mm of a point" in verdict
+    n_points = verdict.rpartition("--points ")[2].rstrip(")")
+    code, out, _ = run("sweep", scene, *TOOL, "--path", "near.csv", "--points", n_points)
+    assert (code, out[:9]) == (0, "comes out")
+    found = json.loads(run("sweep", scene, *TOOL, "--path", "near.csv", *few, "--json")[1])
+    assert (found["verdict"], found["comes_out"]) == ("not decided", False)
+    assert found["proof"]["cover"] > found["proof"]["nearest"] > found["proof"]["cover_needed"]
+
+
+def test_a_saved_shell_is_told_what_it_lacks(run: Run, scene: Path) -> None:
+    poses(scene.parent / "free.csv", (0.0, 0.0, 0.1), (0.4, 0.0, 0.1))
+    hapticdb.PointShell.from_file(scene.parent / "tool.stl", 2000).save(scene.parent / "tool.npz")
+    code, out, _ = run("sweep", scene, "--tool", "tool.npz", "--path", "free.csv")
+    assert code == 3
+    assert "how well the points cover the tool is not known: give its mesh" in out.splitlines()[0]
+
+
 @pytest.mark.usefixtures("free")
 def test_nothing_near_is_said_as_a_bound(run: Run, scene: Path) -> None:
     out = run("sweep", scene, *TOOL, "--path", "free.csv", "--clearance", 0.02)[1]
@@ -76,9 +119,9 @@ def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
     assert (code, err) == (1, "")
     found = json.loads(out)
     assert list(found) == [
-        "comes_out", "verdict", "poses", "samples", "hits", "contacts", "first_hit",
-        "first_contact", "deepest", "objects", "hit_intervals", "contact_intervals", "clearance",
-        "tool", "revision", "elapsed", "cells", "proportions",
+        "verdict", "comes_out", "line", "proof", "poses", "samples", "hits", "contacts",
+        "first_hit", "first_contact", "deepest", "objects", "enclosed", "hit_intervals",
+        "contact_intervals", "clearance", "tool", "revision", "elapsed", "cells", "proportions",
     ]  # fmt: skip
     assert list(found["first_contact"]) == ["sample", "fraction", "segment", "pose", "objects"]
     assert list(found["deepest"]) == ["depth", "point", "moment"]
@@ -86,7 +129,8 @@ def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
         "distance", "at_least", "at_most", "is_beyond", "point", "voxel", "moment",
     ]  # fmt: skip
     assert list(found["objects"][0]) == [
-        "id", "name", "first", "last", "samples", "contacts", "deepest",
+        "id", "name", "first", "last", "intervals", "first_contact", "length", "samples",
+        "contacts", "points", "deepest",
     ]  # fmt: skip
     assert (found["comes_out"], found["poses"], found["tool"]["points"]) == (False, 3, 50)
     assert found["clearance"]["distance"] == 0.0
@@ -110,7 +154,9 @@ def test_a_part_moves_by_displacements_from_where_it_sits(run: Run, scene: Path)
     found = json.loads(out)
     assert code == 1
     assert [one["name"] for one in found["objects"]] == ["box2"]
-    assert found["tool"] == {"points": 300, "parts": [2], "excluded": [2]}
+    tool = found["tool"]
+    assert (tool["parts"], tool["excluded"]) == ([2], [2])
+    assert 0.25 * 0.0125 < tool["spacing"] < 0.5 * 0.0125  # voxels of 12.5 mm
     more = ("--exclude", 3)
     assert run("sweep", scene, "--part", 2, "--path", "aside.csv", *more)[0] == 0
 

@@ -10,21 +10,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.calibration import calibrate
-from hapticdb.errors import (
-    ConnectionLostError,
-    ObjectNotFoundError,
-    ReadOnlyError,
-)
+from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, ReadOnlyError
 from hapticdb.finding import find_objects
 from hapticdb.force import TangentPlane
 from hapticdb.grid import Grid
 from hapticdb.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
-from hapticdb.ingest import (
-    FileReport,
-    ImportOptions,
-    ProgressCallback,
-    ingest_file,
-)
+from hapticdb.ingest import FileReport, ImportOptions, ProgressCallback, ingest_file
 from hapticdb.layout import voxels_of_rows
 from hapticdb.mesh import read_file
 from hapticdb.originals import shell_of_objects
@@ -130,7 +121,13 @@ class Environment:
         """
         return find_objects(self._store, words)
 
-    def shell(self, *words: int | str, points: int = 300, seed: int = 0) -> PointShell:
+    def shell(
+        self,
+        *words: int | str,
+        points: int | None = None,
+        spacing: float | None = None,
+        seed: int = 0,
+    ) -> PointShell:
         """Make objects one rigid tool, where they sit: their surfaces, read from their files again.
 
         The shell is in the world's frame, metres, so that its own pose is the identity, and the
@@ -141,7 +138,7 @@ class Environment:
         ----------
         words : int or str
             As for `find`.
-        points, seed : int
+        points, spacing, seed
             As for `PointShell.from_file`, spread over all surfaces together.
 
         Raises
@@ -153,7 +150,7 @@ class Environment:
         UsageError
             When no word is given, or an object is a point cloud, which has no surface.
         """
-        return shell_of_objects(self.find(*words), points, seed)
+        return shell_of_objects(self.find(*words), points, spacing, seed)
 
     def add(
         self,

@@ -29,6 +29,7 @@ class Surface(NamedTuple):
     normals: Floats  # (F, 3), into the tool
     center: Floats  # (3,)
     is_closed: bool
+    bodies: Ints  # (F,) 0 for all open ones, then the closed ones
 
 
 class _Edges(NamedTuple):
@@ -87,8 +88,9 @@ def orient(triangles: Floats) -> Surface:
         center = np.einsum("f,fk->k", areas, sides.centroids) / total
     sampled = areas > 0.0
     return Surface(
-        triangles[kept][sampled], areas[sampled], inward[sampled], center + origin, is_closed
-    )
+        triangles[kept][sampled], areas[sampled], inward[sampled], center + origin, is_closed,
+        body[sampled],
+    )  # fmt: skip
 
 
 def _edges_of(faces: Ints) -> _Edges:

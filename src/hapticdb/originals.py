@@ -46,7 +46,9 @@ def parts_of(objects: Sequence[Object], to_be: str, instead: str) -> Iterator[tu
             yield obj, parts[obj.name, obj.digest]
 
 
-def shell_of_objects(objects: Sequence[Object], points: int, seed: int) -> PointShell:
+def shell_of_objects(
+    objects: Sequence[Object], points: int | None, spacing: float | None, seed: int
+) -> PointShell:
     """One shell of several objects where they sit, as `Environment.shell` documents it."""
     if not objects:
         raise UsageError("a shell of no objects: name at least one")
@@ -59,4 +61,4 @@ def shell_of_objects(objects: Sequence[Object], points: int, seed: int) -> Point
         triangles.append(part.triangles(obj.transform))
     corners = np.concatenate(triangles).reshape(-1, 3)
     faces = np.arange(len(corners)).reshape(-1, 3)
-    return PointShell.from_mesh(corners, faces, points, seed=seed)
+    return PointShell.from_mesh(corners, faces, points, spacing=spacing, seed=seed)

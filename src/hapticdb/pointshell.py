@@ -9,7 +9,7 @@ holds many points.
 
 import math
 import zipfile
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from os import SEEK_END, PathLike
 from pathlib import Path
 from typing import IO, BinaryIO
@@ -18,12 +18,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb import mesh
+from hapticdb.coverage import Ball, covering_radius, points_for
 from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels import curves, sampling
-from hapticdb.orientation import orient
+from hapticdb.orientation import Surface, orient
 from hapticdb.poses import as_floats
 
 MAX_POINTS = 10_000_000
+DEFAULT_POINTS = 300
+DENSE_POINTS = 200_000
+"""Of a shell whose spacing is given, at most, unless more are asked for: a few seconds' work."""
 ORDER_BITS = 10
 """The curve that orders the points has 2^10 steps along the longest side of their bounding box."""
 
@@ -64,6 +68,11 @@ class PointShell:
         The seed of the points' places.
     defects : str
         What was wrong in that file, in words; not saved.
+    cover : float, optional
+        Covering radius, metres: no place of the tool's surface is farther from a point. None where
+        it is not known; `with_cover` finds it for shells made of a mesh.
+    surface : Surface or Ball, optional
+        What the points were spread over; not saved.
 
     Raises
     ------
@@ -78,8 +87,12 @@ class PointShell:
     link: str = ""
     seed: int = 0
     defects: str = ""
+    cover: float | None = None
+    surface: Surface | Ball | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
+        if self.cover is not None and not (np.isfinite(self.cover) and self.cover >= 0.0):
+            raise UsageError(f"a covering radius of {self.cover} m: give 0 or more, or None")
         for name, shape in (("points", (-1, 3)), ("normals", (-1, 3)), ("center", (3,))):
             array = _as_floats(getattr(self, name), name)
             if array.ndim != len(shape) or array.shape[-1] != 3:
@@ -108,8 +121,9 @@ class PointShell:
     def from_file(
         cls,
         path: str | PathLike[str],
-        points: int = 300,
+        points: int | None = None,
         *,
+        spacing: float | None = None,
         unit: str | None = None,
         seed: int = 0,
     ) -> "PointShell":
@@ -118,10 +132,13 @@ class PointShell:
         Parameters
         ----------
         path : path
-            A mesh file. From a `.npz` the shell is loaded as it was saved, and `points` and `seed`
-            are those of the file.
-        points : int
-            Number of points, 1 to 10^7.
+            A mesh file. From a `.npz` the shell is loaded as it was saved, and `points`, `spacing`
+            and `seed` are those of the file.
+        points : int, optional
+            Number of points, 1 to 10^7; 300 unless given. With a spacing, the most there may be;
+            200,000 unless given.
+        spacing : float, optional
+            Metres between neighbours, about: as many points as that takes, 300 at least.
         unit : str, optional
             Unit of a file that names none; metres otherwise.
         seed : int
@@ -139,21 +156,27 @@ class PointShell:
             if unit is not None:
                 raise UsageError(f"{path} is a saved shell, in metres: leave out the unit")
             return cls.load(path)
-        _check_request(points, seed)
+        _check_request(points, spacing, seed)
         file = mesh.read_file(path, unit=unit)
         parts = [part for part in file.parts if not part.is_cloud]
         if not parts:
             raise FileError(f"{path}: no triangles, only points or nothing; a tool needs a surface")
         triangles = np.concatenate([part.triangles() for part in parts])
         try:
-            shell = cls._from_triangles(triangles, points, seed, file.link)
+            shell = cls._from_triangles(triangles, points, spacing, seed, file.link)
         except UsageError as error:
             raise FileError(f"{path}: {error}") from None
         return replace(shell, defects=file.defects.describe())
 
     @classmethod
     def from_mesh(
-        cls, vertices: ArrayLike, faces: ArrayLike, points: int = 300, *, seed: int = 0
+        cls,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        points: int | None = None,
+        *,
+        spacing: float | None = None,
+        seed: int = 0,
     ) -> "PointShell":
         """Make the shell of a triangle mesh.
 
@@ -163,7 +186,7 @@ class PointShell:
             Metres; they define the shell's frame.
         faces : (F, 3)
             Vertices of each triangle, in any order and winding.
-        points, seed : int
+        points, spacing, seed
             As for `from_file`.
 
         Raises
@@ -171,7 +194,7 @@ class PointShell:
         UsageError
             Numbers out of range, vertices not finite, faces that name no vertex, no area.
         """
-        _check_request(points, seed)
+        _check_request(points, spacing, seed)
         corners = _as_floats(vertices, "vertices", finite=False)
         indices = np.asarray(faces)
         if corners.ndim != 2 or corners.shape[1] != 3:
@@ -180,7 +203,7 @@ class PointShell:
             raise UsageError(f"faces are {indices.dtype} {indices.shape}, not integers (F, 3)")
         if indices.size and (indices.min() < 0 or indices.max() >= len(corners)):
             raise UsageError(f"faces name vertices outside 0 .. {len(corners) - 1}")
-        return cls._from_triangles(corners[indices], points, seed, "")
+        return cls._from_triangles(corners[indices], points, spacing, seed, "")
 
     @classmethod
     def sphere(cls, radius: float, points: int = 300) -> "PointShell":
@@ -198,22 +221,42 @@ class PointShell:
         UsageError
             Numbers out of range.
         """
-        _check_request(points, 0)
+        _check_request(points, None, 0)
         if not (np.isfinite(radius) and radius > 0):
             raise UsageError(f"a sphere of radius {radius}: give metres above 0")
         outward = fibonacci_sphere(points)
         outward = outward[_curve_order(outward)]
-        return cls(outward * radius, -outward, np.zeros(3))
+        return cls(outward * radius, -outward, np.zeros(3), surface=Ball(float(radius)))
 
     @classmethod
-    def _from_triangles(cls, triangles: Floats, points: int, seed: int, link: str) -> "PointShell":
+    def _from_triangles(
+        cls, triangles: Floats, points: int | None, spacing: float | None, seed: int, link: str
+    ) -> "PointShell":
         surface = orient(triangles)
+        n_points = DEFAULT_POINTS if points is None else points
+        if spacing is not None:
+            most = DENSE_POINTS if points is None else points
+            wanted = points_for(float(surface.areas.sum()), spacing)
+            n_points = min(max(wanted, DEFAULT_POINTS), most)
         places, face_of = sampling.sample_surface(
-            surface.triangles, surface.areas, surface.normals, points, np.random.default_rng(seed)
+            surface.triangles, surface.areas, surface.normals, n_points, np.random.default_rng(seed)
         )
         order = _curve_order(places)
         normals = surface.normals[face_of[order]]
-        return cls(places[order], normals, surface.center, surface.is_closed, link, seed)
+        return cls(
+            places[order], normals, surface.center, surface.is_closed, link, seed, surface=surface
+        )
+
+    def with_cover(self) -> "PointShell":
+        """Find the covering radius of a shell of a mesh or sphere; others are returned as they are.
+
+        It takes about as long as making the shell did.
+        """
+        if self.cover is not None or self.surface is None:
+            return self
+        if isinstance(self.surface, Ball):
+            return replace(self, cover=self.surface.covering_radius(self.points))
+        return replace(self, cover=covering_radius(self.surface.triangles, self.points))
 
     def save(self, path: str | PathLike[str]) -> None:
         """Write the shell to a `.npz` file of exactly that name.
@@ -234,6 +277,7 @@ class PointShell:
                     is_closed=np.array(self.is_closed),
                     link=np.array(self.link),
                     seed=np.array(self.seed),
+                    cover=np.array(np.nan if self.cover is None else self.cover),
                 )
         except OSError as error:
             raise FileError(f"{path}: cannot write the shell: {error.strerror}") from None
@@ -260,6 +304,7 @@ class PointShell:
                     bool(saved["is_closed"]),
                     str(saved["link"]),
                     int(saved["seed"]),
+                    cover=_saved_cover(saved),
                 )
         except FileNotFoundError:
             raise FileError(f"{path}: no such file") from None
@@ -270,7 +315,8 @@ class PointShell:
             raise FileError(f"{path}: not a saved shell, or damaged: {cause}") from None
 
 
-def _check_request(points: int, seed: int) -> None:
+def _check_request(points: int | None, spacing: float | None, seed: int) -> None:
+    points = DEFAULT_POINTS if points is None else points
     for number, what in ((points, "points"), (seed, "a seed")):
         if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
             raise UsageError(f"{what} {number!r}: give a whole number")
@@ -278,6 +324,8 @@ def _check_request(points: int, seed: int) -> None:
         raise UsageError(f"{points} points: a shell has 1 to {MAX_POINTS}")
     if seed < 0:
         raise UsageError(f"seed {seed}: give 0 or more")
+    if spacing is not None and not (np.isfinite(spacing) and spacing > 0.0):
+        raise UsageError(f"a spacing of {spacing} m: give metres above 0")
 
 
 def _check_members(file: BinaryIO, path: str | PathLike[str]) -> None:
@@ -316,6 +364,12 @@ def _promised_bytes(stream: IO[bytes]) -> int:
 def _check_format(saved: object, path: str | PathLike[str]) -> None:
     if not isinstance(saved, np.lib.npyio.NpzFile) or str(saved.get("format")) != FORMAT:
         raise FileError(f"{path}: not a saved shell, or of another version")
+
+
+def _saved_cover(saved: "np.lib.npyio.NpzFile") -> float | None:
+    """Covering radius; None where it was not known, or not saved yet by the version that did."""
+    cover = float(saved["cover"]) if "cover" in saved else np.nan
+    return None if np.isnan(cover) else cover
 
 
 def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:

@@ -1,5 +1,7 @@
 """Cells and their directory stand against a dictionary and a plain set of voxels."""
 
+from itertools import product
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -137,13 +139,35 @@ def test_cells_met_are_those_of_the_points(seed: int, most: int) -> None:
         sets.append({int(cell_key(*v)) for v in ijk[grid.contains(ijk)].tolist()})
     found = np.full(256, -1, dtype=np.int64)
     place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-    n_poses, count = kernels.cells_met(points, poses, place, found, most)
+    n_poses, count = kernels.cells_met(points, 0.0, poses, place, found, most)
     united: set[int] = set().union(*sets[:n_poses])
     assert set(found[found >= 0].tolist()) == united
     assert count == len(united)
     assert n_poses == 1 or count <= most
     if n_poses < len(poses):
         assert len(united | sets[n_poses]) > most
+
+
+@given(st.integers(0, 1000), st.floats(0.1, 16.0))
+@settings(max_examples=40)
+def test_cells_met_within_reach_are_those_of_the_boxes_around_the_points(
+    seed: int, reach: float
+) -> None:
+    grid = Grid(0.01, (0.0, 0.0, 0.0), 8)
+    rng = np.random.default_rng(seed)
+    points = np.hstack([rng.normal(0, 0.5, (40, 3)), np.zeros((40, 3))])
+    pose = poses_in(grid, 1, seed)
+    expected = set()
+    for x in (points[:, :3] @ pose[0, :3, :3].T + pose[0, :3, 3]) / grid.voxel_size:
+        low = np.maximum(np.floor(x - reach), 0).astype(int)
+        high = np.minimum(np.floor(x + reach), grid.side - 1).astype(int)
+        if (low <= high).all():
+            sides = [range(a // 32, b // 32 + 1) for a, b in zip(low, high, strict=True)]
+            expected |= {int(cell_key(32 * i, 32 * j, 32 * k)) for i, j, k in product(*sides)}
+    found = np.full(2048, -1, dtype=np.int64)
+    place = Place(*grid.origin, grid.voxel_size, float(grid.side))
+    assert kernels.cells_met(points, reach, pose, place, found, 500) == (1, len(expected))
+    assert set(found[found >= 0].tolist()) == expected
 
 
 def test_the_clock_passes_over_what_is_wanted_and_gives_used_slots_a_second_round() -> None:

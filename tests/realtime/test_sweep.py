@@ -182,7 +182,7 @@ def test_fractions_go_by_the_way_and_not_by_the_number_of_poses() -> None:
 
 def test_a_path_of_one_pose_is_one_sample(env: Environment) -> None:
     found = sweep(env, ball(), line((0, 0, 0)))
-    assert (found.samples, found.comes_out) == (1, True)
+    assert (found.samples, found.hits) == (1, 0)
     assert found.clearance is not None
     assert found.clearance.distance == pytest.approx(naive_clearance(ball(), line((0, 0, 0))))
 
@@ -238,6 +238,8 @@ def test_hits_contacts_and_objects_are_those_of_every_sample(
             frame.depths[frame.hits.index(n)] for frame in frames for n, j in frame.pairs if j == i
         ]
         assert one.deepest == max(depths)
+        points = [sum(j == i for _, j in frame.pairs) for frame in frames]
+        assert one.points == max(points)
 
 
 def test_a_voxel_of_two_objects_is_hit_for_both(env: Environment) -> None:
@@ -290,8 +292,8 @@ def test_clearance_is_the_least_distance_of_any_point_to_any_voxel(
         assert (clearance.distance, clearance.moment) == (limit, None)
         return
     assert clearance.distance == pytest.approx(expected, abs=1e-9)
-    assert (clearance.distance == 0.0) == (not found.comes_out)
-    if found.comes_out:
+    assert (clearance.distance == 0.0) == (found.verdict == "hits")
+    if not found.hits:
         assert clearance.moment is not None
         assert clearance.point is not None
         assert clearance.voxel is not None
@@ -320,21 +322,24 @@ def test_clearance_that_is_not_asked_for_is_not_given(env: Environment) -> None:
 
 
 def test_clearance_says_what_it_means_for_surfaces(env: Environment) -> None:
-    """A point a voxel from the wall's box: its surface is at most a diagonal deeper."""
-    shell = PointShell(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), np.zeros(3))
+    """A voxel and a half from the wall's box: its surface is at most a diagonal deeper."""
+    shell = PointShell(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), np.zeros(3), cover=0.002)
     place = env.grid.centers([[78, 60, 50]])[0]
-    clearance = sweep(env, shell, [pose_of(place)]).clearance
-    assert clearance is not None
-    assert clearance.distance == pytest.approx(1.5 * SIZE)
-    assert clearance.at_least == pytest.approx(1.25 * SIZE)
-    assert clearance.at_most == pytest.approx((1.5 + 3**0.5) * SIZE)
+    aside = place - (0.0, 0.25 * SIZE, 0.0)
+    for poses, off in (([pose_of(place)], 0.0), ([pose_of(place), pose_of(aside)], 0.125 * SIZE)):
+        found = sweep(env, shell, poses)
+        assert found.proof.off == pytest.approx(off, abs=1e-6 * SIZE)
+        assert found.clearance is not None
+        assert found.clearance.distance == pytest.approx(1.5 * SIZE)
+        assert found.clearance.at_least == pytest.approx(1.5 * SIZE - off - 0.002, abs=1e-6 * SIZE)
+        assert found.clearance.at_most == pytest.approx((1.5 + 3**0.5) * SIZE)
 
 
 def test_beside_the_grid_nothing_is_hit_and_the_border_counts(env: Environment) -> None:
     shell = ball(12)
     poses = np.array([pose_of(np.array(GRID.origin) - 1.0), pose_of(np.array(GRID.origin) - 0.9)])
     found = sweep(env, shell, poses)
-    assert found.comes_out
+    assert found.hits == 0
     assert found.clearance is not None
     assert found.clearance.is_beyond
 
@@ -355,7 +360,10 @@ def test_the_least_budget_finds_the_same(tmp_path: Path) -> None:
     assert small.cells > large.cells
     assert (small.hits, small.contacts) == (large.hits, large.contacts)
     assert np.array_equal(small.profile.clearances, large.profile.clearances)
-    assert [one[1:] for one in small.objects] == [one[1:] for one in large.objects]
+    for one, same in zip(small.objects, large.objects, strict=True):
+        assert (one.samples, one.contacts, one.points) == (same.samples, same.contacts, same.points)
+        assert np.array_equal(one.intervals, same.intervals)
+        assert (one.deepest, one.length) == (same.deepest, same.length)
 
 
 def test_a_sweep_sees_one_revision_while_others_write(tmp_path: Path, monkeypatch: Any) -> None:  # noqa: ANN401
@@ -372,9 +380,9 @@ def test_a_sweep_sees_one_revision_while_others_write(tmp_path: Path, monkeypatc
 
         meanwhile = sweep(env, ball(), poses, progress=obstruct)
         after = sweep(env, ball(), poses)
-    assert before.comes_out
-    assert (meanwhile.comes_out, meanwhile.revision) == (True, before.revision)
-    assert not after.comes_out
+    assert before.hits == 0
+    assert (meanwhile.hits, meanwhile.revision) == (0, before.revision)
+    assert after.verdict == "hits"
     assert after.revision > before.revision
 
 

@@ -1,27 +1,23 @@
 """The verb sweep."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated
 
 import typer
 
 from hapticdb.cli import fitting, render
 from hapticdb.cli.choosing import Exclude, Parts, ids_of
-from hapticdb.cli.root import Budget, Json, PathUnit, Points, Seed, ToolUnit, UpName, Url, bytes_of
-from hapticdb.cli.touching import DEFAULT_POINTS, shell_of
+from hapticdb.cli.root import Budget, Json, PathUnit, Seed, ToolUnit, UpName, Url, bytes_of
+from hapticdb.cli.touching import shell_of
+from hapticdb.cli.verdict import record, show, verdict_line
 
-if TYPE_CHECKING:
-    from hapticdb.environment import Environment
-    from hapticdb.pointshell import PointShell
-    from hapticdb.realtime.swept import Clearance, Deepest, Moment, Swept
-    from hapticdb.store.base import Object
-
-MOST_OBJECTS = 20
-MOST_NAMED = 3
+EXIT_CODES = {"comes out": 0, "hits": 1, "not decided": 3}
 DOUBTFUL = 3
-"""Exit code of "comes out" where tool, path and scene do not fit."""
+"""Exit code of "comes out", too, where tool, path and scene do not fit."""
+DENSE = 0.5
+"""Voxels from point to point of the tool, unless --points are given."""
 
 
 def sweep(
@@ -47,7 +43,10 @@ def sweep(
     budget: Budget = 256.0,
     tool_unit: ToolUnit = None,
     path_unit: PathUnit = None,
-    points: Points = None,
+    points: Annotated[
+        int | None,
+        typer.Option(metavar="N", help="Points of the shell.", show_default="half a voxel apart"),
+    ] = None,
     seed: Seed = None,
     as_given: Annotated[
         bool,
@@ -66,6 +65,10 @@ def sweep(
 ) -> None:
     """Say whether a tool or part comes out along a path: what it hits, where, how near it comes.
 
+    Hits: a point of the tool is in a voxel of an object, or something lies inside
+    the tool, whose mesh is closed there. Comes out: proved for the whole surface
+    and the whole path. Not decided: neither, and the line says what would decide.
+
     Between two poses the tool's middle moves straight while the tool turns about
     it, in steps in which no point moves more than half a voxel. Segment 0 leads
     from pose 0 to pose 1.
@@ -75,9 +78,11 @@ def sweep(
     qw 1 is their place. A sub-assembly's name means all that is below it;
     'hapticdb objects --help' says how names choose objects.
 
-    The exit code is 0 when nothing is hit, 1 when anything is, and 3 when
-    nothing is hit, but the sizes or places of tool, path and scene do not fit,
-    as a line then says: --as-given if they are meant so.
+    The points are half a voxel apart, 200,000 at most, unless --points are given.
+
+    The exit code is 0 when it comes out, 1 when it hits, 3 when not decided; 3,
+    too, when it comes out, but the sizes or places of tool, path and scene do not
+    fit, as a line then says: --as-given if they are meant so.
 
     Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
     """
@@ -98,17 +103,18 @@ def sweep(
         parts = ids_of(env, part, "--part")
         excluded = sorted({*parts, *ids_of(env, exclude, "--exclude")})
         render.compile_kernels("sweep", files=[tool] if tool else [])
-        if tool is not None:
-            shell = shell_of(tool, tool_unit, points, seed)
-        else:
-            shell = env.shell(
-                *parts, points=DEFAULT_POINTS if points is None else points, seed=seed or 0
-            )
+        spacing = DENSE * env.grid.voxel_size if points is None else None
+        with _bar("spreading points"):
+            if tool is not None:
+                shell = shell_of(tool, tool_unit, points, seed, spacing)
+            else:
+                shell = env.shell(*parts, points=points, spacing=spacing, seed=seed or 0)
+            shell = shell.with_cover()
         fit = fitting.compare(
             env, shell, poses, exclude=excluded, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=True,
         )  # fmt: skip
-        with _bar() as progress:
+        with _bar("sweeping") as progress:
             found = swept_by(
                 env,
                 shell,
@@ -123,28 +129,28 @@ def sweep(
             render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
         try:
             if json:
-                render.say_json(
-                    _record(found, shell, parts, excluded) | {"proportions": fit.record()}
-                )
+                proportions = {"proportions": fit.record()}
+                render.say_json(record(found, shell, parts, excluded) | proportions)
             else:
-                _show(env, found, shell)
+                show(env, found, shell)
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
                 from hapticdb.sweep_picture import draw_sweep
 
                 draw_sweep(
-                    picture, env, shell, found, exclude=excluded, verdict=_verdict(found), up=up
-                )
+                    picture, env, shell, found, exclude=excluded,
+                    verdict=verdict_line(found, shell), up=up,
+                )  # fmt: skip
     if not json and picture is not None:
         render.say(f"picture: {picture}")
-    if not found.comes_out:
-        raise typer.Exit(1)
+    if found.verdict != "comes out":
+        raise typer.Exit(EXIT_CODES[found.verdict])
     if fit.misfits and not as_given:
         raise typer.Exit(DOUBTFUL)
 
 
 @contextmanager
-def _bar() -> Iterator[Callable[[int, int], None] | None]:
+def _bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
     """Show a bar with samples a second and time left; nothing where nobody looks."""
     import sys
 
@@ -155,192 +161,5 @@ def _bar() -> Iterator[Callable[[int, int], None] | None]:
     from rich.progress import Progress
 
     with Progress(console=Console(file=sys.stderr), transient=True) as bar:
-        task = bar.add_task("sweeping", total=None)
+        task = bar.add_task(what, total=None)
         yield lambda done, total: bar.update(task, completed=done, total=total)
-
-
-# -- for people -----------------------------------------------------------------------------------
-
-
-def _verdict(found: "Swept") -> str:
-    """One line: whether it comes out, and if not, what is in the way first."""
-    samples = f"{found.samples:,} sample{'s' * (found.samples > 1)}"
-    if found.first_hit is None:
-        return f"comes out: no hit in {samples}{_clearance_clause(found.clearance)}"
-    is_start = found.first_hit.sample == 0 and len(found.hit_intervals) == 1
-    if is_start and found.hit_intervals[0, 1] < 1.0:
-        free = _percent(found.hit_intervals[0, 1])
-        met = _names([one.object for one in found.objects])
-        return f"touches {met} where it starts; no hit after {free} of the path"
-    if found.first_contact is None:
-        return (
-            f"grazes {_names(found.first_hit.objects)} at {_where(found, found.first_hit)}: "
-            "within a voxel, without contact"
-        )
-    contact = found.first_contact
-    return f"is caught: first contact at {_where(found, contact)} with {_names(contact.objects)}"
-
-
-def _clearance_clause(clearance: "Clearance | None") -> str:
-    if clearance is None:
-        return ""
-    if clearance.moment is None:
-        return f", nothing nearer than {render.metres(clearance.distance)}"
-    return (
-        f", least clearance {render.metres(clearance.distance)} "
-        f"from {_names(clearance.moment.objects)}"
-    )
-
-
-def _percent(fraction: float) -> str:
-    return f"{100 * fraction:.3g} %"
-
-
-def _where(found: "Swept", moment: "Moment") -> str:
-    """Where on the path: ``31 % of the path (segment 4)``."""
-    segment = f" (segment {moment.segment})" if len(found.path.poses) > 2 else ""
-    return f"{_percent(moment.fraction)} of the path{segment}"
-
-
-def _names(objects: "Sequence[Object]") -> str:
-    names = [obj.name for obj in objects]
-    more = len(names) - MOST_NAMED
-    return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
-
-
-def _show(env: "Environment", found: "Swept", shell: "PointShell") -> None:
-    render.say(_verdict(found))
-    if found.objects:
-        rows = [
-            (
-                str(one.object.id),
-                one.object.name,
-                f"{_percent(one.first)} to {_percent(one.last)}",
-                f"{one.samples:,}",
-                f"{one.contacts:,}",
-                render.metres(one.deepest) if one.deepest > 0.0 else "-",
-            )
-            for one in found.objects[:MOST_OBJECTS]
-        ]
-        columns = ("id>", "hit", "of the path>", "samples>", "in contact>", "deepest>")
-        render.show(render.table(columns, rows))
-        if len(found.objects) > MOST_OBJECTS:
-            render.say(f"{len(found.objects)} objects, {MOST_OBJECTS} of them shown")
-    render.show(render.facts(_facts(env, found, shell)))
-
-
-def _facts(env: "Environment", found: "Swept", shell: "PointShell") -> list[tuple[str, str]]:
-    size = env.grid.voxel_size
-    way = f"{len(found.path.poses):,} poses given, {found.samples:,} samples"
-    rows = [
-        ("path", f"{way}, no point moves more than {render.metres(0.5 * size)} between two"),
-        ("tool", f"{len(shell)} points, {render.metres(_spacing(shell))} apart (median)"),
-        ("hits", f"{found.hits:,} samples hit, {found.contacts:,} in contact"),
-    ]
-    if found.deepest is not None and found.deepest.depth > 0.0:
-        rows.append(("deepest", _deepest_text(found.deepest)))
-    if found.clearance is not None and found.comes_out:
-        rows.append(("clearance", _clearance_text(found.clearance)))
-    rate = f"{found.samples / max(found.elapsed, 1e-9):,.0f} poses a second"
-    rows.append(("took", f"{found.elapsed:.2f} s, {rate}, {found.cells:,} cells fetched"))
-    return rows
-
-
-def _deepest_text(deepest: "Deepest") -> str:
-    return (
-        f"{render.metres(deepest.depth)} at {_percent(deepest.moment.fraction)}, in "
-        f"{_names(deepest.moment.objects)}, at {_place(deepest.point)} m"
-    )
-
-
-def _place(point: "Iterable[float]") -> str:
-    return f"({', '.join(f'{x:.4g}' for x in point)})"
-
-
-def _clearance_text(clearance: "Clearance") -> str:
-    """What the number means: a surface lies somewhere in its voxel."""
-    if clearance.moment is None:
-        return f"no voxel nearer than {render.metres(clearance.distance)}; farther is not looked"
-    return (
-        f"{render.metres(clearance.distance)} from a voxel of {_names(clearance.moment.objects)} "
-        f"at {_percent(clearance.moment.fraction)}: its surface is "
-        f"{render.metres(clearance.at_least)} to {render.metres(clearance.at_most)} from the points"
-    )
-
-
-def _spacing(shell: "PointShell") -> float:
-    """Median distance from a point to its nearest neighbour, metres; of a thousand of them."""
-    import numpy as np
-    from scipy.spatial import cKDTree
-
-    if len(shell) < 2:
-        return 0.0
-    some = shell.points[:: max(1, len(shell) // 1000)]
-    distances, _ = cKDTree(shell.points).query(some, k=2)
-    return float(np.median(np.asarray(distances)[:, 1]))
-
-
-# -- for programs ---------------------------------------------------------------------------------
-
-
-def _record(
-    found: "Swept", shell: "PointShell", parts: list[int], excluded: list[int]
-) -> dict[str, Any]:
-    deepest, clearance = found.deepest, found.clearance
-    return {
-        "comes_out": found.comes_out,
-        "verdict": _verdict(found),
-        "poses": len(found.path.poses),
-        "samples": found.samples,
-        "hits": found.hits,
-        "contacts": found.contacts,
-        "first_hit": _moment(found.first_hit),
-        "first_contact": _moment(found.first_contact),
-        "deepest": deepest
-        and {
-            "depth": deepest.depth,
-            "point": deepest.point.tolist(),
-            "moment": _moment(deepest.moment),
-        },
-        "objects": [
-            {
-                **_named(one.object),
-                "first": one.first,
-                "last": one.last,
-                "samples": one.samples,
-                "contacts": one.contacts,
-                "deepest": one.deepest,
-            }
-            for one in found.objects
-        ],
-        "hit_intervals": found.hit_intervals.tolist(),
-        "contact_intervals": found.contact_intervals.tolist(),
-        "clearance": clearance
-        and {
-            "distance": clearance.distance,
-            "at_least": clearance.at_least,
-            "at_most": None if clearance.is_beyond else clearance.at_most,
-            "is_beyond": clearance.is_beyond,
-            "point": None if clearance.point is None else clearance.point.tolist(),
-            "voxel": None if clearance.voxel is None else clearance.voxel.tolist(),
-            "moment": _moment(clearance.moment),
-        },
-        "tool": {"points": len(shell), "parts": parts, "excluded": excluded},
-        "revision": found.revision,
-        "elapsed": found.elapsed,
-        "cells": found.cells,
-    }
-
-
-def _named(obj: "Object") -> dict[str, object]:
-    return {"id": obj.id, "name": obj.name}
-
-
-def _moment(moment: "Moment | None") -> dict[str, object] | None:
-    return moment and {
-        "sample": moment.sample,
-        "fraction": moment.fraction,
-        "segment": moment.segment,
-        "pose": moment.pose.tolist(),
-        "objects": [_named(obj) for obj in moment.objects],
-    }

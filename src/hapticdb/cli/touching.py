@@ -118,19 +118,20 @@ def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strat
     return wanted
 
 
-def shell_of(tool: str, unit: str | None, points: int | None, seed: int | None) -> "PointShell":
+def shell_of(
+    tool: str,
+    unit: str | None,
+    points: int | None,
+    seed: int | None,
+    spacing: float | None = None,
+) -> "PointShell":
     """Shell of a tool's file, its defects told; --points and --seed as they were given."""
     from hapticdb.errors import UsageError
     from hapticdb.pointshell import PointShell
 
     if tool.lower().endswith(".npz") and (points is not None or seed is not None):
         raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
-    shell = PointShell.from_file(
-        tool,
-        DEFAULT_POINTS if points is None else points,
-        unit=unit,
-        seed=0 if seed is None else seed,
-    )
+    shell = PointShell.from_file(tool, points, spacing=spacing, unit=unit, seed=seed or 0)
     if shell.defects:
         render.note(f"{tool}: found in the file: {shell.defects}")
     if not shell.is_closed:

@@ -252,19 +252,21 @@ def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
     return count
 
 
-@entry(FLOATS2, FLOATS3, PLACE, INTS, INT)
-def cells_met(points, poses, place, found, most):
-    """Distinct cells that points (N, 3+) meet at the first of the poses (M, 4, 4).
+@entry(FLOATS2, FLOAT, FLOATS3, PLACE, INTS, INT)
+def cells_met(points, reach, poses, place, found, most):
+    """Distinct cells within reach, voxels, at most 16, of points (N, 3+) at the first of the poses.
 
-    They go into found (capacity,) int64, -1 all over before, an open-addressing set whose capacity
-    is a power of two and 2 (most + N) at least. Returns how many poses that are: the first at
-    least, then while the cells are no more than `most`; and how many cells.
+    poses (M, 4, 4). The cells go into found (capacity,) int64, -1 all over before, an
+    open-addressing set whose capacity is a power of two and 2 (most + 8 N) at least, 2 (most + N)
+    without reach. Returns how many poses that are: the first at least, then while the cells are no
+    more than `most`; and how many cells.
     """
     capacity = found.shape[0]
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
+    r, top = reach, side - 1.0
     count = 0
-    memo = np.int64(-1)
-    before = np.empty(points.shape[0], dtype=np.int64)
+    low_memo = high_memo = np.int64(-1)
+    before = np.empty((8 if r > 0.0 else 1) * points.shape[0], dtype=np.int64)
     for n in range(poses.shape[0]):
         a, b, c, u = poses[n, 0, 0], poses[n, 0, 1], poses[n, 0, 2], poses[n, 0, 3]
         d, e, f, v = poses[n, 1, 0], poses[n, 1, 1], poses[n, 1, 2], poses[n, 1, 3]
@@ -275,19 +277,28 @@ def cells_met(points, poses, place, found, most):
             x = (turn(a, b, c, px, py, pz) + u - ox) / size
             y = (turn(d, e, f, px, py, pz) + v - oy) / size
             z = (turn(g, h, m, px, py, pz) + w - oz) / size
-            if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
+            if not (-r <= x < side + r and -r <= y < side + r and -r <= z < side + r):
                 continue
-            key = cell_key(np.int64(x), np.int64(y), np.int64(z))
-            if key == memo:
+            low = cell_key(
+                np.int64(max(x - r, 0.0)), np.int64(max(y - r, 0.0)), np.int64(max(z - r, 0.0))
+            )
+            high = cell_key(
+                np.int64(min(x + r, top)), np.int64(min(y + r, top)), np.int64(min(z + r, top))
+            )
+            if low == low_memo and high == high_memo:
                 continue
-            memo = key
-            at = spread_key(key, capacity)
-            while found[at] >= 0 and found[at] != key:
-                at = (at + 1) & (capacity - 1)
-            if found[at] < 0:
-                found[at] = key
-                before[added] = at
-                added += 1
+            low_memo, high_memo = low, high
+            for ci in range(low >> 32, (high >> 32) + 1):
+                for cj in range((low >> 16) & 0xFFFF, ((high >> 16) & 0xFFFF) + 1):
+                    for ck in range(low & 0xFFFF, (high & 0xFFFF) + 1):
+                        key = (ci << 32) | (cj << 16) | ck
+                        at = spread_key(key, capacity)
+                        while found[at] >= 0 and found[at] != key:
+                            at = (at + 1) & (capacity - 1)
+                        if found[at] < 0:
+                            found[at] = key
+                            before[added] = at
+                            added += 1
         if n > 0 and count + added > most:
             for p in range(added):  # in the opposite order, so that no run of entries is torn
                 found[before[added - 1 - p]] = -1

@@ -310,3 +310,13 @@ def enclosures(
     out = np.zeros(len(pairs), dtype=np.uint8)
     nesting_kernel(tree, pairs, picks, _directions(PATIENCE), centroids, out)
     return out.astype(np.bool_)
+
+
+def encloses(tree: TriangleTree, body: int, places: Floats) -> NDArray[np.bool_]:
+    """Tell whether a closed body of the tree encloses places (Q, 3), (Q,)."""
+    asked = np.arange(len(places))
+    pairs = np.stack([asked, np.full(len(places), body)], axis=1)
+    picks = np.repeat(asked[:, None], PATIENCE, axis=1)
+    out = np.zeros(len(places), dtype=np.uint8)
+    nesting_kernel(tree, pairs, picks, _directions(PATIENCE), places, out)
+    return out.astype(np.bool_)

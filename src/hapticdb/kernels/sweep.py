@@ -25,11 +25,14 @@ from hapticdb.kernels._jit import (
 )
 from hapticdb.kernels.cells import (
     CELLS,
+    CLUSTERS,
     EMPTY_SLOT,
+    GROUP,
     PLACE,
     begin_frame,
     cell_key,
     end_frame,
+    is_sphere_free,
     slot_of,
     spread_key,
 )
@@ -69,20 +72,23 @@ class Bounds(NamedTuple):
     """What is known about clearance, in voxels, kept from sample to sample.
 
     expiry (N,): for each point, a travel at which it may have come to an occupied voxel at the
-    earliest, if it went straight there: its distance now is at least expiry - travel; nearest (N,)
+    earliest, if it went straight there: its distance now is at least expiry - travel; of_runs (C,):
+    the same for all points of each run of a cluster; nearest (N,)
     int64: the voxel, packed, that it was nearest to when last looked at, or -1; least (W,): of each
     window of the path so far; state (2,): the least expiry, the least distance of all; where (5,)
-    int64: sample, point and voxel of that, the point that was nearest last, and where it stopped.
+    int64: sample, point and voxel of that, the point that was nearest last, and the run where it
+    stopped.
     """
 
     expiry: NDArray[np.float64]
+    of_runs: NDArray[np.float64]
     nearest: NDArray[np.int64]
     least: NDArray[np.float64]
     state: NDArray[np.float64]
     where: NDArray[np.int64]
 
 
-BOUNDS = fields_of(Bounds, FLOATS, INTS, FLOATS, FLOATS, INTS)
+BOUNDS = fields_of(Bounds, FLOATS, FLOATS, INTS, FLOATS, FLOATS, INTS)
 
 
 SOONEST, LEAST = 0, 1
@@ -144,15 +150,16 @@ def unpack(voxels, out):
         out[n, 2] = voxels[n] & AXIS_MASK
 
 
-@entry(CELLS, INT, FLOATS2, FLOATS3, INTS, PLACE, INT, INT, FOUND)
-def find_hits(cells, reader, points, poses, samples, place, first, count, found):
+@entry(CELLS, INT, CLUSTERS, FLOATS3, INTS, PLACE, INT, INT, FOUND)
+def find_hits(cells, reader, shell, poses, samples, place, first, count, found):
     """Hits at poses[samples[first:]], appended to `found` from its entry `count` on.
 
-    points (N, 6): metres and inward normals. Returns how many of the samples (S,) are done and how
-    many hits there are now: fewer samples than S when a cell was not resident, and the rest of the
-    last one's hits are not counted. Depths are those of `cells.felt`, bit for bit.
+    Runs of points whose sphere is free are passed over. Returns how many of the samples (S,) are
+    done and how many hits there are now: fewer samples than S when a cell was not resident, and the
+    rest of the last one's hits are not counted. Depths are those of `cells.felt`, bit for bit.
     """
-    words, keys, slots = cells.words, cells.keys, cells.slots
+    keys, slots, words, masks, used = cells.keys, cells.slots, cells.words, cells.masks, cells.used
+    points, spheres, groups, run = shell.points, shell.spheres, shell.groups, shell.run
     out_samples, out_points, out_places, out_depths, voxels = found
     capacity = voxels.shape[0]
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
@@ -163,40 +170,58 @@ def find_hits(cells, reader, points, poses, samples, place, first, count, found)
         d, e, f, v = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
         g, h, m, w = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
         before = count
-        for n in range(points.shape[0]):
-            px, py, pz = points[n, 0], points[n, 1], points[n, 2]
-            px, py, pz = (
-                turn(a, b, c, px, py, pz) + u,
-                turn(d, e, f, px, py, pz) + v,
-                turn(g, h, m, px, py, pz) + w,
-            )
-            x, y, z = (px - ox) / size, (py - oy) / size, (pz - oz) / size
-            if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
-                continue
-            i, j, k = np.int64(x), np.int64(y), np.int64(z)
-            slot = slot_of(keys, slots, which, cell_key(i, j, k))
-            if slot < 0:
-                end_frame(cells, reader)
-                return at, before
-            if not (words[slot, ((i & 31) << 5) | (j & 31)] >> np.uint32(k & 31)) & 1:
-                continue
-            nx, ny, nz = points[n, 3], points[n, 4], points[n, 5]
-            nx, ny, nz = (
-                turn(a, b, c, nx, ny, nz),
-                turn(d, e, f, nx, ny, nz),
-                turn(g, h, m, nx, ny, nz),
-            )
-            cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
-            voxel = packed(i, j, k)
-            entry_at = spread_key(voxel, capacity)
-            while voxels[entry_at] >= 0 and voxels[entry_at] != voxel:
-                entry_at = (entry_at + 1) & (capacity - 1)
-            voxels[entry_at] = voxel
-            out_samples[count] = samples[at]
-            out_points[count] = n
-            out_places[count] = entry_at
-            out_depths[count] = max(contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz), 0.0)
-            count += 1
+        group_is_free = False
+        for start in range(0, points.shape[0], run):
+            if spheres.shape[0] > 0:
+                cluster = start // run
+                if cluster % GROUP == 0:
+                    group_is_free = is_sphere_free(
+                        keys, slots, words, masks, used, which, groups, cluster // GROUP, side,
+                        size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
+                    )  # fmt: skip
+                if group_is_free or is_sphere_free(
+                    keys, slots, words, masks, used, which, spheres, cluster, side, size,
+                    ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
+                ):  # fmt: skip
+                    continue
+            for n in range(start, min(start + run, points.shape[0])):
+                px, py, pz = points[n, 0], points[n, 1], points[n, 2]
+                px, py, pz = (
+                    turn(a, b, c, px, py, pz) + u,
+                    turn(d, e, f, px, py, pz) + v,
+                    turn(g, h, m, px, py, pz) + w,
+                )
+                x, y, z = (px - ox) / size, (py - oy) / size, (pz - oz) / size
+                if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
+                    continue
+                i, j, k = np.int64(x), np.int64(y), np.int64(z)
+                slot = slot_of(keys, slots, which, cell_key(i, j, k))
+                if slot < 0:
+                    end_frame(cells, reader)
+                    return at, before
+                if not (words[slot, ((i & 31) << 5) | (j & 31)] >> np.uint32(k & 31)) & 1:
+                    continue
+                nx, ny, nz = points[n, 3], points[n, 4], points[n, 5]
+                nx, ny, nz = (
+                    turn(a, b, c, nx, ny, nz),
+                    turn(d, e, f, nx, ny, nz),
+                    turn(g, h, m, nx, ny, nz),
+                )
+                cx, cy, cz = (
+                    center_of(px, ox, size),
+                    center_of(py, oy, size),
+                    center_of(pz, oz, size),
+                )
+                voxel = packed(i, j, k)
+                entry_at = spread_key(voxel, capacity)
+                while voxels[entry_at] >= 0 and voxels[entry_at] != voxel:
+                    entry_at = (entry_at + 1) & (capacity - 1)
+                voxels[entry_at] = voxel
+                out_samples[count] = samples[at]
+                out_points[count] = n
+                out_places[count] = entry_at
+                out_depths[count] = max(contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz), 0.0)
+                count += 1
     end_frame(cells, reader)
     return samples.shape[0], count
 
@@ -301,17 +326,46 @@ def nearest_voxel(keys, slots, words, masks, used, which, x, y, z, square, voxel
     return square, voxel
 
 
-@entry(CELLS, INT, FLOATS2, FLOATS3, INT, INT, FLOATS, INTS, PLACE, BOUNDS)
-def find_clearance(cells, reader, points, poses, first, base, travels, windows, place, bounds):
+@inlined
+def far_run(
+    keys, slots, words, masks, used, which, spheres, at, near, cap, side, size, ox, oy, oz,
+    a, b, c, u, d, e, f, v, g, h, m, w,
+):  # fmt: skip
+    """Bound, voxels, from a placed run's sphere to what is nearest, as far as `cap`; -1 if unknown.
+
+    near: a voxel, packed, to begin with, or -1. A point of the run is no nearer than the bound.
+    """
+    x, y, z = spheres[at, 0], spheres[at, 1], spheres[at, 2]
+    radius = spheres[at, 3] / size
+    x, y, z = (
+        (turn(a, b, c, x, y, z) + u - ox) / size,
+        (turn(d, e, f, x, y, z) + v - oy) / size,
+        (turn(g, h, m, x, y, z) + w - oz) / size,
+    )
+    square, voxel = (cap + radius + MARGIN) ** 2, np.int64(-1)
+    if near >= 0 and square_to(x, y, z, near) < square:
+        square, voxel = square_to(x, y, z, near), near
+    square, voxel = nearest_voxel(
+        keys, slots, words, masks, used, which, x, y, z, square, voxel, side
+    )
+    return -1.0 if voxel == -2 else max(math.sqrt(square) - radius, 0.0)
+
+
+@entry(CELLS, INT, CLUSTERS, FLOATS3, INT, INT, FLOATS, INTS, PLACE, FLOAT, BOUNDS)
+def find_clearance(
+    cells, reader, shell, poses, first, base, travels, windows, place, small, bounds
+):  # fmt: skip
     """Least distance from the points to an occupied voxel's box at poses[first:], in `bounds`.
 
     travels (B,): how far any point can have come at each pose since the path's start, voxels;
     windows (B,) int64: which of `bounds.least` each pose counts for; base: number of poses[0] as a
-    sample of the path. Returns how many poses are done: fewer than B when a cell was not resident,
-    and `bounds.where` has the point.
+    sample of the path; small: voxels, runs of no greater radius are looked at as one, before their
+    points. Returns how many poses are done: fewer than B when a cell was not resident,
+    and `bounds.where` has the run.
     """
     keys, slots, words, masks, used = cells.keys, cells.slots, cells.words, cells.masks, cells.used
-    expiry, nearest, least, state, where = bounds
+    points, spheres, run = shell.points, shell.spheres, shell.run
+    expiry, of_runs, nearest, least, state, where = bounds
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
     total = points.shape[0]
     which = begin_frame(cells, reader)
@@ -324,37 +378,54 @@ def find_clearance(cells, reader, points, poses, first, base, travels, windows, 
         d, e, f, v = poses[n, 1, 0], poses[n, 1, 1], poses[n, 1, 2], poses[n, 1, 3]
         g, h, m, w = poses[n, 2, 0], poses[n, 2, 1], poses[n, 2, 2], poses[n, 2, 3]
         soonest = np.inf
-        # what was nearest last bounds the search for all others
-        for turn_of in range(-1, total):
-            p = where[NEAREST] if turn_of < 0 else turn_of
-            if expiry[p] - travel < cap:
-                px, py, pz = points[p, 0], points[p, 1], points[p, 2]
-                x = (turn(a, b, c, px, py, pz) + u - ox) / size
-                y = (turn(d, e, f, px, py, pz) + v - oy) / size
-                z = (turn(g, h, m, px, py, pz) + w - oz) / size
-                square, voxel = (cap + MARGIN) ** 2, np.int64(-1)
-                if nearest[p] >= 0 and square_to(x, y, z, nearest[p]) < square:
-                    square, voxel = square_to(x, y, z, nearest[p]), nearest[p]
-                square, voxel = nearest_voxel(
-                    keys, slots, words, masks, used, which, x, y, z, square, voxel, side
-                )
-                if voxel == -2:
-                    where[STOPPED] = p
+        # the run of what was nearest last comes first: it bounds the search for all others
+        for turn_of in range(-1, of_runs.shape[0]):
+            at = where[NEAREST] // run if turn_of < 0 else turn_of
+            start = at * run
+            is_expired = of_runs[at] - travel < cap and turn_of >= 0
+            if is_expired and spheres.shape[0] > 0 and spheres[at, 3] <= small * size:
+                bound = far_run(
+                    keys, slots, words, masks, used, which, spheres, at, nearest[start], cap, side,
+                    size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
+                )  # fmt: skip
+                if bound < 0.0:
+                    where[STOPPED] = at
                     end_frame(cells, reader)
                     return n
-                distance = math.sqrt(square)
-                nearest[p] = voxel
-                expiry[p] = travel + distance - CAUTION
-                if voxel >= 0 and distance < cap:
-                    cap = distance
-                    where[NEAREST] = p
-                    if distance < state[LEAST]:
-                        state[LEAST] = distance
-                        where[SAMPLE] = base + n
-                        where[POINT] = p
-                        where[VOXEL] = voxel
+                of_runs[at] = max(of_runs[at], travel + bound - CAUTION)
+            if of_runs[at] - travel < cap:
+                soonest_of_run = np.inf
+                for p in range(start, min(start + run, total)):
+                    if expiry[p] - travel < cap:
+                        px, py, pz = points[p, 0], points[p, 1], points[p, 2]
+                        x = (turn(a, b, c, px, py, pz) + u - ox) / size
+                        y = (turn(d, e, f, px, py, pz) + v - oy) / size
+                        z = (turn(g, h, m, px, py, pz) + w - oz) / size
+                        square, voxel = (cap + MARGIN) ** 2, np.int64(-1)
+                        if nearest[p] >= 0 and square_to(x, y, z, nearest[p]) < square:
+                            square, voxel = square_to(x, y, z, nearest[p]), nearest[p]
+                        square, voxel = nearest_voxel(
+                            keys, slots, words, masks, used, which, x, y, z, square, voxel, side
+                        )
+                        if voxel == -2:
+                            where[STOPPED] = at
+                            end_frame(cells, reader)
+                            return n
+                        distance = math.sqrt(square)
+                        nearest[p] = voxel
+                        expiry[p] = travel + distance - CAUTION
+                        if voxel >= 0 and distance < cap:
+                            cap = distance
+                            where[NEAREST] = p
+                            if distance < state[LEAST]:
+                                state[LEAST] = distance
+                                where[SAMPLE] = base + n
+                                where[POINT] = p
+                                where[VOXEL] = voxel
+                    soonest_of_run = min(soonest_of_run, expiry[p])
+                of_runs[at] = soonest_of_run
             if turn_of >= 0:
-                soonest = min(soonest, expiry[p])
+                soonest = min(soonest, of_runs[at])
         least[window] = cap
         state[SOONEST] = soonest
     end_frame(cells, reader)

@@ -31,6 +31,8 @@ RUN = 64
 FLAT_RUN = 512
 """Points that are placed at once without clusters: as many as a processor's first cache holds."""
 LEAST_FOUND = 1 << 16
+SMALL = 16.0
+"""Voxels of a run's radius up to which its surroundings are taken for those of its points."""
 
 Floats = NDArray[np.float64]
 
@@ -77,6 +79,36 @@ def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) ->
     return Clusters(points, np.array(shell.center), spheres, groups, run, columns, scratch)
 
 
+class Surroundings(NamedTuple):
+    """Places that stand for a shell's points where cells are looked for.
+
+    places (P, 3+): the points, or the middles of small runs of them and the points of the others;
+    reach : voxels around a place within which its points are; first (C,) int64: place of each run.
+    """
+
+    places: Floats
+    reach: float
+    first: NDArray[np.int64]
+
+
+def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
+    """Places for runs of points, one for a run with a radius of `SMALL` voxels or less."""
+    n_points = len(clusters.points)
+    starts = np.arange(0, n_points, clusters.run)
+    radii = clusters.spheres[:, 3] / voxel_size
+    is_small = radii <= SMALL
+    if not is_small.any():
+        return Surroundings(clusters.points, 0.0, starts)
+    counts = np.where(is_small, 1, np.minimum(starts + clusters.run, n_points) - starts)
+    first = np.cumsum(counts) - counts
+    places = np.empty((int(counts.sum()), 3))
+    places[first[is_small]] = clusters.spheres[is_small, :3]
+    is_point = np.ones(len(places), dtype=bool)
+    is_point[first[is_small]] = False
+    places[is_point] = clusters.points[np.repeat(~is_small, clusters.run)[:n_points], :3]
+    return Surroundings(places, float(radii[is_small].max()), first)
+
+
 class Frames:
     """Frames of one shell that wait for their cells: exact, whatever the database takes.
 
@@ -105,6 +137,7 @@ class Frames:
         self.stiffness = (law or TangentPlane()).stiffness
         self.clusters = clusters_of(shell, residency.grid.voxel_size, run)
         self.met = np.empty(len(shell), dtype=np.int64)
+        self.surroundings = surroundings_of(self.clusters, residency.grid.voxel_size)
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._row = residency.table.join()
 
@@ -144,9 +177,10 @@ class Frames:
         """Make all cells of the first poses resident; returns how many poses that are."""
         residency = self.residency
         most = (residency.table.n_slots - 1) // 2
-        room = max(LEAST_FOUND, 4 * most, 4 * len(self.shell))
+        places, reach, _ = self.surroundings
+        room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
         found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
-        n_poses, _ = kernels.cells_met(self.clusters.points, poses, residency.place, found, most)
+        n_poses, _ = kernels.cells_met(places, reach, poses, residency.place, found, most)
         cells = found[found >= 0]
         residency.bring(cells)
         return int(n_poses)

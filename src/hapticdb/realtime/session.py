@@ -4,7 +4,7 @@ import os
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Literal, Self, get_args
 
@@ -203,7 +203,7 @@ class Session:
             ring=self._memory,
             n_ring=n_ring,
             grid=self.cells.grid,
-            shell=self.shell,
+            shell=replace(self.shell, surface=None),
             device=device,
             stiffness=self.law.stiffness,
             coupling=self.coupling,

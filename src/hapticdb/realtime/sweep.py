@@ -1,12 +1,12 @@
 """Sweep: a whole path as a batch, which says whether a part comes out.
 
-Exact for the shell's points at the samples: every cell that they need is waited for. Between two
-samples no point moves more than half a voxel, and between two points nothing is looked at.
+Exact for the shell's points at the samples: every cell that they need is waited for. What lies
+between two samples and between two points is bounded (`swept.Proof`): "comes out" is said when that
+bound proves it, and otherwise "not decided".
 """
 
 import time
 from collections.abc import Callable, Iterable
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -24,22 +24,31 @@ from hapticdb.query import as_ids
 from hapticdb.realtime.frames import Felt, Frames
 from hapticdb.realtime.residency import Residency
 from hapticdb.realtime.sweep_clearance import ClearanceSearch
-from hapticdb.realtime.sweep_objects import Met, objects_in, pairs_of_hits, tally
+from hapticdb.realtime.sweep_inside import enclosed_ids
+from hapticdb.realtime.sweep_objects import Met, Runs, objects_in, pairs_of_hits, tally
 from hapticdb.realtime.sweep_path import Path
-from hapticdb.realtime.swept import Clearance, Deepest, MetObject, Moment, Profile, Swept
+from hapticdb.realtime.swept import (
+    Clearance,
+    Deepest,
+    MetObject,
+    Moment,
+    Profile,
+    Proof,
+    Swept,
+)
 from hapticdb.realtime.table import DEFAULT_BUDGET, CellTable
-from hapticdb.store.base import Keys
+from hapticdb.store.base import Keys, Object
 
 DEFAULT_LIMIT = 32
 """Voxels up to which clearance is looked for."""
 WINDOWS = 256
 """Stretches that a path's profile has at most."""
+LOOKED = 1.5
+"""Times the distance that proves a tool clear, up to which is looked at least."""
 BLOCK = 1024
 """Samples at a time, at most."""
-BLOCK_POINTS = 1 << 18
+BLOCK_POINTS = 1 << 21
 """Points that are looked up in a block at most; a sample is not divided."""
-JOINED = 2
-"""Samples between two hits that leave them one interval: a voxel's way."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -65,7 +74,9 @@ def sweep(
     env : Environment
         Not in lexicographic order. All of the sweep reads one revision of it.
     shell : PointShell
-        The tool.
+        The tool. That it comes out can be proved where the covering radius is known (shells of a
+        mesh or sphere; it is found here unless it was before) and about as small as a voxel:
+        `PointShell.from_file(path, spacing=0.5 * env.grid.voxel_size)`.
     poses : (M, 4, 4) array
         `world_from_tool`, rigid, metres; one at least. Between two, the middle of the tool's
         bounding box moves on a line while the tool turns about it, the shorter way round.
@@ -87,6 +98,7 @@ def sweep(
     ObjectNotFoundError
         When an excluded object does not exist.
     """
+    shell = shell.with_cover()
     path = Path.of(poses, shell, env.grid.voxel_size)
     limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
     if not (np.isfinite(limit) and limit >= 0.0):
@@ -115,8 +127,11 @@ class _Run:
         self.grid = env.grid
         self.shell = shell
         self.path = path
+        self.is_asked = limit > 0.0  # for clearance; the proof needs some of it in any case
+        if shell.cover is not None:
+            limit = max(limit, LOOKED * (shell.cover + path.off))
         self.limit = limit
-        self.is_profiled = profile and limit > 0.0
+        self.is_profiled = profile and self.is_asked
         self.progress = progress
         self.n_windows = min(len(path), WINDOWS)
         self.begins = -(-np.arange(self.n_windows) * len(path) // self.n_windows)
@@ -131,6 +146,7 @@ class _Run:
                     started = time.perf_counter()
                     residency.refresh()
                     self._begin(frames)
+                    self.enclosed = enclosed_ids(residency, self.shell, self.path.poses[0])
                     self._sweep(frames)
                     return self._result(frames, time.perf_counter() - started)
             finally:
@@ -149,7 +165,7 @@ class _Run:
         self.search = ClearanceSearch(frames, voxels) if voxels > 0.0 else None
         self.along = ClearanceSearch(frames, voxels, self.n_windows) if self.is_profiled else None
         self.met: dict[int, Met] = {}
-        self.hit_runs, self.contact_runs = _Runs(), _Runs()
+        self.hit_runs, self.contact_runs = Runs(), Runs()
         self.hits_in = np.zeros(self.n_windows, dtype=np.int64)
         self.depth_in = np.zeros(self.n_windows)
         self.first_hit: Moment | None = None
@@ -225,11 +241,10 @@ class _Run:
         return np.asarray(pose[:3, :3] @ self.shell.points[point] + pose[:3, 3])
 
     def _clearance(self, exclude: Keys) -> Clearance | None:
-        if self.search is None:
+        if self.search is None or not self.is_asked:
             return None
         size = self.grid.voxel_size
-        # a surface lies anywhere in its voxel; a point halfway between samples is a quarter off
-        diagonal, off = np.sqrt(3.0) * size, 0.25 * size
+        diagonal, off = np.sqrt(3.0) * size, self.path.off + (self.shell.cover or 0.0)
         if self.first_hit is not None:
             return Clearance(0.0, 0.0, diagonal, is_beyond=False, moment=self.first_hit)
         distance = self.search.distance * size
@@ -246,17 +261,36 @@ class _Run:
             point=self._world(moment.pose, point), voxel=self.grid.centers(ijk)[0],
         )  # fmt: skip
 
+    def _met(self, obj: Object, met: Met) -> MetObject:
+        intervals = self.path.fractions(met.hits.array())
+        length = float((intervals[:, 1] - intervals[:, 0]).sum() * self.path.motion.sum())
+        contacts = met.contacts.array()
+        first_contact = (
+            self._moment(int(contacts[0, 0]), np.array([obj.id])) if len(contacts) else None
+        )
+        return MetObject(
+            obj, intervals, met.hits.count, met.contacts.count, first_contact, length, met.points,
+            met.deepest,
+        )  # fmt: skip
+
+    def _proof(self) -> Proof:
+        nearest, is_near = 0.0, False
+        if self.search is not None and self.first_hit is None:
+            nearest = self.search.distance * self.grid.voxel_size
+            is_near = self.search.nearest[0] >= 0
+        is_inside_known = self.enclosed is not None
+        return Proof(self.shell.cover, self.path.off, nearest, is_near, is_inside_known)
+
     def _result(self, frames: Frames, elapsed: float) -> Swept:
         path = self.path
-        met = []
-        for i, one in sorted(self.met.items(), key=lambda item: (item[1].first, item[0])):
-            first, last = path.fractions([one.first, one.last]).tolist()
-            n_samples, n_contacts, deepest = one[2:]
-            met.append(MetObject(self.known[i], first, last, n_samples, n_contacts, deepest))
+        met = [self._met(self.known[i], one) for i, one in self.met.items()]
+        met.sort(key=lambda one: (one.first, one.object.id))
+        enclosed = [] if self.enclosed is None else self.enclosed.tolist()
         unknown = np.full(self.n_windows, np.nan)
         near = unknown if self.along is None else self.along.least * self.grid.voxel_size
         return Swept(
             path=path,
+            voxel_size=self.grid.voxel_size,
             samples=len(path),
             hits=self.hit_runs.count,
             contacts=self.contact_runs.count,
@@ -264,6 +298,8 @@ class _Run:
             first_contact=self.first_contact,
             deepest=self.deepest,
             objects=met,
+            enclosed=tuple(self.known[i] for i in enclosed),
+            proof=self._proof(),
             hit_intervals=path.fractions(self.hit_runs.array()),
             contact_intervals=path.fractions(self.contact_runs.array()),
             clearance=self._clearance(frames.residency.exclude),
@@ -279,31 +315,6 @@ class _Run:
                 exclude=frames.residency.exclude.tolist(),
             ),
         )
-
-
-class _Runs:
-    """Samples, ascending, as runs without gaps to speak of."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._runs: list[list[int]] = []
-
-    def add(self, samples: Ints) -> None:
-        """Count samples (n,) in, all after those before."""
-        if not len(samples):
-            return
-        self.count += len(samples)
-        cuts = [0, *(np.flatnonzero(np.diff(samples) > JOINED) + 1).tolist(), len(samples)]
-        for start, end in pairwise(cuts):
-            low, high = int(samples[start]), int(samples[end - 1])
-            if self._runs and low - self._runs[-1][1] <= JOINED:
-                self._runs[-1][1] = high
-            else:
-                self._runs.append([low, high])
-
-    def array(self) -> Ints:
-        """First and last sample of each run, (K, 2)."""
-        return np.array(self._runs, dtype=np.int64).reshape(-1, 2)
 
 
 def find_hits(frames: Frames, poses: Floats, n_hits: Ints) -> kernels.Found:
@@ -323,7 +334,7 @@ def find_hits(frames: Frames, poses: Floats, n_hits: Ints) -> kernels.Found:
     while True:
         with table.reading() as row:
             done, count = kernels.find_hits(
-                table.cells, row, frames.clusters.points, poses, samples, frames.residency.place,
+                table.cells, row, frames.clusters, poses, samples, frames.residency.place,
                 done, count, found,
             )  # fmt: skip
         if done == len(samples):

@@ -46,8 +46,9 @@ class ClearanceSearch:
     def __init__(self, frames: Frames, limit: float, n_windows: int | None = None) -> None:
         self._frames = frames
         self._stride = STRIDE if n_windows is None else 1
-        self._reach = limit + kernels.MARGIN + 0.5 * self._stride
         residency = frames.residency
+        clusters, surroundings = frames.clusters, frames.surroundings
+        self._reach = limit + kernels.MARGIN + 0.5 * self._stride + surroundings.reach
         self._most = (residency.table.n_slots - 1) // 2
         across = 2.0 * self._reach / CELL
         if across > self._most or (int(across) + 2) ** 3 > self._most:
@@ -59,6 +60,7 @@ class ClearanceSearch:
         self.least = np.full(n_windows or 1, limit)
         self._bounds = kernels.Bounds(
             np.full(len(frames.shell), -np.inf),
+            np.full(-(-len(frames.shell) // clusters.run), -np.inf),
             np.full(len(frames.shell), -1, dtype=np.int64),
             self.least,
             np.array([-np.inf, limit]),
@@ -76,8 +78,8 @@ class ClearanceSearch:
         while True:
             with table.reading() as row:
                 done = kernels.find_clearance(
-                    table.cells, row, frames.clusters.points, poses, done, first, travels,
-                    windows, residency.place, self._bounds,
+                    table.cells, row, frames.clusters, poses, done, first, travels, windows,
+                    residency.place, frames.surroundings.reach, self._bounds,
                 )  # fmt: skip
             if done == len(poses):
                 return
@@ -94,12 +96,13 @@ class ClearanceSearch:
         sample, point, voxel = self._bounds.where[:3].tolist()
         return sample, point, voxel
 
-    def _fetch(self, poses: Floats, point: int) -> None:
-        """Make the surroundings resident of that point at the first pose, then of what follows."""
+    def _fetch(self, poses: Floats, run: int) -> None:
+        """Make the surroundings resident of that run at the first pose, then of what follows."""
         residency = self._frames.residency
+        places, _, first = self._frames.surroundings
         found = np.full(1 << (2 * self._most).bit_length(), UNKNOWN, dtype=np.int64)
         kernels.cells_near(
-            self._frames.clusters.points, poses, residency.place, point, self._stride,
+            places, poses, residency.place, int(first[run]), self._stride,
             self._reach * residency.grid.voxel_size, found, self._most,
         )  # fmt: skip
         residency.bring(np.sort(found[found >= 0]))

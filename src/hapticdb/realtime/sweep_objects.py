@@ -1,5 +1,6 @@
 """Which objects a sweep hits: hit voxels looked up in the database, exactly, and tallied."""
 
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +15,8 @@ Ints = NDArray[np.int64]
 
 KEYS_AT_ONCE = 4096
 """Row keys that one statement asks for."""
+JOINED = 2
+"""Samples between two hits that leave them one interval: a voxel's way."""
 
 
 class Pairs(NamedTuple):
@@ -26,18 +29,50 @@ class Pairs(NamedTuple):
     ids: Ints
 
 
-class Met(NamedTuple):
+class Runs:
+    """Samples, ascending, as runs without gaps to speak of."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._runs: list[list[int]] = []
+
+    def add(self, samples: Ints) -> None:
+        """Count distinct samples (n,) in, all after those before."""
+        if not len(samples):
+            return
+        self.count += len(samples)
+        cuts = [0, *(np.flatnonzero(np.diff(samples) > JOINED) + 1).tolist(), len(samples)]
+        for start, end in pairwise(cuts):
+            low, high = int(samples[start]), int(samples[end - 1])
+            if self._runs and low - self._runs[-1][1] <= JOINED:
+                self._runs[-1][1] = high
+            else:
+                self._runs.append([low, high])
+
+    def array(self) -> Ints:
+        """First and last sample of each run, (K, 2)."""
+        return np.array(self._runs, dtype=np.int64).reshape(-1, 2)
+
+
+class Met:
     """What a sweep had to do with one object.
 
-    first, last : samples of its first and last hit; samples : how many hit it; contacts : how many
-    were in contact with it; deepest : metres, of its deepest hit.
+    hits, contacts : samples that hit it, that were in contact with it; points : most of the tool's
+    points in its voxels at one sample; deepest : metres below a tangent plane, of its deepest hit.
     """
 
-    first: int
-    last: int
-    samples: int
-    contacts: int
-    deepest: float
+    def __init__(self) -> None:
+        self.hits, self.contacts = Runs(), Runs()
+        self.points = 0
+        self.deepest = 0.0
+
+    def add(self, samples: Ints, depths: Floats) -> None:
+        """Count hits in: samples (H,), ascending, and depths (H,), metres."""
+        distinct, counts = np.unique(samples, return_counts=True)
+        self.hits.add(distinct)
+        self.contacts.add(np.unique(samples[depths > 0.0]))
+        self.points = max(self.points, int(counts.max()))
+        self.deepest = max(self.deepest, float(depths.max()))
 
 
 def objects_in(store: Store, voxels: Ints, exclude: Keys) -> Pairs:
@@ -95,29 +130,4 @@ def tally(met: dict[int, Met], pairs: Pairs, samples: Ints, depths: Floats) -> N
     starts = np.flatnonzero(np.diff(ids, prepend=ids[:1] - 1))
     for start, end in zip(starts, np.append(starts[1:], len(ids)), strict=True):
         own = hits[start:end]
-        of_hit, of_contact = samples[own], samples[own[depths[own] > 0.0]]
-        new = Met(
-            int(of_hit[0]),
-            int(of_hit[-1]),
-            _distinct(of_hit),
-            _distinct(of_contact),
-            float(depths[own].max()),
-        )
-        old = met.get(int(ids[start]))
-        met[int(ids[start])] = new if old is None else _joined(old, new)
-
-
-def _joined(old: Met, new: Met) -> Met:
-    """Both together, of samples apart, the old ones before the new ones."""
-    return Met(
-        old.first,
-        new.last,
-        old.samples + new.samples,
-        old.contacts + new.contacts,
-        max(old.deepest, new.deepest),
-    )
-
-
-def _distinct(ascending: Ints) -> int:
-    """How many distinct numbers there are."""
-    return int(np.count_nonzero(np.diff(ascending))) + (len(ascending) > 0)
+        met.setdefault(int(ids[start]), Met()).add(samples[own], depths[own])

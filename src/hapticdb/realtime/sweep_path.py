@@ -23,11 +23,12 @@ RIGID = 1e-6
 class Path:
     """Poses M, and samples between them.
 
-    The middle of the shell's bounding box moves on straight lines while the tool turns about it,
-    evenly, about one axis (slerp): the same motion wherever the file of the tool has its origin. A
-    point at distance r from the middle then moves along a segment by no more than the middle moves
-    plus the angle times r, so that many steps of half a voxel, rounded up, are enough for all.
-    Given poses are samples as they are.
+    No place of the tool's surface moves more than half a voxel between two samples, nor any within
+    the covering radius of a point. The middle of the shell's bounding box moves on straight lines
+    while the tool turns about it, evenly, about one axis (slerp): the same motion wherever the file
+    of the tool has its origin. A point at distance r from the middle then moves along a segment by
+    no more than the middle moves plus the angle times r, so that many steps of half a voxel,
+    rounded up, are enough for all. Given poses are samples as they are.
 
     Attributes
     ----------
@@ -37,11 +38,15 @@ class Path:
         Metres that a point may move at most from each pose to the next.
     starts : (M,) int64
         Which sample each pose is.
+    off : float
+        Metres between a place of the tool at any time and the same place at the nearer of the two
+        samples about that time, at most: half a step, a quarter of a voxel or less.
     """
 
     poses: Floats
     motion: Floats
     starts: Ints
+    off: float
     _center: Floats
     _centers: Floats
     _quaternions: Floats
@@ -61,6 +66,7 @@ class Path:
         low, high = shell.points.min(axis=0), shell.points.max(axis=0)
         center = 0.5 * (low + high)
         radius = float(np.sqrt(((shell.points - center) ** 2).sum(axis=1).max()))
+        radius += shell.cover or 0.0
         rotations = given[:, :3, :3]
         quaternions = quaternion_of(rotations)
         centers = rotations @ center + given[:, :3, 3]
@@ -83,8 +89,9 @@ class Path:
         counts = steps.astype(np.int64)
         starts = np.concatenate([[0], np.cumsum(counts)])
         travels = (motion / counts + slack) / voxel_size + kernels.CAUTION
+        off = 0.5 * voxel_size * float(travels.max(initial=0.0))
         return cls(
-            given, motion, starts, center, centers, quaternions, turns,
+            given, motion, starts, off, center, centers, quaternions, turns,
             np.stack([np.concatenate([[0.0], np.cumsum(travels * counts)])[:-1], travels]),
         )  # fmt: skip
 

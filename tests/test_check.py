@@ -4,9 +4,11 @@
 
 import json
 from collections.abc import Callable
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 
+import apsw
 import numpy as np
 import pytest
 from hypothesis import given
@@ -19,7 +21,7 @@ from hapticdb import Grid, PointShell
 from hapticdb.store import believed
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite import SQLiteStore
-from hapticdb.store.sqlite_pages import PAGE_BYTES
+from hapticdb.store.sqlite_pages import LAYER, PAGE_BYTES
 from hapticdb.testing import KINDS, floor_voxels, write_voxels
 from test_store_sqlite_pages import without_checksums
 
@@ -207,3 +209,15 @@ def test_a_store_says_how_to_get_checksums(tmp_path: Path, run: Run) -> None:
     assert code == 0
     assert "1 object without checksums: 'hapticdb copy'" in out
     assert isinstance(SQLiteStore.open(path).objects()[0].attributes, dict)
+
+
+def test_damage_that_a_fetching_process_reads_is_one_line(tmp_path: Path) -> None:
+    path = made(tmp_path / "e.db", "brick")
+    with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
+        root = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'brick'").get
+    content = bytearray(path.read_bytes())
+    content[int(root) * PAGE_BYTES - 4000] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(hapticdb.DamagedError, match="is not what was written") as caught:
+        hapticdb.ResidentCells(str(path))
+    assert "\n" not in str(caught.value)

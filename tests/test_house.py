@@ -54,6 +54,7 @@ FLOORS: list[set[str]] = [
         "statistics",
         "force",
         "layout",
+        "voxelizing",
         "pointshell",
         "coverage",
         "orientation",

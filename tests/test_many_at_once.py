@@ -27,12 +27,12 @@ from assemblies import ball, box, placement, small_options, write_obj
 from children import PATIENCE, end_forked, joined, received
 from hapticdb import Environment, PointShell
 from hapticdb.cli import main
-from hapticdb.ingest import rows_of_part
 from hapticdb.originals import parts_of
 from hapticdb.query import STRATEGIES
 from hapticdb.store.base import Object, Rows
 from hapticdb.store.postgres import session
 from hapticdb.store.postgres.address import parse
+from hapticdb.voxelizing import rows_of_part
 from servers import Place
 from validity import assert_valid
 

@@ -9,7 +9,7 @@ import contextlib
 import os
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple
 
@@ -26,25 +26,30 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.grid import Grid, GridOptions
-from hapticdb.kernels import voxelize
 from hapticdb.known_parts import KnownParts, added_or_present, drop_others, replace_changed
-from hapticdb.layout import Bricks, rows_of_bricks
 from hapticdb.mesh import Defects, MeshFile, Part, read_file
 from hapticdb.statistics import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Rows, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
+from hapticdb.voxelizing import ShareCallback, rows_of_part
 
 AT_BORDER = 1e-6
 """Voxels by which rounding may carry a part across the grid's border without an error."""
+EVERY = 0.2
+"""Seconds after which the share of a part that takes long is told again."""
 
 
 class Progress(NamedTuple):
-    """How far an import is: sent after each part."""
+    """How far an import is: sent after each part, and five times a second while one takes long.
+
+    share: of the part that is waited for, 0 to 1; 0 after a part.
+    """
 
     link: str
     parts_done: int
     parts_total: int
     voxels: int
+    share: float = 0.0
 
 
 ProgressCallback = Callable[[Progress], None]
@@ -284,13 +289,16 @@ def ingest_file(
             else:
                 yield part
 
-    for obj, rows in _voxelized(still_missing(), mesh_file, store, options.unit, jobs):
+    def tell(share: float) -> None:
+        if progress is not None:
+            progress(Progress(mesh_file.link, n_done, n_parts, voxels, share))
+
+    for obj, rows in _voxelized(still_missing(), mesh_file, store, options.unit, jobs, tell):
         n_done += 1
         if (new_id := added_or_present(store, obj, rows, known)) is not None:
             added.add(new_id)
         voxels += obj.voxels
-        if progress is not None:
-            progress(Progress(mesh_file.link, n_done, n_parts, voxels))
+        tell(0.0)
     n_dropped = drop_others(store, mesh_file) if options.replace else 0
     written = tuple(obj for obj in store.objects() if obj.id in added) if added else ()
     return FileReport(
@@ -308,14 +316,29 @@ def ingest_file(
 
 
 def _voxelized(
-    parts: Iterable[Part], file: MeshFile, store: Store, unit: str | None, jobs: int
+    parts: Iterable[Part],
+    file: MeshFile,
+    store: Store,
+    unit: str | None,
+    jobs: int,
+    tell: ShareCallback,
 ) -> Iterator[tuple[Object, Rows]]:
-    """Objects and rows of parts, in their order, a few parts ahead of the writer."""
+    """Objects and rows of parts, in their order, a few parts ahead of the writer.
+
+    tell: called in this thread with the share of the part that is waited for.
+    """
+    shares: dict[str, float] = {}
     attributes = {"unit": unit, "up": file.up}
     known = {name: value for name, value in attributes.items() if value}
 
     def work(part: Part) -> tuple[Object, Rows]:
-        rows, n_voxels = rows_of_part(part, store.grid, store.layout)
+        def done(share: float) -> None:
+            shares[part.name] = share
+
+        try:
+            rows, n_voxels = rows_of_part(part, store.grid, store.layout, progress=done)
+        except FileError as error:
+            raise FileError(f"{file.link}: {error}") from None
         return (
             Object(
                 name=part.name,
@@ -329,47 +352,24 @@ def _voxelized(
             rows,
         )
 
-    waiting: deque[Future[tuple[Object, Rows]]] = deque()
+    waiting: deque[tuple[str, Future[tuple[Object, Rows]]]] = deque()
+
+    def finished() -> tuple[Object, Rows]:
+        name, future = waiting.popleft()
+        while not wait([future], EVERY).done:
+            tell(shares.get(name, 0.0))
+        return future.result()
+
     pool = ThreadPoolExecutor(jobs, thread_name_prefix="voxelize")
     try:
         for part in parts:
-            waiting.append(pool.submit(work, part))
+            waiting.append((part.name, pool.submit(work, part)))
             if len(waiting) > 2 * jobs:
-                yield waiting.popleft().result()
+                yield finished()
         while waiting:
-            yield waiting.popleft().result()
+            yield finished()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def rows_of_part(
-    part: Part,
-    grid: Grid,
-    layout: Layout,
-    world_from_part: NDArray[np.float64] | None = None,
-) -> tuple[Rows, int]:
-    """Voxelize a part: its rows, ascending by key, and how many voxels its surface touches.
-
-    Parameters
-    ----------
-    part : Part
-        Triangles mark every voxel whose closed box they meet; points the voxel that holds them.
-    world_from_part : (4, 4) float64 or None
-        Placement in metres; the file's unless given.
-    """
-    if part.is_cloud:
-        points = _on_grid(part.world_points(world_from_part), grid)
-        bricks = Bricks(*voxelize.mark_points(points, grid.bits))
-    else:
-        triangles = _on_grid(part.triangles(world_from_part), grid)
-        bricks = Bricks(*voxelize.voxelize(triangles, grid.bits))
-    return rows_of_bricks(bricks, grid, layout)
-
-
-def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
-    """Points (..., 3) in voxels; what rounding carried over the border is set back onto it."""
-    scaled = grid.to_voxel_units(points)
-    return np.clip(scaled, 0.0, float(grid.side), out=scaled)
 
 
 def check_placed_inside(

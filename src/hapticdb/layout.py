@@ -14,6 +14,9 @@ from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.kernels import curves, voxelize
 from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, Keys, Layout, Rows
 
+BRICKS_AT_ONCE = 1 << 15
+"""Bricks whose voxels are unpacked together: their coordinates take 24 bytes a voxel."""
+
 
 class Bricks(NamedTuple):
     """Voxels as bricks in Z-order, whatever the curve of their environment.
@@ -31,13 +34,26 @@ def rows_of_bricks(bricks: Bricks, grid: Grid, layout: Layout) -> tuple[Rows, in
     keys, occupancy = bricks
     n_voxels = voxelize.count_voxels(occupancy)
     if layout == "voxel":
-        keys = np.sort(grid.encode(voxelize.brick_voxels(keys, occupancy)))
+        keys = _voxel_keys(bricks, n_voxels, grid)
         return Rows(keys, np.zeros(len(keys), dtype=np.int64), NO_OCCUPANCY), n_voxels
     if grid.curve != "z":
         keys = _reordered(keys, grid.bits, curves.Z_ORDER, grid.curve_code)
         order = np.argsort(keys)
         keys, occupancy = keys[order], occupancy[order]
     return Rows(keys, np.zeros(len(keys), dtype=np.int64), occupancy.reshape(-1)), n_voxels
+
+
+def _voxel_keys(bricks: Bricks, n_voxels: int, grid: Grid) -> Keys:
+    """Keys (n_voxels,) of all voxels, ascending; a few bricks are unpacked at a time."""
+    keys = np.empty(n_voxels, dtype=np.int64)
+    at = 0
+    for start in range(0, len(bricks.keys), BRICKS_AT_ONCE):
+        some = slice(start, start + BRICKS_AT_ONCE)
+        found = grid.encode(voxelize.brick_voxels(bricks.keys[some], bricks.occupancy[some]))
+        keys[at : at + len(found)] = found
+        at += len(found)
+    keys.sort()
+    return keys
 
 
 def bricks_of_rows(rows: Rows, grid: Grid, layout: Layout) -> Bricks:

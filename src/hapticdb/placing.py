@@ -6,12 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ConflictError, UsageError
-from hapticdb.ingest import check_placed_inside, rows_of_part
+from hapticdb.ingest import check_placed_inside
 from hapticdb.mesh import Part
 from hapticdb.originals import parts_of
 from hapticdb.poses import as_floats
 from hapticdb.query import as_ids
 from hapticdb.store.base import Covering, Object, Store
+from hapticdb.voxelizing import rows_of_part
 
 RESTORE = "restore the file, or remove the object and import it again"
 

@@ -160,7 +160,7 @@ def import_bar() -> "Iterator[ProgressCallback | None]":
         yield None
         return
     with _bar("reading", "parts") as advance:
-        yield lambda now: advance(now.link, now.parts_done, now.parts_total, now.voxels)
+        yield lambda now: advance(now.link, now.parts_done, now.parts_total, now.voxels, now.share)
 
 
 @contextmanager
@@ -194,7 +194,7 @@ def check_bar(doing: str) -> "Iterator[check.ProgressCallback | None]":
 
 
 @contextmanager
-def _bar(first: str, noun: str) -> Iterator[Callable[[str, int, int, int], None]]:
+def _bar(first: str, noun: str) -> Iterator[Callable[[str, float, int, int], None]]:
     """Show a bar; yields what advances it: what is being done, how much of it, voxels so far."""
     from time import monotonic
 
@@ -215,7 +215,7 @@ def _bar(first: str, noun: str) -> Iterator[Callable[[str, int, int, int], None]
     with bar:
         task = bar.add_task("", total=None, doing=first, count="", rate="")
 
-        def advance(doing: str, done: int, total: int, voxels: int) -> None:
+        def advance(doing: str, done: float, total: int, voxels: int) -> None:
             since, before = started.setdefault(doing, (monotonic(), voxels))
             elapsed = monotonic() - since
             rate = (voxels - before) / elapsed if elapsed > 0.05 else 0.0
@@ -225,7 +225,8 @@ def _bar(first: str, noun: str) -> Iterator[Callable[[str, int, int, int], None]
                 total=None if is_last else total,
                 completed=done,
                 doing="finishing" if is_last else _short(doing),
-                count=f"{done}/{total} {noun}",
+                count=f"{int(done)}/{total} {noun}"
+                + (f", {done % 1:.0%} of one" if done % 1 else ""),
                 rate=f"{counted(rate, 'voxel')}/s" if rate else "",
             )
 

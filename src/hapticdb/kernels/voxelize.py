@@ -30,10 +30,12 @@ or none), and a normal whose length is at most 2^-50 of the longest edge's squar
 triangle that is a line to within 1e-9 voxel in the largest grid. The others decide a line exactly.
 """
 
+from collections.abc import Iterator
+
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS3, INT, entry, leaf
+from hapticdb.kernels._jit import FLOATS3, INT, INTS, entry, leaf
 from hapticdb.kernels.bricks import (
     FIRST_CAPACITY,
     RUNS_AT_ONCE,
@@ -45,7 +47,7 @@ from hapticdb.kernels.bricks import (
     sorted_bricks,
 )
 
-__all__ = ["brick_voxels", "count_voxels", "mark_points", "voxelize"]
+__all__ = ["brick_voxels", "count_voxels", "mark_points", "voxelize", "voxelize_pieces"]
 
 TOUCH = 1e-9
 """Separations up to this, in voxels, count as touching."""
@@ -60,6 +62,11 @@ FAR = 2.0**60
 AXIS_X, AXIS_Y, AXIS_Z = np.int64(0), np.int64(1), np.int64(2)
 OUTSIDE, CUT, WHOLE = 0, 1, 2
 """How much of a triangle's bounding box the grid has."""
+MOST_BRICKS = 1 << 17
+"""Bricks of a piece: 10 MB, and as much again while they are put in order."""
+RUNS_A_BRICK = 64
+"""Runs of voxels that a piece may take for each brick that it may have: so that a piece ends, and
+its share is told, where many triangles meet few bricks, too."""
 STEEP = 1e40
 """Stands for 1 / 0 in the slope of an axis that is square to the direction solved for."""
 
@@ -264,6 +271,20 @@ def set_axes(axes, plane, corners, normal, u, v, w):
 
 
 @leaf
+def set_spans(axes, spans, box, v, w):
+    """Set the interval of w for each v of a triangle's bounding box."""
+    for at_v in range(box[0, v], box[1, v] + 1):
+        y = float(at_v)
+        low, high = float(box[0, w]), float(box[1, w])
+        for n in range(6, 9):
+            value = axes[n, 0] * y
+            low = max(low, (axes[n, 1] - value) * axes[n, 3])
+            high = min(high, (axes[n, 2] - value) * axes[n, 3])
+        spans[at_v - box[0, v], 0] = low
+        spans[at_v - box[0, v], 1] = high
+
+
+@leaf
 def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
     """Write the runs of voxels of triangles from resume on until `runs` is full; return how many.
 
@@ -297,15 +318,7 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
         low_w, high_w = float(box[0, w]), float(box[1, w])
         if is_new:
             set_axes(axes, plane, corners, normal, u, v, w)
-            for at_v in range(first_v, last_v + 1):
-                y = float(at_v)
-                low, high = low_w, high_w
-                for n in range(6, 9):
-                    value = axes[n, 0] * y
-                    low = max(low, (axes[n, 1] - value) * axes[n, 3])
-                    high = min(high, (axes[n, 2] - value) * axes[n, 3])
-                spans[at_v - first_v, 0] = low
-                spans[at_v - first_v, 1] = high
+            set_spans(axes, spans, box, v, w)
         else:
             first_u = resume[1]
         for at_u in range(first_u, last_u + 1):
@@ -350,9 +363,14 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
     return n_runs
 
 
-@entry(FLOATS3, INT)
-def voxelize_kernel(triangles, bits):
-    """Bricks of the voxels that triangles (T, 3, 3) meet: packed keys, words (C, 8), count."""
+@entry(FLOATS3, INT, INTS, INT)
+def voxelize_kernel(triangles, bits, resume, most):
+    """Bricks of the voxels that triangles (T, 3, 3) meet: packed keys, words (C, 8), count.
+
+    Stops after `most` bricks or so, or many times as many runs of voxels. resume (4,) int64 is
+    where it begins and then where it has stopped: triangle, row and column in it (row -1: none),
+    thousandths of its rows that are done. All is done when the triangle is T.
+    """
     edge = float(1 << bits)
     bricks, n_bricks = new_bricks(FIRST_CAPACITY), np.int64(0)
     runs = np.empty((RUNS_AT_ONCE, 5), np.int64)
@@ -361,12 +379,47 @@ def voxelize_kernel(triangles, bits):
     axes = np.empty((9, 4))
     plane = np.empty(5)
     spans = np.empty((longest_box(triangles, edge), 2))
-    resume = np.empty(3, np.int64)
-    resume[0], resume[1], resume[2] = 0, -1, 0
-    while resume[0] < triangles.shape[0]:
+    n_done = np.int64(0)
+    if resume[1] >= 0:  # within a triangle: what was computed for it is computed again
+        place_in_grid(triangles, resume[0], edge, corners, box)
+        normal = normal_of(corners)
+        u, v, w = order_axes(box, normal)
+        set_axes(axes, plane, corners, normal, u, v, w)
+        set_spans(axes, spans, box, v, w)
+    while resume[0] < triangles.shape[0] and n_bricks < most and n_done < RUNS_A_BRICK * most:
         n_runs = fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs)
         bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)
+        n_done += n_runs
+    resume[3] = 0
+    if resume[1] >= 0:
+        u, v, w = order_axes(box, normal_of(corners))
+        span = box[1, u] - box[0, u] + 1
+        resume[3] = (1000 * (resume[1] - box[0, u])) // span
     return bricks.keys, bricks.words, n_bricks
+
+
+def voxelize_pieces(
+    triangles: NDArray[np.float64], bits: int, most: int = MOST_BRICKS
+) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8]]]:
+    """Bricks of the voxels that triangles meet, a bounded number at a time.
+
+    The parameters are those of `voxelize`.
+
+    Yields
+    ------
+    share : float
+        Of the triangles that are done, 0 to 1; within a triangle by its rows.
+    bricks_z, occupancy : arrays
+        As `voxelize` returns them. Pieces may have bricks in common, whose bits add.
+    """
+    corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
+    resume = np.array([0, -1, 0, 0], dtype=np.int64)
+    while True:
+        piece = sorted_bricks(*voxelize_kernel(corners, bits, resume, most))
+        if resume[0] >= len(corners):
+            yield 1.0, *piece
+            return
+        yield float(resume[0] + resume[3] / 1000) / len(corners), *piece
 
 
 def voxelize(
@@ -396,4 +449,5 @@ def voxelize(
     of its own, so that threads may voxelize different parts at once.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
-    return sorted_bricks(*voxelize_kernel(corners, bits))
+    resume = np.array([0, -1, 0, 0], dtype=np.int64)
+    return sorted_bricks(*voxelize_kernel(corners, bits, resume, 1 << 40))

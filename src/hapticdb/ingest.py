@@ -321,7 +321,7 @@ def _voxelized(
     store: Store,
     unit: str | None,
     jobs: int,
-    tell: ShareCallback,
+    tell: ShareCallback = lambda _share: None,
 ) -> Iterator[tuple[Object, Rows]]:
     """Objects and rows of parts, in their order, a few parts ahead of the writer.
 

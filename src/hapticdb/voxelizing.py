@@ -12,11 +12,11 @@ from hapticdb.grid import Grid
 from hapticdb.kernels import voxelize
 from hapticdb.layout import Bricks, rows_of_bricks
 from hapticdb.mesh import Part
-from hapticdb.store.base import Layout, Rows
+from hapticdb.store.base import BRICK_BYTES, Layout, Rows
 
 ShareCallback = Callable[[float], None]
 """Hears of the share of a part that is done, 0 to 1; from any thread."""
-BYTES_A_BRICK = 72
+BYTES_A_BRICK = 8 + BRICK_BYTES
 _MERGE_FROM = 8 * voxelize.MOST_BRICKS
 """Bricks that wait before they are merged for the first time."""
 
@@ -97,11 +97,11 @@ def merged_in_turn(pieces: list[Bricks]) -> Bricks:
     if len(pieces) == 1:
         return pieces.pop()
     keys = np.unique(np.concatenate([piece.keys for piece in pieces]))
-    occupancy = np.zeros((len(keys), pieces[0].occupancy.shape[1]), dtype=np.uint8)
+    words = np.zeros((len(keys), BRICK_BYTES // 8), dtype=np.int64)
     while pieces:
         piece = pieces.pop()
-        occupancy[np.searchsorted(keys, piece.keys)] |= piece.occupancy
-    return Bricks(keys, occupancy)
+        words[np.searchsorted(keys, piece.keys)] |= piece.occupancy.view(np.int64)
+    return Bricks(keys, words.view(np.uint8))
 
 
 def check_room(n_bytes: int, what: str) -> None:

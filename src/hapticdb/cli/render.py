@@ -160,7 +160,7 @@ def import_bar() -> "Iterator[ProgressCallback | None]":
         yield None
         return
     with _bar("reading", "parts") as advance:
-        yield lambda now: advance(now.link, now.parts_done, now.parts_total, now.voxels, now.share)
+        yield lambda now: advance(now.link, now.parts_done + now.share, now.parts_total, now.voxels)
 
 
 @contextmanager

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -139,6 +139,12 @@ class ImportOptions:
         if self.layout is not None and self.grid.curve is not None:
             check_curve(self.grid.curve, self.layout)
 
+    @property
+    def limits(self) -> dict[str, Any]:
+        """Limits of reading a file that are given, by their names in `read_file`."""
+        named = {"time_limit": self.time_limit, "memory_limit": self.memory_limit}
+        return {name: limit for name, limit in named.items() if limit is not None}
+
 
 def import_files(
     url: str | os.PathLike[str],
@@ -195,12 +201,7 @@ def import_files(
         with contextlib.ExitStack() as loading:
             for n, file in enumerate(files):
                 try:
-                    mesh_file = read_file(
-                        file,
-                        unit=chosen.unit,
-                        memory_limit=chosen.memory_limit,
-                        time_limit=chosen.time_limit,
-                    )
+                    mesh_file = read_file(file, unit=chosen.unit, **chosen.limits)
                     if store is None:
                         grid = chosen.grid.fit(mesh_file.bounds)
                         _check_inside(mesh_file, grid)

@@ -197,3 +197,39 @@ def test_limits_are_options_of_an_import(tmp_path: Path) -> None:
     assert report.status == "imported"
     with pytest.raises(UsageError, match="above 0"):
         ImportOptions(time_limit=0.0)
+
+
+def _laz(path: Path, point_format: int, n_points: int) -> Path:
+    """Packed points of a format, with extra bytes."""
+    laspy = pytest.importorskip("laspy", reason="the extra 'pointcloud' is not installed")
+    header = laspy.LasHeader(point_format=point_format, version="1.4")
+    header.add_extra_dims([laspy.ExtraBytesParams("a", "f8"), laspy.ExtraBytesParams("b", "u2")])
+    cloud = laspy.LasData(header)
+    rng = np.random.default_rng(point_format)
+    cloud.x, cloud.y, cloud.z = rng.random((3, n_points)) * 100.0
+    cloud.a = rng.random(n_points)
+    cloud.write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("point_format", [1, 3, 6, 7, 8, 9, 10])
+def test_packed_points_of_every_kind_are_read_in_their_chunks(
+    tmp_path: Path, point_format: int
+) -> None:
+    n_points = 110_000  # chunks have 50,000
+    file = parse_in_process(_laz(tmp_path / "a.laz", point_format, n_points))
+    assert len(file.parts[0].vertices) == n_points
+
+
+@pytest.mark.parametrize("layer", [0, 1, 5, 8, 18])
+def test_a_layer_that_is_longer_than_its_chunk_is_refused(tmp_path: Path, layer: int) -> None:
+    """A length of 2^28 in a file of 787 bytes took 244 MiB."""
+    path = _laz(tmp_path / "a.laz", 6, 40)
+    content = bytearray(path.read_bytes())
+    (points_at,) = struct.unpack_from("<I", content, 96)
+    at = points_at + 8 + 30 + 10 + 4 + 4 * layer  # the table's place, a point, their number
+    (length,) = struct.unpack_from("<I", content, at)
+    struct.pack_into("<I", content, at, length + (1 << 28))
+    path.write_bytes(content)
+    line = cause(path)
+    assert "it is damaged: the layers of the chunk at byte" in line

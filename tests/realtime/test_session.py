@@ -30,6 +30,7 @@ from hapticdb.testing import write_voxels
 from realtime.hands import Beckoned, Talking, Unplugged, at, still, stroking
 from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until
 from realtime.worlds import block, make
+from recordings import motion, write
 
 
 @pytest.fixture(scope="module")
@@ -260,6 +261,8 @@ def test_a_session_ended_while_its_recording_is_made_leaves_none(
     step: str,
 ) -> None:
     path = tmp_path / "never.hdbrec"
+    mine = write(tmp_path / "mine.hdbrec", motion(5))
+    before = mine.read_bytes()
     whole = getattr(Recorder, step)
 
     def ended(recorder: Recorder, **options: bool) -> None:
@@ -270,10 +273,9 @@ def test_a_session_ended_while_its_recording_is_made_leaves_none(
     with pytest.raises(SystemExit):
         Session(cells, sphere, still(0.010), record=path)
     assert not path.exists()
-    path.write_text("mine")
     with pytest.raises(SystemExit):
-        Session(cells, sphere, still(0.010), record=path, replace_recording=True)
-    assert path.exists()
+        Session(cells, sphere, still(0.010), record=mine, replace_recording=True)
+    assert mine.read_bytes() == before
 
 
 @pytest.mark.parametrize(

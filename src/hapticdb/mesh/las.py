@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import laspy
+import lazrs
 import numpy as np
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 from numpy.typing import NDArray
@@ -24,6 +25,10 @@ _RECORD, _LONG_RECORD = 54, 60
 """Bytes of the header of a variable-length record, and of an extended one."""
 _VARIABLE = 0xFFFFFFFF
 """Stands for chunks of any size."""
+_LAYERED = 3
+_BYTES = 14
+_LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
+"""Layers of each kind of item of a point; bytes have one each (LASzip's source, laszip.hpp)."""
 _POINTS_AT_ONCE = 50_000, 1_000_000
 """At least and at most; between them a point for each byte of the file. laspy takes the memory for
 all before it reads the first."""
@@ -36,6 +41,7 @@ def read(path: Path) -> Parsed:
     with laspy.open(path) as reader:
         promised = reader.header.point_count
         _check_chunks(reader.header)
+        _check_layers(path, reader.header)
         unit = _unit_of(reader.header.vlrs)
         least, most = _POINTS_AT_ONCE
         for points in reader.chunk_iterator(min(most, max(least, path.stat().st_size))):
@@ -88,6 +94,34 @@ def _check_chunks(header: laspy.LasHeader) -> None:
                 f"it is damaged: its chunks have {n_points:,} points, and it has "
                 f"{header.point_count:,}; unpack it to LAS with another program"
             )
+
+
+def _check_layers(path: Path, header: laspy.LasHeader) -> None:
+    """Refuse layers longer than their chunk: lazrs takes memory for what a chunk promises.
+
+    A chunk in layers begins with a point as it is, the number of its points and the length of each
+    layer (LASzip's compressor 3, for point formats from 6 on).
+    """
+    for record in header.vlrs.get("LasZipVlr"):
+        content = record.record_data
+        compressor, n_items = struct.unpack_from("<H", content)[0], len(content[34:]) // 6
+        if compressor != _LAYERED:
+            continue
+        items = [struct.unpack_from("<HHH", content, 34 + 6 * n) for n in range(n_items)]
+        n_point = sum(size for _, size, _ in items)
+        n_layers = sum(size if kind == _BYTES else _LAYERS.get(kind, 0) for kind, size, _ in items)
+        with path.open("rb") as stream:
+            stream.seek(header.offset_to_point_data)
+            at = header.offset_to_point_data + 8
+            for _, n_bytes in lazrs.read_chunk_table(stream, lazrs.LazVlr(content)):
+                stream.seek(at + n_point + 4)
+                lengths = np.frombuffer(stream.read(4 * n_layers), dtype="<u4")
+                if int(lengths.sum(dtype=np.int64)) > n_bytes:
+                    raise UnreadableError(
+                        f"it is damaged: the layers of the chunk at byte {at:,} are longer than "
+                        f"it, {n_bytes:,} bytes"
+                    )
+                at += n_bytes
 
 
 def _check_header(path: Path) -> None:

@@ -222,6 +222,7 @@ def run(
                 size = path.stat().st_size
                 print(f"file {n} ({suffix}, {size} bytes): {found}: {line[-1500:]}", flush=True)
                 if kept is not None:
+                    kept.mkdir(parents=True, exist_ok=True)
                     (kept / f"{n}{suffix}").write_bytes(path.read_bytes())
     finally:
         reader.subprocess.Popen = popen  # type: ignore[attr-defined]

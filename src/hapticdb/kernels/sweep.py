@@ -76,8 +76,7 @@ class Bounds(NamedTuple):
     the same for all points of each run of a cluster; nearest (N,)
     int64: the voxel, packed, that it was nearest to when last looked at, or -1; least (W,): of each
     window of the path so far; state (2,): the least expiry, the least distance of all; where (5,)
-    int64: sample, point and voxel of that, the point that was nearest last, and the run where it
-    stopped.
+    int64: sample, point and voxel of that, the point that was nearest last, and where it stopped.
     """
 
     expiry: NDArray[np.float64]
@@ -361,7 +360,7 @@ def find_clearance(
     windows (B,) int64: which of `bounds.least` each pose counts for; base: number of poses[0] as a
     sample of the path; small: voxels, runs of no greater radius are looked at as one, before their
     points. Returns how many poses are done: fewer than B when a cell was not resident,
-    and `bounds.where` has the run.
+    and `bounds.where` has the point, or the first of the run.
     """
     keys, slots, words, masks, used = cells.keys, cells.slots, cells.words, cells.masks, cells.used
     points, spheres, run = shell.points, shell.spheres, shell.run
@@ -389,7 +388,7 @@ def find_clearance(
                     size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
                 )  # fmt: skip
                 if bound < 0.0:
-                    where[STOPPED] = at
+                    where[STOPPED] = start
                     end_frame(cells, reader)
                     return n
                 of_runs[at] = max(of_runs[at], travel + bound - CAUTION)
@@ -408,7 +407,7 @@ def find_clearance(
                             keys, slots, words, masks, used, which, x, y, z, square, voxel, side
                         )
                         if voxel == -2:
-                            where[STOPPED] = at
+                            where[STOPPED] = p
                             end_frame(cells, reader)
                             return n
                         distance = math.sqrt(square)

@@ -83,12 +83,21 @@ class Surroundings(NamedTuple):
     """Places that stand for a shell's points where cells are looked for.
 
     places (P, 3+): the points, or the middles of small runs of them and the points of the others;
-    reach : voxels around a place within which its points are; first (C,) int64: place of each run.
+    reach : voxels around a place within which its points are; run : points of a run; first (C,)
+    int64: the first place of each run.
     """
 
     places: Floats
     reach: float
+    run: int
     first: NDArray[np.int64]
+
+    def place_of(self, point: int) -> int:
+        """Index of the place that stands for a point."""
+        run, within = divmod(point, self.run)
+        first = int(self.first[run])
+        end = int(self.first[run + 1]) if run + 1 < len(self.first) else len(self.places)
+        return min(first + within, end - 1)
 
 
 def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
@@ -98,7 +107,7 @@ def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
     radii = clusters.spheres[:, 3] / voxel_size
     is_small = radii <= SMALL
     if not is_small.any():
-        return Surroundings(clusters.points, 0.0, starts)
+        return Surroundings(clusters.points, 0.0, clusters.run, starts)
     counts = np.where(is_small, 1, np.minimum(starts + clusters.run, n_points) - starts)
     first = np.cumsum(counts) - counts
     places = np.empty((int(counts.sum()), 3))
@@ -106,7 +115,7 @@ def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
     is_point = np.ones(len(places), dtype=bool)
     is_point[first[is_small]] = False
     places[is_point] = clusters.points[np.repeat(~is_small, clusters.run)[:n_points], :3]
-    return Surroundings(places, float(radii[is_small].max()), first)
+    return Surroundings(places, float(radii[is_small].max()), clusters.run, first)
 
 
 class Frames:
@@ -177,7 +186,7 @@ class Frames:
         """Make all cells of the first poses resident; returns how many poses that are."""
         residency = self.residency
         most = (residency.table.n_slots - 1) // 2
-        places, reach, _ = self.surroundings
+        places, reach = self.surroundings.places, self.surroundings.reach
         room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
         found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
         n_poses, _ = kernels.cells_met(places, reach, poses, residency.place, found, most)

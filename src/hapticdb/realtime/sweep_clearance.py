@@ -96,13 +96,13 @@ class ClearanceSearch:
         sample, point, voxel = self._bounds.where[:3].tolist()
         return sample, point, voxel
 
-    def _fetch(self, poses: Floats, run: int) -> None:
-        """Make the surroundings resident of that run at the first pose, then of what follows."""
+    def _fetch(self, poses: Floats, point: int) -> None:
+        """Bring in what surrounds that point, or its run, at the first pose; then what follows."""
         residency = self._frames.residency
-        places, _, first = self._frames.surroundings
+        places = self._frames.surroundings.places
         found = np.full(1 << (2 * self._most).bit_length(), UNKNOWN, dtype=np.int64)
         kernels.cells_near(
-            places, poses, residency.place, int(first[run]), self._stride,
+            places, poses, residency.place, self._frames.surroundings.place_of(point), self._stride,
             self._reach * residency.grid.voxel_size, found, self._most,
         )  # fmt: skip
         residency.bring(np.sort(found[found >= 0]))

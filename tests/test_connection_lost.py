@@ -265,7 +265,9 @@ def test_an_interrupted_touch_leaves_nothing_behind(
         touching.send_signal(signal.SIGINT)
         _, err = touching.communicate(timeout=PATIENCE)
     assert touching.returncode == 130, err
-    assert err.splitlines() == ["hapticdb: interrupted"]
+    far, interrupted = err.splitlines()
+    assert far.startswith("hapticdb: no pose comes within ")
+    assert interrupted == "hapticdb: interrupted"
     left = (
         "SELECT 1 FROM pg_stat_activity WHERE application_name = 'hapticdb'"
         " AND query LIKE '%brick%'"

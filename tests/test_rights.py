@@ -383,10 +383,9 @@ def test_what_is_no_secret_stays_readable(password: str) -> None:
 
 def lines(url: str) -> dict[str, list[str]]:
     """A command line of each verb that takes a URL, in an order in which all go well."""
-    by = ["--tool", "tool.stl"]
-    return {
-        "import": [url, "boxes.glb", "--bits", "6"],
-        **{verb: [url] for verb in ("info", "objects", "calibrate", "analyze")},
+    by = ("--tool", "tool.stl")
+    return {"import": [url, "boxes.glb", "--bits", "6"]} | {
+        **{verb: [url] for verb in ("info", "objects", "check", "calibrate", "analyze")},
         "touch": [url, *by, "--poses", "path.csv"],
         "feel": [url, *by, "--device", "path.csv", "--seconds", "0.2", "--record", "felt.hdbrec"],
         "replay": ["felt.hdbrec", url],
@@ -409,7 +408,8 @@ def files(tmp_path: Path) -> None:
 
 
 def test_every_verb_that_takes_a_url_is_tried() -> None:
-    assert {c.name for c in app.registered_commands} == {*lines(""), "sample", "warm"}
+    verbs = {c.name for c in app.registered_commands} - {"sample", "warm", "backup", "restore"}
+    assert verbs == {*lines("")}
 
 
 @pytest.mark.long
@@ -419,7 +419,7 @@ def test_no_verb_prints_a_password_when_all_goes_well(run: Run, place: Place) ->
     for verb, args in lines(url).items():
         if verb != "demo":  # takes long
             code, out, err = run("--debug", verb, *args)
-            is_well = code == 0 or (verb, code) == ("sweep", 1)  # the path is no free one
+            is_well = code == 0 or (verb, code) == ("sweep", 1)  # the path is not free
             assert (is_well, MARK in out + err) == (True, False), (verb, out, err)
     for verb in ("info", "touch", "remove", "copy", "grant"):
         code, out, err = run("--debug", verb, *lines(f"{url}&environment=missing")[verb])

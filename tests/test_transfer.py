@@ -120,7 +120,8 @@ def test_an_object_keeps_everything_but_its_revision(tmp_path: Path) -> None:
     with hapticdb.open(source) as a, hapticdb.open(tmp_path / "b.db") as b:
         (left,), (right,) = a.objects(), b.objects()
     for name, value in vars(left).items():
-        np.testing.assert_array_equal(getattr(right, name), value)
+        if name != "rows_crc":  # of rows in another layout
+            np.testing.assert_array_equal(getattr(right, name), value)
     assert right.id == 7
 
 

@@ -156,7 +156,7 @@ class PointShell:
             if unit is not None:
                 raise UsageError(f"{path} is a saved shell, in metres: leave out the unit")
             return cls.load(path)
-        _check_request(points, spacing, seed)
+        _check_request(DEFAULT_POINTS if points is None else points, spacing, seed)
         file = mesh.read_file(path, unit=unit)
         parts = [part for part in file.parts if not part.is_cloud]
         if not parts:
@@ -194,7 +194,7 @@ class PointShell:
         UsageError
             Numbers out of range, vertices not finite, faces that name no vertex, no area.
         """
-        _check_request(points, spacing, seed)
+        _check_request(DEFAULT_POINTS if points is None else points, spacing, seed)
         corners = _as_floats(vertices, "vertices", finite=False)
         indices = np.asarray(faces)
         if corners.ndim != 2 or corners.shape[1] != 3:
@@ -315,8 +315,7 @@ class PointShell:
             raise FileError(f"{path}: not a saved shell, or damaged: {cause}") from None
 
 
-def _check_request(points: int | None, spacing: float | None, seed: int) -> None:
-    points = DEFAULT_POINTS if points is None else points
+def _check_request(points: int, spacing: float | None, seed: int) -> None:
     for number, what in ((points, "points"), (seed, "a seed")):
         if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
             raise UsageError(f"{what} {number!r}: give a whole number")

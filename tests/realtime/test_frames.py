@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hapticdb import PointShell, UsageError
 from hapticdb.grid import CurveName
-from hapticdb.realtime.frames import Frames
+from hapticdb.realtime.frames import RUN, Frames
 from hapticdb.realtime.residency import Residency
 from hapticdb.realtime.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Layout
@@ -119,8 +119,26 @@ def test_a_tool_larger_than_the_table_is_told_so(tmp_path: Path) -> None:
     shell = cloud(5000, extent=0.1)
     with CellTable.create(LEAST_BUDGET) as table:
         frames = Frames(Residency(env.store, table), shell)
-        with pytest.raises(UsageError, match=r"more than fit into .*: give a larger budget"):
+        with pytest.raises(UsageError, match=r"more than fit into .*give a larger budget"):
             frames.feel(np.eye(4))
+
+
+def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Path) -> None:
+    """Small runs of points, far apart: around each are up to eight cells, and its own is one."""
+    env = make(tmp_path, bits=9)
+    size = env.grid.voxel_size
+    rng = np.random.default_rng(1)
+    middles = np.array(env.grid.origin) + size * (32.0 * rng.integers(1, 15, (100, 3)) + 1.0)
+    points = np.repeat(middles, RUN, axis=0) + rng.uniform(0.0, size, (100 * RUN, 3))
+    normals = np.tile((0.0, 0.0, 1.0), (len(points), 1))
+    shell = PointShell(points, normals, np.zeros(3))
+    write_voxels(env.store, env.grid.voxels_of(middles))
+    with CellTable.create(LEAST_BUDGET) as table:
+        frames = Frames(Residency(env.store, table), shell)
+        n_cells = len(np.unique(env.grid.voxels_of(points) // 32, axis=0))
+        assert n_cells <= (table.n_slots - 1) // 2 < 8 * n_cells
+        felt = frames.feel(np.eye(4))
+        assert (felt.unknown[0], felt.hits[0]) == (0, len(points))
 
 
 def test_a_pose_that_is_not_rigid_is_named(tmp_path: Path) -> None:

@@ -186,10 +186,14 @@ class Frames:
         """Make all cells of the first poses resident; returns how many poses that are."""
         residency = self.residency
         most = (residency.table.n_slots - 1) // 2
-        places, reach = self.surroundings.places, self.surroundings.reach
-        room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
-        found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
-        n_poses, _ = kernels.cells_met(places, reach, poses, residency.place, found, most)
+        around = self.surroundings
+        # where the surroundings of the first pose do not fit, its points alone may
+        for places, reach in ((around.places, around.reach), (self.clusters.points, 0.0)):
+            room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
+            found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
+            n_poses, count = kernels.cells_met(places, reach, poses, residency.place, found, most)
+            if count <= most:
+                break
         cells = found[found >= 0]
         residency.bring(cells)
         return int(n_poses)

@@ -259,7 +259,7 @@ def test_a_private_server_goes_with_a_command_that_the_system_ends(
     importing = command("import", PRIVATE, made / "boxes.glb", "--bits", 6)
     finished(importing, cwd=tmp_path, check=True)
     stl = tool(tmp_path / "tool.stl")
-    many = poses(tmp_path / "many.csv", *[(0.0, 0.0, 0.3)] * 20_000)
+    many = poses(tmp_path / "many.csv", *[(0.0, 0.0, 0.055)] * 20_000)
     args = ("touch", PRIVATE, "--tool", stl, "--poses", many, "--json")
     with started(tmp_path, *args) as process:
         assert process.stdout is not None

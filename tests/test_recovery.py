@@ -210,7 +210,9 @@ def test_the_command_line_says_in_one_line_that_the_server_stays_away(
         After(patch, Environment, "touch", server.kill, 5)
         code, out, err = run(*touch)
     assert len(out.splitlines()) == 4
-    refused((code, out, err), "cannot be reached")
+    far, _, lost = err.partition("\n")
+    assert far.startswith("hapticdb: no pose comes within ")
+    refused((code, out, lost), "cannot be reached")
     server.start()
     code, out, _ = run(*touch)
     assert (code, len(out.splitlines())) == (0, 20)

@@ -166,7 +166,7 @@ def _facts(env: "Environment", found: "Swept", shell: "PointShell") -> list[tupl
         ("hits", f"{found.hits:,} samples hit, {found.contacts:,} in contact"),
     ]
     if found.deepest is not None and found.deepest.depth > 0.0:
-        rows.append(("squarest", _deepest_text(found.deepest, size)))
+        rows.append(("tangent depth", _deepest_text(found.deepest, size)))
     if found.clearance is not None and not found.hits:
         rows.append(("clearance", _clearance_text(found.clearance)))
     rate = f"{found.samples / max(found.elapsed, 1e-9):,.0f} poses a second"

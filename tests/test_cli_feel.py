@@ -235,7 +235,7 @@ def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
 
 @pytest.mark.long
 def test_a_session_goes_on_without_its_recording_at_the_limit(run: Run, scene: Path) -> None:
-    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--seconds", 4, "--json")
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--seconds", 12, "--json")
     path = scene.with_name("felt.hdbrec")
     code, out, err = run(*args, "--record", path.name, "--record-limit", "1MiB")
     report = json.loads(out)

@@ -1,8 +1,6 @@
 """A part -> its rows, in pieces of bounded size, with word of how far it is."""
 
-import contextlib
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +10,7 @@ from hapticdb.grid import Grid
 from hapticdb.kernels import voxelize
 from hapticdb.layout import Bricks, rows_of_bricks
 from hapticdb.mesh import Part
+from hapticdb.mesh.child import bytes_available
 from hapticdb.store.base import BRICK_BYTES, Layout, Rows
 
 ShareCallback = Callable[[float], None]
@@ -106,18 +105,9 @@ def merged_in_turn(pieces: list[Bricks]) -> Bricks:
 
 def check_room(n_bytes: int, what: str) -> None:
     """Refuse what needs more memory than the machine has left."""
-    left = _bytes_available()
+    left = bytes_available()
     if n_bytes > left:
         raise FileError(
             f"{what}: its voxels take more than {n_bytes / 2**30:.1f} GiB of memory, and "
             f"{left / 2**30:.1f} are left; import it into a grid of fewer --bits"
         )
-
-
-def _bytes_available() -> int:
-    """Memory that the machine can give without swapping; unknown is plenty."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) << 10
-    return 1 << 62

@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     from hapticdb.store.base import Object
     from hapticdb.touches import Touch
 
-DEFAULT_POINTS = 300
 MOST_TOUCHED = 8
 FEW_POSES = 500
 """Poses of a path for which measuring the database's costs, most of a second, does not pay."""

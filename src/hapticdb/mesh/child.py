@@ -118,7 +118,7 @@ def _bytes_now() -> int:
     return 0
 
 
-def _bytes_available() -> int:
+def bytes_available() -> int:
     """Memory that the machine can give without swapping; unknown is plenty."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text().splitlines():
@@ -134,7 +134,7 @@ def allowance(path: Path, n_beside: int = 0) -> int:
     """
     n_bytes = path.stat().st_size + n_beside
     factor = BYTES_PER_PACKED_BYTE if path.suffix.lower() in _PACKED else BYTES_PER_BYTE
-    return min(BASE_BYTES + factor * n_bytes, _bytes_available() * 3 // 4)
+    return min(BASE_BYTES + factor * n_bytes, bytes_available() * 3 // 4)
 
 
 def _bytes_beside(path: Path) -> int:

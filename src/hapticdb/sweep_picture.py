@@ -263,13 +263,14 @@ def _draw_way(axes: Axes, camera: Camera, shell: PointShell, found: Swept) -> No
         axes.add_collection(
             LineCollection(segments.tolist(), colors=colors, linewidths=width, alpha=alpha)
         )
-    if found.first_contact is None or found.first_contact.sample > 0:
+    first_contact = found.caught or found.first_contact
+    if first_contact is None or first_contact.sample > 0:
         _mark(axes, seen[0], "start", FREE)
     if found.samples > 1:
         _mark(axes, seen[-1], "end", FREE)
     clearance = found.clearance
-    if found.first_contact is not None:
-        _mark(axes, _middle_at(camera, middle, found.first_contact), "first contact", CAUGHT)
+    if first_contact is not None:
+        _mark(axes, _middle_at(camera, middle, first_contact), "first contact", CAUGHT)
     elif clearance is not None and clearance.point is not None:
         at = camera.project(clearance.point[None])[0, :2] / SAMPLES
         _mark(axes, at, f"nearest: {length_text(clearance.distance)}", COLORS[1])
@@ -356,11 +357,11 @@ def _draw_profile(figure: Figure, found: Swept) -> None:
     profile = found.profile
     share = 100 * np.append(profile.fractions, 1.0)
     top = figure.add_axes((0.055, 0.165, 0.925, 0.085))
-    size, unit = readable_unit(float(np.nanmax(profile.clearances, initial=0.0)))
+    farthest = float(np.nanmax(profile.clearances, initial=0.0)) or found.voxel_size
+    size, unit = readable_unit(farthest)
     near = profile.clearances / size
     top.step(share, np.append(near, near[-1:]), where="post", color=COLORS[1], linewidth=1.2)
     if found.clearance is not None and np.isfinite(near).all():
-        limit = float(np.nanmax(near, initial=0.0))
         top.fill_between(
             share,
             0,
@@ -370,7 +371,7 @@ def _draw_profile(figure: Figure, found: Swept) -> None:
             alpha=0.2,
             linewidth=0,
         )
-        top.set_ylim(0, 1.08 * max(limit, 1e-6))
+        top.set_ylim(0, 1.08 * farthest / size)
     bottom = figure.add_axes((0.055, 0.06, 0.925, 0.085))
     hits = np.append(profile.hits, profile.hits[-1:])
     bottom.fill_between(share, 0, hits, step="post", color=CAUGHT, alpha=0.75, linewidth=0)

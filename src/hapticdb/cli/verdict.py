@@ -50,13 +50,12 @@ def verdict_line(found: "Swept", shell: "PointShell") -> str:
 
 def _obstacle_clause(found: "Swept", obstacles: "Sequence[MetObject]") -> str:
     """What is in the way first, of objects that are hit elsewhere than where the path starts."""
-    contacts = [one.first_contact for one in obstacles if one.first_contact is not None]
-    if not contacts:
+    first_contact = found.caught
+    if first_contact is None:
         first = min(one.first for one in obstacles)
         grazed = [one.object for one in obstacles if one.first == first]
         where = f"{_percent(first)} of the path"
         return f"grazes {_names(grazed)} at {where}: within a voxel, without contact"
-    first_contact = min(contacts, key=lambda moment: moment.sample)
     caught = [
         one.object
         for one in obstacles

@@ -210,6 +210,13 @@ class Swept:
     proportions: Proportions
 
     @property
+    def caught(self) -> Moment | None:
+        """First contact with an object in the way: one that is not only left at once."""
+        in_way = [one.first_contact for one in self.objects if not one.is_left_at_once]
+        contacts = [moment for moment in in_way if moment is not None]
+        return min(contacts, key=lambda moment: moment.sample, default=None)
+
+    @property
     def verdict(self) -> Verdict:
         """What is proved: it hits something, it comes out, or neither."""
         if self.hits or self.enclosed:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, PointShell, ResidentCells, Session
-from hapticdb.realtime.devices import Player
+from hapticdb.devices.scripted import Player
 
 ABOVE = 0.05
 DIP = 0.004

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from hapticdb import Environment
 from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
-from hapticdb.grouping import object_ranges
-from hapticdb.statistics import DEFAULT_RESOLUTION
+from hapticdb.query.grouping import object_ranges
+from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Rows, Store, row_shift
 
 MAX_BITS = 15

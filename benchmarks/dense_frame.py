@@ -1,7 +1,7 @@
 """The limit of a real-time frame: the same flat loop over one dense bitmap in memory.
 
 Word ``(i * side + j) * side / 32 + k / 32``, bit ``k & 31``. All of a frame's arithmetic, and the
-order of its sums, are those of `hapticdb.kernels.cells.felt`; only the lookup differs.
+order of its sums, are those of `hapticdb.kernels.resident.cells.felt`; only the lookup differs.
 """
 
 import numpy as np
@@ -9,8 +9,7 @@ from numba import types
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOAT, FLOATS2, FLOATS3, INT, INTS, INTS32, WORDS32_2, entry, leaf
-from hapticdb.kernels.cells import CLUSTERS, CONTACTS, DEEPEST, EMPTY_SLOT, HITS, PLACE, Cells
-from hapticdb.kernels.contact import (
+from hapticdb.kernels.query.contact import (
     average_into,
     center_of,
     contact_depth,
@@ -18,6 +17,15 @@ from hapticdb.kernels.contact import (
     is_rigid,
     moment,
     turn,
+)
+from hapticdb.kernels.resident.cells import (
+    CLUSTERS,
+    CONTACTS,
+    DEEPEST,
+    EMPTY_SLOT,
+    HITS,
+    PLACE,
+    Cells,
 )
 
 

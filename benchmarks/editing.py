@@ -15,8 +15,8 @@ import numpy as np
 
 import hapticdb
 from hapticdb import PointShell, Session
+from hapticdb.devices.scripted import Path
 from hapticdb.poses import read_poses
-from hapticdb.realtime.devices import Path
 
 RATE = 1000.0
 EDITS = 60

@@ -28,20 +28,20 @@ from numpy.typing import NDArray
 import hapticdb
 from erring import erring
 from hapticdb import GridOptions, ImportOptions, PointShell
+from hapticdb.devices.scripted import Path as HandPath
 from hapticdb.poses import read_poses, write_poses
-from hapticdb.realtime.devices import Path as HandPath
-from hapticdb.realtime.frames import Frames as Batch
-from hapticdb.realtime.recorded import State
-from hapticdb.realtime.recording import Recording
-from hapticdb.realtime.replay import replay
 from hapticdb.realtime.report import Report
-from hapticdb.realtime.residency import Residency
-from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
-from hapticdb.realtime.table import CellTable
+from hapticdb.recording.file import Recording
+from hapticdb.recording.frame import State
+from hapticdb.recording.replay import replay
+from hapticdb.resident.frames import Frames as Batch
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
 from hapticdb.sample import write_sample
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.private_server import PrivateServer
+from hapticdb.store.postgres.private_server import PrivateServer
 
 STALENESS = 0.5
 FALLING = 0.04

@@ -34,12 +34,12 @@ from hapticdb.bench.run import Workload
 from hapticdb.bench.subject import PAPER_CACHE, Subject, limited
 from hapticdb.bench.workload import RADIUS_VOXELS, Task
 from hapticdb.grid import CurveName
-from hapticdb.kernels.voxelize import count_voxels
+from hapticdb.kernels.surfaces.voxelize import count_voxels
 from hapticdb.poses import read_poses
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import LAYOUTS, Layout
 from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.private_server import Binaries, find_binaries
+from hapticdb.store.postgres.private_server import Binaries, find_binaries
 from peers import Peer, PeerWork, all_bricks
 from peers.run import Measured, measure_peers
 from peers.voxelizers import measure_voxelizers, read_assembly

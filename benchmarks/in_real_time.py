@@ -29,15 +29,15 @@ from dense_frame import dense_bitmap, dense_feel
 from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.bench import records
-from hapticdb.kernels.cells import BUFFERS, RESULTS, feel_kernel
+from hapticdb.kernels.resident.cells import BUFFERS, RESULTS, feel_kernel
 from hapticdb.mesh import read_file
 from hapticdb.poses import read_poses, write_poses
-from hapticdb.realtime.frames import Frames
-from hapticdb.realtime.residency import Residency
-from hapticdb.realtime.table import CellTable
+from hapticdb.resident.frames import Frames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
 from hapticdb.sample import write_sample
 from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.private_server import find_binaries
+from hapticdb.store.postgres.private_server import find_binaries
 from places import serving
 
 BITS = 11

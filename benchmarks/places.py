@@ -9,8 +9,8 @@ from hapticdb.errors import UsageError
 from hapticdb.store.connect import exists
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.private_server import Binaries, PrivateServer, find_binaries
-from hapticdb.store.sqlite_file import remove_file
+from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
+from hapticdb.store.sqlite.file import remove_file
 
 CACHE = "4 MB"
 """The paper's 500 blocks of 8 KB."""

@@ -34,11 +34,11 @@ from hapticdb.bench.measure import Alternative, Cell, in_turns
 from hapticdb.bench.subject import CURVES, PAPER_CACHE
 from hapticdb.bench.workload import POSES, SEED, random_poses, slide_poses, sphere_shell
 from hapticdb.errors import DatabaseError, HapticDBError, UsageError
-from hapticdb.query import Strategy
+from hapticdb.query.frame import Strategy
 from hapticdb.sample import write_sample
 from hapticdb.store.base import SupportsCaches
 from hapticdb.store.connect import create_store, exists
-from hapticdb.store.sqlite_file import remove_file
+from hapticdb.store.sqlite.file import remove_file
 from places import CACHE, SETTINGS, Place, place_of
 
 SIZES = (1.4e6, 1.4e7, 1.4e8, 1.4e9)

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from hapticdb.query import STRATEGIES, Strategy
+from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import LAYOUTS, Layout
 from peers import PeerWork, Pose
 from peers.memory import DenseBitmap

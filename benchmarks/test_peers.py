@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import peers
-from hapticdb.store.private_server import find_binaries
+from hapticdb.store.postgres.private_server import find_binaries
 from peers import FAMILIES, SAME, Missing, Peer, PeerMissingError, PeerWork, all_peers
 from peers.rows import RowPeer
 from peers.run import measure_peers

@@ -25,15 +25,15 @@ from pytest_benchmark.fixture import BenchmarkFixture
 import hapticdb
 from awake import awake
 from hapticdb import Environment
-from hapticdb.kernels import contact
-from hapticdb.query import STRATEGIES, Strategy
+from hapticdb.kernels.query import contact
+from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import LAYOUTS, Frame, Layout, row_shift
 from hapticdb.store.postgres import statements, wire
 from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.session import Session
 from hapticdb.store.postgres.store import PostgresStore
-from hapticdb.store.private_server import Binaries, PrivateServer
 from scene import Scene, is_measuring
 from servers import FOUND, named
 

@@ -18,8 +18,8 @@ from hapticdb import Object
 from hapticdb.bench.workload import random_poses, sphere_shell
 from hapticdb.errors import DatabaseError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.kernels.voxelize import brick_voxels
-from hapticdb.layout import rows_of_voxels
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.kernels.surfaces.voxelize import brick_voxels
 from places import Place, place_of
 from scale import Built, Size, stored
 from servers import FOUND

@@ -21,7 +21,7 @@ import trimesh
 from numpy.typing import NDArray
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from hapticdb.kernels.voxelize import count_voxels, voxelize
+from hapticdb.kernels.surfaces.voxelize import count_voxels, voxelize
 from peers import PeerMissingError
 from peers.voxelizers import BITS, EDGE, Assembly, Triangles, by_open3d, read_assembly, tight
 

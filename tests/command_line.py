@@ -43,7 +43,7 @@ HALTING = """
 import sys, time
 from hapticdb.cli import main
 from hapticdb.store.postgres.store import PostgresStore
-from hapticdb.store.sqlite import SQLiteStore
+from hapticdb.store.sqlite.store import SQLiteStore
 
 left = int(sys.argv.pop(1))
 

@@ -14,7 +14,7 @@ import children
 import examples
 from hapticdb import PointShell
 from hapticdb.kernels.compiling import NAMES, compile_missing
-from hapticdb.pointshell import fibonacci_sphere
+from hapticdb.pointshell.shell import fibonacci_sphere
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 
 
@@ -30,7 +30,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     older = set(map(named, FOUND[1:]))
     for item in items:
         params = getattr(getattr(item, "callspec", None), "id", "").split("-")
-        is_contract = item.path.name.startswith("test_store_postgres")
+        is_contract = item.path.name.startswith("test_contract_postgres")
         if not is_contract and not older.isdisjoint(params):
             item.add_marker(pytest.mark.long)
 

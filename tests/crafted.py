@@ -8,8 +8,8 @@ import numpy as np
 
 from hapticdb import Grid
 from hapticdb.store.base import Layout
-from hapticdb.store.sqlite import SQLiteStore
-from hapticdb.store.sqlite_pages import LAYER
+from hapticdb.store.sqlite.pages import LAYER
+from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 7)

@@ -15,11 +15,11 @@ import hapticdb
 from assemblies import Mesh, ball, placement, write_obj
 from children import joined
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
-from hapticdb.ingest import Progress
-from hapticdb.query import Strategy
+from hapticdb.ingest.files import Progress
+from hapticdb.query.frame import Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import session
-from hapticdb.store.private_server import Binaries, PrivateServer, find_binaries
+from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
 from validity import Contents, contents, valid_contents
 
 N_PARTS = 30

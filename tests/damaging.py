@@ -27,9 +27,9 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Grid, PointShell
 from hapticdb.grid import CurveName
-from hapticdb.query import STRATEGIES, Strategy
+from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
-from hapticdb.store.sqlite_pages import PAGE_BYTES
+from hapticdb.store.sqlite.pages import PAGE_BYTES
 from hapticdb.testing import KINDS, write_voxels
 
 PLACES: tuple[tuple[tuple[float, float, float], tuple[Strategy, ...]], ...] = (

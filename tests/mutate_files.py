@@ -143,7 +143,7 @@ def _read_ours(path: Path) -> None:
         _, poses = read_timed_poses(path)
         assert np.isfinite(poses).all(), "poses that are not finite"
     else:
-        from hapticdb.realtime.recording import Recording  # noqa: PLC0415
+        from hapticdb.recording.file import Recording  # noqa: PLC0415
 
         Recording(path).columns("time", "hand", "wrench", until_damage=True)
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import apsw
 
 from hapticdb.store.schema import MIGRATIONS, SQLITE_APPLICATION_ID
-from hapticdb.store.sqlite import SQLiteStore
+from hapticdb.store.sqlite.store import SQLiteStore
 
 
 def make_old(path: Path) -> None:

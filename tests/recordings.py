@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 
 from hapticdb import Grid, PointShell, TangentPlane
-from hapticdb.realtime.chunks import HEAD, Chunk
-from hapticdb.realtime.recording import FRAME, Frames, Header, Recorder, Recording
+from hapticdb.recording.chunks import HEAD, Chunk
+from hapticdb.recording.file import FRAME, Frames, Header, Recorder, Recording
 
 POINT = PointShell(
     np.array([[0.1, 0.2, 0.3]]), np.array([[0.0, 0.0, 1.0]]), np.array([0.01, 0.0, 0.0])

@@ -20,7 +20,7 @@ import pytest
 from psycopg import sql
 
 from hapticdb.store.postgres.address import parse, with_environment
-from hapticdb.store.private_server import Binaries, PrivateServer, find_binaries
+from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
 
 SETTINGS = {"fsync": "off", "full_page_writes": "off", "max_connections": "60"}
 """A crash of the machine may lose these servers; a kill of their processes may not."""

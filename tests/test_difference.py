@@ -15,7 +15,7 @@ from assemblies import placement, voxel_set
 from hapticdb import Environment, Grid, diff_environments, transfer
 from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
-from hapticdb.layout import rows_of_voxels
+from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Layout
 from hapticdb.testing import KINDS, blob, voxel_object
 

@@ -24,11 +24,12 @@ from assemblies import (
     write_obj,
 )
 from children import PIPE, child
-from hapticdb import Environment, PointShell, environment, ingest
+from hapticdb import Environment, PointShell, environment
 from hapticdb.grid import CurveName
+from hapticdb.ingest import files
 from hapticdb.mesh import MeshFile, parse_in_process
-from hapticdb.query import STRATEGIES
-from hapticdb.statistics import machine_name
+from hapticdb.query.cost_model import machine_name
+from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.base import Layout
 from hapticdb.testing import KINDS, blob, write_voxels
 from mesh_files import gltf
@@ -62,7 +63,7 @@ def write_balls(path: Path, *placed: NDArray[np.float64]) -> Path:
 @pytest.fixture
 def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
     """Files are parsed in this process: the tests' own are sound, and a child takes longer."""
-    for module in (environment, ingest):
+    for module in (environment, files):
         monkeypatch.setattr(module, "read_file", parse_in_process)
 
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from command_line import Run, made, poses, refused, run, scene, tool  # noqa: F401 - fixtures
 from hapticdb import Object, PointShell, Proportions, UsageError, compare_proportions
 from hapticdb.poses import rotation_of
-from hapticdb.realtime.sweep_path import Path
+from hapticdb.sweeps.path import Path
 from hapticdb.units import UNITS
 
 TOOL = ("--tool", "tool.stl")

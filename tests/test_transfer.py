@@ -21,11 +21,11 @@ from assemblies import index_rows, left_behind, placement, rows_of, voxel_set
 from children import child
 from hapticdb import Environment, Grid, PointShell, copy_environment, diff_environments, transfer
 from hapticdb.grid import CurveName
-from hapticdb.layout import rows_of_voxels
-from hapticdb.statistics import DEFAULT_RESOLUTION
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout
-from hapticdb.store.sqlite import SQLiteStore
-from hapticdb.store.sqlite_pages import LAYER
+from hapticdb.store.sqlite.pages import LAYER
+from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import KINDS, blob, voxel_object, write_voxels
 from hapticdb.transfer import CopyReport, Progress
 

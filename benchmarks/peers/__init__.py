@@ -18,11 +18,11 @@ import trimesh
 from numpy.typing import NDArray
 
 from hapticdb import Environment, PointShell
-from hapticdb.layout import Bricks
+from hapticdb.ingest.layout import Bricks
 from hapticdb.mesh import read_file
 from hapticdb.sample import SampleFiles
 from hapticdb.store.base import BRICK_BYTES, BRICK_SHIFT, Keys
-from hapticdb.store.private_server import Binaries
+from hapticdb.store.postgres.private_server import Binaries
 
 Pose = NDArray[np.float64]
 SAME = "the same hits and wrench, without the objects"

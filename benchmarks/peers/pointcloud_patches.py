@@ -17,7 +17,7 @@ import psycopg
 
 from hapticdb.kernels import curves
 from hapticdb.store.base import NO_OCCUPANCY, Keys
-from hapticdb.store.private_server import PrivateServer
+from hapticdb.store.postgres.private_server import PrivateServer
 from peers import PeerMissingError, PeerWork
 from peers.rows import Found, RowPeer
 

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb import PointShell
-from hapticdb.force import TangentPlane
 from hapticdb.grid import Grid
-from hapticdb.kernels import contact
+from hapticdb.kernels.query import contact
+from hapticdb.query.law import TangentPlane
 from hapticdb.store.base import NO_KEYS, NO_OCCUPANCY, Keys, Layout, row_shift
 from peers import SAME, PeerWork, Pose
 

@@ -16,7 +16,7 @@ import trimesh
 from numpy.typing import NDArray
 
 from hapticdb.bench.measure import Cell
-from hapticdb.kernels.voxelize import count_voxels, voxelize
+from hapticdb.kernels.surfaces.voxelize import count_voxels, voxelize
 from hapticdb.mesh import read_file
 from peers import INSTALL, PeerMissingError
 from peers.run import Measured

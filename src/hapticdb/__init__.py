@@ -36,27 +36,28 @@ if TYPE_CHECKING:
         StuckError,
         UsageError,
     )
-    from hapticdb.force import TangentPlane
     from hapticdb.grid import Grid, GridOptions
-    from hapticdb.ingest import FileReport, ImportOptions, import_files
-    from hapticdb.pointshell import PointShell
+    from hapticdb.ingest.files import FileReport, ImportOptions, import_files
+    from hapticdb.pointshell.shell import PointShell
     from hapticdb.pool import Pool
     from hapticdb.poses import read_poses, write_poses
     from hapticdb.proportions import Proportions, compare_proportions
-    from hapticdb.query import Query
+    from hapticdb.query.cost_model import CostModel
+    from hapticdb.query.frame import Query
+    from hapticdb.query.law import TangentPlane
+    from hapticdb.query.quantiles import QuantileVector
+    from hapticdb.query.touches import Touch, Touches
     from hapticdb.realtime.coupling import Coupling
     from hapticdb.realtime.handle import Handle
-    from hapticdb.realtime.recording import Recording
-    from hapticdb.realtime.replay import Replayed, replay
     from hapticdb.realtime.report import Report
-    from hapticdb.realtime.resident import ResidentCells
+    from hapticdb.realtime.resident_cells import ResidentCells
     from hapticdb.realtime.session import Session
-    from hapticdb.realtime.sweep import sweep
-    from hapticdb.realtime.swept import Swept
-    from hapticdb.statistics import CostModel, QuantileVector
+    from hapticdb.recording.file import Recording
+    from hapticdb.recording.replay import Replayed, replay
     from hapticdb.store.base import Object
     from hapticdb.store.connect import backup_environment, restore_environment
-    from hapticdb.touches import Touch, Touches
+    from hapticdb.sweeps.result import Swept
+    from hapticdb.sweeps.run import sweep
     from hapticdb.transfer import CopyReport, copy_environment
     from hapticdb.warm import warm_up
 
@@ -136,27 +137,28 @@ _HOMES = {
         "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutsideGridError "
         "ReadOnlyError StuckError UsageError"
     ),
-    "force": "TangentPlane",
+    "query.law": "TangentPlane",
     "grid": "Grid GridOptions",
-    "ingest": "FileReport ImportOptions import_files",
-    "pointshell": "PointShell",
+    "ingest.files": "FileReport ImportOptions import_files",
+    "pointshell.shell": "PointShell",
     "pool": "Pool",
     "poses": "read_poses write_poses",
     "proportions": "Proportions compare_proportions",
-    "query": "Query",
+    "query.frame": "Query",
     "realtime.coupling": "Coupling",
     "realtime.handle": "Handle",
-    "realtime.recording": "Recording",
-    "realtime.replay": "Replayed replay",
+    "recording.file": "Recording",
+    "recording.replay": "Replayed replay",
     "realtime.report": "Report",
-    "realtime.resident": "ResidentCells",
+    "realtime.resident_cells": "ResidentCells",
     "realtime.session": "Session",
-    "realtime.sweep": "sweep",
-    "realtime.swept": "Swept",
-    "statistics": "CostModel QuantileVector",
+    "sweeps.run": "sweep",
+    "sweeps.result": "Swept",
+    "query.cost_model": "CostModel",
+    "query.quantiles": "QuantileVector",
     "store.base": "Object",
     "store.connect": "backup_environment restore_environment",
-    "touches": "Touch Touches",
+    "query.touches": "Touch Touches",
     "transfer": "CopyReport copy_environment",
     "warm": "warm_up",
 }

@@ -18,15 +18,15 @@ from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError, GridError, UsageError
 from hapticdb.grid import GridOptions
-from hapticdb.ingest import FileReport, ImportOptions, ProgressCallback, import_files
+from hapticdb.ingest.files import FileReport, ImportOptions, ProgressCallback, import_files
 from hapticdb.kernels.compiling import compile_missing, entries_for
-from hapticdb.pointshell import PointShell
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import read_poses, write_poses
-from hapticdb.query import Strategy
+from hapticdb.query.frame import Strategy
+from hapticdb.query.touches import Touch
 from hapticdb.sample import SampleFiles, slide_over_voxels, write_sample, write_wrench
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import beside, name_of, redact
-from hapticdb.touches import Touch
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"

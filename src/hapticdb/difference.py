@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, CELL_BITS, Grid
-from hapticdb.grouping import box_ranges
-from hapticdb.kernels import curves, voxelize
-from hapticdb.layout import Bricks, bricks_of_rows
-from hapticdb.statistics import QuantileVector
+from hapticdb.ingest.layout import Bricks, bricks_of_rows
+from hapticdb.kernels import curves
+from hapticdb.kernels.surfaces import voxelize
+from hapticdb.query.grouping import box_ranges
+from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import BRICK_BYTES, Object, Store
 from hapticdb.store.connect import open_store
 from hapticdb.transfer import (

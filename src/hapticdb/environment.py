@@ -3,30 +3,38 @@
 import os
 from collections.abc import Iterable
 from time import perf_counter_ns
-from types import TracebackType
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.calibration import calibrate
 from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, ReadOnlyError
 from hapticdb.finding import find_objects
-from hapticdb.force import TangentPlane
 from hapticdb.grid import Grid
-from hapticdb.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
-from hapticdb.ingest import FileReport, ImportOptions, ProgressCallback, ingest_file
-from hapticdb.layout import voxels_of_rows
+from hapticdb.ingest.files import FileReport, ImportOptions, ProgressCallback, ingest_file
+from hapticdb.ingest.layout import voxels_of_rows
+from hapticdb.ingest.originals import shell_of_objects
+from hapticdb.ingest.placing import move_object, shift_objects
 from hapticdb.mesh import read_file
-from hapticdb.originals import shell_of_objects
-from hapticdb.placing import move_object, shift_objects
-from hapticdb.pointshell import PointShell
-from hapticdb.query import NOTHING_EXCLUDED, Answer, HapticQuery, Strategy, as_id, as_ids, as_poses
-from hapticdb.statistics import DEFAULT_RESOLUTION, CostModel, QuantileVector, machine_name
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.calibration import calibrate
+from hapticdb.query.cost_model import CostModel, machine_name
+from hapticdb.query.frame import (
+    NOTHING_EXCLUDED,
+    Answer,
+    HapticQuery,
+    Strategy,
+    as_id,
+    as_ids,
+    as_poses,
+)
+from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
+from hapticdb.query.law import TangentPlane
+from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+from hapticdb.query.touches import Touch, Touches
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
 from hapticdb.store.believed import damaged
 from hapticdb.store.connect import create_store, open_store
-from hapticdb.touches import Touch, Touches
 
 _NOBODY: tuple[int, ...] = ()
 
@@ -51,12 +59,7 @@ class Environment:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -177,7 +180,7 @@ class Environment:
         replace : bool
             Replace objects of the file that it holds otherwise now, and remove those it lacks.
         progress : callable or None
-            Called after each part with a `hapticdb.ingest.Progress`.
+            Called after each part with a `hapticdb.ingest.files.Progress`.
 
         Raises
         ------

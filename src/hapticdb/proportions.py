@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.pointshell import PointShell
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
 from hapticdb.store.base import Object, scene_bounds
 from hapticdb.units import NAMES, UNITS, length_text, metres_of

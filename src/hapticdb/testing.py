@@ -28,8 +28,8 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.grid import CurveName, Grid
-from hapticdb.grouping import object_ranges
-from hapticdb.layout import rows_of_voxels
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.grouping import object_ranges
 from hapticdb.store.base import (
     Covering,
     Frame,

@@ -17,10 +17,10 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.grid import CurveName, Grid
-from hapticdb.grouping import Ranges, object_ranges
-from hapticdb.kernels import voxelize
-from hapticdb.layout import bricks_of_rows, merged, rows_of_bricks
-from hapticdb.statistics import DEFAULT_RESOLUTION, QuantileVector
+from hapticdb.ingest.layout import bricks_of_rows, merged, rows_of_bricks
+from hapticdb.kernels.surfaces import voxelize
+from hapticdb.query.grouping import Ranges, object_ranges
+from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Rows, Store
 from hapticdb.store.connect import create_store, exists, open_store
 

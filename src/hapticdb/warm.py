@@ -10,7 +10,7 @@ def warm_up(progress: Callable[[Compiled], None] | None = None) -> None:
 
     Half a minute on two processors where nothing is compiled yet, a process for each; about a
     second later. Afterwards no import, touch, session or sweep of this process compiles anything
-    (`tests/test_warm.py`).
+    (`tests/house/test_warm.py`).
 
     Parameters
     ----------

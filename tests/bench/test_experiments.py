@@ -16,9 +16,9 @@ from hapticdb.bench.measure import Cell
 from hapticdb.bench.run import Workload
 from hapticdb.bench.subject import Subject, limited
 from hapticdb.bench.workload import Task
-from hapticdb.query import STRATEGIES
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.query.quantiles import QuantileVector
 from hapticdb.sample import write_sample
-from hapticdb.statistics import QuantileVector
 from hapticdb.store.base import LAYOUTS, SupportsCaches
 from servers import Place
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from hapticdb.bench import measure
 from hapticdb.bench.measure import CHUNK, Alternative, Pose, in_turns, summary
-from hapticdb.query import Query
+from hapticdb.query.frame import Query
 
 POSES = np.tile(np.eye(4), (5 * CHUNK + 3, 1, 1))
 POSES[:, 0, 3] = np.arange(len(POSES))

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 
 from hapticdb import Grid
 from hapticdb.grid import CurveName
-from hapticdb.kernels import cell_table as kernels
-from hapticdb.kernels.cells import CELL_WORDS, Place, cell_key, spread_key
-from hapticdb.layout import rows_of_voxels
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident.cells import CELL_WORDS, Place, cell_key, spread_key
 from hapticdb.store.base import Layout, row_shift
 from naive import Voxel
 from realtime.worlds import HIERARCHICAL, cells_of, poses_in

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hapticdb.kernels import anchors, coupling
-from hapticdb.kernels.cells import UNKNOWN
+from hapticdb.kernels.hand import anchors, coupling
+from hapticdb.kernels.resident.cells import UNKNOWN
 
 STEP = st.integers(-1, 1)
 NUMBER = st.floats(-10.0, 10.0)

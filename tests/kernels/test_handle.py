@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hapticdb.kernels.handle import FARTHEST, is_somewhere
+from hapticdb.kernels.hand.handle import FARTHEST, is_somewhere
 
 BEYOND = [math.nan, math.inf, -math.inf, 1e308, -1.001 * FARTHEST]
 

@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hapticdb.kernels import sampling
+from hapticdb.kernels.surfaces import sampling
 
 
 @given(seed=st.integers(0, 2**32), n_keep=st.integers(20, 50))

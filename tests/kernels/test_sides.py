@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticdb.kernels import sides
+from hapticdb.kernels.surfaces import sides
 
 Floats = NDArray[np.float64]
 

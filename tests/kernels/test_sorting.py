@@ -4,7 +4,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticdb.kernels.sorting import SORTED_RUN, insert_distinct, sorting_order
+from hapticdb.kernels.query.sorting import SORTED_RUN, insert_distinct, sorting_order
 
 KEYS = st.integers(-(2**63), 2**63 - 1)
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from children import PATIENCE
-from hapticdb.kernels.voxelize import brick_voxels, count_voxels, mark_points, voxelize
+from hapticdb.kernels.surfaces.voxelize import brick_voxels, count_voxels, mark_points, voxelize
 from naive import Voxel, bricks_of_voxels, voxels_of_points, voxels_of_triangles, z_order
 
 JIT = not numba.config.DISABLE_JIT

@@ -8,13 +8,13 @@ from numpy.typing import ArrayLike, NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.kernels import coupling as kernels
-from hapticdb.kernels.cells import HITS, MOST_MISSED, RESULTS
+from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.motion import poses_of
+from hapticdb.kernels.resident.cells import HITS, MOST_MISSED, RESULTS
 from hapticdb.realtime.coupling import Coupling
-from hapticdb.realtime.frames import clusters_of
-from hapticdb.realtime.residency import Residency
-from hapticdb.realtime.table import CellTable
+from hapticdb.resident.frames import clusters_of
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
 from hapticdb.testing import write_voxels
 from realtime.worlds import cells_of
 

@@ -8,8 +8,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.devices.scripted import Player, Reading
 from hapticdb.errors import DeviceError
-from hapticdb.realtime.devices import Player, Reading
 
 Floats = NDArray[np.float64]
 

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 import children
 from children import PATIENCE
 from hapticdb import Environment
-from hapticdb.realtime.recording import Recording
 from hapticdb.realtime.session import Session
+from hapticdb.recording.file import Recording
 from hapticdb.testing import floor_voxels, write_voxels
 
 RATE = 500.0

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticdb import PointShell, UsageError
-from hapticdb.kernels import coupling as kernels
-from hapticdb.kernels.cells import (
+from hapticdb.kernels.hand import coupling as kernels
+from hapticdb.kernels.resident.cells import (
     BUFFERS,
     DEEPEST,
     REVISION,

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hapticdb import PointShell
-from hapticdb.kernels import coupling as kernels
+from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.poses import quaternion_of, rotation_of
 from realtime.coupled import SIDE, SIZE, Tool, World, box, punch
 from realtime.worlds import block

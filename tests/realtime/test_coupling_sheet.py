@@ -9,10 +9,10 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticdb import Grid, PointShell
-from hapticdb.kernels import coupling as kernels
-from hapticdb.kernels.anchors import LOOSE
-from hapticdb.kernels.cells import UNKNOWNS
-from hapticdb.kernels.voxelize import voxelize
+from hapticdb.kernels.hand import coupling as kernels
+from hapticdb.kernels.hand.anchors import LOOSE
+from hapticdb.kernels.resident.cells import UNKNOWNS
+from hapticdb.kernels.surfaces.voxelize import voxelize
 from hapticdb.poses import rotation_of
 from realtime.coupled import BITS, SIDE, SIZE, Tool, World, box, punch
 from realtime.worlds import block

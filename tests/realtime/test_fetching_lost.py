@@ -16,16 +16,16 @@ import hapticdb
 from children import PATIENCE, joined
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import GridError
-from hapticdb.realtime import prefetch, resident
-from hapticdb.realtime.prefetch import Fetching, FetchRequest
-from hapticdb.realtime.process import Process
-from hapticdb.realtime.resident import ResidentCells
-from hapticdb.realtime.table import LEAST_BUDGET, STOP, CellTable
+from hapticdb.realtime import fetching, resident_cells
+from hapticdb.realtime.fetching import Fetching, FetchRequest
+from hapticdb.realtime.processes import Process
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.resident.table import LEAST_BUDGET, STOP, CellTable
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
-from hapticdb.store.sqlite_file import remove_file
+from hapticdb.store.sqlite.file import remove_file
 from hapticdb.testing import write_voxels
-from realtime.test_prefetch import Side, until
+from realtime.test_fetching import Side, until
 from realtime.worlds import SIZE, block, expected, ids_by_voxel, make
 from servers import Place
 
@@ -199,13 +199,13 @@ def test_a_connection_lost_while_warming_up_puts_ready_off(
         warm_up(fetching)
 
     monkeypatch.setattr(Fetching, "warm_up", lost_at_first)
-    monkeypatch.setattr(prefetch, "parent_is_gone", lambda: False)
+    monkeypatch.setattr(fetching, "parent_is_gone", lambda: False)
     with CellTable.create(LEAST_BUDGET) as table:
         listener: Any = Listener(table)
-        prefetch.fetch(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid), listener)
+        fetching.fetch(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid), listener)
         assert listener.said == ["ready"]
         assert next(losses, None) is None
-        assert table.desk.figures[prefetch.LOSSES] == 1
+        assert table.desk.figures[fetching.LOSSES] == 1
 
 
 def test_a_table_goes_when_its_process_does_not_start(
@@ -244,8 +244,8 @@ def test_threads_that_supervise_together_start_one_process(
         barrier.wait(PATIENCE)
         cells.supervise()
 
-    monkeypatch.setattr(resident, "Process", noted)
-    monkeypatch.setattr(resident, "RESTART_EVERY", 0.0)
+    monkeypatch.setattr(resident_cells, "Process", noted)
+    monkeypatch.setattr(resident_cells, "RESTART_EVERY", 0.0)
     threads = [threading.Thread(target=supervise) for _ in range(4)]
     for thread in threads:
         thread.start()

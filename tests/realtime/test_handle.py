@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hapticdb.devices.scripted import Reading
 from hapticdb.errors import UsageError
-from hapticdb.kernels.coupling import HAND, HAND_VELOCITY, IS_OPEN, IS_STALE
+from hapticdb.kernels.hand.coupling import HAND, HAND_VELOCITY, IS_OPEN, IS_STALE
 from hapticdb.kernels.motion import poses_of
-from hapticdb.realtime.devices import Reading
 from hapticdb.realtime.handle import Handle
 from realtime.worlds import turned
 

@@ -11,26 +11,26 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from devices.readings import FAULTS, FORMS, MOMENTS, Change
 from hapticdb import PointShell
+from hapticdb.devices.scripted import Device
 from hapticdb.errors import DeviceError, HapticDBError
-from hapticdb.kernels import servo
-from hapticdb.kernels.cells import RESULTS, UNKNOWNS
-from hapticdb.kernels.coupling import APPLIED, OUT
+from hapticdb.kernels.hand import servo
+from hapticdb.kernels.hand.coupling import APPLIED, OUT
+from hapticdb.kernels.resident.cells import RESULTS, UNKNOWNS
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
-from hapticdb.realtime.devices import Device
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of, work
-from hapticdb.realtime.process import Message, Voice
-from hapticdb.realtime.recorded import FRAME, State
+from hapticdb.realtime.processes import Message, Voice
 from hapticdb.realtime.report import LoopAnswer
-from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import frames_of
-from hapticdb.realtime.table import anonymous_memory
+from hapticdb.recording.frame import FRAME, State
+from hapticdb.resident.table import anonymous_memory
 from hapticdb.testing import floor_voxels, write_voxels
 from realtime.hands import Clutched, Lost, Odd, Slow, Talking, Unplugged, still, stroking
-from realtime.readings import FAULTS, FORMS, MOMENTS, Change
 from realtime.worlds import make
 
 N_RING = 4096

@@ -10,18 +10,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hapticdb.devices.scripted import Reading
 from hapticdb.errors import DeviceError
-from hapticdb.kernels import coupling as kernels
-from hapticdb.kernels.cells import UNKNOWNS
+from hapticdb.kernels.hand import coupling as kernels
+from hapticdb.kernels.resident.cells import UNKNOWNS
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
-from hapticdb.realtime.devices import Reading
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import WITHDRAWN_NS, Loop, LoopRequest, ring_bytes, work
-from hapticdb.realtime.process import Voice
+from hapticdb.realtime.processes import Voice
 from hapticdb.realtime.session import frames_of
-from hapticdb.realtime.table import HEARTBEAT, anonymous_memory
+from hapticdb.resident.table import HEARTBEAT, anonymous_memory
 from realtime.coupled import SIDE, World, punch
 from realtime.hands import at
 from realtime.worlds import block

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from children import PATIENCE, child, finished
 from hapticdb import Environment, PointShell
+from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
-from hapticdb.realtime.devices import Player
-from hapticdb.realtime.recorded import State
-from hapticdb.realtime.recording import Recorder, Recording
-from hapticdb.realtime.replay import replay
 from hapticdb.realtime.report import Report
-from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
-from hapticdb.realtime.table import is_alive
+from hapticdb.recording.file import Recorder, Recording
+from hapticdb.recording.frame import State
+from hapticdb.recording.replay import replay
+from hapticdb.resident.table import is_alive
 from hapticdb.testing import write_voxels
 from realtime.hands import Beckoned, Talking, Unplugged, at, still, stroking
 from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until

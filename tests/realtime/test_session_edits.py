@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.force import TangentPlane
 from hapticdb.kernels.motion import poses_of
-from hapticdb.realtime.recorded import State
-from hapticdb.realtime.replay import touching
+from hapticdb.query.law import TangentPlane
 from hapticdb.realtime.session import Session
+from hapticdb.recording.frame import State
+from hapticdb.recording.replay import touching
 from hapticdb.testing import floor_voxels
 from realtime.hands import stroking
 from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until

@@ -12,12 +12,12 @@ import pytest
 from children import exit_code
 from hapticdb import Environment, PointShell
 from hapticdb.errors import FileError, HapticDBError, UsageError
-from hapticdb.realtime import resident
+from hapticdb.realtime import resident_cells
 from hapticdb.realtime import session as module
-from hapticdb.realtime.recording import Recorder, Recording
-from hapticdb.realtime.resident import ResidentCells
+from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
-from hapticdb.realtime.table import MOST_READERS, is_alive
+from hapticdb.recording.file import Recorder, Recording
+from hapticdb.resident.table import MOST_READERS, is_alive
 from realtime.hands import Noted, still
 from realtime.sessions import RATE, floored, until
 from realtime.worlds import make
@@ -186,7 +186,7 @@ def test_cells_that_are_closed_are_refused(env: Environment, sphere: PointShell)
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("place", "name"), [(resident, "fetching"), (module, "loop's")])
+@pytest.mark.parametrize(("place", "name"), [(resident_cells, "fetching"), (module, "loop's")])
 def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
     env: Environment,
     sphere: PointShell,

@@ -5,7 +5,7 @@ import sys
 import time
 
 from hapticdb import DatabaseError
-from hapticdb.realtime.process import Voice, parent_is_gone
+from hapticdb.realtime.processes import Voice, parent_is_gone
 
 
 def work(request: tuple[str, object], voice: Voice) -> None:

@@ -11,10 +11,18 @@ import hapticdb
 import naive_frame
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
-from hapticdb.kernels.cells import HITS, RESULTS, UNKNOWNS, WRENCH, Cells, Place, feel_kernel
-from hapticdb.layout import rows_of_voxels
-from hapticdb.realtime.frames import clusters_of
-from hapticdb.realtime.table import CellTable
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.kernels.resident.cells import (
+    HITS,
+    RESULTS,
+    UNKNOWNS,
+    WRENCH,
+    Cells,
+    Place,
+    feel_kernel,
+)
+from hapticdb.resident.frames import clusters_of
+from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Layout, Store
 from hapticdb.testing import voxel_object, write_voxels
 from naive import Voxel

@@ -10,9 +10,9 @@ from hapticdb.bench.cells import IN_THE_SERVER
 from hapticdb.bench.measure import Alternative, Cell, in_turns
 from hapticdb.bench.subject import Subject
 from hapticdb.bench.workload import RADIUS_VOXELS, SEED, Region, Task, random_poses, sphere_shell
-from hapticdb.grouping import cbgroup
-from hapticdb.query import STRATEGIES, Strategy
-from hapticdb.statistics import QuantileVector
+from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.query.grouping import cbgroup
+from hapticdb.query.quantiles import QuantileVector
 
 GAPS = (0, 10, 30, 100, 300, 500, 1000, 3000, 10_000, 30_000, 100_000, 1_000_000)
 """MAXGAP of Figure 9, in voxel keys; 500 is the paper's."""

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.query import Query
+from hapticdb.query.frame import Query
 
 FRAMES_FOR_P999 = 10_000
 """Fewer frames say nothing of the slowest in a thousand."""

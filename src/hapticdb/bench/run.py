@@ -23,8 +23,8 @@ from hapticdb.bench.workload import (
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import ReadOnlyError, UsageError
-from hapticdb.pointshell import PointShell
-from hapticdb.statistics import QuantileVector
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import SupportsCaches
 from hapticdb.warm import warm_up
 

@@ -8,12 +8,13 @@ from typing import Any
 from hapticdb.bench.cells import ONE_STATEMENT
 from hapticdb.bench.measure import Alternative, Cell, Pose
 from hapticdb.bench.workload import Task
-from hapticdb.calibration import calibrate
 from hapticdb.environment import Environment
 from hapticdb.errors import DatabaseError
-from hapticdb.pointshell import PointShell
-from hapticdb.query import HapticQuery, Query, Strategy
-from hapticdb.statistics import CostModel, QuantileVector
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.calibration import calibrate
+from hapticdb.query.cost_model import CostModel
+from hapticdb.query.frame import HapticQuery, Query, Strategy
+from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import Store, SupportsCaches
 
 PAPER_CACHE = 4 << 20

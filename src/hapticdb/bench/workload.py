@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 from hapticdb.demo import slide_along
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
-from hapticdb.grouping import box_ranges
-from hapticdb.layout import voxels_of_rows
-from hapticdb.pointshell import PointShell
+from hapticdb.ingest.layout import voxels_of_rows
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.grouping import box_ranges
 from hapticdb.store.base import row_shift
 
 POINTS = 300

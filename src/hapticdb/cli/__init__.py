@@ -12,20 +12,20 @@ from collections.abc import Callable, Sequence
 from itertools import takewhile
 
 from hapticdb.cli import render
-from hapticdb.cli.benching import bench
-from hapticdb.cli.checking import check
-from hapticdb.cli.editing import move, remove
-from hapticdb.cli.feeling import feel
-from hapticdb.cli.granting import grant
-from hapticdb.cli.importing import import_
-from hapticdb.cli.keeping import backup, restore
-from hapticdb.cli.listing import analyze, calibrate, info, objects
-from hapticdb.cli.moving import copy, diff
-from hapticdb.cli.replaying import replay
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
-from hapticdb.cli.sampling import demo, sample, warm
-from hapticdb.cli.sweeping import sweep
-from hapticdb.cli.touching import touch
+from hapticdb.cli.verbs.benching import bench
+from hapticdb.cli.verbs.checking import check
+from hapticdb.cli.verbs.editing import move, remove
+from hapticdb.cli.verbs.feeling import feel
+from hapticdb.cli.verbs.granting import grant
+from hapticdb.cli.verbs.importing import import_
+from hapticdb.cli.verbs.keeping import backup, restore
+from hapticdb.cli.verbs.listing import analyze, calibrate, info, objects
+from hapticdb.cli.verbs.moving import copy, diff
+from hapticdb.cli.verbs.replaying import replay
+from hapticdb.cli.verbs.sampling import demo, sample, warm
+from hapticdb.cli.verbs.sweeping import sweep
+from hapticdb.cli.verbs.touching import touch
 from hapticdb.errors import HapticDBError
 
 __all__ = ["app", "main"]

@@ -21,9 +21,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb.pointshell import PointShell
-    from hapticdb.realtime.recorded import Frames
-    from hapticdb.touches import Touch
+    from hapticdb.pointshell.shell import PointShell
+    from hapticdb.query.touches import Touch
+    from hapticdb.recording.frame import Frames
 
 STDOUT = "-"
 FORMULAS = ("=", "+", "-", "@")

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hapticdb.environment import Environment
-    from hapticdb.pointshell import PointShell
+    from hapticdb.pointshell.shell import PointShell
     from hapticdb.proportions import Proportions
 
 UNITLESS = {".stl", ".obj", ".ply", ".off"}

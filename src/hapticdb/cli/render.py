@@ -17,8 +17,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hapticdb import check, transfer
-    from hapticdb.ingest import ProgressCallback
-    from hapticdb.store import sqlite_backup
+    from hapticdb.ingest.files import ProgressCallback
+    from hapticdb.store.sqlite import backup as sqlite_backup
 
 _UNPRINTABLE = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"

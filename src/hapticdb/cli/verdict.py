@@ -7,9 +7,9 @@ from hapticdb.cli import render
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
-    from hapticdb.pointshell import PointShell
-    from hapticdb.realtime.swept import Clearance, Deepest, MetObject, Moment, Swept
+    from hapticdb.pointshell.shell import PointShell
     from hapticdb.store.base import Object
+    from hapticdb.sweeps.result import Clearance, Deepest, MetObject, Moment, Swept
 
 MOST_OBJECTS = 20
 MOST_NAMED = 3
@@ -66,9 +66,9 @@ def _obstacle_clause(found: "Swept", obstacles: "Sequence[MetObject]") -> str:
 
 def _doubt(found: "Swept", shell: "PointShell") -> str:
     """Why no verdict is proved, and what would decide."""
-    from hapticdb.coverage import COVER_OF_SPACING, points_for
-    from hapticdb.orientation import Surface
-    from hapticdb.pointshell import MAX_POINTS
+    from hapticdb.pointshell.coverage import COVER_OF_SPACING, points_for
+    from hapticdb.pointshell.orientation import Surface
+    from hapticdb.pointshell.shell import MAX_POINTS
 
     proof = found.proof
     if proof.cover is None:

@@ -2,7 +2,7 @@
 
 numba's on-disk cache watches only the file of the entry itself, by time stamp and size. A leaf
 edited in another file, or a wheel whose files all carry one fixed time stamp, would leave stale
-machine code behind. So the cache folder's name carries a digest of every source in this folder.
+machine code behind. So the cache folder's name carries a digest of every source below this folder.
 """
 
 import hashlib
@@ -15,11 +15,11 @@ IN_WORKER = "HAPTICDB_COMPILING"
 
 
 def sources_digest(folder: Path) -> str:
-    """Digest of the names and contents of the Python sources in `folder`, 16 hex digits."""
+    """Digest of the names and contents of the Python sources below `folder`, 16 hex digits."""
     digest = hashlib.sha256()
-    for source in sorted(folder.glob("*.py")):
+    for source in sorted(folder.rglob("*.py")):
         content = source.read_bytes()
-        digest.update(f"{source.name}\0{len(content)}\0".encode())
+        digest.update(f"{source.relative_to(folder)}\0{len(content)}\0".encode())
         digest.update(content)
     return digest.hexdigest()[:16]
 

@@ -32,7 +32,7 @@ An array that cannot be written is of another type than one that can.
 ENTRIES: list[Any] = []
 """Every compiled entry, in order of definition."""
 SIGNATURES: dict[str, tuple[Any, ...]] = {}
-"""Types of the arguments of every entry, by its module and name: ``curves.encode_kernel``."""
+"""Types of the arguments of every entry, by its module and name: ``query.grouping.gap_rows``."""
 
 
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped
@@ -57,7 +57,8 @@ def entry(*signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
         finally:
             config.CACHE_DIR = before
         ENTRIES.append(compiled)
-        SIGNATURES[f"{function.__module__.rpartition('.')[2]}.{function.__name__}"] = signature
+        module = function.__module__.removeprefix("hapticdb.kernels.")
+        SIGNATURES[f"{module}.{function.__name__}"] = signature
         return compiled  # type: ignore[no-any-return]
 
     return decorate

@@ -27,31 +27,31 @@ from typing import NamedTuple, Self
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 ENTRIES = {
-    "coupling": "advance",
-    "voxelize": "voxelize_kernel",
-    "sweep": "poses_between unpack find_hits find_clearance cells_near",
-    "cells": "feel_kernel bounding_spheres",
-    "contact": (
+    "hand.coupling": "advance",
+    "surfaces.voxelize": "voxelize_kernel",
+    "resident.sweep": "poses_between unpack find_hits find_clearance cells_near",
+    "resident.cells": "feel_kernel bounding_spheres",
+    "query.contact": (
         "locate_kernel spans_of_keys refine_kernel pairs_of_hits wrench_of_addresses depths_of_hits"
     ),
-    "cell_table": (
+    "resident.cell_table": (
         "insert_cells remove_cells slots_of_cells fill_cells curve_keys_of_cells "
         "cells_of_curve_keys slots_to_free publish oldest_version_read cells_ahead "
         "cells_met"
     ),
-    "sides": "side_votes_kernel nesting_kernel",
+    "surfaces.sides": "side_votes_kernel nesting_kernel",
     "motion": "poses_of play sway survey pull",
-    "grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
-    "sampling": "eliminate_kernel",
-    "servo": "tell name_voxels note",
+    "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
+    "surfaces.sampling": "eliminate_kernel",
+    "hand.servo": "tell name_voxels note",
     "curves": "encode_kernel decode_kernel",
-    "bricks": "z_keys_kernel mark_points_kernel count_kernel brick_voxels_kernel",
-    "handle": "is_somewhere grip carry",
+    "surfaces.bricks": "z_keys_kernel mark_points_kernel count_kernel brick_voxels_kernel",
+    "hand.handle": "is_somewhere grip carry",
 }
 """Entries by module, those that take longest to compile first. They are named here so that nobody
 loads numba to see that they are compiled."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
-TOGETHER = {"cells": "coupling"}
+TOGETHER = {"resident.cells": "hand.coupling"}
 """Modules that are compiled after another in one process, since they share its leaves."""
 LONGEST_S = 600.0
 """Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
@@ -59,32 +59,43 @@ where it is first called."""
 SERVE = "from hapticdb.kernels.compiling import serve; serve()"
 """What a process that compiles runs."""
 
-_SHELL = ("sampling.*", "sides.*", "curves.encode_kernel")
+_SHELL = ("surfaces.sampling.*", "surfaces.sides.*", "curves.encode_kernel")
 _VOXELIZE = (
-    "voxelize.*", "bricks.z_keys_kernel", "bricks.mark_points_kernel", "bricks.count_kernel",
-)  # fmt: skip
-_RANGES = ("grouping.ranges_of_box", "bricks.brick_voxels_kernel")
+    "surfaces.voxelize.*",
+    "surfaces.bricks.z_keys_kernel",
+    "surfaces.bricks.mark_points_kernel",
+    "surfaces.bricks.count_kernel",
+)
+_RANGES = ("query.grouping.ranges_of_box", "surfaces.bricks.brick_voxels_kernel")
 _COST = (
-    "contact.locate_kernel", "contact.spans_of_keys", "contact.wrench_of_addresses",
-    "grouping.gap_rows", "grouping.group_by_gap", "grouping.group_by_cost", "curves.*",
-)  # fmt: skip
+    "query.contact.locate_kernel",
+    "query.contact.spans_of_keys",
+    "query.contact.wrench_of_addresses",
+    "query.grouping.gap_rows",
+    "query.grouping.group_by_gap",
+    "query.grouping.group_by_cost",
+    "curves.*",
+)
 _RESIDENT = (
-    "cell_table.*", "cells.bounding_spheres", "grouping.group_spans_by_cost", *_COST,
-)  # fmt: skip
+    "resident.cell_table.*",
+    "resident.cells.bounding_spheres",
+    "query.grouping.group_spans_by_cost",
+    *_COST,
+)
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,
     "move": (*_VOXELIZE, *_RANGES),
-    "copy": ("bricks.*", "curves.*", "grouping.gap_rows", *_RANGES),
+    "copy": ("surfaces.bricks.*", "curves.*", "query.grouping.gap_rows", *_RANGES),
     "shell": _SHELL,
     "calibrate": _COST,
-    "touch": (*_SHELL, *_COST, "contact.*"),
+    "touch": (*_SHELL, *_COST, "query.contact.*"),
     "resident": _RESIDENT,
-    "feel": (*_SHELL, *_RESIDENT, "coupling.*", "servo.*", "handle.*", "motion.*"),
-    "replay": (*_RESIDENT, "cells.*", "motion.poses_of"),
-    "sweep": (*_SHELL, *_RESIDENT, "cells.*", "sweep.*", *_RANGES),
+    "feel": (*_SHELL, *_RESIDENT, "hand.coupling.*", "hand.servo.*", "hand.handle.*", "motion.*"),
+    "replay": (*_RESIDENT, "resident.cells.*", "motion.poses_of"),
+    "sweep": (*_SHELL, *_RESIDENT, "resident.cells.*", "resident.sweep.*", *_RANGES),
     "everything": ("*",),
 }
-"""Entries that a purpose calls, with ``*`` for any name; `tests/test_warm.py` holds them to it."""
+"""Entries that a purpose calls, with ``*`` for any name (`tests/house/test_warm.py` checks it)."""
 
 
 class Compiled(NamedTuple):
@@ -157,7 +168,7 @@ def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
     """Names by job: entries of one module, and of one that goes with it, share their leaves."""
     jobs: dict[str, list[str]] = {}
     for name in sorted(names, key=NAMES.index):
-        module = name.partition(".")[0]
+        module = name.rpartition(".")[0]
         jobs.setdefault(TOGETHER.get(module, module), []).append(name)
     return list(map(tuple, jobs.values()))
 
@@ -244,12 +255,12 @@ def serve() -> None:
 
 def _module_of(name: str) -> ModuleType:
     """Module of an entry, loaded."""
-    return importlib.import_module(f"hapticdb.kernels.{name.partition('.')[0]}")
+    return importlib.import_module(f"hapticdb.kernels.{name.rpartition('.')[0]}")
 
 
 def _compile_here(name: str) -> None:
     """Compile an entry in this process, or load it, and mark it as compiled."""
-    compiled = getattr(_module_of(name), name.partition(".")[2])
+    compiled = getattr(_module_of(name), name.rpartition(".")[2])
     if not hasattr(compiled, "compile"):
         return  # the JIT is off
     compiled.compile(importlib.import_module("hapticdb.kernels._jit").SIGNATURES[name])

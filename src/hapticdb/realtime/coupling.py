@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.cells import Place
-from hapticdb.kernels.coupling import Body
-from hapticdb.pointshell import PointShell
+from hapticdb.kernels.hand.coupling import Body
+from hapticdb.kernels.resident.cells import Place
+from hapticdb.pointshell.shell import PointShell
 
 
 @dataclass(frozen=True)

@@ -5,12 +5,12 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.devices.scripted import Reading, pose_at
 from hapticdb.errors import UsageError
-from hapticdb.kernels.contact import is_rigid
-from hapticdb.kernels.coupling import HAND_VELOCITY, IS_OPEN, IS_STALE
-from hapticdb.kernels.handle import carry, grip, is_somewhere
+from hapticdb.kernels.hand.coupling import HAND_VELOCITY, IS_OPEN, IS_STALE
+from hapticdb.kernels.hand.handle import carry, grip, is_somewhere
+from hapticdb.kernels.query.contact import is_rigid
 from hapticdb.poses import quaternion_of
-from hapticdb.realtime.devices import Reading, pose_at
 
 Floats = NDArray[np.float64]
 MOST_SCALE = 1e6

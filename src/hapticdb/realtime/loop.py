@@ -14,12 +14,23 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.devices.protocol import (
+    Device,
+    Reader,
+    Reading,
+    SupportsClose,
+    SupportsEnd,
+    SupportsOpen,
+    SupportsRewind,
+)
 from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.grid import Grid
-from hapticdb.kernels import coupling as kernels
-from hapticdb.kernels import servo
 from hapticdb.kernels._jit import ENTRIES
-from hapticdb.kernels.cells import (
+from hapticdb.kernels.hand import coupling as kernels
+from hapticdb.kernels.hand import servo
+from hapticdb.kernels.hand.handle import is_somewhere
+from hapticdb.kernels.motion import poses_of
+from hapticdb.kernels.resident.cells import (
     CONTACTS,
     DEEPEST,
     HITS,
@@ -28,14 +39,10 @@ from hapticdb.kernels.cells import (
     UNKNOWNS,
     Place,
 )
-from hapticdb.kernels.handle import is_somewhere
-from hapticdb.kernels.motion import poses_of
-from hapticdb.pointshell import PointShell
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
-from hapticdb.realtime.frames import clusters_of
-from hapticdb.realtime.handle import Handle
-from hapticdb.realtime.prefetch import (
+from hapticdb.realtime.fetching import (
     ASKED_TO_END,
     DONE,
     HANDLE,
@@ -45,19 +52,12 @@ from hapticdb.realtime.prefetch import (
     TOOL,
     VELOCITY,
 )
-from hapticdb.realtime.process import Voice, parent_is_gone
-from hapticdb.realtime.readings import (
-    Device,
-    Reader,
-    Reading,
-    SupportsClose,
-    SupportsEnd,
-    SupportsOpen,
-    SupportsRewind,
-)
-from hapticdb.realtime.recorded import State
+from hapticdb.realtime.handle import Handle
+from hapticdb.realtime.processes import Voice, parent_is_gone
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
-from hapticdb.realtime.table import ACTIVE, HEARTBEAT, STOP, CellTable
+from hapticdb.recording.frame import State
+from hapticdb.resident.frames import clusters_of
+from hapticdb.resident.table import ACTIVE, HEARTBEAT, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
 """Length of the empty loop, at most: shorter sessions have shorter ones."""

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.proportions import Proportions
-from hapticdb.realtime.resident import CacheFigures
+from hapticdb.realtime.resident_cells import CacheFigures
 
 BINS = 200_000
 BIN = 1e-7

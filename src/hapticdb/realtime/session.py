@@ -11,24 +11,24 @@ from typing import Literal, Self, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import FileError, HapticDBError, UsageError
-from hapticdb.force import TangentPlane
 from hapticdb.kernels.compiling import compile_missing, entries_for
-from hapticdb.pointshell import PointShell
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
+from hapticdb.query.law import TangentPlane
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
+from hapticdb.realtime.fetching import ASKED_TO_END, DONE
+from hapticdb.realtime.hand_path import way_of
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
-from hapticdb.realtime.prefetch import ASKED_TO_END, DONE
-from hapticdb.realtime.process import Process
-from hapticdb.realtime.readings import Device, check_device
-from hapticdb.realtime.recorded import FRAME, Frames
-from hapticdb.realtime.recording import DEFAULT_LIMIT, Header, Recorder
+from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report
-from hapticdb.realtime.resident import ResidentCells, never_began
-from hapticdb.realtime.table import DEFAULT_BUDGET, anonymous_memory
-from hapticdb.realtime.way import way_of
+from hapticdb.realtime.resident_cells import ResidentCells, never_began
+from hapticdb.recording.file import DEFAULT_LIMIT, Header, Recorder
+from hapticdb.recording.frame import FRAME, Frames
+from hapticdb.resident.table import DEFAULT_BUDGET, anonymous_memory
 
 Policy = Literal["hold", "wait"]
 RING_SECONDS = 4.0
@@ -76,7 +76,7 @@ class Session:
     exclude : iterable of int
         As `ResidentCells` takes them; only with a URL: who shares cells feels the same objects.
     record : path or None
-        A file for the recording; see `hapticdb.realtime.recording.Recorder`.
+        A file for the recording; see `hapticdb.recording.file.Recorder`.
     append_recording, replace_recording : bool
         Go on with the recording that is there, of the same tool, scene and law; or begin anew in
         its place, once there is a frame to record.

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import CELL_BITS, Grid
-from hapticdb.kernels.cell_table import cells_ahead
+from hapticdb.kernels.resident.cell_table import cells_ahead
 from hapticdb.store.base import Keys
 
 REACH_VOXELS = 500.0

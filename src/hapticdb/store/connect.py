@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING
 
 from hapticdb.errors import MissingExtraError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.store import sqlite_check
 from hapticdb.store.base import LAYOUTS, Layout, Store
 from hapticdb.store.postgres import address
 from hapticdb.store.postgres.address import redact
-from hapticdb.store.sqlite import SQLiteStore
+from hapticdb.store.sqlite import checking as sqlite_check
+from hapticdb.store.sqlite.store import SQLiteStore
 
 if TYPE_CHECKING:
     from hapticdb.store.postgres.rights import Right
-    from hapticdb.store.sqlite_backup import BackupReport, ProgressCallback
+    from hapticdb.store.sqlite.backup import BackupReport, ProgressCallback
 
 __all__ = [
     "backup_environment",
@@ -131,7 +131,7 @@ def backup_environment(
     UsageError
         When either is on PostgreSQL, or both are one file.
     """
-    from hapticdb.store.sqlite_backup import back_up  # noqa: PLC0415 - seldom needed
+    from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 
     _refuse_server(url, "pg_dump copies it")
     _refuse_server(file, "give a path")
@@ -169,7 +169,7 @@ def restore_environment(
     UsageError
         When either is on PostgreSQL, or both are one file.
     """
-    from hapticdb.store.sqlite_backup import back_up  # noqa: PLC0415 - seldom needed
+    from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 
     _refuse_server(file, "give a path")
     _refuse_server(url, "pg_restore puts a copy into it")

@@ -3,7 +3,7 @@
 ``postgresql://user@host:port/database?environment=NAME`` and everything else that libpq takes in a
 URL, its TLS parameters among them. An environment is a schema of its own, `hapticdb` unless named;
 libpq's own way, ``?options=-csearch_path=NAME``, names it, too. ``?data=FOLDER`` asks for a private
-server in a folder (see `hapticdb.store.private_server`).
+server in a folder (see `hapticdb.store.postgres.private_server`).
 """
 
 import re

@@ -21,8 +21,8 @@ from hapticdb.store import believed
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import failures
 from hapticdb.store.postgres.address import Address, parse
+from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.session import Session, identifier
-from hapticdb.store.private_server import PrivateServer
 from hapticdb.store.schema import FORMAT_VERSION, MIGRATIONS
 
 DEFAULT_DATABASE = "hapticdb"

@@ -1,0 +1,225 @@
+"""The verb import."""
+
+import time
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hapticdb.cli import render
+from hapticdb.cli.root import (
+    CurveName,
+    Interrupted,
+    Json,
+    LayoutName,
+    UnitName,
+    Url,
+    numbers_of,
+)
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hapticdb.ingest.files import FileReport
+
+
+def import_(
+    url: Url,
+    files: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="FILE...",
+            help="GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP, LAS and LAZ with their extras.",
+        ),
+    ],
+    *,
+    unit: Annotated[
+        UnitName | None, typer.Option(help="Unit of files that name none; metres otherwise.")
+    ] = None,
+    bits: Annotated[
+        int | None,
+        typer.Option(metavar="1..21", help="Bits an axis: 2^bits voxels.", show_default="10"),
+    ] = None,
+    voxel_size: Annotated[
+        float | None, typer.Option(metavar="METRES", help="Edge of a voxel.")
+    ] = None,
+    extent: Annotated[
+        float | None,
+        typer.Option(
+            metavar="FACTOR",
+            help="Edge of the grid in longest sides of the first file's box.",
+            show_default="1.6",
+        ),
+    ] = None,
+    origin: Annotated[
+        str | None,
+        typer.Option(
+            metavar="X,Y,Z", help="Lower corner in metres; without it the first file is centred."
+        ),
+    ] = None,
+    layout: Annotated[
+        LayoutName | None,
+        typer.Option(help="Index table of a new environment.", show_default="brick"),
+    ] = None,
+    curve: Annotated[
+        CurveName | None, typer.Option(help="Order of the keys of a new one.", show_default="z")
+    ] = None,
+    jobs: Annotated[
+        int | None, typer.Option(metavar="N", help="Threads.", show_default="one a processor")
+    ] = None,
+    keep_removed: Annotated[
+        bool, typer.Option("--keep-removed", help="Leave parts out that were removed.")
+    ] = False,
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help="That reading one file may take.",
+            show_default="20 and more by its size",
+        ),
+    ] = None,
+    memory_limit: Annotated[
+        int | None,
+        typer.Option(
+            metavar="MIB",
+            help="Memory that reading one file may take.",
+            show_default="512 and more by its size",
+        ),
+    ] = None,
+    replace: Annotated[
+        bool,
+        typer.Option(
+            "--replace", help="Replace objects of these files by what the files hold now."
+        ),
+    ] = False,
+    json: Json = False,
+) -> None:
+    """Import files into an environment, which is made when it does not exist.
+
+    Every part becomes an object, in a transaction of its own: run the same
+    command again to go on with what was interrupted. A file that cannot be
+    used is named and skipped, and the others go in. Parts that were removed
+    come in again, and are counted, unless --keep-removed leaves them out.
+
+    Into an environment that is there, files are added. With --replace it holds
+    what they hold now: objects of another geometry, place or unit are replaced
+    under their ids, moved ones go back, and those that the file lacks are
+    removed; each in a transaction, so that an interruption loses none.
+
+    Example: hapticdb import car.db car.glb --bits 11 --extent 1.6
+
+    Example: hapticdb import 'postgresql://me@host/plant?environment=hall' plant.glb
+    """
+    from hapticdb.grid import GridOptions
+    from hapticdb.ingest.files import ImportOptions, import_files
+
+    corner = None if origin is None else numbers_of(origin, [3], "--origin", "X,Y,Z in metres")
+    options = ImportOptions(
+        unit=unit,
+        grid=GridOptions(
+            bits=bits, voxel_size=voxel_size, extent=extent, origin=corner, curve=curve
+        ),
+        layout=layout,
+        jobs=jobs,
+        keep_removed=keep_removed,
+        time_limit=time_limit,
+        memory_limit=None if memory_limit is None else memory_limit << 20,
+        replace=replace,
+    )
+    try:
+        render.compile_kernels("import", files=files)
+        started = time.perf_counter()
+        with render.import_bar() as progress:
+            reports = import_files(url, files, options, progress)
+    except KeyboardInterrupt:
+        raise Interrupted(
+            "interrupted; what went in is whole, and the same command goes on from there"
+        ) from None
+    elapsed = time.perf_counter() - started
+    scene = _scene(url) if json and any(report.error is None for report in reports) else None
+    for file, report in zip(files, reports, strict=True):
+        if json:
+            render.say_json(_record(report) | {"scene": render.box_record(scene)})
+        elif report.error is None:
+            _say(file, report)
+        if report.error is not None:
+            render.note(str(report.error))
+    if not json and any(report.status == "imported" for report in reports):
+        _say_total(url, elapsed)
+    if any(report.error for report in reports):
+        raise typer.Exit(2)
+
+
+def _record(report: "FileReport") -> dict[str, object]:
+    return {
+        "file": report.link,
+        "status": report.status,
+        "objects": len(report.added),
+        "present": report.present,
+        "restored": report.restored,
+        "kept_removed": report.kept_removed,
+        "replaced": report.replaced,
+        "dropped": report.dropped,
+        "voxels": sum(obj.voxels for obj in report.added),
+        "is_unit_assumed": report.is_unit_assumed,
+        "defects": report.defects.as_dict(),
+        "error": None if report.error is None else str(report.error),
+    }
+
+
+def _say(file: str, report: "FileReport") -> None:
+    if report.status == "complete":
+        there = render.counted(report.present, "object")
+        line = f"{file}: complete already ({there}), nothing to do"
+    else:
+        voxels = sum(obj.voxels for obj in report.added)
+        line = (
+            f"{file}: {render.counted(len(report.added), 'object')} imported, "
+            f"{render.counted(voxels, 'voxel')}"
+        )
+        if report.present:
+            line += f"; {report.present} were there already"
+        if report.replaced:
+            line += f"; {report.replaced} replaced"
+        if report.dropped:
+            line += f"; {report.dropped} removed, which the file has no more"
+        if report.restored:
+            line += (
+                f"; {report.restored} of them had been removed and are back: --keep-removed leaves "
+                "such parts out"
+            )
+    if report.kept_removed:
+        line += f"; {render.counted(report.kept_removed, 'removed part')} left out"
+    render.say(line)
+    if report.is_unit_assumed:
+        render.say("  it names no unit, so its numbers are taken as metres; --unit says another")
+    if report.defects:
+        render.say(f"  found in the file: {report.defects.describe()}")
+
+
+def _say_total(url: str, elapsed: float) -> None:
+    import hapticdb
+    from hapticdb.store.base import scene_bounds
+
+    with hapticdb.open(url, read_only=True) as env:
+        size = env.size()
+        objects = env.objects()
+        render.say(
+            f"{env.url}: {render.counted(len(objects), 'object')}, "
+            f"{render.counted(size.rows, 'row')}, "
+            f"{render.bytes_text(size.bytes)}; {env.grid.describe()}; {elapsed:.1f} s"
+        )
+        scene = scene_bounds(objects)
+    if scene is not None:
+        render.say(f"the scene: {render.box(scene)}")
+
+
+def _scene(url: str) -> "NDArray[np.float64] | None":
+    """Bounds of all that an environment holds now."""
+    from contextlib import closing
+
+    from hapticdb.store.base import scene_bounds
+    from hapticdb.store.connect import open_store
+
+    with closing(open_store(url, read_only=True)) as store:
+        return scene_bounds(store.objects())

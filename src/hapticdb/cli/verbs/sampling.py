@@ -1,0 +1,204 @@
+"""The verbs that need no data of the user's: sample, demo."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hapticdb.cli import render
+from hapticdb.cli.root import Json
+
+if TYPE_CHECKING:
+    from hapticdb.demo import Comparison, Imported, Measured, Scene
+
+Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
+Frames = Annotated[int, typer.Option(metavar="N", help="Poses of the path.")]
+
+
+def sample(
+    folder: Folder,
+    *,
+    along: Annotated[
+        str | None,
+        typer.Option(metavar="URL", help="Slide over this environment instead of the sample."),
+    ] = None,
+    frames: Frames = 1000,
+    json: Json = False,
+) -> None:
+    """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
+
+    With --along, a path over another environment, and wrench.stl scaled to its size.
+
+    Example: hapticdb sample sample
+    """
+    if along is None:
+        from hapticdb.sample import write_sample
+
+        written: tuple[Path, ...] = write_sample(folder, frames)
+    else:
+        from hapticdb.demo import write_along
+
+        render.compile_kernels("copy", "shell")
+        written = write_along(folder, along, frames)
+    if json:
+        render.say_json({"files": [str(path) for path in written], "poses": frames})
+        return
+    for path in written:
+        render.say(str(path))
+
+
+def warm(*, json: Json = False) -> None:
+    """Compile every kernel that this machine has not compiled yet, so that no verb has to.
+
+    Half a minute on two processors; kept in the user's cache folder until
+    another version of hapticdb or numba is installed.
+
+    Example: hapticdb warm
+    """
+    from time import perf_counter
+
+    from hapticdb.kernels.compiling import entries_for
+
+    started = perf_counter()
+    n_compiled = render.compile_kernels("everything")
+    total = len(entries_for("everything"))
+    elapsed = perf_counter() - started
+    if json:
+        render.say_json({"kernels": total, "compiled": n_compiled, "elapsed": elapsed})
+        return
+    render.say(
+        f"{render.counted(total, 'kernel')} ready: {n_compiled} compiled now, in {elapsed:.1f} s"
+    )
+
+
+def demo(
+    folder: Folder = Path("demo"),
+    *,
+    url: Annotated[
+        str | None,
+        typer.Option(
+            metavar="URL",
+            help="Import beside this environment, instead of into DIR: postgresql://host/database.",
+        ),
+    ] = None,
+    bits: Annotated[int, typer.Option(metavar="1..21", help="Bits an axis of the grid.")] = 10,
+    frames: Frames = 1000,
+    points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
+    json: Json = False,
+) -> None:
+    """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
+
+    Example: hapticdb demo demo --bits 11
+
+    Example: hapticdb demo --url 'postgresql:///local?data=DIR'
+    """
+    import numpy as np
+
+    from hapticdb.demo import compare, prepare
+    from hapticdb.pictures.demo import draw
+
+    render.compile_kernels("import", "touch")
+    render.note(f"writing the sample into {folder}, importing it in both layouts ...")
+    with render.import_bar() as progress:
+        scene = prepare(folder, url=url, bits=bits, frames=frames, points=points, progress=progress)
+    if not json:
+        _show_scene(scene)
+    comparison = compare(scene)
+    picture = folder / "demo.png"
+    if not json:
+        for measured in comparison.layouts:
+            _show_layout(measured, scene, float(np.median(comparison.trace.hits)))
+        render.say(f"\n{comparison.against_paper()}")
+        render.say(comparison.verdict)
+    draw(picture, scene, comparison)
+    if json:
+        render.say_json(_record(scene, comparison, picture))
+    else:
+        render.say(f"picture: {picture}")
+    if comparison.disagreed:
+        raise typer.Exit(1)
+
+
+def _record(scene: "Scene", comparison: "Comparison", picture: Path) -> dict[str, object]:
+    from hapticdb.store.connect import redact
+
+    return {
+        "files": [str(path) for path in scene.files],
+        "points": len(scene.shell),
+        "poses": len(scene.poses),
+        "layouts": [
+            {
+                **measured.imported._asdict(),
+                "url": redact(measured.imported.url),
+                "strategies": {
+                    name: {
+                        "median_us": felt.median_us,
+                        "p99_us": felt.p99_us,
+                        "statements": sum(felt.statements),
+                        "ranges": sum(felt.ranges),
+                        "rows": sum(felt.rows),
+                        "used": dict(felt.used),
+                    }
+                    for name, felt in measured.felt.items()
+                },
+            }
+            for measured in comparison.layouts
+        ],
+        "frames_compared": comparison.compared,
+        "frames_disagreed": len(comparison.disagreed),
+        "picture": str(picture),
+    }
+
+
+def _show_scene(scene: "Scene") -> None:
+    rows = [
+        ("sample", ", ".join(str(path) for path in scene.files)),
+        ("grid", scene.grid_text),
+    ]
+    rows += [(f"import, {one.layout}", _import_text(one)) for one in scene.imported]
+    rows.append(("tool", f"{len(scene.shell)} points, {len(scene.poses):,} poses"))
+    render.show(render.facts(rows))
+
+
+def _import_text(one: "Imported") -> str:
+    from hapticdb.store.connect import redact
+
+    where = redact(one.url)
+    size = (
+        f"{render.counted(one.objects, 'object')}, {render.counted(one.voxels, 'voxel')}, "
+        f"{render.counted(one.rows, 'row')}, {render.bytes_text(one.bytes)}"
+    )
+    if not one.is_new:
+        return f"{where}: {size}; there already"
+    rate = render.counted(one.voxels / one.seconds, "voxel")
+    return f"{where}: {size}; {one.seconds:.1f} s, {rate} a second"
+
+
+def _show_layout(measured: "Measured", scene: "Scene", hits: float) -> None:
+    import numpy as np
+
+    from hapticdb.demo import YARDSTICK
+
+    base = measured.felt[YARDSTICK].median_us
+    rows = [
+        (
+            name,
+            f"{felt.median_us:.0f}",
+            f"{felt.p99_us:.0f}",
+            f"{np.mean(felt.statements):.0f}",
+            f"{np.mean(felt.ranges):.0f}",
+            f"{np.mean(felt.rows):.0f}",
+            f"{base / felt.median_us:.1f}",
+        )
+        for name, felt in measured.felt.items()
+    ]
+    keys = np.median(measured.felt[YARDSTICK].ranges)
+    one = measured.imported
+    render.say(
+        f"\n{one.engine}, {one.layout} layout, {render.counted(one.rows, 'row')}; "
+        "warm, strategies in turns\n"
+        f"a frame: {len(scene.shell)} points, {keys:.0f} distinct keys, {hits:.0f} hits (medians)\n"
+    )
+    columns = ("strategy", "median µs>", "p99 µs>", "statements>", "ranges>", "rows>", "x faster>")
+    render.show(render.table(columns, rows))
+    render.say(f"auto chose {render.shares(measured.felt['auto'].used)}")

@@ -1,0 +1,224 @@
+"""The verb touch."""
+
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hapticdb.cli import fitting, render
+from hapticdb.cli.choosing import Exclude, ids_of
+from hapticdb.cli.csv_files import (
+    CONTACTS,
+    STDOUT,
+    TOUCHED,
+    CsvFile,
+    row_of_pose,
+    rows_of_contacts,
+    sheet,
+)
+from hapticdb.cli.root import Json, PathUnit, Points, Seed, StrategyName, ToolUnit, Url
+
+if TYPE_CHECKING:
+    from hapticdb.environment import Environment
+    from hapticdb.pointshell.shell import PointShell
+    from hapticdb.query.frame import Strategy
+    from hapticdb.query.touches import Touch
+    from hapticdb.store.base import Object
+
+MOST_TOUCHED = 8
+FEW_POSES = 500
+"""Poses of a path for which measuring the database's costs, most of a second, does not pay."""
+
+
+def touch(
+    url: Url,
+    *,
+    tool: Annotated[
+        str, typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
+    ],
+    poses: Annotated[
+        str,
+        typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header."),
+    ],
+    tool_unit: ToolUnit = None,
+    path_unit: PathUnit = None,
+    points: Points = None,
+    seed: Seed = None,
+    strategy: Annotated[StrategyName, typer.Option(help="How the database is asked.")] = "auto",
+    maxgap: Annotated[
+        int, typer.Option(metavar="KEYS", help="Of the strategy maxgap, in voxel keys.")
+    ] = 500,
+    exclude: Exclude = None,
+    stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")] = 1000.0,
+    csv: CsvFile = None,
+    contacts_csv: Annotated[
+        str | None,
+        typer.Option(metavar="FILE", help="Write every contact as CSV: a new file; - is stdout."),
+    ] = None,
+    json: Json = False,
+) -> None:
+    """Touch an environment with a tool along a path: force, torque and objects of every pose.
+
+    Where tool, path and scene do not fit in size or place, a line says what is
+    off and by which factor: then no hit says little.
+
+    Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
+    """
+    import hapticdb
+    from hapticdb.errors import UsageError
+    from hapticdb.poses import read_poses
+
+    law = hapticdb.TangentPlane(stiffness)
+    path = read_poses(poses, unit=path_unit or "m")
+    summary = _Summary()
+    to_stdout = [csv == STDOUT, contacts_csv == STDOUT, json]
+    if sum(to_stdout) > 1:
+        raise UsageError("--csv -, --contacts-csv - and --json: only one may be standard output")
+    with (
+        sheet(csv, "--csv", TOUCHED) as rows,
+        sheet(contacts_csv, "--contacts-csv", CONTACTS) as contact_rows,
+        hapticdb.open(url, read_only=True) as env,
+    ):
+        excluded = ids_of(env, exclude, "--exclude")
+        render.compile_kernels("touch", files=[tool])
+        shell = shell_of(tool, tool_unit, points, seed)
+        fit = fitting.compare(
+            env, shell, path, exclude=excluded, tool=tool, tool_unit=tool_unit,
+            path_unit=path_unit, is_moving=False,
+        )  # fmt: skip
+        misfits = [misfit._asdict() for misfit in fit.misfits]
+        asked = _strategy_of(strategy, env, len(path))
+
+        def felt(index: int) -> "Touch":
+            return env.touch(shell, path[index], asked, exclude=excluded, maxgap=maxgap, law=law)
+
+        felt(0)  # compiles kernels and reads statistics, which belong to no frame's time
+        for index in range(len(path)):
+            touched = felt(index)
+            if rows is not None:
+                rows.write([row_of_pose(index, touched)])
+            if contact_rows is not None:
+                contact_rows.write(rows_of_contacts(index, touched, shell, path[index]))
+            if json:
+                render.say_json(_record(index, touched) | {"misfits": misfits})
+            elif not any(to_stdout):
+                summary.add(touched)
+    if not any(to_stdout):
+        summary.show()
+
+
+def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strategy":
+    """`array` for `auto` on a short path, where the costs that `auto` decides by are not kept."""
+    from hapticdb.query.cost_model import machine_name
+
+    if wanted == "auto" and n_poses < FEW_POSES and not env.store.costs(machine_name()):
+        return "array"
+    return wanted
+
+
+def shell_of(
+    tool: str,
+    unit: str | None,
+    points: int | None,
+    seed: int | None,
+    spacing: float | None = None,
+) -> "PointShell":
+    """Shell of a tool's file, its defects told; --points and --seed as they were given."""
+    from hapticdb.errors import UsageError
+    from hapticdb.pointshell.shell import PointShell
+
+    if tool.lower().endswith(".npz") and (points is not None or seed is not None):
+        raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
+    shell = PointShell.from_file(tool, points, spacing=spacing, unit=unit, seed=seed or 0)
+    if shell.defects:
+        render.note(f"{tool}: found in the file: {shell.defects}")
+    if not shell.is_closed:
+        render.note(f"{tool}: the tool's mesh is open, so its inside is a guess")
+    return shell
+
+
+def _record(index: int, touched: "Touch") -> dict[str, object]:
+    query = touched.query
+    return {
+        "pose": index,
+        "force": touched.force.tolist(),
+        "torque": touched.torque.tolist(),
+        "hits": len(touched.hits),
+        "contacts": len(touched.contacts),
+        "objects": [{"id": obj.id, "name": obj.name} for obj in touched.objects],
+        "query": {
+            "strategy": query.strategy,
+            "statements": query.statements,
+            "ranges": query.ranges,
+            "rows": query.rows,
+            "elapsed_us": query.elapsed_us,
+        },
+    }
+
+
+@dataclass
+class _Summary:
+    """What a path felt like, gathered frame by frame."""
+
+    forces: list[float] = field(default_factory=list)
+    torques: list[float] = field(default_factory=list)
+    hits: list[int] = field(default_factory=list)
+    contacts: list[int] = field(default_factory=list)
+    queries: list[tuple[int, int, int, float]] = field(default_factory=list)
+    strategies: Counter[str] = field(default_factory=Counter)
+    frames_of: Counter[int] = field(default_factory=Counter)
+    objects: dict[int, "Object"] = field(default_factory=dict)
+
+    def add(self, touched: "Touch") -> None:
+        """Count one frame in."""
+        import numpy as np
+
+        query = touched.query
+        self.forces.append(float(np.linalg.norm(touched.force)))
+        self.torques.append(float(np.linalg.norm(touched.torque)))
+        self.hits.append(len(touched.hits))
+        self.contacts.append(len(touched.contacts))
+        self.queries.append((query.statements, query.ranges, query.rows, query.elapsed_us))
+        self.strategies[query.strategy] += 1
+        for obj in touched.objects:
+            self.frames_of[obj.id] += 1
+            self.objects[obj.id] = obj
+
+    def show(self) -> None:
+        """Print it."""
+        import numpy as np
+
+        peak, twist = int(np.argmax(self.forces)), int(np.argmax(self.torques))
+        statements, ranges, rows, elapsed = np.array(self.queries, dtype=float).T
+        median, p99 = np.percentile(elapsed, [50, 99])
+        asked = (
+            f"{statements.mean():.3g} statements, {ranges.mean():.3g} ranges, "
+            f"reads {rows.mean():.3g} rows"
+        )
+        n_hit, n_contact = np.count_nonzero(self.hits), np.count_nonzero(self.contacts)
+        render.show(
+            render.facts(
+                [
+                    ("frames", f"{len(self.hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
+                    (
+                        "hits a frame",
+                        f"median {np.median(self.hits):.0f}, {max(self.hits)} at most",
+                    ),
+                    ("peak force", f"{self.forces[peak]:.4g} N at pose {peak}"),
+                    ("peak torque", f"{self.torques[twist]:.4g} N m at pose {twist}"),
+                    ("frame time", f"median {median:.0f} µs, p99 {p99:.0f} µs"),
+                    ("a frame asks", asked),
+                    ("strategy", render.shares(self.strategies)),
+                    ("objects", f"{len(self.objects)} touched"),
+                ]
+            )
+        )
+        if self.objects:
+            ranked = sorted(self.frames_of.items(), key=lambda item: (-item[1], item[0]))
+            render.show(
+                render.table(
+                    ("id>", "touched most", "frames>"),
+                    [(str(i), self.objects[i].name, str(n)) for i, n in ranked[:MOST_TOUCHED]],
+                )
+            )

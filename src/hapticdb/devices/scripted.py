@@ -1,0 +1,443 @@
+"""Devices that follow a script; what any device is, is in `hapticdb.devices.protocol`.
+
+Scripted devices need no hardware. They read the time from a clock and start at their first read.
+What a read of theirs returns holds until the next read: its arrays are written anew each time.
+"""
+
+import math
+import os
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.devices.protocol import (
+    Device,
+    Reading,
+    SupportsClose,
+    SupportsEnd,
+    SupportsOpen,
+    SupportsRewind,
+)
+from hapticdb.errors import UsageError
+from hapticdb.kernels.motion import play, survey, sway
+from hapticdb.poses import quaternion_of, read_timed_poses
+
+__all__ = [
+    "Circle",
+    "Clock",
+    "Device",
+    "Line",
+    "Path",
+    "Player",
+    "RandomHand",
+    "Reading",
+    "SupportsClose",
+    "SupportsEnd",
+    "SupportsOpen",
+    "SupportsRewind",
+    "Tumble",
+    "capped",
+    "pose_at",
+]
+
+Clock = Callable[[], float]
+"""Seconds since some instant, never going back."""
+
+LEVER = 0.1
+"""A turn counts as the way of a point this far (m) from the origin, where a path has a speed."""
+
+CYCLE = 20.0
+"""Seconds after which `RandomHand` repeats itself."""
+
+SLOWEST, FASTEST = 0.3, 8.0
+"""Frequencies (Hz) of a hand's motion."""
+
+
+def capped(wrench: NDArray[np.float64], force: float, torque: float) -> NDArray[np.float64]:
+    """Copy of a wrench (6,), force and torque no longer than the caps (N, N m), directions kept.
+
+    What is not finite becomes zero: no motor is ever asked for it.
+    """
+    fx, fy, fz, tx, ty, tz = wrench.tolist()
+    f, t = math.hypot(fx, fy, fz), math.hypot(tx, ty, tz)
+    out = wrench.copy()
+    if not f <= force:
+        out[:3] = out[:3] * (force / f) if math.isfinite(f) else 0.0
+    if not t <= torque:
+        out[3:] = out[3:] * (torque / t) if math.isfinite(t) else 0.0
+    return out
+
+
+def pose_at(place: ArrayLike) -> NDArray[np.float64]:
+    """Pose (4, 4) of a pose, or of a point (3,) with the hand upright."""
+    given = np.array(place, dtype=np.float64)
+    if given.shape not in {(3,), (4, 4)} or not np.isfinite(given).all():
+        raise UsageError(
+            f"a place is a point (3,) or a pose (4, 4) of finite numbers, not {given.tolist()}"
+        )
+    if given.shape == (4, 4):
+        return given
+    pose = np.eye(4)
+    pose[:3, 3] = given
+    return pose
+
+
+def _positive(name: str, value: float) -> float:
+    if not (value > 0.0 and math.isfinite(value)):
+        raise UsageError(f"{name} must be a positive number, not {value}")
+    return float(value)
+
+
+class _Scripted:
+    """A device that needs no hardware and feels nothing."""
+
+    is_over = False
+
+    def __init__(self, clock: Clock) -> None:
+        self.clock = clock
+        self._start: float | None = None
+        self._pose = np.eye(4)
+        self._velocity = np.zeros(6)
+        self._reading = Reading(self._pose, self._velocity, 0)
+
+    def rewind(self) -> None:
+        """Begin the script anew at the next read."""
+        self._start = None
+
+    def _elapsed(self) -> float:
+        """Seconds since the first read."""
+        now = self.clock()
+        if self._start is None:
+            self._start = now
+        return now - self._start
+
+    def apply(self, wrench: NDArray[np.float64]) -> None:
+        """Feel nothing: the hand follows its script whatever pushes it."""
+
+
+class Player(_Scripted):
+    """A hand that follows timed poses, moving straight and turning evenly between them.
+
+    Parameters
+    ----------
+    times : array_like
+        (M,) seconds, increasing; the first is when the first read is.
+    poses : array_like
+        (M, 4, 4) rigid transforms, metres. Their differences give the velocity.
+    loops : bool
+        Start anew at the end; to return smoothly, let the path end where it starts. Otherwise the
+        hand rests at the last pose.
+    clock : callable
+        Seconds; it must be possible to pickle it.
+    """
+
+    def __init__(
+        self,
+        times: ArrayLike,
+        poses: ArrayLike,
+        *,
+        loops: bool = False,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        super().__init__(clock)
+        when = np.array(times, dtype=np.float64)
+        where = np.array(poses, dtype=np.float64)
+        if where.ndim != 3 or where.shape[1:] != (4, 4) or when.shape != where.shape[:1]:
+            raise UsageError(f"times (M,) and poses (M, 4, 4), not {when.shape} and {where.shape}")
+        if not len(when) or not np.isfinite(when).all() or not np.isfinite(where).all():
+            raise UsageError("a path needs a pose at least, and finite numbers")
+        if (np.diff(when) <= 0.0).any():
+            raise UsageError("the times of a path must increase")
+        if len(when) == 1:
+            when, where = np.array([0.0, 1e-9]), np.concatenate([where, where])
+        self.duration = float(when[-1] - when[0])
+        self.loops = loops
+        self._knots = np.column_stack(
+            [when - when[0], where[:, :3, 3], quaternion_of(where[:, :3, :3])]
+        )
+
+    def read(self) -> Reading:
+        """Pose and velocity now."""
+        elapsed = self._elapsed()
+        if self.loops:
+            elapsed %= self.duration
+        else:
+            self.is_over = elapsed >= self.duration
+        play(elapsed, self._knots, self._pose, self._velocity)
+        return self._reading
+
+
+class Path(Player):
+    """A hand that follows a file of poses (`hapticdb.read_poses`).
+
+    Parameters
+    ----------
+    path : path
+        The file. Where it has a column ``t``, its seconds are kept unless `speed` or `seconds` is
+        given.
+    speed : float, optional
+        Metres a second, 0.1 if nothing else says how fast. A turn counts as the way of a point
+        0.1 m from the origin; poses that repeat the one before are left out.
+    seconds : float, optional
+        Time for the whole path.
+    loops, clock
+        As for `Player`.
+
+    Raises
+    ------
+    FileError
+        If the file cannot be read.
+    UsageError
+        If both a speed and a time are given.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        *,
+        speed: float | None = None,
+        seconds: float | None = None,
+        loops: bool = False,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        if speed is not None and seconds is not None:
+            raise UsageError("a path takes a speed or a time in seconds, not both")
+        times, poses = read_timed_poses(path)
+        if times is None or speed is not None:
+            times, poses = _times_at(poses, _positive("speed", 0.1 if speed is None else speed))
+        if seconds is not None and len(times) > 1:
+            times = (times - times[0]) * (_positive("seconds", seconds) / (times[-1] - times[0]))
+        super().__init__(times, poses, loops=loops, clock=clock)
+
+
+def _times_at(
+    poses: NDArray[np.float64], speed: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Times of poses that are run through at a speed, and the poses, repeated ones left out."""
+    q = quaternion_of(poses[:, :3, :3])
+    # the chord between q and -q's nearer one; exact for small turns, where acos is not
+    chord = np.minimum(
+        np.linalg.norm(q[1:] - q[:-1], axis=1), np.linalg.norm(q[1:] + q[:-1], axis=1)
+    )
+    turns = 4.0 * np.arcsin(np.minimum(0.5 * chord, 1.0))
+    moves = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    ways = np.maximum(moves, LEVER * turns)
+    kept = np.concatenate([[True], ways > 1e-12])
+    return np.concatenate([[0.0], np.cumsum(ways[kept[1:]])]) / speed, poses[kept]
+
+
+class Line(Player):
+    """A hand that moves from one place straight to another.
+
+    Parameters
+    ----------
+    start, end : array_like
+        Points (3,) or poses (4, 4), metres.
+    speed : float
+        Metres a second; a turn counts as in `Path`.
+    there_and_back : bool
+        Go to and fro without end.
+    clock
+        As for `Player`.
+    """
+
+    def __init__(
+        self,
+        start: ArrayLike,
+        end: ArrayLike,
+        speed: float = 0.1,
+        *,
+        there_and_back: bool = False,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        places = [pose_at(start), pose_at(end), *([pose_at(start)] if there_and_back else [])]
+        times, poses = _times_at(np.array(places), _positive("speed", speed))
+        if len(times) == 1:
+            raise UsageError("a line needs two different places")
+        super().__init__(times, poses, loops=there_and_back, clock=clock)
+
+
+class Circle(_Scripted):
+    """A hand that goes round a place, without turning.
+
+    Parameters
+    ----------
+    center : array_like
+        Point (3,) or pose (4, 4), metres.
+    radius : float
+        Metres.
+    speed : float
+        Metres a second.
+    axis : array_like
+        (3,) normal of the circle, counter-clockwise seen from its tip; of any length.
+    clock
+        As for `Player`.
+    """
+
+    def __init__(
+        self,
+        center: ArrayLike,
+        radius: float,
+        speed: float = 0.1,
+        axis: ArrayLike = (0.0, 0.0, 1.0),
+        *,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        super().__init__(clock)
+        normal = np.array(axis, dtype=np.float64)
+        length = float(np.linalg.norm(normal)) if normal.shape == (3,) else 0.0
+        if not (length > 0.0 and math.isfinite(length)):
+            raise UsageError(f"an axis is a vector (3,) that is not zero, not {normal.tolist()}")
+        self._pose[:] = pose_at(center)
+        self._radius = _positive("radius", radius)
+        self._speed = _positive("speed", speed)
+        # the axis of the world that leans least on the normal gives the circle's own axes
+        side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+        side /= np.linalg.norm(side)
+        self._center: list[float] = self._pose[:3, 3].tolist()
+        self._u: list[float] = side.tolist()
+        self._v: list[float] = np.cross(normal / length, side).tolist()
+
+    def read(self) -> Reading:
+        """Pose and velocity now."""
+        angle = self._elapsed() * self._speed / self._radius
+        sine, cosine = math.sin(angle), math.cos(angle)
+        for axis in range(3):
+            u, v = self._u[axis], self._v[axis]
+            self._pose[axis, 3] = self._center[axis] + self._radius * (cosine * u + sine * v)
+            self._velocity[axis] = self._speed * (cosine * v - sine * u)
+        return self._reading
+
+
+class Tumble(_Scripted):
+    """A hand that stays in place and turns about axes that change all the time.
+
+    The rotation is Rz(a t) Rx(b t) after the center's, a and b in the golden ratio, so that it
+    comes close to every attitude; |w| = sqrt(a^2 + b^2) stays the same.
+
+    Parameters
+    ----------
+    center : array_like
+        Point (3,) or pose (4, 4), metres.
+    rate : float
+        Turns a second.
+    clock
+        As for `Player`.
+    """
+
+    def __init__(
+        self, center: ArrayLike, rate: float = 0.25, *, clock: Clock = time.perf_counter
+    ) -> None:
+        super().__init__(clock)
+        self._pose[:] = pose_at(center)
+        self._columns: list[list[float]] = self._pose[:3, :3].T.tolist()
+        golden = 0.5 * (1.0 + math.sqrt(5.0))
+        self._about_z = 2.0 * math.pi * _positive("rate", rate) / math.hypot(1.0, golden)
+        self._about_x = golden * self._about_z
+
+    def read(self) -> Reading:
+        """Pose and velocity now."""
+        elapsed = self._elapsed()
+        sz, cz = math.sin(self._about_z * elapsed), math.cos(self._about_z * elapsed)
+        sx, cx = math.sin(self._about_x * elapsed), math.cos(self._about_x * elapsed)
+        pose = self._pose
+        for column, (x, y, z) in enumerate(self._columns):
+            y, z = cx * y - sx * z, sx * y + cx * z  # noqa: PLW2901 - turned about x
+            pose[0, column] = cz * x - sz * y
+            pose[1, column] = sz * x + cz * y
+            pose[2, column] = z
+        self._velocity[3] = self._about_x * cz
+        self._velocity[4] = self._about_x * sz
+        self._velocity[5] = self._about_z
+        return self._reading
+
+
+class RandomHand(_Scripted):
+    """Smooth random motion about a place, like a hand's: always the same for a seed.
+
+    Each axis is a sum of sines between 0.3 and 8 Hz with amplitudes as 1 / f^2, all multiples of
+    one frequency, so that the motion repeats after 20 s. It starts at the center. Where the slow
+    waves would carry the hand farther than its reach, they are left out.
+
+    Parameters
+    ----------
+    center : array_like
+        Point (3,) or pose (4, 4), metres.
+    seed : int
+        Which motion.
+    speed, angular_speed : float
+        Fastest in a cycle, m/s and rad/s; to within 0.1 %.
+    reach : float
+        Farthest from the center, metres.
+    clock
+        As for `Player`.
+
+    Raises
+    ------
+    UsageError
+        If no motion below 8 Hz is that fast within the reach.
+    """
+
+    def __init__(
+        self,
+        center: ArrayLike,
+        seed: int = 0,
+        speed: float = 0.3,
+        angular_speed: float = 1.5,
+        reach: float = 0.3,
+        *,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        super().__init__(clock)
+        self._center = pose_at(center)
+        self._waves = _random_waves(
+            seed,
+            _positive("speed", speed),
+            _positive("angular_speed", angular_speed),
+            _positive("reach", reach),
+        )
+
+    def read(self) -> Reading:
+        """Pose and velocity now."""
+        sway(self._elapsed(), self._waves, self._center, self._pose, self._velocity)
+        return self._reading
+
+
+N_WAVES = 8
+N_SAMPLES = 16384
+
+
+def _random_waves(
+    seed: int, speed: float, angular_speed: float, reach: float
+) -> NDArray[np.float64]:
+    """Waves (6, 8, 4) as the kernel `sway` takes them."""
+    slowest = SLOWEST
+    while slowest < FASTEST:
+        waves = _waves_above(slowest, seed)
+        farthest, fastest, _ = survey(waves, CYCLE, N_SAMPLES)
+        if farthest * speed <= reach * fastest:
+            waves[:3, :, 0] *= speed / fastest
+            # turns do not add: doubling the waves does not quite double the angular velocity
+            for _ in range(20):
+                turning = survey(waves, CYCLE, N_SAMPLES)[2]
+                waves[3:, :, 0] *= angular_speed / turning
+                if abs(turning / angular_speed - 1.0) < 1e-4:
+                    break
+            return waves
+        slowest *= 1.2
+    raise UsageError(
+        f"no hand reaches {speed:g} m/s within {reach:g} m of its place; lower the speed or widen"
+        " the reach"
+    )
+
+
+def _waves_above(slowest: float, seed: int) -> NDArray[np.float64]:
+    """Waves (6, 8, 4) of random phases between a frequency and the fastest, amplitudes 1 / f^2."""
+    random = np.random.default_rng(seed)
+    steps = np.linspace(0.0, 1.0, N_WAVES)
+    spread = np.clip(steps + random.uniform(-0.5, 0.5, (6, N_WAVES)) / N_WAVES, 0.0, 1.0)
+    hertz = np.round(slowest * (FASTEST / slowest) ** spread * CYCLE) / CYCLE
+    phases = random.uniform(0.0, 2.0 * np.pi, (6, N_WAVES))
+    return np.stack([hertz**-2.0, 2.0 * np.pi * hertz, phases, np.sin(phases)], axis=2)

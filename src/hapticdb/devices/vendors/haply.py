@@ -1,0 +1,205 @@
+"""Devices of Haply (Inverse3, Minverse) through the Haply Inverse Service on this machine.
+
+Written from the documentation of the Inverse SDK 3.5 (docs.haply.co: "WebSocket Protocol", "Control
+Commands", tutorials 01, 02 and 06). On connection the service sends all devices; then exactly one
+state for each message that it gets. Positions are metres, velocities m/s, forces N, x right, y
+forward, z up. A VerseGrip, where there is one, gives the orientation and the buttons; the Inverse3
+has no motors for torque, which is dropped. Angular velocity is measured over 20 ms.
+"""
+
+import contextlib
+import json
+import math
+import time
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.devices.scripted import Clock, Reading, capped
+from hapticdb.devices.vendors import VelocityWindow, load
+from hapticdb.errors import DeviceError, UsageError
+from hapticdb.poses import rotation_of
+
+URL = "ws://localhost:10001"
+LOOPBACK = {"localhost", "127.0.0.1", "::1"}
+
+SILENCE = 0.1
+"""Seconds without an answer after which the device counts as gone."""
+
+HANDSHAKE = {"configure": {"profile": {"name": "hapticdb"}}}
+"""What the first message says of the session."""
+
+AXES = ("x", "y", "z")
+
+
+class HaplyDevice:
+    """A device of Haply.
+
+    Parameters
+    ----------
+    device_id : str, optional
+        As the service names it ("049D"); the first one otherwise.
+    url : str
+        The service's address, on this machine.
+    max_force : float
+        Cap, N.
+    clock : callable
+        Seconds; it must be possible to pickle it.
+
+    Raises
+    ------
+    UsageError
+        If the address leads to another machine.
+    """
+
+    def __init__(
+        self,
+        device_id: str | None = None,
+        *,
+        url: str = URL,
+        max_force: float = 7.0,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        parts = urlsplit(url)
+        if parts.scheme != "ws" or parts.hostname not in LOOPBACK:
+            raise UsageError(f"the Haply service runs on this machine, as at {URL}, not at {url}")
+        self.device_id = device_id
+        self.url = url
+        self.max_force = max_force
+        self.clock = clock
+        self._socket: Any = None
+        self._held = contextlib.ExitStack()
+        self._exceptions: Any = None
+        self._id = ""
+        self._force = [0.0, 0.0, 0.0]
+        self._n_awaited = 0
+        self._rotation = np.eye(3)
+        self._window = VelocityWindow()
+
+    def open(self) -> None:
+        """Connect to the service and find the device."""
+        client = load("websockets.sync.client", "haply")
+        self._exceptions = load("websockets.exceptions", "haply")
+        try:
+            # every message is answered within the period: no pings, and no proxy to this machine
+            connection = client.connect(
+                self.url,
+                open_timeout=2.0,
+                close_timeout=0.5,
+                ping_interval=None,
+                compression=None,
+                proxy=None,
+            )
+            self._socket = self._held.enter_context(connection)
+        except (OSError, self._exceptions.WebSocketException) as error:
+            raise DeviceError(
+                f"no Haply Inverse Service at {self.url}: {error}; start the Haply Hub"
+            ) from error
+        try:
+            self._id = self._find()
+            self._window = VelocityWindow()
+            self._send([0.0, 0.0, 0.0], session=HANDSHAKE)
+        except DeviceError:
+            self.close()
+            raise
+
+    def _find(self) -> str:
+        """The wanted device's name, from the list that the service sends first."""
+        found = [each.get("device_id") for each in self._receive().get("inverse3", [])]
+        if not found or self.device_id not in {None, *found}:
+            which = "no Inverse3" if self.device_id is None else f"no Inverse3 {self.device_id}"
+            names = ", ".join(map(str, found)) or "none"
+            raise DeviceError(f"{which} at {self.url}; it has {names}; is it plugged in?")
+        return str(self.device_id or found[0])
+
+    def read(self) -> Reading:
+        """Pose, velocity and buttons as the service answers to the force sent last."""
+        if not self._n_awaited:  # nothing is said unasked: ask by the same force again
+            self._send(self._force)
+        state: dict[str, Any] = {}
+        while self._n_awaited:
+            state = self._receive()
+            self._n_awaited -= 1
+        return self._reading_of(state)
+
+    def apply(self, wrench: NDArray[np.float64]) -> None:
+        """Push with the force of a wrench (6,), N, capped; the torque is dropped."""
+        self._send(capped(wrench, self.max_force, 0.0).tolist()[:3])
+
+    def close(self) -> None:
+        """Take the force away and disconnect."""
+        if self._socket is not None:
+            try:
+                if self._id:
+                    self._send([0.0, 0.0, 0.0])
+            except DeviceError:
+                pass  # it is gone, and its force with it
+            finally:
+                self._socket, self._id, self._n_awaited = None, "", 0
+                self._held.close()
+
+    def _send(self, force: list[float], **more: object) -> None:
+        vector = dict(zip(AXES, force, strict=True))
+        command = {"device_id": self._id, "commands": {"set_cursor_force": {"vector": vector}}}
+        socket = self._opened()
+        try:
+            socket.send(json.dumps({**more, "inverse3": [command]}))
+        except (OSError, self._exceptions.WebSocketException) as error:
+            raise self._lost(error) from error
+        self._force = force
+        self._n_awaited += 1
+
+    def _receive(self) -> dict[str, Any]:
+        socket = self._opened()
+        try:
+            state = json.loads(socket.recv(timeout=SILENCE))
+        except (OSError, ValueError, self._exceptions.WebSocketException) as error:
+            raise self._lost(error) from error
+        if not isinstance(state, dict):
+            raise self._lost("an answer of another form")
+        return state
+
+    def _opened(self) -> Any:  # noqa: ANN401 - of a package loaded late
+        if self._socket is None:
+            raise DeviceError("the Haply device is not open; call open() first")
+        return self._socket
+
+    def _lost(self, reason: object) -> DeviceError:
+        said = str(reason) or "no answer in time"
+        return DeviceError(f"the Haply device at {self.url} is gone: {said}; check the Haply Hub")
+
+    def _reading_of(self, state: dict[str, Any]) -> Reading:
+        mine = [each for each in state.get("inverse3", []) if each.get("device_id") == self._id]
+        if not mine:
+            raise self._lost(f"the service no longer lists {self._id}")
+        pose = np.eye(4)
+        try:
+            pose[:3, 3] = _vector(mine[0]["state"]["cursor_position"])
+            linear = _vector(mine[0]["state"]["cursor_velocity"])
+        except (KeyError, TypeError, ValueError) as error:
+            raise self._lost(f"a state without {error}") from error
+        buttons = self._take_grip(state)
+        pose[:3, :3] = self._rotation
+        velocity = self._window.measure(self.clock(), pose)
+        velocity[:3] = linear
+        return Reading(pose, velocity, buttons)
+
+    def _take_grip(self, state: dict[str, Any]) -> int:
+        """Take the orientation of the first VerseGrip, if there is one, and give its buttons."""
+        grips = state.get("wireless_verse_grip") or state.get("verse_grip") or [{}]
+        grip = grips[0].get("state", {})
+        q = grip.get("orientation", {})
+        values = [float(q.get(name, 0.0)) for name in ("w", *AXES)]
+        norm = math.hypot(*values)
+        if norm > 0.5:  # a grip that has not yet spoken says zeros
+            self._rotation = rotation_of([value / norm for value in values])[0]
+        if "button" in grip:  # the wired grip has one
+            return int(bool(grip["button"]))
+        held = grip.get("buttons", {})
+        return sum(1 << bit for bit, name in enumerate(("a", "b", "c")) if held.get(name))
+
+
+def _vector(named: dict[str, float]) -> list[float]:
+    return [float(named[axis]) for axis in AXES]

@@ -1,0 +1,127 @@
+"""Devices of 3D Systems (Touch, Touch X, Phantom) through OpenHaptics.
+
+Written from the README and the sources of `pyopenhaptics` 1.0.1, which calls OpenHaptics 3.4: the
+device's state may only be asked in a callback of the OpenHaptics scheduler, 1000 times a second in
+a thread of its own. So the callback leaves what it saw for `read`, and takes the force that `apply`
+left. The package gives neither velocity nor torque: velocities are measured over 20 ms, torque is
+dropped. The library itself comes from the maker.
+"""
+
+import contextlib
+import io
+import time
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.devices.scripted import Clock, Reading, capped
+from hapticdb.devices.vendors import VelocityWindow, load
+from hapticdb.errors import DeviceError
+
+INVALID_HANDLE = 0xFFFFFFFF
+"""HD_INVALID_HANDLE, which hdInitDevice returns where there is no device."""
+
+SILENCE = 0.1
+"""Seconds without a callback after which the device counts as gone."""
+
+STALE = 0.05
+"""Seconds that a force lasts if no other follows: the scheduler goes on when the loop does not."""
+
+
+class OpenHapticsDevice:
+    """A device of 3D Systems, its frame OpenHaptics' own: x right, y up, z towards the user.
+
+    Parameters
+    ----------
+    name : str
+        As it was given in the maker's setup.
+    max_force : float
+        Cap, N; a Touch can do 3.3.
+    clock : callable
+        Seconds; it must be possible to pickle it.
+    """
+
+    def __init__(
+        self,
+        name: str = "Default Device",
+        *,
+        max_force: float = 3.3,
+        clock: Clock = time.perf_counter,
+    ) -> None:
+        self.name = name
+        self.max_force = max_force
+        self.clock = clock
+        self._hd: Any = None
+        self._id = 0
+        self._callback: Any = None
+        # each is replaced as a whole, so that no thread sees a half of it
+        self._seen: tuple[float, Reading] | None = None
+        self._push: tuple[float, list[float]] = (0.0, [0.0, 0.0, 0.0])
+
+    def open(self) -> None:
+        """Open the device and wait until its scheduler has called."""
+        hd = load("pyOpenHaptics.hd", "openhaptics")
+        callbacks = load("pyOpenHaptics.hd_callback", "openhaptics")
+        # the package tells its progress and its errors on standard output
+        with contextlib.redirect_stdout(io.StringIO()) as told:
+            device = hd.init_device(self.name)
+            if device is None or device == INVALID_HANDLE:
+                raise DeviceError(f"no OpenHaptics device named {self.name!r}; is it plugged in?")
+            hd.enable_force()
+            hd.start_scheduler()
+            if _has_failed(hd):
+                hd.stop_scheduler()
+                hd.close_device(device)
+                raise DeviceError(f"OpenHaptics failed to start: {told.getvalue().strip()[-200:]}")
+        self._hd, self._id, self._seen = hd, device, None
+        window = VelocityWindow()
+        # kept here, for OpenHaptics calls it as long as the scheduler runs
+        self._callback = callbacks.hd_callback(lambda: self._serve(hd, window))
+        callbacks.hdAsyncSheduler(self._callback)
+        deadline = self.clock() + 1.0
+        while self._seen is None and self.clock() < deadline:
+            time.sleep(0.001)
+        if self._seen is None:
+            self.close()
+            raise DeviceError("the OpenHaptics scheduler does not call; restart its driver")
+
+    def _serve(self, hd: Any, window: VelocityWindow) -> None:  # noqa: ANN401 - a module without types
+        """In a frame of the scheduler: see where the hand is, and push it."""
+        now = self.clock()
+        # an OpenGL matrix, column after column, in millimetres
+        pose = np.array(hd.get_transform(), dtype=np.float64).T.copy()
+        pose[:3, 3] *= 1e-3
+        buttons = int(hd.get_buttons())
+        self._seen = now, Reading(pose, window.measure(now, pose), buttons)
+        since, force = self._push
+        hd.set_force(force if now - since <= STALE else [0.0, 0.0, 0.0])
+
+    def read(self) -> Reading:
+        """Pose, velocity and buttons as the scheduler saw them last."""
+        if self._seen is None:
+            raise DeviceError("the OpenHaptics device is not open; call open() first")
+        when, reading = self._seen
+        if self.clock() - when > SILENCE:
+            raise DeviceError("the OpenHaptics device went silent; check its cable and power")
+        return reading
+
+    def apply(self, wrench: NDArray[np.float64]) -> None:
+        """Push with the force of a wrench (6,), N, capped; the torque is dropped."""
+        self._push = self.clock(), capped(wrench, self.max_force, 0.0).tolist()[:3]
+
+    def close(self) -> None:
+        """Stop the scheduler and let go of the device."""
+        if self._hd is not None:
+            hd, self._hd = self._hd, None
+            hd.stop_scheduler()
+            hd.close_device(self._id)
+            self._seen = None
+
+
+def _has_failed(hd: Any) -> bool:  # noqa: ANN401 - a module without types
+    """Whether OpenHaptics reports an error."""
+    try:
+        return bool(hd.get_error())
+    except KeyError:  # the package knows names for five of the codes only
+        return True

@@ -1,0 +1,1 @@
+"""Parts to rows: files read, voxelized and written, objects placed and replaced."""

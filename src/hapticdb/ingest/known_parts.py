@@ -1,0 +1,122 @@
+"""Parts of a file that an environment holds already: known, added beside others, replaced."""
+
+import contextlib
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from hapticdb.errors import EnvironmentExistsError, ObjectNotFoundError
+from hapticdb.mesh import MeshFile, Part
+from hapticdb.query.grouping import object_ranges
+from hapticdb.store.base import Covering, Object, Rows, Store
+
+MOST_ATTEMPTS = 100
+"""To add a part that others add and remove meanwhile."""
+
+
+class KnownParts:
+    """Parts of a file that an environment holds, brought up to date by its log of changes.
+
+    Of two imports of one file of 1,500 parts at once, the second took 33 s with a listing of all
+    objects for each part that the other had added, and 4.6 s so.
+    """
+
+    def __init__(self, store: Store, link: str) -> None:
+        self._store, self._link = store, link
+        self._revision = store.revision()  # first: what is written meanwhile is looked at again
+        self._name_of: dict[int, str] = {}
+        self._digest_of: dict[str, str] = {}
+        for obj in store.objects():
+            self._enter(obj)
+
+    def digest_of(self, name: str) -> str | None:
+        """Digest of the part's geometry, or None where the environment lacks that part."""
+        return self._digest_of.get(name)
+
+    def changed(self, parts: Sequence[Part], unit: str | None) -> dict[int, Part]:
+        """Parts that differ from the objects of their names, by the ids of those.
+
+        By geometry, by placement, or by the unit that they are read in.
+        """
+        ids = {name: object_id for object_id, name in self._name_of.items()}
+        objects = {obj.id: obj for obj in self._store.objects()}
+        found = {}
+        for part in parts:
+            obj = objects.get(ids.get(part.name, 0))
+            if obj is not None and (
+                obj.digest != part.digest
+                or obj.attributes.get("unit") != unit
+                or not np.array_equal(obj.transform, part.world_from_part)
+            ):
+                found[obj.id] = part
+        return found
+
+    def refresh(self) -> None:
+        """Look at what was written since the last look."""
+        changes = list(self._store.changes(self._revision))
+        for object_id in {change.id for change in changes}:
+            self._digest_of.pop(self._name_of.pop(object_id, ""), None)
+            with contextlib.suppress(ObjectNotFoundError):
+                self._enter(self._store.object(object_id))
+        if changes:
+            self._revision = changes[-1].revision
+
+    def _enter(self, obj: Object) -> None:
+        if obj.link == self._link:
+            self._name_of[obj.id] = obj.name
+            self._digest_of[obj.name] = obj.digest
+
+
+def added_or_present(store: Store, part: Object, rows: Rows, known: KnownParts) -> int | None:
+    """Id of a part that is added now, or None where another has added the same one meanwhile.
+
+    Raises
+    ------
+    EnvironmentExistsError
+        When the environment holds a part of that name with another geometry.
+    """
+    for attempt in range(MOST_ATTEMPTS):
+        try:
+            return store.add(part, rows)
+        except EnvironmentExistsError:
+            known.refresh()
+            digest = known.digest_of(part.name)
+            if digest == part.digest:
+                return None
+            if digest is not None or attempt == MOST_ATTEMPTS - 1:
+                raise
+            # a third has removed it since: its name is free again
+    raise AssertionError  # the last attempt returns or raises
+
+
+def replace_changed(
+    store: Store, anew: Iterable[tuple[Object, Rows]], id_of: dict[str, int]
+) -> int:
+    """Put parts in the place of the objects of their names, in a transaction each; counts them."""
+    n_replaced = 0
+    for part, rows in anew:
+        with contextlib.suppress(ObjectNotFoundError):  # another has removed it
+            store.replace(dataclasses.replace(part, id=id_of[part.name]), rows, _covering(store))
+            n_replaced += 1
+    return n_replaced
+
+
+def drop_others(store: Store, mesh_file: MeshFile) -> int:
+    """Remove the objects of a file that it holds no more, in a transaction each; counts them."""
+    names = {part.name for part in mesh_file.parts}
+    n_dropped = 0
+    for obj in store.objects():
+        if obj.link == mesh_file.link and obj.name not in names:
+            with contextlib.suppress(ObjectNotFoundError):
+                store.remove(obj.id, _covering(store))
+                n_dropped += 1
+    return n_dropped
+
+
+def _covering(store: Store) -> Covering:
+    def ranges(obj: Object) -> Iterable[tuple[int, int]]:
+        lows, highs = object_ranges(store.grid, store.layout, obj.bounds)
+        return zip(lows.tolist(), highs.tolist(), strict=True)
+
+    return ranges

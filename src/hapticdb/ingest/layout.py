@@ -1,0 +1,106 @@
+"""Voxels <-> rows of the index table, in either layout and on any curve.
+
+Bricks in Z-order stand between: what the voxelizer makes, and what two environments of different
+layouts or curves have in common.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import BRICK_BITS, Grid
+from hapticdb.kernels import curves
+from hapticdb.kernels.surfaces import voxelize
+from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, Keys, Layout, Rows
+
+BRICKS_AT_ONCE = 1 << 15
+"""Bricks whose voxels are unpacked together: their coordinates take 24 bytes a voxel."""
+
+
+class Bricks(NamedTuple):
+    """Voxels as bricks in Z-order, whatever the curve of their environment.
+
+    keys (B,) int64, ascending, each once; occupancy (B, 64) uint8, bit number n the voxel of
+    Z-order n modulo 8, least significant first.
+    """
+
+    keys: Keys
+    occupancy: NDArray[np.uint8]
+
+
+def rows_of_bricks(bricks: Bricks, grid: Grid, layout: Layout) -> tuple[Rows, int]:
+    """Rows in that layout and the grid's order, and how many voxels they hold."""
+    keys, occupancy = bricks
+    n_voxels = voxelize.count_voxels(occupancy)
+    if layout == "voxel":
+        keys = _voxel_keys(bricks, n_voxels, grid)
+        return Rows(keys, np.zeros(len(keys), dtype=np.int64), NO_OCCUPANCY), n_voxels
+    if grid.curve != "z":
+        keys = _reordered(keys, grid.bits, curves.Z_ORDER, grid.curve_code)
+        order = np.argsort(keys)
+        keys, occupancy = keys[order], occupancy[order]
+    return Rows(keys, np.zeros(len(keys), dtype=np.int64), occupancy.reshape(-1)), n_voxels
+
+
+def _voxel_keys(bricks: Bricks, n_voxels: int, grid: Grid) -> Keys:
+    """Keys (n_voxels,) of all voxels, ascending; a few bricks are unpacked at a time."""
+    keys = np.empty(n_voxels, dtype=np.int64)
+    at = 0
+    for start in range(0, len(bricks.keys), BRICKS_AT_ONCE):
+        some = slice(start, start + BRICKS_AT_ONCE)
+        found = grid.encode(voxelize.brick_voxels(bricks.keys[some], bricks.occupancy[some]))
+        keys[at : at + len(found)] = found
+        at += len(found)
+    keys.sort()
+    return keys
+
+
+def bricks_of_rows(rows: Rows, grid: Grid, layout: Layout) -> Bricks:
+    """Bricks of one object's rows: undoes `rows_of_bricks`."""
+    if layout == "voxel":
+        return bricks_of_voxels(grid.decode(rows.keys), grid)
+    keys = rows.keys
+    if grid.curve != "z":
+        keys = _reordered(keys, grid.bits, grid.curve_code, curves.Z_ORDER)
+    order = np.argsort(keys)
+    return Bricks(keys[order], rows.occupancy.reshape(-1, BRICK_BYTES)[order])
+
+
+def bricks_of_voxels(ijk: NDArray[np.int64], grid: Grid) -> Bricks:
+    """Bricks of voxels (n, 3) inside the grid, in any order."""
+    return Bricks(*voxelize.mark_points(ijk.astype(np.float64) + 0.5, grid.bits))
+
+
+def rows_of_voxels(ijk: NDArray[np.int64], grid: Grid, layout: Layout) -> Rows:
+    """Rows of voxels (n, 3) that were made and not imported: analytic scenes."""
+    return rows_of_bricks(bricks_of_voxels(ijk, grid), grid, layout)[0]
+
+
+def voxels_of_rows(rows: Rows, grid: Grid, layout: Layout) -> NDArray[np.int64]:
+    """Voxels (n, 3) of one object's rows, in the order of their keys."""
+    if layout == "voxel":
+        return grid.decode(rows.keys)
+    ijk = voxelize.brick_voxels(*bricks_of_rows(rows, grid, layout))
+    return ijk[np.argsort(grid.encode(ijk))]
+
+
+def merged(parts: Sequence[Bricks]) -> Bricks:
+    """Bricks of all parts together, at least one; a brick that several hold has the bits of all."""
+    if len(parts) == 1:
+        return parts[0]
+    keys = np.concatenate([part.keys for part in parts])
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    starts = np.flatnonzero(np.diff(keys, prepend=-1))
+    if not len(starts):
+        return parts[0]
+    occupancy = np.concatenate([part.occupancy for part in parts])[order]
+    return Bricks(keys[starts], np.bitwise_or.reduceat(occupancy, starts, axis=0))
+
+
+def _reordered(keys: Keys, bits: int, curve: int, onto: int) -> Keys:
+    """Brick keys on another curve, in the order in which they came."""
+    level = max(bits - BRICK_BITS, 0)
+    return curves.encode(curves.decode(keys, level, curve), level, onto)

@@ -1,0 +1,64 @@
+"""Geometry of stored objects, read from the files that they were imported from."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from hapticdb.errors import FileError, GeometryChangedError, UsageError
+from hapticdb.mesh import Part, read_file
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.store.base import Object
+
+
+def parts_of(objects: Sequence[Object], to_be: str, instead: str) -> Iterator[tuple[Object, Part]]:
+    """Objects with their geometry, checked to be the one that was imported; a file is read once.
+
+    Parameters
+    ----------
+    objects : sequence of Object
+        In any order; they come ordered by file.
+    to_be, instead : str
+        For messages: what they cannot be (``moved``), and what to do where the file has changed.
+
+    Raises
+    ------
+    GeometryChangedError
+        When an object's file is gone or holds another geometry.
+    """
+    of_file: dict[tuple[str, str | None], list[Object]] = {}
+    for obj in objects:
+        unit = obj.attributes.get("unit")
+        of_file.setdefault((obj.link, unit if isinstance(unit, str) else None), []).append(obj)
+    for (link, unit), some in of_file.items():
+        first = f"object {some[0].id} ({some[0].name})"
+        try:
+            parts = {(part.name, part.digest): part for part in read_file(link, unit=unit).parts}
+        except FileError as error:
+            raise GeometryChangedError(
+                f"{first} cannot be {to_be}, its file cannot be read: {error}"
+            ) from error
+        for obj in some:
+            if (obj.name, obj.digest) not in parts:
+                raise GeometryChangedError(
+                    f"object {obj.id} ({obj.name}) cannot be {to_be}: {link} no longer holds the "
+                    f"geometry that was imported; {instead}"
+                )
+            yield obj, parts[obj.name, obj.digest]
+
+
+def shell_of_objects(
+    objects: Sequence[Object], points: int | None, spacing: float | None, seed: int
+) -> PointShell:
+    """One shell of several objects where they sit, as `Environment.shell` documents it."""
+    if not objects:
+        raise UsageError("a shell of no objects: name at least one")
+    triangles = []
+    for obj, part in parts_of(objects, "a tool", "give its mesh as a tool"):
+        if part.is_cloud:
+            raise UsageError(
+                f"object {obj.id} ({obj.name}) is a point cloud, which has no surface: leave it out"
+            )
+        triangles.append(part.triangles(obj.transform))
+    corners = np.concatenate(triangles).reshape(-1, 3)
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    return PointShell.from_mesh(corners, faces, points, spacing=spacing, seed=seed)

@@ -1,0 +1,85 @@
+"""Objects placed anew: their geometry is read again, voxelized, and exchanged in a transaction."""
+
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import ConflictError, UsageError
+from hapticdb.ingest.files import check_placed_inside
+from hapticdb.ingest.originals import parts_of
+from hapticdb.ingest.voxelizing import rows_of_part
+from hapticdb.mesh import Part
+from hapticdb.poses import as_floats
+from hapticdb.query.frame import as_ids
+from hapticdb.store.base import Covering, Object, Store
+
+RESTORE = "restore the file, or remove the object and import it again"
+
+Floats = NDArray[np.float64]
+
+
+def move_object(
+    store: Store, old: Object, transform: ArrayLike, revision: int | None, covering: Covering
+) -> None:
+    """Place an object anew, as `Environment.move` documents it."""
+    placed = _as_transform(transform)
+    ((_, part),) = parts_of([old], "moved", RESTORE)
+    _place(store, old, part, placed, revision or 0, covering)
+
+
+def shift_objects(
+    store: Store, ids: Iterable[int], way: ArrayLike, covering: Covering
+) -> list[Object]:
+    """Shift objects alike, as `Environment.shift` documents it."""
+    shift = np.eye(4)
+    shift[:3, 3] = _as_way(way)
+    pairs = list(parts_of([store.object(int(i)) for i in as_ids(ids)], "moved", RESTORE))
+    for obj, part in pairs:
+        check_placed_inside(part, obj.link, store.grid, shift @ obj.transform)
+    for known, part in pairs:
+        obj = known
+        while True:
+            try:
+                _place(store, obj, part, shift @ obj.transform, obj.revision, covering)
+                break
+            except ConflictError:  # another has moved it: from there, then
+                obj = store.object(obj.id)
+                if obj.digest != part.digest:
+                    raise
+    return [store.object(obj.id) for obj, _ in sorted(pairs, key=lambda pair: pair[0].id)]
+
+
+def _place(
+    store: Store, old: Object, part: Part, placed: Floats, revision: int, covering: Covering
+) -> None:
+    bounds = check_placed_inside(part, old.link, store.grid, placed)
+    rows, n_voxels = rows_of_part(part, store.grid, store.layout, placed)
+    new = Object(
+        id=old.id,
+        name=old.name,
+        link=old.link,
+        digest=old.digest,
+        transform=placed,
+        voxels=n_voxels,
+        bounds=bounds,
+        attributes=old.attributes,
+        revision=revision,
+    )
+    store.replace(new, rows, covering)
+
+
+def _as_way(way: ArrayLike) -> Floats:
+    shift = as_floats(way, "a way")
+    if shift.shape != (3,) or not np.isfinite(shift).all():
+        raise UsageError("a way that is no shift: give three finite numbers x, y, z in metres")
+    return shift
+
+
+def _as_transform(transform: ArrayLike) -> Floats:
+    placed = as_floats(transform, "a transform").copy()
+    if placed.shape != (4, 4) or not np.isfinite(placed).all() or (placed[3] != (0, 0, 0, 1)).any():
+        raise UsageError("a transform that is no placement: give a finite 4 x 4 matrix in metres")
+    if np.linalg.matrix_rank(placed[:3, :3]) < 3:
+        raise UsageError("a transform that flattens the object: give one that can be undone")
+    return placed

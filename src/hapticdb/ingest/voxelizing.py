@@ -1,0 +1,113 @@
+"""A part -> its rows, in pieces of bounded size, with word of how far it is."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import FileError
+from hapticdb.grid import Grid
+from hapticdb.ingest.layout import Bricks, rows_of_bricks
+from hapticdb.kernels.surfaces import voxelize
+from hapticdb.mesh import Part
+from hapticdb.mesh.child import bytes_available
+from hapticdb.store.base import BRICK_BYTES, Layout, Rows
+
+ShareCallback = Callable[[float], None]
+"""Hears of the share of a part that is done, 0 to 1; from any thread."""
+BYTES_A_BRICK = 8 + BRICK_BYTES
+_MERGE_FROM = 8 * voxelize.MOST_BRICKS
+"""Bricks that wait before they are merged for the first time."""
+
+
+def rows_of_part(
+    part: Part,
+    grid: Grid,
+    layout: Layout,
+    world_from_part: NDArray[np.float64] | None = None,
+    progress: ShareCallback | None = None,
+) -> tuple[Rows, int]:
+    """Voxelize a part: its rows, ascending by key, and how many voxels its surface touches.
+
+    Parameters
+    ----------
+    part : Part
+        Triangles mark every voxel whose closed box they meet; points the voxel that holds them.
+    world_from_part : (4, 4) float64 or None
+        Placement in metres; the file's unless given.
+    progress : callable or None
+        Called with the share of a large part that is done.
+
+    Raises
+    ------
+    FileError
+        When its voxels would take more memory than the machine has left.
+    """
+    if part.is_cloud:
+        points = _on_grid(part.world_points(world_from_part), grid)
+        bricks = Bricks(*voxelize.mark_points(points, grid.bits))
+    else:
+        triangles = _on_grid(part.triangles(world_from_part), grid)
+        bricks = bricks_of_triangles(triangles, grid.bits, f"part {part.name!r}", progress)
+        if layout == "voxel":
+            check_room(8 * voxelize.count_voxels(bricks.occupancy), f"part {part.name!r}")
+    return rows_of_bricks(bricks, grid, layout)
+
+
+def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
+    """Points (..., 3) in voxels; what rounding carried over the border is set back onto it."""
+    scaled = grid.to_voxel_units(points)
+    return np.clip(scaled, 0.0, float(grid.side), out=scaled)
+
+
+def bricks_of_triangles(
+    triangles: NDArray[np.float64],
+    bits: int,
+    what: str,
+    progress: ShareCallback | None = None,
+    most: int = voxelize.MOST_BRICKS,
+) -> Bricks:
+    """Bricks of the voxels that triangles (T, 3, 3) meet, in voxels from the grid's origin.
+
+    Takes memory for the result twice, and for one piece of `most` bricks. what: named in errors.
+
+    Raises
+    ------
+    FileError
+        When the bricks would take more memory than the machine has left.
+    """
+    pieces: list[Bricks] = []
+    n_waiting, merge_from = 0, _MERGE_FROM
+    for share, keys, occupancy in voxelize.voxelize_pieces(triangles, bits, most):
+        pieces.append(Bricks(keys, occupancy))
+        n_waiting += len(keys)
+        if progress is not None and share < 1.0:
+            progress(share)
+        if n_waiting > merge_from:
+            pieces = [merged_in_turn(pieces)]
+            n_waiting = len(pieces[0].keys)
+            merge_from = 2 * n_waiting + _MERGE_FROM
+            check_room(2 * BYTES_A_BRICK * n_waiting, what)
+    return merged_in_turn(pieces)
+
+
+def merged_in_turn(pieces: list[Bricks]) -> Bricks:
+    """Bricks of all pieces; empties the list as it goes, so that no piece is held twice."""
+    if len(pieces) == 1:
+        return pieces.pop()
+    keys = np.unique(np.concatenate([piece.keys for piece in pieces]))
+    words = np.zeros((len(keys), BRICK_BYTES // 8), dtype=np.int64)
+    while pieces:
+        piece = pieces.pop()
+        words[np.searchsorted(keys, piece.keys)] |= piece.occupancy.view(np.int64)
+    return Bricks(keys, words.view(np.uint8))
+
+
+def check_room(n_bytes: int, what: str) -> None:
+    """Refuse what needs more memory than the machine has left."""
+    left = bytes_available()
+    if n_bytes > left:
+        raise FileError(
+            f"{what}: its voxels take more than {n_bytes / 2**30:.1f} GiB of memory, and "
+            f"{left / 2**30:.1f} are left; import it into a grid of fewer --bits"
+        )

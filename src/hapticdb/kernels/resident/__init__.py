@@ -1,0 +1,5 @@
+"""Kernels of resident cells: the table in shared memory, frames and sweeps that read it."""
+
+from hapticdb.kernels._later import later_modules
+
+__getattr__ = later_modules(__name__, __file__)

@@ -1,0 +1,307 @@
+"""A table of cells from its writer's side: directories, rows into cells, which slots are free."""
+
+import numpy as np
+
+from hapticdb.kernels._jit import (
+    BYTES,
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    INTS2,
+    INTS32_2,
+    READ_BYTES,
+    WORDS,
+    WORDS32_2,
+    entry,
+    leaf,
+)
+from hapticdb.kernels.curves import compact, key_of, voxel_of
+from hapticdb.kernels.query.contact import turn
+from hapticdb.kernels.query.grouping import first_bound
+from hapticdb.kernels.resident.cells import (
+    BUFFERS,
+    PLACE,
+    READER_STRIDE,
+    REVISION,
+    VERSION,
+    brick_bit,
+    cell_key,
+    slot_of,
+    spread_key,
+)
+from hapticdb.kernels.resident.fence import fence
+
+NEVER_AGAIN = 0x7FFFFFFFFFFFFFFF
+
+
+@entry(INTS2, INTS32_2, INT, INTS, INTS)
+def insert_cells(keys, slots, which, new_keys, new_slots):
+    """Enter cells (n,) that directory `which` lacks, or give those that it has other slots."""
+    capacity = keys.shape[1]
+    for n in range(new_keys.shape[0]):
+        at = spread_key(new_keys[n], capacity)
+        while keys[which, at] >= 0 and keys[which, at] != new_keys[n]:
+            at = (at + 1) & (capacity - 1)
+        slots[which, at] = new_slots[n]
+        keys[which, at] = new_keys[n]
+
+
+@entry(INTS2, INTS32_2, INT, INTS)
+def remove_cells(keys, slots, which, old_keys):
+    """Take cells (n,) out of directory `which`; what followed them in their run moves up."""
+    capacity = keys.shape[1]
+    for n in range(old_keys.shape[0]):
+        at = spread_key(old_keys[n], capacity)
+        while keys[which, at] >= 0 and keys[which, at] != old_keys[n]:
+            at = (at + 1) & (capacity - 1)
+        if keys[which, at] < 0:
+            continue
+        hole = at
+        while True:
+            at = (at + 1) & (capacity - 1)
+            if keys[which, at] < 0:
+                break
+            home = spread_key(keys[which, at], capacity)
+            # an entry whose home lies behind the hole, going round, is still found from there
+            if ((at - home) & (capacity - 1)) >= ((at - hole) & (capacity - 1)):
+                keys[which, hole] = keys[which, at]
+                slots[which, hole] = slots[which, at]
+                hole = at
+        keys[which, hole] = -1
+
+
+@entry(INTS2, INTS32_2, INT, INTS, INTS)
+def slots_of_cells(keys, slots, which, asked, out):
+    """Slots (n,) of cells (n,) in directory `which`, UNKNOWN where it has none."""
+    for n in range(asked.shape[0]):
+        out[n] = slot_of(keys, slots, which, asked[n])
+
+
+@leaf
+def mark_brick(masks, slot, i, j, k):
+    """Mark the brick that holds voxel (i, j, k) in the mask of its cell's slot."""
+    masks[slot] |= np.uint64(1) << brick_bit(i, j, k)
+
+
+@leaf
+def fill_brick(words, slot, i, j, k, occupancy, start):
+    """Set the voxels of a brick of origin (i, j, k), its bits at `start`; whether it has any."""
+    has_any = False
+    for byte in range(64):
+        value = occupancy[start + byte]
+        if value == 0:
+            continue
+        has_any = True
+        x = (i & 31) | (compact(byte >> 2) << 1)
+        y = (j & 31) | (compact(byte >> 1) << 1)
+        z = (k & 31) | (compact(byte) << 1)
+        for column in range(4):  # bits of a byte: i, j, k of one each, k the lowest
+            two = np.uint32((value >> (2 * column)) & 3)
+            word = ((x | (column >> 1)) << 5) | y | (column & 1)
+            words[slot, word] |= two << np.uint32(z)
+    return has_any
+
+
+@entry(INTS, INTS, READ_BYTES, INTS, INTS, INTS, INT, INT, INT, WORDS32_2, WORDS)
+def fill_cells(
+    row_keys, row_ids, occupancy, exclude, cell_keys, places, bits, curve, shift, words, masks
+):
+    """Rows of the index table into cells that were empty.
+
+    row_keys (R,) ascending, row_ids (R,), occupancy (64 R,) or empty for voxel rows; exclude (E,)
+    ids, ascending, that are left out; cell_keys (n,) ascending, on the curve (voxel keys >> 15),
+    and the slots places (n,) of words (S, 1024) uint32 and masks (S,) uint64 that they go into.
+    Rows of other cells are passed over.
+    """
+    n_cells = cell_keys.shape[0]
+    n_excluded = exclude.shape[0]
+    has_bits = occupancy.shape[0] > 0
+    at = 0
+    for row in range(row_keys.shape[0]):
+        row_key = row_keys[row]
+        cell = row_key >> (15 - shift)
+        while at < n_cells and cell_keys[at] < cell:
+            at += 1
+        if at == n_cells:
+            break
+        if cell_keys[at] != cell:
+            continue
+        if n_excluded > 0:
+            found = first_bound(row_ids[row], exclude, np.int64(0))
+            if found < n_excluded and exclude[found] == row_ids[row]:
+                continue
+        slot = places[at]
+        if has_bits:
+            i, j, k = voxel_of(row_key, max(bits - 3, 0), curve)
+            i, j, k = i << 3, j << 3, k << 3
+            if fill_brick(words, slot, i, j, k, occupancy, 64 * row):
+                mark_brick(masks, slot, i, j, k)
+        else:
+            i, j, k = voxel_of(row_key, bits, curve)
+            words[slot, ((i & 31) << 5) | (j & 31)] |= np.uint32(1) << np.uint32(k & 31)
+            mark_brick(masks, slot, i, j, k)
+
+
+@entry(INTS, INT, INT, INTS)
+def curve_keys_of_cells(cells, bits, curve, out):
+    """Cells (n,), as directories name them, on the curve: their voxels' keys >> 15."""
+    level = max(bits - 5, 0)
+    for n in range(cells.shape[0]):
+        key = cells[n]
+        out[n] = key_of(key >> 32, (key >> 16) & 0xFFFF, key & 0xFFFF, level, curve)
+
+
+@entry(INTS, INT, INT, INTS)
+def cells_of_curve_keys(curve_keys, bits, curve, out):
+    """Undo `curve_keys_of_cells`."""
+    level = max(bits - 5, 0)
+    for n in range(curve_keys.shape[0]):
+        i, j, k = voxel_of(curve_keys[n], level, curve)
+        out[n] = (i << 32) | (j << 16) | k
+
+
+@entry(INTS, INTS, BYTES, INT, INT, INT, INTS)
+def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
+    """Clock eviction: slots of cells that no frame has used since the hand last passed.
+
+    cell_of_slot (S,) int64, -1 where free; wanted_at (S,) int64: slots wanted at `since` or later
+    stay; used (S,) uint8 is cleared as the hand passes. Up to `wanted` slots go into out. Returns
+    how many, and where the hand stands.
+    """
+    total = cell_of_slot.shape[0]
+    count = 0
+    for _ in range(2 * total):
+        if count == wanted:
+            break
+        hand += 1
+        if hand >= total:
+            hand = 1
+        if cell_of_slot[hand] < 0 or wanted_at[hand] >= since:
+            continue
+        if used[hand]:
+            used[hand] = 0
+            continue
+        wanted_at[hand] = NEVER_AGAIN
+        out[count] = hand
+        count += 1
+    return count, hand
+
+
+@entry(INTS, INT, INT)
+def publish(control, version, revision):
+    """Make a directory, complete in its buffer, the one that frames read from now on."""
+    control[REVISION + version % BUFFERS] = revision
+    fence()
+    control[VERSION] = version
+    fence()
+
+
+@entry(INTS)
+def oldest_version_read(readers):
+    """Lowest version that a frame is reading; the largest number when there is none."""
+    fence()
+    oldest = np.int64(0x7FFFFFFFFFFFFFFF)
+    for n in range(0, readers.shape[0], READER_STRIDE):
+        if readers[n] > 0:
+            oldest = min(oldest, readers[n])
+    return oldest
+
+
+@entry(INTS, INTS, FLOATS, FLOATS, FLOAT, FLOAT, INTS, FLOATS)
+def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
+    """Cells of a box that a sphere comes near on a straight way, and how urgent each is.
+
+    first, last (3,) int64: the box, in cells; start, move (3,), radius, margin: the sphere's way,
+    and how far beside it counts as near, in voxels. keys (n,) and urgency (n,) take what is found:
+    voxels from the sphere at its nearest, and that it has to go until there, 0 where it is already.
+    Returns how many.
+    """
+    length = move[0] * move[0] + move[1] * move[1] + move[2] * move[2]
+    way = np.sqrt(length)
+    count = 0
+    for i in range(first[0], last[0] + 1):
+        x = 32.0 * i + 16.0
+        for j in range(first[1], last[1] + 1):
+            y = 32.0 * j + 16.0
+            for k in range(first[2], last[2] + 1):
+                z = 32.0 * k + 16.0
+                along = 0.0
+                if length > 0.0:
+                    along = (
+                        (x - start[0]) * move[0]
+                        + (y - start[1]) * move[1]
+                        + (z - start[2]) * move[2]
+                    ) / length
+                    along = min(max(along, 0.0), 1.0)
+                dx = max(abs(start[0] + along * move[0] - x) - 16.0, 0.0)
+                dy = max(abs(start[1] + along * move[1] - y) - 16.0, 0.0)
+                dz = max(abs(start[2] + along * move[2] - z) - 16.0, 0.0)
+                gap = np.sqrt(dx * dx + dy * dy + dz * dz) - radius
+                if gap <= margin:
+                    dx = max(abs(start[0] - x) - 16.0, 0.0)
+                    dy = max(abs(start[1] - y) - 16.0, 0.0)
+                    dz = max(abs(start[2] - z) - 16.0, 0.0)
+                    keys[count] = (i << 32) | (j << 16) | k
+                    urgency[count] = 0.0
+                    if dx * dx + dy * dy + dz * dz > radius * radius:
+                        urgency[count] = max(gap, 0.0) + along * way
+                    count += 1
+    return count
+
+
+@entry(FLOATS2, FLOAT, FLOATS3, PLACE, INTS, INT)
+def cells_met(points, reach, poses, place, found, most):
+    """Distinct cells within reach, voxels, at most 16, of points (N, 3+) at the first of the poses.
+
+    poses (M, 4, 4). The cells go into found (capacity,) int64, -1 all over before, an
+    open-addressing set whose capacity is a power of two and 2 (most + 8 N) at least, 2 (most + N)
+    without reach. Returns how many poses that are: the first at least, then while the cells are no
+    more than `most`; and how many cells.
+    """
+    capacity = found.shape[0]
+    ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
+    r, top = reach, side - 1.0
+    count = 0
+    low_memo = high_memo = np.int64(-1)
+    before = np.empty((8 if r > 0.0 else 1) * points.shape[0], dtype=np.int64)
+    for n in range(poses.shape[0]):
+        a, b, c, u = poses[n, 0, 0], poses[n, 0, 1], poses[n, 0, 2], poses[n, 0, 3]
+        d, e, f, v = poses[n, 1, 0], poses[n, 1, 1], poses[n, 1, 2], poses[n, 1, 3]
+        g, h, m, w = poses[n, 2, 0], poses[n, 2, 1], poses[n, 2, 2], poses[n, 2, 3]
+        added = 0
+        for p in range(points.shape[0]):
+            px, py, pz = points[p, 0], points[p, 1], points[p, 2]
+            x = (turn(a, b, c, px, py, pz) + u - ox) / size
+            y = (turn(d, e, f, px, py, pz) + v - oy) / size
+            z = (turn(g, h, m, px, py, pz) + w - oz) / size
+            if not (-r <= x < side + r and -r <= y < side + r and -r <= z < side + r):
+                continue
+            low = cell_key(
+                np.int64(max(x - r, 0.0)), np.int64(max(y - r, 0.0)), np.int64(max(z - r, 0.0))
+            )
+            high = cell_key(
+                np.int64(min(x + r, top)), np.int64(min(y + r, top)), np.int64(min(z + r, top))
+            )
+            if low == low_memo and high == high_memo:
+                continue
+            low_memo, high_memo = low, high
+            for ci in range(low >> 32, (high >> 32) + 1):
+                for cj in range((low >> 16) & 0xFFFF, ((high >> 16) & 0xFFFF) + 1):
+                    for ck in range(low & 0xFFFF, (high & 0xFFFF) + 1):
+                        key = (ci << 32) | (cj << 16) | ck
+                        at = spread_key(key, capacity)
+                        while found[at] >= 0 and found[at] != key:
+                            at = (at + 1) & (capacity - 1)
+                        if found[at] < 0:
+                            found[at] = key
+                            before[added] = at
+                            added += 1
+        if n > 0 and count + added > most:
+            for p in range(added):  # in the opposite order, so that no run of entries is torn
+                found[before[added - 1 - p]] = -1
+            return n, count
+        count += added
+    return poses.shape[0], count

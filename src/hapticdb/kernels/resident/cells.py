@@ -1,0 +1,438 @@
+"""Resident cells: a frame against voxels in memory, none of it waiting for a database.
+
+A cell is 32^3 voxels, held as 1024 words: word ``(i & 31) << 5 | (j & 31)``, bit ``k & 31``. A
+directory, an open-addressing table, says in which slot a cell is; slot 0 is empty for ever and
+stands for every cell known to be empty, and a cell without an entry is *unknown*. Beside its words
+each slot has a mask of 64 bits, one for each of its 4^3 bricks that holds a voxel.
+
+Directories are published in versions, three buffers in turn. A frame announces which version it
+reads and keeps to it, so it never sees one half changed; the process that writes uses a buffer or a
+slot again only when no frame can still see it (`hapticdb.resident.table`).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import (
+    BYTES,
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    INTS2,
+    INTS32_2,
+    WORDS,
+    WORDS32_2,
+    entry,
+    fields_of,
+    inlined,
+    leaf,
+)
+from hapticdb.kernels.query.contact import (
+    average_into,
+    center_of,
+    contact_depth,
+    contact_force,
+    is_rigid,
+    moment,
+    turn,
+)
+from hapticdb.kernels.resident.fence import fence
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+CELL_WORDS = 1024
+BUFFERS = 3
+UNKNOWN = -1
+EMPTY_SLOT = 0
+VERSION = 0
+"""Where `Cells.control` has the number of the published version."""
+REVISION = 1
+"""And, from there on, the database's revision of each buffer."""
+READER_STRIDE = 8
+"""Readers stand a cache line apart."""
+MOST_MISSED = 63
+"""Unknown cells that a frame names, for whoever fetches them."""
+GROUP = 4
+"""Runs of a group, which are skipped together."""
+MOST_COLUMNS = 64
+"""Of a cluster's box, looked at one by one: more, and an occupied brick counts as near."""
+MOST_CELLS = 8
+"""Of a cluster's box: more, and its points are looked up one by one."""
+WRENCH, HITS, CONTACTS, UNKNOWNS, DEEPEST, RESULTS = 0, 6, 7, 8, 9, 10
+"""Where a frame's result has what: (10,) float64."""
+
+
+class Cells(NamedTuple):
+    """A table of cells, as `hapticdb.resident.table.CellTable` lays it out in shared memory.
+
+    control (16,) int64; readers (16 x 8,) int64, the version that each reader sees, 0 for none;
+    keys (3, capacity) int64 and slots (3, capacity) int32, the directories; words (slots, 1024)
+    uint32; masks (slots,) uint64; used (slots,) uint8, set where a frame has looked.
+    """
+
+    control: Ints
+    readers: Ints
+    keys: NDArray[np.int64]
+    slots: NDArray[np.int32]
+    words: NDArray[np.uint32]
+    masks: NDArray[np.uint64]
+    used: NDArray[np.uint8]
+
+
+CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES)
+
+
+class Place(NamedTuple):
+    """A grid as kernels take it: origin and voxel size in metres, voxels an axis."""
+
+    x: float
+    y: float
+    z: float
+    size: float
+    side: float
+
+
+PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
+
+
+class Clusters(NamedTuple):
+    """A shell as frames take it.
+
+    points (N, 6): metres and inward normals, tool frame, in the order of the shell; center (3,);
+    spheres (C, 4): centre and radius, metres, of each run of `run` points, or (0, 4) for none;
+    groups (G, 4): likewise of each `GROUP` of them;
+    columns (3, N): the points again, an axis a row; scratch (6, run): where a run is placed. A
+    thread of its own needs a scratch of its own.
+    """
+
+    points: Floats
+    center: Floats
+    spheres: Floats
+    groups: Floats
+    run: int
+    columns: Floats
+    scratch: Floats
+
+
+CLUSTERS = fields_of(Clusters, FLOATS2, FLOATS, FLOATS2, FLOATS2, INT, FLOATS2, FLOATS2)
+
+
+def _masks_of_runs(stride: int) -> NDArray[np.uint64]:
+    """Mask (4, 4) of the bricks from one step to another on the axis of that stride."""
+    masks = np.zeros((4, 4), dtype=np.uint64)
+    for low in range(4):
+        for high in range(low, 4):
+            bits = [b for b in range(64) if low <= (b // stride) % 4 <= high]
+            masks[low, high] = sum(1 << b for b in bits)
+    return masks
+
+
+_MASKS_I, _MASKS_J, _MASKS_K = _masks_of_runs(16), _masks_of_runs(4), _masks_of_runs(1)
+_COLUMNS = np.array(
+    [[((2 << high) - 1) & ~((1 << low) - 1) for high in range(32)] for low in range(32)]
+).astype(np.uint32)
+"""Bits of a word from one k to another, (32, 32)."""
+
+
+@leaf
+def cell_key(i, j, k):
+    """Key of the cell that holds voxel (i, j, k): its coordinates side by side."""
+    return ((i >> 5) << 32) | ((j >> 5) << 16) | (k >> 5)
+
+
+@leaf
+def brick_bit(i, j, k):
+    """Which bit of its cell's mask stands for the brick that holds voxel (i, j, k)."""
+    return np.uint64((((i >> 3) & 3) << 4) | (((j >> 3) & 3) << 2) | ((k >> 3) & 3))
+
+
+@leaf
+def spread_key(key, capacity):
+    """Where a directory of that capacity, a power of two, looks for a key first."""
+    # Fibonacci hashing (Knuth, volume 3, section 6.4); the fold brings the upper axis into reach
+    return (((key ^ (key >> 29)) * 0x9E3779B97F4A7C1) >> 20) & (capacity - 1)
+
+
+@inlined
+def slot_of(keys, slots, which, key):
+    """Slot of a cell in directory `which`, or UNKNOWN."""
+    capacity = keys.shape[1]
+    at = spread_key(key, capacity)
+    while keys[which, at] >= 0:
+        if keys[which, at] == key:
+            return np.int64(slots[which, at])
+        at = (at + 1) & (capacity - 1)
+    return np.int64(UNKNOWN)
+
+
+@leaf
+def begin_frame(cells, reader):
+    """Announce a frame of that reader; returns the directory that it reads to its end."""
+    control, readers = cells.control, cells.readers
+    while True:
+        version = control[VERSION]
+        readers[reader * READER_STRIDE] = version
+        fence()
+        if control[VERSION] == version:
+            return version % BUFFERS
+
+
+@leaf
+def end_frame(cells, reader):
+    """Let go of what `begin_frame` announced."""
+    fence()
+    cells.readers[reader * READER_STRIDE] = 0
+
+
+@leaf
+def voxel_state(cells, which, i, j, k):
+    """1 where voxel (i, j, k), inside the grid, is occupied, 0 where it is free, or UNKNOWN."""
+    slot = slot_of(cells.keys, cells.slots, which, cell_key(i, j, k))
+    if slot < 0:
+        return np.int64(UNKNOWN)
+    return np.int64((cells.words[slot, ((i & 31) << 5) | (j & 31)] >> np.uint32(k & 31)) & 1)
+
+
+@inlined
+def is_something_near(
+    keys, slots, words, masks, used, which, low_i, low_j, low_k, high_i, high_j, high_k
+):
+    """Whether a closed box of voxels, inside the grid, holds one, or may: unknown counts, too.
+
+    First by the masks of its cells' bricks, then, where the box is small, voxel by voxel: without
+    an early end, since a branch that is guessed wrong costs more than ten words.
+    """
+    is_near = False
+    first_i, first_j, first_k = low_i >> 5, low_j >> 5, low_k >> 5
+    last_i, last_j, last_k = high_i >> 5, high_j >> 5, high_k >> 5
+    n_cells = (last_i - first_i + 1) * (last_j - first_j + 1) * (last_k - first_k + 1)
+    n_columns = (high_i - low_i + 1) * (high_j - low_j + 1)
+    if n_cells > MOST_CELLS:
+        return True
+    for ci in range(first_i, last_i + 1):
+        i0, i1 = max(low_i, ci << 5) & 31, min(high_i, (ci << 5) | 31) & 31
+        for cj in range(first_j, last_j + 1):
+            j0, j1 = max(low_j, cj << 5) & 31, min(high_j, (cj << 5) | 31) & 31
+            for ck in range(first_k, last_k + 1):
+                slot = slot_of(keys, slots, which, (ci << 32) | (cj << 16) | ck)
+                if slot < 0:
+                    return True
+                if slot == EMPTY_SLOT:
+                    continue
+                used[slot] = 1
+                k0, k1 = max(low_k, ck << 5) & 31, min(high_k, (ck << 5) | 31) & 31
+                bricks = _MASKS_I[i0 >> 3, i1 >> 3] & _MASKS_J[j0 >> 3, j1 >> 3]
+                if not masks[slot] & bricks & _MASKS_K[k0 >> 3, k1 >> 3]:
+                    continue
+                if n_columns > MOST_COLUMNS:
+                    return True
+                met = np.uint32(0)
+                for i in range(i0, i1 + 1):
+                    for word in range((i << 5) | j0, ((i << 5) | j1) + 1):
+                        met |= words[slot, word]
+                if met & _COLUMNS[k0, k1]:
+                    is_near = True
+    return is_near
+
+
+@inlined
+def is_sphere_free(
+    keys, slots, words, masks, used, which, spheres, n, side, size, ox, oy, oz,
+    a, b, c, u, d, e, f, v, g, h, m, w,
+):  # fmt: skip
+    """Whether no voxel is in the box around sphere n, placed by rotation a .. m and shift u, v, w.
+
+    Unknown cells count as voxels; what is outside the grid is free.
+    """
+    x, y, z = spheres[n, 0], spheres[n, 1], spheres[n, 2]
+    radius = spheres[n, 3] / size
+    sx = (turn(a, b, c, x, y, z) + u - ox) / size
+    sy = (turn(d, e, f, x, y, z) + v - oy) / size
+    sz = (turn(g, h, m, x, y, z) + w - oz) / size
+    if sx + radius < 0.0 or sy + radius < 0.0 or sz + radius < 0.0:
+        return True
+    if sx - radius >= side or sy - radius >= side or sz - radius >= side:
+        return True
+    return not is_something_near(
+        keys, slots, words, masks, used, which,
+        np.int64(max(sx - radius, 0.0)),
+        np.int64(max(sy - radius, 0.0)),
+        np.int64(max(sz - radius, 0.0)),
+        np.int64(min(sx + radius, side - 1.0)),
+        np.int64(min(sy + radius, side - 1.0)),
+        np.int64(min(sz + radius, side - 1.0)),
+    )  # fmt: skip
+
+
+@inlined
+def with_missed(missed, count, key):
+    """Put an unknown cell on the list, once; returns how many are on it."""
+    for n in range(1, count + 1):
+        if missed[n] == key:
+            return count
+    if count < MOST_MISSED:
+        missed[count + 1] = key
+        return count + 1
+    return count
+
+
+@leaf
+def felt(cells, which, shell, pose, place, stiffness, met, missed, out):
+    """One frame: hits of a placed shell and their wrench into out (RESULTS,).
+
+    met (N,) takes the indices of the hits, missed (1 + MOST_MISSED,) the number of unknown cells
+    that points are in and their keys; unknown points neither hit nor miss. The arithmetic, and the
+    order of the sums, are those of `contact.locate` and `contact.refine`.
+    """
+    points, words, masks, used = shell.points, cells.words, cells.masks, cells.used
+    keys, slots = cells.keys, cells.slots
+    total = points.shape[0]
+    a, b, c, u = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
+    d, e, f, v = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
+    g, h, m, w = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
+    x, y, z = shell.center[0], shell.center[1], shell.center[2]
+    mx = turn(a, b, c, x, y, z) + u
+    my = turn(d, e, f, x, y, z) + v
+    mz = turn(g, h, m, x, y, z) + w
+    fx = fy = fz = tx = ty = tz = deepest = 0.0
+    count = n_contacts = n_unknown = n_missed = 0
+    memo = np.int64(-1)
+    slot = np.int64(UNKNOWN)
+    n_clusters = shell.spheres.shape[0]
+    run = shell.run
+    columns, scratch = shell.columns, shell.scratch
+    mask = np.uint64(0)
+    start = 0
+    cluster = 0
+    while start < total:
+        end = min(start + run, total)
+        if n_clusters > 0:
+            if cluster % GROUP == 0 and is_sphere_free(
+                keys, slots, words, masks, used, which, shell.groups, cluster // GROUP, side,
+                size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
+            ):  # fmt: skip
+                start += GROUP * run
+                cluster += GROUP
+                continue
+            is_free = is_sphere_free(
+                keys, slots, words, masks, used, which, shell.spheres, cluster, side,
+                size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
+            )  # fmt: skip
+            cluster += 1
+            if is_free:
+                start = end
+                continue
+        # a run at a time, an axis after another: these loops the compiler makes vectors of, which
+        # halves the time of a flat frame of 100,000 points
+        for at in range(end - start):
+            x, y, z = columns[0, start + at], columns[1, start + at], columns[2, start + at]
+            scratch[0, at] = turn(a, b, c, x, y, z) + u
+            scratch[1, at] = turn(d, e, f, x, y, z) + v
+            scratch[2, at] = turn(g, h, m, x, y, z) + w
+        for at in range(end - start):
+            scratch[3, at] = (scratch[0, at] - ox) / size
+        for at in range(end - start):
+            scratch[4, at] = (scratch[1, at] - oy) / size
+        for at in range(end - start):
+            scratch[5, at] = (scratch[2, at] - oz) / size
+        for at in range(end - start):
+            x, y, z = scratch[3, at], scratch[4, at], scratch[5, at]
+            if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
+                continue
+            i, j, k = np.int64(x), np.int64(y), np.int64(z)
+            key = cell_key(i, j, k)
+            if key != memo:
+                memo = key
+                slot = slot_of(keys, slots, which, key)
+                mask = np.uint64(0)
+                if slot > EMPTY_SLOT:
+                    used[slot] = 1
+                    mask = masks[slot]
+                elif slot < 0:
+                    n_missed = with_missed(missed, n_missed, key)
+            # by the bricks first: most of space is free, and the mask is in a register
+            if not (mask >> brick_bit(i, j, k)) & np.uint64(1):
+                if slot < 0:
+                    n_unknown += 1
+                continue
+            if not (words[slot, ((i & 31) << 5) | (j & 31)] >> np.uint32(k & 31)) & 1:
+                continue
+            n = start + at
+            px, py, pz = scratch[0, at], scratch[1, at], scratch[2, at]
+            nx, ny, nz = points[n, 3], points[n, 4], points[n, 5]
+            nx, ny, nz = (
+                turn(a, b, c, nx, ny, nz),
+                turn(d, e, f, nx, ny, nz),
+                turn(g, h, m, nx, ny, nz),
+            )
+            cx = center_of(px, ox, size)
+            cy = center_of(py, oy, size)
+            cz = center_of(pz, oz, size)
+            depth = contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz)
+            met[count] = n
+            count += 1
+            if depth > 0.0:
+                n_contacts += 1
+                deepest = max(deepest, depth)
+                x, y, z = contact_force(nx, ny, nz, depth, stiffness)
+                fx += x
+                fy += y
+                fz += z
+                x, y, z = moment(px - mx, py - my, pz - mz, x, y, z)
+                tx += x
+                ty += y
+                tz += z
+        start = end
+    average_into(out, count, fx, fy, fz, tx, ty, tz)
+    out[HITS] = count
+    out[CONTACTS] = n_contacts
+    out[UNKNOWNS] = n_unknown
+    out[DEEPEST] = deepest
+    missed[0] = n_missed
+
+
+@entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, FLOAT, INTS, INTS, FLOATS2)
+def feel_kernel(cells, reader, shell, poses, place, stiffness, met, missed, out):
+    """`felt` at poses (M, 4, 4) into out (M, RESULTS); met and missed keep the last frame's.
+
+    Returns the number of poses done: fewer than M when one is not rigid.
+    """
+    for n in range(poses.shape[0]):
+        if not is_rigid(poses[n]):
+            return n
+        which = begin_frame(cells, reader)
+        felt(cells, which, shell, poses[n], place, stiffness, met, missed, out[n])
+        end_frame(cells, reader)
+    return poses.shape[0]
+
+
+@entry(FLOATS2, INT, FLOAT, FLOATS2)
+def bounding_spheres(points, run, slack, out):
+    """Sphere (C, 4) around the box of each run of points (N, 6), its radius larger by `slack`.
+
+    Larger, too, by what a pose that `is_rigid` lets pass may stretch.
+    """
+    total = points.shape[0]
+    for cluster in range(out.shape[0]):
+        start = cluster * run
+        end = min(start + run, total)
+        for axis in range(3):
+            low = high = points[start, axis]
+            for n in range(start + 1, end):
+                low = min(low, points[n, axis])
+                high = max(high, points[n, axis])
+            out[cluster, axis] = 0.5 * (low + high)
+        furthest = 0.0
+        for n in range(start, end):
+            x = points[n, 0] - out[cluster, 0]
+            y = points[n, 1] - out[cluster, 1]
+            z = points[n, 2] - out[cluster, 2]
+            furthest = max(furthest, x * x + y * y + z * z)
+        out[cluster, 3] = np.sqrt(furthest) * (1.0 + 1e-5) + slack

@@ -1,0 +1,453 @@
+"""Triangles -> the voxels that they meet, exactly, at a cost in proportion to those voxels.
+
+A voxel belongs when the triangle meets its closed box by the separating axis test (Akenine-Moeller,
+"Fast 3D Triangle-Box Overlap Testing", 2001): no separation above 1e-9 voxel along the 3 box
+normals, the 9 cross products of an edge and a box normal, and the triangle's normal, each axis of
+unit length and both shadows taken whole (all three corners, not one face of them).
+
+Here the test is not made voxel by voxel. Each axis bounds a linear function of the voxel's corner
+from below and from above. A cross product with box normal w has no w in it, so the nine are three
+each on the planes (u, v), (u, w) and (v, w), as in the conservative rasterisation of Schwarz and
+Seidel ("Fast parallel surface and solid voxelization on GPUs", 2010). Hence, with w the axis along
+which the fewest columns meet the triangle:
+
+- each row u has one interval of columns v, and one of w;
+- each v has one interval of w;
+- each column (u, v) has one interval of w from the normal,
+
+and what is left of w is one run of voxels, set by one OR for each half brick that it crosses.
+
+Precision
+---------
+Each triangle is first moved by whole voxels to the corner of its own bounding box, without
+rounding. Axes are kept unscaled and the tolerance is scaled instead, so that on coordinates with
+few bits every bound is exact. Otherwise a bound errs by a few 2^-53 of the triangle's length: far
+below the tolerance up to 2^16 voxels, near it at 2^21. The normal of a thin triangle is computed in
+twice the precision, since what cancels in it would turn the axis.
+
+Null axes are skipped: a cross product shorter than 1e-30 voxel (an edge parallel to the box normal,
+or none), and a normal whose length is at most 2^-50 of the longest edge's square, that is, of a
+triangle that is a line to within 1e-9 voxel in the largest grid. The others decide a line exactly.
+"""
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import FLOATS3, INT, INTS, entry, leaf
+from hapticdb.kernels.surfaces.bricks import (
+    FIRST_CAPACITY,
+    RUNS_AT_ONCE,
+    brick_voxels,
+    count_voxels,
+    mark_points,
+    mark_runs,
+    new_bricks,
+    sorted_bricks,
+)
+
+__all__ = ["brick_voxels", "count_voxels", "mark_points", "voxelize", "voxelize_pieces"]
+
+TOUCH = 1e-9
+"""Separations up to this, in voxels, count as touching."""
+NULL_EDGE = 1e-30
+"""Cross products of an edge and a box normal up to this length, in voxels, are null."""
+NULL_NORMAL = 2.0**-50
+"""Normals up to this length, in squares of the longest edge, are null."""
+THIN = 2.0**14
+"""Above this edge^3 / |normal| the normal's rounding would show at 1e-11 voxel."""
+FAR = 2.0**60
+"""Coordinates beyond are pulled to this: no product of three of them overflows."""
+AXIS_X, AXIS_Y, AXIS_Z = np.int64(0), np.int64(1), np.int64(2)
+OUTSIDE, CUT, WHOLE = 0, 1, 2
+"""How much of a triangle's bounding box the grid has."""
+MOST_BRICKS = 1 << 17
+"""Bricks of a piece: 10 MB, and as much again while they are put in order."""
+RUNS_A_BRICK = 64
+"""Runs of voxels that a piece may take for each brick that it may have: so that a piece ends, and
+its share is told, where many triangles meet few bricks, too."""
+STEEP = 1e40
+"""Stands for 1 / 0 in the slope of an axis that is square to the direction solved for."""
+
+
+@leaf
+def exact_difference(a, b):
+    """Return (d, e) with d + e = a - b exactly (Knuth, TwoDiff)."""
+    d = a - b
+    t = d - a
+    return d, (a - (d - t)) - (b + t)
+
+
+@leaf
+def exact_product(a, b):
+    """Return (p, e) with p + e = a b exactly (Dekker 1971)."""
+    p = a * b
+    t = 134217729.0 * a
+    a_high = t - (t - a)
+    a_low = a - a_high
+    t = 134217729.0 * b
+    b_high = t - (t - b)
+    b_low = b - b_high
+    return p, ((a_high * b_high - p) + a_high * b_low + a_low * b_high) + a_low * b_low
+
+
+@leaf
+def exact_minor(corners, p, q):
+    """Return (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p, right to the last bits."""
+    a, a_low = exact_difference(corners[1, p], corners[0, p])
+    b, b_low = exact_difference(corners[2, q], corners[0, q])
+    c, c_low = exact_difference(corners[1, q], corners[0, q])
+    d, d_low = exact_difference(corners[2, p], corners[0, p])
+    left, left_low = exact_product(a, b)
+    right, right_low = exact_product(c, d)
+    whole, low = exact_difference(left, right)
+    low += left_low - right_low
+    return whole + (low + ((a * b_low + a_low * b) - (c * d_low + c_low * d)))
+
+
+@leaf
+def minor(corners, p, q):
+    """Return (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p."""
+    return (corners[1, p] - corners[0, p]) * (corners[2, q] - corners[0, q]) - (
+        corners[1, q] - corners[0, q]
+    ) * (corners[2, p] - corners[0, p])
+
+
+@leaf
+def normal_of(corners):
+    """Return the normal (x, y, z) of a triangle (3, 3), zeros where it is null."""
+    x, y, z = (
+        minor(corners, AXIS_Y, AXIS_Z),
+        minor(corners, AXIS_Z, AXIS_X),
+        minor(corners, AXIS_X, AXIS_Y),
+    )
+    longest = 0.0
+    for n in range(3):
+        m = (n + 1) % 3
+        dx = corners[m, 0] - corners[n, 0]
+        dy = corners[m, 1] - corners[n, 1]
+        dz = corners[m, 2] - corners[n, 2]
+        longest = max(longest, dx * dx + dy * dy + dz * dz)
+    if longest * np.sqrt(longest) > THIN * np.sqrt(x * x + y * y + z * z):
+        x = exact_minor(corners, AXIS_Y, AXIS_Z)
+        y = exact_minor(corners, AXIS_Z, AXIS_X)
+        z = exact_minor(corners, AXIS_X, AXIS_Y)
+        if np.sqrt(x * x + y * y + z * z) <= NULL_NORMAL * longest:
+            return 0.0, 0.0, 0.0
+    return x, y, z
+
+
+@leaf
+def slope(along, length):
+    """Inverse of an axis' component along the direction solved for, never infinite."""
+    return 1.0 / along if along * STEEP > length else STEEP / length
+
+
+@leaf
+def edge_axis(from_p, from_q, to_p, to_q, other_p, other_q):
+    """Axis square to an edge in the plane of two axes p and q, to be solved for q.
+
+    Returns the coefficient of p, the least and the greatest value of ``coefficient * p + rest * q``
+    over the corners of voxels that touch, and 1 / rest.
+    """
+    at_p = to_q - from_q
+    at_q = from_p - to_p
+    if at_q < 0.0:
+        at_p = -at_p
+        at_q = -at_q
+    length = np.sqrt(at_p * at_p + at_q * at_q)
+    if length <= NULL_EDGE:
+        return 0.0, -1.0, 1.0, STEEP
+    edge = at_p * from_p + at_q * from_q
+    other = at_p * other_p + at_q * other_q
+    low = min(edge, other) - TOUCH * length - (max(at_p, 0.0) + at_q)
+    high = max(edge, other) + TOUCH * length - min(at_p, 0.0)
+    return at_p, low, high, slope(at_q, length)
+
+
+@leaf
+def set_normal_axis(plane, corners, normal, u, v, w):
+    """Like `set_edge_axis` for the normal: coefficients of u and v, bounds, 1 / that of w."""
+    at_u, at_v, at_w = normal[u], normal[v], normal[w]
+    if at_w < 0.0:
+        at_u, at_v, at_w = -at_u, -at_v, -at_w
+    length = np.sqrt(at_u * at_u + at_v * at_v + at_w * at_w)
+    plane[0] = at_u
+    plane[1] = at_v
+    if length == 0.0:
+        plane[2] = -1.0
+        plane[3] = 1.0
+        plane[4] = STEEP
+        return
+    low = np.inf
+    high = -np.inf
+    for n in range(3):
+        value = at_u * corners[n, u] + at_v * corners[n, v] + at_w * corners[n, w]
+        low = min(low, value)
+        high = max(high, value)
+    plane[2] = low - TOUCH * length - (max(at_u, 0.0) + max(at_v, 0.0) + at_w)
+    plane[3] = high + TOUCH * length - (min(at_u, 0.0) + min(at_v, 0.0))
+    plane[4] = slope(at_w, length)
+
+
+@leaf
+def place_in_grid(triangles, t, edge, corners, box):
+    """Move a triangle to its own corner and find the voxels of its bounding box.
+
+    Writes corners (3, 3), and to box (3, 3) int64 the first and last voxel on each axis, counted
+    from the move, and the move. Returns OUTSIDE when the grid has none of them, CUT when it has not
+    all, WHOLE otherwise.
+    """
+    placed = WHOLE
+    for axis in range(3):
+        a = min(max(triangles[t, 0, axis], -FAR), FAR)
+        b = min(max(triangles[t, 1, axis], -FAR), FAR)
+        c = min(max(triangles[t, 2, axis], -FAR), FAR)
+        low = min(a, b, c)
+        high = max(a, b, c)
+        if low > edge + TOUCH or high < -TOUCH:
+            return OUTSIDE
+        move = max(np.floor(low), 0.0)  # never negative: a - move is exact only below a
+        corners[0, axis] = a - move
+        corners[1, axis] = b - move
+        corners[2, axis] = c - move
+        first = np.ceil(low - move - TOUCH) - 1.0
+        last = np.floor(high - move + TOUCH)
+        if first < -move or last > edge - 1.0 - move:
+            placed = CUT
+            first = max(first, -move)
+            last = min(last, edge - 1.0 - move)
+            if first > last:
+                return OUTSIDE
+        box[0, axis] = int(first)
+        box[1, axis] = int(last)
+        box[2, axis] = int(move)
+    return placed
+
+
+@leaf
+def order_axes(box, normal):
+    """Axes (u, v, w): w crosses the fewest columns, and u has fewer rows than v."""
+    x = box[1, 0] - box[0, 0]
+    y = box[1, 1] - box[0, 1]
+    z = box[1, 2] - box[0, 2]
+    columns_x = 0.5 * abs(normal[0]) + y + z
+    columns_y = 0.5 * abs(normal[1]) + x + z
+    columns_z = 0.5 * abs(normal[2]) + x + y
+    if columns_z <= columns_x and columns_z <= columns_y:
+        return (0, 1, 2) if x <= y else (1, 0, 2)
+    if columns_y <= columns_x:
+        return (0, 2, 1) if x <= z else (2, 0, 1)
+    return (1, 2, 0) if y <= z else (2, 1, 0)
+
+
+@leaf
+def longest_box(triangles, edge):
+    """Return the most voxels that a triangle's bounding box has along an axis, in the grid."""
+    longest = 0.0
+    for t in range(triangles.shape[0]):
+        for axis in range(3):
+            a, b, c = triangles[t, 0, axis], triangles[t, 1, axis], triangles[t, 2, axis]
+            longest = max(longest, min(max(a, b, c), edge) - max(min(a, b, c), 0.0))
+    return int(longest) + 3
+
+
+@leaf
+def set_axes(axes, plane, corners, normal, u, v, w):
+    """Set the ten axes of a triangle: rows 0-2 of (u, v), 3-5 of (u, w), 6-8 of (v, w); plane."""
+    for n in range(3):
+        m, o = (n + 1) % 3, (n + 2) % 3
+        nu, nv, nw = corners[n, u], corners[n, v], corners[n, w]
+        mu, mv, mw = corners[m, u], corners[m, v], corners[m, w]
+        ou, ov, ow = corners[o, u], corners[o, v], corners[o, w]
+        at, low, high, steepness = edge_axis(nu, nv, mu, mv, ou, ov)
+        axes[n, 0], axes[n, 1], axes[n, 2], axes[n, 3] = at, low, high, steepness
+        at, low, high, steepness = edge_axis(nu, nw, mu, mw, ou, ow)
+        axes[n + 3, 0], axes[n + 3, 1], axes[n + 3, 2], axes[n + 3, 3] = at, low, high, steepness
+        at, low, high, steepness = edge_axis(nv, nw, mv, mw, ov, ow)
+        axes[n + 6, 0], axes[n + 6, 1], axes[n + 6, 2], axes[n + 6, 3] = at, low, high, steepness
+    set_normal_axis(plane, corners, normal, u, v, w)
+
+
+@leaf
+def set_spans(axes, spans, box, v, w):
+    """Set the interval of w for each v of a triangle's bounding box."""
+    for at_v in range(box[0, v], box[1, v] + 1):
+        y = float(at_v)
+        low, high = float(box[0, w]), float(box[1, w])
+        for n in range(6, 9):
+            value = axes[n, 0] * y
+            low = max(low, (axes[n, 1] - value) * axes[n, 3])
+            high = min(high, (axes[n, 2] - value) * axes[n, 3])
+        spans[at_v - box[0, v], 0] = low
+        spans[at_v - box[0, v], 1] = high
+
+
+@leaf
+def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
+    """Write the runs of voxels of triangles from resume on until `runs` is full; return how many.
+
+    resume (3,) int64 is where it stopped: the triangle, and row and column in it, or -1 where the
+    triangle is new. The other arrays keep what was computed for the triangle.
+    """
+    n_runs = 0
+    capacity = runs.shape[0]
+    for t in range(resume[0], triangles.shape[0]):
+        is_new = resume[1] < 0
+        placed = place_in_grid(triangles, t, edge, corners, box) if is_new else CUT
+        if placed == OUTSIDE:
+            continue
+        if n_runs == capacity:
+            resume[0] = t
+            return n_runs
+        normal = normal_of(corners)
+        u, v, w = order_axes(box, normal)
+        first_u, last_u = box[0, u], box[1, u]
+        first_v, last_v = box[0, v], box[1, v]
+        move_u, move_v, move_w = box[2, u], box[2, v], box[2, w]
+        if placed == WHOLE and first_u == last_u and first_v == last_v:
+            # a triangle that lies in one column meets every voxel of it that its bounding box does
+            runs[n_runs, u] = first_u + move_u
+            runs[n_runs, v] = first_v + move_v
+            runs[n_runs, w] = box[0, w] + move_w
+            runs[n_runs, 3] = 2 - w
+            runs[n_runs, 4] = box[1, w] + move_w
+            n_runs += 1
+            continue
+        low_w, high_w = float(box[0, w]), float(box[1, w])
+        if is_new:
+            set_axes(axes, plane, corners, normal, u, v, w)
+            set_spans(axes, spans, box, v, w)
+        else:
+            first_u = resume[1]
+        for at_u in range(first_u, last_u + 1):
+            x = float(at_u)
+            low, high = float(first_v), float(last_v)
+            low_row, high_row = low_w, high_w
+            for n in range(3):
+                value = axes[n, 0] * x
+                low = max(low, (axes[n, 1] - value) * axes[n, 3])
+                high = min(high, (axes[n, 2] - value) * axes[n, 3])
+                value = axes[n + 3, 0] * x
+                low_row = max(low_row, (axes[n + 3, 1] - value) * axes[n + 3, 3])
+                high_row = min(high_row, (axes[n + 3, 2] - value) * axes[n + 3, 3])
+            if low_row > high_row or low > high:
+                resume[1] = -1
+                continue
+            low_v = int(np.ceil(low))
+            if resume[1] >= 0:
+                low_v = resume[2]
+                resume[1] = -1
+            value_row = plane[0] * x
+            for at_v in range(low_v, int(np.floor(high)) + 1):
+                value = value_row + plane[1] * float(at_v)
+                low_w_here = max(low_row, spans[at_v - first_v, 0], (plane[2] - value) * plane[4])
+                high_w_here = min(high_row, spans[at_v - first_v, 1], (plane[3] - value) * plane[4])
+                first = int(np.ceil(low_w_here))
+                last = int(np.floor(high_w_here))
+                if first > last or low_w_here > high_w_here:
+                    continue
+                if n_runs == capacity:
+                    resume[0] = t
+                    resume[1] = at_u
+                    resume[2] = at_v
+                    return n_runs
+                runs[n_runs, u] = at_u + move_u
+                runs[n_runs, v] = at_v + move_v
+                runs[n_runs, w] = first + move_w
+                runs[n_runs, 3] = 2 - w
+                runs[n_runs, 4] = last + move_w
+                n_runs += 1
+    resume[0] = triangles.shape[0]
+    return n_runs
+
+
+@entry(FLOATS3, INT, INTS, INT)
+def voxelize_kernel(triangles, bits, resume, most):
+    """Bricks of the voxels that triangles (T, 3, 3) meet: packed keys, words (C, 8), count.
+
+    Stops after `most` bricks or so, or many times as many runs of voxels. resume (4,) int64 is
+    where it begins and then where it has stopped: triangle, row and column in it (row -1: none),
+    thousandths of its rows that are done. All is done when the triangle is T.
+    """
+    edge = float(1 << bits)
+    bricks, n_bricks = new_bricks(FIRST_CAPACITY), np.int64(0)
+    runs = np.empty((RUNS_AT_ONCE, 5), np.int64)
+    corners = np.empty((3, 3))
+    box = np.empty((3, 3), np.int64)
+    axes = np.empty((9, 4))
+    plane = np.empty(5)
+    spans = np.empty((longest_box(triangles, edge), 2))
+    n_done = np.int64(0)
+    if resume[1] >= 0:  # within a triangle: what was computed for it is computed again
+        place_in_grid(triangles, resume[0], edge, corners, box)
+        normal = normal_of(corners)
+        u, v, w = order_axes(box, normal)
+        set_axes(axes, plane, corners, normal, u, v, w)
+        set_spans(axes, spans, box, v, w)
+    while resume[0] < triangles.shape[0] and n_bricks < most and n_done < RUNS_A_BRICK * most:
+        n_runs = fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs)
+        bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)
+        n_done += n_runs
+    resume[3] = 0
+    if resume[1] >= 0:
+        u, v, w = order_axes(box, normal_of(corners))
+        span = box[1, u] - box[0, u] + 1
+        resume[3] = (1000 * (resume[1] - box[0, u])) // span
+    return bricks.keys, bricks.words, n_bricks
+
+
+def voxelize_pieces(
+    triangles: NDArray[np.float64], bits: int, most: int = MOST_BRICKS
+) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8]]]:
+    """Bricks of the voxels that triangles meet, a bounded number at a time.
+
+    The parameters are those of `voxelize`.
+
+    Yields
+    ------
+    share : float
+        Of the triangles that are done, 0 to 1; within a triangle by its rows.
+    bricks_z, occupancy : arrays
+        As `voxelize` returns them. Pieces may have bricks in common, whose bits add.
+    """
+    corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
+    resume = np.array([0, -1, 0, 0], dtype=np.int64)
+    while True:
+        piece = sorted_bricks(*voxelize_kernel(corners, bits, resume, most))
+        if resume[0] >= len(corners):
+            yield 1.0, *piece
+            return
+        yield float(resume[0] + resume[3] / 1000) / len(corners), *piece
+
+
+def voxelize(
+    triangles: NDArray[np.float64], bits: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
+    """Bricks of the voxels that triangles meet.
+
+    Parameters
+    ----------
+    triangles : NDArray[np.float64]
+        (T, 3, 3), corners in voxels from the grid's origin, finite. What lies outside the grid is
+        cut off.
+    bits : int
+        Bits an axis of the grid, 1 to 21.
+
+    Returns
+    -------
+    bricks_z : NDArray[np.int64]
+        (B,) Z-order keys of the bricks, ascending, each once.
+    occupancy : NDArray[np.uint8]
+        (B, 64), bit number n the voxel of Z-order n modulo 8, least significant first.
+
+    Notes
+    -----
+    Boxes are closed: a triangle in the plane between two layers of voxels marks both. The result
+    is the union over the triangles, whatever their order. Holds no interpreter lock and no state
+    of its own, so that threads may voxelize different parts at once.
+    """
+    corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
+    resume = np.array([0, -1, 0, 0], dtype=np.int64)
+    return sorted_bricks(*voxelize_kernel(corners, bits, resume, 1 << 40))

@@ -1,0 +1,1 @@
+"""Pictures: splatted voxels, the demo's picture, the picture of a sweep."""

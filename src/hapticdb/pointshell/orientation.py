@@ -1,0 +1,292 @@
+"""Which side of a surface is inside, found from where its triangles lie, not how they are wound.
+
+Files wind faces any way, repeat them and tear their edges. So corners are joined where they
+coincide, faces that hang together by edges form patches of one winding and closed bodies, and lines
+through the patches vote on the side (`kernels.sides`). What is left without a vote is guessed from
+its shape.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.surfaces import sides as kernels
+
+JOIN = 1e-6
+"""Corners on open edges are joined up to this part of the bounding box's diagonal."""
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class Surface(NamedTuple):
+    """Triangles whose inside is known: what points are spread over."""
+
+    triangles: Floats  # (F, 3, 3), none twice
+    areas: Floats  # (F,), zero where degenerate
+    normals: Floats  # (F, 3), into the tool
+    center: Floats  # (3,)
+    is_closed: bool
+    bodies: Ints  # (F,) 0 for all open ones, then the closed ones
+
+
+class _Edges(NamedTuple):
+    """Edges of the faces (F, 3) of a topology, every edge of a face with a number of its own."""
+
+    number: Ints  # (3 F,) edge of each face's side: corners 0 1, 1 2, 2 0
+    is_forward: NDArray[np.bool_]  # (3 F,) whether the side runs from the lesser corner on
+    uses: Ints  # (E,) faces at each edge
+
+
+class _Sides(NamedTuple):
+    """Faces in the course of learning which of their sides is inside, about a common origin."""
+
+    triangles: Floats  # (F, 3, 3)
+    centroids: Floats  # (F, 3)
+    normals: Floats  # (F, 3) unit, by a winding that agrees in each patch; zero where degenerate
+    areas: Floats  # (F,)
+    patch: Ints  # (F,)
+    body: Ints  # (F,) 0 all open bodies together, then the closed ones
+    is_flipped: NDArray[np.bool_]  # (F,) whether the file winds the face the other way
+
+
+def orient(triangles: Floats) -> Surface:
+    """Find for each triangle (F, 3, 3) the side that is inside, whatever its winding.
+
+    Faces that hang together get one winding, and lines through them vote on the side (a line that
+    crosses a body an odd number of times ahead comes from inside it). Each closed body is asked by
+    itself, so that bodies may overlap; one that lies inside another whole is a void in it, one in a
+    void is a body again. All open bodies are asked together; where no line tells, `_guess` does.
+    """
+    if not np.isfinite(triangles).all():
+        n_bad = int((~np.isfinite(triangles)).any(axis=(1, 2)).sum())
+        raise UsageError(f"{n_bad} triangles have a corner that is not finite: repair the mesh")
+    if len(triangles) == 0:
+        raise UsageError("no triangles: a tool needs a surface")
+    corners = triangles.reshape(-1, 3)
+    origin = corners.min(axis=0) / 2.0 + corners.max(axis=0) / 2.0
+    local = triangles - origin
+    faces = _join_corners(local)
+    kept = _drop_repeated(faces)
+    normals, areas = kernels.normals_of(local[kept])
+    total = float(areas.sum())
+    if not 0.0 < total < np.inf:
+        raise UsageError("its triangles have no area, or more than can be counted")
+    faces, local = faces[kept], local[kept]
+    edges = _edges_of(faces)
+    patch, is_flipped = _wind(faces, edges)
+    normals[is_flipped] *= -1.0
+    body = _bodies(len(faces), edges)
+    sides = _Sides(local, local.mean(axis=1), normals, areas, patch, body, is_flipped)
+    signs = _vote(sides)
+    inward = normals * signs[:, None]
+    center, has_volume = _center(sides, inward)
+    is_closed = has_volume and not bool((edges.uses % 2).any())
+    if not is_closed:
+        center = np.einsum("f,fk->k", areas, sides.centroids) / total
+    sampled = areas > 0.0
+    return Surface(
+        triangles[kept][sampled], areas[sampled], inward[sampled], center + origin, is_closed,
+        body[sampled],
+    )  # fmt: skip
+
+
+def _edges_of(faces: Ints) -> _Edges:
+    tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
+    keys = np.minimum(tail, head) * (faces.max(initial=0) + 1) + np.maximum(tail, head)
+    _, number, uses = np.unique(keys, return_inverse=True, return_counts=True)
+    return _Edges(number.astype(np.int64), tail < head, uses.astype(np.int64))
+
+
+def _join_corners(triangles: Floats) -> Ints:
+    """Corners (F, 3) by number, equal where they coincide: files such as STL do not say.
+
+    Corners that are equal to the bit are one. Where that leaves open edges, their corners are
+    joined within `JOIN`, too: two parts' roundings of one edge.
+    """
+    corners = triangles.reshape(-1, 3) + 0.0  # -0.0 is 0.0
+    order = np.lexsort(corners.T)
+    is_new = np.ones(len(corners), dtype=bool)
+    is_new[1:] = (corners[order[1:]] != corners[order[:-1]]).any(axis=1)
+    number = np.empty(len(corners), dtype=np.int64)
+    number[order] = np.cumsum(is_new) - 1
+    faces = number.reshape(-1, 3)
+    edges = _edges_of(faces)
+    is_open = (edges.uses == 1)[edges.number]
+    if not is_open.any():
+        return faces
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - half a second, for torn files alone
+
+    loose = np.unique(
+        np.concatenate((faces.ravel()[is_open], np.roll(faces, -1, axis=1).ravel()[is_open]))
+    )
+    places = corners[order[is_new]]
+    tolerance = JOIN * float(np.linalg.norm(np.ptp(places, axis=0)))
+    pairs = loose[cKDTree(places[loose]).query_pairs(tolerance, output_type="ndarray")]
+    return _components(pairs, len(places))[faces]
+
+
+def _components(pairs: Ints, n: int) -> Ints:
+    """Component (n,) of each node of the graph with those edges (E, 2), in order of first nodes.
+
+    Every root with a lower neighbour is hung below the lowest, and all paths are shortened to their
+    roots, until no edge joins two: at most half of the roots of a component stay in each round.
+    scipy's would do, but its import takes a third of a second, which every shell would wait for.
+    """
+    root = np.arange(n, dtype=np.int64)
+    tail, head = root[pairs[:, 0]], root[pairs[:, 1]]
+    while (tail != head).any():
+        np.minimum.at(root, np.maximum(tail, head), np.minimum(tail, head))
+        while not np.array_equal(root, above := root[root]):
+            root = above
+        tail, head = root[pairs[:, 0]], root[pairs[:, 1]]
+    return np.unique(root, return_inverse=True)[1].astype(np.int64)
+
+
+def _neighbours(number: Ints, sides: Ints) -> Ints:
+    """Pairs (P, 2) of the given sides that lie on one edge, each with the next."""
+    order = sides[np.argsort(number[sides], kind="stable")]
+    is_pair = number[order[1:]] == number[order[:-1]]
+    return np.stack((order[:-1][is_pair], order[1:][is_pair]), axis=1)
+
+
+def _drop_repeated(faces: Ints) -> Ints:
+    """Faces to keep, by number, ascending: each set of corners once.
+
+    Bodies glued together may have the wall between them twice. Once would leave them open there, so
+    a patch of repeated faces goes altogether where more of its border would be open than closed.
+    """
+    is_face = (faces != np.roll(faces, -1, axis=1)).all(axis=1)
+    whole = np.flatnonzero(is_face)
+    if len(whole) == 0:
+        return whole
+    _, first, counts = np.unique(
+        np.sort(faces[whole], axis=1), axis=0, return_index=True, return_counts=True
+    )
+    kept = whole[np.sort(first)]
+    is_even = (counts % 2 == 0)[np.argsort(first)]
+    if not is_even.any():
+        return kept
+    edges = _edges_of(faces[kept])
+    sides = np.flatnonzero(np.repeat(is_even, 3))
+    pairs = _neighbours(edges.number, sides)
+    patch = _components(pairs // 3, len(kept))
+    within = np.bincount(edges.number[sides], minlength=len(edges.uses))
+    is_border = (within == 1) & (edges.uses > 1)
+    border = sides[is_border[edges.number[sides]]]
+    is_odd = edges.uses[edges.number[border]] % 2 == 1
+    lean = np.bincount(patch[border // 3], np.where(is_odd, 1.0, -1.0), len(kept))
+    is_wall: NDArray[np.bool_] = is_even & (lean[patch] > 0.0)
+    return kept[~is_wall]
+
+
+def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
+    """Patches of faces that hang together by edges of two faces, and a winding that agrees in each.
+
+    Returns the patch (F,) of each face and whether the face is to be flipped (F,). A patch that has
+    one side only (Moebius) falls into single faces.
+    """
+    n = len(faces)
+    pairs = _neighbours(edges.number, np.flatnonzero((edges.uses == 2)[edges.number]))
+    f, g = pairs[:, 0] // 3, pairs[:, 1] // 3
+    # The double cover: node f is the face as it stands, node n + f the face flipped.
+    agrees = edges.is_forward[pairs[:, 0]] != edges.is_forward[pairs[:, 1]]
+    links = np.concatenate(
+        (
+            np.stack((f, np.where(agrees, g, g + n)), axis=1),
+            np.stack((f + n, np.where(agrees, g + n, g)), axis=1),
+        )
+    )
+    sheet = _components(links, 2 * n)
+    is_one_sided = sheet[:n] == sheet[n:]
+    patch = np.minimum(sheet[:n], sheet[n:])
+    is_flipped = (sheet[:n] > sheet[n:]) & ~is_one_sided
+    patch[is_one_sided] = 2 * n + np.flatnonzero(is_one_sided)
+    return np.unique(patch, return_inverse=True)[1].astype(np.int64), is_flipped
+
+
+def _bodies(n_faces: int, edges: _Edges) -> Ints:
+    """Body (F,) of each face: 1, 2, ... what hangs together by edges, 0 whatever is open."""
+    pairs = _neighbours(edges.number, np.arange(3 * n_faces))
+    body = _components(pairs // 3, n_faces)
+    is_open = np.zeros(n_faces, dtype=bool)
+    is_open[body[np.flatnonzero((edges.uses % 2 == 1)[edges.number]) // 3]] = True
+    body += 1
+    body[is_open[body - 1]] = 0
+    return np.unique(np.append(body, 0), return_inverse=True)[1][:-1].astype(np.int64)
+
+
+def _vote(sides: _Sides) -> Floats:
+    """For each face (F,) 1 where its normal points inside, -1 where outside."""
+    tree = kernels.triangle_tree(sides.triangles, sides.body)
+    votes = kernels.side_votes(
+        tree, sides.patch, sides.body, sides.areas, sides.centroids, sides.normals
+    )
+    signs = np.sign(votes).astype(np.float64)[sides.patch]
+    _guess(sides, signs)
+    signs[_voids(sides, tree)[sides.body]] *= -1.0
+    return signs
+
+
+def _guess(sides: _Sides, signs: Floats) -> None:
+    """Fill in the signs (F,) that no line could tell: still zero.
+
+    A patch that bulges has its inside where its middle is. Flat ones all face one way: out of the
+    side that the file's winding calls the outer one, or, where the winding contradicts itself,
+    towards the positive end of the axis that they face most.
+    """
+    silent = np.flatnonzero(signs == 0.0)
+    if len(silent) == 0:
+        return
+    patch = np.unique(sides.patch[silent], return_inverse=True)[1]
+    areas, normals, centroids = sides.areas[silent], sides.normals[silent], sides.centroids[silent]
+    total = np.maximum(np.bincount(patch, areas), np.finfo(np.float64).tiny)
+    middle = np.stack([np.bincount(patch, areas * x) for x in centroids.T], axis=1) / total[:, None]
+    arm = middle[patch] - centroids
+    bulge = np.bincount(patch, areas * (normals * arm).sum(axis=1))
+    size = np.bincount(patch, areas * np.linalg.norm(arm, axis=1))
+    guess = np.where(np.abs(bulge) > 1e-6 * size, np.sign(bulge), 0.0)[patch]
+    flat = guess == 0.0
+    wound = np.where(sides.is_flipped[silent], -areas, areas)
+    outer = wound[flat] @ normals[flat]
+    if np.linalg.norm(outer) < 0.5 * areas[flat].sum():
+        outer = np.linalg.eigh((normals[flat].T * areas[flat]) @ normals[flat])[1][:, -1]
+        outer = outer * np.sign(outer[np.argmax(np.abs(outer))])
+    facing = normals @ outer
+    is_outward = (facing > 0.0) | ((facing == 0.0) & (wound >= 0.0))
+    signs[silent] = np.where(flat, np.where(is_outward, -1.0, 1.0), guess)
+
+
+def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
+    """Whether each body (B,) is the wall of a void: whole inside an odd number of closed bodies."""
+    n_bodies = int(sides.body.max()) + 1
+    low = np.full((n_bodies, 3), np.inf)
+    high = np.full((n_bodies, 3), -np.inf)
+    np.minimum.at(low, sides.body, sides.triangles.min(axis=1))
+    np.maximum.at(high, sides.body, sides.triangles.max(axis=1))
+    low[0], high[0] = np.inf, -np.inf  # what is open encloses nothing
+    pairs = [
+        (inner, outer)
+        for inner in range(1, n_bodies)
+        for outer in np.flatnonzero(((low <= low[inner]) & (high >= high[inner])).all(axis=1))
+        if outer != inner
+    ]
+    is_void = np.zeros(n_bodies, dtype=bool)
+    if pairs:
+        nests = np.array(pairs, dtype=np.int64)
+        encloses = kernels.enclosures(tree, nests, sides.body, sides.areas, sides.centroids)
+        is_void = np.bincount(nests[:, 0], encloses, n_bodies) % 2 == 1
+    return is_void
+
+
+def _center(sides: _Sides, inward: Floats) -> tuple[Floats, bool]:
+    """Centre of mass of the solid, and whether there is one: a volume beyond rounding."""
+    a, b, c = sides.triangles[:, 0], sides.triangles[:, 1], sides.triangles[:, 2]
+    # A face with its outward normal n spans with the origin the volume (centroid . n) area / 3.
+    volumes = -(inward * sides.centroids).sum(axis=1) * sides.areas / 3.0
+    volume = float(volumes.sum())
+    if not volume > 1e-9 * float(np.abs(volumes).sum()):
+        return np.zeros(3), False
+    return np.einsum("f,fk->k", volumes, a + b + c) / (4.0 * volume), True  # no BLAS: no threads

@@ -1,0 +1,401 @@
+"""PointShell: the moving tool as points on its surface, each with a normal into the tool.
+
+A mesh becomes a shell in three steps: each face learns which of its sides is inside
+(`orientation`), points are spread over the faces (`kernels.sampling`), and the points are put in
+order along a Z-order curve. Neighbours in a shell made here are therefore neighbours in space, and
+a frame that takes the points in turn finds the same brick many times in a row, wherever a brick
+holds many points.
+"""
+
+import math
+import zipfile
+from dataclasses import dataclass, field, replace
+from os import SEEK_END, PathLike
+from pathlib import Path
+from typing import IO, BinaryIO
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb import mesh
+from hapticdb.errors import FileError, UsageError
+from hapticdb.kernels import curves
+from hapticdb.kernels.surfaces import sampling
+from hapticdb.pointshell.coverage import Ball, covering_radius, points_for
+from hapticdb.pointshell.orientation import Surface, orient
+from hapticdb.poses import as_floats
+
+MAX_POINTS = 10_000_000
+DEFAULT_POINTS = 300
+DENSE_POINTS = 200_000
+"""Of a shell whose spacing is given, at most, unless more are asked for: a few seconds' work."""
+ORDER_BITS = 10
+"""The curve that orders the points has 2^10 steps along the longest side of their bounding box."""
+
+FORMAT = "hapticdb.pointshell.shell 1"
+MOST_INFLATION, INFLATED_ANYWAY = 10, 1 << 20
+"""A saved shell may unpack to so many times its size, and so many bytes on top. `save` packs
+nothing; numbers of a surface pack to two thirds."""
+
+Floats = NDArray[np.float64]
+
+
+LEAST_COMPONENT = 1e-100
+"""Of a normal: below, it is 0. PostgreSQL takes a product that underflows for an error."""
+
+
+@dataclass(frozen=True, eq=False)
+class PointShell:
+    """The tool: points on its surface and unit normals that point into it.
+
+    Shells made by `from_mesh` and `from_file` have their points along a Z-order curve, so that
+    points next to each other by index are mostly close in space; given arrays and saved shells keep
+    their order.
+
+    Parameters
+    ----------
+    points : (N, 3)
+        Metres, the tool's frame: the file's own, not re-centred.
+    normals : (N, 3)
+        Unit normals, into the tool.
+    center : (3,)
+        Centre of mass, metres, the same frame: of a solid of uniform density where the surface is
+        closed (bodies that overlap count twice where they do), of the surface where it is open.
+    is_closed : bool
+        False where the surface has open edges, so that its inside is a guess.
+    link : str
+        The file that it was made from, absolute; empty if from none.
+    seed : int
+        The seed of the points' places.
+    defects : str
+        What was wrong in that file, in words; not saved.
+    cover : float, optional
+        Covering radius, metres: no place of the tool's surface is farther from a point. None where
+        it is not known; `with_cover` finds it for shells made of a mesh.
+    surface : Surface or Ball, optional
+        What the points were spread over; not saved.
+
+    Raises
+    ------
+    UsageError
+        Arrays of another shape, not finite, or normals that are not of unit length.
+    """
+
+    points: Floats
+    normals: Floats
+    center: Floats
+    is_closed: bool = True
+    link: str = ""
+    seed: int = 0
+    defects: str = ""
+    cover: float | None = None
+    surface: Surface | Ball | None = field(default=None, repr=False)
+
+    def __post_init__(self) -> None:
+        if self.cover is not None and not (np.isfinite(self.cover) and self.cover >= 0.0):
+            raise UsageError(f"a covering radius of {self.cover} m: give 0 or more, or None")
+        for name, shape in (("points", (-1, 3)), ("normals", (-1, 3)), ("center", (3,))):
+            array = _as_floats(getattr(self, name), name)
+            if array.ndim != len(shape) or array.shape[-1] != 3:
+                raise UsageError(f"a shell's {name} have the shape {array.shape}, not {shape}")
+            if name == "normals":  # too small to turn anything, and their products to be numbers
+                array = np.where(np.abs(array) < LEAST_COMPONENT, 0.0, array)
+            array.flags.writeable = False
+            object.__setattr__(self, name, array)
+        if len(self.points) == 0 or len(self.points) != len(self.normals):
+            raise UsageError(
+                f"a shell of {len(self.points)} points and {len(self.normals)} normals: "
+                "give one normal for each of at least one point"
+            )
+        if np.any(np.abs(np.einsum("nk,nk->n", self.normals, self.normals) - 1.0) > 1e-6):
+            raise UsageError("a shell's normals are not of unit length: divide them by their norms")
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def __repr__(self) -> str:
+        size = ", ".join(f"{x:.4g}" for x in np.ptp(self.points, axis=0))
+        kind = "closed" if self.is_closed else "open"
+        return f"PointShell({len(self)} points, {size} m, {kind}, {self.link or 'from no file'})"
+
+    @classmethod
+    def from_file(
+        cls,
+        path: str | PathLike[str],
+        points: int | None = None,
+        *,
+        spacing: float | None = None,
+        unit: str | None = None,
+        seed: int = 0,
+    ) -> "PointShell":
+        """Make the shell of all parts of a mesh file together, or load one that was saved.
+
+        Parameters
+        ----------
+        path : path
+            A mesh file. From a `.npz` the shell is loaded as it was saved, and `points`, `spacing`
+            and `seed` are those of the file.
+        points : int, optional
+            Number of points, 1 to 10^7; 300 unless given. With a spacing, the most there may be;
+            200,000 unless given.
+        spacing : float, optional
+            Metres between neighbours, about: as many points as that takes, 300 at least.
+        unit : str, optional
+            Unit of a file that names none; metres otherwise.
+        seed : int
+            Seed of the points' places: equal seeds, equal points.
+
+        Raises
+        ------
+        UsageError
+            Numbers out of range, or a unit for a saved shell, which is in metres.
+        FileError
+            A file that cannot be read or holds no surface.
+        """
+        path = Path(path)
+        if path.suffix.lower() == ".npz":
+            if unit is not None:
+                raise UsageError(f"{path} is a saved shell, in metres: leave out the unit")
+            return cls.load(path)
+        _check_request(DEFAULT_POINTS if points is None else points, spacing, seed)
+        file = mesh.read_file(path, unit=unit)
+        parts = [part for part in file.parts if not part.is_cloud]
+        if not parts:
+            raise FileError(f"{path}: no triangles, only points or nothing; a tool needs a surface")
+        triangles = np.concatenate([part.triangles() for part in parts])
+        try:
+            shell = cls._from_triangles(triangles, points, spacing, seed, file.link)
+        except UsageError as error:
+            raise FileError(f"{path}: {error}") from None
+        return replace(shell, defects=file.defects.describe())
+
+    @classmethod
+    def from_mesh(
+        cls,
+        vertices: ArrayLike,
+        faces: ArrayLike,
+        points: int | None = None,
+        *,
+        spacing: float | None = None,
+        seed: int = 0,
+    ) -> "PointShell":
+        """Make the shell of a triangle mesh.
+
+        Parameters
+        ----------
+        vertices : (V, 3)
+            Metres; they define the shell's frame.
+        faces : (F, 3)
+            Vertices of each triangle, in any order and winding.
+        points, spacing, seed
+            As for `from_file`.
+
+        Raises
+        ------
+        UsageError
+            Numbers out of range, vertices not finite, faces that name no vertex, no area.
+        """
+        _check_request(DEFAULT_POINTS if points is None else points, spacing, seed)
+        corners = _as_floats(vertices, "vertices", finite=False)
+        indices = np.asarray(faces)
+        if corners.ndim != 2 or corners.shape[1] != 3:
+            raise UsageError(f"vertices have the shape {corners.shape}, not (V, 3)")
+        if indices.ndim != 2 or indices.shape[1] != 3 or indices.dtype.kind not in "iu":
+            raise UsageError(f"faces are {indices.dtype} {indices.shape}, not integers (F, 3)")
+        if indices.size and (indices.min() < 0 or indices.max() >= len(corners)):
+            raise UsageError(f"faces name vertices outside 0 .. {len(corners) - 1}")
+        return cls._from_triangles(corners[indices], points, spacing, seed, "")
+
+    @classmethod
+    def sphere(cls, radius: float, points: int = 300) -> "PointShell":
+        """Make the shell of a sphere about the origin, its points spread evenly.
+
+        Parameters
+        ----------
+        radius : float
+            Metres.
+        points : int
+            Number of points, 1 to 10^7.
+
+        Raises
+        ------
+        UsageError
+            Numbers out of range.
+        """
+        _check_request(points, None, 0)
+        if not (np.isfinite(radius) and radius > 0):
+            raise UsageError(f"a sphere of radius {radius}: give metres above 0")
+        outward = fibonacci_sphere(points)
+        outward = outward[_curve_order(outward)]
+        return cls(outward * radius, -outward, np.zeros(3), surface=Ball(float(radius)))
+
+    @classmethod
+    def _from_triangles(
+        cls, triangles: Floats, points: int | None, spacing: float | None, seed: int, link: str
+    ) -> "PointShell":
+        surface = orient(triangles)
+        n_points = DEFAULT_POINTS if points is None else points
+        if spacing is not None:
+            most = DENSE_POINTS if points is None else points
+            wanted = points_for(float(surface.areas.sum()), spacing)
+            n_points = min(max(wanted, DEFAULT_POINTS), most)
+        places, face_of = sampling.sample_surface(
+            surface.triangles, surface.areas, surface.normals, n_points, np.random.default_rng(seed)
+        )
+        order = _curve_order(places)
+        normals = surface.normals[face_of[order]]
+        return cls(
+            places[order], normals, surface.center, surface.is_closed, link, seed, surface=surface
+        )
+
+    def with_cover(self) -> "PointShell":
+        """Find the covering radius of a shell of a mesh or sphere; others are returned as they are.
+
+        It takes about as long as making the shell did.
+        """
+        if self.cover is not None or self.surface is None:
+            return self
+        if isinstance(self.surface, Ball):
+            return replace(self, cover=self.surface.covering_radius(self.points))
+        return replace(self, cover=covering_radius(self.surface.triangles, self.points))
+
+    def save(self, path: str | PathLike[str]) -> None:
+        """Write the shell to a `.npz` file of exactly that name.
+
+        Raises
+        ------
+        FileError
+            The file cannot be written.
+        """
+        try:
+            with Path(path).open("wb") as file:
+                np.savez(
+                    file,
+                    format=np.array(FORMAT),
+                    points=self.points,
+                    normals=self.normals,
+                    center=self.center,
+                    is_closed=np.array(self.is_closed),
+                    link=np.array(self.link),
+                    seed=np.array(self.seed),
+                    cover=np.array(np.nan if self.cover is None else self.cover),
+                )
+        except OSError as error:
+            raise FileError(f"{path}: cannot write the shell: {error.strerror}") from None
+
+    @classmethod
+    def load(cls, path: str | PathLike[str]) -> "PointShell":
+        """Read a shell that `save` wrote.
+
+        Raises
+        ------
+        FileError
+            The file is missing, damaged, or no saved shell.
+        """
+        try:
+            with Path(path).open("rb") as file:
+                _check_members(file, path)
+                file.seek(0)
+                saved = np.load(file, allow_pickle=False)
+                _check_format(saved, path)
+                return cls(
+                    saved["points"],
+                    saved["normals"],
+                    saved["center"],
+                    bool(saved["is_closed"]),
+                    str(saved["link"]),
+                    int(saved["seed"]),
+                    cover=_saved_cover(saved),
+                )
+        except FileNotFoundError:
+            raise FileError(f"{path}: no such file") from None
+        except FileError:
+            raise
+        except Exception as error:  # noqa: BLE001 - a foreign or damaged zip fails in any way
+            cause = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise FileError(f"{path}: not a saved shell, or damaged: {cause}") from None
+
+
+def _check_request(points: int, spacing: float | None, seed: int) -> None:
+    for number, what in ((points, "points"), (seed, "a seed")):
+        if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
+            raise UsageError(f"{what} {number!r}: give a whole number")
+    if not 1 <= points <= MAX_POINTS:
+        raise UsageError(f"{points} points: a shell has 1 to {MAX_POINTS}")
+    if seed < 0:
+        raise UsageError(f"seed {seed}: give 0 or more")
+    if spacing is not None and not (np.isfinite(spacing) and spacing > 0.0):
+        raise UsageError(f"a spacing of {spacing} m: give metres above 0")
+
+
+def _check_members(file: BinaryIO, path: str | PathLike[str]) -> None:
+    """Refuse an archive by its headers, before any of it is unpacked."""
+    n_bytes = file.seek(0, SEEK_END)
+    most = INFLATED_ANYWAY + MOST_INFLATION * n_bytes
+    with zipfile.ZipFile(file) as archive:
+        members = archive.infolist()
+        unpacked = sum(member.file_size for member in members)
+        if unpacked > most:
+            raise FileError(
+                f"{path}: no saved shell: its {n_bytes:,} bytes unpack to {unpacked:,}, more than "
+                f"{MOST_INFLATION} times as many; save the shell anew"
+            )
+        for member in members:
+            if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise FileError(f"{path}: no saved shell: packed by another method than deflate")
+            with archive.open(member) as stream:
+                promised = _promised_bytes(stream)
+            if promised > member.file_size:
+                raise FileError(
+                    f"{path}: not a saved shell, or damaged: {member.filename!a} promises "
+                    f"{promised:,} bytes and has {member.file_size:,}"
+                )
+
+
+def _promised_bytes(stream: IO[bytes]) -> int:
+    """Bytes of the array that a .npy member's header describes."""
+    version = np.lib.format.read_magic(stream)
+    if version != (1, 0):
+        raise ValueError(f"an array of version {version[0]}.{version[1]}")
+    shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
+    return math.prod(shape) * int(dtype.itemsize)
+
+
+def _check_format(saved: object, path: str | PathLike[str]) -> None:
+    if not isinstance(saved, np.lib.npyio.NpzFile) or str(saved.get("format")) != FORMAT:
+        raise FileError(f"{path}: not a saved shell, or of another version")
+
+
+def _saved_cover(saved: "np.lib.npyio.NpzFile") -> float | None:
+    """Covering radius; None where it was not known, or not saved yet by the version that did."""
+    cover = float(saved["cover"]) if "cover" in saved else np.nan
+    return None if np.isnan(cover) else cover
+
+
+def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:
+    """Copy an array as C-contiguous float64."""
+    floats = as_floats(array, name).copy()
+    if finite and not np.isfinite(floats).all():
+        raise UsageError(f"{name} hold values that are not finite")
+    return floats
+
+
+def _curve_order(points: Floats) -> NDArray[np.intp]:
+    """Indices (N,) that put points (N, 3) in order along a Z-order curve over their bounding box.
+
+    Its steps are cubes, as bricks are, whatever the box's proportions.
+    """
+    low = points.min(axis=0)
+    extent = float((points.max(axis=0) - low).max()) or 1.0
+    # Half a step short of all: a tool's planes lie at its box's ends, middle and quarters, where a
+    # border of steps would leave the order of their points to roundings.
+    steps = ((points - low) * ((2**ORDER_BITS - 0.5) / extent)).astype(np.int64)
+    return np.argsort(curves.encode(steps, ORDER_BITS, curves.Z_ORDER), kind="stable")
+
+
+def fibonacci_sphere(n_points: int) -> Floats:
+    """Points (N, 3) spread over the unit sphere along a spiral of the golden angle."""
+    heights = 1 - (2 * np.arange(n_points) + 1) / n_points
+    angles = np.pi * (1 + 5**0.5) * np.arange(n_points)
+    radii = np.sqrt(1 - heights**2)
+    return np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1)

@@ -1,0 +1,305 @@
+"""The cost model fitted to the opened database, by real scans around its own surface."""
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.query import contact, grouping
+from hapticdb.pointshell.shell import fibonacci_sphere
+from hapticdb.query.cost_model import CostModel
+from hapticdb.query.grouping import cbgroup
+from hapticdb.query.quantiles import QuantileVector
+from hapticdb.store.base import (
+    Frame,
+    Keys,
+    Store,
+    SupportsCaches,
+    SupportsStatement,
+    row_shift,
+)
+
+CAUTIONS = tuple(2.0**n for n in range(-2, 8))
+"""Tried for `CostModel.caution`."""
+TOO_MANY_ROWS = 20_000
+"""A range of more is no part of a frame."""
+
+
+class _Probe(NamedTuple):
+    """A located shell of the calibration: what `kernels.contact.locate` returned."""
+
+    frame: Frame
+    keys: Keys
+    first: Keys
+    last: Keys
+
+
+def calibrate(
+    store: Store, *, seed: int = 0, repeats: int = 5, budget: float = 0.9, cold: bool = False
+) -> CostModel:
+    """Measure what queries cost on this database, in real scans around its own surface.
+
+    Spheres of shell points of several sizes are placed on occupied voxels drawn by the quantile
+    vector, asked for in every form, and the medians of their times fitted by least squares with
+    non-negative figures.
+
+    Parameters
+    ----------
+    store : Store
+        An environment with at least one row.
+    seed : int
+        Of the drawn places.
+    repeats : int
+        Timings of each form at each place; their median counts. The first, untimed, warms up.
+    budget : float
+        Seconds after which no further place is measured (at least 12 are).
+    cold : bool
+        Empty all caches before each query: what frames cost where the hand has not been before.
+
+    Raises
+    ------
+    UsageError
+        When the environment is empty, or cold figures are asked of a server, whose caches are its
+        own.
+    """
+    size = store.size()
+    if size.rows == 0:
+        raise UsageError(f"{store.url} is empty: import a file before calibrating")
+    before: Callable[[], None] | None = None
+    if cold:
+        if not isinstance(store, SupportsCaches):
+            raise UsageError(
+                f"{store.url}: a server's caches cannot be emptied from here; leave out cold"
+            )
+        before = store.drop_caches
+    rows_per_block = size.rows / max(size.leaf_blocks, 1)
+    quantiles = QuantileVector.of(store)
+    trials = _Trials(store, quantiles, 1 if cold else repeats, before)
+    started = time.perf_counter()
+    for n, probe in enumerate(_probes(store, quantiles, seed)):
+        trials.measure(probe)
+        if n >= 11 and time.perf_counter() - started > budget:
+            break
+    return trials.fit(rows_per_block)
+
+
+class _Trials:
+    """Timings of every form at several places, and their fit."""
+
+    def __init__(
+        self,
+        store: Store,
+        quantiles: QuantileVector,
+        repeats: int,
+        before: Callable[[], None] | None,
+    ) -> None:
+        self._store = store
+        self._before = before
+        self._quantiles = quantiles
+        self._repeats = repeats
+        self._scans: list[tuple[float, ...]] = []
+        self._counts: list[tuple[float, ...]] = []
+        self._lookups: list[tuple[float, ...]] = []
+        self._singles: list[tuple[float, ...]] = []
+        self._statements: list[tuple[float, ...]] = []
+        self._keys: list[Keys] = []
+        self._under_keys = np.zeros(2)
+
+    def measure(self, probe: _Probe) -> None:
+        """Ask for one shell in every form."""
+        store = self._store
+        for gap in (0, 1 << 9, 1 << 13, 1 << 16):
+            lows, highs = grouping.group_by_gap(probe.keys, probe.first, probe.last, gap)
+            rows = len(store.scan(lows, highs))
+            if rows > TOO_MANY_ROWS:
+                continue
+            scan = self._time(lambda lo=lows, hi=highs: store.scan(lo, hi))  # type: ignore[misc]
+            count = self._time(lambda lo=lows, hi=highs: store.count(lo, hi))  # type: ignore[misc]
+            self._scans.append((1, len(lows), rows, scan))
+            self._counts.append((1, len(lows), rows, count))
+        rows = len(store.lookup(probe.keys))
+        asked = sum(self._quantiles.rows_between(key, key) for key in probe.keys.tolist())
+        self._under_keys += np.array([rows, asked])
+        self._keys.append(probe.keys)
+        lookup = self._time(lambda: store.lookup(probe.keys))
+        self._lookups.append((1, len(probe.keys), rows, lookup))
+        few = probe.keys[:: max(1, len(probe.keys) // 20)].copy()
+        self._singles.append((len(few), self._time(lambda: store.lookup_each(few))))
+        if isinstance(store, SupportsStatement):
+            self._statements.append(
+                (1, len(probe.frame.addresses), self._time(self._figure_3(probe)))
+            )
+
+    def _figure_3(self, probe: _Probe) -> Callable[[], object]:
+        store = self._store
+        assert isinstance(store, SupportsStatement)  # noqa: S101 - narrows the type for mypy
+
+        def run() -> None:
+            with self._store.snapshot():
+                store.statement(probe.frame)
+                store.statement_hits(probe.frame)
+
+        return run
+
+    def _time(self, query: Callable[[], object]) -> float:
+        """Median time of a query, microseconds, after one that warms up, or each from the disk."""
+        if self._before is None:
+            query()
+        times = []
+        for _ in range(self._repeats):
+            if self._before is not None:
+                self._before()
+            start = time.perf_counter_ns()
+            query()
+            times.append(time.perf_counter_ns() - start)
+        return statistics.median(times) / 1000
+
+    def _groupings(self) -> list[tuple[float, ...]]:
+        """Times of grouping by cost, place after place: no processor foresees a frame's keys."""
+        equal = CostModel.of_equal_parts()
+        times = np.empty((self._repeats + 1, len(self._keys)))
+        for row in times:
+            for n, keys in enumerate(self._keys):
+                start = time.perf_counter_ns()
+                cbgroup(keys, self._quantiles, equal)
+                row[n] = (time.perf_counter_ns() - start) / 1000
+        medians = np.median(times[1:], axis=0).tolist()
+        return [(1, len(keys), us) for keys, us in zip(self._keys, medians, strict=True)]
+
+    def fit(self, rows_per_block: float) -> CostModel:
+        """Least squares over all that was measured."""
+        if not self._scans:  # every range held more than a frame could wait for
+            return CostModel.of_equal_parts()
+        (statement, descent, scanned), s_scan = _least_squares(self._scans)
+        (_, _, counted), s_count = _least_squares(self._counts)
+        counted = min(counted, scanned)
+        # the client's share of a row: what scanning it costs beyond counting it in the engine
+        row = scanned - counted
+        # keys and rows of a lookup go hand in hand: what rows cost is known from the scans
+        keyed = [(*n, max(us - row * rows, us / 10)) for *n, rows, us in self._lookups]
+        (lookup, probe), s_lookup = _least_squares(keyed)
+        (single,), s_single = _least_squares(self._singles)
+        (aggregate, point), s_statement = (
+            _least_squares(self._statements) if self._statements else ((np.inf, np.inf), (0.0, 0.0))
+        )
+        (group, group_key), s_group = _least_squares(self._groupings())
+        model = CostModel(
+            statement=statement,
+            descent=descent,
+            block=counted * rows_per_block,
+            row=row,
+            rows_per_block=rows_per_block,
+            lookup=lookup,
+            probe=probe,
+            single=single,
+            aggregate=aggregate,
+            point=point,
+            presence=_ratio(*self._under_keys.tolist()),
+            group=group,
+            group_key=group_key,
+            spread={
+                "statement": s_scan[0],
+                "descent": s_scan[1],
+                "row": s_scan[2],
+                "block": s_count[2],
+                "lookup": s_lookup[0],
+                "probe": s_lookup[1],
+                "single": s_single[0],
+                "aggregate": s_statement[0],
+                "point": s_statement[1],
+                "group": s_group[0],
+                "group_key": s_group[1],
+            },
+        )
+        found = float(self._under_keys[0])
+        return _cautious(model, self._keys, self._quantiles, self._store.count, found)
+
+
+def _cautious(
+    model: CostModel,
+    frames: Sequence[Keys],
+    quantiles: QuantileVector,
+    count: Callable[[Keys, Keys], int],
+    under_keys: float,
+) -> CostModel:
+    """The model with the caution that would have cost least over some frames' keys.
+
+    count : how many rows ranges hold; under_keys : rows under the keys of all frames.
+    """
+    trials = []
+    for caution in CAUTIONS:
+        cautious = replace(model, caution=caution)
+        ranges = rows = expected = 0.0
+        for keys in frames:
+            (lows, highs), _, in_gaps = cbgroup(keys, quantiles, cautious)
+            ranges += len(lows)
+            rows += count(lows, highs)
+            expected += in_gaps
+        cost = model.descent * ranges + model.row_scanned * rows
+        # of equal costs the one that reads fewer rows
+        trials.append((cost, -caution, rows, expected))
+    _, caution, rows, expected = min(trials)
+    return replace(model, caution=-caution, crowding=_ratio(rows - under_keys, expected))
+
+
+def _ratio(found: float, expected: float) -> float:
+    """Rows found over rows expected; one where nothing can be said."""
+    return max(found, 0.0) / expected if expected > 0 else 1.0
+
+
+def _least_squares(
+    measured: Sequence[tuple[float, ...]],
+) -> tuple[tuple[float, ...], tuple[float, ...]]:
+    """Fit times (last column) to the columns before it; figures >= 0 and relative errors.
+
+    Rows are weighted by 1 / time: what counts is the relative error of a prediction.
+    """
+    from scipy.optimize import nnls  # noqa: PLC0415 - half of the package's import time
+
+    table = np.array(measured, dtype=np.float64)
+    design, times = table[:, :-1], table[:, -1]
+    weights = 1 / times
+    weighted = design * weights[:, None]
+    figures, residual = nnls(weighted, np.ones(len(times)))
+    freedom = max(len(times) - design.shape[1], 1)
+    covariance = np.linalg.pinv(weighted.T @ weighted) * residual**2 / freedom
+    errors = np.sqrt(np.diag(covariance)) / np.where(figures > 0, figures, np.inf)
+    return tuple(map(float, figures)), tuple(map(float, errors))
+
+
+def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
+    """Spheres of shell points on occupied voxels, small and large ones in turn."""
+    rng = np.random.default_rng(seed)
+    grid = store.grid
+    shift = row_shift(store.layout)
+    places = rng.choice(quantiles.bounds, size=64)
+    centers = grid.centers(grid.decode(places << shift))
+    origin = np.array(grid.origin)
+    grid_codes = (grid.bits, grid.curve_code)
+    middle = np.zeros(3)
+    middle.flags.writeable = False
+    probes = []
+    for n, surface in enumerate(centers):
+        n_points = (300, 100, 30, 600)[n % 4]
+        radius = min(grid.voxel_size * (12, 8, 4, 24)[n % 4], grid.edge / 4)
+        normals = -fibonacci_sphere(n_points)
+        points = -normals * radius
+        # one compiled signature: PointShell, too, hands its arrays out read-only
+        points.flags.writeable = normals.flags.writeable = False
+        pose = np.eye(4)
+        # a tool lies on a surface or a little in it, seldom half inside: its gaps are emptier
+        away = rng.normal(size=3)
+        pose[:3, 3] = surface + away / np.linalg.norm(away) * radius * rng.uniform(0.5, 1.0)
+        placed, asked, keys = contact.locate(
+            points, normals, middle, pose, origin, grid.voxel_size, *grid_codes, shift
+        )
+        if not len(keys):
+            continue
+        first, last = contact.spans_of_keys(asked, keys, *grid_codes, shift)
+        frame = Frame(placed, asked[0], 1000.0, np.empty(0, dtype=np.int64))
+        probes.append(_Probe(frame, keys, first, last))
+    return probes

@@ -1,0 +1,103 @@
+"""Grouping a frame's sorted keys into ranges: points, MaxGap, CBGroup (the paper, section 5)."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.grid import Grid
+from hapticdb.kernels.query import grouping as kernels
+from hapticdb.query.cost_model import CostModel
+from hapticdb.query.quantiles import QuantileVector
+from hapticdb.store.base import Keys, Layout, row_shift
+
+DEFAULT_MAXGAP = 500
+"""The paper's choice of MAXGAP, in voxel keys."""
+BOX_CUBES = 16
+"""Cubes along a box's longest edge when it is covered by key ranges."""
+
+
+class Ranges(NamedTuple):
+    """Closed ranges of row keys, ascending and disjoint: lows (G,), highs (G,) int64."""
+
+    lows: Keys
+    highs: Keys
+
+
+class Grouping(NamedTuple):
+    """Ranges of CBGroup and what the quantile vector expects in them."""
+
+    ranges: Ranges
+    rows_asked: float
+    rows_in_gaps: float
+
+
+def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
+    """Group neighbours p < q if and only if q - p <= gap, in voxel keys on both layouts.
+
+    Parameters
+    ----------
+    keys : (U,) int64
+        Distinct row keys, ascending.
+    first, last : (U,) int64
+        Lowest and highest voxel key asked for under each row key.
+    gap : int
+        MAXGAP; 0 is the point query sequence.
+    """
+    if gap < 0:
+        raise UsageError(f"MAXGAP {gap}: give 0 or more")
+    # a key has at most 63 bits, and so has every gap between two
+    return Ranges(*kernels.group_by_gap(keys, first, last, min(int(gap), 2**63 - 1)))
+
+
+def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping:
+    """Close a gap if and only if scanning it costs no more than another descent of the index.
+
+    The gap between keys p < q covers p+1 .. q-1. Costs of neighbouring gaps add, so deciding each
+    by itself gives the least cost over all groupings.
+    """
+    lows, highs = np.empty_like(keys), np.empty_like(keys)
+    count, asked, scanned = kernels.group_by_cost(
+        keys,
+        quantiles.bounds,
+        quantiles.rows_per_bucket,
+        costs.row_in_gap,
+        costs.descent,
+        lows,
+        highs,
+    )
+    return Grouping(Ranges(lows[:count], highs[:count]), asked, scanned)
+
+
+def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostModel) -> Ranges:
+    """CBGroup over closed spans of row keys (U,), ascending and disjoint, such as cells'.
+
+    The gap between two spans is closed on the same condition as between two keys.
+    """
+    lows, highs = lows.copy(), highs.copy()
+    count = kernels.group_spans_by_cost(
+        lows, highs, quantiles.bounds, quantiles.rows_per_bucket, costs.row_in_gap, costs.descent
+    )
+    return Ranges(lows[:count].copy(), highs[:count].copy())
+
+
+def object_ranges(grid: Grid, layout: Layout, bounds: NDArray[np.float64]) -> Ranges:
+    """Ranges of row keys that hold an object of those bounds (2, 3), a voxel wider on each side."""
+    low, high = grid.voxels_of(bounds)
+    return box_ranges(grid, layout, low - 1, high + 1)
+
+
+def box_ranges(
+    grid: Grid, layout: Layout, low: NDArray[np.int64], high: NDArray[np.int64]
+) -> Ranges:
+    """Ranges of row keys that cover the voxels low .. high (3,) each; cut to the grid."""
+    low = np.clip(low, 0, grid.side - 1)
+    high = np.clip(high, 0, grid.side - 1)
+    longest = int((high - low).max()) + 1
+    finest = max((longest // BOX_CUBES).bit_length(), 3)
+    found = kernels.ranges_of_box(low, high, grid.bits, grid.curve_code, min(finest, grid.bits))
+    found = (found >> row_shift(layout))[np.argsort(found[:, 0])]
+    starts = np.flatnonzero(np.append(True, found[1:, 0] > found[:-1, 1] + 1))
+    ends = np.append(starts[1:], len(found)) - 1
+    return Ranges(found[starts, 0].copy(), found[ends, 1].copy())

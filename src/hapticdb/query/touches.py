@@ -1,0 +1,146 @@
+"""What a tool felt: at one pose, and at many."""
+
+from collections.abc import Iterable, Mapping
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.query.frame import Answer, Query
+from hapticdb.store.base import Object
+
+CONTACT: np.dtype[np.void] = np.dtype([("pose", "<i8"), ("point", "<i8"), ("depth", "<f8")])
+"""A contact of many poses: number of the pose, index of the shell's point, metres."""
+
+
+class Touch:
+    """What a tool felt in one frame.
+
+    Attributes
+    ----------
+    force : (3,) float64
+        N, world frame, on the tool.
+    torque : (3,) float64
+        N m about the tool's centre of mass, world frame.
+    hits : (H,) int64
+        Indices of the shell's points inside a voxel, ascending.
+    depths : (H,) float64
+        Metres below each hit's tangent plane; 0 above it.
+    query : Query
+        How the database was asked.
+    """
+
+    __slots__ = ("_answer", "_known", "depths", "force", "hits", "query", "torque")
+
+    def __init__(self, answer: Answer, known: Mapping[int, Object]) -> None:
+        self._answer = answer
+        self._known = known
+        self.force: NDArray[np.float64] = answer.wrench[:3]
+        self.torque: NDArray[np.float64] = answer.wrench[3:]
+        self.hits: NDArray[np.int64] = answer.hits
+        self.depths: NDArray[np.float64] = answer.depths
+        self.query: Query = answer.query
+
+    @property
+    def contacts(self) -> NDArray[np.int64]:
+        """Indices (C,) of the shell's points whose depth is above 0, ascending."""
+        return self.hits[self.depths > 0]
+
+    @property
+    def objects(self) -> list[Object]:
+        """Objects of all hits, ordered by id."""
+        return [self._known[i] for i in self._answer.ids]
+
+    @property
+    def pairs(self) -> NDArray[np.int64]:
+        """Every hit with every object in its voxel, (P, 2): index of the point, id."""
+        return self._answer.pairs()
+
+    def __repr__(self) -> str:
+        x, y, z = self.force
+        return (
+            f"Touch(force=({x:.4g}, {y:.4g}, {z:.4g}) N, {len(self.hits)} hits, "
+            f"{len(self.contacts)} contacts, objects {self._answer.ids})"
+        )
+
+
+class Touches:
+    """What a tool felt at n poses, all of them at one committed revision.
+
+    Attributes
+    ----------
+    forces : (n, 3) float64
+        N, world frame, on the tool.
+    torques : (n, 3) float64
+        N m about the tool's centre of mass, world frame.
+    hits, n_contacts : (n,) int64
+        How many of the shell's points are inside a voxel, and how many of those are below their
+        tangent plane.
+    deepest : (n,) float64
+        Metres of the deepest contact, 0 without any.
+    ids : list of lists of int
+        Ids of the objects that each pose's hits are in, ascending.
+    contacts : (C,) array of `CONTACT`, or None
+        Every contact: ``pose``, ``point``, ``depth``, ordered by the first two; where asked for.
+    query : Query
+        How the database was asked, all statements together.
+    """
+
+    def __init__(self, n_poses: int, *, has_contacts: bool) -> None:
+        self.forces: NDArray[np.float64] = np.zeros((n_poses, 3))
+        self.torques: NDArray[np.float64] = np.zeros((n_poses, 3))
+        self.hits: NDArray[np.int64] = np.zeros(n_poses, dtype=np.int64)
+        self.n_contacts: NDArray[np.int64] = np.zeros(n_poses, dtype=np.int64)
+        self.deepest: NDArray[np.float64] = np.zeros(n_poses)
+        self.ids: list[list[int]] = []
+        self.contacts: NDArray[np.void] | None = np.empty(0, CONTACT) if has_contacts else None
+        self.query = Query("array", 0, 0, 0, 0.0)
+        self._known: Mapping[int, Object] = {}
+
+    def __len__(self) -> int:
+        return len(self.forces)
+
+    def __repr__(self) -> str:
+        return (
+            f"Touches({len(self)} poses, {np.count_nonzero(self.hits)} hit, "
+            f"{np.count_nonzero(self.n_contacts)} in contact, {len(self.objects)} objects)"
+        )
+
+    @property
+    def objects(self) -> list[Object]:
+        """Objects of all hits at all poses, ordered by id."""
+        return [self._known[i] for i in sorted({i for ids in self.ids for i in ids})]
+
+    def gather(self, answers: Iterable[Answer]) -> Self:
+        """Take the answers of all poses, in their order."""
+        pieces = [np.empty(0, CONTACT)]
+        total = self.query
+        for n, answer in enumerate(answers):
+            self.forces[n], self.torques[n] = answer.wrench[:3], answer.wrench[3:]
+            is_contact = answer.depths > 0
+            self.hits[n], self.n_contacts[n] = len(answer.hits), np.count_nonzero(is_contact)
+            self.deepest[n] = answer.depths.max(initial=0.0)
+            self.ids.append(answer.ids)
+            asked = answer.query
+            total = Query(
+                asked.strategy,
+                total.statements + asked.statements,
+                total.ranges + asked.ranges,
+                total.rows + asked.rows,
+                0.0,
+            )
+            if self.contacts is not None:
+                piece = np.empty(self.n_contacts[n], CONTACT)
+                piece["pose"], piece["point"] = n, answer.hits[is_contact]
+                piece["depth"] = answer.depths[is_contact]
+                pieces.append(piece)
+        if self.contacts is not None:
+            self.contacts = np.concatenate(pieces)
+        self.query = total
+        return self
+
+    def name(self, known: Mapping[int, Object], elapsed_us: float) -> Self:
+        """Take the objects of the revision that was seen, and how long all of it took."""
+        self._known = known
+        self.query = self.query._replace(elapsed_us=elapsed_us)
+        return self

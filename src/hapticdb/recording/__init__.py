@@ -1,0 +1,1 @@
+"""Sessions on file: frames laid out, packed, written, read and replayed."""

@@ -1,0 +1,198 @@
+"""What stands at the head of a recording: everything that a replay needs beside the database."""
+
+import datetime as dt
+import io
+import json
+import math
+import os
+import struct
+import zlib
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, field
+from importlib.metadata import version
+from operator import index
+from typing import Any, Self
+
+import numpy as np
+
+from hapticdb.errors import FileError, UsageError
+from hapticdb.grid import Grid
+from hapticdb.pointshell.shell import MAX_POINTS, PointShell
+from hapticdb.query.frame import as_ids
+from hapticdb.query.law import TangentPlane
+from hapticdb.store.connect import redact
+
+MAGIC = b"HDBREC\r\n"
+FORMAT_VERSION = 1
+PREAMBLE = struct.Struct("<8sIIII")
+MOST_TEXT = 1 << 24
+"""Bytes of JSON that a header may have."""
+
+Value = str | int | float | bool | None | list[Any] | dict[str, Any]
+
+
+def _now() -> str:
+    return dt.datetime.now(dt.UTC).isoformat(timespec="milliseconds")
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """What was felt, and how.
+
+    Attributes
+    ----------
+    environment : str
+        Its URL; a password is left out.
+    grid : Grid
+        Of the environment.
+    revision : int
+        Of the environment when the session began.
+    shell : PointShell
+        The tool.
+    law : TangentPlane
+        The force law.
+    rate : float
+        Frames a second that were asked for.
+    exclude : iterable of int
+        Ids of objects that were not felt.
+    coupling : mapping
+        Parameters of the virtual coupling by their names, of what JSON holds.
+    version : str
+        Of hapticdb.
+    started : str
+        When the session began: ISO 8601, UTC. Frames count their time from here.
+
+    Raises
+    ------
+    UsageError
+        When the rate is no positive number or the parameters are not of JSON.
+    """
+
+    environment: str
+    grid: Grid
+    revision: int
+    shell: PointShell
+    rate: float
+    law: TangentPlane = field(default_factory=TangentPlane)
+    exclude: Iterable[int] = ()
+    coupling: Mapping[str, Value] = field(default_factory=dict)
+    version: str = field(default_factory=lambda: version("hapticdb"))
+    started: str = field(default_factory=_now)
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.rate) and self.rate > 0):
+            raise UsageError(f"rate {self.rate}: give frames a second, above 0")
+        try:
+            coupling = json.loads(json.dumps(dict(self.coupling), allow_nan=False))
+        except (TypeError, ValueError, RecursionError):
+            raise UsageError(
+                "parameters of the coupling are finite numbers and words, by their names"
+            ) from None
+        object.__setattr__(self, "coupling", coupling)
+        object.__setattr__(self, "environment", redact(str(self.environment)))
+        object.__setattr__(self, "exclude", tuple(as_ids(self.exclude).tolist()))
+        object.__setattr__(self, "revision", int(self.revision))
+        object.__setattr__(self, "rate", float(self.rate))
+
+    def differing(self, other: "Header") -> list[str]:
+        """Names of what is not the same in another header, when and at which revision aside."""
+        names = [
+            name
+            for name in ("environment", "grid", "law", "rate", "exclude", "coupling")
+            if getattr(self, name) != getattr(other, name)
+        ]
+        return names if _arrays(self.shell) == _arrays(other.shell) else [*names, "shell"]
+
+    def packed(self) -> bytes:
+        """The header's bytes.
+
+        Raises
+        ------
+        UsageError
+            When its text is longer than a header may have.
+        """
+        shell = self.shell
+        text = json.dumps(
+            {
+                "environment": self.environment,
+                "grid": asdict(self.grid),
+                "revision": self.revision,
+                "shell": {"is_closed": shell.is_closed, "link": shell.link, "seed": shell.seed},
+                "stiffness": self.law.stiffness,
+                "rate": self.rate,
+                "exclude": self.exclude,
+                "coupling": self.coupling,
+                "version": self.version,
+                "started": self.started,
+            }
+        ).encode("ascii")
+        if len(text) > MOST_TEXT:
+            raise UsageError(f"a recording's header of {len(text)} bytes: exclude fewer objects")
+        body = text + _arrays(self.shell)
+        counts = PREAMBLE.pack(MAGIC, FORMAT_VERSION, len(text), len(shell), 0)[:-4]
+        return counts + struct.pack("<I", zlib.crc32(body, zlib.crc32(counts))) + body
+
+    @classmethod
+    def read(cls, file: io.RawIOBase, where: str) -> tuple[Self, int]:
+        """Header of an opened recording, and where its chunks begin.
+
+        Raises
+        ------
+        FileError
+            When it is no recording, a newer one, or cut off or damaged within its header.
+        """
+        size = file.seek(0, os.SEEK_END)
+        file.seek(0)
+        preamble = file.read(PREAMBLE.size) or b""
+        if preamble[: len(MAGIC)] != MAGIC[: len(preamble)]:
+            raise FileError(f"{where} is no recording of hapticdb")
+        if len(preamble) < PREAMBLE.size:
+            raise FileError(f"{where}: cut off in its header, nothing was recorded; delete it")
+        _, number, n_text, n_points, crc = PREAMBLE.unpack(preamble)
+        if number > FORMAT_VERSION:
+            raise FileError(f"{where}: format {number}, and this hapticdb reads {FORMAT_VERSION}")
+        n_bytes = n_text + 48 * n_points + 24
+        if n_text <= MOST_TEXT and n_points <= MAX_POINTS and PREAMBLE.size + n_bytes > size:
+            raise FileError(f"{where}: cut off in its header, nothing was recorded; delete it")
+        if n_text <= MOST_TEXT and n_points <= MAX_POINTS:
+            body = file.read(n_bytes) or b""
+            if zlib.crc32(body, zlib.crc32(preamble[:-4])) == crc:
+                return cls._parse(body, n_text, n_points, where), PREAMBLE.size + n_bytes
+        raise FileError(f"{where}: its header is damaged; nothing of it can be read")
+
+    @classmethod
+    def _parse(cls, body: bytes, n_text: int, n_points: int, where: str) -> Self:
+        points, normals, center = np.split(
+            np.frombuffer(body[n_text:], dtype="<f8").reshape(-1, 3), [n_points, 2 * n_points]
+        )
+        try:
+            told = json.loads(body[:n_text])
+            grid = told["grid"]
+            made = told["shell"]
+            return cls(
+                environment=told["environment"],
+                grid=Grid(grid["voxel_size"], grid["origin"], index(grid["bits"]), grid["curve"]),
+                revision=told["revision"],
+                shell=PointShell(
+                    points,
+                    normals,
+                    center[0],
+                    bool(made["is_closed"]),
+                    str(made["link"]),
+                    index(made["seed"]),
+                ),
+                rate=told["rate"],
+                law=TangentPlane(told["stiffness"]),
+                exclude=told["exclude"],
+                coupling=told["coupling"],
+                version=str(told["version"]),
+                started=str(told["started"]),
+            )
+        except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
+            raise FileError(f"{where}: its header cannot be used: {error}") from error
+
+
+def _arrays(shell: PointShell) -> bytes:
+    """Points, normals and centre, as they stand in the file."""
+    arrays = (shell.points, shell.normals, shell.center)
+    return b"".join(array.astype("<f8").tobytes() for array in arrays)

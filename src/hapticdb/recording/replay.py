@@ -1,0 +1,223 @@
+"""A recorded session felt again: the same wrenches bit for bit, or the frame at which they part."""
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.environment import Environment
+from hapticdb.errors import GridError
+from hapticdb.kernels.motion import poses_of
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import TangentPlane
+from hapticdb.recording.file import Recording
+from hapticdb.recording.frame import Frames, State
+
+Floats = NDArray[np.float64]
+Feel = Callable[[Floats], tuple[Floats, NDArray[np.int64]]]
+"""Poses (M, 4, 4) world_from_tool -> contact wrenches (M, 6), N and N m, and hits (M,)."""
+
+
+class Parting(NamedTuple):
+    """The first frame that is felt otherwise than it was recorded.
+
+    frame : its index; time : s since the session's start; recorded, present : wrenches (6,), N and
+    N m; hits_recorded, hits_present : shell points inside a voxel; revision_recorded,
+    revision_present : of the database, then and now.
+    """
+
+    frame: int
+    time: float
+    recorded: Floats
+    present: Floats
+    hits_recorded: int
+    hits_present: int
+    revision_recorded: int
+    revision_present: int
+
+    def describe(self) -> str:
+        """One line for people."""
+        then, now = (", ".join(f"{x:.6g}" for x in w) for w in (self.recorded, self.present))
+        return (
+            f"parts at frame {self.frame} ({self.time:.3f} s): {self.hits_recorded} hits and "
+            f"({then}) N, N m at revision {self.revision_recorded}, {self.hits_present} and "
+            f"({now}) at revision {self.revision_present}"
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Replayed:
+    """What a replay found.
+
+    Attributes
+    ----------
+    n_compared : int
+        Frames whose wrench was computed again.
+    n_skipped : int
+        Frames that had unknown points or held their wrench: nothing to compare.
+    n_differing : int
+        Frames compared whose wrench or number of hits is not the same.
+    parting : Parting or None
+        The first of them.
+    revision : int
+        Of the database at the end.
+    is_same_revision : bool
+        Whether all frames were recorded at the database's present revision.
+    """
+
+    n_compared: int
+    n_skipped: int
+    n_differing: int
+    parting: Parting | None
+    revision: int
+    is_same_revision: bool
+
+    @property
+    def is_equal(self) -> bool:
+        """Whether frames were compared and none differs."""
+        return self.n_compared > 0 and self.parting is None
+
+    def describe(self) -> str:
+        """One line for people."""
+        skipped = f"{self.n_skipped} skipped (unknown or held)"
+        if self.parting is not None:
+            return (
+                f"{self.parting.describe()}; {self.n_differing} of {self.n_compared} frames "
+                f"differ, {skipped}"
+            )
+        if not self.n_compared:
+            return f"nothing to compare: {skipped}"
+        at = "the same revision" if self.is_same_revision else "another revision, now"
+        return f"equal: {self.n_compared} frames at {at} {self.revision}, {skipped}"
+
+
+def touching(
+    environment: Environment, shell: PointShell, law: TangentPlane, exclude: Iterable[int] = ()
+) -> Feel:
+    """Feel by one touch of the database a pose: right, and slow.
+
+    Excluded objects that are gone are left out: nobody feels them.
+    """
+    present = {obj.id for obj in environment.objects()}
+    excluded = [i for i in exclude if i in present]
+
+    def feel(poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
+        wrenches = np.empty((len(poses), 6))
+        n_hits = np.empty(len(poses), dtype=np.int64)
+        for n, pose in enumerate(poses):
+            touch = environment.touch(shell, pose, "array", exclude=excluded, law=law)
+            wrenches[n, :3] = touch.force
+            wrenches[n, 3:] = touch.torque
+            n_hits[n] = len(touch.hits)
+        return wrenches, n_hits
+
+    return feel
+
+
+def replay(
+    recording: Recording,
+    environment: Environment,
+    feel: Feel | None = None,
+    *,
+    until_damage: bool = False,
+    progress: Callable[[int], None] | None = None,
+) -> Replayed:
+    """Compute the contact wrench of every recorded frame again, at the recorded pose of the tool.
+
+    Parameters
+    ----------
+    recording : Recording
+        The session.
+    environment : Environment
+        Where it was recorded, at whatever revision it is now.
+    feel : callable or None
+        Computes wrenches and hits; asks the database frame by frame unless given. It stands for
+        the recording's shell, law and excluded objects.
+    until_damage : bool
+        Compare the frames before a damaged chunk, and end there.
+    progress : callable or None
+        Called after each chunk with the number of frames done.
+
+    Raises
+    ------
+    GridError
+        When the environment has another grid than the recording.
+    FileError
+        When a chunk of the recording is damaged, unless `until_damage`.
+    """
+    header = recording.header
+    if header.grid != environment.grid:
+        raise GridError(
+            f"{recording.path} was recorded on {header.grid.describe()}, and {environment.url} "
+            f"has {environment.grid.describe()}: give the environment of {header.environment}"
+        )
+    feel = feel or touching(environment, header.shell, header.law, header.exclude)
+    comparison = _Comparison(environment, feel)
+    for frames in recording.frames(until_damage=until_damage):
+        comparison.add(frames)
+        if progress is not None:
+            progress(comparison.n_done)
+    return comparison.result()
+
+
+class _Comparison:
+    """Frames as they were recorded against frames as they are felt now."""
+
+    def __init__(self, environment: Environment, feel: Feel) -> None:
+        self._environment = environment
+        self._feel = feel
+        self._n_compared = self._n_differing = self.n_done = 0
+        self._parting: Parting | None = None
+        self._revisions: set[int] = set()
+
+    def add(self, frames: Frames) -> None:
+        """Compare the next frames."""
+        self._revisions.update(np.unique(frames["revision"]).tolist())
+        is_known = (frames["unknown"] == 0) & (frames["state"] & State.HELD == 0)
+        (indices,) = np.nonzero(is_known)
+        if len(indices):
+            known = frames[indices]
+            poses = np.empty((len(known), 4, 4))
+            poses_of(np.ascontiguousarray(known["tool"]), poses)
+            wrenches, n_hits = self._feel(poses)
+            recorded = np.ascontiguousarray(known["wrench"]).view(np.uint64)
+            present = np.ascontiguousarray(wrenches, dtype=np.float64).view(np.uint64)
+            differs = (recorded != present).any(axis=1) | (known["hits"] != n_hits)
+            if differs.any() and self._parting is None:
+                self._part(known, indices, wrenches, n_hits, int(np.argmax(differs)))
+            self._n_differing += int(differs.sum())
+        self._n_compared += len(indices)
+        self.n_done += len(frames)
+
+    def result(self) -> Replayed:
+        """What was found in all frames."""
+        revision = self._environment.store.revision()
+        return Replayed(
+            n_compared=self._n_compared,
+            n_skipped=self.n_done - self._n_compared,
+            n_differing=self._n_differing,
+            parting=self._parting,
+            revision=revision,
+            is_same_revision=self._revisions <= {revision},
+        )
+
+    def _part(
+        self,
+        known: Frames,
+        indices: NDArray[np.intp],
+        wrenches: Floats,
+        n_hits: NDArray[np.int64],
+        at: int,
+    ) -> None:
+        self._parting = Parting(
+            frame=self.n_done + int(indices[at]),
+            time=float(known["time"][at]),
+            recorded=known["wrench"][at].copy(),
+            present=np.array(wrenches[at]),
+            hits_recorded=int(known["hits"][at]),
+            hits_present=int(n_hits[at]),
+            revision_recorded=int(known["revision"][at]),
+            revision_present=self._environment.store.revision(),
+        )

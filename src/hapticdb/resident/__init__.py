@@ -1,0 +1,1 @@
+"""Cells of an environment in memory, and frames that read nothing else."""

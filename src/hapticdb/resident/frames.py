@@ -1,0 +1,209 @@
+"""Frames against resident cells in this process: exact, for paths, replays and benchmarks."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident.cells import (
+    CONTACTS,
+    DEEPEST,
+    GROUP,
+    HITS,
+    MOST_MISSED,
+    RESULTS,
+    UNKNOWN,
+    UNKNOWNS,
+    WRENCH,
+    Clusters,
+    bounding_spheres,
+    feel_kernel,
+)
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.poses import as_floats
+from hapticdb.query.law import TangentPlane
+from hapticdb.resident.residency import Residency
+
+RUN = 64
+"""Points of a cluster."""
+FLAT_RUN = 512
+"""Points that are placed at once without clusters: as many as a processor's first cache holds."""
+LEAST_FOUND = 1 << 16
+SMALL = 16.0
+"""Voxels of a run's radius up to which its surroundings are taken for those of its points."""
+
+Floats = NDArray[np.float64]
+
+
+class Felt(NamedTuple):
+    """What a shell felt at M poses.
+
+    wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
+    int64: points in a voxel, below their tangent plane, in a cell that is not resident; deepest
+    (M,): metres, of the deepest contact.
+    """
+
+    wrenches: Floats
+    hits: NDArray[np.int64]
+    contacts: NDArray[np.int64]
+    unknown: NDArray[np.int64]
+    deepest: Floats
+
+
+def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
+    """Shell as frames take it: points with normals, and spheres around runs of neighbours.
+
+    Parameters
+    ----------
+    shell : PointShell
+        In any order; clusters skip most where neighbours by index are neighbours in space, as in
+        shells made from files.
+    voxel_size : float
+        Metres; spheres are a thousandth of it larger, above all rounding.
+    run : int or None
+        Points of a cluster, 0 for no clusters; 64 unless given.
+    """
+    if run is None:
+        run = RUN if len(shell) > RUN else 0
+    points = np.hstack([shell.points, shell.normals])
+    spheres = np.empty((-(-len(points) // run) if run else 0, 4))
+    groups = np.empty((-(-len(spheres) // GROUP), 4))
+    if run:
+        bounding_spheres(points, run, 1e-3 * voxel_size, spheres)
+        bounding_spheres(points, GROUP * run, 1e-3 * voxel_size, groups)
+    run = run or min(len(points), FLAT_RUN)
+    columns = np.ascontiguousarray(shell.points.T)
+    scratch = np.empty((6, run))
+    return Clusters(points, np.array(shell.center), spheres, groups, run, columns, scratch)
+
+
+class Surroundings(NamedTuple):
+    """Places that stand for a shell's points where cells are looked for.
+
+    places (P, 3+): the points, or the middles of small runs of them and the points of the others;
+    reach : voxels around a place within which its points are; run : points of a run; first (C,)
+    int64: the first place of each run.
+    """
+
+    places: Floats
+    reach: float
+    run: int
+    first: NDArray[np.int64]
+
+    def place_of(self, point: int) -> int:
+        """Index of the place that stands for a point."""
+        run, within = divmod(point, self.run)
+        first = int(self.first[run])
+        end = int(self.first[run + 1]) if run + 1 < len(self.first) else len(self.places)
+        return min(first + within, end - 1)
+
+
+def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
+    """Places for runs of points, one for a run with a radius of `SMALL` voxels or less."""
+    n_points = len(clusters.points)
+    starts = np.arange(0, n_points, clusters.run)
+    radii = clusters.spheres[:, 3] / voxel_size
+    is_small = radii <= SMALL
+    if not is_small.any():
+        return Surroundings(clusters.points, 0.0, clusters.run, starts)
+    counts = np.where(is_small, 1, np.minimum(starts + clusters.run, n_points) - starts)
+    first = np.cumsum(counts) - counts
+    places = np.empty((int(counts.sum()), 3))
+    places[first[is_small]] = clusters.spheres[is_small, :3]
+    is_point = np.ones(len(places), dtype=bool)
+    is_point[first[is_small]] = False
+    places[is_point] = clusters.points[np.repeat(~is_small, clusters.run)[:n_points], :3]
+    return Surroundings(places, float(radii[is_small].max()), clusters.run, first)
+
+
+class Frames:
+    """Frames of one shell that wait for their cells: exact, whatever the database takes.
+
+    Parameters
+    ----------
+    residency : Residency
+        Of the environment; this is its table's only reader or one of several.
+    shell : PointShell
+        The tool.
+    law : TangentPlane or None
+        1000 N/m unless given.
+    run : int or None
+        As `clusters_of` takes it.
+    """
+
+    def __init__(
+        self,
+        residency: Residency,
+        shell: PointShell,
+        law: TangentPlane | None = None,
+        *,
+        run: int | None = None,
+    ) -> None:
+        self.residency = residency
+        self.shell = shell
+        self.stiffness = (law or TangentPlane()).stiffness
+        self.clusters = clusters_of(shell, residency.grid.voxel_size, run)
+        self.met = np.empty(len(shell), dtype=np.int64)
+        self.surroundings = surroundings_of(self.clusters, residency.grid.voxel_size)
+        self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        self._row = residency.table.join()
+
+    def close(self) -> None:
+        """Be the table's reader no more."""
+        self.residency.table.leave(self._row)
+
+    def feel(self, poses: ArrayLike) -> Felt:
+        """Wrenches at poses (M, 4, 4) `world_from_tool`, every cell that they need fetched before.
+
+        Raises
+        ------
+        UsageError
+            When a pose is not rigid.
+        """
+        matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
+        out = np.zeros((len(matrices), RESULTS))
+        done = 0
+        while done < len(matrices):
+            n_poses = self._fetch(matrices[done:])
+            self._run(matrices, out, done, n_poses)
+            done += n_poses
+        return Felt(
+            out[:, WRENCH : WRENCH + 6],
+            out[:, HITS].astype(np.int64),
+            out[:, CONTACTS].astype(np.int64),
+            out[:, UNKNOWNS].astype(np.int64),
+            out[:, DEEPEST],
+        )
+
+    def wrenches(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
+        """Wrenches (M, 6) and numbers of hits (M,) at poses, as a replay asks for them."""
+        felt = self.feel(poses)
+        return felt.wrenches, felt.hits
+
+    def _fetch(self, poses: Floats) -> int:
+        """Make all cells of the first poses resident; returns how many poses that are."""
+        residency = self.residency
+        most = (residency.table.n_slots - 1) // 2
+        around = self.surroundings
+        # where the surroundings of the first pose do not fit, its points alone may
+        for places, reach in ((around.places, around.reach), (self.clusters.points, 0.0)):
+            room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
+            found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
+            n_poses, count = kernels.cells_met(places, reach, poses, residency.place, found, most)
+            if count <= most:
+                break
+        cells = found[found >= 0]
+        residency.bring(cells)
+        return int(n_poses)
+
+    def _run(self, poses: Floats, out: Floats, start: int, n_poses: int) -> None:
+        """Frames at poses start .. start + n_poses, whose cells are resident."""
+        part = slice(start, start + n_poses)
+        done = feel_kernel(
+            self.residency.table.cells, self._row, self.clusters, poses[part],
+            self.residency.place, self.stiffness, self.met, self.missed, out[part],
+        )  # fmt: skip
+        if done < n_poses:
+            raise UsageError(f"pose {start + done} is no rigid transform: give a rotation")

@@ -1,0 +1,1 @@
+"""SQLite's engine: one file, its log, its checksums, its copies."""

@@ -1,0 +1,206 @@
+"""Whole copies of SQLite environments, made while others write, and put in place safely.
+
+The backup API copies pages, and begins anew whenever another connection has written between two of
+its steps: for ever, where somebody always writes. Here its source is inside one read transaction
+from the first page to the last, whose pages no writer changes in WAL mode; the log grows meanwhile.
+VACUUM INTO, the other way, orders all rows anew in one statement that tells no progress.
+"""
+
+import contextlib
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import apsw
+
+from hapticdb.errors import (
+    BusyError,
+    DamagedError,
+    DatabaseError,
+    EnvironmentExistsError,
+    NotAnEnvironmentError,
+    ReadOnlyError,
+    UsageError,
+)
+from hapticdb.store.schema import SQLITE_APPLICATION_ID
+from hapticdb.store.sqlite import file as sqlite_file
+from hapticdb.store.sqlite import log as sqlite_log
+from hapticdb.store.sqlite import pages as sqlite_pages
+from hapticdb.store.sqlite import raw as sqlite_bytes
+from hapticdb.store.sqlite.file import named_errors
+
+STEP_PAGES = 512
+"""Copied between two reports of progress: 4 MiB."""
+SOURCE_CACHE_KIB = 4096
+"""Each page is read once."""
+
+
+class BackupProgress(NamedTuple):
+    """How far a copy is: sent after each step."""
+
+    bytes_done: int
+    bytes_total: int
+
+
+class BackupReport(NamedTuple):
+    """What a backup or restore has copied.
+
+    revision : of the environment in the copy; objects : how many it holds; bytes : of its file.
+    """
+
+    source: str
+    target: str
+    revision: int
+    objects: int
+    bytes: int
+
+
+ProgressCallback = Callable[[BackupProgress], object]
+
+
+def back_up(
+    source: Path, target: Path, *, replace: bool, progress: ProgressCallback | None
+) -> BackupReport:
+    """Copy an environment as of one moment into a file, which appears whole or not at all."""
+    real = target.resolve()
+    _check_target(source, real, replace=replace)
+    with sqlite_file.unfinished_beside(real) as unfinished:
+        revision, objects = _copied(source, unfinished, progress)
+        if replace and real.exists():
+            shutil.copymode(real, unfinished)
+        _sync(unfinished)
+        if replace:
+            _put_in_place(unfinished, real)
+        else:
+            sqlite_file.publish(unfinished, real)
+        sqlite_bytes.sync_folder(real)
+    return BackupReport(str(source), str(target), revision, objects, real.stat().st_size)
+
+
+def _check_target(source: Path, target: Path, *, replace: bool) -> None:
+    """Refuse a place that a copy cannot be put into, before anything is copied."""
+    if target == source.resolve():
+        raise UsageError(f"{source} cannot be copied onto itself: give another path")
+    if not replace and target.exists():
+        raise EnvironmentExistsError(
+            f"{target} exists already: give another path, or --replace to have the new copy there"
+        )
+    if not replace:
+        sqlite_file.check_free(target)
+    elif target.exists():
+        first = b""
+        if target.is_file():
+            try:
+                first = sqlite_bytes.read_bytes(target, sqlite_pages.PAGE_BYTES)
+            except OSError as error:
+                raise ReadOnlyError(f"{target} cannot be read: {error.strerror}") from error
+        is_ours = int.from_bytes(first[68:72], "big") == SQLITE_APPLICATION_ID
+        if not (is_ours or sqlite_pages.is_marked(first)):
+            raise NotAnEnvironmentError(
+                f"{target} is no hapticdb environment, so it is not replaced; give another path"
+            )
+        if not os.access(target, os.W_OK):
+            raise ReadOnlyError(f"{target} may not be written, so it is not replaced")
+        with _alone(target):
+            pass
+    sqlite_file.check_folder(target)
+
+
+def _copied(source: Path, unfinished: Path, progress: ProgressCallback | None) -> tuple[int, int]:
+    """Copy all pages as of one moment; returns the revision and the number of objects."""
+    connection, file = sqlite_file.open_file(source, read_only=True)
+    with contextlib.closing(file), named_errors(str(source)):
+        connection.execute(f"PRAGMA cache_size = -{SOURCE_CACHE_KIB}")
+        connection.execute("BEGIN")
+        ((revision, objects),) = connection.execute(
+            "SELECT (SELECT coalesce(max(revision), 0) FROM change), (SELECT count(*) FROM object)"
+        ).fetchall()
+        layer = sqlite_file.layer_of(source)
+        with named_errors(str(unfinished)):
+            made = apsw.Connection(str(unfinished), vfs=layer)
+            with contextlib.closing(made):
+                _copy_pages(connection, made, progress, is_checked=layer is not None)
+                _finish(made)
+        if Path(f"{unfinished}-wal").exists():
+            raise DatabaseError(f"{unfinished}-wal could not be folded into the copy: try again")
+        file.look()  # what was copied is what the path leads to
+        if file.stamp is not None:
+            file.check_stamp()
+    return int(str(revision)), int(str(objects))
+
+
+def _copy_pages(
+    source: apsw.Connection,
+    made: apsw.Connection,
+    progress: ProgressCallback | None,
+    *,
+    is_checked: bool,
+) -> None:
+    made.execute(f"PRAGMA page_size = {sqlite_pages.PAGE_BYTES}")
+    if is_checked:
+        made.reserve_bytes(reserve=sqlite_pages.TAIL_BYTES)
+    made.execute("PRAGMA journal_mode = OFF").fetchall()
+    made.execute("PRAGMA synchronous = OFF")  # nobody knows the file yet; it is synced as a whole
+    with made.backup("main", source, "main") as copying:
+        while not copying.done:
+            copying.step(STEP_PAGES)
+            if progress is not None:
+                done = copying.page_count - copying.remaining
+                total = copying.page_count * sqlite_pages.PAGE_BYTES
+                progress(BackupProgress(done * sqlite_pages.PAGE_BYTES, total))
+
+
+def _finish(made: apsw.Connection) -> None:
+    """Bring a copy up to date, and draw a mark for it: no log may follow it but its own."""
+    ((version,),) = made.execute("PRAGMA user_version").fetchall()
+    sqlite_file.migrate(made, sqlite_file.tables_version(int(str(version))))
+    made.execute("UPDATE environment SET lineage = ?", (sqlite_log.first_lineage(),))
+    if made.vfsname("main") != sqlite_pages.LAYER:  # no page has told whether it is whole
+        found = made.execute("PRAGMA quick_check(1)").fetchall()
+        if found != [("ok",)]:
+            raise DamagedError(
+                f"what was to be copied is damaged ({found[0][0]}): restore an older copy, "
+                "or import the files again"
+            )
+    made.wal_checkpoint(mode=apsw.SQLITE_CHECKPOINT_TRUNCATE)
+
+
+def _sync(path: Path) -> None:
+    """Have a file on disk that no connection has open."""
+    with path.open("rb") as file:
+        os.fsync(file.fileno())
+
+
+@contextlib.contextmanager
+def _alone(path: Path) -> Iterator[None]:
+    """Hold off all others from a database that is there; refuse when one has it open.
+
+    Whoever has read from a database in WAL mode holds a lock on it until he closes it. Readers of
+    a folder that they cannot write hold none; they notice by the file's time.
+    """
+    with contextlib.ExitStack() as held:
+        if path.exists():
+            flags = apsw.SQLITE_OPEN_MAIN_DB | apsw.SQLITE_OPEN_READWRITE
+            file = held.enter_context(sqlite_bytes.opened_bytes(path, flags))
+            try:
+                file.xLock(apsw.SQLITE_LOCK_SHARED)
+                file.xLock(apsw.SQLITE_LOCK_EXCLUSIVE)
+            except apsw.BusyError as error:
+                raise BusyError(
+                    f"{path} is open: end all that has it open, then run the same command again"
+                ) from error
+        yield
+
+
+def _put_in_place(unfinished: Path, path: Path) -> None:
+    """Replace a database, and remove what belonged to the former one.
+
+    Cut off in between, the former log lies beside the new file, whose mark it does not know: that
+    is refused in one line, and the same command finishes.
+    """
+    with _alone(path):
+        unfinished.replace(path)
+        for suffix in ("-wal", "-shm"):
+            Path(f"{path}{suffix}").unlink(missing_ok=True)

@@ -1,0 +1,331 @@
+"""Opening and creating SQLite files: what is told apart, and how an engine's error is named."""
+
+import contextlib
+import glob
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import cast
+
+import apsw
+
+from hapticdb.errors import (
+    BusyError,
+    DamagedError,
+    DatabaseError,
+    EnvironmentExistsError,
+    EnvironmentNotFoundError,
+    NewerVersionError,
+    NotAnEnvironmentError,
+    ReadOnlyError,
+)
+from hapticdb.store.schema import (
+    CHECKED_VERSION,
+    FORMAT_VERSION,
+    MIGRATIONS,
+    SQLITE_APPLICATION_ID,
+)
+from hapticdb.store.sqlite import pages as sqlite_pages
+from hapticdb.store.sqlite import raw as sqlite_bytes
+from hapticdb.store.sqlite.place import OpenedFile
+
+BUSY_TIMEOUT_MS = 10_000
+CACHE_KIB = 256 * 1024
+"""Page cache of one connection: the bricks of a large car; memory is taken as it is filled."""
+HEADER_BYTES = 100
+MAGIC = b"SQLite format 3\0"
+
+
+@contextlib.contextmanager
+def named_errors(path: str) -> Iterator[None]:
+    """Turn the engine's errors into ours: what, where, what next."""
+    try:
+        yield
+    except (apsw.CorruptError, apsw.NotADBError, apsw.FormatError) as error:
+        raise damaged(path, str(error)) from error
+    except (apsw.ReadOnlyError, apsw.PermissionsError) as error:
+        raise ReadOnlyError(
+            f"{path} can only be read: 'hapticdb backup {path} COPY' makes one to write to "
+            f"({error})"
+        ) from error
+    except (apsw.BusyError, apsw.LockedError) as error:
+        raise BusyError(f"{path} is being written by another process: try again later") from error
+    except apsw.FullError as error:
+        raise DatabaseError(f"{path}: the disk is full; what was committed is safe") from error
+    except apsw.IOError as error:
+        raise DatabaseError(f"{path}: the disk does not answer ({error})") from error
+    except (apsw.ConnectionClosedError, apsw.CursorClosedError) as error:
+        raise DatabaseError(f"{path} has been closed: open it again") from error
+    except apsw.CantOpenError as error:
+        raise DatabaseError(f"{path} cannot be opened: check its folder's rights") from error
+    except (apsw.SQLError, apsw.MismatchError, apsw.ConstraintError) as error:
+        # our statements fit our tables: these are others
+        raise damaged(path, str(error)) from error
+
+
+def damaged(path: str, cause: str) -> DamagedError:
+    """Build the error for an environment whose contents are broken."""
+    return sqlite_pages.damaged_page(path, cause)
+
+
+def check_kind(path: Path) -> None:
+    """Tell an environment from a missing file, a folder, a file of another kind, a cut one.
+
+    Looks at the header's first 100 bytes (https://sqlite.org/fileformat2.html, section 1.3):
+    before the engine opens it, so that a foreign file is never touched.
+    """
+    try:
+        is_there = path.exists()
+    except OSError as error:
+        raise DatabaseError(f"{path} cannot be reached: {error.strerror}") from error
+    if not is_there:
+        raise EnvironmentNotFoundError(
+            f"no environment at {path}; make one with 'hapticdb import {path} FILE'"
+        )
+    if not path.is_file():
+        raise NotAnEnvironmentError(f"{path} is not a file, so it is no environment")
+    try:
+        first = sqlite_bytes.read_bytes(path, sqlite_pages.PAGE_BYTES)
+    except OSError as error:
+        raise DatabaseError(f"{path} cannot be read: {error.strerror}") from error
+    header = first[:HEADER_BYTES]
+    foreign: DatabaseError = _foreign(path)
+    if sqlite_pages.is_marked(first):
+        foreign = damaged(str(path), "its header is not what was written")
+    if not header:
+        raise NotAnEnvironmentError(f"{path} is empty; remove it, or give another path")
+    if header[:16] != MAGIC[: len(header[:16])]:
+        raise foreign
+    if len(header) < HEADER_BYTES:
+        raise damaged(str(path), "its header is cut off")
+    if int.from_bytes(header[68:72], "big") != SQLITE_APPLICATION_ID:
+        raise foreign
+    _check_known(path, int.from_bytes(header[60:64], "big"))
+    wal = Path(f"{path.resolve()}-wal")
+    if wal.exists() and wal.stat().st_size:
+        return  # the size may be older than the log: the engine decides
+    page = int.from_bytes(header[16:18], "big")
+    expected = int.from_bytes(header[28:32], "big") * (65536 if page == 1 else page)
+    if path.stat().st_size < expected:
+        raise damaged(str(path), f"{path.stat().st_size} bytes of {expected}")
+
+
+def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFile]:
+    """Open an existing environment; migrate it when it is older and may be written."""
+    check_kind(path)
+    file = OpenedFile(path)
+    is_immutable = read_only and needs_immutable(path)
+    has_log = os.path.exists(f"{path.resolve()}-wal")  # noqa: PTH110 - before the engine makes one
+    with named_errors(str(path)):
+        connection = _connect_to_read(path) if read_only else _connect_to_write(path)
+        try:
+            version = _version(connection, path)
+            connection.execute("SELECT id FROM environment").fetchall()  # a page of every log
+            file.settle(connection, is_immutable=is_immutable)
+            _bring_up_to_date(connection, path, version, read_only=read_only)
+        except BaseException as error:
+            connection.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
+            connection.close()
+            if isinstance(error, DamagedError) and "-wal" in str(error) and not has_log:
+                raise BusyError(
+                    f"{path}-wal was removed while another has {path} open: end all that has it "
+                    "open, which puts what was committed into the file, then open it again"
+                ) from error
+            raise
+    return connection, file
+
+
+def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
+    """Make an environment of the newest format; `fill` writes what belongs into it from the start.
+
+    The file appears at its path whole or not at all: it is made under another name beside it.
+    """
+    check_free(path)
+    check_folder(path)
+    with unfinished_beside(path) as unfinished:
+        made = apsw.Connection(str(unfinished), vfs=sqlite_pages.LAYER)
+        with named_errors(str(path)), contextlib.closing(made) as new:
+            new.execute(f"PRAGMA page_size = {sqlite_pages.PAGE_BYTES}")
+            new.reserve_bytes(reserve=sqlite_pages.TAIL_BYTES)
+            new.execute("PRAGMA journal_mode = OFF").fetchall()
+            new.execute(f"PRAGMA user_version = {CHECKED_VERSION}")
+            migrate(new, 0)
+            fill(new)
+            new.execute("PRAGMA journal_mode = WAL").fetchall()
+        publish(unfinished, path)
+
+
+def check_free(path: Path) -> None:
+    """Refuse a path where a file is, or the log of one that is gone."""
+    if path.exists():
+        raise EnvironmentExistsError(f"{path} exists already; open it, or give another path")
+    log = Path(f"{path}-wal")
+    if log.exists() and log.stat().st_size:
+        raise EnvironmentExistsError(
+            f"{log} was left by a {path.name} that is gone: put that file back, or remove "
+            f"{log.name} and {path.name}-shm"
+        )
+
+
+def check_folder(path: Path) -> None:
+    """Refuse a path whose folder is missing, or takes no file."""
+    if not path.parent.is_dir():
+        raise EnvironmentNotFoundError(f"folder {path.parent} does not exist; make it first")
+    if not os.access(path.parent, os.W_OK):
+        raise ReadOnlyError(f"folder {path.parent} cannot be written to; give another path")
+
+
+@contextlib.contextmanager
+def unfinished_beside(path: Path) -> Iterator[Path]:
+    """Name for a file that will have that path when it is whole; removed when it has not."""
+    _sweep_unfinished(path)
+    unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
+    try:
+        yield unfinished
+    finally:
+        for suffix in ("", "-wal", "-shm", "-journal"):
+            Path(f"{unfinished}{suffix}").unlink(missing_ok=True)
+
+
+def publish(unfinished: Path, path: Path) -> None:
+    """Give a finished file its path, unless another has taken it."""
+    try:
+        os.link(unfinished, path)  # unlike a renaming, it never replaces another's file
+    except FileExistsError as error:
+        raise EnvironmentExistsError(f"{path} exists already; open it") from error
+    except OSError:
+        unfinished.rename(path)  # a file system without hard links
+
+
+def remove_file(path: Path) -> None:
+    """Delete a database and what the engine keeps beside it."""
+    for suffix in ("", "-wal", "-shm"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
+
+
+def _sweep_unfinished(path: Path) -> None:
+    """Remove what a process that was killed while making this file left behind."""
+    for left in path.parent.glob(f".{glob.escape(path.name)}.*.new*"):
+        pid = left.name.split(".")[-2]
+        if pid.isdigit() and not Path(f"/proc/{pid}").exists():
+            left.unlink(missing_ok=True)
+
+
+def migrate(connection: apsw.Connection, version: int) -> None:
+    """Run the migrations after `version`, each in one transaction with the number it leads to."""
+    for number, migration in enumerate(MIGRATIONS[version:], start=version + 1):
+        connection.execute("BEGIN IMMEDIATE")
+        try:
+            marked, done = divmod(_pragma(connection, "user_version"), CHECKED_VERSION)
+            if done < number:  # another process may have been faster
+                for statement in migration.sqlite:
+                    connection.execute(statement)
+                connection.execute(f"PRAGMA application_id = {SQLITE_APPLICATION_ID}")
+                connection.execute(f"PRAGMA user_version = {marked * CHECKED_VERSION + number}")
+            connection.execute("COMMIT")
+        except BaseException:
+            connection.execute("ROLLBACK")
+            raise
+
+
+def needs_immutable(path: Path) -> bool:
+    """Whether only an immutable opening can read this file: nobody here can write its folder.
+
+    A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, and no log is
+    there whose pages would be missed, SQLite can still read the file alone.
+    """
+    real = path.resolve()
+    return not os.access(real.parent, os.W_OK) and not any(
+        Path(f"{real}{suffix}").exists() for suffix in ("-wal", "-shm")
+    )
+
+
+def _connect_to_read(path: Path) -> apsw.Connection:
+    options = "?immutable=1" if needs_immutable(path) else "?mode=ro"
+    connection = apsw.Connection(
+        path.resolve().as_uri() + options,
+        flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI | apsw.SQLITE_OPEN_NOMUTEX,
+        vfs=layer_of(path),
+    )
+    _settle(connection)
+    return connection
+
+
+def _connect_to_write(path: Path) -> apsw.Connection:
+    if not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
+        raise ReadOnlyError(
+            f"{path} can only be read: 'hapticdb backup {path} COPY' makes one to write to"
+        )
+    flags = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_NOMUTEX
+    connection = apsw.Connection(str(path), flags=flags, vfs=layer_of(path))
+    _settle(connection)
+    return connection
+
+
+def is_checked(path: Path) -> bool:
+    """Whether the pages of a file carry checksums."""
+    return sqlite_pages.is_checked(sqlite_bytes.read_bytes(path, sqlite_pages.PAGE_BYTES))
+
+
+def layer_of(path: Path) -> str | None:
+    """Name of the file system layer through which a file is to be opened."""
+    return sqlite_pages.LAYER if is_checked(path) else None
+
+
+def _pragma(connection: apsw.Connection, name: str) -> int:
+    return int(cast("int", connection.execute(f"PRAGMA {name}").fetchall()[0][0]))
+
+
+def _settle(connection: apsw.Connection) -> None:
+    connection.set_busy_timeout(BUSY_TIMEOUT_MS)
+    connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
+    # in WAL mode NORMAL survives the death of the process; only a power cut can lose the last
+    # commits, and leaves the database valid even then
+    connection.execute("PRAGMA synchronous = NORMAL")
+    # a blob is never taken for text, nor a string in double quotes for a literal
+    connection.config(apsw.SQLITE_DBCONFIG_DQS_DML, 0)
+    connection.config(apsw.SQLITE_DBCONFIG_DQS_DDL, 0)
+
+
+def _version(connection: apsw.Connection, path: Path) -> int:
+    """Version of a file's tables; refuses what is no environment, or newer."""
+    found = _pragma(connection, "user_version")
+    if _pragma(connection, "application_id") != SQLITE_APPLICATION_ID:
+        raise _foreign(path)
+    version = _check_known(path, found)
+    if version < 1:
+        raise damaged(str(path), f"format {version}")
+    return version
+
+
+def _bring_up_to_date(
+    connection: apsw.Connection, path: Path, version: int, *, read_only: bool
+) -> None:
+    """Run the migrations that an older file lacks; a reader does without some of them."""
+    if not read_only:
+        migrate(connection, version)
+    elif any(migration.readers_need_it for migration in MIGRATIONS[version:]):
+        raise ReadOnlyError(
+            f"{path} has the older format {version}: open it once to write, "
+            "and it is brought up to date"
+        )
+
+
+def tables_version(found: int) -> int:
+    """Version of a file's tables, from its user version."""
+    return found - CHECKED_VERSION if found >= CHECKED_VERSION else found
+
+
+def _check_known(path: Path, found: int) -> int:
+    """Version of a file's tables, from its user version; refuses one that is newer."""
+    version = tables_version(found)
+    if version > FORMAT_VERSION:
+        raise NewerVersionError(
+            f"{path} has format {version}, newer than the {FORMAT_VERSION} known here: "
+            "install a newer hapticdb"
+        )
+    return version
+
+
+def _foreign(path: Path) -> NotAnEnvironmentError:
+    return NotAnEnvironmentError(f"{path} is no hapticdb environment; give another path")

@@ -1,0 +1,117 @@
+"""The paper's Figure 3 on SQLite: the frame's wrench by one statement and an aggregate of ours.
+
+The PointShell is bound as parallel arrays in the order of its points: ordinal and key through
+``carray`` (its rowid and its value), point and normal through a pointer that `force` indexes by the
+ordinal. On bricks the key is an address: the brick's key, and nine bits that name the voxel in it.
+"""
+
+from typing import Any, cast
+
+import apsw
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import Grid
+from hapticdb.kernels.query import contact
+from hapticdb.store import believed
+from hapticdb.store.base import BRICK_BYTES, Frame, Layout, row_shift
+
+WRENCH = {
+    "voxel": """
+SELECT force(?1, shell.rowid, shell.value)
+  FROM carray(?2) AS shell
+ WHERE EXISTS (SELECT 1 FROM voxel
+                WHERE z_val = shell.value)""",
+    "brick": """
+SELECT force(?1, shell.rowid, shell.value)
+  FROM carray(?2) AS shell
+ WHERE EXISTS (SELECT 1 FROM brick
+                WHERE z_val = shell.value >> 9
+                  AND get_bit(occupancy, shell.value & 511))""",
+}
+HITS = {
+    "voxel": """
+SELECT shell.rowid, id
+  FROM carray(?1) AS shell CROSS JOIN voxel
+ WHERE z_val = shell.value""",
+    "brick": """
+SELECT shell.rowid, id
+  FROM carray(?1) AS shell CROSS JOIN brick
+ WHERE z_val = shell.value >> 9
+   AND get_bit(occupancy, shell.value & 511)""",
+}
+KEY_TEST = {"voxel": "z_val = shell.value", "brick": "z_val = shell.value >> 9"}
+
+
+def wrench_statement(layout: Layout, frame: Frame) -> tuple[str, tuple[Any, ...]]:
+    """Text and bindings of the statement that returns the wrench."""
+    bindings = (apsw.pyobject(frame), apsw.carray(frame.addresses))
+    return _without_excluded(WRENCH[layout], layout, bindings, frame)
+
+
+def hits_statement(layout: Layout, frame: Frame) -> tuple[str, tuple[Any, ...]]:
+    """Text and bindings of the statement that returns ordinal and object id of each hit."""
+    return _without_excluded(HITS[layout], layout, (apsw.carray(frame.addresses),), frame)
+
+
+def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
+    """Give a connection the functions that the statements call."""
+
+    def force() -> _Force:
+        return _Force(grid, layout)
+
+    def get_bit(occupancy: bytes, bit: int) -> int:
+        if not isinstance(occupancy, bytes) or len(occupancy) != BRICK_BYTES:
+            raise believed.damaged(connection.filename, "a brick of the wrong length")
+        return occupancy[bit >> 3] >> (bit & 7) & 1  # as PostgreSQL's function of that name
+
+    connection.create_aggregate_function("force", cast("Any", force), 3)
+    connection.create_scalar_function("get_bit", cast("Any", get_bit), 2, deterministic=True)
+
+
+class _Force:
+    """The user-defined aggregate ``force(shell, ordinal, key)``.
+
+    A step only collects; the wrench is summed at the end, in the order of the ordinals. (An ORDER
+    BY inside the call would say the same in SQL, but SQLite drops a bound pointer when it sorts.)
+    """
+
+    def __init__(self, grid: Grid, layout: Layout) -> None:
+        self._grid = grid
+        self._layout = layout
+        self._frame: Frame | None = None
+        self._hits: list[tuple[int, int]] = []
+
+    def step(self, frame: Frame, ordinal: int, address: int) -> None:
+        """Collect one hit; ordinals count from 1 here, as rowids do."""
+        self._frame = frame
+        self._hits.append((ordinal - 1, address))
+
+    def final(self) -> bytes:
+        """Wrench of all hits: six doubles."""
+        if self._frame is None:
+            return bytes(48)
+        hits = np.array(sorted(self._hits), dtype=np.int64)
+        wrench: NDArray[np.float64] = contact.wrench_of_addresses(
+            self._frame.placed,
+            hits[:, 0].copy(),
+            hits[:, 1].copy(),
+            np.array(self._grid.origin),
+            self._grid.voxel_size,
+            self._grid.bits,
+            self._grid.curve_code,
+            row_shift(self._layout),
+            self._frame.stiffness,
+        )
+        return wrench.tobytes()
+
+
+def _without_excluded(
+    sql: str, layout: Layout, bindings: tuple[Any, ...], frame: Frame
+) -> tuple[str, tuple[Any, ...]]:
+    """Leave objects out of a statement: one more condition on the row's id."""
+    if not frame.exclude.size:
+        return sql, bindings
+    test = KEY_TEST[layout]
+    condition = f"{test} AND id NOT IN carray(?{len(bindings) + 1})"
+    return sql.replace(test, condition), (*bindings, apsw.carray(frame.exclude))

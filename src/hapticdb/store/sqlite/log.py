@@ -1,0 +1,239 @@
+"""Whether a write-ahead log belongs to the file that it lies beside.
+
+Nothing in a log of SQLite's names its file: whatever ``-wal`` lies there is applied, also to an old
+copy that was put in the file's place. So the row of the table `environment` has a lineage: a random
+mark that each commit of ours draws anew, and the mark of the commit before. The row sits on page 2,
+so each commit of ours has that page in its log.
+
+A log begins with the file as the last whole checkpoint left it, and a checkpoint copies pages of
+committed frames only. So the mark in the file is the one before the log's first, or one of the
+log's own, at whatever moment a process or the machine died; any other file's mark is neither.
+
+Layouts: https://sqlite.org/fileformat2.html, sections 1.5, 1.6, 2.1 and 4.
+"""
+
+import contextlib
+import os
+import struct
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticdb.errors import DamagedError
+from hapticdb.store.sqlite import pages as sqlite_pages
+from hapticdb.store.sqlite import raw as sqlite_bytes
+from hapticdb.store.sqlite.pages import FRAME_BYTES, FRAME_HEADER, LOG_HEADER, PAGE_BYTES
+
+MARK_BYTES = 16
+NO_MARK = bytes(MARK_BYTES)
+"""Of a file from before format 2, and what the first mark of a file names as the one before."""
+LINEAGE_COLUMN = 8
+"""Place of `lineage` in the table `environment`."""
+LINEAGE_PAGE = 2
+"""Root of that table, which is made first, and its only page."""
+LINEAGE_AT = (LINEAGE_PAGE - 1) * PAGE_BYTES
+RENEW_LINEAGE = """
+UPDATE environment SET lineage = CAST(randomblob(16) || substr(lineage, 1, 16) AS BLOB)"""
+"""Belongs into every transaction that writes."""
+
+LEAF_OF_TABLE = 13
+BLOB_TYPE = 12
+"""Serial type of an empty blob; two more for each byte."""
+NUMBER_BYTES = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)
+"""Of the serial types below 10."""
+
+LOG_MAGIC = 0x377F0682
+"""With 1 added where checksums are of big-endian words."""
+SUMS = struct.Struct(">2I")
+ATTEMPTS = 10
+PAUSE_SECONDS = 0.02
+"""Between attempts: a writer may be at work, and file and log are not read at one moment."""
+
+
+class Lineage(NamedTuple):
+    """Mark of the last commit that a page has seen, and of the one before it."""
+
+    mark: bytes
+    previous: bytes
+
+
+def first_lineage() -> bytes:
+    """What the row of a new file holds: a mark that no log knows."""
+    return os.urandom(MARK_BYTES) + NO_MARK
+
+
+def check_log(path: Path, log_path: Path | None = None) -> bytes | None:
+    """Refuse a log beside a database that was written for another file; returns the file's mark.
+
+    None without a mark that can be read: page 2 may be half written where power was lost, and the
+    log holds it whole then. `log_path` is where a log is read whose own name is gone.
+
+    Raises
+    ------
+    DamagedError
+        When the log has commits, and the file is none that they can be applied to.
+    """
+    for attempt in range(ATTEMPTS):
+        if attempt:
+            time.sleep(PAUSE_SECONDS)
+        try:
+            with contextlib.closing(_Log.at(log_path or Path(f"{path}-wal"))) as log:
+                mark = file_mark(path)  # before the log's frames: it may be the newest of them
+                if mark is None or log.follows(mark):
+                    return mark
+        except OSError:
+            return None  # the engine says better what cannot be read
+    raise not_its_log(path)
+
+
+def not_its_log(path: Path) -> DamagedError:
+    """Build the error for a log that was written for another file."""
+    name = path.name
+    return DamagedError(
+        f"{path} is not the file that {name}-wal and {name}-shm were written for (was a copy put "
+        f"in its place?): put that file back, or run 'hapticdb restore COPY {path}'; to open this "
+        "one as it is, remove both"
+    )
+
+
+def file_mark(path: Path) -> bytes | None:
+    """Mark in the database file itself, whatever its log says; None where it cannot be told."""
+    return mark_in(sqlite_bytes.read_bytes(path, PAGE_BYTES, LINEAGE_AT))
+
+
+def mark_in(page: bytes) -> bytes | None:
+    """Mark on page 2 of a database."""
+    found = lineage_in(page)
+    return found.mark if found else None
+
+
+def lineage_in(page: bytes) -> Lineage | None:
+    """Lineage on the page of the table `environment`; None when it is no such page, or broken."""
+    try:
+        if page[0] != LEAF_OF_TABLE or int.from_bytes(page[3:5], "big") != 1:
+            return None
+        length, at = _varint(page, int.from_bytes(page[8:10], "big"))
+        _, at = _varint(page, at)
+        record = page[at : at + length]
+        head, at = _varint(record, 0)
+        kinds = []
+        while at < head:
+            kind, at = _varint(record, at)
+            kinds.append(kind)
+        if len(kinds) < LINEAGE_COLUMN:
+            return None
+        if len(kinds) == LINEAGE_COLUMN or kinds[LINEAGE_COLUMN] == 0:
+            return Lineage(NO_MARK, NO_MARK)  # the column is not there yet
+        if kinds[LINEAGE_COLUMN] != BLOB_TYPE + 2 * 2 * MARK_BYTES:
+            return None
+        at = head + sum(_bytes_of(kind) for kind in kinds[:LINEAGE_COLUMN])
+        lineage = record[at : at + 2 * MARK_BYTES]
+    except IndexError:
+        return None
+    if len(lineage) < 2 * MARK_BYTES:
+        return None
+    return Lineage(lineage[:MARK_BYTES], lineage[MARK_BYTES:])
+
+
+def _varint(page: bytes, at: int) -> tuple[int, int]:
+    """Integer of variable length, and where the next thing begins."""
+    value = 0
+    for n in range(9):
+        byte = page[at + n]
+        if n == 8:
+            return value << 8 | byte, at + 9
+        value = value << 7 | byte & 127
+        if byte < 128:
+            return value, at + n + 1
+    raise IndexError
+
+
+def _bytes_of(kind: int) -> int:
+    """Length of a value of that serial type."""
+    return NUMBER_BYTES[kind] if kind < BLOB_TYPE else (kind - BLOB_TYPE) // 2
+
+
+class _Log:
+    """A log, read as far as its frames carry the salts of its header."""
+
+    def __init__(self, descriptor: int | None) -> None:
+        self._descriptor = descriptor
+        header = self._read(LOG_HEADER, 0)
+        if len(header) < LOG_HEADER:
+            header = bytes(LOG_HEADER)
+        magic, _, self._page = struct.unpack_from(">3I", header)
+        self._order = ">u4" if magic & 1 else "<u4"
+        self._salts = header[16:24]
+        self._sums = SUMS.unpack_from(header, 24)
+        self._is_void = magic & ~1 != LOG_MAGIC or self._sums != _header_sums(header, self._order)
+
+    @classmethod
+    def at(cls, path: Path) -> "_Log":
+        """The log at a path; a void one when there is none."""
+        try:
+            return cls(os.open(path, os.O_RDONLY | os.O_CLOEXEC))
+        except FileNotFoundError:
+            return cls(None)
+
+    def close(self) -> None:
+        """Give the descriptor back: nobody takes locks on a log."""
+        if self._descriptor is not None:
+            os.close(self._descriptor)
+
+    def _read(self, amount: int, at: int) -> bytes:
+        return b"" if self._descriptor is None else os.pread(self._descriptor, amount, at)
+
+    def follows(self, mark: bytes) -> bool:
+        """Whether this log can be applied to a file with that mark; true of one without commits."""
+        if self._is_void:
+            return True
+        if self._page != PAGE_BYTES:  # of no file of ours
+            return False
+        is_marked = False
+        for number, _, at in self._frames():
+            # one that is not committed cannot have its mark in any file, so no checksum is needed
+            if number == LINEAGE_PAGE and (lineage := self._lineage(at)):
+                if mark in lineage:
+                    return True
+                is_marked = True
+        return not (is_marked and self._has_commit_of_ours())
+
+    def _frames(self) -> Iterator[tuple[int, int, int]]:
+        """Page number, pages after a commit or 0, and place of each frame."""
+        at = LOG_HEADER
+        while True:
+            head = self._read(FRAME_HEADER, at)
+            if len(head) < FRAME_HEADER or head[8:16] != self._salts:
+                return
+            yield *SUMS.unpack_from(head), at
+            at += FRAME_BYTES
+
+    def _lineage(self, at: int) -> Lineage | None:
+        return lineage_in(self._read(PAGE_BYTES, at + FRAME_HEADER))
+
+    def _has_commit_of_ours(self) -> bool:
+        """Whether the engine would apply any page 2 of this log: by its checksums."""
+        sums, is_ours = self._sums, False
+        for number, pages, at in self._frames():
+            frame = self._read(FRAME_BYTES, at)
+            if len(frame) < FRAME_BYTES:
+                return False
+            sums = sqlite_pages.log_checksum(np.frombuffer(frame, self._order), *sums)
+            if sums != SUMS.unpack_from(frame, 16):
+                return False
+            is_ours = is_ours or (number == LINEAGE_PAGE and self._lineage(at) is not None)
+            if is_ours and pages:
+                return True
+        return False
+
+
+def _header_sums(header: bytes, order: str) -> tuple[int, int]:
+    """Checksum of a log's header."""
+    s1 = s2 = 0
+    for word, other in np.frombuffer(header[:24], order).reshape(3, 2).tolist():
+        s1 = (s1 + word + s2) & 0xFFFFFFFF
+        s2 = (s2 + other + s1) & 0xFFFFFFFF
+    return s1, s2

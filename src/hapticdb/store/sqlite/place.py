@@ -1,0 +1,183 @@
+"""The files that an open database consists of, and whether its path still leads to them.
+
+In WAL mode the engine does not look: it goes on writing into files that were deleted or replaced,
+and reports every commit as done.
+"""
+
+import contextlib
+import os
+import time
+from pathlib import Path
+
+import apsw
+
+from hapticdb.errors import BusyError, ConnectionLostError, DamagedError
+from hapticdb.store.sqlite import log as sqlite_log
+from hapticdb.store.sqlite import raw as sqlite_bytes
+from hapticdb.store.sqlite.pages import PAGE_BYTES
+
+LOOK_SECONDS = 0.25
+"""How long it may go unnoticed by a reader that a path leads to another file than before."""
+
+Identity = tuple[int, int]
+"""Device and inode."""
+Stamp = tuple[int, int, bool]
+"""Time of the last write, size, and whether a log is there."""
+
+
+class OpenedFile:
+    """The file that a path led to when it was opened; its engine keeps reading that one.
+
+    Raises
+    ------
+    ConnectionLostError
+        When it cannot be reached.
+    DamagedError
+        When the log beside it belongs to another file.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._real = path.resolve()
+        """Beside which the engine keeps its log, when the path is a link."""
+        self._log = f"{self._real}-wal"
+        self._due = 0.0
+        self._connection: apsw.Connection | None = None
+        self._beside: dict[str, Identity] = {}
+        self.stamp: Stamp | None = None
+        self.identity = self._found()
+        self._mark = sqlite_log.check_log(self._real)
+
+    def settle(self, connection: apsw.Connection, *, is_immutable: bool) -> None:
+        """Note what the engine keeps beside the file, once it has read from it.
+
+        Raises
+        ------
+        ConnectionLostError
+            When the path leads to another file by now.
+        """
+        self._connection = connection
+        if is_immutable:
+            self.stamp = _stamp(self._path)
+        else:
+            for beside in (self._log, f"{self._real}-shm"):
+                found = _identity(beside)
+                if found:
+                    self._beside[beside] = found
+        self.look()
+
+    def check(self) -> None:
+        """Look now and then: a reader that asks all the time pays for a clock."""
+        if time.monotonic() >= self._due:
+            self.look()
+
+    def look(self, *, has_committed: bool = False) -> None:
+        """Refuse to go on when the path leads elsewhere, or to other contents.
+
+        Raises
+        ------
+        ConnectionLostError
+            When the file, or what the engine keeps beside it, was moved, deleted or replaced.
+        DamagedError
+            When another file was copied over it.
+        """
+        lost = "what was written last is not in it; open it again"
+        if self._found() != self.identity:
+            what = lost if has_committed else "open it again"
+            raise ConnectionLostError(f"{self._path} is another file than before: {what}")
+        for beside, identity in self._beside.items():
+            if _identity(beside) != identity:
+                what = "what was written last may be lost; " if has_committed else ""
+                raise ConnectionLostError(
+                    f"{beside} was removed or replaced while {self._path.name} was open: {what}"
+                    f"end all that has {self._path.name} open, then open it again"
+                )
+        self._check_mark()
+        self._due = time.monotonic() + LOOK_SECONDS
+
+    def check_stamp(self) -> None:
+        """Refuse to answer once somebody else has written: an immutable opening takes no locks.
+
+        Raises
+        ------
+        BusyError
+            When that is so.
+        """
+        if self.has_new_stamp():
+            raise BusyError(f"{self._path} has been written since it was opened: open it again")
+
+    def has_new_stamp(self) -> bool:
+        """Whether somebody has written or removed a file that was opened as immutable."""
+        return _stamp(self._path) != self.stamp
+
+    def close(self) -> None:
+        """Close the connection; the last one's log goes into the file that it belongs to."""
+        if self._connection is None:
+            return
+        if not self._may_fold():
+            self._connection.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
+        self._connection.close()
+        self._connection = None
+
+    def __del__(self) -> None:
+        """Close, too, where nobody has: else the engine would, into whatever file there is."""
+        with contextlib.suppress(Exception):
+            self.close()
+
+    def _may_fold(self) -> bool:
+        """Whether the engine may write its log into the file when the connection closes."""
+        try:
+            self.look()
+        except DamagedError:
+            return False
+        except ConnectionLostError:
+            return self._owns_its_log()
+        return True
+
+    def _owns_its_log(self) -> bool:
+        """Whether only names beside the file are gone, and the log can still go into it."""
+        descriptor = sqlite_bytes.descriptor_of(self._beside.get(self._log, (0, 0)))
+        if _identity(str(self._path)) != self.identity or descriptor is None:
+            return False
+        try:
+            sqlite_log.check_log(self._real, sqlite_bytes.DESCRIPTORS / str(descriptor))
+        except DamagedError:
+            return False
+        return True
+
+    def _check_mark(self) -> None:
+        if self._connection is None or self.stamp is not None:
+            return
+        # in halves, which are not compared with the page's checksum: another may be writing it
+        half, at = PAGE_BYTES // 2, sqlite_log.LINEAGE_AT
+        first, second = (self._connection.read("main", 0, at + n * half, half)[1] for n in (0, 1))
+        if (mark := sqlite_log.mark_in(first + second)) != self._mark:
+            mark = sqlite_log.check_log(self._real)
+            if mark is None:  # it was there before, and a checkpoint keeps it
+                raise sqlite_log.not_its_log(self._real)
+            self._mark = mark
+
+    def _found(self) -> Identity:
+        try:
+            status = self._path.stat()
+        except OSError as error:
+            raise ConnectionLostError(
+                f"{self._path} cannot be reached any more ({error.strerror}): put it back"
+            ) from error
+        return status.st_dev, status.st_ino
+
+
+def _identity(path: str) -> Identity | None:
+    try:
+        status = os.stat(path)  # noqa: PTH116 - a tenth of making a Path, twice for each write
+    except OSError:
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _stamp(path: Path) -> Stamp:
+    try:
+        status = path.stat()
+    except FileNotFoundError:
+        return 0, 0, False
+    return status.st_mtime_ns, status.st_size, Path(f"{path}-wal").exists()

@@ -1,0 +1,163 @@
+"""A path between given poses, sampled so densely that no point of the tool skips half a voxel."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.resident import sweep as kernels
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.poses import as_floats, quaternion_of, rotation_of
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MOST_SAMPLES = 1e9
+"""A path of more is in another unit than its environment, or takes days."""
+RIGID = 1e-6
+"""What a rotation's columns may deviate from orthonormal ones, as in a frame."""
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Poses M, and samples between them.
+
+    No place of the tool's surface moves more than half a voxel between two samples, nor any within
+    the covering radius of a point. The middle of the shell's bounding box moves on straight lines
+    while the tool turns about it, evenly, about one axis (slerp): the same motion wherever the file
+    of the tool has its origin. A point at distance r from the middle then moves along a segment by
+    no more than the middle moves plus the angle times r, so that many steps of half a voxel,
+    rounded up, are enough for all. Given poses are samples as they are.
+
+    Attributes
+    ----------
+    poses : (M, 4, 4)
+        As given, `world_from_tool`.
+    motion : (M - 1,)
+        Metres that a point may move at most from each pose to the next.
+    starts : (M,) int64
+        Which sample each pose is.
+    off : float
+        Metres between a place of the tool at any time and the same place at the nearer of the two
+        samples about that time, at most: half a step, a quarter of a voxel or less.
+    """
+
+    poses: Floats
+    motion: Floats
+    starts: Ints
+    off: float
+    _center: Floats
+    _centers: Floats
+    _quaternions: Floats
+    _turns: Floats
+    _travels: Floats
+
+    @classmethod
+    def of(cls, poses: ArrayLike, shell: PointShell, voxel_size: float) -> "Path":
+        """Path through poses (M, 4, 4), at least one, of a shell over voxels of that size, metres.
+
+        Raises
+        ------
+        UsageError
+            When there is none, one that is not rigid, or the path is too long for its voxels.
+        """
+        given = _checked(poses)
+        low, high = shell.points.min(axis=0), shell.points.max(axis=0)
+        center = 0.5 * (low + high)
+        radius = float(np.sqrt(((shell.points - center) ** 2).sum(axis=1).max()))
+        radius += shell.cover or 0.0
+        rotations = given[:, :3, :3]
+        quaternions = quaternion_of(rotations)
+        centers = rotations @ center + given[:, :3, 3]
+        turns = _turns_between(quaternions)
+        with np.errstate(over="ignore"):
+            motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+        motion += radius * np.linalg.norm(turns, axis=1)
+        # a given rotation is not quite that of its quaternion, from which the samples between start
+        off = radius * np.linalg.norm(rotations - rotation_of(quaternions), axis=(1, 2))
+        slack = off[:-1] + off[1:]
+        step = np.maximum(0.5 * voxel_size - slack, 0.25 * voxel_size)
+        with np.errstate(over="ignore"):
+            steps = np.maximum(np.ceil(motion / step), 1.0)
+            if steps.sum() > MOST_SAMPLES:
+                way = np.hypot.reduce(np.diff(centers, axis=0), axis=1).sum()
+                raise UsageError(
+                    f"the path moves {way:.4g} m, and turns a tool {2.0 * radius:.4g} m across, in "
+                    f"voxels of {voxel_size:.4g} m: check the units of path and tool"
+                )
+        counts = steps.astype(np.int64)
+        starts = np.concatenate([[0], np.cumsum(counts)])
+        travels = (motion / counts + slack) / voxel_size + kernels.CAUTION
+        off = 0.5 * voxel_size * float(travels.max(initial=0.0))
+        return cls(
+            given, motion, starts, off, center, centers, quaternions, turns,
+            np.stack([np.concatenate([[0.0], np.cumsum(travels * counts)])[:-1], travels]),
+        )  # fmt: skip
+
+    def __len__(self) -> int:
+        """Count the samples."""
+        return int(self.starts[-1]) + 1
+
+    def sample(self, first: int, last: int) -> Floats:
+        """Poses (last - first, 4, 4) of samples first .. last, the last one left out."""
+        out = np.empty((last - first, 4, 4))
+        kernels.poses_between(
+            self.poses, self._centers, self._quaternions, self._turns, self.starts, self._center,
+            first, out,
+        )  # fmt: skip
+        return out
+
+    def segments(self, samples: ArrayLike) -> Ints:
+        """After which given pose samples (n,) come, (n,): 0 .. M - 2; 0 for a path of one pose."""
+        found = np.searchsorted(self.starts, np.asarray(samples), side="right") - 1
+        return np.asarray(np.clip(found, 0, max(len(self.starts) - 2, 0)))
+
+    def fractions(self, samples: ArrayLike) -> Floats:
+        """Share of the path's motion, 0 .. 1, that lies before samples (n,), (n,)."""
+        asked = np.asarray(samples)
+        total = float(self.motion.sum())
+        if total == 0.0:
+            return np.zeros(asked.shape)
+        before = np.concatenate([[0.0], np.cumsum(self.motion)])
+        return np.asarray(np.interp(asked, self.starts, before / before[-1]))
+
+    def travels(self, first: int, last: int) -> Floats:
+        """Voxels, at most, that any point has moved until each sample of `sample`, (n,)."""
+        if not len(self.motion):
+            return np.zeros(last - first)
+        samples = np.arange(first, last)
+        at = self.segments(samples)
+        return np.asarray(self._travels[0, at] + (samples - self.starts[at]) * self._travels[1, at])
+
+
+def _checked(poses: ArrayLike) -> Floats:
+    """Poses (M, 4, 4), each a rigid transform."""
+    given = as_floats(poses, "a path")
+    if given.ndim != 3 or given.shape[1:] != (4, 4) or not len(given):
+        raise UsageError(f"a path of shape {given.shape}: give poses (M, 4, 4), one at least")
+    rotations = given[:, :3, :3]
+    with np.errstate(invalid="ignore", over="ignore"):
+        products = np.swapaxes(rotations, 1, 2) @ rotations
+        is_rigid = (
+            np.isfinite(given).all(axis=(1, 2))
+            & (np.abs(products - np.eye(3)).max(axis=(1, 2)) <= RIGID)
+            & (np.linalg.det(np.nan_to_num(rotations)) > 0.0)
+            & (given[:, 3] == (0.0, 0.0, 0.0, 1.0)).all(axis=1)
+        )
+    bad = np.flatnonzero(~is_rigid)
+    if len(bad):
+        raise UsageError(f"pose {bad[0]} of the path is no rigid transform: give a rotation")
+    return given
+
+
+def _turns_between(quaternions: Floats) -> Floats:
+    """Rotation vectors (M - 1, 3), world frame, the shorter way from each (M, 4) to the next."""
+    aw, a = quaternions[1:, :1], quaternions[1:, 1:]
+    bw, b = quaternions[:-1, :1], -quaternions[:-1, 1:]
+    w = aw * bw - (a * b).sum(axis=1, keepdims=True)
+    v = aw * b + bw * a + np.cross(a, b)
+    v = np.where(w < 0.0, -v, v)
+    sine = np.linalg.norm(v, axis=1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, np.abs(w))
+    return np.asarray(v * np.where(sine < 1e-12, 2.0, angle / np.maximum(sine, 1e-300)))

@@ -1,0 +1,334 @@
+"""Sweep: a whole path as a batch, which says whether a part comes out.
+
+Exact for the shell's points at the samples: every cell that they need is waited for. What lies
+between two samples and between two points is bounded (`swept.Proof`): "comes out" is said when that
+bound proves it, and otherwise "not decided".
+"""
+
+import time
+from collections.abc import Callable, Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.environment import Environment
+from hapticdb.errors import (
+    ConnectionLostError,
+    ObjectNotFoundError,
+    UsageError,
+)
+from hapticdb.kernels.resident import sweep as kernels
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.proportions import compare_proportions
+from hapticdb.query.frame import as_ids
+from hapticdb.resident.frames import Felt, Frames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
+from hapticdb.store.base import Keys, Object
+from hapticdb.sweeps.clearance import ClearanceSearch
+from hapticdb.sweeps.inside import enclosed_ids
+from hapticdb.sweeps.objects import Met, Runs, objects_in, pairs_of_hits, tally
+from hapticdb.sweeps.path import Path
+from hapticdb.sweeps.result import Clearance, Deepest, MetObject, Moment, Profile, Proof, Swept
+
+DEFAULT_LIMIT = 32
+"""Voxels up to which clearance is looked for."""
+WINDOWS = 256
+"""Stretches that a path's profile has at most."""
+LOOKED = 1.5
+"""Times the distance that proves a tool clear, up to which is looked at least."""
+BLOCK = 1024
+"""Samples at a time, at most."""
+BLOCK_POINTS = 1 << 21
+"""Points that are looked up in a block at most; a sample is not divided."""
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+ProgressCallback = Callable[[int, int], None]
+"""Called after each block with the samples done and their total."""
+
+
+def sweep(
+    env: Environment,
+    shell: PointShell,
+    poses: ArrayLike,
+    *,
+    exclude: Iterable[int] = (),
+    budget_bytes: int = DEFAULT_BUDGET,
+    clearance_limit: float | None = None,
+    profile: bool = False,
+    progress: ProgressCallback | None = None,
+) -> Swept:
+    """Move a tool along a path and say what it hits, whatever the size of the environment.
+
+    Parameters
+    ----------
+    env : Environment
+        Not in lexicographic order. All of the sweep reads one revision of it.
+    shell : PointShell
+        The tool. That it comes out can be proved where the covering radius is known (shells of a
+        mesh or sphere; it is found here unless it was before) and about as small as a voxel:
+        `PointShell.from_file(path, spacing=0.5 * env.grid.voxel_size)`.
+    poses : (M, 4, 4) array
+        `world_from_tool`, rigid, metres; one at least. Between two, the middle of the tool's
+        bounding box moves on a line while the tool turns about it, the shorter way round.
+    exclude : iterable of int
+        Ids of objects that are not felt: a part taken out must not hit itself.
+    budget_bytes : int
+        For resident cells; never exceeded.
+    clearance_limit : float or None
+        Metres up to which clearance is looked for, 32 voxels unless given; 0: not at all.
+    profile : bool
+        Look for clearance along the path, too, and not only for the least.
+    progress : callable or None
+        Called after each block with the samples done and their total.
+
+    Raises
+    ------
+    UsageError
+        When a pose is not rigid, or the budget too small for the tool.
+    ObjectNotFoundError
+        When an excluded object does not exist.
+    """
+    shell = shell.with_cover()
+    path = Path.of(poses, shell, env.grid.voxel_size)
+    limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
+    if not (np.isfinite(limit) and limit >= 0.0):
+        raise UsageError(f"clearance up to {limit} m: give a finite length, 0 or more")
+    excluded = as_ids(exclude)
+    run = _Run(env, shell, path, limit, profile, progress)
+    try:
+        return run.swept(excluded, budget_bytes)
+    except ConnectionLostError:  # in the middle of a snapshot: once more, from its start
+        return run.swept(excluded, budget_bytes)
+
+
+class _Run:
+    """One sweep while it runs."""
+
+    def __init__(
+        self,
+        env: Environment,
+        shell: PointShell,
+        path: Path,
+        limit: float,
+        profile: bool,  # noqa: FBT001 - private
+        progress: ProgressCallback | None,
+    ) -> None:
+        self.store = env.store
+        self.grid = env.grid
+        self.shell = shell
+        self.path = path
+        self.is_asked = limit > 0.0  # for clearance; the proof needs some of it in any case
+        if shell.cover is not None:
+            limit = max(limit, LOOKED * (shell.cover + path.off))
+        self.limit = limit
+        self.is_profiled = profile and self.is_asked
+        self.progress = progress
+        self.n_windows = min(len(path), WINDOWS)
+        self.begins = -(-np.arange(self.n_windows) * len(path) // self.n_windows)
+
+    def swept(self, exclude: Keys, budget_bytes: int) -> Swept:
+        """Sweep from the start, in one snapshot."""
+        with CellTable.create(budget_bytes) as table:
+            residency = Residency(self.store, table, exclude)
+            frames = Frames(residency, self.shell)
+            try:
+                with self.store.snapshot():
+                    started = time.perf_counter()
+                    residency.refresh()
+                    self._begin(frames)
+                    self.enclosed = enclosed_ids(residency, self.shell, self.path.poses[0])
+                    self._sweep(frames)
+                    return self._result(frames, time.perf_counter() - started)
+            finally:
+                frames.close()
+
+    def _begin(self, frames: Frames) -> None:
+        residency = frames.residency
+        self.known = {obj.id: obj for obj in self.store.objects()}
+        for i in residency.exclude.tolist():
+            if i not in self.known:
+                raise ObjectNotFoundError(
+                    f"no object {i} in {self.store.url} to exclude; 'hapticdb objects "
+                    f"{self.store.url}' lists them"
+                )
+        voxels = self.limit / self.grid.voxel_size
+        self.search = ClearanceSearch(frames, voxels) if voxels > 0.0 else None
+        self.along = ClearanceSearch(frames, voxels, self.n_windows) if self.is_profiled else None
+        self.met: dict[int, Met] = {}
+        self.hit_runs, self.contact_runs = Runs(), Runs()
+        self.hits_in = np.zeros(self.n_windows, dtype=np.int64)
+        self.depth_in = np.zeros(self.n_windows)
+        self.first_hit: Moment | None = None
+        self.first_contact: Moment | None = None
+        self.deepest: Deepest | None = None
+
+    def _sweep(self, frames: Frames) -> None:
+        total = len(self.path)
+        block = max(1, min(BLOCK, BLOCK_POINTS // len(self.shell)))
+        for first in range(0, total, block):
+            last = min(first + block, total)
+            poses = self.path.sample(first, last)
+            windows = np.arange(first, last) * self.n_windows // total
+            felt = frames.feel(poses)
+            np.maximum.at(self.hits_in, windows, felt.hits)
+            np.maximum.at(self.depth_in, windows, felt.deepest)
+            is_hit = felt.hits > 0
+            if is_hit.any():
+                self._note_hits(frames, first, poses, felt)
+            self._note_clearance(first, poses, is_hit)
+            if self.progress is not None:
+                self.progress(last, total)
+
+    def _note_clearance(self, first: int, poses: Floats, is_hit: NDArray[np.bool_]) -> None:
+        """Look around at a block's samples, of which those that hit (B,) are at 0."""
+        last = first + len(poses)
+        travels = self.path.travels(first, last)
+        if self.search is not None and self.first_hit is None:
+            self.search.look(first, poses, travels, np.zeros(len(poses), dtype=np.int64))
+        if self.along is not None:
+            windows = np.flatnonzero((self.begins >= first) & (self.begins < last))
+            at = self.begins[windows] - first
+            self.along.least[windows[is_hit[at]]] = 0.0
+            at, windows = at[~is_hit[at]], windows[~is_hit[at]]
+            self.along.look(first, poses[at], travels[at], windows)
+
+    def _note_hits(self, frames: Frames, first: int, poses: Floats, felt: Felt) -> None:
+        """Find the objects of a block's hits, and count them in."""
+        self.hit_runs.add(first + np.flatnonzero(felt.hits))
+        self.contact_runs.add(first + np.flatnonzero(felt.contacts))
+        found = find_hits(frames, poses, felt.hits)
+        exclude = frames.residency.exclude
+        pairs = pairs_of_hits(found.places, found.voxels, self.store, exclude)
+        samples = found.samples + first
+        tally(self.met, pairs, samples, found.depths)
+
+        def moment(hits: NDArray[np.bool_], sample: int) -> Moment:
+            ids = np.unique(pairs.ids[hits[pairs.hits]])
+            return self._moment(sample, ids)
+
+        if self.first_hit is None:
+            self.first_hit = moment(samples == samples[0], int(samples[0]))
+        is_contact = found.depths > 0.0
+        if self.first_contact is None and is_contact.any():
+            sample = int(samples[np.argmax(is_contact)])
+            self.first_contact = moment(is_contact & (samples == sample), sample)
+        deepest = int(np.argmax(found.depths))
+        depth = float(found.depths[deepest])
+        if self.deepest is None or depth > self.deepest.depth:
+            at = moment(np.arange(len(samples)) == deepest, int(samples[deepest]))
+            self.deepest = Deepest(depth, at, self._world(at.pose, int(found.points[deepest])))
+
+    def _moment(self, sample: int, ids: Ints) -> Moment:
+        return Moment(
+            sample,
+            float(self.path.fractions(sample)),
+            int(self.path.segments(sample)),
+            self.path.sample(sample, sample + 1)[0],
+            tuple(self.known[i] for i in ids.tolist()),
+        )
+
+    def _world(self, pose: Floats, point: int) -> Floats:
+        return np.asarray(pose[:3, :3] @ self.shell.points[point] + pose[:3, 3])
+
+    def _clearance(self, exclude: Keys) -> Clearance | None:
+        if self.search is None or not self.is_asked:
+            return None
+        size = self.grid.voxel_size
+        diagonal, off = np.sqrt(3.0) * size, self.path.off + (self.shell.cover or 0.0)
+        if self.first_hit is not None:
+            return Clearance(0.0, 0.0, diagonal, is_beyond=False, moment=self.first_hit)
+        distance = self.search.distance * size
+        at_least = max(distance - off, 0.0)
+        sample, point, voxel = self.search.nearest
+        if sample < 0:
+            return Clearance(self.limit, at_least, np.inf, is_beyond=True)
+        packed = np.array([voxel])
+        ijk = np.empty((1, 3), dtype=np.int64)
+        kernels.unpack(packed, ijk)
+        moment = self._moment(sample, objects_in(self.store, packed, exclude).ids)
+        return Clearance(
+            distance, at_least, distance + diagonal, is_beyond=False, moment=moment,
+            point=self._world(moment.pose, point), voxel=self.grid.centers(ijk)[0],
+        )  # fmt: skip
+
+    def _met(self, obj: Object, met: Met) -> MetObject:
+        intervals = self.path.fractions(met.hits.array())
+        length = float((intervals[:, 1] - intervals[:, 0]).sum() * self.path.motion.sum())
+        contacts = met.contacts.array()
+        first_contact = (
+            self._moment(int(contacts[0, 0]), np.array([obj.id])) if len(contacts) else None
+        )
+        return MetObject(
+            obj, intervals, met.hits.count, met.contacts.count, first_contact, length, met.points,
+            met.deepest,
+        )  # fmt: skip
+
+    def _proof(self) -> Proof:
+        nearest, is_near = 0.0, False
+        if self.search is not None and self.first_hit is None:
+            nearest = self.search.distance * self.grid.voxel_size
+            is_near = self.search.nearest[0] >= 0
+        is_inside_known = self.enclosed is not None
+        return Proof(self.shell.cover, self.path.off, nearest, is_near, is_inside_known)
+
+    def _result(self, frames: Frames, elapsed: float) -> Swept:
+        path = self.path
+        met = [self._met(self.known[i], one) for i, one in self.met.items()]
+        met.sort(key=lambda one: (one.first, one.object.id))
+        enclosed = [] if self.enclosed is None else self.enclosed.tolist()
+        unknown = np.full(self.n_windows, np.nan)
+        near = unknown if self.along is None else self.along.least * self.grid.voxel_size
+        return Swept(
+            path=path,
+            voxel_size=self.grid.voxel_size,
+            samples=len(path),
+            hits=self.hit_runs.count,
+            contacts=self.contact_runs.count,
+            first_hit=self.first_hit,
+            first_contact=self.first_contact,
+            deepest=self.deepest,
+            objects=met,
+            enclosed=tuple(self.known[i] for i in enclosed),
+            proof=self._proof(),
+            hit_intervals=path.fractions(self.hit_runs.array()),
+            contact_intervals=path.fractions(self.contact_runs.array()),
+            clearance=self._clearance(frames.residency.exclude),
+            profile=Profile(path.fractions(self.begins), self.hits_in, self.depth_in, near),
+            revision=frames.residency.revision,
+            elapsed=elapsed,
+            cells=frames.residency.loaded,
+            proportions=compare_proportions(
+                self.known.values(),
+                self.grid.voxel_size,
+                self.shell,
+                path.poses,
+                exclude=frames.residency.exclude.tolist(),
+            ),
+        )
+
+
+def find_hits(frames: Frames, poses: Floats, n_hits: Ints) -> kernels.Found:
+    """Hits at poses (B, 4, 4), of which there are n_hits (B,), in the order of the poses."""
+    samples = np.flatnonzero(n_hits)
+    total = int(n_hits.sum())
+    room = 1 << (2 * total).bit_length()
+    found = kernels.Found(
+        np.empty(total, dtype=np.int64),
+        np.empty(total, dtype=np.int64),
+        np.empty(total, dtype=np.int64),
+        np.empty(total),
+        np.full(room, -1, dtype=np.int64),
+    )
+    table = frames.residency.table
+    done = count = 0
+    while True:
+        with table.reading() as row:
+            done, count = kernels.find_hits(
+                table.cells, row, frames.clusters, poses, samples, frames.residency.place,
+                done, count, found,
+            )  # fmt: skip
+        if done == len(samples):
+            return found
+        frames.feel(poses[samples[done] : samples[done] + 1])  # fetches what was evicted since

@@ -1,0 +1,330 @@
+"""The command line as a user meets it: what is offered, import, and the process around it."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import os
+import re
+import signal
+import sys
+from pathlib import Path
+from typing import get_args
+
+import pytest
+
+import hapticdb
+from children import PATIENCE, child, finished
+from command_line import (  # noqa: F401 - fixtures among them
+    Run,
+    boxes,
+    command,
+    command_that_halts,
+    made,
+    poses,
+    refused,
+    rows_of,
+    run,
+    scene,
+    wait_for_an_object,
+)
+from hapticdb.cli import root
+from hapticdb.grid import CURVE_NAMES
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.store import connect
+from hapticdb.store.base import LAYOUTS
+from hapticdb.units import UNITS
+
+VERBS = (
+    "import",
+    "info",
+    "objects",
+    "touch",
+    "move",
+    "remove",
+    "calibrate",
+    "analyze",
+    "copy",
+    "diff",
+    "sample",
+    "demo",
+    "warm",
+)
+
+
+# -- what is offered ------------------------------------------------------------------------------
+
+
+def test_alone_it_shows_the_verbs(run: Run) -> None:
+    code, out, err = run()
+    assert (code, err) == (0, "")
+    for verb in VERBS:
+        assert re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_every_verb_has_help_with_an_example(run: Run, verb: str) -> None:
+    code, out, err = run(verb, "--help")
+    assert (code, err) == (0, "")
+    assert f"Example: hapticdb {verb}" in out
+
+
+def test_version(run: Run) -> None:
+    assert run("--version") == (0, f"hapticdb {hapticdb.__version__}\n", "")
+
+
+def test_choices_are_those_of_the_library() -> None:
+    assert get_args(root.StrategyName) == STRATEGIES
+    assert set(get_args(root.CurveName)) == set(CURVE_NAMES)
+    assert set(get_args(root.LayoutName)) == set(LAYOUTS)
+    assert set(get_args(root.UnitName)) == set(UNITS)
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (["nothing"], "nothing"),
+        (["import"], "missing argument"),
+        (["import", "a.db"], "missing argument"),
+        (["info"], "missing argument"),
+        (["info", "a.db", "--jsn"], "--jsn"),
+        (["touch", "a.db"], "missing option"),
+        (["import", "a.db", "b.glb", "--bits", "x"], "--bits"),
+        (["import", "a.db", "b.glb", "--unit", "yard"], "--unit"),
+    ],
+)
+def test_a_wrong_command_line_is_one_line_that_names_the_help(
+    run: Run, args: list[str], word: str
+) -> None:
+    refused(run(*args), word, "--help")
+
+
+def test_debug_shows_where_an_error_came_from(run: Run) -> None:
+    code, _, err = run("--debug", "info", "none.db")
+    assert code == 2
+    assert "Traceback" in err
+    assert err.splitlines()[-1].startswith("hapticdb: no environment at none.db")
+
+
+def test_an_unforeseen_error_is_one_line_too(
+    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_: object, **__: object) -> None:
+        raise RuntimeError("first line\nsecond line")
+
+    monkeypatch.setattr(connect, "open_store", fails)
+    code, out, err = run("info", scene)
+    assert (code, out) == (1, "")
+    assert err == "hapticdb: RuntimeError: first line; 'hapticdb --debug ...' shows where\n"
+
+
+def modules_after(program: str, *names: str) -> list[str]:
+    """Which of those modules a program has loaded at its end."""
+    code = f"{program}\nimport sys\nprint(*sorted(sys.modules))"
+    done = finished([sys.executable, "-c", code], check=True)
+    return sorted({*names} & {*done.stdout.splitlines()[-1].split()})
+
+
+def test_the_library_does_without_typer_and_rich() -> None:
+    program = (
+        "import hapticdb, hapticdb.demo, hapticdb.pictures.demo\n"
+        "for name in hapticdb.__all__: getattr(hapticdb, name)"
+    )
+    assert modules_after(program, "typer", "rich", "numba") == ["numba"]
+
+
+SLOW_TO_LOAD = ("numba", "scipy", "matplotlib", "trimesh", "collada", "cascadio", "psycopg")
+
+
+@pytest.mark.parametrize(
+    ("args", "others"),
+    [
+        ("'--help'", ["numpy", "apsw"]),
+        ("'--version'", ["numpy", "apsw", "rich.table"]),
+        ("'touch', '--help'", ["numpy", "apsw"]),
+        ("'info', URL", ["hapticdb.environment"]),
+        ("'objects', URL", ["hapticdb.environment"]),
+    ],
+)
+def test_what_answers_at_once_loads_nothing_that_is_slow(
+    scene: Path, args: str, others: list[str]
+) -> None:
+    program = f"from hapticdb.cli import main\nURL = {str(scene)!r}\nassert main([{args}]) == 0"
+    assert modules_after(program, *SLOW_TO_LOAD, *others) == []
+
+
+# -- import ---------------------------------------------------------------------------------------
+
+
+def test_an_import_says_what_went_in(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    code, out, err = run("import", "a.db", file, "--bits", 6)
+    assert (code, err) == (0, "")
+    assert "3 objects imported" in out
+    assert "64^3 voxels" in out
+
+
+def test_a_complete_import_is_told_to_be_one(run: Run, scene: Path, made: Path) -> None:
+    before = rows_of(scene)
+    code, out, err = run("import", scene, made / "boxes.glb", "--bits", 6, "--extent", 1.6)
+    assert (code, err) == (0, "")
+    assert "complete already (3 objects), nothing to do" in out
+    assert rows_of(scene) == before
+
+
+def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    code, out, err = run("import", "a.db", file, "none.stl", "--json", "--bits", 5)
+    assert code == 2
+    good, bad = map(json.loads, out.splitlines())
+    assert set(good) == {
+        *(
+            "file",
+            "status",
+            "objects",
+            "present",
+            "restored",
+            "kept_removed",
+            "replaced",
+            "dropped",
+            "voxels",
+            "is_unit_assumed",
+            "defects",
+            "error",
+        ),
+        "scene",
+    }
+    assert (good["status"], good["objects"], good["error"]) == ("imported", 3, None)
+    assert bad["status"] == "failed"
+    assert "none.stl" in bad["error"]
+    assert "none.stl" in err
+
+
+def test_a_bad_file_is_named_and_the_others_go_in(run: Run, tmp_path: Path) -> None:
+    bad = tmp_path / "bad.stl"
+    bad.write_bytes(b"no mesh at all")
+    result = run("import", "a.db", bad, boxes(tmp_path / "boxes.glb"), "--bits", 5)
+    refused(result, "bad.stl")
+    with hapticdb.open("a.db", read_only=True) as env:
+        assert [obj.name for obj in env.objects()] == ["box0", "box1", "box2"]
+
+
+def test_nothing_usable_leaves_no_database(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "empty.obj").write_bytes(b"")
+    refused(run("import", "a.db", "empty.obj"), "empty.obj")
+    assert [path.name for path in tmp_path.iterdir()] == ["empty.obj"]
+
+
+def test_defects_are_counted_in_the_summary(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nf 1 2 3\nf 1 2 4\n")
+    code, out, err = run("import", "a.db", "nan.obj", "--bits", 4)
+    assert (code, err) == (0, "")
+    assert "1 non-finite" in out
+
+
+@pytest.mark.parametrize("form", [["--origin", "-1,-2,-0.5"], ["--origin=-1,-2,-0.5"]])
+def test_a_negative_origin_is_read(run: Run, tmp_path: Path, form: list[str]) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    code, _, err = run("import", "a.db", file, *form, "--voxel-size", 0.05, "--bits", 7)
+    assert (code, err) == (0, "")
+    assert json.loads(run("info", "a.db", "--json")[1])["origin"] == [-1, -2, -0.5]
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--bits", "22"], "22 bits"),
+        (["--bits", "5", "--extent", "2", "--voxel-size", "0.1"], "contradict"),
+        (["--curve", "lexicographic"], "hierarchical"),
+        (["--origin", "1,2"], "--origin"),
+        (["--origin", "1,2,nan"], "--origin"),
+        (["--voxel-size", "-1"], "voxel size"),
+        (["--extent", "0"], "extent"),
+        (["--jobs", "0"], "jobs"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(
+    run: Run, tmp_path: Path, options: list[str], word: str
+) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    refused(run("import", "a.db", file, *options), word)
+    assert not (tmp_path / "a.db").exists()
+
+
+def test_another_grid_than_the_environments_is_refused(run: Run, scene: Path, made: Path) -> None:
+    file = made / "boxes.glb"
+    refused(run("import", scene, file, "--bits", 7), "bits 7 instead of 6")
+    refused(run("import", scene, file, "--layout", "voxel"), "layout")
+    refused(run("import", scene, file, "--curve", "hilbert"), "curve")
+
+
+def test_a_part_outside_the_grid_is_named(run: Run, scene: Path, tmp_path: Path) -> None:
+    large = boxes(tmp_path / "large.glb", count=1, side=5.0)
+    refused(run("import", scene, large), "large.glb", "box0", "outside the grid")
+    assert json.loads(run("info", scene, "--json")[1])["objects"] == 3
+
+
+def test_a_file_of_another_kind_is_no_environment(run: Run, tmp_path: Path) -> None:
+    note = tmp_path / "note.db"
+    note.write_text("Dear reader, " * 100)
+    for verb in ("info", "objects", "calibrate"):
+        refused(run(verb, note), "note.db")
+    refused(run("import", note, boxes(tmp_path / "boxes.glb")), "note.db")
+    assert note.read_text().startswith("Dear reader")
+
+
+@pytest.mark.parametrize("verb", ["info", "objects", "calibrate"])
+def test_a_missing_environment_is_named(run: Run, verb: str) -> None:
+    refused(run(verb, "none.db"), "no environment at none.db", "hapticdb import")
+
+
+# -- as a process ---------------------------------------------------------------------------------
+
+
+def test_it_runs_as_a_module(scene: Path) -> None:
+    found = finished(command("info", scene, "--json"), check=True)
+    assert json.loads(found.stdout)["objects"] == 3
+    assert found.stderr == ""
+
+
+def test_a_reader_that_stops_early_is_no_error(scene: Path, tmp_path: Path) -> None:
+    poses(tmp_path / "long.csv", *[(0.0, 0.0, 0.055)] * 2000)
+    args = command("touch", scene, "--tool", "tool.npz", "--poses", "long.csv", "--json")
+    with child(args, cwd=tmp_path) as process:
+        assert process.stdout is not None
+        assert process.stderr is not None
+        assert process.stdout.readline().startswith("{")
+        process.stdout.close()
+        assert process.stderr.read() == ""
+
+
+def test_names_beyond_the_terminals_encoding_are_printed(tmp_path: Path) -> None:
+    (tmp_path / "ä.obj").write_text("o é\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", encoding="utf-8")
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    for args in (["import", "a.db", "ä.obj", "--bits", "4"], ["objects", "a.db"], ["info", "a.db"]):
+        done = finished(command(*args), cwd=tmp_path, env=environment)
+        assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "many.glb", count=60, side=0.15)
+    options = ("--layout", "voxel", "--voxel-size", 0.002)
+    assert run("import", "whole.db", file, *options)[0] == 0
+    args = command_that_halts(30, "import", "cut.db", file, *options)
+    with child(args, cwd=tmp_path) as process:
+        cut = tmp_path / "cut.db"
+        wait_for_an_object(cut, process)
+        process.send_signal(signal.SIGINT)
+        _, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert err.splitlines() == [
+        "hapticdb: interrupted; what went in is whole, and the same command goes on from there"
+    ]
+    with hapticdb.open(cut, read_only=True) as env:
+        n_objects = len(env.objects())
+        assert all(len(env.voxels(obj.id)) == obj.voxels for obj in env.objects())
+    assert 0 < n_objects < 60
+    code, out, err_text = run("import", "cut.db", file, *options)
+    assert (code, err_text) == (0, "")
+    assert f"{60 - n_objects} objects imported" in out
+    assert f"{n_objects} were there already" in out
+    assert rows_of(cut) == rows_of(tmp_path / "whole.db")

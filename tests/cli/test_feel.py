@@ -1,0 +1,363 @@
+"""The verbs feel and replay, as a newcomer uses them: with mistakes, and with Ctrl-C."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import os
+import re
+import resource
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from children import PATIENCE, child, until
+from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
+from hapticdb.cli.root import size_of
+from hapticdb.recording.file import Frames, Recording
+from hapticdb.resident.table import is_alive
+
+ABOVE = "0,0,0.3"
+LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
+PLAY = ("--device", "path.csv", "--rate", 500)
+LIMITED = (*PLAY, "--record", "felt.hdbrec", "--record-limit")
+
+
+def children() -> set[int]:
+    """Ids of the processes that this one has started and that run."""
+    me, found = str(os.getpid()), set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if fields[1] == me and fields[0] != "Z":
+            found.add(int(path.parent.name))
+    return found
+
+
+def feel(*args: object) -> tuple[object, ...]:
+    return ("feel", "scene.db", "--tool", "tool.npz", *args)
+
+
+def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    wish = feel("--device", "path.csv", "--seconds", 0.2)
+    code, out, err = run(*wish)
+    assert (code, err) == (0, "")
+    assert re.search(r"^ *played at +0\.1 m/s: the path has no times", out, re.MULTILINE)
+    assert json.loads(run(*wish, "--json")[1])["path_speed"] == 0.1
+    assert json.loads(run(*wish, "--json", "--speed", 0.2)[1])["path_speed"] is None
+
+
+def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) -> None:
+    """And told to differ once an object has moved."""
+    before = children()
+    code, out, err = run(*feel(*PLAY, "--speed", 0.5, "--record", "felt.hdbrec"))
+    assert (code, err) == (0, "")
+    lines = [line.strip() for line in out.splitlines()]
+    rows = dict(re.split(r"  +", line, maxsplit=1) for line in lines if "  " in line)
+    recording = Recording(scene.with_name("felt.hdbrec"))
+    n_frames = sum(map(len, recording.frames()))
+    assert rows["frames"].split()[0] == f"{n_frames:,}"
+    assert rows["recorded"] == f"{n_frames:,} frames in felt.hdbrec"
+    assert rows["objects"].startswith("2 touched: box")
+    assert rows["resident"].endswith("in 256 MiB")
+    assert "outages" not in rows
+    assert max(map(len, out.splitlines())) <= 100
+    assert children() == before
+
+    code, out, err = run("replay", "felt.hdbrec")
+    assert (code, err) == (0, "")
+    assert out.startswith("equal: ")
+    code, out, _ = run("replay", "felt.hdbrec", "scene.db", "--json")
+    replayed = json.loads(out)
+    assert (code, replayed["differing"], replayed["parts_at"]) == (0, 0, None)
+    assert replayed["compared"] + replayed["skipped"] == n_frames
+
+    code, out, err = run(
+        *feel("--device", "felt.hdbrec", "--rate", 500, "--json", "--budget", 8, "--scale", 1.0)
+    )
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert report["hit_frames"] > 0
+    assert report["objects"]
+    assert report["cache"]["budget_bytes"] <= 8 << 20
+    assert report["loop"]["seconds"] == pytest.approx(recording.poses()[0][-1], rel=0.1)
+
+    assert run("move", "scene.db", 1, "--translate", "0,0,0.05")[0] == 0
+    code, out, err = run("replay", "felt.hdbrec")
+    assert (code, err) == (1, "")
+    parted = re.match(r"parts at frame (\d+) \(\d+\.\d{3} s\)", out)
+    assert parted
+    frames = recorded(scene.with_name("felt.hdbrec"))
+    assert frames["hits"][int(parted[1])] > 0
+    code, out, _ = run("replay", "felt.hdbrec", "--json")
+    assert (code, json.loads(out)["parts_at"]) == (1, int(parted[1]))
+
+
+def test_without_a_baseline_no_empty_loop_is_run(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    wish = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.2)
+    code, out, err = run(*wish, "--no-baseline")
+    assert (code, err) == (0, "")
+    assert out.splitlines()[0].split() == ["session"]
+    assert re.search(r"^ *empty loop +not measured", out, re.MULTILINE)
+    assert json.loads(run(*wish, "--no-baseline", "--json")[1])["empty"] is None
+    assert json.loads(run(*wish, "--json")[1])["empty"]["frames"] > 0
+
+
+def test_what_is_excluded_is_not_felt(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    code, out, _ = run(*feel(*PLAY, "--seconds", 0.3, "--exclude", "1,2", "--exclude", 3, "--json"))
+    assert code == 0
+    assert json.loads(out)["hit_frames"] == 0
+
+
+def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    args = ("--device", "random", "--at", "0,0,0.05", "--seconds", 0.5, "--simulate", "--seed", 2)
+    code, out, err = run(*feel(*args, "--policy", "wait", "--rate", 200, "--json"))
+    assert (code, err) == (0, "")
+    report = json.loads(out)
+    assert report["unknown_frames"] == report["held_frames"] == 0
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--device", "joystick"], ["--device 'joystick'", ".csv", "random"]),
+        (["--device", "nowhere.csv"], ["nowhere.csv"]),
+        (["--device", "nowhere.hdbrec"], ["no recording at nowhere.hdbrec"]),
+        (["--device", "random"], ["give --at"]),
+        (["--device", "path.csv", "--at", ABOVE], ["--at belongs to random"]),
+        (["--device", "random", "--at", "here"], ["--at 'here'", "0.5,0,1.2"]),
+        (["--device", "path.csv", "--speed", 0], ["speed", "positive"]),
+        (["--device", "haply", "--speed", 1], ["real hand"]),
+        (["--device", "felt.hdbrec", "--speed", 1], ["--speed", "has its own"]),
+        (["--device", "tumble", "--at", ABOVE, "--speed", 1], ["--speed", "tumble has its own"]),
+        (["--device", "tumble", "--at", ABOVE, "--loop"], ["--loop", "tumble has no end"]),
+        (["--device", "random", "--at", ABOVE, "--loop"], ["--loop", "random has no end"]),
+        ([*PLAY, "--processor", -1], ["processor -1", "0 to 4095"]),
+        ([*PLAY, "--processor", 10**30], ["processor 1e+30", "0 to 4095"]),
+        ([*PLAY, "--processor", 4095], ["processor 4095 is not granted", "may run on"]),
+        (["--device", "haply", "--policy", "wait"], ["cannot wait"]),
+        ([*PLAY, "--rate", 5], ["a rate of 5.0 Hz: give 10 to 20,000"]),
+        ([*PLAY, "--seconds", -1], ["-1.0 seconds"]),
+        ([*PLAY, "--staleness", 0], ["staleness"]),
+        ([*PLAY, "--scale", 0], ["a scale of 0.0"]),
+        ([*PLAY, "--scale", 1e300], ["a scale of 1e+300", "at most"]),
+        (["--device", "random", "--at", ABOVE, "--seed", -1], ["--seed -1: give 0 or more"]),
+        ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
+        ([*PLAY, "--budget", 0.5], ["--budget 0.5: give MiB"]),
+        ([*PLAY, "--stiffness", -5], ["stiffness"]),
+        ([*PLAY, "--stiffness", 1e300], ["stiffness 1e+300 N/m: give a number from 0 to 1e+09"]),
+        ([*PLAY, "--policy", "hope"], ["hold", "wait"]),
+        ([*PLAY, "--exclude", "nobody"], ["--exclude", "nobody"]),
+        ([*PLAY, "--exclude", 99], ["no object 99"]),
+        ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),
+        ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already", "--append", "--replace"]),
+        ([*PLAY, "--record", "tool.npz", "--replace"], ["tool.npz is no recording"]),
+        ([*PLAY, "--record", "tool.npz", "--append"], ["tool.npz is no recording"]),
+        ([*PLAY, "--record", "x.hdbrec", "--append", "--replace"], ["choose one"]),
+        ([*PLAY, "--append"], ["--append and --replace belong to --record"]),
+        ([*PLAY, "--record-limit", "1GiB"], ["--record-limit belongs to --record"]),
+        ([*LIMITED, "0"], ["--record-limit '0': give MiB, 1 to a million, or such as 4GiB"]),
+        ([*LIMITED, "-3GiB"], ["--record-limit '-3GiB': give MiB"]),
+        ([*LIMITED, "nan"], ["--record-limit 'nan': give MiB"]),
+        ([*LIMITED, "1e30"], ["--record-limit '1e30': give MiB"]),
+        ([*LIMITED, "4 parsecs"], ["--record-limit '4 parsecs': give MiB"]),
+        ([*LIMITED, "9999999G"], ["--record-limit '9999999G': give MiB"]),
+    ],
+)
+def test_a_mistake_is_one_line_and_leaves_no_process(
+    run: Run, scene: Path, args: list[object], words: list[str]
+) -> None:
+    assert scene.exists()
+    before = children()
+    refused(run(*feel(*args)), *words)
+    assert children() == before
+
+
+def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path) -> None:
+    path = scene.with_name("path.csv")
+    missing = run("feel", "nowhere.db", "--tool", "tool.npz", *PLAY)
+    refused(missing, "nowhere.db", "hapticdb import")
+    refused(run("feel", "scene.db", "--tool", "path.csv", *PLAY), "path.csv")
+    refused(run("feel", "scene.db", "--tool", "nowhere.stl", *PLAY), "nowhere.stl")
+    refused(run("feel", path, "--tool", "tool.npz", *PLAY), "path.csv")
+    assert run("copy", "scene.db", "lexical.db", *LEXICOGRAPHIC)[0] == 0
+    refused(run("feel", "lexical.db", "--tool", "tool.npz", *PLAY), "lexicographic", "--curve z")
+
+
+def test_a_recording_is_gone_on_with_or_replaced(run: Run, scene: Path) -> None:
+    path = scene.with_name("felt.hdbrec")
+    args = (*feel(*PLAY, "--seconds", 0.2), "--record", path)
+    assert run(*args)[0] == 0
+    first = len(Recording(path))
+    refused(run(*args), "is there already", "--append", "--replace")
+    assert run(*args, "--append")[0] == 0
+    both = len(Recording(path))
+    assert both > first > 0
+    assert run("replay", path)[0] == 0
+    refused(run(*args, "--replace", "--processor", 4095), "processor 4095")
+    assert len(Recording(path)) == both
+    assert run(*args, "--replace")[0] == 0
+    assert 0 < len(Recording(path)) < both
+
+
+@pytest.mark.long
+def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) -> None:
+    path = scene.with_name("felt.hdbrec")
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 2000, "--seconds", 6)
+    assert run(*args, "--record", path)[0] == 0
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-100])
+    code, out, err = run("replay", path)
+    assert (code, out.startswith("equal: ")) == (0, True)
+    assert re.fullmatch(
+        r"hapticdb: .*felt\.hdbrec: the last [\d,]+ bytes are no whole piece.*\n", err
+    )
+    start = path.stat().st_size - len(whole) + len(whole) // 2
+    path.write_bytes(whole[:start] + b"?" * 64 + whole[start + 64 :])
+    refused(run("replay", path), "damaged at frame", "--until-damage")
+    code, out, err = run("replay", path, "--until-damage")
+    assert (code, out.startswith("equal: "), err) == (0, True, "")
+
+
+def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
+    assert scene.exists()
+    refused(run("replay", "nowhere.hdbrec"), "no recording at nowhere.hdbrec")
+    refused(run("replay", "path.csv"), "path.csv")
+
+
+@pytest.mark.long
+def test_a_session_goes_on_without_its_recording_at_the_limit(run: Run, scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--seconds", 12, "--json")
+    path = scene.with_name("felt.hdbrec")
+    code, out, err = run(*args, "--record", path.name, "--record-limit", "1MiB")
+    report = json.loads(out)
+    n_frames = len(recorded(path))
+    assert code == 0
+    assert report["recording_ended"] == (
+        f"felt.hdbrec: the recording ends after {n_frames:,} frames, at its limit of 1 MiB"
+    )
+    assert err == f"hapticdb: {report['recording_ended']}; the session goes on without it\n"
+    assert 1000 < n_frames == report["recorded_frames"] < report["loop"]["frames"]
+    assert path.stat().st_size <= 1 << 20
+    assert run("replay", path.name)[0] == 0
+
+
+@pytest.mark.long
+def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
+    path = scene.with_name("cut.hdbrec")
+    with child(command(*args, "--json"), cwd=scene.parent) as process:
+        until(lambda: frames_in(path))
+        most = path.stat().st_size + 100_000
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (most, most))
+        assert process.stderr is not None
+        told = process.stderr.readline()
+        process.send_signal(signal.SIGTERM)
+        out, _ = process.communicate(timeout=PATIENCE)
+    report = json.loads(out)
+    n_frames = len(recorded(path))
+    assert report["recording_ended"] == (
+        f"cannot write cut.hdbrec: File too large; its first {n_frames} frames are whole"
+    )
+    assert told == f"hapticdb: {report['recording_ended']}; the session goes on without it\n"
+    assert 0 < n_frames == report["recorded_frames"] < report["loop"]["frames"]
+
+
+@pytest.mark.parametrize(
+    ("text", "n_bytes"),
+    [
+        ("1", 1 << 20),
+        ("512", 512 << 20),
+        ("1.5 GiB", 3 << 29),
+        ("4g", 4 << 30),
+        ("20MIB", 20 << 20),
+    ],
+)
+def test_a_size_is_mib_or_has_its_unit(text: str, n_bytes: int) -> None:
+    assert size_of(text, "--record-limit") == n_bytes
+
+
+def recorded(path: Path) -> Frames:
+    return np.concatenate(list(Recording(path).frames()))
+
+
+def frames_in(path: Path) -> bool:
+    """Whether a session has begun to record."""
+    try:
+        return sum(map(len, Recording(path).frames(until_damage=True))) > 0
+    except hapticdb.HapticDBError:
+        return False
+
+
+def descendants(pid: int) -> list[int]:
+    found = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return list(map(int, found))
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")],
+)
+def test_a_signal_ends_a_session_with_its_report(
+    scene: Path, number: signal.Signals, code: int, words: str
+) -> None:
+    """And with a recording that has every frame."""
+    args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
+    with child(command(*args, "--json"), cwd=scene.parent) as process:
+
+        def is_recording() -> bool:  # the first chunk is full
+            assert process.poll() is None
+            return frames_in(scene.with_name("cut.hdbrec"))
+
+        until(is_recording, every=0.05)
+        started = descendants(process.pid)
+        process.send_signal(number)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == code
+    assert re.fullmatch(rf"hapticdb: ended by {words} after [\d.]+ s\n", err)
+    report = json.loads(out)
+    frames = recorded(scene.with_name("cut.hdbrec"))
+    assert len(frames) == report["loop"]["frames"] == report["recorded_frames"]
+    np.testing.assert_allclose(np.diff(frames["time"]), frames["dt"][1:], atol=1e-9)
+    assert len(started) == 2
+    assert not any(map(is_alive, started))
+
+
+def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE)
+    with child(command(*args), cwd=scene.parent) as process:
+        until(lambda: descendants(process.pid), every=0.002)
+        started = descendants(process.pid)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 130
+    assert out == ""
+    assert "hapticdb: interrupted" in err.splitlines()
+    until(lambda: not any(map(is_alive, started)))
+
+
+def test_sigterm_before_the_first_frame_leaves_nothing(scene: Path) -> None:
+    args = feel("--device", "random", "--at", ABOVE, "--record", "never.hdbrec")
+    path = scene.with_name("never.hdbrec")
+    with child(command(*args), cwd=scene.parent) as process:
+        until(path.exists, every=0.002)
+        process.send_signal(signal.SIGTERM)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, out, err) == (143, "", "")
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("verb", ["feel", "replay"])
+def test_help_fits_a_terminal_and_has_an_example(run: Run, verb: str) -> None:
+    code, out, _ = run(verb, "--help")
+    assert code == 0
+    assert max(map(len, out.splitlines())) <= 80
+    assert f"Example: hapticdb {verb} " in " ".join(out.split())

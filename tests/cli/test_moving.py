@@ -1,0 +1,251 @@
+"""The verbs copy and diff, used rightly and wrongly."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import os
+import pty
+import signal
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from assemblies import voxel_set
+from children import PATIENCE, child
+from command_line import (  # noqa: F401 - fixtures among them
+    Run,
+    command,
+    command_that_halts,
+    made,
+    refused,
+    rows_of,
+    run,
+    scene,
+    wait_for_an_object,
+)
+from hapticdb import Grid
+from hapticdb.cli.verbs import moving
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.testing import blob, voxel_object, write_voxels
+
+# -- copy -----------------------------------------------------------------------------------------
+
+
+def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path) -> None:
+    code, out, err = run("copy", scene, "b.db", "--layout", "voxel", "--curve", "hilbert")
+    assert (code, err) == (0, "")
+    assert out.startswith("b.db: 3 objects copied, ")
+    found = json.loads(run("info", "b.db", "--json")[1])
+    assert (found["layout"], found["curve"], found["objects"]) == ("voxel", "hilbert", 3)
+    code, out, err = run("diff", scene, "b.db")
+    assert (code, err) == (0, "")
+    size = f"{found['voxel_size'] * 1000:.4g} mm"
+    assert out == (
+        f"{scene} and b.db hold the same: 3 objects, {found['voxels']:,} voxels, "
+        f"64^3 cells of {size}\n"
+    )
+
+
+def test_a_second_copy_has_nothing_to_do(run: Run, scene: Path) -> None:
+    assert run("copy", scene, "b.db")[0] == 0
+    before = rows_of(Path("b.db"))
+    assert run("copy", scene, "b.db") == (
+        0,
+        "b.db: complete already (3 objects), nothing to do\n",
+        "",
+    )
+    assert rows_of(Path("b.db")) == before == rows_of(scene)
+
+
+def test_a_copy_goes_on_with_what_is_missing(run: Run, scene: Path) -> None:
+    assert run("copy", scene, "b.db")[0] == 0
+    assert run("remove", "b.db", 2)[0] == 0
+    assert "1 object copied" in (out := run("copy", scene, "b.db")[1])
+    assert out.endswith("; 2 were there already\n")
+
+
+def test_other_ids_are_told(run: Run, scene: Path) -> None:
+    assert run("copy", scene, "b.db")[0] == 0
+    assert run("remove", "b.db", 1, 2, 3)[0] == 0
+    ijk = np.array([[1, 2, 3]])
+    with hapticdb.open("b.db") as env:
+        record = replace(voxel_object(env.grid, ijk, "x"), id=2)
+        assert env.store.add(record, rows_of_voxels(ijk, env.grid, env.layout)) == 2
+    out = run("copy", scene, "b.db")[1]
+    assert "3 objects copied" in out
+    assert out.endswith("; 1 under another id, since their own was taken\n")
+    code, out, _ = run("diff", scene, "b.db")
+    assert code == 1
+    assert out.splitlines()[2].split() == ["2", "x", "only", "in", "B", "1", "made"]
+
+
+def test_copy_json_has_the_documented_keys(run: Run, scene: Path) -> None:
+    code, out, err = run("copy", scene, "b.db", "--json")
+    assert (code, err) == (0, "")
+    with hapticdb.open(scene, read_only=True) as env:
+        voxels = sum(obj.voxels for obj in env.objects())
+    assert json.loads(out) == {
+        "source": str(scene),
+        "target": "b.db",
+        "copied": 3,
+        "voxels": voxels,
+        "present": 0,
+        "renumbered": 0,
+    }
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        (["scene.db", "scene.db"], "are one"),
+        (["none.db", "b.db"], "no environment at none.db"),
+        (["scene.db", "none/b.db"], "folder none"),
+        (["scene.db", "tool.stl"], "tool.stl"),
+        (["scene.db", "b.db", "--curve", "lexicographic"], "hierarchical"),
+        (["scene.db", "b.db", "--curve", "peano"], "peano"),
+        (["scene.db"], "missing argument"),
+    ],
+)
+def test_a_copy_that_cannot_be_leaves_nothing(
+    run: Run, scene: Path, args: list[str], word: str
+) -> None:
+    before = rows_of(scene)
+    refused(run("copy", *args), word)
+    assert not Path("b.db").exists()
+    assert rows_of(scene) == before
+
+
+def test_a_part_that_stands_elsewhere_is_a_conflict(run: Run, scene: Path) -> None:
+    assert run("copy", scene, "b.db")[0] == 0
+    assert run("move", "b.db", 2, "--translate", "0,0,0.01")[0] == 0
+    refused(run("copy", scene, "b.db"), "object 2 (box1)", "in another place")
+
+
+# -- diff -----------------------------------------------------------------------------------------
+
+
+def test_differences_are_told_a_line_each(run: Run, scene: Path) -> None:
+    assert run("copy", scene, "b.db", "--layout", "voxel")[0] == 0
+    assert run("move", "b.db", 2, "--translate", "0,0,0.01")[0] == 0
+    assert run("remove", "b.db", 3)[0] == 0
+    with hapticdb.open("b.db") as env:
+        link = env.object(1).link
+    code, out, err = run("diff", scene, "b.db")
+    assert (code, err) == (1, "")
+    head, _, gone, moved, sides, total = out.splitlines()
+    assert head.split()[:2] == ["id", "name"]
+    with hapticdb.open(scene) as env, hapticdb.open("b.db") as other:
+        before, after = voxel_set(env.voxels(2)), voxel_set(other.voxels(2))
+        n_gone, n_same = env.object(3).voxels, env.object(1).voxels
+    shared = len(before & after)
+    assert gone.split() == ["3", "box2", "only", "in", "A", str(n_gone), link]
+    counts = (str(len(before - after)), str(len(after - before)))
+    share = f"{100 * shared / len(before | after):.3g}"
+    assert moved.split()[:8] == ["2", "box1", "another", "place", *counts, share, "%"]
+    assert "10 mm (0.8 voxels)" in moved
+    assert sides == f"A: {scene}; B: b.db"
+    assert total.startswith(f"2 differences; {n_gone + len(before - after):,} voxels only in A, ")
+    assert f"{n_same + shared:,} voxels shared" in total
+    code, out, _ = run("diff", scene, "b.db", "--json")
+    found = json.loads(out)
+    assert code == 1
+    assert (found["equal"], found["same_grid"], found["objects_compared"]) == (False, True, 1)
+    assert found["only_in_a"] == [{"id": 3, "name": "box2", "link": link, "voxels": n_gone}]
+    (record,) = found["moved"]
+    assert (record["id"], record["shared"]) == (2, shared)
+    np.testing.assert_allclose(record["moved_by"], [0, 0, 0.01], atol=1e-12)
+    assert record["farthest_corner_voxels"] == pytest.approx(0.8)
+    assert found["totals"]["shared"] == n_same + shared
+    assert found["only_in_b"] == found["changed"] == found["voxels"] == []
+
+
+def test_voxels_that_differ_are_counted(run: Run, tmp_path: Path) -> None:
+    del tmp_path
+    ijk = blob(1, (20, 20, 20))
+    for name, voxels in (("a.db", ijk[3:]), ("b.db", ijk[:-2])):
+        with hapticdb.create(name, Grid(0.01, (0, 0, 0), 6)) as env:
+            obj = env.store.add(
+                voxel_object(env.grid, ijk), rows_of_voxels(voxels, env.grid, "brick")
+            )
+            assert obj == 1
+    code, out, _ = run("diff", "a.db", "b.db")
+    assert code == 1
+    _, _, row, _, total = out.splitlines()
+    assert row.split()[:6] == ["1", "voxels", "other", "voxels", "2", "3"]
+    assert total.startswith("1 difference; 2 voxels only in A, 3 voxels only in B, ")
+
+
+def test_many_differences_are_cut_and_counted(run: Run, scene: Path) -> None:
+    assert run("copy", scene, "b.db")[0] == 0
+    with hapticdb.open("b.db") as env:
+        for n in range(2 * moving.MOST_LINES):
+            write_voxels(env.store, np.array([[1, 2, 3]]), f"new {n}")
+    code, out, _ = run("diff", scene, "b.db")
+    lines = out.splitlines()
+    assert code == 1
+    assert len(lines) == moving.MOST_LINES + 4
+    cut = f"{2 * moving.MOST_LINES} differences, {moving.MOST_LINES} of them shown; "
+    assert lines[-1].startswith(cut)
+
+
+def test_other_grids_are_a_difference(run: Run, scene: Path) -> None:
+    hapticdb.create("b.db", Grid(0.01, (0, 0, 0), 6)).close()
+    code, out, _ = run("diff", scene, "b.db")
+    assert code == 1
+    assert out.startswith("other grids, so that voxels cannot be compared: 64^3 voxels of ")
+    refused(run("copy", scene, "b.db"), "another grid")
+
+
+@pytest.mark.parametrize("args", [["scene.db", "none.db"], ["none.db", "scene.db"]])
+def test_a_diff_with_nothing_is_an_error(run: Run, scene: Path, args: list[str]) -> None:
+    assert scene.exists()
+    refused(run("diff", *args), "no environment at none.db")
+
+
+# -- the process ----------------------------------------------------------------------------------
+
+
+def test_a_copy_that_is_interrupted_says_that_it_goes_on(run: Run, tmp_path: Path) -> None:
+    source, target = tmp_path / "a.db", tmp_path / "b.db"
+    with hapticdb.create(source, Grid(0.01, (0, 0, 0), 8)) as env:
+        for n in range(40):
+            write_voxels(env.store, blob(n, (30 + 4 * n, 100, 100), 24), f"blob {n}")
+    urls = [str(source), str(target)]
+    args = command_that_halts(20, "copy", *urls, "--layout", "voxel")
+    with child(args) as copying:
+        wait_for_an_object(target, copying)
+        copying.send_signal(signal.SIGINT)
+        _, err = copying.communicate(timeout=PATIENCE)
+    assert copying.returncode == 130
+    assert err.splitlines() == [
+        "hapticdb: interrupted; what went over is whole, and the same command goes on from there"
+    ]
+    code, out, _ = run("copy", source, target, "--layout", "voxel")
+    assert code == 0
+    assert "were there already" in out
+    assert run("diff", source, target)[0] == 0
+
+
+def test_a_terminal_sees_a_bar_with_objects(run: Run, scene: Path) -> None:
+    assert callable(run)
+    ours, theirs = pty.openpty()
+    args = command("copy", scene, "b.db")
+    with child(args, stderr=theirs) as copying:
+        os.close(theirs)
+        seen = b""
+        while chunk := read_terminal(ours):
+            seen += chunk
+    os.close(ours)
+    assert copying.returncode == 0
+    assert b"objects" in seen
+
+
+def read_terminal(ours: int) -> bytes:
+    """What was drawn; nothing once the other side is closed."""
+    try:
+        return os.read(ours, 4096)
+    except OSError:
+        return b""

@@ -1,0 +1,319 @@
+"""The command line on PostgreSQL: what it does on a file, and what only a server can do wrong."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import re
+import shutil
+import signal
+import sys
+from collections.abc import Iterator
+from contextlib import AbstractContextManager
+from pathlib import Path
+from subprocess import Popen
+
+import psycopg
+import pytest
+from psycopg import sql
+
+from children import PATIENCE, child, finished, until
+from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixture `scene` below
+    test_a_move_that_cannot_be_changes_nothing,
+    test_a_pose_and_a_matrix_replace_the_placement,
+    test_a_summary_without_json,
+    test_a_translation_counts_from_where_the_object_is,
+    test_an_excluded_object_is_not_felt,
+    test_analyze_renews_what_an_edit_made_stale,
+    test_calibrate_prints_figures_with_their_spread,
+    test_every_strategy_prints_the_same_wrench,
+    test_info_json_has_the_documented_keys,
+    test_info_speaks_to_people,
+    test_objects_are_listed_by_id,
+    test_remove_takes_all_or_nothing,
+    test_stiffness_scales_the_force,
+    test_touch_json_has_a_line_a_pose,
+    test_touch_json_is_the_librarys_answer_to_the_bit,
+)
+from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
+from hapticdb.demo import prepare
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.store.connect import beside, redact
+from hapticdb.store.postgres.address import parse
+from hapticdb.store.postgres.private_server import PrivateServer
+from servers import FOUND, SETTINGS, Place, named
+
+PASSWORD = "h@nter:2/#?&%"  # noqa: S105 - nobody's
+ESCAPED = "h%40nter%3A2%2F%23%3F%26%25"
+
+
+@pytest.fixture
+def scene(run: Run, made: Path, tmp_path: Path, place: Place) -> str:
+    """The environment of three boxes on a server, with tool and path in the folder.
+
+    Copied, since an import starts a process to read the file.
+    """
+    for name in ("tool.stl", "tool.npz", "path.csv"):
+        shutil.copy(made / name, tmp_path)
+    url = place()
+    assert run("copy", made / "scene.db", url)[0] == 0
+    return url
+
+
+# -- import ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("layout", ["brick", "voxel"])
+def test_an_import_holds_the_rows_of_one_into_a_file(
+    run: Run, made: Path, place: Place, layout: str
+) -> None:
+    url, file = place(), made / "boxes.glb"
+    options = (file, "--bits", 6, "--layout", layout)
+    code, out, err = run("import", url, *options)
+    assert (code, err) == (0, "")
+    assert "3 objects imported" in out
+    assert f"{redact(url)}: 3 objects" in out
+    assert run("import", "file.db", *options)[0] == 0
+    assert rows_of(url) == rows_of("file.db")
+    before = rows_of(url)
+    code, out, err = run("import", url, *options)
+    assert (code, err) == (0, "")
+    assert "complete already (3 objects), nothing to do" in out
+    assert rows_of(url) == before
+
+
+def test_a_touch_prints_what_it_prints_on_a_file(run: Run, scene: str, made: Path) -> None:
+    args = ("--tool", "tool.npz", "--poses", "path.csv", "--json")
+    felt = [
+        [line.split('"query"')[0] for line in run("touch", url, *args)[1].splitlines()]
+        for url in (scene, made / "scene.db")
+    ]
+    assert felt[0] == felt[1]
+    assert len(felt[0]) == len(PLACES)
+
+
+def test_nothing_usable_leaves_no_environment(run: Run, place: Place, tmp_path: Path) -> None:
+    url = place()
+    (tmp_path / "empty.obj").write_bytes(b"")
+    refused(run("import", url, "empty.obj"), "empty.obj")
+    refused(run("info", url), "no environment", "hapticdb import URL FILE")
+
+
+def test_another_grid_than_the_environments_is_refused(run: Run, scene: str, made: Path) -> None:
+    refused(run("import", scene, made / "boxes.glb", "--bits", 7), "bits 7 instead of 6")
+    refused(run("import", scene, made / "boxes.glb", "--layout", "voxel"), "layout")
+
+
+def test_info_names_the_environment_and_the_server(
+    run: Run, scene: str, admin: psycopg.Connection
+) -> None:
+    found = json.loads(run("info", scene, "--json")[1])
+    assert found["name"] == parse(scene).environment
+    version = admin.execute("SHOW server_version").fetchone()
+    assert version is not None
+    assert found["engine"] == f"PostgreSQL {version[0].split()[0]}"
+
+
+# -- what no one may read over a shoulder ---------------------------------------------------------
+
+LINES: tuple[tuple[str, ...], ...] = (
+    ("info",),
+    ("info", "--json"),
+    ("objects",),
+    ("objects", "--json"),
+    ("calibrate",),
+    ("analyze",),
+    ("move", "1", "--translate", "0,0,0.01"),
+    ("move", "1", "--translate", "90,0,0"),
+    ("touch", "--tool", "tool.npz", "--poses", "path.csv"),
+    ("touch", "--tool", "tool.npz", "--poses", "path.csv", "--exclude", "77"),
+    ("remove", "77"),
+    ("remove", "1"),
+    ("import", "tool.stl"),
+)
+
+
+def test_a_password_never_shows(run: Run, scene: str) -> None:
+    for url in (f"{scene}&password={ESCAPED}", f"{beside(scene, 'none')}&password={ESCAPED}"):
+        for verb, *rest in LINES:
+            code, out, err = run("--debug", verb, url, *rest)
+            assert code in {0, 2}, err
+            for secret in (ESCAPED, PASSWORD, "nter"):
+                assert secret not in out + err
+
+
+@pytest.mark.parametrize(
+    "secret", ["h@nter", "h/nter@x", "hunter?@y", "7/hunter", "h#nter", "h%nter"]
+)
+def test_a_password_that_should_have_been_escaped_is_refused_unseen(run: Run, secret: str) -> None:
+    url = f"postgresql://me:{secret}@localhost:1/x"
+    assert "nter" not in refused(run("info", url), "%40")
+    assert "nter" not in run("--debug", "info", url)[2]
+
+
+# -- what only a server can do wrong --------------------------------------------------------------
+
+
+def test_no_server_is_one_line(run: Run, tmp_path: Path) -> None:
+    refused(run("info", f"postgresql:///x?host={tmp_path}"), "cannot be reached")
+    refused(run("info", "postgresql://127.0.0.1:1/x"), "cannot be reached", "refused")
+
+
+def test_a_missing_database_is_one_line(run: Run, database: str, made: Path) -> None:
+    url = re.sub(r"(://[^/]*)/[^?]*", r"\1/nowhere", parse(database).conninfo)
+    refused(run("info", url), '"nowhere" does not exist', "createdb")
+    refused(run("import", url, made / "boxes.glb"), '"nowhere" does not exist', "createdb")
+
+
+def test_psycopg_missing_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    refused(run("info", "postgresql://host/x"), "pip install 'hapticdb[postgres]'")
+
+
+@pytest.fixture(params=[found for found in FOUND if not isinstance(found, str)], ids=named)
+def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[PrivateServer]:
+    """A server of this test's own."""
+    started = PrivateServer.at(tmp_path / "plant", request.param, SETTINGS)
+    started.start()
+    yield started
+    started.stop()
+
+
+def test_a_wrong_password_and_a_missing_role_are_one_line(run: Run, server: PrivateServer) -> None:
+    with psycopg.connect(server.conninfo(), autocommit=True) as connection:
+        connection.execute("CREATE ROLE locked LOGIN PASSWORD 'right'")
+        rules = server.folder / "data" / "pg_hba.conf"
+        rules.write_text("local all locked scram-sha-256\n" + rules.read_text())
+        connection.execute("SELECT pg_reload_conf()").fetchall()
+    url = server.conninfo().replace("user=hapticdb", "user=")
+    for user, words in (
+        ("locked&password=wr0ng", ("authentication failed", "~/.pgpass")),
+        ("locked", ("no password", "~/.pgpass")),
+        ("nobody_here", ('"nobody_here" does not exist', "pg_hba.conf")),
+    ):
+        assert "wr0ng" not in refused(run("info", url + user), *words)
+    refused(run("info", f"{url}locked&password=right"), "no environment")
+
+
+@pytest.mark.long
+def test_a_standby_is_read_and_refuses_to_be_written(
+    run: Run, server: PrivateServer, made: Path, tmp_path: Path
+) -> None:
+    standby = tmp_path / "standby"
+    standby.mkdir(mode=0o700)
+    (standby / "lock").touch(mode=0o600)
+    primary, file = server.conninfo(), made / "boxes.glb"
+    assert run("import", primary, file, "--bits", 6)[0] == 0
+    copied = [server.binaries.path("pg_basebackup"), "--write-recovery-conf", "--checkpoint=fast"]
+    finished([*copied, f"--pgdata={standby / 'data'}", f"--dbname={primary}"], check=True)
+    (standby / "data").chmod(0o700)
+    replica = PrivateServer.at(standby, server.binaries, SETTINGS)
+    try:
+        replica.start()
+        url = replica.conninfo()
+        assert rows_of(url) == rows_of(primary)
+        refused(run("import", url, file), "standby")
+        refused(run("remove", url, 1), "standby")
+        assert run("calibrate", url, "--json")[0] == 0
+        touched = ("--tool", made / "tool.npz", "--poses", made / "path.csv", "--json")
+        for strategy in STRATEGIES:
+            args = (*touched, "--strategy", strategy)
+            felt = [run("touch", place, *args)[1] for place in (primary, url)]
+            assert felt[0].count('"pose"') == len(PLACES)
+            assert re.sub('"query".*', "", felt[0]) == re.sub('"query".*', "", felt[1])
+        assert run("remove", primary, 1)[0] == 0
+        until(lambda: rows_of(url) == rows_of(primary))
+    finally:
+        replica.stop()
+
+
+# -- a first try ----------------------------------------------------------------------------------
+
+PRIVATE = "postgresql:///local?data=server"
+
+
+def started(tmp_path: Path, *args: object) -> AbstractContextManager["Popen[str]"]:
+    """The command line in a process of its own: a private server is released at its end."""
+    return child(command(*args), cwd=tmp_path)
+
+
+@pytest.mark.long
+def test_a_private_server_comes_and_goes_with_the_commands(made: Path, tmp_path: Path) -> None:
+    importing = command("import", PRIVATE, made / "boxes.glb", "--bits", 6)
+    done = finished(importing, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"{PRIVATE}: 3 objects" in done.stdout
+    folder = tmp_path / "server"
+    assert folder.is_dir()
+    args = ("touch", PRIVATE, "--tool", made / "tool.npz", "--poses", made / "path.csv", "--json")
+    with started(tmp_path, *args) as one, started(tmp_path, *args) as other:
+        ended = [process.communicate(timeout=PATIENCE) for process in (one, other)]
+    assert [one.returncode, other.returncode] == [0, 0], ended
+    assert {out.count('"pose"') for out, _ in ended} == {len(PLACES)}
+    assert not PrivateServer.at(folder).is_running
+
+
+@pytest.mark.long
+def test_a_private_server_goes_with_a_command_that_the_system_ends(
+    made: Path, tmp_path: Path
+) -> None:
+    importing = command("import", PRIVATE, made / "boxes.glb", "--bits", 6)
+    finished(importing, cwd=tmp_path, check=True)
+    stl = tool(tmp_path / "tool.stl")
+    many = poses(tmp_path / "many.csv", *[(0.0, 0.0, 0.055)] * 20_000)
+    args = ("touch", PRIVATE, "--tool", stl, "--poses", many, "--json")
+    with started(tmp_path, *args) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline()
+        assert PrivateServer.at(tmp_path / "server").is_running
+        process.terminate()
+        _, err = process.communicate(timeout=PATIENCE)
+    assert (process.returncode, err) == (128 + signal.SIGTERM, "")
+    assert not PrivateServer.at(tmp_path / "server").is_running
+
+
+def test_reading_sets_no_server_up(run: Run, tmp_path: Path) -> None:
+    for verb, *rest in (("info",), ("move", "1", "--translate", "0,0,1"), ("analyze",)):
+        refused(run(verb, PRIVATE, *rest), "no environment", "hapticdb import URL FILE")
+    (tmp_path / "empty.obj").write_bytes(b"")
+    refused(run("import", PRIVATE, "empty.obj"), "empty.obj")
+    assert not (tmp_path / "server").exists()
+
+
+def test_a_private_server_has_no_host(run: Run, tmp_path: Path) -> None:
+    refused(run("info", "postgresql://host/x?data=server"), "leave host")
+    refused(run("info", "postgresql:///x?data=server&user=me"), "leave host")
+    refused(run("info", "postgresql:///x?data="), "names no folder")
+    (tmp_path / "server").mkdir()
+    (tmp_path / "server" / "mine").touch()
+    refused(run("info", PRIVATE), "holds something else")
+
+
+# -- the demo -------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_the_demo_stands_beside_an_environment_and_joins_its_own(
+    run: Run, scene: str, admin: psycopg.Connection, tmp_path: Path
+) -> None:
+    before = rows_of(scene)
+    args = ("demo", "demo", "--url", scene, "--frames", 12, "--points", 40, "--bits", 7)
+    name = parse(scene).environment
+    try:
+        code, out, _ = run(*args)
+        assert code == 0
+        assert "there already" not in out
+        assert "all agreed: hits, ids and wrench bit for bit" in out
+        for layout in ("brick", "voxel"):
+            assert re.search(rf"^PostgreSQL [\d.]+, {layout} layout, ", out, re.MULTILINE)
+        assert f"environment={name}_demo_car:" in out
+        again = prepare("demo", url=scene, bits=7, frames=12, points=40)
+        assert [one.is_new for one in again.imported] == [False, False]
+        assert (tmp_path / "demo" / "demo.png").is_file()
+        assert rows_of(scene) == before
+        code, out, err = run(*args[:-1], 6)
+        assert (code, out) == (2, "")
+        assert "is of another demo" in err
+    finally:
+        for layout in ("", "_voxel"):
+            schema = sql.Identifier(f"{name}_demo_car{layout}")
+            admin.execute(sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema))

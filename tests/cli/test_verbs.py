@@ -1,0 +1,323 @@
+"""The verbs on a small environment, used rightly and wrongly: info to touch."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+
+import hapticdb
+from command_line import PLACES, Run, boxes, made, poses, refused, rows_of, run, scene, tool  # noqa: F401 - fixtures
+from hapticdb.query.frame import STRATEGIES
+
+Scene = Path | str
+"""A file here; the same tests run on servers in cli/test_postgres.py."""
+
+# -- info, objects, calibrate, analyze -----------------------------------------------------------
+
+
+def test_info_json_has_the_documented_keys(run: Run, scene: Scene) -> None:
+    code, out, err = run("info", scene, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert list(found) == [
+        *("name", "engine", "voxel_size", "bits", "origin", "curve", "layout"),
+        *("objects", "scene", "voxels", "rows", "bytes", "page_checksums", "statistics"),
+    ]
+    with hapticdb.open(scene, read_only=True) as env:
+        assert found["voxels"] == sum(len(env.voxels(obj.id)) for obj in env.objects())
+        assert (found["voxel_size"], found["bits"]) == (env.grid.voxel_size, 6)
+        assert (found["name"], found["engine"]) == (env.name, env.engine)
+        assert found["bytes"] == env.size().bytes > 0
+    assert found["statistics"] == {"source": "kept", "revision": 3, "changes": 0, "rows": 0}
+    assert (found["curve"], found["layout"], found["objects"]) == ("z", "brick", 3)
+
+
+def test_info_speaks_to_people(run: Run, scene: Scene) -> None:
+    code, out, err = run("info", scene)
+    assert (code, err) == (0, "")
+    assert "262,144 cells" in out
+    assert "a voxel)" in out
+    assert re.search(r"^engine +(SQLite|PostgreSQL) \d+\.\d+", out, re.MULTILINE)
+    assert re.search(r"^statistics +computed and kept; fresh$", out, re.MULTILINE)
+
+
+def test_analyze_renews_what_an_edit_made_stale(run: Run, scene: Scene) -> None:
+    assert run("remove", scene, 2)[0] == 0
+    assert "1 write behind" in run("info", scene)[1]
+    code, out, err = run("analyze", scene)
+    assert (code, err) == (0, "")
+    assert "10,000 buckets over" in out
+    assert "before: 1 write behind" in out
+    code, out, err = run("analyze", scene, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert list(found) == ["source", "buckets", "rows", "before"]
+    assert found["before"] == {"revision": 4, "changes": 0, "rows": 0}
+    assert (found["source"], found["buckets"]) == ("kept", 10_000)
+    assert found["rows"] == json.loads(run("info", scene, "--json")[1])["rows"]
+
+
+def test_objects_are_listed_by_id(run: Run, scene: Scene) -> None:
+    code, out, err = run("objects", scene, "--json")
+    assert (code, err) == (0, "")
+    found = [json.loads(line) for line in out.splitlines()]
+    assert [(obj["id"], obj["name"]) for obj in found] == [(1, "box0"), (2, "box1"), (3, "box2")]
+    assert np.allclose(np.diff(found[0]["bounds"], axis=0), 0.1)
+    table = run("objects", scene)[1]
+    assert re.search(r"2\s+box1\s+\d+\s+100 x 100 x 100\s+boxes.glb", table)
+
+
+def test_a_name_in_brackets_is_printed_as_it_is(run: Run, tmp_path: Path) -> None:
+    (tmp_path / "a.obj").write_text("o [bold]x[/bold]\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    assert run("import", "a.db", "a.obj", "--bits", 4)[0] == 0
+    with hapticdb.open("a.db", read_only=True) as env:
+        name = env.objects()[0].name
+    assert "[bold]" in name
+    assert name in run("objects", "a.db")[1]
+
+
+def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> None:
+    code, out, err = run("calibrate", scene, "--json")
+    assert (code, err) == (0, "")
+    found = json.loads(out)
+    assert found["kept"] is True
+    assert found["figures"]["descent"] >= 0
+    assert set(found["spread"]) < set(found["figures"])
+    assert "±" in run("calibrate", scene)[1]
+
+
+# -- move, remove ---------------------------------------------------------------------------------
+
+
+def bounds_of(scene: Scene, object_id: int) -> Any:  # noqa: ANN401 - an array
+    with hapticdb.open(scene, read_only=True) as env:
+        return env.object(object_id).bounds
+
+
+def test_a_translation_counts_from_where_the_object_is(run: Run, scene: Scene) -> None:
+    before = bounds_of(scene, 2)
+    for n in (1, 2):
+        code, out, err = run("move", scene, 2, "--translate", "-0.01,0,0.02")
+        assert (code, err) == (0, "")
+        assert "box1" in out
+        assert np.allclose(bounds_of(scene, 2), before + n * np.array([-0.01, 0, 0.02]))
+
+
+def test_a_pose_and_a_matrix_replace_the_placement(run: Run, scene: Scene, tmp_path: Path) -> None:
+    assert run("move", scene, 1, "--pose", "0.1,0,0,0,0,0,2")[0] == 0  # half a turn about z
+    assert np.allclose(bounds_of(scene, 1).mean(axis=0), (0.1, 0, 0))
+    matrix = tmp_path / "matrix.txt"
+    matrix.write_text("1 0 0 0.3\n0 1 0 0.05\n0 0 1 0\n0 0 0 1\n")
+    for given in (matrix, "1,0,0,.3,0,1,0,.05,0,0,1,0,0,0,0,1"):
+        code, out, _ = run("move", scene, 1, "--matrix", given, "--json")
+        assert code == 0
+        assert np.allclose(np.mean(json.loads(out)["bounds"], axis=0), (0.3, 0.05, 0))
+
+
+@pytest.mark.parametrize(
+    ("args", "word"),
+    [
+        ([1], "give one of"),
+        ([1, "--translate", "1,2,3", "--pose", "0,0,0,1,0,0,0"], "give one of"),
+        ([1, "--translate", "1,2"], "--translate"),
+        ([1, "--pose", "0,0,0,0,0,0,0"], "no rotation"),
+        ([1, "--matrix", "none.txt"], "none.txt"),
+        ([1, "--translate", "50,0,0"], "outside the grid"),
+        ([9, "--translate", "0,0,0"], "no object 9"),
+    ],
+)
+def test_a_move_that_cannot_be_changes_nothing(
+    run: Run, scene: Scene, args: list[object], word: str
+) -> None:
+    before = rows_of(scene)
+    refused(run("move", scene, *args), word)
+    assert rows_of(scene) == before
+
+
+def test_a_move_says_when_the_file_is_gone(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "gone.glb")
+    assert run("import", "a.db", file, "--bits", 4)[0] == 0
+    file.unlink()
+    refused(run("move", "a.db", 1, "--translate", "0,0,0.01"), "gone.glb")
+
+
+def test_remove_takes_all_or_nothing(run: Run, scene: Scene) -> None:
+    refused(run("remove", scene, 1, 9), "no object 9")
+    refused(run("remove", scene, "first"), "first")
+    code, out, err = run("remove", scene, 1, "3,1")
+    assert (code, err) == (0, "")
+    assert out == "removed 1 (box0)\nremoved 3 (box2)\n"
+    with hapticdb.open(scene, read_only=True) as env:
+        assert [obj.id for obj in env.objects()] == [2]
+
+
+# -- touch ----------------------------------------------------------------------------------------
+
+
+def touch(run: Run, scene: Scene, *more: object) -> tuple[int, str, str]:
+    return run("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", *more)
+
+
+def test_touch_json_has_a_line_a_pose(run: Run, scene: Scene) -> None:
+    code, out, err = touch(run, scene, "--json", "--strategy", "cbgroup")
+    assert (code, err) == (0, "")
+    found = [json.loads(line) for line in out.splitlines()]
+    assert [frame["pose"] for frame in found] == [0, 1, 2]
+    keys = ["pose", "force", "torque", "hits", "contacts", "objects", "query", "misfits"]
+    assert all(list(frame) == keys for frame in found)
+    asked = ["strategy", "statements", "ranges", "rows", "elapsed_us"]
+    assert all(list(frame["query"]) == asked for frame in found)
+    assert found[0]["objects"] == [{"id": 1, "name": "box0"}]
+    assert found[2]["objects"] == [{"id": 2, "name": "box1"}]
+    assert found[1]["force"] == [0, 0, 0]
+    assert found[0]["hits"] >= found[0]["contacts"] > 0
+
+
+def test_touch_json_is_the_librarys_answer_to_the_bit(run: Run, scene: Scene) -> None:
+    lines = touch(run, scene, "--json", "--tool", "tool.stl", "--points", 90)[1].splitlines()
+    shell = hapticdb.PointShell.from_file("tool.stl", 90)
+    with hapticdb.open(scene, read_only=True) as env:
+        for line, place in zip(lines, PLACES, strict=True):
+            pose = np.eye(4)
+            pose[:3, 3] = place
+            touched = env.touch(shell, pose)
+            frame = json.loads(line)
+            assert frame["force"] == touched.force.tolist()
+            assert frame["torque"] == touched.torque.tolist()
+            assert frame["hits"] == len(touched.hits)
+
+
+def test_every_strategy_prints_the_same_wrench(run: Run, scene: Scene) -> None:
+    wrenches = set()
+    for strategy in STRATEGIES:
+        lines = touch(run, scene, "--json", "--strategy", strategy)[1].splitlines()
+        frames = [json.loads(line) for line in lines]
+        wrenches.add(str([(f["force"], f["torque"], f["hits"], f["objects"]) for f in frames]))
+    assert len(wrenches) == 1
+
+
+def test_an_excluded_object_is_not_felt(run: Run, scene: Scene) -> None:
+    out = touch(run, scene, "--json", "--exclude", "1,3", "--exclude", 2)[1]
+    assert [json.loads(line)["hits"] for line in out.splitlines()] == [0, 0, 0]
+
+
+def test_stiffness_scales_the_force(run: Run, scene: Scene) -> None:
+    one, two = (
+        json.loads(touch(run, scene, "--json", "--stiffness", k)[1].splitlines()[0])["force"]
+        for k in (1000, 2000)
+    )
+    assert np.allclose(2 * np.array(one), two)
+
+
+def test_a_saved_shell_is_a_tool(run: Run, scene: Scene) -> None:
+    saved = touch(run, scene, "--json")[1].splitlines()
+    meshed = touch(run, scene, "--json", "--tool", "tool.stl")[1].splitlines()
+    for one, other in zip(saved, meshed, strict=True):
+        assert one.split('"query"')[0] == other.split('"query"')[0]
+    refused(touch(run, scene, "--points", 9), "saved shell")
+    refused(touch(run, scene, "--tool-unit", "mm"), "saved shell")
+
+
+def test_an_open_tool_is_told_to_be_a_guess(run: Run, scene: Scene, tmp_path: Path) -> None:
+    tool(tmp_path / "open.stl", is_open=True)
+    code, out, err = run("touch", scene, "--tool", "open.stl", "--poses", "path.csv", "--json")
+    assert code == 0
+    assert len(out.splitlines()) == 3
+    assert "inside is a guess" in err
+
+
+def test_the_tools_unit_is_its_own(run: Run, scene: Scene, tmp_path: Path) -> None:
+    cube = trimesh.creation.box((20.0, 20.0, 20.0))
+    (tmp_path / "mm.stl").write_bytes(cube.export(file_type="stl"))
+    args = ("touch", scene, "--tool", "mm.stl", "--poses", "path.csv", "--json")
+    assert json.loads(run(*args, "--tool-unit", "mm")[1].splitlines()[0])["hits"] > 0
+    assert json.loads(run(*args)[1].splitlines()[0])["hits"] == 0
+
+
+def test_a_summary_without_json(run: Run, scene: Scene) -> None:
+    code, out, err = touch(run, scene)
+    assert (code, err) == (0, "")
+    assert re.search(r"frames\s+3: 2 hit, 2 in contact", out)
+    assert "N at pose" in out
+    assert "box1" in out
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--exclude", "77"], "no object 77"),
+        (["--exclude", "x"], "--exclude"),
+        (["--strategy", "guess"], "--strategy"),
+        (["--maxgap", "-1", "--strategy", "maxgap"], "MAXGAP"),
+        (["--stiffness", "nan"], "stiffness"),
+        (["--points", "0", "--tool", "tool.stl"], "points"),
+        (["--seed", "-1", "--tool", "tool.stl"], "seed"),
+        (["--tool", "none.stl"], "none.stl"),
+        (["--poses", "none.csv"], "none.csv"),
+    ],
+)
+def test_a_touch_that_cannot_be_is_one_line(
+    run: Run, scene: Scene, options: list[str], word: str
+) -> None:
+    refused(touch(run, scene, *options), word)
+
+
+@pytest.mark.parametrize("text", ["", "1,2,3\n", "x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0\n", "x,y\n\0"])
+def test_bad_poses_are_named(run: Run, scene: Scene, tmp_path: Path, text: str) -> None:
+    (tmp_path / "bad.csv").write_text(text)
+    refused(touch(run, scene, "--poses", "bad.csv"), "bad.csv")
+
+
+def test_a_few_poses_are_touched_without_measuring_costs_first(run: Run, scene: Path) -> None:
+    args = ("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", "--json")
+    used = {json.loads(line)["query"]["strategy"] for line in run(*args)[1].splitlines()}
+    assert used == {"array"}
+    assert run("calibrate", scene)[0] == 0
+    used = {json.loads(line)["query"]["strategy"] for line in run(*args)[1].splitlines()}
+    assert used <= set(STRATEGIES)
+
+
+# -- names from elsewhere --------------------------------------------------------------------------
+
+UNWANTED = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
+SPITEFUL = ("bell\x07\x1b[2J\x1b]0;owned", "gnp.\u202eexe", "\x9b31mred", "isolated\u2066\u2069")
+
+
+def test_no_name_from_elsewhere_moves_the_cursor_or_turns_the_writing(
+    run: Run, tmp_path: Path
+) -> None:
+    """Of parts in a file and in a database, of the file itself, in results and in errors."""
+    lines = []
+    for n, name in enumerate(SPITEFUL):
+        corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]
+        lines += [f"o {name}", *(f"v {x + 2 * n} {y} {z}" for x, y, z in corners)]
+        lines += [f"f {a + 4 * n} {b + 4 * n} {c + 4 * n}" for a, b, c in ((1, 3, 2), (1, 2, 4))]
+    file = tmp_path / "pa\x1b[31mrts.obj"
+    file.write_text("\n".join([*lines, ""]))
+    tool(tmp_path / "tool.stl")
+    poses(tmp_path / "path.csv", (0.02, 0.02, 0.0))
+    said = []
+    for args in (
+        ("import", "a.db", file, "--bits", 6),
+        ("import", "a.db", file, "no\x1b[31m.obj"),
+        ("objects", "a.db"),
+        ("objects", "a.db", "--json"),
+        ("touch", "a.db", "--tool", "tool.stl", "--poses", "path.csv"),
+        ("move", "a.db", 1, "--translate", "0.1,0,0"),
+        ("remove", "a.db", 1),
+        ("info", "no\x1b[31m\u202e.db"),
+        ("--debug", "info", "no\x1b[31m\u202e.db"),
+        ("touch", "a.db", "--\x1b[31m"),
+    ):
+        _, out, err = run(*args)
+        assert not UNWANTED.search(out + err)
+        said.append(out + err)
+    for shown in (r"gnp.\u202eexe", r"isolated\u2066\u2069", r"pa\x1b[31mrts.obj"):
+        assert shown in said[2]
+    assert said[6].startswith("removed 1 (bell")

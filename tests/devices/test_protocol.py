@@ -1,0 +1,72 @@
+"""What may stand for a device, and what a simulated one makes of a hand that is nowhere."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from devices.readings import FAULTS, Change
+from hapticdb import DeviceError, PointShell, Session, UsageError
+from hapticdb.devices.protocol import Reader
+from hapticdb.devices.scripted import Reading, Tumble
+from hapticdb.devices.simulated import SimulatedDevice
+from realtime.hands import Odd, still
+
+
+class Mute:
+    """It can be read, and that is all."""
+
+    def read(self) -> Reading:
+        return Reading(np.eye(4), np.zeros(6), 0)
+
+
+class Rows:
+    """What has poses, as a recording."""
+
+    def poses(self) -> None: ...
+
+
+@pytest.mark.parametrize(
+    ("device", "hint"),
+    [
+        (
+            np.tile(np.eye(4), (5, 1, 1)),
+            r"an array \(5, 4, 4\) of float64 .*Player\(times, poses\)$",
+        ),
+        ([np.eye(4)], r"of the type list .*Player\(times, poses\)$"),
+        ("path.csv", r"of the type str .*Path\(file\)$"),
+        (Path("path.csv"), r"Path\(file\)$"),
+        (Rows(), r"of the type Rows .*Player\(\*recording\.poses\(\)\)$"),
+        (Tumble, r"Tumble is a class"),
+        (Mute(), r"of the type Mute is none, it has no apply; see hapticdb\.realtime\.devices"),
+        (None, r"None is none, it has no read and no apply"),
+    ],
+)
+def test_what_is_no_device_is_refused_with_what_to_pass_instead(
+    sphere: PointShell,
+    device: Any,  # noqa: ANN401 - that is the test
+    hint: str,
+) -> None:
+    for refused in (lambda: Session("none.db", sphere, device), lambda: SimulatedDevice(device)):
+        with pytest.raises(UsageError, match=rf"^device: .*{hint}") as error:
+            refused()
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(("change", "told"), FAULTS)
+def test_a_simulated_device_believes_no_wrong_hand(change: Change, told: str) -> None:
+    device = SimulatedDevice(Odd(still(0.0), change, first=3))
+    device.read()
+    device.read()
+    with pytest.raises(DeviceError, match=rf"^Odd\.read\(\) returned {told}"):
+        device.read()
+
+
+def test_a_simulated_device_goes_on_when_its_hand_is_somewhere_again() -> None:
+    nowhere = Odd(still(0.25), lambda r: r._replace(velocity=np.full(6, np.nan)), 5, 5)
+    device = SimulatedDevice(nowhere)
+    told = [Reader(device).read() for _ in range(12)]
+    assert [bool(np.isfinite(r.velocity).all()) for r in told[4:9]] == [False] * 5
+    assert np.isfinite(told[-1].pose).all()
+    assert told[-1].pose[2, 3] == 0.25

@@ -1,0 +1,205 @@
+"""The simulated device: how it follows the hand, when a wrench arrives, and how much of it."""
+
+import pickle
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb import UsageError
+from hapticdb.devices.scripted import Player, RandomHand, Reading, SupportsEnd
+from hapticdb.devices.simulated import SimulatedDevice
+from hapticdb.poses import quaternion_of, rotation_of
+
+
+class SetClock:
+    """A clock that only moves when told."""
+
+    def __init__(self) -> None:
+        self.now = 0.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+class Still:
+    """A hand that is where it is put."""
+
+    def __init__(self) -> None:
+        self.pose, self.velocity, self.buttons = np.eye(4), np.zeros(6), 0
+
+    def read(self) -> Reading:
+        return Reading(self.pose, self.velocity, self.buttons)
+
+    def apply(self, wrench: NDArray[np.float64]) -> None:
+        raise AssertionError(f"the person feels the device, not this: {wrench}")
+
+
+def run(device: SimulatedDevice, clock: SetClock, seconds: float, rate: float = 1000.0) -> Reading:
+    """Read at a rate for a while; the last reading."""
+    start = clock.now
+    for n in range(1, round(seconds * rate) + 1):
+        clock.now = start + n / rate
+        reading = device.read()
+    return reading
+
+
+def angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
+    return float(2.0 * np.arccos(min(1.0, abs(quaternion_of(a.T @ b)[0][0]))))
+
+
+def energy(reading: Reading, hand: Still) -> float:
+    """Of the default device and its spring: J."""
+    x = reading.pose[:3, 3] - hand.pose[:3, 3]
+    v, w = reading.velocity[:3], reading.velocity[3:]
+    angle = angle_between(reading.pose[:3, :3], hand.pose[:3, :3])
+    return float(0.5 * (0.1 * v @ v + 1e-4 * w @ w + 300.0 * x @ x + 0.3 * angle * angle))
+
+
+@given(
+    st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3),
+    st.lists(st.floats(-1.0, 1.0), min_size=4, max_size=4).filter(
+        lambda q: np.linalg.norm(q) > 0.1
+    ),
+)
+@settings(max_examples=25, deadline=None)
+def test_a_free_device_comes_to_the_hand_and_only_loses_energy(
+    position: list[float], q: list[float]
+) -> None:
+    clock, hand = SetClock(), Still()
+    device = SimulatedDevice(hand, clock=clock)
+    device.read()
+    hand.pose = np.eye(4)
+    hand.pose[:3, 3] = position
+    hand.pose[:3, :3] = rotation_of(np.array(q) / np.linalg.norm(q))[0]
+    last = energy(device.read(), hand)
+    for _ in range(60):
+        now = energy(run(device, clock, 0.01), hand)
+        assert now <= last * (1.0 + 1e-6) + 1e-12
+        last = now
+    rested = device.read()
+    assert np.allclose(rested.pose, hand.pose, atol=1e-5)
+    assert np.allclose(rested.velocity, 0.0, atol=1e-4)
+
+
+def test_a_step_of_the_hand_is_followed_as_the_equation_says() -> None:
+    clock, hand = SetClock(), Still()
+    device = SimulatedDevice(hand, clock=clock)
+    device.read()
+    hand.pose = np.eye(4)
+    hand.pose[0, 3] = 0.01
+    w = np.sqrt(300.0 / 0.1)
+    for _ in range(50):
+        x = run(device, clock, 0.001).pose[0, 3]
+        t = clock.now
+        assert x == pytest.approx(0.01 * (1.0 - (1.0 + w * t) * np.exp(-w * t)), abs=3e-5)
+
+
+def test_a_wrench_pushes_after_the_latency_and_not_before() -> None:
+    clock, hand = SetClock(), Still()
+    device = SimulatedDevice(hand, latency=0.005, clock=clock)
+    device.read()
+    device.apply(np.array([1.0, 0, 0, 0, 0, 0.01]))
+    assert run(device, clock, 0.0049, 10_000).velocity.tolist() == [0.0] * 6
+    moved = run(device, clock, 0.0006, 10_000)
+    # half a millisecond of 1 N on 0.1 kg
+    assert moved.velocity[0] == pytest.approx(0.005, rel=0.05)
+    assert moved.velocity[5] == pytest.approx(0.05, rel=0.05)
+
+
+def test_wrenches_push_in_turn() -> None:
+    clock, hand = SetClock(), Still()
+    device = SimulatedDevice(hand, latency=0.002, grip=0.0, turn_grip=0.0, clock=clock)
+    device.read()
+    for force in (1.0, -1.0, 0.0):
+        device.apply(np.array([force, 0, 0, 0, 0, 0]))
+        clock.now += 0.001
+    # one read sees them all: a millisecond forth, a millisecond back
+    clock.now = 0.010
+    reading = device.read()
+    assert reading.velocity[0] == pytest.approx(0.0, abs=1e-12)
+    assert reading.pose[0, 3] == pytest.approx(0.001**2 / 0.1, rel=1e-6)
+
+
+def test_the_motors_are_capped() -> None:
+    clock, hand = SetClock(), Still()
+    device = SimulatedDevice(hand, clock=clock)
+    device.read()
+    device.apply(np.array([30.0, 40.0, 0, 0, 0, -5.0]))
+    assert np.allclose(device.last_wrench, [4.2, 5.6, 0, 0, 0, -0.2])
+    rested = run(device, clock, 1.0)
+    assert np.allclose(rested.pose[:3, 3], [4.2 / 300.0, 5.6 / 300.0, 0.0], atol=1e-6)
+    assert angle_between(np.eye(3), rested.pose[:3, :3]) == pytest.approx(0.2 / 0.3, abs=1e-4)
+
+
+def test_a_wrench_is_kept_though_the_caller_writes_over_it() -> None:
+    clock, hand = SetClock(), Still()
+    device = SimulatedDevice(hand, clock=clock)
+    wrench = np.array([3.0, 0, 0, 0, 0, 0])
+    device.read()
+    device.apply(wrench)
+    wrench[:] = 0.0
+    assert run(device, clock, 1.0).pose[0, 3] == pytest.approx(0.01, abs=1e-6)
+    assert device.last_wrench[0] == 3.0
+
+
+@pytest.mark.parametrize("rate", [300.0, 1000.0, 7000.0])
+def test_how_often_it_is_read_hardly_changes_where_it_goes(rate: float) -> None:
+    poses = []
+    for each in (rate, 10_000.0):
+        clock = SetClock()
+        device = SimulatedDevice(RandomHand((0, 0, 0), 2, 0.5, clock=clock), clock=clock)
+        device.read()
+        poses.append(run(device, clock, 1.0, each).pose.copy())
+    assert np.allclose(poses[0], poses[1], atol=2e-3)
+
+
+def test_it_keeps_up_with_a_hand_that_moves_steadily() -> None:
+    clock = SetClock()
+    end = np.eye(4)
+    end[0, 3] = 1.0
+    hand = Player([0.0, 1.0], [np.eye(4), end], clock=clock)
+    device = SimulatedDevice(hand, clock=clock)
+    device.read()
+    reading = run(device, clock, 0.5)
+    assert reading.pose[0, 3] == pytest.approx(0.5, abs=1e-4)
+    assert reading.velocity[0] == pytest.approx(1.0, abs=1e-3)
+    assert not device.is_over
+    run(device, clock, 0.6)
+    assert isinstance(device, SupportsEnd)
+    assert device.is_over
+
+
+def test_a_long_pause_is_skipped_but_for_its_end() -> None:
+    clock, hand = SetClock(), Still()
+    device = SimulatedDevice(hand, grip=0.0, turn_grip=0.0, latency=0.0, clock=clock)
+    device.read()
+    device.apply(np.array([1.0, 0, 0, 0, 0, 0]))
+    clock.now = 100.0
+    # 50 ms at 10 m/s^2
+    assert device.read().velocity[0] == pytest.approx(0.5, rel=1e-3)
+
+
+def test_buttons_are_the_hand_s_and_a_hand_without_an_end_has_none() -> None:
+    hand = Still()
+    device = SimulatedDevice(hand)
+    hand.buttons = 5
+    assert device.read().buttons == 5
+    assert not device.is_over
+
+
+def test_it_can_be_pickled() -> None:
+    twin = pickle.loads(pickle.dumps(SimulatedDevice(RandomHand((0, 0, 0)))))  # noqa: S301 - its own
+    twin.apply(np.ones(6))
+    assert np.isfinite(twin.read().pose).all()
+
+
+@pytest.mark.parametrize(
+    "wrong", [{"mass": 0.0}, {"grip": -1.0}, {"latency": float("nan")}, {"mass": 1e-6}]
+)
+def test_devices_that_cannot_be_are_refused(wrong: dict[str, Any]) -> None:
+    with pytest.raises(UsageError):
+        SimulatedDevice(Still(), **wrong)

@@ -1,0 +1,426 @@
+"""Bought devices, each against a fake of what its maker documents."""
+
+import math
+import pickle
+import sys
+import time
+from collections.abc import Callable, Iterator
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from children import PATIENCE
+from devices.fake_dhd import FakeDhd
+from devices.fake_dhd import install as install_dhd
+from devices.fake_haply import IDENTITY, FakeHaply, vector
+from devices.fake_hd import INVALID_HANDLE, FakeHd
+from devices.fake_hd import install as install_hd
+from hapticdb import DeviceError, MissingExtraError, UsageError
+from hapticdb.devices.scripted import Device, SupportsClose, SupportsOpen
+from hapticdb.devices.vendors import VelocityWindow, load
+from hapticdb.devices.vendors.force_dimension import ForceDimensionDevice
+from hapticdb.devices.vendors.haply import HaplyDevice
+from hapticdb.devices.vendors.openhaptics import OpenHapticsDevice
+
+PUSH = np.array([30.0, 0.0, 40.0, 0.0, 3.0, 0.0])
+
+
+@pytest.fixture
+def dhd(monkeypatch: pytest.MonkeyPatch) -> FakeDhd:
+    return install_dhd(monkeypatch)
+
+
+@pytest.fixture
+def hd(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeHd]:
+    fake = install_hd(monkeypatch)
+    yield fake
+    fake.stop_scheduler()
+
+
+@pytest.fixture
+def haply() -> Iterator[FakeHaply]:
+    with FakeHaply() as fake:
+        yield fake
+
+
+def eventually(claim: Callable[[], bool]) -> bool:
+    deadline = time.monotonic() + PATIENCE
+    while not claim():
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.002)
+    return True
+
+
+# --- all of them --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("make", "package", "extra"),
+    [
+        (ForceDimensionDevice, "forcedimension_core", "force-dimension"),
+        (OpenHapticsDevice, "pyOpenHaptics", "openhaptics"),
+        (HaplyDevice, "websockets", "haply"),
+    ],
+)
+def test_a_package_that_is_not_there_is_named_with_its_extra(
+    monkeypatch: pytest.MonkeyPatch, make: Callable[[], SupportsOpen], package: str, extra: str
+) -> None:
+    for name in [n for n in sys.modules if n.split(".")[0] == package]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setattr(sys, "meta_path", [Without(package), *sys.meta_path])
+    with pytest.raises(MissingExtraError, match=rf"{package}.*hapticdb\[{extra}\]"):
+        make().open()
+
+
+class Without:
+    """An installation without one package."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+
+    def find_spec(self, name: str, path: object = None, target: object = None) -> None:
+        del path, target
+        if name.partition(".")[0] == self.package:
+            raise ModuleNotFoundError(f"No module named {name!r}", name=self.package)
+
+
+def test_a_maker_s_library_that_does_not_load_is_another_matter(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    def fail(name: str) -> ModuleType:
+        raise OSError(f"libHD.so: cannot open shared object file\n{name}")
+
+    monkeypatch.setattr("hapticdb.devices.vendors.importlib.import_module", fail)
+    with pytest.raises(DeviceError, match=r"libHD\.so") as caught:
+        load("pyOpenHaptics.hd", "openhaptics")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("make", [ForceDimensionDevice, OpenHapticsDevice, HaplyDevice])
+def test_devices_travel_before_they_are_opened(make: Callable[[], Device]) -> None:
+    device = make()
+    assert isinstance(device, SupportsOpen)
+    assert isinstance(device, SupportsClose)
+    device.close()
+    assert type(pickle.loads(pickle.dumps(device))) is make  # noqa: S301 - its own
+
+
+@pytest.mark.parametrize("make", [ForceDimensionDevice, OpenHapticsDevice, HaplyDevice])
+def test_a_device_that_is_not_open_says_so(make: Callable[[], Device]) -> None:
+    with pytest.raises(DeviceError, match="not open"):
+        make().read()
+
+
+def test_velocity_is_the_difference_over_the_window() -> None:
+    window = VelocityWindow()
+    pose = np.eye(4)
+    assert window.measure(5.0, pose.copy()).tolist() == [0.0] * 6
+    for n in range(1, 60):
+        angle = 2.0 * n * 0.001
+        pose[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+        pose[1, 3] = 0.3 * n * 0.001
+        velocity = window.measure(5.0 + n * 0.001, pose.copy())
+        assert np.allclose(velocity, [0, 0.3, 0, 0, 0, 2.0], atol=1e-6)
+    for n in range(60, 90):  # the hand stops, and 20 ms later nothing is left of its speed
+        velocity = window.measure(5.0 + n * 0.001, pose.copy())
+    assert velocity.tolist() == [0.0] * 6
+
+
+# --- Force Dimension ----------------------------------------------------------------------------
+
+
+def test_force_dimension_reports_pose_velocity_and_buttons(dhd: FakeDhd) -> None:
+    device = ForceDimensionDevice()
+    device.open()
+    reading = device.read()
+    assert reading.pose[:3, 3].tolist() == [0.01, 0.02, 0.03]
+    assert reading.pose[:3, :3].tolist() == dhd.rows
+    assert reading.pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert reading.velocity.tolist() == [0.1, 0.2, 0.3, 1.0, 2.0, 3.0]
+    assert reading.buttons == 5
+    assert dhd.calls[:2] == [("open",), ("enableForce", True, 0)]
+
+
+def test_force_dimension_is_capped_in_force_and_torque(dhd: FakeDhd) -> None:
+    device = ForceDimensionDevice(4711)
+    device.open()
+    assert dhd.calls[0] == ("openSerial", 4711)
+    device.apply(PUSH)
+    name, force, torque, opened = dhd.calls[-1]
+    assert (name, opened) == ("setForceAndTorque", 0)
+    assert np.allclose(np.array(force), [4.2, 0.0, 5.6])
+    assert np.allclose(np.array(torque), [0.0, 0.2, 0.0])
+
+
+def test_force_dimension_without_a_wrist_is_upright_and_pushes_straight(dhd: FakeDhd) -> None:
+    dhd.wrist = dhd.active_wrist = False
+    device = ForceDimensionDevice(max_force=50.0)
+    device.open()
+    reading = device.read()
+    assert np.array_equal(reading.pose[:3, :3], np.eye(3))
+    assert reading.pose[:3, 3].tolist() == dhd.position
+    assert reading.velocity.tolist() == [0.1, 0.2, 0.3, 0.0, 0.0, 0.0]
+    device.apply(PUSH)
+    assert dhd.calls[-1] == ("setForce", [30.0, 0.0, 40.0], 0)
+
+
+def test_force_dimension_has_no_speed_before_two_positions(dhd: FakeDhd) -> None:
+    dhd.velocity_code = -1
+    device = ForceDimensionDevice()
+    device.open()
+    assert device.read().velocity.tolist() == [0.0] * 6
+
+
+def test_force_dimension_takes_saturated_motors_for_what_they_are(dhd: FakeDhd) -> None:
+    dhd.push_code = 2
+    device = ForceDimensionDevice()
+    device.open()
+    device.apply(PUSH)
+    assert dhd.calls[-1][0] == "setForceAndTorque"
+
+
+def test_force_dimension_that_is_not_there_is_told(dhd: FakeDhd) -> None:
+    dhd.n_devices = 0
+    with pytest.raises(DeviceError, match="no device found"):
+        ForceDimensionDevice().open()
+    with pytest.raises(DeviceError, match="serial number 12: no device found"):
+        ForceDimensionDevice(12).open()
+
+
+def test_force_dimension_that_is_unplugged_is_told(dhd: FakeDhd) -> None:
+    device = ForceDimensionDevice()
+    device.open()
+    dhd.is_plugged = False
+    with pytest.raises(DeviceError, match="communication error"):
+        device.read()
+    with pytest.raises(DeviceError, match="communication error"):
+        device.apply(PUSH)
+
+
+def test_force_dimension_is_stopped_and_closed_once(dhd: FakeDhd) -> None:
+    device = ForceDimensionDevice()
+    device.open()
+    device.close()
+    device.close()
+    assert dhd.calls[-2:] == [("stop", 0), ("close", 0)]
+    assert dhd.calls.count(("close", 0)) == 1
+
+
+# --- OpenHaptics --------------------------------------------------------------------------------
+
+
+def test_openhaptics_turns_millimetres_and_columns_into_a_pose(
+    hd: FakeHd, capsys: pytest.CaptureFixture[str]
+) -> None:
+    device = OpenHapticsDevice("Left")
+    device.open()
+    reading = device.read()
+    assert np.allclose(reading.pose[:3, 3], [0.01, 0.02, 0.03])
+    assert reading.pose[:3, 1].tolist() == [0.0, 0.0, 1.0]  # its second column
+    assert reading.pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
+    assert reading.buttons == 2
+    assert hd.calls[:3] == [("init_device", "Left"), "enable_force", "start_scheduler"]
+    device.close()
+    assert hd.calls[3:] == ["stop_scheduler", ("close_device", 7)]
+    assert capsys.readouterr().out == ""
+
+
+def test_openhaptics_pushes_what_was_applied_capped(hd: FakeHd) -> None:
+    device = OpenHapticsDevice()
+    device.open()
+    assert set(map(tuple, hd.forces)) == {(0.0, 0.0, 0.0)}
+
+    def is_pushed() -> bool:
+        device.apply(PUSH)
+        return bool(np.allclose(hd.forces[-1], [1.98, 0.0, 2.64]))
+
+    assert eventually(is_pushed)
+    device.close()
+
+
+def test_openhaptics_lets_a_force_go_that_no_other_follows(hd: FakeHd) -> None:
+    now = [0.0]
+    device = OpenHapticsDevice(clock=lambda: now[0])
+    device.open()
+    device.apply(PUSH)
+    assert eventually(lambda: hd.forces[-1] != [0.0, 0.0, 0.0])
+    now[0] = 0.06
+    assert eventually(lambda: hd.forces[-1] == [0.0, 0.0, 0.0])
+    device.close()
+
+
+def test_openhaptics_measures_velocity(hd: FakeHd) -> None:
+    now = [0.0]
+    seen_at = [0.0]
+
+    def clock() -> float:
+        seen_at[0] = now[0]
+        return now[0]
+
+    def is_moving() -> bool:
+        now[0] += 0.001
+        # the hand is where it was when the callback asked for the time: 0.1 m/s along y
+        hd.columns[3][1] = 100.0 * seen_at[0]
+        return bool(abs(device.read().velocity[1] - 0.1) < 0.02)
+
+    device = OpenHapticsDevice(clock=clock)
+    device.open()
+    assert eventually(is_moving)
+    device.close()
+
+
+@pytest.mark.parametrize("handle", [None, INVALID_HANDLE])
+def test_openhaptics_that_is_not_there_is_told(hd: FakeHd, handle: int | None) -> None:
+    hd.handle = handle
+    with pytest.raises(DeviceError, match="no OpenHaptics device named 'Default Device'"):
+        OpenHapticsDevice().open()
+    assert "start_scheduler" not in hd.calls
+
+
+@pytest.mark.parametrize("code", [0x0103, 0x0302])
+def test_openhaptics_that_fails_to_start_is_let_go(hd: FakeHd, code: int) -> None:
+    hd.error = code  # one that the package knows by name, one that it does not
+    with pytest.raises(DeviceError, match="failed to start"):
+        OpenHapticsDevice().open()
+    assert hd.calls[-2:] == ["stop_scheduler", ("close_device", 7)]
+
+
+def test_openhaptics_that_goes_silent_is_told(hd: FakeHd) -> None:
+    device = OpenHapticsDevice()
+    device.open()
+    hd.is_plugged = False
+
+    def is_told() -> bool:
+        try:
+            device.read()
+        except DeviceError as error:
+            return "silent" in str(error)
+        return False
+
+    assert eventually(is_told)
+    device.close()
+
+
+# --- Haply --------------------------------------------------------------------------------------
+
+
+def test_haply_reports_what_the_service_says(haply: FakeHaply) -> None:
+    haply.velocity = vector(0.1, 0.2, 0.3)
+    device = HaplyDevice(url=haply.url)
+    device.open()
+    reading = device.read()
+    assert reading.pose[:3, 3].tolist() == [0.0, -0.12, 0.15]
+    assert np.array_equal(reading.pose[:3, :3], np.eye(3))
+    assert reading.velocity.tolist() == [0.1, 0.2, 0.3, 0.0, 0.0, 0.0]
+    assert reading.buttons == 0
+    assert haply.told[0]["session"] == {"configure": {"profile": {"name": "hapticdb"}}}
+    device.close()
+
+
+def test_haply_is_told_forces_capped_and_nothing_else(haply: FakeHaply) -> None:
+    device = HaplyDevice("049D", url=haply.url)
+    device.open()
+    for _ in range(3):
+        device.read()
+        device.apply(PUSH)
+    device.read()
+    device.close()
+    assert haply.is_over.wait(PATIENCE)
+    push = {"x": pytest.approx(4.2), "y": 0.0, "z": pytest.approx(5.6)}
+    assert haply.forces == [vector(0, 0, 0), push, push, push, vector(0, 0, 0)]
+    assert all(message["inverse3"][0]["device_id"] == "049D" for message in haply.told)
+    assert all("session" not in message for message in haply.told[1:])
+
+
+def test_haply_reads_the_newest_state_whatever_was_asked_before(haply: FakeHaply) -> None:
+    device = HaplyDevice(url=haply.url)
+    device.open()
+    for n in range(5):
+        device.apply(PUSH)
+        haply.position = vector(0.01 * n, 0.0, 0.0)
+    device.read()  # the answers so far
+    haply.position = vector(0.5, 0.0, 0.0)
+    assert device.read().pose[0, 3] == 0.5
+    assert haply.forces[-1] == haply.forces[-2] != vector(0, 0, 0)
+    device.close()
+
+
+@pytest.mark.parametrize(
+    ("kind", "state", "buttons"),
+    [
+        ("wireless_verse_grip", {"buttons": {"a": True, "b": False, "c": True}}, 5),
+        ("verse_grip", {"button": True, "hall": 3}, 1),
+    ],
+)
+def test_haply_takes_turns_and_buttons_from_the_grip(
+    haply: FakeHaply, kind: str, state: dict[str, object], buttons: int
+) -> None:
+    half = math.sqrt(0.5)
+    turned = {"w": half, "x": 0.0, "y": 0.0, "z": half}
+    haply.grips = {kind: [{"device_id": "61548", "state": {"orientation": turned, **state}}]}
+    device = HaplyDevice(url=haply.url)
+    device.open()
+    reading = device.read()
+    assert np.allclose(reading.pose[:3, 0], [0.0, 1.0, 0.0])
+    assert reading.buttons == buttons
+    haply.grips[kind][0]["state"]["orientation"] = dict.fromkeys(IDENTITY, 0.0)
+    assert np.allclose(device.read().pose[:3, 0], [0.0, 1.0, 0.0])  # zeros are no turn
+    device.close()
+
+
+def test_haply_without_the_device_is_told(haply: FakeHaply) -> None:
+    with pytest.raises(DeviceError, match=r"no Inverse3 XY at .* it has 049D"):
+        HaplyDevice("XY", url=haply.url).open()
+    haply.devices = []
+    with pytest.raises(DeviceError, match=r"no Inverse3 at .* it has none"):
+        HaplyDevice(url=haply.url).open()
+
+
+def test_haply_without_the_service_is_told(haply: FakeHaply) -> None:
+    url = haply.url
+    haply.__exit__(None, None, None)
+    with pytest.raises(DeviceError, match="no Haply Inverse Service") as caught:
+        HaplyDevice(url=url).open()
+    assert "\n" not in str(caught.value)
+
+
+def test_haply_that_goes_silent_is_told(haply: FakeHaply) -> None:
+    device = HaplyDevice(url=haply.url)
+    device.open()
+    device.read()
+    haply.answers = False
+    with pytest.raises(DeviceError, match="is gone"):
+        device.read()
+    device.close()
+
+
+def test_haply_whose_service_stops_is_told(haply: FakeHaply) -> None:
+    device = HaplyDevice(url=haply.url)
+    device.open()
+    device.read()
+    haply.unplug()
+    with pytest.raises(DeviceError, match="is gone"):
+        device.read()
+    with pytest.raises(DeviceError, match="is gone"):
+        device.apply(PUSH)
+    device.close()
+
+
+def test_haply_that_is_unplugged_from_the_service_is_told(haply: FakeHaply) -> None:
+    device = HaplyDevice(url=haply.url)
+    device.open()
+    device.read()
+    haply.devices = ["FFFF"]
+    with pytest.raises(DeviceError, match="no longer lists 049D"):
+        device.read()
+    device.close()
+
+
+@pytest.mark.parametrize(
+    "url", ["ws://192.0.2.1:10001", "wss://localhost:10001", "http://localhost", "localhost:10001"]
+)
+def test_haply_is_sought_on_this_machine_only(url: str) -> None:
+    with pytest.raises(UsageError, match="on this machine"):
+        HaplyDevice(url=url)

@@ -1,0 +1,86 @@
+"""A run of the tests hears Ctrl-C however it was started, and leaves nothing however it ends."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from children import RUN, child, finished, until
+from hapticdb.resident.table import is_alive
+
+HERE = Path(__file__).parent.parent
+PATHS = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+
+HEARING = """
+import signal, subprocess, sys
+import children
+assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+children.begin_run()
+asked = [sys.executable, "-c", "import signal; print(signal.getsignal(signal.SIGINT))"]
+print(signal.getsignal(signal.SIGINT), children.finished(asked).stdout)
+"""
+
+
+def test_a_run_that_was_started_deaf_to_interrupts_hears_them_and_so_do_its_children() -> None:
+    deaf = ["bash", "-c", 'trap "" INT; exec "$@"', "bash", sys.executable, "-c", HEARING]
+    done = finished(deaf, env=PATHS)
+    assert done.stderr == ""
+    assert done.stdout.count("default_int_handler") == 2
+
+
+HOLDING = """
+import os, subprocess, sys, time
+import children, servers
+children.begin_run()
+server = servers.private_server(next(b for b in servers.FOUND if not isinstance(b, str)))
+asleep = [sys.executable, "-c", "import time; time.sleep(600)"]
+apart = subprocess.Popen(asleep, start_new_session=True)
+forked = os.fork()
+if forked:
+    children.end_forked(forked)
+    print(server._postmaster(), apart.pid, forked, os.environ[children.RUN], flush=True)
+time.sleep(600)
+"""
+
+
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM], ids=str)
+def test_a_run_that_is_killed_leaves_no_server_no_process_and_no_file(how: signal.Signals) -> None:
+    with child([sys.executable, "-c", HOLDING], env=PATHS, stderr=None) as run:
+        assert run.stdout is not None
+        *numbers, folder = run.stdout.readline().split()
+        pids = list(map(int, numbers))
+        assert len(pids) == 3
+        assert all(map(is_alive, pids))
+        assert Path(folder).is_dir()
+        os.kill(run.pid, how)
+        until(lambda: not any(map(is_alive, pids)))
+        until(lambda: not Path(folder).exists())
+
+
+def test_a_child_is_killed_with_its_group_when_its_time_is_over() -> None:
+    pids: list[int] = []
+
+    def listen() -> None:
+        with child(["sh", "-c", "sleep 600 & echo $!; wait"], patience=0.5) as process:
+            assert process.stdout is not None
+            pids.extend(map(int, process.stdout))  # until the pipe closes
+
+    with pytest.raises(pytest.fail.Exception, match=r"killed, since it did not end within 0\.5 s"):
+        listen()
+    (grandchild,) = pids
+    until(lambda: not is_alive(grandchild))
+
+
+def test_a_test_that_fails_does_not_wait_for_its_child() -> None:
+    with pytest.raises(ZeroDivisionError), child(["sleep", "600"]) as process:
+        raise ZeroDivisionError
+    assert process.returncode == -signal.SIGKILL
+
+
+def test_temporary_files_are_in_the_folder_of_the_run(tmp_path: Path) -> None:
+    """But those that a person may want to see after it."""
+    done = finished([sys.executable, "-c", "import tempfile; print(tempfile.gettempdir())"])
+    assert done.stdout.strip() == os.environ[RUN]
+    assert not tmp_path.is_relative_to(os.environ[RUN])

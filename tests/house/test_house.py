@@ -1,0 +1,467 @@
+"""Rules of the house, read off the sources: which way imports point, sizes, names, what is public.
+
+ARCHITECTURE.md draws the floors; this file keeps them.
+"""
+
+import ast
+import builtins
+import inspect
+import os
+import re
+import shutil
+import sys
+import tomllib
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+
+import numba
+import pytest
+
+import hapticdb
+from children import finished
+from hapticdb import errors
+from hapticdb.kernels._cache import cache_folder, sources_digest
+
+ROOT = Path(__file__).parent.parent.parent
+PACKAGE = ROOT / "src" / "hapticdb"
+
+# from the top; a module imports its own floor and those below it
+FLOORS: list[set[str]] = [
+    {"__main__"},
+    {"cli", "server"},
+    {"bench", "demo", "pictures"},
+    {"pool", "warm"},
+    {"realtime", "sweeps"},
+    {"recording", "devices"},
+    {"environment", "resident", "sample", "testing"},
+    {"check", "difference", "finding", "ingest", "proportions", "transfer"},
+    {"query"},
+    {"pointshell", "mesh", "poses"},
+    {"store"},
+    {"grid"},
+    {"kernels"},
+    {"units"},
+    {"errors", "interrupting"},
+]
+LEVELS = {name: level for level, floor in enumerate(FLOORS) for name in floor}
+# what may import less than its floor allows
+NARROW: dict[str, set[str]] = {
+    "kernels": set(),
+    "errors": set(),
+    "interrupting": set(),
+    "poses": {"errors", "units"},
+    "mesh": {"errors", "units"},
+    "devices": {"errors", "kernels", "poses"},
+    "sample": {"poses", "errors"},
+}
+PUBLIC = [
+    "AccessError",
+    "BusyError",
+    "CheckReport",
+    "ConflictError",
+    "ConnectionLostError",
+    "CopyReport",
+    "CostModel",
+    "Coupling",
+    "DamagedError",
+    "DatabaseError",
+    "DeviceError",
+    "Difference",
+    "Environment",
+    "EnvironmentExistsError",
+    "EnvironmentNotFoundError",
+    "FileError",
+    "FileReport",
+    "GeometryChangedError",
+    "Grid",
+    "GridError",
+    "GridOptions",
+    "Handle",
+    "HapticDBError",
+    "ImportOptions",
+    "MissingExtraError",
+    "NewerVersionError",
+    "NotAnEnvironmentError",
+    "Object",
+    "ObjectNotFoundError",
+    "OutsideGridError",
+    "PointShell",
+    "Pool",
+    "Proportions",
+    "QuantileVector",
+    "Query",
+    "ReadOnlyError",
+    "Recording",
+    "Replayed",
+    "Report",
+    "ResidentCells",
+    "Session",
+    "StuckError",
+    "Swept",
+    "TangentPlane",
+    "Touch",
+    "Touches",
+    "UsageError",
+    "backup_environment",
+    "check_environment",
+    "compare_proportions",
+    "copy_environment",
+    "create",
+    "diff_environments",
+    "import_files",
+    "open",
+    "read_poses",
+    "replay",
+    "restore_environment",
+    "sweep",
+    "warm_up",
+    "write_poses",
+]
+
+
+def modules() -> list[Path]:
+    return sorted(PACKAGE.rglob("*.py"))
+
+
+def python_files() -> list[Path]:
+    folders = ("src", "tests", "benchmarks")
+    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def named(path: Path) -> str:
+    return path.relative_to(ROOT).as_posix()
+
+
+def domain(path: Path) -> str:
+    """Module or folder directly below the package that a source belongs to."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Dotted names of all modules that a source imports, at its top or inside a function."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{named(path)} imports relatively"
+            assert node.module is not None
+            if node.module == "hapticdb":
+                yield from (f"hapticdb.{alias.name}" for alias in node.names)
+            else:
+                yield node.module
+
+
+def own(path: Path) -> set[str]:
+    """Domains of the package that a source imports, its own left out."""
+    found = {name.split(".")[1] for name in imported(path) if name.startswith("hapticdb.")}
+    return found - {domain(path)}
+
+
+# --- imports ------------------------------------------------------------------------------------
+
+
+def test_every_module_stands_on_a_floor() -> None:
+    assert {domain(path) for path in modules()} - {"__init__"} <= set(LEVELS)
+
+
+def test_imports_point_one_way() -> None:
+    for path in modules():
+        if domain(path) == "__init__":
+            continue
+        # those on top may use the public names as a user does
+        public = {*PUBLIC, "__version__"} if LEVELS[domain(path)] < LEVELS["environment"] else set()
+        above = {n for n in own(path) - public if LEVELS.get(n, -1) < LEVELS[domain(path)]}
+        assert above == set(), f"{named(path)} imports from above"
+
+
+def test_modules_import_no_more_than_they_need() -> None:
+    for path in modules():
+        if domain(path) in NARROW:
+            assert own(path) <= NARROW[domain(path)], f"{named(path)}: {own(path)}"
+
+
+def test_no_two_domains_import_each_other() -> None:
+    """Within a floor, too; for the type checker as well."""
+    below: dict[str, set[str]] = {}
+    for path in modules():
+        below.setdefault(domain(path), set()).update(own(path) & set(LEVELS))
+    while below:
+        free = [name for name, needed in below.items() if not needed & set(below)]
+        assert free, f"imports go round among {sorted(below)}"
+        for name in free:
+            del below[name]
+
+
+def test_kernels_import_numpy_numba_and_their_own_folder() -> None:
+    # llvmlite is numba's own lower half
+    for path in (PACKAGE / "kernels").glob("*.py"):
+        found = {
+            name for name in imported(path) if name.split(".")[0] not in sys.stdlib_module_names
+        }
+        foreign = [
+            n for n in found if not re.match(r"(numpy|numba|llvmlite|hapticdb\.kernels)(\.|$)", n)
+        ]
+        assert foreign == [], named(path)
+
+
+def test_nothing_imports_the_command_line() -> None:
+    importers = {domain(path) for path in modules() if "cli" in own(path)}
+    assert importers <= {"__main__"}
+
+
+def test_only_the_command_line_draws_on_terminals() -> None:
+    for path in modules():
+        if domain(path) not in {"cli", "__main__"}:
+            words = {name.split(".")[0] for name in imported(path)}
+            assert not words & {"rich", "typer", "click"}, named(path)
+
+
+def test_only_the_stores_know_their_engine() -> None:
+    for path in modules():
+        if domain(path) != "store":
+            words = {name.split(".")[0] for name in imported(path)}
+            assert not words & {"apsw", "sqlite3", "psycopg"}, named(path)
+
+
+def test_importing_the_package_stays_light() -> None:
+    """What only some commands need waits until one does."""
+    script = "import sys, hapticdb; print(*sys.modules)"
+    loaded = run_python(script).split()
+    heavy = {"trimesh", "matplotlib", "rich", "typer", "laspy", "cascadio", "collada", "pytest"}
+    assert not heavy & set(loaded)
+
+
+def run_python(script: str, *arguments: str, **variables: str) -> str:
+    return finished(
+        [sys.executable, "-c", script, *arguments],
+        check=True,
+        env={k: v for k, v in os.environ.items() if k != "NUMBA_CACHE_DIR"} | variables,
+    ).stdout
+
+
+# --- sizes and names ----------------------------------------------------------------------------
+
+
+def test_no_file_is_longer_than_500_lines() -> None:
+    lengths = {named(path): len(path.read_text().splitlines()) for path in python_files()}
+    assert {name: n for name, n in lengths.items() if n > 500} == {}
+
+
+def test_files_are_named_by_the_words_of_the_domain() -> None:
+    vague = re.compile(r"util|helper|manager|(^|_)data(_|$)|common|misc")
+    assert [named(p) for p in python_files() if vague.search(p.stem)] == []
+
+
+def test_nothing_is_left_to_do_in_the_sources() -> None:
+    unfinished = re.compile(r"\b(TODO|FIXME|XXX|HACK)\b")
+    assert [named(p) for p in modules() if unfinished.search(p.read_text())] == []
+
+
+def committed_texts() -> Iterator[tuple[str, str]]:
+    """Name and text of each text file that is or would be committed."""
+    paths: list[Path] = []
+    if shutil.which("git") and (ROOT / ".git").exists():
+        listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+        asked = finished(listing, cwd=ROOT, check=True)
+        paths = [ROOT / name for name in asked.stdout.split("\0") if name]
+    else:  # a source distribution
+        folders = ("src", "tests", "benchmarks", "docs", "requirements")
+        paths = [p for folder in folders for p in (ROOT / folder).rglob("*")]
+        paths += ROOT.glob("*.*")
+    for path in paths:
+        if path.is_file() and "__pycache__" not in path.parts:
+            content = path.read_bytes()
+            if b"\0" not in content:
+                yield named(path), content.decode("utf-8", "replace")
+
+
+def test_no_text_names_this_machine_or_a_package_index() -> None:
+    place = re.compile(r"(?<![\w.~$}/])/(?:work|root|home|Users)/")
+    # written so that this file does not hold what it looks for
+    index = re.compile(r"pypi\.(org|python)|files\.pythonhosted|-index-ur[l]|-find-link[s]")
+    found = [
+        f"{name}: {match.group()}"
+        for name, text in committed_texts()
+        for pattern in (place, index)
+        if (match := pattern.search(text))
+    ]
+    assert found == []
+
+
+# --- what tests wait for -------------------------------------------------------------------------
+
+# called without any argument, they may wait for ever; deadlines and tables have such words, too
+WAITS = {"acquire", "communicate", "get", "join", "recv", "result", "wait"}
+WAITS_OF_OTHERS = {("table", "join"), ("deadlines", "wait")}
+RUNS = {"run", "call", "check_call", "check_output"}
+
+
+def endless_waits(source: str, *, is_test: bool) -> Iterator[tuple[int, str]]:
+    """Line and text of each call and loop of a source that may wait for ever.
+
+    Tests start processes by the module `children` alone; benchmarks give a timeout each time.
+    """
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.While) and _sleeps(node) and not _looks_at_clock(node):
+            yield node.lineno, f"while {ast.unparse(node.test)}"
+        if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
+            continue
+        name, owner = node.func.attr, ast.unparse(node.func.value)
+        is_limited = any(keyword.arg == "timeout" for keyword in node.keywords)
+        bare = not node.args and not node.keywords
+        starts = owner == "subprocess" and (name in RUNS or (name == "Popen" and is_test))
+        waits = name in WAITS and bare and (owner.split(".")[-1], name) not in WAITS_OF_OTHERS
+        if waits or (starts and (is_test or not is_limited)) or (owner, name) == ("os", "waitpid"):
+            yield node.lineno, ast.unparse(node)
+
+
+def _sleeps(loop: ast.While) -> bool:
+    calls = [node.func for node in ast.walk(loop) if isinstance(node, ast.Call)]
+    return any(isinstance(call, ast.Attribute) and call.attr == "sleep" for call in calls)
+
+
+def _looks_at_clock(loop: ast.While) -> bool:
+    return any(
+        isinstance(node, ast.Attribute) and node.attr == "monotonic" for node in ast.walk(loop)
+    )
+
+
+def test_nothing_is_waited_for_without_an_end() -> None:
+    """Or a test that fails hangs the run."""
+    # the latter three wait in what is ended by others: a process of a session, a thread of a
+    # fake, a process that is given damaged files
+    allowed = [
+        "tests/children.py",
+        "tests/realtime/workers.py",
+        "tests/devices/fake_hd.py",
+        "tests/damaging.py",
+    ]
+    found: list[str] = []
+    for path in python_files():
+        folder = named(path).split("/")[0]
+        if folder in {"tests", "benchmarks"} and named(path) not in allowed:
+            waits = endless_waits(path.read_text(), is_test=folder == "tests")
+            found += [f"{named(path)}:{line}: {text}" for line, text in waits]
+    assert found == []
+
+
+@pytest.mark.parametrize(
+    ("line", "is_refused"),
+    [
+        ("child.wait()", True),
+        ("child.wait(5)", False),
+        ("out, _ = child.communicate()", True),
+        ("child.communicate(timeout=5)", False),
+        ("thread.join()", True),
+        ("', '.join(words)", False),
+        ("subprocess.run(command, timeout=5)", False),
+        ("subprocess.run(command, check=True)", True),
+        ("while not path.exists(): time.sleep(1)", True),
+        ("while not path.exists() and time.monotonic() < end: time.sleep(1)", False),
+    ],
+)
+def test_a_wait_without_an_end_is_seen(line: str, is_refused: bool) -> None:
+    assert bool(list(endless_waits(line, is_test=False))) == is_refused
+
+
+# --- what is public -----------------------------------------------------------------------------
+
+
+def test_public_names() -> None:
+    assert hapticdb.__all__ == PUBLIC == sorted(PUBLIC)
+    for name in PUBLIC:
+        assert inspect.getdoc(getattr(hapticdb, name)), f"{name} has no docstring"
+
+
+def test_the_version_is_one() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert hapticdb.__version__ == project["version"] == version("hapticdb")
+
+
+def error_classes() -> dict[str, type[Exception]]:
+    return {
+        name: kind
+        for name, kind in inspect.getmembers(errors, inspect.isclass)
+        if issubclass(kind, Exception) and kind.__module__ == errors.__name__
+    }
+
+
+def test_every_error_is_public() -> None:
+    assert set(error_classes()) <= set(PUBLIC)
+
+
+def test_the_drawn_error_tree_is_the_real_one() -> None:
+    """Parents by indentation, builtin bases in parentheses."""
+    drawn: dict[str, tuple[str, str | None]] = {}
+    above: list[str] = []
+    for line in (errors.__doc__ or "").splitlines():
+        match = re.match(r"    ([│ ├└─]*)(\w+Error)\b(?: \((\w+)\))?", line)
+        if match:
+            depth = len(match[1]) // 4
+            above[depth:] = [match[2]]
+            drawn[match[2]] = (above[depth - 1] if depth else "Exception", match[3])
+    real = {
+        name: (
+            kind.__bases__[0].__name__,
+            kind.__bases__[1].__name__ if len(kind.__bases__) > 1 else None,
+        )
+        for name, kind in error_classes().items()
+    }
+    assert drawn == real
+    assert all(hasattr(builtins, second) for _, second in real.values() if second)
+
+
+# --- the kernels' cache -------------------------------------------------------------------------
+
+
+def test_any_edit_of_a_kernel_moves_the_cache(tmp_path: Path) -> None:
+    """A leaf edited in another file than its entry's, though size and time stamp stay."""
+    folder = tmp_path / "kernels"
+    shutil.copytree(PACKAGE / "kernels", folder, ignore=shutil.ignore_patterns("__pycache__"))
+    first = sources_digest(folder)
+    assert first == sources_digest(PACKAGE / "kernels")
+    assert first in cache_folder()
+    for source in sorted(folder.glob("*.py")):
+        content, status = source.read_bytes(), source.stat()
+        source.write_bytes(content[:-1] + b" ")
+        os.utime(source, ns=(status.st_atime_ns, status.st_mtime_ns))
+        assert sources_digest(folder) != first, source.name
+        source.write_bytes(content)
+        assert sources_digest(folder) == first
+    (folder / "curves.py").rename(folder / "bends.py")
+    assert sources_digest(folder) != first
+
+
+CACHES = """
+import sys
+from numba import config, njit
+before = config.CACHE_DIR
+import hapticdb, hapticdb.environment
+import hapticdb.kernels.curves
+from hapticdb.kernels._jit import ENTRIES, CACHE_FOLDER
+assert config.CACHE_DIR == before, (before, config.CACHE_DIR)
+sys.path.insert(0, sys.argv[1])
+import theirs
+theirs.twice(21)
+print(theirs.twice._cache.cache_path)
+print(CACHE_FOLDER)
+print(*{entry._cache.cache_path for entry in ENTRIES})
+"""
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="without the JIT there is no cache")
+@pytest.mark.parametrize("is_configured", [False, True])
+def test_users_kernels_keep_their_own_cache(tmp_path: Path, is_configured: bool) -> None:
+    (tmp_path / "theirs.py").write_text(
+        "from numba import njit\n@njit(cache=True)\ndef twice(x):\n    return 2 * x\n"
+    )
+    variables = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")} if is_configured else {}
+    theirs, folder, ours = run_python(CACHES, str(tmp_path), **variables).splitlines()
+    wanted = tmp_path / ("cache" if is_configured else "__pycache__")
+    assert wanted in (Path(theirs), *Path(theirs).parents)
+    assert Path(folder).name == f"kernels-{sources_digest(PACKAGE / 'kernels')}"
+    assert all(Path(folder) in Path(path).parents for path in ours.split(" "))
+    assert not Path(theirs).is_relative_to(folder)
+    if is_configured:
+        assert Path(folder).is_relative_to(tmp_path / "cache")

@@ -1,0 +1,189 @@
+"""After `warm_up` nothing is compiled any more, and each verb compiles its own kernels only."""
+
+import fnmatch
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from pathlib import Path
+from typing import Any
+
+import numba
+import pytest
+
+from children import finished
+from command_line import command
+from hapticdb.kernels import compiling
+from hapticdb.kernels.compiling import NAMES, PURPOSES, entries_for, jobs_of
+
+SCRIPT = """
+import json, sys
+from pathlib import Path
+import numpy as np
+import hapticdb
+from hapticdb.kernels import _jit, compiling
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.resident.frames import Frames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.testing import KINDS, floor_voxels, write_voxels
+
+def name(entry):
+    return f"{entry.py_func.__module__.rpartition('.')[2]}.{entry.py_func.__name__}"
+
+hapticdb.warm_up()
+folder = Path(sys.argv[1])
+stl = folder / "part.stl"
+facets = np.array([[[0, 0, 0], [0, 1, 0], [1, 0, 0]], [[0, 0, 0], [1, 0, 0], [0, 0, 1]],
+                   [[0, 0, 0], [0, 0, 1], [0, 1, 0]], [[1, 0, 0], [0, 1, 0], [0, 0, 1]]])
+lines = ["solid part"]
+for facet in facets:
+    lines += ["facet normal 0 0 0", "outer loop"]
+    lines += ["vertex %d %d %d" % tuple(v) for v in facet]
+    lines += ["endloop", "endfacet"]
+stl.write_text("\\n".join(lines + ["endsolid part", ""]))
+shell = hapticdb.PointShell.from_file(stl, points=300)
+shell.save(folder / "shell.npz")
+loaded = hapticdb.PointShell.from_file(folder / "shell.npz")
+for n, (layout, curve) in enumerate(KINDS):
+    url = folder / f"{n}.db"
+    grid = hapticdb.GridOptions(bits=6, curve=curve)
+    hapticdb.import_files(url, [stl], hapticdb.ImportOptions(grid=grid, layout=layout))
+    with hapticdb.open(url) as env:
+        for strategy in STRATEGIES:
+            for each in (shell, loaded):
+                env.touch(each, np.eye(4), strategy, exclude=[1]).pairs
+                env.touch(each, np.eye(4), strategy).pairs
+        env.calibrate()
+        env.move(1, np.eye(4))
+        env.voxels(1)
+        env.remove(1)
+        write_voxels(env.store, floor_voxels(env.grid))
+        env.touch(shell, np.eye(4)).pairs
+        if curve != "lexicographic":
+            hapticdb.sweep(env, shell, [np.eye(4), np.eye(4)], profile=True)
+            hapticdb.sweep(env, shell, [np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4)])
+            with CellTable.create(LEAST_BUDGET) as table:
+                frames = Frames(Residency(env.store, table), shell, run=4)
+                frames.feel(np.eye(4)[None])
+                frames.close()
+assert set(_jit.SIGNATURES) == set(compiling.NAMES)
+found = {name(entry): [tuple(s) == _jit.SIGNATURES[name(entry)] for s in entry.signatures]
+         for entry in _jit.ENTRIES}
+print(json.dumps(found))
+"""
+
+
+NEEDS_JIT = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="without JIT none compiles")
+
+
+@NEEDS_JIT
+def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
+    """Every entry has the one signature that it names, whatever is done after.
+
+    A session's loop tells itself when a kernel is compiled while it runs (`realtime.loop.work`).
+    """
+    done = finished([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True)
+    found = json.loads(done.stdout)
+    assert set(found) == set(NAMES)
+    assert {name: declared for name, declared in found.items() if declared != [True]} == {}
+
+
+def test_a_purpose_names_entries_that_exist() -> None:
+    for purpose, patterns in PURPOSES.items():
+        for pattern in patterns:
+            assert fnmatch.filter(NAMES, pattern), (purpose, pattern)
+    assert entries_for("everything") == list(NAMES)
+    assert sorted(name for job in jobs_of(NAMES) for name in job) == sorted(NAMES)
+
+
+VERBS: tuple[tuple[str, str], ...] = (
+    ("", "sample s --frames 20"),
+    ("import", "import a.db s/car.glb --bits 7"),
+    ("touch", "touch a.db --tool s/wrench.stl --poses s/path.csv"),
+    ("feel", "feel a.db --tool s/wrench.stl --device s/path.csv --seconds 0.5 --record a.hdbrec"),
+    ("replay", "replay a.hdbrec a.db"),
+    ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --picture s.png"),
+    ("move", "move a.db 12 --translate 0,0,0.001"),
+    ("copy", "copy a.db b.db --layout voxel --curve hilbert"),
+    ("copy", "diff a.db b.db"),
+    ("calibrate", "calibrate a.db"),
+)
+
+
+@NEEDS_JIT
+@pytest.mark.long
+def test_a_verb_compiles_its_own_kernels_once_and_says_so(tmp_path: Path) -> None:
+    """From an empty cache; what numba has stored is what the purposes of the verbs name."""
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    so_far: set[str] = set()
+    for purpose, words in VERBS:
+        done = finished(command(*words.split()), cwd=tmp_path, env=env)
+        assert done.returncode in {0, 1}, done.stderr  # 1: a sweep that hits
+        wanted = so_far | set(entries_for(purpose) if purpose else ())
+        n_new = len(wanted - so_far)
+        assert done.stderr.count("compiling, once") == (n_new > 0), words
+        found = {path.name.partition("-")[0] for path in (tmp_path / "cache").rglob("*.nbi")}
+        assert found == wanted, words
+        so_far = wanted
+    done = finished(command("warm"), env=env)
+    ready = f"{len(NAMES)} kernels ready:"
+    assert done.stdout.startswith(f"{ready} {len(NAMES) - len(so_far)} compiled now")
+    assert finished(command("warm"), env=env).stdout.startswith(f"{ready} 0 compiled now")
+
+
+@NEEDS_JIT
+@pytest.mark.parametrize("fault", ["dies", "is not there"])
+def test_a_process_that_cannot_compile_leaves_it_to_the_first_call(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, fault: str
+) -> None:
+    monkeypatch.setattr(compiling, "CACHE_FOLDER", str(tmp_path))
+    monkeypatch.setattr(sys, "executable", "/bin/false" if fault == "dies" else "/no/such/python")
+    told: list[compiling.Compiled] = []
+    names = entries_for("import")
+    assert compiling.compile_missing(names, told.append) == len(names)
+    assert (told[0].done, told[-1].done) == (0, len(names))
+    assert compiling.missing(names) == names
+
+
+@NEEDS_JIT
+def test_compiling_that_is_interrupted_ends_its_processes(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setattr(compiling, "CACHE_FOLDER", str(tmp_path))
+    monkeypatch.setattr(compiling, "SERVE", "import time; time.sleep(600)")
+    started: list[int] = []
+    real = subprocess.Popen
+
+    def remembered(*args: Any, **options: Any) -> Any:  # noqa: ANN401 - handed on
+        process = real(*args, **options)
+        started.append(process.pid)
+        if len(started) == 1:
+            threading.Timer(0.5, os.kill, (os.getpid(), signal.SIGINT)).start()
+        return process
+
+    monkeypatch.setattr(subprocess, "Popen", remembered)
+    with pytest.raises(KeyboardInterrupt):
+        compiling.compile_missing(entries_for("import"))
+    assert started
+    for pid in started:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
+@NEEDS_JIT
+@pytest.mark.parametrize(
+    "words", ["import a.db none.stl", "feel a.db --tool none.stl --device p.csv"]
+)
+def test_nobody_waits_for_kernels_to_hear_that_a_file_is_missing(
+    tmp_path: Path, words: str
+) -> None:
+    env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    (tmp_path / "p.csv").write_text("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n0,0,1,1,0,0,0\n")
+    done = finished(command(*words.split()), cwd=tmp_path, env=env)
+    assert done.returncode == 2
+    assert "compiling" not in done.stderr
+    assert "none.stl" in done.stderr
+    assert not list((tmp_path / "cache").rglob("*.nbi"))

@@ -1,0 +1,234 @@
+"""An import that ends at any moment leaves a valid database, and again it ends as if undisturbed.
+
+Each interrupted import is a process of its own that says how many parts it has committed, and
+waits before the last of them, so that no signal comes when it has ended.
+"""
+
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from subprocess import Popen
+
+import numpy as np
+import pytest
+
+import hapticdb
+from assemblies import Mesh, Rows, ball, left_behind, rows_of, small_options, write_obj
+from children import PATIENCE, child, until
+from hapticdb import GridOptions, ImportOptions
+from hapticdb.ingest.files import Progress
+from hapticdb.resident.table import is_alive
+from hapticdb.store.sqlite.store import SQLiteStore
+
+N_PARTS = 60
+MOMENTS = np.random.default_rng(20).permutation(np.arange(1, N_PARTS))[:10].tolist()
+
+IMPORT = """
+import sys, time
+import hapticdb
+from hapticdb import GridOptions, ImportOptions
+
+database, file, jobs = sys.argv[1:]
+options = ImportOptions(grid=GridOptions(bits=8), layout="voxel", jobs=int(jobs))
+
+def say(progress):
+    print(progress.parts_done, flush=True)
+    if progress.parts_done == progress.parts_total - 1:
+        time.sleep(600)
+
+print(0, flush=True)
+hapticdb.import_files(database, [file], options, say)
+"""
+
+
+def big_options(jobs: int) -> ImportOptions:
+    """What the child asks for."""
+    return ImportOptions(grid=GridOptions(bits=8), layout="voxel", jobs=jobs)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A file of sixty balls, each of about 4,000 voxels, and an undisturbed import of it."""
+    made = tmp_path_factory.mktemp("undisturbed")
+    rng = np.random.default_rng(3)
+    parts: dict[str, Mesh] = {}
+    for n in range(N_PARTS):
+        parts[f"ball {n}"] = ball(rng.uniform(-0.3, 0.3, 3), 0.07, 16)
+    file = write_obj(made / "balls.obj", parts)
+    hapticdb.import_files(made / "whole.db", [file], big_options(2))
+    return made
+
+
+@pytest.fixture(scope="module")
+def undisturbed(folder: Path) -> Rows:
+    return rows_of(folder / "whole.db")
+
+
+@contextmanager
+def importing(database: Path, file: Path, jobs: int = 2) -> Iterator["Popen[str]"]:
+    """A process that imports, and is gone afterwards."""
+    with child([sys.executable, "-c", IMPORT, str(database), str(file), str(jobs)]) as process:
+        yield process
+        process.kill()
+
+
+def wait_for(process: "Popen[str]", n_parts: int) -> None:
+    """Until that many parts are committed."""
+    assert process.stdout is not None
+    for line in process.stdout:
+        if int(line) >= n_parts:
+            return
+    assert process.stderr is not None
+    pytest.fail(f"the import ended before {n_parts} parts: {process.stderr.read()}")
+
+
+def assert_finishes(database: Path, file: Path, undisturbed: Rows, jobs: int = 1) -> None:
+    (report,) = hapticdb.import_files(database, [file], big_options(jobs))
+    assert report.present + len(report.added) == N_PARTS
+    assert left_behind(database.parent) == ["e.db"]
+    assert rows_of(database) == undisturbed
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("n_parts", MOMENTS)
+def test_a_killed_import_run_again_ends_as_an_undisturbed_one(
+    folder: Path, undisturbed: Rows, tmp_path: Path, n_parts: int
+) -> None:
+    """kill -9 at ten moments: so many parts are in, and some way into the next one."""
+    rng = np.random.default_rng(n_parts)
+    database = tmp_path / "e.db"
+    with importing(database, folder / "balls.obj", int(rng.integers(1, 4))) as process:
+        wait_for(process, n_parts)
+        time.sleep(rng.uniform(0, 0.02))
+        process.kill()
+        process.wait(PATIENCE)
+    left = rows_of(database, "object", "voxel", "change")
+    n_left = len(left["object"])
+    assert n_parts <= n_left <= N_PARTS
+    assert [row[0] for row in left["object"]] == list(range(1, n_left + 1))
+    # every object is whole, and nothing of the next one is there
+    counts = np.bincount([row[1] for row in left["voxel"]], minlength=n_left + 1)
+    assert counts[1:].tolist() == [row[5] for row in left["object"]]
+    assert [row[0] for row in left["change"]] == list(range(1, n_left + 1))
+    with hapticdb.open(database, read_only=True) as env:
+        assert len(env.objects()) == n_left
+    assert_finishes(database, folder / "balls.obj", undisturbed, int(rng.integers(1, 4)))
+
+
+def test_most_moments_fall_into_the_middle() -> None:
+    """Or the test above would show little."""
+    assert sum(5 < n < N_PARTS - 5 for n in MOMENTS) >= 7
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_import_killed_before_its_first_object_leaves_nothing_or_an_empty_database(
+    folder: Path, undisturbed: Rows, tmp_path: Path, seed: int
+) -> None:
+    database = tmp_path / "e.db"
+    with importing(database, folder / "balls.obj") as process:
+        wait_for(process, 0)
+        # reading the file takes longest; the second waits for the database to appear
+        if seed < 2:
+            time.sleep(np.random.default_rng(seed).uniform(0, 0.3))
+        if seed == 2:
+            until(lambda: left_behind(tmp_path), every=0.0005)
+        process.kill()
+        process.wait(PATIENCE)
+    if database.exists():
+        assert len(rows_of(database, "object")["object"]) <= 3
+    assert_finishes(database, folder / "balls.obj", undisturbed)
+
+
+def test_an_interrupted_import_run_again_ends_as_an_undisturbed_one(
+    folder: Path, undisturbed: Rows, tmp_path: Path
+) -> None:
+    """Ctrl-C: the process ends soon, by the signal, and folds the log into the file."""
+    database = tmp_path / "e.db"
+    with importing(database, folder / "balls.obj") as process:
+        wait_for(process, 7)
+        process.send_signal(signal.SIGINT)
+        _, words = process.communicate(timeout=PATIENCE)
+        assert process.returncode == -signal.SIGINT
+    assert words.strip().endswith("KeyboardInterrupt")
+    assert left_behind(tmp_path) == ["e.db"]
+    assert 7 <= len(rows_of(database, "object")["object"]) < N_PARTS
+    assert_finishes(database, folder / "balls.obj", undisturbed)
+
+
+def test_an_import_interrupted_while_it_reads_leaves_nothing(folder: Path, tmp_path: Path) -> None:
+    """Nor does the process that parses outlive the one that is interrupted."""
+    with importing(tmp_path / "e.db", folder / "balls.obj") as process:
+        wait_for(process, 0)
+        parser = wait_for_parser(process.pid)
+        process.send_signal(signal.SIGINT)
+        process.communicate(timeout=PATIENCE)
+        assert process.returncode == -signal.SIGINT
+    assert left_behind(tmp_path) == []
+    until(lambda: not is_alive(parser))
+
+
+def wait_for_parser(pid: int) -> int:
+    """Process id of the child of a child, once it is there."""
+    children = Path(f"/proc/{pid}/task/{pid}/children")
+    until(children.read_text, every=0.001)
+    return int(children.read_text().split()[0])
+
+
+@pytest.mark.parametrize("n_parts", [1, 4, 9])
+def test_an_error_out_of_the_progress_callback_keeps_what_is_committed(
+    folder: Path, tmp_path: Path, n_parts: int
+) -> None:
+    class StoppedError(Exception):
+        pass
+
+    def stop(progress: Progress) -> None:
+        if progress.parts_done == n_parts:
+            raise StoppedError
+
+    database = tmp_path / "e.db"
+    with pytest.raises(StoppedError):
+        hapticdb.import_files(database, [folder / "balls.obj"], big_options(2), stop)
+    assert left_behind(tmp_path) == ["e.db"]
+    assert len(rows_of(database, "object")["object"]) == n_parts
+
+
+def test_a_later_file_of_an_interrupted_command_goes_in_when_it_is_run_again(
+    tmp_path: Path,
+) -> None:
+    files = [
+        write_obj(tmp_path / f"{n}.obj", {f"ball {n}": ball((0, 0, 0.01 * n), 0.05)})
+        for n in range(4)
+    ]
+    hapticdb.import_files(tmp_path / "whole.db", files, small_options())
+
+    def stop(progress: Progress) -> None:
+        if progress.link.endswith("2.obj"):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        hapticdb.import_files(tmp_path / "e.db", files, small_options(), stop)
+    reports = hapticdb.import_files(tmp_path / "e.db", files, small_options())
+    assert [r.status for r in reports] == ["complete", "complete", "complete", "imported"]
+    assert rows_of(tmp_path / "e.db") == rows_of(tmp_path / "whole.db")
+
+
+def test_statistics_missed_by_an_interruption_are_kept_by_the_next_import(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every object is in, the quantile vector is not: the same command again still writes it."""
+    file = write_obj(tmp_path / "ball.obj", {"ball": ball((0, 0, 0), 0.1)})
+    hapticdb.import_files(tmp_path / "whole.db", [file], small_options())
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SQLiteStore, "analyze", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            hapticdb.import_files(tmp_path / "e.db", [file], small_options())
+    (report,) = hapticdb.import_files(tmp_path / "e.db", [file], small_options())
+    assert report.status == "complete"
+    assert rows_of(tmp_path / "e.db") == rows_of(tmp_path / "whole.db")

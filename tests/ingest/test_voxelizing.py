@@ -1,0 +1,99 @@
+"""Huge parts: voxelized in bounded pieces, to the same bits, and their share is told."""
+
+import threading
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hapticdb.errors import FileError
+from hapticdb.grid import GridOptions
+from hapticdb.ingest.files import ImportOptions, Progress, import_files
+from hapticdb.ingest.layout import Bricks
+from hapticdb.ingest.voxelizing import bricks_of_triangles, merged_in_turn
+from hapticdb.kernels.surfaces import voxelize
+from mesh_files import text
+
+BITS = 8
+HUGE = np.array([[[1.0, 2.0, 3.0], [250.0, 80.3, 41.7], [50.2, 251.0, 199.9]]])
+
+
+def triangles() -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
+    """One across the grid, long thin ones, ones that leave the grid, many small ones."""
+    random = np.random.default_rng(5)
+    far = random.uniform(-100.0, 400.0, (20, 3, 3))
+    small = random.uniform(0.0, 255.0, (300, 1, 3)) + random.uniform(-3.0, 3.0, (300, 3, 3))
+    flat = np.array([[[0.0, 0.0, 8.0], [256.0, 0.0, 8.0], [0.0, 256.0, 8.0]]])
+    return np.concatenate([HUGE, far, small, flat])
+
+
+@pytest.mark.parametrize("most", [1, 7, 100, 5000])
+@pytest.mark.parametrize("given", [HUGE, triangles()], ids=["one", "many"])
+def test_pieces_give_the_bits_of_the_whole(
+    given: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]", most: int
+) -> None:
+    """Each begins and ends within a row of a triangle."""
+    keys, occupancy = voxelize.voxelize(4 * given, BITS + 2)
+    found = bricks_of_triangles(4 * given, BITS + 2, "a part", most=most)
+    np.testing.assert_array_equal(found.keys, keys)
+    np.testing.assert_array_equal(found.occupancy, occupancy)
+
+
+def test_pieces_are_bounded_and_tell_their_share() -> None:
+    pieces = list(voxelize.voxelize_pieces(8 * HUGE, BITS + 3, 100))
+    shares = [share for share, _, _ in pieces]
+    assert len(pieces) > 5
+    # a piece ends after the batch of runs that fills it, each of which crosses few bricks
+    assert max(len(keys) for _, keys, _ in pieces) <= 100 + 2 * 1024
+    assert shares == sorted(shares)
+    assert 0.0 < shares[0] < 0.5 < shares[-2] < shares[-1] == 1.0
+
+
+def test_a_merge_empties_its_list() -> None:
+    found = voxelize.voxelize_pieces(8 * HUGE, BITS + 3, 100)
+    pieces = [Bricks(keys, occupancy) for _, keys, occupancy in found]
+    assert len(pieces) > 1
+    merged_in_turn(pieces)
+    assert pieces == []
+
+
+def test_a_part_that_does_not_fit_into_memory_is_refused_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticdb.ingest.voxelizing._MERGE_FROM", 100)
+    monkeypatch.setattr("hapticdb.ingest.voxelizing.bytes_available", lambda: 50_000)
+    with pytest.raises(FileError, match=r"a part: its voxels take .*fewer --bits"):
+        bricks_of_triangles(HUGE, BITS, "a part", most=100)
+    path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    options = ImportOptions(grid=GridOptions(bits=BITS), layout="voxel")
+    (report,) = import_files(tmp_path / "a.db", [path], options)
+    assert report.status == "failed"
+    assert str(path) in str(report.error)
+    assert not (tmp_path / "a.db").exists()
+
+
+@pytest.mark.parametrize("layout", ["voxel", "brick"])
+def test_an_import_tells_the_share_of_a_part(
+    tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    told = threading.Event()
+    heard: list[Progress] = []
+
+    def slow(*given: object) -> "object":
+        given[3](0.5)  # type: ignore[operator]
+        assert told.wait(60)
+        return Bricks(*voxelize.voxelize(HUGE, BITS))
+
+    def progress(now: Progress) -> None:
+        heard.append(now)
+        if now.share:
+            told.set()
+
+    monkeypatch.setattr("hapticdb.ingest.voxelizing.bricks_of_triangles", slow)
+    path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    options = ImportOptions(grid=GridOptions(bits=BITS), layout=layout)  # type: ignore[arg-type]
+    (report,) = import_files(tmp_path / "a.db", [path], options, progress)
+    assert report.status == "imported"
+    assert any(0.0 < now.share < 1.0 and now.parts_done == 0 for now in heard)
+    assert heard[-1].share == 0.0
+    assert heard[-1].parts_done == 1

@@ -1,0 +1,235 @@
+"""Small files that ask for much: of memory, of time, of points that are not there."""
+
+import json
+import struct
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from children import PATIENCE
+from hapticdb import PointShell
+from hapticdb.errors import FileError, UsageError
+from hapticdb.ingest.files import ImportOptions, import_files
+from hapticdb.mesh import accessors, parse_in_process, read_file
+from hapticdb.mesh import threemf as threemf_module
+from hapticdb.pointshell.shell import FORMAT
+from mesh_files import MESH_3MF, TRIANGLE, cause, glb_of, gltf, text, threemf
+
+
+def test_a_glTF_that_lists_itself_is_read_once(  # noqa: N802
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """9,000 buffers that were the file itself took 5.6 GB."""
+    n = 500
+    tree = {
+        "buffers": [{"byteLength": 100, "uri": "self.gltf"}] * n,
+        "bufferViews": [{"buffer": i, "byteLength": 36} for i in range(n)],
+        "accessors": [
+            {"bufferView": i, "componentType": 5126, "count": 3, "type": "VEC3"} for i in range(n)
+        ],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": i}}]} for i in range(n)],
+        "nodes": [{"mesh": i} for i in range(n)],
+        "scenes": [{"nodes": list(range(n))}],
+    }
+    path = gltf(tree, tmp_path / "self.gltf")
+    read: list[Path] = []
+    bytes_of = accessors._bytes_of
+
+    def counted(file: Path) -> bytes:
+        read.append(file)
+        return bytes_of(file)
+
+    monkeypatch.setattr(accessors, "_bytes_of", counted)
+    assert len(parse_in_process(path).parts) == n
+    assert len(read) == 1
+
+
+def test_what_no_mesh_uses_is_not_read(tmp_path: Path) -> None:
+    tree = json.loads(gltf({}, tmp_path / "a.gltf").read_text())
+    tree["buffers"].append({"byteLength": 1 << 40, "uri": "picture.bin"})
+    tree["accessors"].append({"componentType": 5126, "count": 1 << 40, "type": "VEC3"})
+    path = text(tmp_path / "b.gltf", json.dumps(tree))
+    np.testing.assert_array_equal(parse_in_process(path).parts[0].vertices, TRIANGLE)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("buffers", [7]),
+        ("buffers", {"a": 1}),
+        ("bufferViews", "x"),
+        ("accessors", [None]),
+        ("meshes", [[]]),
+        ("nodes", [1]),
+        ("scenes", 3),
+    ],
+)
+def test_a_glTF_of_the_wrong_kinds_says_which(  # noqa: N802
+    tmp_path: Path, key: str, value: object
+) -> None:
+    assert f"'{key}' is no list of objects" in cause(gltf({key: value}, tmp_path / "a.gltf"))
+    assert f"'{key}'" in cause(tmp_path / "a.gltf", read_file)
+
+
+@pytest.mark.parametrize(
+    ("change", "word"),
+    [
+        ({"buffers": [{"byteLength": 48, "uri": 5}]}, "'uri'"),
+        ({"buffers": [{"byteLength": 48, "uri": "data:,abc"}]}, "base64"),
+        ({"scenes": [{"nodes": {"a": 1}}]}, "'nodes'"),
+        ({"scenes": [{"nodes": [True]}]}, "no whole number"),
+        ({"nodes": [{"mesh": 0, "children": [0.5]}]}, "no whole number"),
+        ({"nodes": [{"mesh": -1}]}, "no whole number"),
+        ({"scene": 4}, "scene 4 of 1"),
+    ],
+)
+def test_a_glTF_with_a_wrong_number_says_which(  # noqa: N802
+    tmp_path: Path, change: dict[str, Any], word: str
+) -> None:
+    assert word in cause(gltf(change, tmp_path / "a.gltf"))
+
+
+@pytest.mark.parametrize("suffix", [".gltf", ".glb"])
+def test_nesting_without_end_is_one_line_from_the_child(tmp_path: Path, suffix: str) -> None:
+    path = text(tmp_path / "a.gltf", '{"asset":{"version":"2.0"},"nodes":' + "[" * 100_000)
+    if suffix == ".glb":
+        path = glb_of(path, tmp_path / "a.glb")
+    assert "nested too deeply" in cause(path, read_file)
+
+
+def test_names_along_deep_nodes_have_an_end(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nodes = [{"name": "n" * 50, "mesh": 0, "children": [i + 1]} for i in range(300)]
+    path = gltf({"nodes": [*nodes, {"mesh": 0}]}, tmp_path / "deep.gltf")
+    monkeypatch.setattr("hapticdb.mesh.raw.MOST_CHARACTERS", 1_000_000)
+    assert "nests its nodes too deeply" in cause(path)
+
+
+def _las(tmp_path: Path, **counts: int) -> Path:
+    """LAS 1.4 file of three points in format 0, with other counts in its header."""
+    header = bytearray(375)
+    header[:4], header[24], header[25], header[105] = b"LASF", 1, 4, 20
+    given = {"size": 375, "points_at": 375, "records": 0} | counts
+    struct.pack_into("<HII", header, 94, given["size"], given["points_at"], given["records"])
+    struct.pack_into("<I", header, 107, 3)
+    struct.pack_into("<3d", header, 131, 0.01, 0.01, 0.01)
+    struct.pack_into("<QIQ", header, 235, 0, counts.get("long_records", 0), 3)
+    path = tmp_path / "a.las"
+    path.write_bytes(bytes(header) + bytes(60))
+    return path
+
+
+def test_a_LAS_file_that_promises_more_than_it_holds(tmp_path: Path) -> None:  # noqa: N802
+    """2^31 records took 37 s and all memory that the file was allowed."""
+    assert len(parse_in_process(_las(tmp_path)).parts[0].vertices) == 3
+    assert "2,147,483,648 records" in cause(_las(tmp_path, records=1 << 31))
+    assert "extended records" in cause(_las(tmp_path, long_records=1 << 31))
+    assert "points begin" in cause(_las(tmp_path, points_at=1 << 31))
+    assert "points begin" in cause(_las(tmp_path, size=12))
+
+
+def test_a_3MF_file_that_unpacks_to_much_more_is_refused(  # noqa: N802
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(threemf_module, "_UNPACKED", 100_000)
+    resources = f'<object id="1">{MESH_3MF}</object>{" " * 2_000_000}'
+    path = threemf(tmp_path / "a.3mf", resources, '<item objectid="1"/>')
+    assert "save it with less compression" in cause(path)
+
+
+def test_a_3MF_file_packed_by_another_method_is_refused(tmp_path: Path) -> None:  # noqa: N802
+    path = tmp_path / "a.3mf"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_LZMA) as archive:
+        archive.writestr("3D/3dmodel.model", "<model/>")
+    assert "deflate" in cause(path)
+
+
+def test_faces_of_an_obj_may_end_in_a_comment(tmp_path: Path) -> None:
+    corners = "v 0 0 0 # origin\nv 1 0 0\nv 0 1 0\n"
+    plain = text(tmp_path / "a.obj", f"{corners}o wheel #3\nf 1 2 3\n")
+    noted = text(tmp_path / "b.obj", f"{corners}o wheel #3\nf 1 2 3 #c\nf -3 -2 -1#c\n")
+    assert parse_in_process(plain).parts[0].name == "wheel #3"
+    np.testing.assert_array_equal(parse_in_process(noted).parts[0].faces, [[0, 1, 2]] * 2)
+
+
+def _shell(path: Path, **changes: Any) -> Path:  # noqa: ANN401 - arrays
+    shell = PointShell.sphere(0.1, 8)
+    arrays = {"points": shell.points, "normals": shell.normals, "center": shell.center}
+    arrays |= {"format": np.array(FORMAT), "is_closed": np.array(True), "seed": np.array(0)}
+    np.savez_compressed(path, **(arrays | {"link": np.array("")} | changes))
+    return path
+
+
+def test_a_saved_shell_that_unpacks_to_much_more_is_refused(tmp_path: Path) -> None:
+    """2.3 MB that became 5.9 GB."""
+    assert len(PointShell.load(_shell(tmp_path / "a.npz"))) == 8
+    with pytest.raises(FileError, match="more than 10 times as many"):
+        PointShell.load(_shell(tmp_path / "b.npz", points=np.zeros((200_000, 3))))
+    with pytest.raises(FileError, match="more than 10 times as many"):
+        PointShell.load(_shell(tmp_path / "b.npz", other=np.zeros(2_000_000)))
+
+
+def test_a_saved_shell_that_promises_more_than_it_holds(tmp_path: Path) -> None:
+    path = _shell(tmp_path / "a.npz")
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    points = entries["points.npy"]
+    assert b"(8, 3), }" in points
+    entries["points.npy"] = points.replace(b"(8, 3), }      ", b"(8000000, 3), }")
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    with pytest.raises(FileError, match="promises 192,000,000 bytes"):
+        PointShell.load(path)
+
+
+def test_limits_are_options_of_an_import(tmp_path: Path) -> None:
+    path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\n" * 50_000 + "f 1 2 3\n")
+    for options in ({"time_limit": 1e-3}, {"memory_limit": 1}):
+        (report,) = import_files(tmp_path / "a.db", [path], ImportOptions(**options))
+        assert report.status == "failed"
+        assert f"--{next(iter(options)).replace('_', '-')}" in str(report.error)
+    (report,) = import_files(tmp_path / "a.db", [path], ImportOptions(time_limit=PATIENCE))
+    assert report.status == "imported"
+    with pytest.raises(UsageError, match="above 0"):
+        ImportOptions(time_limit=0.0)
+
+
+def _laz(path: Path, point_format: int, n_points: int) -> Path:
+    """Packed points of a format, with extra bytes."""
+    laspy = pytest.importorskip("laspy", reason="the extra 'pointcloud' is not installed")
+    header = laspy.LasHeader(point_format=point_format, version="1.4")
+    header.add_extra_dims([laspy.ExtraBytesParams("a", "f8"), laspy.ExtraBytesParams("b", "u2")])
+    cloud = laspy.LasData(header)
+    rng = np.random.default_rng(point_format)
+    cloud.x, cloud.y, cloud.z = rng.random((3, n_points)) * 100.0
+    cloud.a = rng.random(n_points)
+    cloud.write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("point_format", [1, 3, 6, 7, 8, 9, 10])
+def test_packed_points_of_every_kind_are_read_in_their_chunks(
+    tmp_path: Path, point_format: int
+) -> None:
+    n_points = 110_000  # chunks have 50,000
+    file = parse_in_process(_laz(tmp_path / "a.laz", point_format, n_points))
+    assert len(file.parts[0].vertices) == n_points
+
+
+@pytest.mark.parametrize("layer", [0, 1, 5, 8, 18])
+def test_a_layer_that_is_longer_than_its_chunk_is_refused(tmp_path: Path, layer: int) -> None:
+    """A length of 2^28 in a file of 787 bytes took 244 MiB."""
+    path = _laz(tmp_path / "a.laz", 6, 40)
+    content = bytearray(path.read_bytes())
+    (points_at,) = struct.unpack_from("<I", content, 96)
+    at = points_at + 8 + 30 + 10 + 4 + 4 * layer  # the table's place, a point, their number
+    (length,) = struct.unpack_from("<I", content, at)
+    struct.pack_into("<I", content, at, length + (1 << 28))
+    path.write_bytes(content)
+    line = cause(path)
+    assert "it is damaged: the layers of the chunk at byte" in line

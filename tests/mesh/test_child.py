@@ -1,0 +1,163 @@
+"""The child process that parses: same result, bounded damage, no orphan."""
+
+import os
+import signal
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from subprocess import Popen
+
+import numpy as np
+import pytest
+
+from children import child, finished, until
+from hapticdb.errors import MissingExtraError
+from hapticdb.mesh import Defects, parse_in_process, read_file
+from hapticdb.mesh import reader as reader_module
+from hapticdb.mesh.child import allowance
+from hapticdb.mesh.gltf import bytes_beside
+from hapticdb.resident.table import is_alive
+from mesh_files import cause, gltf, names, text, threemf
+
+
+def test_the_child_hands_back_what_this_process_reads(tmp_path: Path) -> None:
+    nodes = [{"name": "a", "mesh": 0}, {"name": "b", "mesh": 0, "scale": [0.1, 3, 1]}]
+    tree = {"nodes": nodes, "scenes": [{"nodes": [0, 1]}]}
+    path = gltf(tree, tmp_path / "two.gltf", indices=[0, 1, 2, 0, 1, 9])
+    here, there = parse_in_process(path), read_file(path)
+    assert there.link == str(path.resolve())
+    assert names(there) == names(here)
+    assert there.defects == here.defects == Defects(out_of_range=2)
+    assert there.parts[0].vertices is there.parts[1].vertices
+    for a, b in zip(here.parts, there.parts, strict=True):
+        assert a.digest == b.digest
+        np.testing.assert_array_equal(a.triangles(), b.triangles())
+
+
+def test_a_zip_bomb_does_not_unpack_into_memory(tmp_path: Path) -> None:
+    filler = " " * (64 << 20)
+    path = threemf(tmp_path / "bomb.3mf", f'<object id="1">{filler}</object>', "")
+    assert path.stat().st_size < 200_000
+    cause(path, read_file, memory_limit=32 << 20)
+
+
+def test_the_allowance_goes_with_the_file(tmp_path: Path) -> None:
+    small, large = text(tmp_path / "a.obj", "v"), text(tmp_path / "b.obj", "v" * 1_000_000)
+    assert allowance(small) < allowance(large) < allowance(small) + (128 << 20)
+
+
+def test_files_that_a_glTF_refers_to_count_once(tmp_path: Path) -> None:  # noqa: N802
+    beside = tmp_path / "a b.bin"
+    beside.write_bytes(b"\0" * 1_000_000)
+    (tmp_path / "link.bin").symlink_to(beside)
+    named = ["a b.bin", "a%20b.bin", "link.bin", "./a b.bin", "gone.bin"] * 100
+    tree = {"buffers": [{"byteLength": 1_000_000, "uri": name} for name in named]}
+    path = gltf(tree, tmp_path / "d.gltf")
+    assert bytes_beside(path) == 1_000_000
+    assert allowance(path, bytes_beside(path)) > allowance(path) + 1_000_000
+
+
+@pytest.fixture
+def fake_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """A LAS file whose parser does whatever a test wants."""
+
+    def make(body: str) -> Path:
+        (tmp_path / "laspy" / "vlrs").mkdir(parents=True)
+        classes = "class GeoKeyDirectoryVlr: ...\nclass WktCoordinateSystemVlr: ...\n"
+        text(tmp_path / "laspy" / "vlrs" / "known.py", classes)
+        source = f"import os, signal, time\nclass LasHeader: ...\ndef open(path):\n    {body}\n"
+        text(tmp_path / "laspy" / "__init__.py", source)
+        text(tmp_path / "lazrs.py", "")
+        monkeypatch.syspath_prepend(str(tmp_path))
+        header = bytearray(227)
+        header[:4] = b"LASF"
+        struct.pack_into("<HI", header, 94, 227, 227)
+        path = tmp_path / "a.las"
+        path.write_bytes(header)
+        return path
+
+    return make
+
+
+def test_a_parser_that_crashes_ends_in_one_line(fake_laspy: Callable[[str], Path]) -> None:
+    path = fake_laspy("os.kill(os.getpid(), signal.SIGSEGV)")
+    line = cause(path, read_file)
+    assert "lazrs" in line
+    assert "SIGSEGV" in line
+    assert "unpack it to LAS" in line
+
+
+def test_a_parser_that_eats_memory_ends_in_one_line(fake_laspy: Callable[[str], Path]) -> None:
+    line = cause(fake_laspy("bytearray(2 << 30)"), read_file, memory_limit=64 << 20)
+    assert "more memory" in line
+    assert "--memory-limit" in line
+
+
+def test_a_parser_that_leaves_ends_in_one_line(fake_laspy: Callable[[str], Path]) -> None:
+    path = fake_laspy("os.write(2, b'out of luck'); os._exit(3)")
+    line = cause(path, read_file)
+    assert "status 3" in line
+    assert "out of luck" in line
+
+
+def test_a_parser_that_hangs_is_ended(fake_laspy: Callable[[str], Path]) -> None:
+    path = fake_laspy("time.sleep(600)")
+    line = cause(path, read_file, time_limit=2)
+    assert "longer than 2 s" in line
+    assert "--time-limit" in line
+
+
+def test_what_a_parser_prints_does_not_mix_with_its_answer(
+    fake_laspy: Callable[[str], Path],
+) -> None:
+    path = fake_laspy("os.write(1, b'chatter'); raise ValueError('odd\\nfile')")
+    assert "odd file" in cause(path, read_file)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the limit of time ends the child")
+def test_no_child_outlives_a_killed_parent(
+    tmp_path: Path, fake_laspy: Callable[[str], Path]
+) -> None:
+    pid_file = tmp_path / "pid"
+    path = fake_laspy(f"os.rename(_note(), {str(pid_file)!r}); time.sleep(600)")
+    module = tmp_path / "laspy" / "__init__.py"
+    note = "def _note():\n    f = os.open('note', os.O_WRONLY | os.O_CREAT)\n"
+    note += "    os.write(f, str(os.getpid()).encode()); os.close(f); return 'note'\n"
+    module.write_text(module.read_text() + note)
+    # No guard for the main module: a child by spawn would run this script again.
+    script = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom hapticdb.mesh import read_file\nread_file({str(path)!r})\n"  # noqa: E501
+    scratch = os.environ | {"TMPDIR": str(tmp_path)}  # a killed parent leaves its own behind
+    with child([sys.executable, "-c", script], cwd=tmp_path, env=scratch) as parent:
+        until(pid_file.exists)
+        parser = int(pid_file.read_text())
+        parent.kill()  # it alone, not its group
+        until(lambda: not is_alive(parser))
+
+
+def test_an_interrupt_leaves_no_child(
+    fake_laspy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started: list[Popen[bytes]] = []
+
+    def interrupted(parser: Popen[bytes], _request: object) -> None:
+        started.append(parser)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(reader_module, "_talk", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        read_file(fake_laspy("time.sleep(600)"))
+    assert started[0].returncode == -signal.SIGKILL
+
+
+def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    with pytest.raises(MissingExtraError, match=r"pip install 'hapticdb\[step\]'"):
+        read_file(text(tmp_path / "a.STEP", "ISO-10303-21;"))
+
+
+def test_importing_the_module_loads_no_parser() -> None:
+    heavy = ("trimesh", "collada", "laspy", "cascadio")
+    script = f"import sys, hapticdb.mesh; print([m for m in {heavy} if m in sys.modules])"
+    found = finished([sys.executable, "-c", script], check=True)
+    assert found.stdout.strip() == "[]"

@@ -1,0 +1,151 @@
+"""The whole way from a CAD file to a force, on real assemblies, or on the sample without them."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, PointShell
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.sample import slide_over_voxels, write_sample, write_wrench
+from hapticdb.store.base import LAYOUTS, Layout
+from naive_frame import touch as naive_touch
+
+ASSEMBLIES = {
+    "demo_vintage_car/vintage_car.glb": 200,
+    "assembly_vw_t1/vw_t1.glb": 1428,
+    "robot_lekiwi/lekiwi.glb": 42,
+}
+SAMPLE_PARTS = 217
+BITS = 8
+
+
+@pytest.fixture(scope="module", params=ASSEMBLIES)
+def assembly(
+    request: pytest.FixtureRequest,
+    test_data: Path | None,
+    tmp_path_factory: pytest.TempPathFactory,
+) -> tuple[Path, int]:
+    """A file and how many parts it has."""
+    name = str(request.param)
+    if test_data is not None:
+        return test_data / name, ASSEMBLIES[name]
+    return write_sample(tmp_path_factory.mktemp("sample"), count=2).car, SAMPLE_PARTS
+
+
+@pytest.fixture(scope="module")
+def environments(
+    assembly: tuple[Path, int], tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[dict[Layout, Environment]]:
+    folder = tmp_path_factory.mktemp("cad")
+    opened: dict[Layout, Environment] = {}
+    for layout in LAYOUTS:
+        options = hapticdb.ImportOptions(
+            grid=hapticdb.GridOptions(bits=BITS, extent=1.6), layout=layout
+        )
+        (report,) = hapticdb.import_files(folder / f"{layout}.db", [assembly[0]], options)
+        assert report.status == "imported"
+        opened[layout] = hapticdb.open(folder / f"{layout}.db")
+    yield opened
+    for env in opened.values():
+        env.close()
+
+
+def all_voxels(env: Environment) -> dict[tuple[int, int, int], set[int]]:
+    found: dict[tuple[int, int, int], set[int]] = {}
+    for obj in env.objects():
+        for i, j, k in env.voxels(obj.id).tolist():
+            found.setdefault((i, j, k), set()).add(obj.id)
+    return found
+
+
+def scaled_tool(env: Environment, folder: Path) -> tuple[PointShell, NDArray[np.float64]]:
+    """The sample's wrench, 24 voxels long, and a path that slides it over the scene."""
+    whole = PointShell.from_file(write_wrench(folder), points=300)
+    length = float(np.ptp(whole.points, axis=0).max())
+    scale = 24 * env.grid.voxel_size / length
+    shell = PointShell(
+        points=whole.points * scale, normals=whole.normals, center=whole.center * scale
+    )
+    centers = env.grid.centers(np.array(sorted(all_voxels(env))))
+    poses = slide_over_voxels(centers, env.grid.voxel_size, shell.points, count=12, seed=1)
+    return shell, np.asarray(poses)
+
+
+def test_every_instance_becomes_an_object_that_touches_voxels(
+    assembly: tuple[Path, int], environments: dict[Layout, Environment]
+) -> None:
+    objects = environments["brick"].objects()
+    assert len(objects) == assembly[1]
+    assert [obj.id for obj in objects] == list(range(1, assembly[1] + 1))
+    assert len({obj.name for obj in objects}) == assembly[1]
+    assert all(obj.voxels > 0 for obj in objects)
+
+
+def test_both_layouts_hold_the_same_voxels(environments: dict[Layout, Environment]) -> None:
+    brick, voxel = environments["brick"], environments["voxel"]
+    for obj in brick.objects()[::7]:
+        ijk = brick.voxels(obj.id)
+        assert len(ijk) == obj.voxels
+        np.testing.assert_array_equal(ijk, voxel.voxels(obj.id))
+    assert voxel.size().rows == sum(obj.voxels for obj in voxel.objects())
+
+
+def test_strategies_layouts_and_the_plain_set_agree_along_a_path(
+    environments: dict[Layout, Environment], tmp_path: Path
+) -> None:
+    env = environments["brick"]
+    plain = all_voxels(env)
+    shell, poses = scaled_tool(env, tmp_path)
+    x, y, z = shell.center.tolist()
+    n_hits = 0
+    for pose in poses:
+        wanted = naive_touch(
+            plain,
+            [(a, b, c) for a, b, c in shell.points.tolist()],
+            [(a, b, c) for a, b, c in shell.normals.tolist()],
+            (x, y, z),
+            pose.tolist(),
+            env.grid.origin,
+            env.grid.voxel_size,
+            env.grid.side,
+        )
+        n_hits += len(wanted.hits)
+        for each in environments.values():
+            for strategy in STRATEGIES:
+                touch = each.touch(shell, pose, strategy)
+                assert touch.hits.tolist() == wanted.hits
+                assert [obj.id for obj in touch.objects] == wanted.ids
+                assert touch.force.tobytes() == np.array(wanted.force).tobytes()
+                assert touch.torque.tobytes() == np.array(wanted.torque).tobytes()
+    assert n_hits > 10 * len(poses), "the path touches too little to show anything"
+
+
+def test_half_the_voxel_size_gives_about_four_times_the_voxels(
+    assembly: tuple[Path, int], environments: dict[Layout, Environment], tmp_path: Path
+) -> None:
+    """Case 12, once parts are larger than a voxel: here between 9 and 10 bits."""
+    counted = []
+    for bits in (9, 10):
+        options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=bits, extent=1.6))
+        (report,) = hapticdb.import_files(tmp_path / f"{bits}.db", [assembly[0]], options)
+        counted.append(sum(obj.voxels for obj in report.added))
+    assert 3.0 < counted[1] / counted[0] < 4.6
+    assert counted[0] > sum(obj.voxels for obj in environments["brick"].objects())
+
+
+def test_a_part_moved_away_and_back_leaves_the_scene_as_it_was(
+    environments: dict[Layout, Environment],
+) -> None:
+    env = environments["voxel"]
+    part = env.objects()[5]
+    before = env.voxels(part.id)
+    away = np.eye(4)
+    away[:3, 3] = env.grid.voxel_size * np.array([6, -5, 7])
+    env.move(part.id, away @ part.transform)
+    assert len(env.voxels(part.id)) > 0
+    env.move(part.id, part.transform)
+    np.testing.assert_array_equal(env.voxels(part.id), before)

@@ -1,0 +1,132 @@
+"""How well points cover a surface, and what is inside of it, against sampling and closed forms."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb import PointShell, UsageError
+from hapticdb.pointshell.coverage import Interior, covering_radius
+from hapticdb.pointshell.orientation import orient
+
+Floats = NDArray[np.float64]
+
+coordinates = st.tuples(*[st.floats(-1.0, 1.0, width=32)] * 3)
+
+
+def places_on(triangles: Floats, steps: int = 40) -> Floats:
+    """Places all over triangles (F, 3, 3), corners and sides among them."""
+    u, v = np.meshgrid(*[np.linspace(0.0, 1.0, steps)] * 2)
+    u, v = u[u + v <= 1.0 + 1e-12], v[u + v <= 1.0 + 1e-12]
+    weights = np.stack([1.0 - u - v, u, v], axis=1)
+    return np.asarray(np.einsum("wc,fck->fwk", weights, triangles)).reshape(-1, 3)
+
+
+def farthest(triangles: Floats, points: Floats) -> float:
+    """Greatest distance from such a place to the nearest of the points: at most the radius."""
+    places = places_on(triangles)
+    apart = np.linalg.norm(places[:, None] - points[None], axis=2)
+    return float(apart.min(axis=1).max())
+
+
+@given(
+    triangles=st.lists(st.tuples(coordinates, coordinates, coordinates), min_size=1, max_size=4),
+    points=st.lists(coordinates, min_size=1, max_size=12),
+)
+def test_a_covering_radius_bounds_the_distance_of_every_place(
+    triangles: list[Any], points: list[Any]
+) -> None:
+    surface, given_points = np.array(triangles), np.array(points)
+    least = farthest(surface, given_points)
+    bound = covering_radius(surface, given_points)
+    assert bound >= least
+    # 40 steps a side miss the farthest place by a twentieth of a triangle at most
+    assert bound <= 1.11 * (least + 0.1) + 0.1 * np.sqrt(len(triangles) / len(points)) * 2.0
+
+
+def test_a_square_with_points_at_its_corners_is_covered_by_half_a_diagonal() -> None:
+    corners = np.array([(0.0, 0.0, 0.0), (1.0, 0.0, 0.0), (1.0, 1.0, 0.0), (0.0, 1.0, 0.0)])
+    radius = covering_radius(corners[[[0, 1, 2], [0, 2, 3]]], corners)
+    assert np.sqrt(0.5) <= radius <= 1.11 * np.sqrt(0.5)
+
+
+@pytest.mark.parametrize("n_points", [1, 3, 4, 20, 300, 3000])
+def test_points_of_a_sphere_know_how_they_cover_it(n_points: int) -> None:
+    shell = PointShell.sphere(0.05, n_points).with_cover()
+    directions = np.random.default_rng(0).normal(size=(20_000, 3))
+    places = 0.05 * directions / np.linalg.norm(directions, axis=1)[:, None]
+    dots = np.clip((places @ shell.points.T).max(axis=1), -(0.05**2), 0.05**2)
+    least = np.sqrt(2.0 * (0.05**2 - dots.min()))
+    assert shell.cover is not None
+    assert least <= shell.cover
+    if n_points > 4:
+        assert shell.cover <= 1.2 * least
+
+
+@pytest.mark.parametrize("spacing", [0.02, 0.004])
+def test_a_shell_of_a_spacing_has_points_about_so_far_apart(spacing: float) -> None:
+    box = trimesh.creation.box((0.1, 0.08, 0.06))
+    shell = PointShell.from_mesh(box.vertices, box.faces, spacing=spacing).with_cover()
+    assert len(shell) == max(300, int(np.ceil(2.0 * box.area / (np.sqrt(3.0) * spacing**2))))
+    assert shell.cover is not None
+    assert shell.cover >= farthest(np.array(box.triangles), shell.points)
+    real = np.sqrt(2.0 * box.area / (np.sqrt(3.0) * len(shell)))
+    assert 0.5 * real < shell.cover < 1.5 * real
+    fewer = PointShell.from_mesh(box.vertices, box.faces, 500, spacing=spacing)
+    assert len(fewer) == min(500, len(shell))
+
+
+@pytest.mark.parametrize("spacing", [0.0, -1.0, np.nan, np.inf])
+def test_a_spacing_that_is_none_is_refused(spacing: float) -> None:
+    box = trimesh.creation.box((0.1, 0.08, 0.06))
+    with pytest.raises(UsageError, match="spacing"):
+        PointShell.from_mesh(box.vertices, box.faces, spacing=spacing)
+
+
+def test_a_saved_shell_keeps_its_covering_radius(tmp_path: Any) -> None:  # noqa: ANN401
+    shell = PointShell.sphere(0.05, 50)
+    for made in (shell, shell.with_cover()):
+        made.save(tmp_path / "shell.npz")
+        assert PointShell.load(tmp_path / "shell.npz").cover == made.cover
+
+
+def boxes(*many: tuple[float, float]) -> trimesh.Trimesh:
+    """Cubes of an edge, each moved along x."""
+    made = [trimesh.creation.box([edge] * 3) for edge, _ in many]
+    for cube, (_, x) in zip(made, many, strict=True):
+        cube.apply_translation((x, 0.0, 0.0))
+    return trimesh.util.concatenate(made)
+
+
+@given(places=st.lists(st.tuples(*[st.floats(-1.6, 1.6)] * 3), min_size=1, max_size=20))
+def test_inside_is_what_closed_bodies_enclose_without_their_voids(places: list[Any]) -> None:
+    # a cube with a void and a cube in the void; another overlaps it from the right
+    many = boxes((2.0, 0.0), (1.2, 0.0), (0.4, 0.0), (1.0, 0.9))
+    interior = Interior(orient(np.array(many.triangles)))
+    asked = np.array(places)
+
+    def in_cube(edge: float, x: float) -> NDArray[np.bool_]:
+        return np.asarray((np.abs(asked - (x, 0.0, 0.0)) < 0.5 * edge).all(axis=1))
+
+    body = in_cube(2.0, 0.0) & ~in_cube(1.2, 0.0) | in_cube(0.4, 0.0)
+    # the right one begins at 0.4, in the void, which it fills up to 0.6
+    expected = body | in_cube(1.0, 0.9)
+    on_a_wall = np.zeros(len(asked), dtype=bool)
+    for edge, x in ((2.0, 0.0), (1.2, 0.0), (0.4, 0.0), (1.0, 0.9)):
+        on_a_wall |= (np.abs(np.abs(asked - (x, 0.0, 0.0)) - 0.5 * edge) < 1e-6).any(axis=1)
+    depth = interior.holds(asked)
+    overlap = in_cube(1.2, 0.0) & in_cube(1.0, 0.9)  # void and body: one each, neither counts
+    sure = ~on_a_wall & ~overlap
+    assert (depth[sure] == expected[sure]).all()
+
+
+def test_an_open_surface_encloses_nothing() -> None:
+    box = trimesh.creation.box((1.0, 1.0, 1.0))
+    assert Interior(orient(np.array(box.triangles)))
+    torn = Interior(orient(np.array(box.triangles[:-1])))
+    assert not torn
+    assert not torn.holds(np.zeros((1, 3))).any()

@@ -1,0 +1,458 @@
+"""A tool's mesh, whatever its state, becomes even points with normals into the tool."""
+
+import struct
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial.transform import Rotation
+
+from hapticdb.errors import FileError, UsageError
+from hapticdb.pointshell import orientation
+from hapticdb.pointshell.shell import PointShell
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Mesh = tuple[Floats, Ints]
+
+
+def cube(edge: float = 1.0, at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
+    """A cube from the corner `at`, two triangles a face, wound outwards."""
+    corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=float)
+    quads = np.array(
+        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    )
+    return corners * edge + at, np.concatenate((quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]))
+
+
+def sphere(radius: float = 1.0, n: int = 600) -> Mesh:
+    """A sphere about the origin: the hull of a Fibonacci lattice, in random winding."""
+    k = np.arange(n) + 0.5
+    z, angle = 1.0 - 2.0 * k / n, np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z * z)
+    corners = radius * np.stack((ring * np.cos(angle), ring * np.sin(angle), z), axis=1)
+    return corners, ConvexHull(corners).simplices.astype(np.int64)
+
+
+def torus(major: float = 1.0, minor: float = 0.4, n: int = 48) -> Mesh:
+    """A torus about the z axis."""
+    u, v = (x.ravel() for x in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
+    a, b = 2.0 * np.pi * u / n, 2.0 * np.pi * v / n
+    ring = major + minor * np.cos(b)
+    corners = np.stack((ring * np.cos(a), ring * np.sin(a), minor * np.sin(b)), axis=1)
+
+    def at(i: Ints, j: Ints) -> Ints:
+        return (i % n) * n + j % n
+
+    here, there = at(u, v), at(u + 1, v + 1)
+    first = np.stack((here, at(u + 1, v), there), axis=1)
+    return corners, np.concatenate((first, np.stack((here, there, at(u, v + 1)), axis=1)))
+
+
+def together(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0] + [len(corners) for corners, _ in meshes])
+    return (
+        np.concatenate([corners for corners, _ in meshes]),
+        np.concatenate([faces + n for (_, faces), n in zip(meshes, starts, strict=False)]),
+    )
+
+
+def tumbled(mesh: Mesh, seed: int = 1) -> Mesh:
+    """The same surface with every triangle wound at random and no corner shared."""
+    corners, faces = mesh
+    rng = np.random.default_rng(seed)
+    flip = rng.random(len(faces)) < 0.5
+    wound = np.where(flip[:, None], faces[:, ::-1], faces)
+    return corners[wound].reshape(-1, 3), np.arange(3 * len(faces)).reshape(-1, 3)
+
+
+def write_stl(path: Path, mesh: Mesh) -> Path:
+    corners, faces = mesh
+    record = [struct.pack("<12fH", 0, 0, 0, *corners[face].ravel(), 0) for face in faces]
+    path.write_bytes(b"tool".ljust(80) + struct.pack("<I", len(faces)) + b"".join(record))
+    return path
+
+
+def spacing(area: float, n: int) -> float:
+    """Neighbours' distance in a hexagonal lattice of n points over that area."""
+    return float(np.sqrt(2.0 * area / (np.sqrt(3.0) * n)))
+
+
+def cube_inward(points: Floats, edge: float = 1.0) -> Floats:
+    """Inward normals of a cube at the origin, exact, at points on its faces."""
+    offsets = np.concatenate((points, edge - points), axis=1)
+    nearest = np.argmin(np.abs(offsets), axis=1)
+    inward: Floats = np.concatenate((np.eye(3), -np.eye(3)))[nearest]
+    return inward
+
+
+@pytest.mark.parametrize("n", [1, 2, 7, 300, 1000])
+def test_a_shell_has_exactly_the_points_asked_for(n: int) -> None:
+    shell = PointShell.from_mesh(*cube(), n)
+    assert len(shell) == n
+    assert shell.points.shape == shell.normals.shape == (n, 3)
+    assert shell.points.flags.c_contiguous
+    assert shell.normals.flags.c_contiguous
+
+
+def test_points_lie_on_the_surface_and_normals_of_a_cube_are_exact() -> None:
+    shell = PointShell.from_mesh(*tumbled(cube()), 500)
+    sides = np.minimum(np.abs(shell.points), np.abs(shell.points - 1.0)).min(axis=1)
+    assert sides.max() <= 1e-15
+    assert np.array_equal(shell.normals, cube_inward(shell.points))
+    assert shell.is_closed
+    assert np.allclose(shell.center, 0.5, atol=1e-15)
+
+
+@pytest.mark.parametrize("n", [100, 300, 3000, 25_000])
+def test_neighbours_keep_six_tenths_of_the_hexagonal_spacing(n: int) -> None:
+    corners, faces = sphere()
+    points = PointShell.from_mesh(corners, faces, n).points
+    edges = corners[faces]
+    area = np.linalg.norm(
+        np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0]), axis=1
+    ).sum()
+    nearest = np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1]
+    assert nearest.min() > 0.6 * spacing(area / 2.0, n)
+
+
+def test_every_patch_of_equal_area_gets_its_share() -> None:
+    # One face of the cube is cut into slivers, another into triangles down to 2^-20 of its edge.
+    corners, faces = cube()
+    slivers = [[(0, y / 500, 0), (1, y / 500, 0), (0, (y + 1) / 500, 0)] for y in range(500)]
+    slivers += [[(1, y / 500, 0), (1, (y + 1) / 500, 0), (0, (y + 1) / 500, 0)] for y in range(500)]
+    halves = [2.0**-k for k in range(21)]
+    fan = [[(0, 0, 1), (a, 0, 1), (b, 1, 1)] for a, b in zip(halves, halves, strict=True)]
+    fan += [[(b, 0, 1), (a, 0, 1), (a, 1, 1)] for a, b in pairwise(halves)]
+    fan += [[(b, 0, 1), (a, 1, 1), (b, 1, 1)] for a, b in pairwise(halves)]
+    kept = faces[~(np.isin(corners[faces][:, :, 2].sum(axis=1), (0.0, 3.0)))]
+    strip = np.array(fan[21:], dtype=float)
+    end = np.array([[(0, 0, 1), (halves[-1], 0, 1), (0, 1, 1)]], dtype=float)
+    last = np.array([[(halves[-1], 0, 1), (halves[-1], 1, 1), (0, 1, 1)]], dtype=float)
+    triangles = np.concatenate((corners[kept], np.array(slivers, dtype=float), strip, end, last))
+    n = 6000
+    shell = PointShell.from_mesh(
+        triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3), n
+    )
+    inward = cube_inward(shell.points)
+    axis = np.abs(inward).argmax(axis=1)
+    side = inward[np.arange(n), axis] > 0
+    u = shell.points[np.arange(n), (axis + 1) % 3]
+    v = shell.points[np.arange(n), (axis + 2) % 3]
+    tile = ((axis * 2 + side) * 4 + np.minimum(u * 4, 3).astype(int)) * 4
+    counts = np.bincount(tile + np.minimum(v * 4, 3).astype(int), minlength=96)
+    expected = n / 96
+    # Independent points would give a chi-square of 95 on average; even ones far less.
+    assert ((counts - expected) ** 2 / expected).sum() < 48.0
+
+
+def test_both_sides_of_a_thin_wall_get_their_share() -> None:
+    corners, faces = cube()
+    fin = (corners * (2.0, 1.0, 0.004) + (1.5, 0.0, 0.0), faces)
+    points = PointShell.from_mesh(*together((corners, faces), fin), 3000).points
+    area = 2.0 * (2.0 + 0.012)
+    assert np.mean(points[:, 0] > 1.25) == pytest.approx(area / (area + 6.0), rel=0.03)
+
+
+@given(seed=st.integers(0, 2**32), shift=st.integers(-3, 3))
+@settings(max_examples=15, deadline=None)
+def test_a_moved_tool_has_a_moved_shell(seed: int, shift: int) -> None:
+    corners, faces = torus(n=12)
+    turn = Rotation.random(rng=np.random.default_rng(seed)).as_matrix()
+    offset = np.array([shift, -2.0 * shift, 0.5])
+    here = PointShell.from_mesh(corners, faces, 60, seed=seed)
+    there = PointShell.from_mesh(corners @ turn.T + offset, faces, 60, seed=seed)
+    # The curve that orders the points follows the frame's axes: a turned tool has them in another.
+    twin = np.asarray(cKDTree(there.points).query(here.points @ turn.T + offset)[1])
+    assert len(np.unique(twin)) == 60
+    assert np.allclose(there.points[twin], here.points @ turn.T + offset, atol=1e-12)
+    assert np.allclose(there.normals[twin], here.normals @ turn.T, atol=1e-12)
+    assert np.allclose(there.center, turn @ here.center + offset, atol=1e-12)
+
+
+def test_equal_seeds_give_equal_shells_and_others_do_not() -> None:
+    first, again, other = (PointShell.from_mesh(*torus(), 200, seed=s) for s in (5, 5, 6))
+    assert np.array_equal(first.points, again.points)
+    assert np.array_equal(first.normals, again.normals)
+    assert not np.array_equal(first.points, other.points)
+    assert first.seed == 5
+
+
+def mean_step(points: Floats) -> float:
+    """Mean distance from each point to the one after it."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).mean())
+
+
+@pytest.mark.parametrize("stretch", [(1.0, 1.0, 1.0), (30.0, 1.0, 1.0), (1.0, 1.0, 0.01)])
+def test_points_next_to_each_other_by_index_are_close_in_space(
+    stretch: tuple[float, float, float],
+) -> None:
+    corners, faces = torus()
+    points = PointShell.from_mesh(corners * stretch, faces, 2000).points
+    shuffled = np.random.default_rng(0).permutation(points)
+    assert mean_step(points) < mean_step(shuffled) / 8.0
+    nearest = np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1]
+    assert mean_step(points) < 3.0 * nearest.mean()
+
+
+def test_a_frame_finds_the_same_brick_many_times_in_a_row() -> None:
+    points = PointShell.from_mesh(*torus(), 5000).points
+    bricks = np.floor(points / 0.8).astype(np.int64)
+    n_runs = 1 + int((np.diff(bricks, axis=0) != 0).any(axis=1).sum())
+    assert n_runs < 5000 / 5  # in random order, nearly one run a point
+
+
+def test_a_rounding_of_the_frame_leaves_the_order() -> None:
+    # A cube's points lie on the ends of their bounding box: where a step must not end.
+    here, there = (PointShell.from_mesh(*cube(at=(x, 0.0, 0.0)), 500) for x in (0.0, 0.1))
+    assert np.allclose(there.points, here.points + np.array([0.1, 0.0, 0.0]), atol=1e-12)
+
+
+def test_points_given_as_arrays_keep_their_order(tmp_path: Path) -> None:
+    sampled = PointShell.from_mesh(*torus(), 200)
+    order = np.random.default_rng(1).permutation(200)
+    shell = PointShell(sampled.points[order], sampled.normals[order], sampled.center)
+    shell.save(tmp_path / "tool.npz")
+    for kept in (shell, PointShell.from_file(tmp_path / "tool.npz")):
+        assert np.array_equal(kept.points, sampled.points[order])
+        assert np.array_equal(kept.normals, sampled.normals[order])
+
+
+@pytest.mark.parametrize("state", ["outward", "inside out", "tumbled", "mirrored", "doubled"])
+def test_normals_point_inward_whatever_the_winding(state: str) -> None:
+    corners, faces = torus()
+    if state == "inside out":
+        faces = faces[:, ::-1]
+    elif state == "tumbled":
+        corners, faces = tumbled((corners, faces))
+    elif state == "mirrored":
+        corners = corners * (-1.0, 1.0, 1.0)
+    elif state == "doubled":
+        corners, faces = together((corners, faces), tumbled((corners, faces)))
+    shell = PointShell.from_mesh(corners, faces, 1000)
+    flat = shell.points * (1.0, 1.0, 0.0)
+    core = flat / np.linalg.norm(flat, axis=1, keepdims=True)
+    assert np.einsum("nk,nk->n", shell.normals, core - shell.points).min() > 0.0
+    assert shell.is_closed
+    assert np.allclose(shell.center, 0.0, atol=1e-12)
+
+
+def test_in_a_cavity_inward_is_away_from_the_void() -> None:
+    hole = cube(0.5, (0.1, 0.25, 0.25))
+    shell = PointShell.from_mesh(*tumbled(together(cube(), hole)), 800)
+    in_hole = (np.abs(shell.points - 0.5) < 0.45).all(axis=1)
+    assert in_hole.sum() > 100
+    middle = np.array([0.35, 0.5, 0.5])
+    outward = np.einsum("nk,nk->n", shell.normals, shell.points - middle)
+    assert (outward[in_hole] > 0.0).all()
+    assert np.array_equal(shell.normals[~in_hole], cube_inward(shell.points[~in_hole]))
+    # Mass 1 at 0.5 less mass 1/8 at 0.35.
+    assert np.allclose(shell.center, [(0.5 - 0.125 * 0.35) / 0.875, 0.5, 0.5], atol=1e-14)
+
+
+def test_a_body_in_a_void_is_a_body_again() -> None:
+    nested = together(cube(), cube(0.6, (0.2, 0.2, 0.2)), cube(0.2, (0.4, 0.4, 0.4)))
+    shell = PointShell.from_mesh(*tumbled(nested), 2000)
+    ring = np.abs(shell.points - 0.5).max(axis=1)
+    outward = np.einsum("nk,nk->n", shell.normals, shell.points - 0.5) > 0.0
+    assert (outward == ((ring > 0.2) & (ring < 0.4))).all()
+
+
+@pytest.mark.parametrize("gap", [2.0, 1.0, 0.5])
+def test_bodies_apart_glued_or_overlapping_each_have_their_inside(gap: float) -> None:
+    pair = together(cube(), cube(at=(gap, 0.0, 0.0)))
+    shell = PointShell.from_mesh(*tumbled(pair), 1000)
+    assert shell.is_closed
+    assert np.allclose(shell.center, [(1.0 + gap) / 2.0, 0.5, 0.5], atol=1e-14)
+    for axis, level, normal in ((0, 0.0, 1.0), (0, gap + 1.0, -1.0), (2, 0.0, 1.0)):
+        on_face = shell.points[:, axis] == level
+        assert on_face.any()
+        assert (shell.normals[on_face, axis] == normal).all()
+    if gap == 0.5:
+        assert (shell.normals[shell.points[:, 0] == 1.0, 0] == -1.0).all()
+
+
+def test_an_open_hemisphere_faces_its_hollow_and_says_that_it_is_open() -> None:
+    corners, faces = sphere(n=2000)
+    faces = faces[(corners[faces][:, :, 2] >= 0.0).all(axis=1)]
+    shell = PointShell.from_mesh(*tumbled((corners, faces)), 300)
+    assert not shell.is_closed
+    assert np.einsum("nk,nk->n", shell.normals, -shell.points).min() > 0.0
+    # Archimedes: the centroid of a hemisphere's surface is at half its height.
+    assert np.allclose(shell.center, [0.0, 0.0, 0.5], atol=0.03)
+
+
+def test_a_solid_hemisphere_has_its_centre_at_three_eighths() -> None:
+    corners, _ = sphere(n=4000)
+    rim = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
+    half = np.concatenate(
+        (corners[corners[:, 2] > 0.02], np.stack((np.cos(rim), np.sin(rim), 0.0 * rim), axis=1))
+    )
+    shell = PointShell.from_mesh(half, ConvexHull(half).simplices, 100)
+    assert shell.is_closed
+    assert np.allclose(shell.center, [0.0, 0.0, 0.375], atol=2e-3)
+
+
+def test_a_flat_sheet_of_random_winding_faces_one_way() -> None:
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(9.0), np.arange(9.0)))
+    low = np.stack((x, y, 0.0 * x), axis=1)[:, None]
+    triangles = np.concatenate(
+        (
+            low + np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]]),
+            low + np.array([[0, 0, 0], [1, 1, 0], [0, 1, 0]]),
+        )
+    )
+    mesh = (triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
+    shell = PointShell.from_mesh(*tumbled(mesh), 300)
+    assert not shell.is_closed
+    assert len(np.unique(shell.normals, axis=0)) == 1
+    assert np.allclose(shell.center, [4.5, 4.5, 0.0])
+
+
+def test_corners_that_differ_by_a_rounding_are_joined() -> None:
+    corners, faces = tumbled(sphere())
+    noise = np.random.default_rng(3).uniform(-1e-7, 1e-7, corners.shape)
+    assert PointShell.from_mesh(corners + noise, faces, 50).is_closed
+    assert not PointShell.from_mesh(corners + 1e3 * noise, faces, 50).is_closed
+
+
+def test_degenerate_faces_change_nothing() -> None:
+    corners, faces = cube()
+    needles = np.array([[0, 0, 1], [2, 2, 2], [0, 7, 7]])
+    clean, dirty = (
+        PointShell.from_mesh(corners, f, 100) for f in (faces, np.concatenate((needles, faces)))
+    )
+    assert np.array_equal(clean.points, dirty.points)
+    assert dirty.is_closed
+
+
+def test_far_from_the_origin_nothing_is_lost() -> None:
+    corners, faces = torus()
+    far = np.array([4.5e6, 5.4e6, 500.0])
+    shell = PointShell.from_mesh(corners + far, faces, 200)
+    assert shell.is_closed
+    assert np.allclose(shell.center, far, atol=1e-6)
+
+
+@pytest.mark.parametrize("points", [0, -1, 10_000_001])
+def test_a_number_of_points_out_of_range_is_a_usage_error(points: int) -> None:
+    with pytest.raises(UsageError, match="points"):
+        PointShell.from_mesh(*cube(), points)
+
+
+@pytest.mark.parametrize(
+    ("mesh", "cause"),
+    [
+        ((np.zeros((3, 3)), [[0, 1, 2]]), "no area"),
+        ((np.zeros((3, 3)), np.empty((0, 3), dtype=int)), "no triangles"),
+        ((np.full((3, 3), np.nan), [[0, 1, 2]]), "not finite"),
+        ((np.eye(3), [[0, 1, 3]]), "outside"),
+        ((np.eye(3), [[0.0, 1.0, 2.0]]), "integers"),
+        ((np.eye(2), [[0, 1, 1]]), "shape"),
+    ],
+)
+def test_a_mesh_without_a_surface_is_a_usage_error(mesh: Mesh, cause: str) -> None:
+    with pytest.raises(UsageError, match=cause):
+        PointShell.from_mesh(*mesh, 10)
+
+
+def test_a_saved_shell_loads_to_the_bit(tmp_path: Path) -> None:
+    shell = PointShell.from_mesh(*torus(), 123, seed=9)
+    path = tmp_path / "tool.shell.npz"
+    shell.save(path)
+    for loaded in (PointShell.load(path), PointShell.from_file(path)):
+        assert loaded.points.tobytes() == shell.points.tobytes()
+        assert loaded.normals.tobytes() == shell.normals.tobytes()
+        assert loaded.center.tobytes() == shell.center.tobytes()
+        assert (loaded.is_closed, loaded.link, loaded.seed) == (True, "", 9)
+    with pytest.raises(UsageError, match="unit"):
+        PointShell.from_file(path, unit="mm")
+
+
+def test_what_is_no_saved_shell_is_refused_in_one_line(tmp_path: Path) -> None:
+    shell = PointShell.from_mesh(*cube(), 20)
+    path = tmp_path / "tool.npz"
+    shell.save(path)
+    whole = path.read_bytes()
+    contents = [b"", b"no zip", whole[: len(whole) // 2], whole[:-30]]
+    contents.append(whole.replace(shell.points.tobytes(), b"\xff" * (20 * 24)))
+    for content in contents:
+        path.write_bytes(content)
+        with pytest.raises(FileError, match=r"tool\.npz") as caught:
+            PointShell.load(path)
+        assert "\n" not in str(caught.value)
+    np.savez(path, points=shell.points)
+    with pytest.raises(FileError, match="not a saved shell"):
+        PointShell.load(path)
+    np.savez(path, format=np.array([None], dtype=object))
+    with pytest.raises(FileError, match="not a saved shell"):
+        PointShell.load(path)
+    with pytest.raises(FileError, match="no such file"):
+        PointShell.load(tmp_path / "missing.npz")
+    with pytest.raises(FileError, match="cannot write"):
+        shell.save(tmp_path / "missing" / "tool.npz")
+
+
+def test_a_shell_by_hand_is_checked() -> None:
+    up = np.array([[0.0, 0.0, 1.0]])
+    assert len(PointShell(np.zeros((1, 3)), up, np.zeros(3))) == 1
+    for points, normals, center in (
+        (np.zeros((2, 3)), up, np.zeros(3)),
+        (np.zeros((1, 3)), 2.0 * up, np.zeros(3)),
+        (np.zeros((1, 2)), up, np.zeros(3)),
+        (np.full((1, 3), np.inf), up, np.zeros(3)),
+        (np.zeros((1, 3)), up, np.zeros(2)),
+        (np.empty((0, 3)), np.empty((0, 3)), np.zeros(3)),
+    ):
+        with pytest.raises(UsageError, match=r"shell|points|normals"):
+            PointShell(points, normals, center)
+
+
+def test_a_file_keeps_its_frame_and_its_unit(tmp_path: Path) -> None:
+    path = write_stl(tmp_path / "tool.stl", tumbled(cube(at=(3.0, 4.0, 5.0))))
+    shell = PointShell.from_file(path, 100)
+    assert np.allclose(shell.center, [3.5, 4.5, 5.5])
+    assert shell.is_closed
+    assert Path(shell.link) == path.resolve()
+    small = PointShell.from_file(path, 100, unit="mm")
+    assert np.allclose(small.points, 1e-3 * shell.points, atol=1e-12)
+
+
+def test_a_file_without_a_surface_is_named(tmp_path: Path) -> None:
+    corners, faces = cube()
+    flat = write_stl(tmp_path / "line.stl", (corners * (1.0, 0.0, 0.0), faces))
+    with pytest.raises(FileError, match=r"line\.stl.*no area"):
+        PointShell.from_file(flat)
+    cloud = tmp_path / "cloud.ply"
+    cloud.write_text(
+        "ply\nformat ascii 1.0\nelement vertex 2\nproperty float x\nproperty float y\n"
+        "property float z\nend_header\n0 0 0\n1 1 1\n"
+    )
+    with pytest.raises(FileError, match=r"cloud\.ply.*surface"):
+        PointShell.from_file(cloud)
+    with pytest.raises(FileError, match=r"missing\.stl"):
+        PointShell.from_file(tmp_path / "missing.stl")
+
+
+@given(
+    n=st.integers(1, 40),
+    ends=st.lists(st.tuples(st.integers(0, 39), st.integers(0, 39)), max_size=60),
+)
+def test_components_are_those_of_scipy(n: int, ends: list[tuple[int, int]]) -> None:
+    pairs = np.array(ends, dtype=np.int64).reshape(-1, 2) % n
+    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    wanted = connected_components(graph, directed=False)[1]
+    assert orientation._components(pairs, n).tolist() == wanted.tolist()
+
+
+def test_the_components_of_a_long_chain_are_one() -> None:
+    order = np.random.default_rng(1).permutation(20_000)
+    pairs = np.stack([order[:-1], order[1:]], axis=1)
+    assert not orientation._components(pairs, len(order)).any()

@@ -1,0 +1,270 @@
+"""Case 9: every strategy, layout, curve and engine finds what a plain set finds, bit for bit."""
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, Grid, PointShell, TangentPlane
+from hapticdb.grid import CurveName
+from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.store.base import Layout
+from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.postgres.private_server import Binaries
+from hapticdb.store.postgres.schema_of import drop
+from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.testing import KINDS, blob, write_voxels
+from naive_frame import NaiveTouch
+from naive_frame import touch as naive_touch
+from servers import FOUND, base_url, named
+
+ORIGIN = (-0.31, 0.17, -0.05)
+SIZE = 0.013
+BITS = 6
+BLOBS = [((20, 20, 20), 1), ((26, 22, 20), 2), ((20, 21, 27), 3), ((60, 60, 60), 4), ((2, 3, 2), 5)]
+
+
+def scene_voxels() -> list[NDArray[np.int64]]:
+    """Blobs that share voxels, and two that the grid's border cuts."""
+    voxels = [blob(seed, center) for center, seed in BLOBS]
+    return [v[((v >= 0) & (v < 1 << BITS)).all(axis=1)] for v in voxels]
+
+
+@pytest.fixture(scope="module")
+def plain() -> dict[tuple[int, int, int], set[int]]:
+    found: dict[tuple[int, int, int], set[int]] = {}
+    for n, voxels in enumerate(scene_voxels()):
+        for i, j, k in voxels.tolist():
+            found.setdefault((i, j, k), set()).add(n + 1)
+    return found
+
+
+ENGINES: list[Binaries | str | None] = [None, *FOUND]
+"""SQLite, and every PostgreSQL server."""
+
+
+@pytest.fixture(scope="module", params=KINDS, ids="-".join)
+def kind(request: pytest.FixtureRequest) -> tuple[Layout, CurveName]:
+    layout, curve = request.param
+    return layout, curve
+
+
+@pytest.fixture(
+    scope="module", params=ENGINES, ids=lambda found: "sqlite" if found is None else named(found)
+)
+def env(
+    request: pytest.FixtureRequest,
+    kind: tuple[Layout, CurveName],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Environment]:
+    if request.param is None:
+        yield make_scene(tmp_path_factory.mktemp("scene") / "e.db", *kind)
+        return
+    env = make_scene(with_environment(base_url(request.param), f"scene_{os.getpid()}"), *kind)
+    yield env
+    assert isinstance(env.store, PostgresStore)
+    drop(env.store.session)
+    env.close()
+
+
+def make_scene(url: Path | str, layout: Layout, curve: CurveName) -> Environment:
+    env = hapticdb.create(url, Grid(SIZE, ORIGIN, BITS, curve), layout=layout)
+    for n, voxels in enumerate(scene_voxels()):
+        write_voxels(env.store, voxels, f"blob {n}")
+    return env
+
+
+def random_shell(seed: int, n_points: int) -> PointShell:
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(n_points, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = rng.uniform(-12, 12, (n_points, 3)) * SIZE
+    points[n_points // 2 :] = points[: n_points - n_points // 2]  # points that share a key
+    return PointShell(points=points, normals=normals, center=rng.normal(size=3) * SIZE)
+
+
+def random_pose(seed: int) -> NDArray[np.float64]:
+    rng = np.random.default_rng(seed)
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q *= np.sign(np.diag(r))
+    if np.linalg.det(q) < 0:
+        q[:, 0] *= -1
+    pose = np.eye(4)
+    pose[:3, :3] = q
+    center = np.array(BLOBS[rng.integers(len(BLOBS))][0]) + rng.normal(size=3) * 4
+    pose[:3, 3] = np.array(ORIGIN) + SIZE * center
+    return pose
+
+
+def expected(
+    plain: dict[tuple[int, int, int], set[int]],
+    shell: PointShell,
+    pose: NDArray[np.float64],
+    exclude: list[int],
+) -> NaiveTouch:
+    x, y, z = shell.center.tolist()
+    return naive_touch(
+        plain,
+        [(a, b, c) for a, b, c in shell.points.tolist()],
+        [(a, b, c) for a, b, c in shell.normals.tolist()],
+        (x, y, z),
+        pose.tolist(),
+        ORIGIN,
+        SIZE,
+        1 << BITS,
+        exclude=exclude,
+    )
+
+
+def assert_same(touch: hapticdb.Touch, wanted: NaiveTouch) -> None:
+    assert touch.hits.tolist() == wanted.hits
+    assert touch.contacts.tolist() == wanted.contacts
+    assert touch.depths.tolist() == wanted.depths
+    assert [o.id for o in touch.objects] == wanted.ids
+    assert [tuple(pair) for pair in touch.pairs.tolist()] == wanted.pairs
+    assert touch.force.tobytes() == np.array(wanted.force).tobytes()
+    assert touch.torque.tobytes() == np.array(wanted.torque).tobytes()
+
+
+@settings(
+    max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_points=st.sampled_from([1, 2, 9, 40, 300]),
+    exclude=st.lists(st.integers(1, 5), max_size=3),
+    maxgap=st.sampled_from([0, 1, 7, 500, 10**5, 10**18]),
+)
+def test_every_strategy_finds_what_a_plain_set_finds(
+    env: Environment,
+    plain: dict[tuple[int, int, int], set[int]],
+    seed: int,
+    n_points: int,
+    exclude: list[int],
+    maxgap: int,
+) -> None:
+    shell, pose = random_shell(seed, n_points), random_pose(seed)
+    wanted = expected(plain, shell, pose, exclude)
+    for strategy in STRATEGIES:
+        touch = env.touch(shell, pose, strategy, exclude=exclude, maxgap=maxgap)
+        assert_same(touch, wanted)
+
+
+def test_the_scene_hits_and_misses(
+    env: Environment, plain: dict[tuple[int, int, int], set[int]]
+) -> None:
+    """What the property test draws touches several objects at once, or it would show nothing."""
+    found = [expected(plain, random_shell(s, 300), random_pose(s), []) for s in range(20)]
+    assert max(len(f.ids) for f in found) >= 3
+    assert any(10 <= len(f.hits) < 300 for f in found)
+    assert any(f.contacts != f.hits for f in found)
+    assert env.grid.bits == BITS
+
+
+def test_maxgap_0_is_the_point_query_sequence(env: Environment) -> None:
+    shell, pose = random_shell(3, 300), random_pose(3)
+    points = env.touch(shell, pose, "points").query
+    ranges = env.touch(shell, pose, "maxgap", maxgap=0).query
+    if env.layout == "voxel":
+        assert ranges.ranges == points.ranges == points.statements
+    assert ranges.rows == points.rows
+    assert ranges.statements == 1
+
+
+def test_one_range_reads_everything_between(env: Environment) -> None:
+    shell, pose = random_shell(3, 300), random_pose(3)
+    assert env.touch(shell, pose, "maxgap", maxgap=10**18).query.ranges == 1
+
+
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_points_outside_the_grid_miss_and_never_wrap(env: Environment, strategy: Strategy) -> None:
+    shell = random_shell(1, 40)
+    for axis in range(3):
+        for side in (-1.0, 1.0):
+            pose = random_pose(1)
+            pose[axis, 3] += side * env.grid.edge  # the same place, were keys to wrap
+            touch = env.touch(shell, pose, strategy)
+            inside = env.grid.contains(
+                env.grid.voxels_of(shell.points @ pose[:3, :3].T + pose[:3, 3])
+            )
+            assert set(touch.hits.tolist()) <= set(np.flatnonzero(inside).tolist())
+    pose = np.eye(4)
+    pose[:3, 3] = 1e300
+    touch = env.touch(shell, pose, strategy)
+    assert not touch.hits.size
+    assert not touch.force.any()
+
+
+def test_excluding_everything_leaves_nothing(env: Environment) -> None:
+    for strategy in STRATEGIES:
+        touch = env.touch(random_shell(1, 300), random_pose(1), strategy, exclude=range(1, 6))
+        assert not touch.hits.size
+        assert not touch.objects
+
+
+def test_excluding_an_unknown_object_is_told(env: Environment) -> None:
+    with pytest.raises(hapticdb.ObjectNotFoundError, match="no object 77"):
+        env.touch(random_shell(1, 3), random_pose(1), exclude=[77])
+
+
+@pytest.mark.parametrize(
+    "pose",
+    [
+        np.eye(3),
+        np.full((4, 4), np.nan),
+        np.diag([2.0, 1, 1, 1]),
+        np.diag([-1.0, 1, 1, 1]),
+        np.diag([1.0, 1, 1, 2]),
+        np.array([[1, 0, 0, np.inf], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1.0]]),
+    ],
+)
+def test_a_pose_that_is_not_rigid_is_refused(env: Environment, pose: NDArray[Any]) -> None:
+    with pytest.raises(hapticdb.UsageError, match="pose"):
+        env.touch(random_shell(1, 3), pose)
+
+
+def test_an_unknown_strategy_is_refused(env: Environment) -> None:
+    with pytest.raises(hapticdb.UsageError, match="choose one of auto"):
+        env.touch(random_shell(1, 3), np.eye(4), "fastest")  # type: ignore[arg-type]
+    with pytest.raises(hapticdb.UsageError, match="MAXGAP -1"):
+        env.touch(random_shell(1, 3), np.eye(4), "maxgap", maxgap=-1)
+
+
+def test_a_touch_reads_one_revision_though_objects_come_and_go(tmp_path: Path) -> None:
+    """The objects named are those of the revision whose voxels were hit."""
+    env = make_scene(tmp_path / "e.db", "brick", "z")
+    other = hapticdb.open(tmp_path / "e.db")
+    shell, pose = random_shell(5, 300), random_pose(5)
+    before = env.touch(shell, pose)
+    touched = before.objects[0].id
+    other.remove(touched)
+    after = env.touch(shell, pose)
+    assert touched not in [o.id for o in after.objects]
+    new = write_voxels(other.store, scene_voxels()[touched - 1], "again")
+    assert new in [o.id for o in env.touch(shell, pose).objects]
+    assert [o.name for o in env.touch(shell, pose).objects if o.id == new] == ["again"]
+
+
+def test_an_empty_environment_is_free(tmp_path: Path) -> None:
+    env = hapticdb.create(tmp_path / "e.db", Grid(SIZE, ORIGIN, BITS))
+    for strategy in STRATEGIES:
+        touch = env.touch(random_shell(1, 300), random_pose(1), strategy)
+        assert not touch.force.any()
+        assert not touch.torque.any()
+
+
+def test_stiffness_scales_the_wrench(env: Environment) -> None:
+    shell, pose = random_shell(5, 300), random_pose(5)
+    soft = env.touch(shell, pose)
+    hard = env.touch(shell, pose, law=TangentPlane(stiffness=4000))
+    np.testing.assert_allclose(hard.force, 4 * soft.force, rtol=1e-12)
+    for bad in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(hapticdb.UsageError, match="stiffness"):
+            TangentPlane(stiffness=bad)

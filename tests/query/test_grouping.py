@@ -1,0 +1,255 @@
+"""Grouping keys into ranges: MaxGap as defined, CBGroup against brute force (case 10), boxes."""
+
+from collections.abc import Iterator
+from itertools import pairwise, product
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from hapticdb import Grid
+from hapticdb.errors import UsageError
+from hapticdb.grid import CurveName
+from hapticdb.query.cost_model import CostModel
+from hapticdb.query.grouping import Ranges, box_ranges, cbgroup, maxgap
+from hapticdb.query.quantiles import QuantileVector
+from hapticdb.store.base import Keys, Layout, row_shift
+from hapticdb.testing import KINDS
+
+few = settings(max_examples=100, deadline=None)
+LARGEST = 2**63 - 2
+
+
+def as_keys(values: list[int]) -> Keys:
+    return np.array(values, dtype=np.int64)
+
+
+def as_pairs(ranges: Ranges) -> list[tuple[int, int]]:
+    return list(zip(ranges.lows.tolist(), ranges.highs.tolist(), strict=True))
+
+
+def key_lists(values: st.SearchStrategy[int], most: int) -> st.SearchStrategy[list[int]]:
+    return st.lists(values, min_size=1, max_size=most, unique=True).map(sorted)
+
+
+# --- MaxGap -------------------------------------------------------------------------------------
+
+
+def definition_of_maxgap(keys: list[int], gap: int) -> list[tuple[int, int]]:
+    """Neighbours p < q share a range if and only if q - p <= gap."""
+    ranges = [(keys[0], keys[0])]
+    for p, q in pairwise(keys):
+        ranges.append((ranges.pop()[0], q) if q - p <= gap else (q, q))
+    return ranges
+
+
+@few
+@given(
+    keys=st.one_of(key_lists(st.integers(0, 60), 30), key_lists(st.integers(0, LARGEST), 30)),
+    gap=st.one_of(st.integers(0, 20), st.integers(0, 2**70)),
+)
+@example(keys=[0, 2**62 + 1, LARGEST], gap=2**70)
+def test_neighbours_share_a_range_if_and_only_if_they_are_maxgap_apart(
+    keys: list[int], gap: int
+) -> None:
+    array = as_keys(keys)
+    assert as_pairs(maxgap(array, array, array, gap)) == definition_of_maxgap(keys, gap)
+
+
+@few
+@given(keys=key_lists(st.integers(0, 60), 40))
+def test_maxgap_0_asks_for_each_key_by_itself(keys: list[int]) -> None:
+    """Adjacent keys, too: the point query sequence."""
+    array = as_keys(keys)
+    assert as_pairs(maxgap(array, array, array, 0)) == [(k, k) for k in keys]
+
+
+@few
+@given(voxels=key_lists(st.integers(0, 20 * 512), 60), gap=st.integers(0, 3000))
+def test_gaps_are_voxel_keys_on_bricks(voxels: list[int], gap: int) -> None:
+    """Two bricks share a range where two voxels of theirs do on the voxel layout, and else not."""
+    under: dict[int, list[int]] = {}
+    for voxel in voxels:
+        under.setdefault(voxel >> 9, []).append(voxel)
+    found = maxgap(
+        as_keys(list(under)),
+        as_keys([v[0] for v in under.values()]),
+        as_keys([v[-1] for v in under.values()]),
+        gap,
+    )
+    cuts = {p >> 9 for p, q in pairwise(voxels) if q - p > gap and p >> 9 != q >> 9}
+    wanted: list[tuple[int, int]] = []
+    first = None
+    for brick in under:
+        first = brick if first is None else first
+        if brick in cuts or brick == max(under):
+            wanted.append((first, brick))
+            first = None
+    assert as_pairs(found) == wanted
+
+
+def test_a_negative_maxgap_is_refused() -> None:
+    with pytest.raises(UsageError, match="MAXGAP -1"):
+        maxgap(as_keys([1]), as_keys([1]), as_keys([1]), -1)
+
+
+# --- CBGroup ------------------------------------------------------------------------------------
+
+
+def costs_of(descent: float, row: float) -> CostModel:
+    """Figures in which only a descent and a scanned row cost something."""
+    return CostModel(
+        statement=0.0,
+        descent=descent,
+        block=row,
+        row=row / 2,
+        rows_per_block=2.0,
+        lookup=0.0,
+        probe=0.0,
+        single=0.0,
+        aggregate=0.0,
+        point=0.0,
+    )
+
+
+def all_groupings(keys: list[int]) -> Iterator[list[tuple[int, int]]]:
+    """Every way to cut sorted keys into ranges: 2^(n-1)."""
+    for is_cut in product((False, True), repeat=len(keys) - 1):
+        ranges = [(keys[0], keys[0])]
+        for key, cut in zip(keys[1:], is_cut, strict=True):
+            ranges.append((key, key) if cut else (ranges.pop()[0], key))
+        yield ranges
+
+
+def least_cost(keys: list[int], quantiles: QuantileVector, costs: CostModel) -> float:
+    """Cost of the cheapest grouping: each of all, a range by a range."""
+    known = {
+        (low, high): costs.descent + costs.row_scanned * quantiles.rows_between(low, high)
+        for low, high in product(keys, keys)
+        if low <= high
+    }
+    return min(sum(map(known.__getitem__, ranges)) for ranges in all_groupings(keys))
+
+
+def vectors(values: st.SearchStrategy[int]) -> st.SearchStrategy[QuantileVector]:
+    """Quantile vectors: from few values, so that many buckets have no width."""
+    return st.builds(
+        lambda bounds, n_rows: QuantileVector(as_keys(sorted(bounds)), n_rows),
+        st.lists(values, min_size=2, max_size=30),
+        st.integers(1, 500),
+    )
+
+
+def scenes() -> st.SearchStrategy[tuple[list[int], QuantileVector]]:
+    """Keys asked for, and a quantile vector over the same values."""
+    ties, spread = st.integers(0, 25), st.integers(0, LARGEST)
+    return st.one_of(
+        st.tuples(key_lists(ties, 14), vectors(ties)),
+        st.tuples(key_lists(spread, 10), vectors(spread)),
+        st.tuples(key_lists(spread, 10), vectors(ties)),
+    )
+
+
+@settings(max_examples=150, deadline=None)
+@given(scene=scenes(), descent=st.floats(0, 100), row=st.floats(0, 10))
+@example(
+    scene=(list(range(14)), QuantileVector(as_keys([0, 3, 3, 3, 9, 9, 13]), 60)),
+    descent=5.0,
+    row=1.0,
+)
+@example(
+    scene=(list(range(0, 28, 2)), QuantileVector(as_keys([1, 1, 5, 5, 5, 5, 16, 27]), 70)),
+    descent=12.0,
+    row=1.0,
+)
+def test_cost_based_grouping_costs_the_least_of_all_groupings(
+    scene: tuple[list[int], QuantileVector], descent: float, row: float
+) -> None:
+    keys, quantiles = scene
+    costs = costs_of(descent, row)
+    found = as_pairs(cbgroup(as_keys(keys), quantiles, costs).ranges)
+    cost = sum(descent + costs.row_scanned * quantiles.rows_between(*pair) for pair in found)
+    assert cost == pytest.approx(least_cost(keys, quantiles, costs), rel=1e-9, abs=1e-9)
+    assert found in list(all_groupings(keys))
+
+
+@few
+@given(scene=scenes(), descent=st.floats(0, 100))
+def test_the_expected_rows_are_those_of_the_keys_and_of_the_closed_gaps(
+    scene: tuple[list[int], QuantileVector], descent: float
+) -> None:
+    keys, quantiles = scene
+    grouping = cbgroup(as_keys(keys), quantiles, costs_of(descent, 1.0))
+    asked = sum(quantiles.rows_between(key, key) for key in keys)
+    read = sum(quantiles.rows_between(*pair) for pair in as_pairs(grouping.ranges))
+    assert grouping.rows_asked == pytest.approx(asked, rel=1e-9, abs=1e-9)
+    assert grouping.rows_asked + grouping.rows_in_gaps == pytest.approx(read, rel=1e-9, abs=1e-9)
+
+
+def test_a_gap_covers_the_keys_between_and_not_its_ends() -> None:
+    """All rows lie under the keys asked for: the gap is free, and closed at any price."""
+    quantiles = QuantileVector(as_keys([4, 4, 4, 5, 9, 9, 9]), 60)
+    ranges = cbgroup(as_keys([3, 9]), quantiles, costs_of(1.0, 1.0)).ranges
+    assert as_pairs(ranges) == [(3, 3), (9, 9)]
+    ranges = cbgroup(as_keys([4, 5]), quantiles, costs_of(0.0, 1.0)).ranges
+    assert as_pairs(ranges) == [(4, 5)]
+
+
+def test_a_gap_that_costs_as_much_as_a_descent_is_closed() -> None:
+    quantiles = QuantileVector(as_keys([0, 8, 16]), 16)  # one row a key
+    keys = as_keys([1, 6])  # four keys between
+    assert len(cbgroup(keys, quantiles, costs_of(4.0, 1.0)).ranges.lows) == 1
+    assert len(cbgroup(keys, quantiles, costs_of(3.99, 1.0)).ranges.lows) == 2
+
+
+def test_an_empty_environment_is_asked_for_one_range() -> None:
+    nothing = QuantileVector(as_keys([0, 0]), 0)
+    grouping = cbgroup(as_keys([3, 70, 5000]), nothing, costs_of(1.0, 1.0))
+    assert as_pairs(grouping.ranges) == [(3, 5000)]
+    assert grouping.rows_asked == grouping.rows_in_gaps == 0.0
+
+
+# --- boxes --------------------------------------------------------------------------------------
+
+triples = st.lists(st.integers(-3, 34), min_size=3, max_size=3)
+
+
+@pytest.mark.parametrize(("layout", "curve"), KINDS)
+@settings(max_examples=40, deadline=None)
+@given(a=triples, b=triples)
+def test_the_ranges_of_a_box_hold_every_row_of_its_voxels(
+    layout: Layout, curve: CurveName, a: list[int], b: list[int]
+) -> None:
+    """Ascending, disjoint, merged where they touch, and cut to the grid."""
+    grid = Grid(1.0, (0, 0, 0), 5, curve)
+    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
+    pairs = as_pairs(box_ranges(grid, layout, low, high))
+    axes = [range(max(lo, 0), min(hi, 31) + 1) for lo, hi in zip(low, high, strict=True)]
+    voxels = np.array(list(product(*axes)), dtype=np.int64)
+    held = {key for first, last in pairs for key in range(first, last + 1)}
+    assert set((grid.encode(voxels) >> row_shift(layout)).tolist()) <= held
+    assert all(first <= last for first, last in pairs)
+    assert all(before + 1 < after for (_, before), (after, _) in pairwise(pairs))
+    assert min(held) >= 0
+    assert max(held) < 8**5 >> row_shift(layout)
+
+
+@pytest.mark.parametrize("curve", ["z", "hilbert"])
+@settings(max_examples=30, deadline=None)
+@given(
+    ends=st.lists(
+        st.lists(st.integers(0, 2**21 - 1), min_size=3, max_size=3), min_size=2, max_size=2
+    )
+)
+def test_a_box_of_any_size_has_a_bounded_number_of_ranges(
+    curve: CurveName, ends: list[list[int]]
+) -> None:
+    """17 cubes along the longest edge at most, two layers of which are not merged into larger."""
+    grid = Grid(1.0, (0, 0, 0), 21, curve)
+    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
+    ranges = box_ranges(grid, "brick", low, high)
+    assert 1 <= len(ranges.lows) <= 17**3 - 13**3
+    corners = grid.encode(np.array(list(product(*zip(low, high, strict=True))))) >> 9
+    at = np.searchsorted(ranges.lows, corners, side="right") - 1
+    assert (ranges.highs[at] >= corners).all()

@@ -1,0 +1,392 @@
+"""The wrench against closed forms: cases 1, 2, 4 to 6, 8, 11 and 12, averaging, bounds of depth.
+
+The scene of most is the floor: every voxel below the plane z = 0 is solid, eight layers deep. Its
+voxels measure 2^-8 m where a point must lie exactly on a border, 5 mm elsewhere.
+"""
+
+import itertools
+import math
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike, NDArray
+
+import hapticdb
+from hapticdb import Environment, Grid, PointShell, TangentPlane
+from hapticdb.kernels.surfaces.voxelize import count_voxels, voxelize
+from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.store.base import Layout
+from hapticdb.testing import blob, floor_voxels, write_voxels
+
+K = 1000.0
+SIZE = 0.005
+BINARY = 2.0**-8
+MIDDLE = 32
+ROUNDING = 1e-12
+"""Newtons, and newton metres: forces here are some N, sums have some hundred terms."""
+Array = NDArray[np.float64]
+UP = (0.0, 0.0, 1.0)
+few = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+strategies = pytest.mark.parametrize("strategy", STRATEGIES)
+# without figures that would have to be measured first, in each new environment
+unplanned = pytest.mark.parametrize("strategy", ["statement", "array", "points", "maxgap"])
+
+
+def grid_of(size: float) -> Grid:
+    """64^3 voxels about the world's origin, which is a vertex of the grid."""
+    low = -MIDDLE * size
+    return Grid(size, (low, low, low), 6)
+
+
+def scene_of(
+    path: Path, *objects: NDArray[np.int64], size: float = SIZE, layout: Layout = "brick"
+) -> Environment:
+    env = hapticdb.create(path, grid_of(size), layout=layout)
+    for n, ijk in enumerate(objects):
+        write_voxels(env.store, ijk, f"object {n + 1}")
+    return env
+
+
+@pytest.fixture(scope="module", params=["brick", "voxel"])
+def floor(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Environment]:
+    path = tmp_path_factory.mktemp("floor") / "e.db"
+    with scene_of(path, floor_voxels(grid_of(SIZE)), layout=request.param) as env:
+        yield env
+
+
+@pytest.fixture(scope="module")
+def binary_floor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    path = tmp_path_factory.mktemp("floor") / "e.db"
+    with scene_of(path, floor_voxels(grid_of(BINARY)), size=BINARY) as env:
+        yield env
+
+
+def shell_of(
+    points: ArrayLike, normals: ArrayLike = UP, center: ArrayLike = (0, 0, 0)
+) -> PointShell:
+    """Shell of points (N, 3); one normal may serve them all."""
+    placed = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    return PointShell(
+        points=placed,
+        normals=np.broadcast_to(np.asarray(normals, dtype=np.float64), placed.shape).copy(),
+        center=np.asarray(center, dtype=np.float64),
+    )
+
+
+def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
+    """Pose that only shifts."""
+    pose = np.eye(4)
+    pose[:3, 3] = x, y, z
+    return pose
+
+
+def unit(vectors: Array) -> Array:
+    lengths: Array = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return vectors / lengths
+
+
+def random_shell(seed: int, n_points: int, reach: float) -> PointShell:
+    rng = np.random.default_rng(seed)
+    normals = unit(rng.normal(size=(n_points, 3)))
+    return shell_of(rng.uniform(-reach, reach, (n_points, 3)), normals, rng.normal(size=3) * SIZE)
+
+
+# --- case 1 -------------------------------------------------------------------------------------
+
+
+@strategies
+@few
+@given(part=st.integers(1, 8 * 256))
+@example(part=128)  # half a voxel: the tangent plane
+@example(part=256)  # a border: the upper voxel's, where the law is at its peak
+@example(part=257)
+@example(part=8 * 256)
+def test_one_point_in_a_solid_floor_feels_a_sawtooth(
+    binary_floor: Environment, strategy: Strategy, part: int
+) -> None:
+    """F_z = K max(0, u - s (ceil(u / s) - 1) - s / 2), of peak K s / 2."""
+    depth = part * BINARY / 256
+    touch = binary_floor.touch(shell_of([0.3 * BINARY, 0.6 * BINARY, -depth]), np.eye(4), strategy)
+    within = depth - BINARY * (math.ceil(depth / BINARY) - 1)
+    assert touch.force[2] == pytest.approx(K * max(0.0, within - BINARY / 2), abs=ROUNDING)
+    assert touch.force[2] <= K * BINARY / 2 + ROUNDING
+    assert not touch.force[:2].any()
+    assert touch.hits.tolist() == [0]
+    assert touch.contacts.tolist() == ([0] if within > BINARY / 2 else [])
+
+
+def test_a_point_on_a_border_belongs_to_the_upper_voxel(binary_floor: Environment) -> None:
+    """At z = 0 it is free; at the floor's underside it still hits; a hair below it does not."""
+    for height, is_hit in ((0.0, False), (-8 * BINARY, True), (-8 * BINARY - 2.0**-20, False)):
+        touch = binary_floor.touch(shell_of([0, 0, height]), np.eye(4))
+        assert touch.hits.tolist() == ([0] if is_hit else [])
+
+
+# --- case 2, averaging --------------------------------------------------------------------------
+
+
+def punch(n_points: int, spacing: float = 0.0031) -> Array:
+    """Points (N, 3) of a flat punch, symmetric about the z axis."""
+    side = math.isqrt(n_points)
+    if side * side == n_points:
+        along = (np.arange(side) - (side - 1) / 2) * spacing
+        across = along
+    else:
+        along = (np.arange(n_points // 2) - (n_points // 2 - 1) / 2) * spacing
+        across = np.array([-0.5, 0.5]) * spacing
+    xy = np.stack(np.meshgrid(along, across, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.column_stack([xy, np.zeros(len(xy))])
+
+
+@strategies
+@pytest.mark.parametrize(("n_points", "force"), [(4, 6.0), (9, 13.5), (10, 15.0), (100, 15.0)])
+def test_a_flat_punch_feels_its_points_averaged_from_ten_on(
+    floor: Environment, strategy: Strategy, n_points: int, force: float
+) -> None:
+    """u = 4 mm, s = 5 mm: 1.5 N a point; torque 0 about the middle, e F about e aside."""
+    points = punch(n_points)
+    touch = floor.touch(shell_of(points), at(z=-0.004), strategy)
+    assert len(touch.contacts) == n_points
+    np.testing.assert_allclose(touch.force, [0, 0, force], atol=ROUNDING)
+    np.testing.assert_allclose(touch.torque, 0, atol=ROUNDING)
+    aside = floor.touch(shell_of(points, center=(0.02, 0, 0)), at(z=-0.004), strategy)
+    np.testing.assert_allclose(aside.force, touch.force, atol=0)
+    np.testing.assert_allclose(aside.torque, [0, 0.02 * force, 0], atol=ROUNDING)
+
+
+@pytest.mark.parametrize(
+    ("n_deep", "n_shallow", "divisor"), [(8, 1, 1.0), (8, 2, 1.0), (8, 12, 2.0), (1, 29, 3.0)]
+)
+@unplanned
+def test_the_average_counts_hits_and_not_contacts(
+    floor: Environment, strategy: Strategy, n_deep: int, n_shallow: int, divisor: float
+) -> None:
+    """Shallow points hit above the tangent plane; free ones do not count."""
+    heights = [-0.004] * n_deep + [-0.001] * n_shallow + [0.002] * 7
+    points = np.column_stack([np.full(len(heights), 0.0012), np.zeros(len(heights)), heights])
+    touch = floor.touch(shell_of(points), np.eye(4), strategy)
+    assert len(touch.hits) == n_deep + n_shallow
+    assert len(touch.contacts) == n_deep
+    force = 1.5 * n_deep / divisor
+    np.testing.assert_allclose(touch.force, [0, 0, force], atol=ROUNDING)
+    np.testing.assert_allclose(touch.torque, [0, -0.0012 * force, 0], atol=ROUNDING)
+
+
+# --- bounds of the depth ------------------------------------------------------------------------
+
+
+@few
+@given(seed=st.integers(0, 2**32 - 1))
+def test_depths_are_bounded_by_half_a_voxel_along_the_normal(floor: Environment, seed: int) -> None:
+    shell = random_shell(seed, 60, 7 * SIZE)
+    touch = floor.touch(shell, at(z=-4 * SIZE), "points")
+    bounds = SIZE / 2 * np.abs(shell.normals[touch.hits]).sum(axis=1)
+    assert (touch.depths >= 0).all()
+    assert (touch.depths <= bounds + 1e-15).all()
+    assert (bounds <= math.sqrt(3) / 2 * SIZE * (1 + 1e-12)).all()
+
+
+# --- case 4 -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_the_force_averaged_over_a_shift_of_one_voxel_is_an_eighth_of_k_s(
+    floor: Environment, axis: int, sign: float
+) -> None:
+    """A hit point, axis normal; nine points, so that the law divides by nothing."""
+    rng = np.random.default_rng(axis)
+    points = rng.uniform(-3, 3, (9, 3)) * SIZE
+    steps = 64
+    points[:, axis] = (rng.integers(-128, 128, 9) + 0.5) * SIZE / steps
+    normal = sign * np.eye(3)[axis]
+    shell, total = shell_of(points, normal), np.zeros(3)
+    for n in range(steps):
+        shift = np.array([0, 0, -4 * SIZE])
+        shift[axis] += n * SIZE / steps
+        touch = floor.touch(shell, at(*shift), "points")
+        assert len(touch.hits) == 9
+        total += touch.force
+    np.testing.assert_allclose(total / steps, 9 * K * SIZE / 8 * normal, atol=ROUNDING)
+
+
+# --- case 5 -------------------------------------------------------------------------------------
+
+
+def mirrored(vectors: Array) -> Array:
+    """Each row with its images in the planes x = 0 and y = 0, image by image."""
+    signs = np.array([[1, 1, 1], [-1, 1, 1], [1, -1, 1], [-1, -1, 1]], dtype=np.float64)
+    images: Array = (vectors[None] * signs[:, None]).reshape(-1, 3)
+    return images
+
+
+@unplanned
+def test_a_peg_centred_in_a_hole_feels_no_lateral_force_and_no_torque(
+    tmp_path: Path, strategy: Strategy
+) -> None:
+    """The peg is wider than the hole by less than half a voxel a side."""
+    floor = floor_voxels(grid_of(SIZE))
+    is_wall = (np.abs(floor[:, :2] + 0.5 - MIDDLE) > 4).any(axis=1)
+    env = scene_of(tmp_path / "e.db", floor[is_wall])
+    rng = np.random.default_rng(5)
+    along, down = rng.uniform(0.1, 3.9, 60) * SIZE, rng.uniform(-7.9, 4, 60) * SIZE
+    face = np.full(60, 4.8 * SIZE)
+    points = np.concatenate([np.stack([face, along, down], 1), np.stack([along, face, down], 1)])
+    normals = np.repeat([[-1.0, 0, 0], [0, -1.0, 0]], 60, axis=0)
+    shell = shell_of(mirrored(points), mirrored(normals), (0, 0, -3 * SIZE))
+    touch = env.touch(shell, np.eye(4), strategy)
+    assert len(touch.contacts) > 100
+    np.testing.assert_allclose(touch.force, 0, atol=ROUNDING)
+    np.testing.assert_allclose(touch.torque, 0, atol=ROUNDING)
+    aside = env.touch(shell, at(x=0.1 * SIZE), strategy)
+    assert aside.force[0] < -1e-3  # pushed back to the middle
+
+
+@unplanned
+def test_a_wedge_on_its_axis_feels_a_force_along_it_alone(
+    floor: Environment, strategy: Strategy
+) -> None:
+    rng = np.random.default_rng(6)
+    x, y = rng.uniform(0.05, 3, 80) * SIZE, rng.uniform(0, 9, 80) * SIZE
+    points = np.stack([x, y, 2 * x - 4.3 * SIZE], axis=1)  # its edge points down, along y
+    normals = np.broadcast_to(unit(np.array([-2.0, 0.0, 1.0])), points.shape)
+    shell = shell_of(mirrored(points), mirrored(normals), (0, 0, 2 * SIZE))
+    touch = floor.touch(shell, np.eye(4), strategy)
+    assert touch.force[2] > 0.1
+    np.testing.assert_allclose(touch.force[:2], 0, atol=ROUNDING)
+    np.testing.assert_allclose(touch.torque, 0, atol=ROUNDING)
+
+
+# --- case 6 -------------------------------------------------------------------------------------
+
+
+@strategies
+def test_free_points_feel_exactly_nothing(
+    floor: Environment, sphere: PointShell, strategy: Strategy
+) -> None:
+    """Above the floor, beside it, below it, and outside the grid."""
+    for pose in (at(z=0.0121), at(x=0.1), at(z=-0.08), at(y=7.0)):
+        touch = floor.touch(sphere, pose, strategy)
+        assert (touch.force == 0).all()
+        assert (touch.torque == 0).all()
+        assert len(touch.hits) == len(touch.contacts) == len(touch.objects) == 0
+
+
+# --- case 8 -------------------------------------------------------------------------------------
+
+
+def quarter_turn(axis: int) -> Array:
+    """90 degrees about an axis through the world's origin, exact."""
+    a, b = (axis + 1) % 3, (axis + 2) % 3
+    turn = np.zeros((3, 3))
+    turn[axis, axis] = turn[b, a] = 1.0
+    turn[a, b] = -1.0
+    return turn
+
+
+def off_borders(points: Array) -> bool:
+    """No point so near a voxel's face that rounding could carry it across."""
+    scaled = points / SIZE
+    return bool((np.abs(scaled - np.round(scaled)) > 1e-9).all())
+
+
+def tilted(seed: int) -> Array:
+    """Rigid pose, turned at random about a place near the world's origin."""
+    rng = np.random.default_rng(seed)
+    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
+    q = q * np.sign(np.diag(r))
+    pose = at(*rng.normal(size=3) * SIZE)
+    pose[:3, :3] = q * np.linalg.det(q)
+    return pose
+
+
+BLOB = blob(3, (30, 34, 31))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int, quarters: int) -> None:
+    """Tool and environment together, by 90 degrees about a vertex of the grid."""
+    turn = np.linalg.matrix_power(quarter_turn(axis), quarters)
+    turned = np.round((BLOB + 0.5 - MIDDLE) @ turn.T - 0.5 + MIDDLE).astype(np.int64)
+    before = scene_of(tmp_path / "a.db", BLOB)
+    after = scene_of(tmp_path / "b.db", turned)
+    whole = np.eye(4)
+    whole[:3, :3] = turn
+    for seed, n_points in ((1, 6), (2, 200)):
+        shell, pose = random_shell(seed, n_points, 8 * SIZE), tilted(seed)
+        assert off_borders(shell.points @ pose[:3, :3].T + pose[:3, 3])
+        plain = before.touch(shell, pose, "maxgap")
+        moved = after.touch(shell, whole @ pose, "maxgap")
+        assert moved.hits.tolist() == plain.hits.tolist()
+        assert np.abs(plain.force).max() > 1e-3
+        np.testing.assert_allclose(moved.force, turn @ plain.force, atol=ROUNDING)
+        np.testing.assert_allclose(moved.torque, turn @ plain.torque, atol=ROUNDING)
+
+
+@pytest.mark.parametrize("shift", [(1, 0, 0), (0, -5, 0), (0, 0, 13), (-7, 3, 11), (15, 15, -15)])
+@unplanned
+def test_a_scene_shifted_by_whole_voxels_keeps_the_wrench(
+    tmp_path: Path, strategy: Strategy, shift: tuple[int, int, int]
+) -> None:
+    before = scene_of(tmp_path / "a.db", BLOB)
+    after = scene_of(tmp_path / "b.db", BLOB + np.array(shift), layout="voxel")
+    shell, pose = random_shell(4, 200, 8 * SIZE), tilted(4)
+    assert off_borders(shell.points @ pose[:3, :3].T + pose[:3, 3])
+    plain = before.touch(shell, pose, strategy)
+    moved = after.touch(shell, at(*(SIZE * s for s in shift)) @ pose, strategy)
+    assert moved.hits.tolist() == plain.hits.tolist()
+    assert np.abs(plain.force).max() > 1e-3
+    np.testing.assert_allclose(moved.force, plain.force, atol=ROUNDING)
+    np.testing.assert_allclose(moved.torque, plain.torque, atol=ROUNDING)
+
+
+# --- cases 11 and 12 ----------------------------------------------------------------------------
+
+
+@strategies
+@pytest.mark.parametrize("layout", ["brick", "voxel"])
+def test_two_objects_in_one_voxel_push_once_and_are_both_named(
+    tmp_path: Path, layout: Layout, strategy: Strategy
+) -> None:
+    floor = floor_voxels(grid_of(SIZE))
+    alone = scene_of(tmp_path / "a.db", floor, layout=layout)
+    half = floor[floor[:, 0] >= MIDDLE]
+    shared = scene_of(tmp_path / "b.db", floor, half, floor, layout=layout)
+    shell = shell_of(punch(9))
+    one = alone.touch(shell, at(z=-0.004), "points")
+    all_three = shared.touch(shell, at(z=-0.004), strategy)
+    assert all_three.force.tobytes() == one.force.tobytes()
+    assert all_three.torque.tobytes() == one.torque.tobytes()
+    assert all_three.hits.tolist() == one.hits.tolist()
+    assert [obj.id for obj in all_three.objects] == [1, 2, 3]
+    ids = [(1, 2, 3) if x >= 0 else (1, 3) for x in shell.points[:, 0]]
+    assert [tuple(p) for p in all_three.pairs] == [
+        (n, i) for n, found in enumerate(ids) for i in found
+    ]
+
+
+def test_half_the_voxel_size_gives_about_four_times_the_surface_voxels() -> None:
+    sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.4)
+    triangles = np.asarray(sphere.vertices)[np.asarray(sphere.faces)] + 0.5
+    counts = [count_voxels(voxelize(triangles * 2**bits, bits)[1]) for bits in (6, 7, 8)]
+    for coarse, fine in itertools.pairwise(counts):
+        assert fine == pytest.approx(4 * coarse, rel=0.03)
+
+
+# --- stiffness ----------------------------------------------------------------------------------
+
+
+def test_the_wrench_is_never_capped(floor: Environment) -> None:
+    """Caps belong to devices."""
+    touch = floor.touch(shell_of(punch(4)), at(z=-0.004), law=TangentPlane(stiffness=1e9))
+    np.testing.assert_allclose(touch.force, [0, 0, 6e6], rtol=1e-12, atol=1e-6)

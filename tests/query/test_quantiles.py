@@ -1,0 +1,339 @@
+"""The quantile vector against counted rows; the cost model, its calibration, and `auto`."""
+
+import json
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.errors import UsageError
+from hapticdb.query.calibration import _cautious, _probes, calibrate
+from hapticdb.query.cost_model import CostModel, machine_name
+from hapticdb.query.frame import Strategy
+from hapticdb.query.grouping import cbgroup
+from hapticdb.query.quantiles import DEFAULT_RESOLUTION, MAX_RESOLUTION, QuantileVector
+from hapticdb.store.base import Layout, SupportsCaches, SupportsStatement, row_shift
+from hapticdb.testing import blob, floor_voxels, write_voxels
+
+few = settings(max_examples=200, deadline=None)
+GRID = Grid(0.005, (-0.16, -0.16, -0.16), 6)
+KEYS = st.one_of(
+    st.lists(st.integers(0, 30), min_size=1, max_size=200),
+    st.lists(st.integers(0, 10**6), min_size=1, max_size=200),
+    st.lists(st.integers(0, 2**62), min_size=1, max_size=50),
+)
+
+
+def vector_of(keys: list[int], resolution: int) -> QuantileVector:
+    """Definition 2: bound i is the key of the row of rank ceil(i N / R), bound 0 the lowest."""
+    rows = sorted(keys)
+    ranks = [max(-(-i * len(rows) // resolution), 1) for i in range(resolution + 1)]
+    return QuantileVector(np.array([rows[r - 1] for r in ranks], dtype=np.int64), len(rows))
+
+
+# --- the quantile vector ------------------------------------------------------------------------
+
+
+@few
+@given(keys=KEYS, resolution=st.integers(1, 250), unit=st.tuples(st.floats(0, 1), st.floats(0, 1)))
+def test_expected_rows_are_off_by_two_buckets_at_most(
+    keys: list[int], resolution: int, unit: tuple[float, float]
+) -> None:
+    """A bucket at each end, however many rows share a key."""
+    quantiles = vector_of(keys, resolution)
+    left, right = sorted(int(u * (max(keys) + 2)) for u in unit)
+    counted = sum(left <= key <= right for key in keys)
+    bound = 2 * quantiles.rows_per_bucket * (1 + 1e-12)
+    assert abs(quantiles.rows_between(left, right) - counted) <= bound
+
+
+@few
+@given(keys=KEYS, resolution=st.integers(1, 250))
+def test_all_rows_lie_between_the_lowest_and_the_highest_key(
+    keys: list[int], resolution: int
+) -> None:
+    quantiles = vector_of(keys, resolution)
+    assert quantiles.rows_between(min(keys), max(keys)) == pytest.approx(len(keys), rel=1e-12)
+    assert quantiles.rows_between(max(keys) + 1, 2**62 + 9) == 0.0
+    assert quantiles.rows_between(-1, min(keys) - 1) == 0.0
+
+
+@pytest.mark.parametrize("n_rows", [1, 2, 7, 100])
+def test_a_bucket_a_row_counts_neighbouring_keys_exactly(n_rows: int) -> None:
+    """Where every key has a row; the bucket of a row ends at its key."""
+    quantiles = vector_of(list(range(10, 10 + n_rows)), n_rows)
+    assert quantiles.rows_per_bucket == 1.0
+    for left in range(11, 10 + n_rows):
+        for right in range(left, 9 + n_rows):
+            assert quantiles.rows_between(left, right) == right - left + 1
+
+
+def test_a_key_of_many_rows_counts_by_its_rows() -> None:
+    """Half of all rows under one key: what a histogram without ties would spread out."""
+    quantiles = vector_of([*range(100), *[1000] * 200, *range(2000, 2100)], 100)
+    assert quantiles.rows_between(1000, 1000) == pytest.approx(200, abs=8)
+    assert quantiles.rows_between(1001, 1999) == pytest.approx(0, abs=8)
+    assert quantiles.rows_between(100, 999) == pytest.approx(0, abs=8)
+
+
+@pytest.mark.parametrize("layout", ["voxel", "brick"])
+def test_the_vector_of_an_environment_counts_its_rows(tmp_path: Path, layout: Layout) -> None:
+    """Two objects in the same voxels: every key ties."""
+    env = make_scene(tmp_path / "e.db", layout)
+    write_voxels(env.store, floor_voxels(GRID), "again")
+    rows = env.store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
+    for resolution in (1, 7, 100):
+        quantiles = env.quantiles(resolution)
+        assert quantiles.resolution == resolution
+        assert quantiles.n_rows == len(rows) == env.size().rows
+        for left, right in ((0, 2**62), *(rows.keys[[a, -a]].tolist() for a in (2, 9))):
+            counted = int(((rows.keys >= left) & (rows.keys <= right)).sum())
+            error = abs(quantiles.rows_between(left, right) - counted)
+            assert error <= 2 * quantiles.rows_per_bucket * (1 + 1e-12)
+
+
+@pytest.mark.parametrize("resolution", [0, -1, MAX_RESOLUTION + 1])
+def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: int) -> None:
+    with pytest.raises(UsageError, match=f"{resolution} quantiles"):
+        scene.quantiles(resolution)
+
+
+def test_the_resolution_is_the_papers_best_unless_given(scene: Environment) -> None:
+    assert scene.quantiles().resolution == DEFAULT_RESOLUTION == 10_000
+
+
+# --- the cost model -----------------------------------------------------------------------------
+
+figures = st.floats(0, 1e9, allow_nan=False)
+MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0, 7.0, 0.25, 11.0, 13.0, 0.125)
+
+
+@few
+@given(values=st.lists(figures, min_size=15, max_size=15), spread=figures)
+def test_a_cost_model_returns_from_its_figures(values: list[float], spread: float) -> None:
+    """Also through text, as a store keeps them."""
+    names = [name for name in vars(MODEL) if name != "spread"]
+    model = CostModel.from_figures(dict(zip(names, values, strict=True)))
+    model = replace(model, spread={"row": spread, "descent": 0.0})
+    assert CostModel.from_figures(model.figures()) == model
+    assert CostModel.from_figures(json.loads(json.dumps(model.figures()))) == model
+
+
+def test_figures_kept_before_crowding_was_measured_still_serve() -> None:
+    older = {k: v for k, v in MODEL.figures().items() if k not in {"crowding", "presence"}}
+    assert CostModel.from_figures(older) == MODEL
+
+
+def test_cautious_grouping_closes_fewer_gaps() -> None:
+    keys = np.arange(0, 4000, 40, dtype=np.int64)
+    quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 40 * 4)  # 1.56 rows a gap
+    assert len(cbgroup(keys, quantiles, replace(MODEL, caution=1.0)).ranges.lows) == 1
+    assert len(cbgroup(keys, quantiles, replace(MODEL, caution=3.0)).ranges.lows) == len(keys)
+
+
+@pytest.mark.parametrize("rows_in_a_gap", [0, 1, 50])
+def test_caution_grows_with_what_small_gaps_turn_out_to_hold(rows_in_a_gap: int) -> None:
+    """One row expected in each gap: it pays to close them when they are empty, not when full."""
+    keys = np.arange(0, 4000, 40, dtype=np.int64)
+    quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 100)
+    model = replace(MODEL, descent=2.0, block=0.0, row=1.0)
+
+    def count(lows: NDArray[np.int64], highs: NDArray[np.int64]) -> int:
+        return int(((highs - lows) // 40).sum()) * rows_in_a_gap + len(keys)
+
+    fitted = _cautious(model, [keys], quantiles, count, under_keys=float(len(keys)))
+    closed = len(cbgroup(keys, quantiles, fitted).ranges.lows) == 1
+    assert closed == (rows_in_a_gap < 2)
+    assert fitted.crowding == pytest.approx(rows_in_a_gap, rel=0.1) or not closed
+
+
+def test_the_cost_of_a_frame_is_the_sum_of_its_parts() -> None:
+    """C(s) = C_io(s) + C_cpu(s) of the paper's section 5, in fitted figures."""
+    assert MODEL.row_scanned == 50.0 / 100.0 + 0.5
+    assert MODEL.of_ranges(4, 10) == 2.0 + 3.0 * 4 + 1.0 * 10
+    assert MODEL.of_keys(8, 10) == 7.0 + 0.25 * 8 + 0.5 * 10
+    assert MODEL.of_points(5) == 55.0
+    assert MODEL.of_statement(8) == 14.0
+
+
+# --- calibration --------------------------------------------------------------------------------
+
+
+def make_scene(path: Path, layout: Layout = "brick") -> Environment:
+    env = hapticdb.create(path, GRID, layout=layout)
+    write_voxels(env.store, floor_voxels(GRID), "floor")
+    write_voxels(env.store, blob(1, (32, 32, 36), 5), "blob")
+    return env
+
+
+@pytest.fixture(scope="module", params=["brick", "voxel"])
+def scene(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Environment]:
+    with make_scene(tmp_path_factory.mktemp("scene") / "e.db", request.param) as env:
+        yield env
+
+
+def test_calibrated_figures_are_finite_and_not_negative(scene: Environment) -> None:
+    model = calibrate(scene.store, repeats=1, budget=0.0)
+    assert isinstance(scene.store, SupportsStatement)
+    for name, value in model.figures().items():
+        assert math.isfinite(value), name
+        assert value >= 0, name
+    size = scene.size()
+    assert model.rows_per_block == size.rows / size.leaf_blocks
+    assert set(model.spread) <= set(vars(model))
+    assert model.of_points(100) > 0
+
+
+def test_cold_figures_are_measured_from_the_disk(scene: Environment) -> None:
+    """Each query is preceded by emptied caches: at least one block is read for it."""
+    emptied: list[None] = []
+    store = scene.store
+    assert isinstance(store, SupportsCaches)
+    drop = store.drop_caches
+    store.drop_caches = lambda: emptied.append(drop())  # type: ignore[method-assign]
+    model = calibrate(store, budget=0.0, cold=True)
+    assert len(emptied) > 12 * 10
+    assert all(math.isfinite(value) and value >= 0 for value in model.figures().values())
+
+
+def test_the_places_measured_depend_on_the_seed_alone(scene: Environment) -> None:
+    first, again, other = (
+        list(_probes(scene.store, scene.quantiles(), seed)) for seed in (0, 0, 1)
+    )
+    assert len(first) >= 12
+    assert [p.keys.tolist() for p in first] == [p.keys.tolist() for p in again]
+    assert [p.keys.tolist() for p in first] != [p.keys.tolist() for p in other]
+
+
+def test_the_places_measured_touch_occupied_voxels(scene: Environment) -> None:
+    shift = row_shift(scene.layout)
+    rows = scene.store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
+    corners = scene.grid.centers(scene.grid.decode(np.unique(rows.keys) << shift))
+    row = scene.grid.voxel_size * (1 << (shift // 3)) * 3**0.5
+    for probe in _probes(scene.store, scene.quantiles(), 3):
+        *points, center = probe.frame.placed[:, :3]
+        radius = np.linalg.norm(np.array(points) - center, axis=1).max()
+        nearest = np.linalg.norm(corners - center, axis=1).min()
+        assert nearest <= radius + row
+
+
+@pytest.mark.parametrize("bits", [1, 2, 3])
+@pytest.mark.parametrize("layout", ["brick", "voxel"])
+def test_a_grid_smaller_than_a_tool_can_be_calibrated(
+    tmp_path: Path, layout: Layout, bits: int
+) -> None:
+    """Or the first touch, whose strategy is `auto`, would fail there."""
+    env = hapticdb.create(tmp_path / "e.db", Grid(0.005, (0, 0, 0), bits), layout=layout)
+    write_voxels(env.store, np.full((1, 3), env.grid.side // 2))
+    figures = calibrate(env.store, repeats=1, budget=0.0).figures()
+    assert all(math.isfinite(value) and value >= 0 for value in figures.values())
+
+
+def test_an_empty_environment_cannot_be_calibrated(tmp_path: Path) -> None:
+    env = hapticdb.create(tmp_path / "e.db", GRID)
+    with pytest.raises(UsageError, match="is empty: import a file before"):
+        env.calibrate()
+
+
+def test_calibrated_figures_are_kept_for_this_machine(tmp_path: Path) -> None:
+    env = make_scene(tmp_path / "e.db")
+    model = env.calibrate()
+    assert env.store.costs(machine_name()) == model.figures()
+    with hapticdb.open(tmp_path / "e.db", read_only=True) as reader:
+        assert reader._statistics()[1] == model
+        renewed = reader.calibrate()
+        assert reader._statistics()[1] == renewed
+    assert env.store.costs(machine_name()) == model.figures()
+
+
+def test_figures_that_are_not_to_be_kept_are_not(tmp_path: Path) -> None:
+    env = make_scene(tmp_path / "e.db")
+    model = env.calibrate(keep=False)
+    assert env.store.costs(machine_name()) is None
+    assert env._statistics()[1] == model
+
+
+# --- auto ---------------------------------------------------------------------------------------
+
+DEAR = CostModel(1e6, 1e6, 1e6, 1e6, 1.0, 1e6, 1e6, 1e6, 1e6, 1e6)
+CHEAP: dict[Strategy, CostModel] = {
+    "array": replace(DEAR, lookup=1.0, probe=1.0, row=0.0),
+    "points": replace(DEAR, single=1.0),
+    "cbgroup": replace(DEAR, statement=1.0, descent=1.0, block=1.0, row=0.0),
+    "statement": replace(DEAR, aggregate=1.0, point=1.0),
+}
+
+
+def resting() -> NDArray[np.float64]:
+    pose = np.eye(4)
+    pose[:3, 3] = 0.002, 0.001, -0.004
+    return pose
+
+
+def opened_with(scene: Environment, model: CostModel) -> Environment:
+    """The scene, opened anew, with figures as if calibrated on this machine."""
+    scene.store.save_costs(machine_name(), model.figures())
+    return hapticdb.open(scene.url, read_only=True)
+
+
+@pytest.mark.parametrize("cheapest", CHEAP)
+def test_auto_takes_the_cheapest_strategy(
+    scene: Environment, sphere: PointShell, cheapest: Strategy
+) -> None:
+    with opened_with(scene, CHEAP[cheapest]) as env:
+        auto = env.touch(sphere, resting(), "auto")
+        named = env.touch(sphere, resting(), cheapest)
+    assert auto.query.strategy == cheapest
+    assert auto.query[:4] == named.query[:4]  # statements, ranges, rows
+    assert auto.force.tobytes() == named.force.tobytes()
+
+
+def test_auto_weighs_the_frame_and_not_the_figures_alone(
+    scene: Environment, sphere: PointShell
+) -> None:
+    """A dear statement pays for many keys, and not for one."""
+    model = replace(DEAR, single=10.0, lookup=50.0, probe=0.1, row=0.0)
+    one = PointShell(points=sphere.points[:1], normals=sphere.normals[:1], center=np.zeros(3))
+    spread = PointShell(points=sphere.points * 8, normals=sphere.normals, center=np.zeros(3))
+    with opened_with(scene, model) as env:
+        assert env.touch(one, resting(), "auto").query.strategy == "points"
+        assert env.touch(spread, resting(), "auto").query.strategy == "array"
+
+
+def test_dear_descents_make_few_ranges_and_dear_rows_many(
+    scene: Environment, sphere: PointShell
+) -> None:
+    found = []
+    for descent, row in ((1.0, 1e6), (1.0, 0.05), (1e6, 0.0)):
+        model = replace(DEAR, descent=descent, block=0.0, row=row)
+        with opened_with(scene, model) as env:
+            found.append(env.touch(sphere, resting(), "cbgroup").query)
+    ranges, rows = [q.ranges for q in found], [q.rows for q in found]
+    assert ranges == sorted(ranges, reverse=True)
+    assert rows == sorted(rows)
+    assert ranges[0] > ranges[-1] == 1
+    assert all(q.statements == 1 for q in found)
+
+
+def test_auto_goes_on_after_the_tool_has_been_beside_the_grid(
+    scene: Environment, sphere: PointShell
+) -> None:
+    far = np.eye(4)
+    far[:3, 3] = 1e3
+    with opened_with(scene, replace(DEAR, lookup=1.0, probe=1.0, row=0.0)) as env:
+        before = env.touch(sphere, resting(), "auto")
+        beside = [env.touch(sphere, far, "auto") for _ in range(20)]
+        after = [env.touch(sphere, resting(), "auto") for _ in range(100)]
+    assert all(len(touch.hits) == 0 for touch in beside)
+    assert {touch.force.tobytes() for touch in after} == {before.force.tobytes()}
+    assert np.linalg.norm(before.force) > 0

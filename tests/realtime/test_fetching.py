@@ -1,0 +1,484 @@
+"""Cells come before the hand does, from a database that is slow, errs, changes or goes away."""
+
+import functools
+import os
+import signal
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from children import PATIENCE
+from hapticdb import DatabaseError, Environment, Grid, HapticDBError, PointShell
+from hapticdb.devices.scripted import RandomHand
+from hapticdb.kernels.hand import servo
+from hapticdb.kernels.resident.cells import cell_key
+from hapticdb.realtime.fetching import (
+    CONFIRM_EVERY,
+    HANDLE,
+    HEARD,
+    MISSING,
+    RADIUS,
+    TOOL,
+    VELOCITY,
+    Fetching,
+    FetchRequest,
+)
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.realtime.wishes import Wish
+from hapticdb.resident.table import ACTIVE, AWAY, HEARTBEAT, LEAST_BUDGET, CellTable
+from hapticdb.testing import write_voxels
+from realtime.troubled import refuse, refuse_strangely, troubled
+from realtime.worlds import Reader, block, expected, ids_by_voxel, make, move, scatter
+
+RADIUS_M = 0.012
+Pose = NDArray[np.float64]
+
+
+def until(claim: Callable[[], bool], do: Callable[[], object] = lambda: None) -> bool:
+    """Whether a claim comes true while something is done again and again."""
+    deadline = time.monotonic() + PATIENCE
+    while not claim():
+        if time.monotonic() > deadline:
+            return False
+        do()
+        time.sleep(1e-3)
+    return True
+
+
+class Side:
+    """A session's side of the desk: tells where it is, and runs its frames."""
+
+    def __init__(self, table: CellTable, grid: Grid, shell: PointShell) -> None:
+        self.reader = Reader(table, grid, shell)
+        self.grid, self.desk = grid, table.desk
+        row = self.row = self.reader.row
+        self.signal = servo.Signal(
+            self.desk.sequence[row : row + 1], self.desk.state[row], self.desk.missed[row],
+            self.desk.voxels[row],
+        )  # fmt: skip
+        self.told = np.zeros(servo.TOLD)
+        self.radius = RADIUS_M
+
+    def be_at(
+        self, pose: Pose, velocity: NDArray[np.float64] | None = None
+    ) -> tuple[list[int], bytes, int]:
+        """Run a frame and tell; returns what the frame found."""
+        found = self.reader.feel(pose)
+        self.told[ACTIVE] = 1.0
+        self.told[TOOL : TOOL + 3] = self.told[HANDLE : HANDLE + 3] = pose[:3, 3]
+        self.told[VELOCITY : VELOCITY + 3] = 0.0 if velocity is None else velocity[:3]
+        self.told[RADIUS] = self.radius
+        servo.tell(self.signal, self.told, self.reader.missed)
+        return found
+
+    def name(self, pose: Pose, n_hits: int) -> None:
+        """Ask for the objects at the last frame's hits."""
+        servo.name_voxels(
+            self.signal, self.reader.clusters, pose, self.reader.place, self.grid.bits,
+            self.grid.curve_code, self.reader.met, n_hits,
+        )  # fmt: skip
+
+    @property
+    def is_served(self) -> bool:
+        state = self.desk.state[self.row]
+        return bool(state[HEARD] >= self.desk.sequence[self.row] and state[MISSING] == 0)
+
+    @property
+    def ids(self) -> list[int]:
+        ids = self.desk.ids[self.row]
+        return sorted(ids[1 : 1 + int(ids[0])].tolist())
+
+
+class LockStep:
+    """A hand, its frames and the fetching process on one clock, which only waiting moves.
+
+    While the database takes its time, the hand moves on and its frames run.
+    """
+
+    def __init__(
+        self,
+        env: Environment,
+        shell: PointShell,
+        budget: int = 8 << 20,
+        **trouble: Any,  # noqa: ANN401 - see `Troubled`
+    ) -> None:
+        self.now = 0.0
+        self.table = CellTable.create(budget)
+        wrap = functools.partial(troubled, wait=self.wait, **trouble)
+        self.unknown = self.frames = self.hit_frames = 0
+        self.hand: RandomHand | None = None
+        self.is_served = False
+        self.pose = np.eye(4)
+        self.pose[:3, 3] = np.array(env.grid.origin) + env.grid.edge / 2
+        self.side = Side(self.table, env.grid, shell)
+        self.fetching = Fetching(
+            FetchRequest(env.url, self.table.descriptor, self.table.n_slots, env.grid, wrap=wrap),
+            clock=lambda: self.now,
+        )
+
+    def wait(self, seconds: float) -> None:
+        """Let time pass, a frame each millisecond."""
+        end = self.now + seconds
+        while self.now < end:
+            self.now = min(self.now + 1e-3, end)
+            self.frame()
+
+    def frame(self) -> None:
+        velocity = None
+        if self.hand is not None:
+            reading = self.hand.read()
+            self.pose, velocity = reading.pose.copy(), reading.velocity
+        hits, _, unknown = self.side.be_at(self.pose, velocity)
+        if self.hand is not None:
+            self.frames += 1
+            self.unknown += unknown > 0
+            self.hit_frames += bool(hits)
+            if self.frames % 10 == 0:
+                self.side.name(self.pose, len(hits))
+
+    def round(self) -> None:
+        self.fetching.round()
+        self.is_served = self.side.is_served  # the next frame tells anew
+        self.wait(1e-3)
+
+    def warm_start(self) -> None:
+        self.frame()
+        for _ in range(1000):
+            self.round()
+            if self.is_served:
+                return
+        raise AssertionError("never warm")
+
+    def run(self, seconds: float) -> None:
+        end = self.now + seconds
+        while self.now < end:
+            self.round()
+
+
+@pytest.fixture
+def world(tmp_path: Path) -> Environment:
+    """A metre of 2 mm voxels, things everywhere, and a board below the middle."""
+    env = make(tmp_path, bits=9)
+    scatter(env, n_objects=8, n_voxels=8000)
+    write_voxels(env.store, block((180, 180, 246), (330, 330, 248)), "board")
+    return env
+
+
+# --- what is wanted -----------------------------------------------------------------------------
+
+
+@given(st.integers(0, 10_000))
+@settings(deadline=None, max_examples=60)
+def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> None:
+    """Wherever the hand goes within its reach, at the border of the grid, too."""
+    grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
+    rng = np.random.default_rng(seed)
+    tool = rng.uniform(-0.02, grid.edge + 0.02, 3)
+    handle = tool + rng.normal(0, 0.02, 3)
+    velocity = rng.normal(0, 0.5, 3)
+    lookahead, radius = float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.0, 0.05))
+    motion = np.concatenate([tool, handle, velocity, [radius]])
+    wish = Wish.of_motion(grid, motion, lookahead, 1.0)
+    assert wish is not None
+    cells, urgency = wish.cells(grid)
+    wanted = set(cells.tolist())
+    assert len(wanted) == len(cells)
+    assert (np.diff(urgency) >= 0).all()
+    for _ in range(200):
+        t = rng.uniform()
+        reach = radius + 1.5 * lookahead * rng.uniform()  # at the speed that it has shown, and half
+        off = rng.normal(size=3)
+        point = (
+            tool + t * (handle + velocity * lookahead - tool) + reach * off / np.linalg.norm(off)
+        )
+        voxel = grid.voxels_of(point[None])
+        if grid.contains(voxel)[0]:
+            assert int(cell_key(*voxel[0])) in wanted
+    at_tool = grid.voxels_of(tool[None])
+    if grid.contains(at_tool)[0]:
+        assert urgency[cells.tolist().index(int(cell_key(*at_tool[0])))] == 0.0
+
+
+def test_a_wish_too_large_keeps_what_is_near() -> None:
+    grid = Grid(0.002, (0.0, 0.0, 0.0), 16)
+    tool = np.array([grid.edge * 0.9, 0.1, grid.edge / 2])
+    motion = np.concatenate([tool, tool, [40.0, 0.0, 0.0], [0.05]])
+    wish = Wish.of_motion(grid, motion, 0.5, 40.0)
+    assert wish is not None
+    cells, _ = wish.cells(grid)
+    assert 0 < len(cells) <= 1 << 15
+    assert int(cell_key(*grid.voxels_of(tool[None])[0])) in cells.tolist()
+
+
+def test_a_motion_that_is_none_wants_nothing() -> None:
+    grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
+    for broken in (np.nan, np.inf):
+        motion = np.zeros(10)
+        motion[4] = broken
+        assert Wish.of_motion(grid, motion, 0.1, 1.0) is None
+
+
+# --- in lock step -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_hand_at_1_m_s_meets_no_unknown_cell_behind_10_ms(
+    world: Environment, sphere: PointShell, seed: int
+) -> None:
+    step = LockStep(world, sphere, latency=0.010, jitter=0.003, seed=seed)
+    step.warm_start()
+    step.hand = RandomHand(step.pose, seed, speed=1.0, angular_speed=3.0, clock=lambda: step.now)
+    step.run(4.0)
+    assert step.frames > 3900
+    assert step.hit_frames > 0
+    assert step.unknown == 0
+
+
+def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
+    step = LockStep(world, sphere)
+    step.warm_start()
+    trouble = functools.partial(troubled, wait=step.wait, latency=0.002, errors=0.1, seed=3)
+    step.fetching.request = FetchRequest(
+        world.url, step.table.descriptor, step.table.n_slots, world.grid, wrap=trouble
+    )
+    step.hand = RandomHand(step.pose, 1, speed=0.6, clock=lambda: step.now)
+    n_lost, is_lost = 0, True
+    while step.now < 4.0:
+        try:
+            if is_lost:
+                step.fetching.reopen()
+            step.round()
+            is_lost = False
+            assert not step.table.cells.control[AWAY]
+        except DatabaseError:
+            step.fetching.lost()
+            is_lost = True
+            n_lost += 1
+            before = step.table.cells.control[HEARTBEAT]
+            step.wait(0.01)
+            assert step.table.cells.control[HEARTBEAT] == before
+    assert n_lost > 3
+    step.hand = None
+    step.fetching.request = FetchRequest(
+        world.url, step.table.descriptor, step.table.n_slots, world.grid
+    )
+    step.fetching.reopen()
+    step.warm_start()
+    naive = expected(ids_by_voxel(world), world.grid, sphere, step.pose)
+    assert step.side.reader.feel(step.pose)[0] == naive.hits
+
+
+def test_the_heartbeat_waits_for_an_answer(
+    world: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """To hear of no commit is none; a question for the revision is, a while after the last."""
+    step = LockStep(world, sphere)
+    step.warm_start()
+    step.run(0.2)
+    control = step.table.cells.control
+    asked: list[float] = []
+    revision = step.fetching.store.revision
+
+    def counted() -> int:
+        asked.append(step.now)
+        return revision()
+
+    monkeypatch.setattr(step.fetching.store, "revision", counted, raising=False)
+    assert until(lambda: bool(asked), step.round)
+    heard = int(control[HEARTBEAT])
+    step.run(0.5 * CONFIRM_EVERY)
+    assert (len(asked), int(control[HEARTBEAT])) == (1, heard)
+    step.run(CONFIRM_EVERY)
+    assert len(asked) == 2
+    assert int(control[HEARTBEAT]) > heard
+
+    def unanswered() -> int:
+        raise hapticdb.ConnectionLostError("gone")
+
+    monkeypatch.setattr(step.fetching.store, "revision", unanswered, raising=False)
+    heard = int(control[HEARTBEAT])
+    with pytest.raises(hapticdb.ConnectionLostError):
+        step.run(2 * CONFIRM_EVERY)
+    assert int(control[HEARTBEAT]) == heard
+
+
+def test_a_round_asks_nothing_when_nothing_has_moved(
+    world: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    step = LockStep(world, sphere)
+    step.warm_start()
+    step.round()
+
+    def forbidden(*_: object) -> None:
+        raise AssertionError
+
+    for name in ("scan", "lookup", "revision", "snapshot"):
+        monkeypatch.setattr(step.fetching.store, name, forbidden, raising=False)
+    monkeypatch.setattr(step.fetching.residency, "missing", forbidden)
+    for _ in range(20):
+        step.round()
+    assert step.is_served
+
+
+def test_objects_are_named_and_named_anew_after_a_write(tmp_path: Path, sphere: PointShell) -> None:
+    env = make(tmp_path)
+    first = write_voxels(env.store, block((50, 50, 58), (78, 78, 63)), "first")
+    step = LockStep(env, sphere)
+    step.warm_start()
+
+    def asked() -> list[int]:
+        step.side.name(step.pose, len(step.side.be_at(step.pose)[0]))
+        for _ in range(12):
+            step.round()
+        return step.side.ids
+
+    assert asked() == [first]
+    second = write_voxels(env.store, block((50, 50, 58), (78, 78, 63)), "second")
+    assert asked() == [first, second]
+    env.remove(first)
+    assert asked() == [second]
+    env.remove(second)
+    assert asked() == []
+
+
+def test_sessions_share_a_table(world: Environment, sphere: PointShell) -> None:
+    step = LockStep(world, sphere)
+    other = Side(step.table, world.grid, sphere)
+    pose = np.eye(4)
+    pose[:3, 3] = np.array(world.grid.origin) + 0.2
+    other.be_at(pose)
+    step.warm_start()
+    for _ in range(50):
+        step.round()
+    assert other.is_served
+    assert other.reader.feel(pose)[2] == step.side.reader.feel(step.pose)[2] == 0
+    step.table.leave(other.row)
+    step.round()
+    assert len(step.fetching._headings) == 1
+
+
+def test_a_tool_too_large_for_the_budget_is_fetched_for_as_far_as_it_goes(
+    tmp_path: Path, sphere: PointShell
+) -> None:
+    """And no longer than it helps: nothing is asked again and again."""
+    env = make(tmp_path, bits=9)
+    n = env.grid.side >> 5
+    write_voxels(env.store, 32 * block((0, 0, 0), (n - 1, n - 1, n - 1)) + 7)
+    step = LockStep(env, sphere, budget=LEAST_BUDGET)
+    step.side.radius = 0.5
+    step.frame()
+    for _ in range(60):
+        step.round()
+    loaded = step.fetching.residency.loaded
+    for _ in range(20):
+        assert not step.fetching.round()
+    assert step.fetching.residency.loaded == loaded
+    assert step.side.reader.feel(step.pose)[2] == 0
+
+
+# --- with a process of its own ------------------------------------------------------------------
+
+
+@pytest.fixture
+def away(tmp_path: Path) -> Path:
+    """A file: while it is there, the database does not answer."""
+    return tmp_path / "away"
+
+
+@pytest.fixture
+def resident(world: Environment, away: Path) -> Iterator[ResidentCells]:
+    with ResidentCells(
+        world.url, budget_bytes=8 << 20, wrap=functools.partial(troubled, away=str(away))
+    ) as cells:
+        yield cells
+
+
+def test_a_process_brings_in_what_is_told_and_notices_writes(
+    world: Environment, resident: ResidentCells, sphere: PointShell
+) -> None:
+    side = Side(resident.table, world.grid, sphere)
+    pose = np.eye(4)
+    side.be_at(pose)
+    assert until(lambda: side.is_served)
+    assert side.reader.feel(pose)[0] == expected(ids_by_voxel(world), world.grid, sphere, pose).hits
+    with hapticdb.open(world.url) as editor:
+        move(editor.store, 1, block((240, 240, 240), (270, 270, 256)))
+        naive = expected(ids_by_voxel(editor), world.grid, sphere, pose)
+    assert len(naive.hits) > 10
+    assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
+    figures = resident.figures()
+    assert figures.resident > 0
+    assert figures.restarts == figures.losses == 0
+
+
+def test_a_database_that_goes_away_silences_the_heartbeat_until_it_is_back(
+    world: Environment, resident: ResidentCells, away: Path, sphere: PointShell
+) -> None:
+    side = Side(resident.table, world.grid, sphere)
+    side.be_at(np.eye(4))
+    assert until(lambda: side.is_served)
+    assert not resident.is_away
+    away.touch()
+    assert until(lambda: resident.is_away)
+    silent = int(resident.table.cells.control[HEARTBEAT])
+    time.sleep(1.2)
+    assert resident.table.cells.control[HEARTBEAT] == silent
+    with hapticdb.open(world.url) as editor:
+        move(editor.store, 1, block((240, 240, 240), (270, 270, 256)))
+        naive = expected(ids_by_voxel(editor), world.grid, sphere, np.eye(4))
+    away.unlink()
+    assert until(lambda: not resident.is_away)
+    assert until(lambda: side.reader.feel(np.eye(4))[0] == naive.hits)
+    resident.supervise()
+    assert resident.restarts == 0
+    assert resident.figures().losses >= 1
+
+
+@pytest.mark.long
+def test_a_process_killed_at_any_moment_is_replaced_and_frames_are_right_again(
+    world: Environment, resident: ResidentCells, away: Path, sphere: PointShell
+) -> None:
+    """Also when the database is away just then."""
+    side = Side(resident.table, world.grid, sphere)
+    rng = np.random.default_rng(5)
+    ids = ids_by_voxel(world)
+    for n in range(3):
+        pose = np.eye(4)
+        pose[:3, 3] = rng.uniform(-0.4, 0.4, 3)
+        side.be_at(pose)
+        time.sleep(float(rng.uniform(0, 0.02)))
+        os.kill(resident.pid, signal.SIGKILL)
+        if n == 2:
+            away.touch()
+        assert until(lambda n=n: resident.restarts == n + 1, resident.supervise)  # type: ignore[misc]
+        if n == 2:
+            time.sleep(1.0)
+            away.unlink()
+        side.be_at(pose)
+        assert until(lambda: side.is_served)
+        found = side.reader.feel(pose)
+        assert (found[0], found[2]) == (expected(ids, world.grid, sphere, pose).hits, 0)
+
+
+def test_what_fails_at_the_start_is_told_in_one_line(
+    tmp_path: Path, world: Environment, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(hapticdb.EnvironmentNotFoundError):
+        ResidentCells(str(tmp_path / "nothing.db"))
+    with pytest.raises(hapticdb.ObjectNotFoundError, match="no object 99"):
+        ResidentCells(world.url, exclude=[99])
+    with pytest.raises(hapticdb.UsageError, match="give 1048576 or more"):
+        ResidentCells(world.url, budget_bytes=1000)
+    with pytest.raises(DatabaseError, match=r"^[^\n]* is not for us: ask another$"):
+        ResidentCells(world.url, wrap=refuse)
+    assert "Traceback" not in capfd.readouterr().err
+    with pytest.raises(HapticDBError, match="the session's process ended: ZeroDivisionError"):
+        ResidentCells(world.url, wrap=refuse_strangely)

@@ -1,0 +1,146 @@
+"""A session's process says what happened, and ends when its session does."""
+
+import gc
+import os
+import pickle
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+
+from children import PATIENCE, child, finished
+from hapticdb import DatabaseError, HapticDBError
+from hapticdb.realtime import processes as module
+from hapticdb.realtime.processes import Message, Process
+from hapticdb.resident.table import is_alive
+from realtime.sessions import until
+
+WORKERS = "realtime.workers:work"
+LONG = PATIENCE
+
+
+@pytest.fixture(autouse=True)
+def _importable(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent.parent))
+
+
+def test_messages_come_whole_and_in_order_whatever_is_printed() -> None:
+    large = list(range(100_000))
+    with Process(WORKERS, ("echo", large), []) as process:
+        assert process.receive(LONG) == Message("heard", large)
+        word, content = process.receive(LONG) or ("", None)
+        assert (word, content) == ("again", (large, process.pid))
+        assert process.receive(LONG) is None
+        assert process.wait(LONG)
+
+
+def test_its_errors_are_raised_here() -> None:
+    with (
+        Process(WORKERS, ("fail", None), []) as process,
+        pytest.raises(DatabaseError, match=r"^no such place: make it first$"),
+    ):
+        process.receive(LONG)
+
+
+@pytest.mark.parametrize(
+    ("word", "cause"),
+    [
+        ("break", "ZeroDivisionError: one$"),
+        ("exit", "SystemExit: 3$"),
+        ("end of file", "EOFError: of something else$"),
+    ],
+)
+def test_what_nobody_expected_is_one_line_here(word: str, cause: str) -> None:
+    with (
+        Process(WORKERS, (word, None), []) as process,
+        pytest.raises(HapticDBError, match=f"the session's process ended: {cause}"),
+    ):
+        process.receive(LONG)
+
+
+def test_silence_is_no_message() -> None:
+    with Process(WORKERS, ("wait", None), []) as process:
+        assert process.receive(LONG) == Message("waiting")
+        assert process.receive(0.01) is None
+        assert process.is_alive
+
+
+def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(module, "END_PATIENCE", 0.5)
+    for word, status in (("wait", 0), ("hang", -signal.SIGKILL)):
+        process = Process(WORKERS, (word, None), [])
+        assert process.receive(LONG) is not None
+        monkeypatch.setattr(module, "END_PATIENCE", 0.5 if word == "hang" else LONG)
+        process.end()
+        assert process._popen.returncode == status
+        process.end()
+
+
+def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
+    with Process(WORKERS, ("tidy", None), []) as process:
+        assert process.receive(LONG) == Message("waiting")
+        os.kill(process.pid, signal.SIGTERM)
+        assert process.receive(LONG) == Message("tidied")
+        assert process.receive(LONG) is None
+        assert process.wait(LONG)
+        assert process._popen.returncode == 128 + signal.SIGTERM
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+def test_a_request_that_is_cut_ends_it_quietly(share: float, tmp_path: Path) -> None:
+    content = pickle.dumps(sys.path) + pickle.dumps(("echo", list(range(1000))))
+    request = tmp_path / "request"
+    request.write_bytes(content[: round(share * len(content))])
+    script = f"from {module.__name__} import serve; serve({WORKERS!r}, 1)"
+    with request.open("rb") as cut:
+        done = finished([sys.executable, "-c", script], stdin=cut.fileno())
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_one_killed_is_silent_and_not_alive() -> None:
+    with Process(WORKERS, ("hang", None), []) as process:
+        assert process.receive(LONG) is not None
+        os.kill(process.pid, signal.SIGKILL)
+        assert process.receive(LONG) is None
+        assert process.wait(LONG)
+        assert not process.is_alive
+
+
+SCRIPT = f"""
+import os, time
+from hapticdb.realtime.processes import Process
+process = Process({WORKERS!r}, ("wait", None), [])
+process.receive({LONG})
+forked = os.fork() if {{forks}} else 0
+if forked or not {{forks}}:
+    print(process.pid, forked, flush=True)
+time.sleep(1000)
+"""
+
+
+@pytest.mark.parametrize("forks", [False, True])
+def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
+    """Though a process that was forked from it holds the line to it open."""
+    args = [sys.executable, "-c", SCRIPT.format(forks=forks)]
+    with child(args, stderr=None) as session:
+        assert session.stdout is not None
+        pid, forked = map(int, session.stdout.readline().split())
+        session.kill()
+        session.wait(PATIENCE)
+        try:
+            until(lambda: not Path(f"/proc/{pid}").exists())
+        finally:
+            if forks:
+                os.kill(forked, signal.SIGKILL)
+
+
+def test_one_that_is_dropped_ends() -> None:
+    process = Process(WORKERS, ("wait", None), [])
+    assert process.receive(LONG) is not None
+    pid = process.pid
+    del process
+    gc.collect()
+    until(lambda: not is_alive(pid))

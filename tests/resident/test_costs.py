@@ -1,0 +1,98 @@
+"""What statements cost is learned in no time: kept, measured nearby, or taken to be all equal."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from hapticdb import Environment
+from hapticdb.query.cost_model import CostModel, machine_name
+from hapticdb.resident import costs as module
+from hapticdb.resident.costs import ASKED, FAR, costs_at_start
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.store.base import Store
+from realtime.troubled import troubled
+from realtime.worlds import make, scatter
+
+MEASURED = CostModel(*range(1, 11))
+EQUAL = CostModel.of_equal_parts()
+
+
+class Line:
+    """A line to the database and the clock that only its round trips move."""
+
+    def __init__(self, latency: float) -> None:
+        self.latency = latency
+        self.now, self.trips = 0.0, 0
+
+    def travel(self, seconds: float) -> None:
+        self.now += seconds
+        self.trips += 1
+
+    def to(self, env: Environment) -> Store:
+        return troubled(env.store, latency=self.latency, wait=self.travel)
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> Iterator[Environment]:
+    with make(tmp_path) as made:
+        scatter(made, n_objects=1, n_voxels=500)
+        yield made
+
+
+@pytest.fixture
+def measured(monkeypatch: pytest.MonkeyPatch) -> list[Store]:
+    """Stores that were calibrated."""
+    seen: list[Store] = []
+
+    def calibrate(store: Store) -> CostModel:
+        seen.append(store)
+        return MEASURED
+
+    monkeypatch.setattr(module, "calibrate", calibrate)
+    return seen
+
+
+def test_a_database_nearby_is_measured(env: Environment, measured: list[Store]) -> None:
+    line = Line(FAR / 2)
+    assert costs_at_start(line.to(env), lambda: line.now) == MEASURED
+    assert len(measured) == 1
+
+
+def test_one_slow_answer_does_not_make_a_database_far(
+    env: Environment, measured: list[Store]
+) -> None:
+    readings = iter([0.0, *[1.0] * (2 * ASKED - 1)])
+    assert costs_at_start(env.store, lambda: next(readings)) == MEASURED
+    assert len(measured) == 1
+
+
+def test_kept_figures_are_taken_and_nothing_is_measured(
+    env: Environment, measured: list[Store]
+) -> None:
+    env.store.save_costs(machine_name(), MEASURED.figures())
+    line = Line(1.0)
+    assert costs_at_start(line.to(env), lambda: line.now) == MEASURED
+    assert (measured, line.trips) == ([], 1)
+
+
+def test_who_has_no_time_measures_nothing(env: Environment, measured: list[Store]) -> None:
+    line = Line(1e-4)
+    assert costs_at_start(line.to(env), lambda: line.now, may_measure=False) == EQUAL
+    assert (measured, line.trips) == ([], 1)
+
+
+def test_a_start_over_a_slow_line_takes_a_few_round_trips(env: Environment) -> None:
+    """However slow: on 150 ms each, a calibration's hundreds took minutes."""
+    line = Line(0.15)
+    with CellTable.create(LEAST_BUDGET) as table:
+        Residency(line.to(env), table, clock=lambda: line.now)
+    assert ASKED < line.trips <= ASKED + 6
+
+
+def test_an_empty_environment_is_not_measured(tmp_path: Path, measured: list[Store]) -> None:
+    (tmp_path / "empty").mkdir()
+    with make(tmp_path / "empty") as empty, CellTable.create(LEAST_BUDGET) as table:
+        Residency(empty.store, table)
+    assert measured == []

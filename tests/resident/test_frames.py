@@ -1,0 +1,151 @@
+"""A frame against resident cells is the frame against the database, bit for bit."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hapticdb import PointShell, UsageError
+from hapticdb.grid import CurveName
+from hapticdb.resident.frames import RUN, Frames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.store.base import Layout
+from hapticdb.testing import write_voxels
+from realtime.worlds import HIERARCHICAL, expected, ids_by_voxel, make, poses_in, scatter
+
+
+def cloud(n_points: int, seed: int = 0, extent: float = 0.02) -> PointShell:
+    """Points about the tool's origin, in no order, with normals of all directions."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(n_points, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    return PointShell(
+        points=rng.normal(0, extent, (n_points, 3)),
+        normals=normals,
+        center=np.array([0.001, 0.002, -0.003]),
+        is_closed=True,
+    )
+
+
+@pytest.mark.parametrize("bits", [3, 4, 5, 7])
+@pytest.mark.parametrize(("layout", "curve"), HIERARCHICAL)
+def test_frames_are_the_oracles_bit_for_bit(
+    tmp_path: Path, layout: Layout, curve: CurveName, bits: int
+) -> None:
+    """In every kind of environment, inside and beside it, with an object left out, clustered."""
+    env = make(tmp_path, bits, layout, curve)
+    scatter(env, n_voxels=min(8**bits // 4, 4000))
+    ids = ids_by_voxel(env)
+    shell = cloud(150, extent=env.grid.edge / 12)
+    poses = poses_in(env.grid, 12)
+    for exclude in ([], [2]):
+        for run in (0, 8):
+            with CellTable.create(LEAST_BUDGET) as table:
+                frames = Frames(Residency(env.store, table, exclude), shell, run=run)
+                felt = frames.feel(poses)
+                frames.close()
+            assert felt.hits.any()
+            assert not felt.unknown.any()
+            for n, pose in enumerate(poses):
+                naive = expected(ids, env.grid, shell, pose, exclude)
+                wrench = np.array([*naive.force, *naive.torque])
+                assert (felt.wrenches[n] + 0.0).tobytes() == (wrench + 0.0).tobytes()
+                assert felt.hits[n] == len(naive.hits)
+                assert felt.contacts[n] == len(naive.contacts)
+                assert felt.deepest[n] == max(naive.depths, default=0.0)
+                touch = env.touch(shell, pose, exclude=exclude)
+                assert (wrench + 0.0).tobytes() == (
+                    np.concatenate([touch.force, touch.torque]) + 0.0
+                ).tobytes()
+
+
+@given(st.integers(0, 10_000))
+@settings(deadline=None, max_examples=8)
+def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    """However many points are in one, and in whatever order the points are."""
+    env = make(tmp_path_factory.mktemp("clusters"))
+    scatter(env, n_objects=2, n_voxels=600, seed=seed)
+    rng = np.random.default_rng(seed)
+    shell = cloud(int(rng.integers(1, 400)), seed, float(rng.choice([0.002, 0.01, 0.04])))
+    order = np.argsort(shell.points[:, 0])
+    shell = PointShell(shell.points[order], shell.normals[order], shell.center, is_closed=True)
+    poses = poses_in(env.grid, 12, seed)
+    with CellTable.create(LEAST_BUDGET) as table:
+        residency = Residency(env.store, table)
+        plain = Frames(residency, shell, run=0).feel(poses)
+        for run in (1, int(rng.integers(2, 64)), len(shell)):
+            clustered = Frames(residency, shell, run=run)
+            found = clustered.feel(poses)
+            clustered.close()
+            for a, b in zip(plain, found, strict=True):
+                assert (a + 0.0).tobytes() == (b + 0.0).tobytes()
+    env.close()
+
+
+def test_an_empty_environment_is_felt_as_empty(tmp_path: Path) -> None:
+    env = make(tmp_path)
+    with CellTable.create(LEAST_BUDGET) as table:
+        felt = Frames(Residency(env.store, table), cloud(50)).feel(poses_in(env.grid, 5))
+    assert not felt.wrenches.any()
+    assert not felt.hits.any()
+    assert not felt.unknown.any()
+
+
+def test_a_path_longer_than_the_table_is_felt_in_parts(tmp_path: Path) -> None:
+    """512 cells, nearly all with voxels, through a table of fewer."""
+    env = make(tmp_path, bits=8)
+    rng = np.random.default_rng(0)
+    ijk = np.unique(rng.integers(0, 256, (60_000, 3)), axis=0)
+    write_voxels(env.store, ijk)
+    shell, poses = cloud(60, extent=0.03), poses_in(env.grid, 200, beyond=0.0)
+    with CellTable.create(LEAST_BUDGET) as table:
+        residency = Residency(env.store, table)
+        assert table.n_slots < 512
+        felt = Frames(residency, shell).feel(poses)
+        assert residency.evicted > 0
+    assert not felt.unknown.any()
+    for n in range(0, 200, 7):
+        touch = env.touch(shell, poses[n])
+        assert (felt.wrenches[n, :3] + 0.0).tobytes() == (touch.force + 0.0).tobytes()
+
+
+def test_a_tool_larger_than_the_table_is_told_so(tmp_path: Path) -> None:
+    env = make(tmp_path, bits=8)
+    rng = np.random.default_rng(0)
+    write_voxels(env.store, np.unique(rng.integers(0, 256, (60_000, 3)), axis=0))
+    shell = cloud(5000, extent=0.1)
+    with CellTable.create(LEAST_BUDGET) as table:
+        frames = Frames(Residency(env.store, table), shell)
+        with pytest.raises(UsageError, match=r"more than fit into .*give a larger budget"):
+            frames.feel(np.eye(4))
+
+
+def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Path) -> None:
+    """Small runs of points, far apart: around each are up to eight cells, and its own is one."""
+    env = make(tmp_path, bits=9)
+    size = env.grid.voxel_size
+    rng = np.random.default_rng(1)
+    middles = np.array(env.grid.origin) + size * (32.0 * rng.integers(1, 15, (100, 3)) + 1.0)
+    points = np.repeat(middles, RUN, axis=0) + rng.uniform(0.0, size, (100 * RUN, 3))
+    normals = np.tile((0.0, 0.0, 1.0), (len(points), 1))
+    shell = PointShell(points, normals, np.zeros(3))
+    write_voxels(env.store, env.grid.voxels_of(middles))
+    with CellTable.create(LEAST_BUDGET) as table:
+        frames = Frames(Residency(env.store, table), shell)
+        n_cells = len(np.unique(env.grid.voxels_of(points) // 32, axis=0))
+        assert n_cells <= (table.n_slots - 1) // 2 < 8 * n_cells
+        felt = frames.feel(np.eye(4))
+        assert (felt.unknown[0], felt.hits[0]) == (0, len(points))
+
+
+def test_a_pose_that_is_not_rigid_is_named(tmp_path: Path) -> None:
+    env = make(tmp_path)
+    poses = np.stack([np.eye(4)] * 3)
+    poses[1, 0, 0] = 1.1
+    with CellTable.create(LEAST_BUDGET) as table:
+        frames = Frames(Residency(env.store, table), cloud(5))
+        with pytest.raises(UsageError, match="pose 1 is no rigid transform"):
+            frames.feel(poses)

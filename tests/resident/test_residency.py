@@ -1,0 +1,434 @@
+"""What is resident is what the database holds, whatever was loaded, evicted and written before."""
+
+import itertools
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from children import joined
+from hapticdb import Environment, PointShell, UsageError
+from hapticdb.errors import GridError
+from hapticdb.kernels.resident.cells import BUFFERS, READER_STRIDE, UNKNOWN, cell_key
+from hapticdb.resident import residency as module
+from hapticdb.resident.residency import RECENT, Residency
+from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.store.connect import open_store
+from hapticdb.testing import write_voxels
+from naive import Voxel
+from realtime.worlds import Reader, block, cells_of, make, move, scatter
+
+NOTHING = np.empty(0, dtype=np.int64)
+
+
+@pytest.fixture
+def table() -> Iterator[CellTable]:
+    with CellTable.create(LEAST_BUDGET) as made:
+        yield made
+
+
+def voxels_by_cell(env: Environment, exclude: tuple[int, ...] = ()) -> dict[int, set[Voxel]]:
+    found: dict[int, set[Voxel]] = {}
+    for obj in env.objects():
+        if obj.id not in exclude:
+            for v in env.voxels(obj.id).tolist():
+                found.setdefault(int(cell_key(*v)), set()).add((v[0], v[1], v[2]))
+    return found
+
+
+def check(residency: Residency, wanted: dict[int, set[Voxel]]) -> int:
+    """Every published cell holds its voxels and nothing else; returns how many are published."""
+    table = residency.table
+    which = table.version % BUFFERS
+    entries = np.flatnonzero(table.cells.keys[which] >= 0)
+    cells, slots = table.cells.keys[which][entries], table.cells.slots[which][entries]
+    filled = slots[slots > 0].tolist()
+    assert len(set(filled)) == len(filled)
+    assert not set(filled) & set(residency._free)
+    limbo = {slot for _, held in residency._limbo for slot in held}
+    assert len(filled) + len(residency._free) + len(limbo) == table.n_slots - 1
+    assert (residency.n_resident, residency.n_empty) == (len(filled), len(slots) - len(filled))
+    assert len(entries) <= table.capacity // 2
+    for key, slot in zip(cells.tolist(), slots.tolist(), strict=True):
+        low = (key >> 32 << 5, (key >> 16 & 0xFFFF) << 5, (key & 0xFFFF) << 5)
+        bits = table.cells.words[slot][:, None] >> np.arange(32, dtype=np.uint32) & 1
+        found = {
+            (low[0] + (w >> 5), low[1] + (w & 31), low[2] + b)
+            for w, b in np.argwhere(bits).tolist()
+        }
+        assert found == wanted.get(key, set())
+        assert bool(found) == (slot > 0)
+    return len(entries)
+
+
+STEPS = st.lists(
+    st.one_of(
+        st.tuples(st.just("load"), st.integers(0, 511), st.integers(1, 120)),
+        st.tuples(st.just("move"), st.integers(1, 3), st.integers(0, 99)),
+        st.tuples(st.just("restart"), st.integers(0, 511), st.integers(0, 120)),
+        st.tuples(st.just("refresh"), st.just(0), st.just(0)),
+    ),
+    min_size=1,
+    max_size=14,
+)
+
+
+@given(STEPS)
+@settings(deadline=None, max_examples=15)
+def test_what_is_resident_is_what_the_database_holds(
+    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
+) -> None:
+    """After loads and evictions in any order, writes of others, and writers that ended."""
+    env = make(tmp_path_factory.mktemp("steps"), bits=8)
+    scatter(env, n_voxels=800)
+    store = open_store(env.url, read_only=True)
+    cells = cells_of(env.grid)
+    with CellTable.create(LEAST_BUDGET) as table:
+        residency = Residency(store, table)
+        for kind, first, second in steps:
+            if kind == "load":
+                residency.round += 1
+                asked = residency.missing(cells[first : first + second])
+                residency.load(asked)
+            elif kind == "move":
+                at = np.random.default_rng(second).integers(0, 220, 3)
+                move(env.store, first, block(at, at + 11))
+            elif kind == "restart":
+                urgent = cells[first : first + second]
+                residency = Residency(store, table, urgent=urgent)
+            else:
+                residency.refresh()
+            if kind != "move":
+                assert table.revision == residency.revision
+            if residency.revision == store.revision():
+                check(residency, voxels_by_cell(env))
+    store.close()
+    env.close()
+
+
+def test_excluded_objects_are_in_no_cell(tmp_path: Path, table: CellTable) -> None:
+    env = make(tmp_path)
+    scatter(env)
+    residency = Residency(env.store, table, [3, 1])
+    residency.load(residency.missing(cells_of(env.grid))[:50])
+    assert check(residency, voxels_by_cell(env, (1, 3))) == 50
+
+
+def full_of_voxels(folder: Path, bits: int = 8) -> Environment:
+    """An environment with a voxel in every cell."""
+    env = make(folder, bits=bits)
+    n = env.grid.side >> 5
+    write_voxels(env.store, 32 * block((0, 0, 0), (n - 1, n - 1, n - 1)) + 7)
+    return env
+
+
+def test_what_is_wanted_stays_and_the_rest_makes_way(tmp_path: Path, table: CellTable) -> None:
+    env = full_of_voxels(tmp_path)
+    residency = Residency(env.store, table)
+    cells = cells_of(env.grid)
+    kept = cells[:100]
+    residency.load(residency.missing(kept)[:100])
+    while len(missing := residency.missing(kept)):
+        residency.load(missing)
+    for at in range(100, 512, 40):
+        residency.round += 1
+        assert not len(residency.missing(kept))
+        residency.load(cells[at : at + 40])
+        assert (residency.slots_of(cells[at : at + 40]) > 0).all()
+    assert (residency.slots_of(kept) > 0).all()
+    assert residency.evicted > 0
+    check(residency, voxels_by_cell(env))
+
+
+def test_nothing_is_thrown_out_that_is_wanted_just_now(tmp_path: Path, table: CellTable) -> None:
+    """A tool too large for the table keeps what it has."""
+    env = full_of_voxels(tmp_path)
+    residency = Residency(env.store, table)
+    cells = cells_of(env.grid)
+    for _ in range(20):
+        residency.round += 1
+        residency.load(residency.missing(cells))
+    resident = residency.slots_of(cells) > 0
+    assert resident.sum() == table.n_slots - 1
+    assert residency.evicted == 0
+    for _ in range(2 * RECENT):
+        residency.round += 1
+        assert residency.load(residency.missing(cells)).cells == 0
+    assert (residency.slots_of(cells) > 0).tolist() == resident.tolist()
+
+
+def test_empty_cells_beyond_number_do_not_push_out_those_at_the_tool(
+    tmp_path: Path, table: CellTable
+) -> None:
+    env = make(tmp_path, bits=9)  # 4096 cells without a voxel
+    residency = Residency(env.store, table)
+    cells = cells_of(env.grid)
+    near = cells[:50]
+    for at in range(0, 4096, 50):
+        residency.load(residency.missing(cells[at : at + 50]))
+        residency.want(near, residency.slots_of(near))
+        residency.load(residency.missing(near))
+        assert (residency.slots_of(near) == 0).all()
+    assert residency.n_empty <= table.capacity // 2 - table.n_slots
+    assert check(residency, {}) > 200
+
+
+def test_a_write_during_a_load_is_caught_up_with(tmp_path: Path, table: CellTable) -> None:
+    """Both in one version: the new cells, and the known ones anew."""
+    env = make(tmp_path)
+    scatter(env)
+    residency = Residency(open_store(env.url, read_only=True), table)
+    cells = cells_of(env.grid)
+    residency.load(residency.missing(cells[:40]))
+    before = table.version
+    move(env.store, 1, block((10, 10, 10), (100, 60, 40)))
+    residency.load(residency.missing(cells)[:20])
+    assert (table.version, table.revision) == (before + 1, env.store.revision())
+    assert check(residency, voxels_by_cell(env)) == 60
+
+
+def test_only_the_most_urgent_cells_are_read_again_and_the_others_forgotten(
+    tmp_path: Path, table: CellTable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MOST_RENEWED", 10)
+    env = full_of_voxels(tmp_path, bits=7)
+    residency = Residency(open_store(env.url, read_only=True), table)
+    cells = np.random.default_rng(0).permutation(cells_of(env.grid))
+    residency.load(residency.missing(cells))
+    residency.want(cells, residency.slots_of(cells))
+    move(env.store, 1, block((0, 0, 0), (127, 127, 10)))
+    residency.refresh()
+    assert np.flatnonzero(residency.slots_of(cells) != UNKNOWN).tolist() == list(range(10))
+    check(residency, voxels_by_cell(env))
+
+
+@pytest.mark.parametrize("few", [0, 1 << 14])
+def test_writes_elsewhere_leave_cells_as_they_are(
+    tmp_path: Path, table: CellTable, few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However the cells of a write are found."""
+    monkeypatch.setattr(module, "FEW_CELLS", few)
+    env = full_of_voxels(tmp_path, bits=7)
+    second = write_voxels(env.store, block((1, 1, 1), (3, 3, 3)), "second")
+    residency = Residency(open_store(env.url, read_only=True), table)
+    cells = cells_of(env.grid)
+    residency.load(residency.missing(cells))
+    slots = residency.slots_of(cells)
+    move(env.store, second, block((1, 1, 100), (3, 3, 103)))
+    assert residency.refresh() == 1
+    changed = np.flatnonzero(residency.slots_of(cells) != slots)
+    assert cells[changed].tolist() == [0, 3]
+    check(residency, voxels_by_cell(env))
+
+
+def test_a_server_that_lost_its_last_commits_makes_all_unknown(
+    tmp_path: Path, table: CellTable
+) -> None:
+    env = full_of_voxels(tmp_path, bits=7)
+    residency = Residency(env.store, table)
+    residency.load(residency.missing(cells_of(env.grid)))
+    residency.want(NOTHING, NOTHING)
+    residency._revision += 1
+    residency.refresh()
+    assert residency.revision == env.store.revision()
+    assert (residency.n_resident, residency.n_empty) == (0, 0)
+
+
+def test_after_more_writes_than_one_looks_at_all_is_unknown(
+    tmp_path: Path, table: CellTable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(module, "MOST_CHANGES", 2)
+    env = make(tmp_path)
+    scatter(env)
+    residency = Residency(open_store(env.url, read_only=True), table)
+    residency.load(residency.missing(cells_of(env.grid))[:50])
+    for n in range(3):
+        write_voxels(env.store, block((n, 0, 0), (n, 0, 0)), f"new {n}")
+    residency.want(NOTHING, NOTHING)
+    residency.refresh()
+    assert check(residency, voxels_by_cell(env)) == 0
+
+
+def test_slots_of_a_load_that_failed_are_used_again(
+    tmp_path: Path, table: CellTable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = full_of_voxels(tmp_path, bits=7)
+    residency = Residency(open_store(env.url, read_only=True), table)
+    cells = cells_of(env.grid)
+    residency.load(residency.missing(cells[:30]))
+    move(env.store, 1, block((0, 0, 0), (127, 127, 10)))
+    bring = residency._bring
+
+    def bring_and_fail(asked: NDArray[np.int64]) -> None:
+        bring(asked)
+        raise hapticdb.ConnectionLostError("gone")
+
+    monkeypatch.setattr(residency, "_bring", bring_and_fail)
+    with pytest.raises(hapticdb.ConnectionLostError):
+        residency.load(cells[30:40])
+    monkeypatch.undo()
+    residency.reopened(open_store(env.url, read_only=True))
+    check(residency, voxels_by_cell(env))
+
+
+def test_another_environment_in_the_same_place_is_refused(tmp_path: Path, table: CellTable) -> None:
+    residency = Residency(make(tmp_path).store, table)
+    with pytest.raises(GridError, match="another environment than before"):
+        residency.reopened(make(tmp_path, bits=6).store)
+
+
+def two_of_one_grid(tmp_path: Path) -> list[Environment]:
+    folders = [tmp_path / "first", tmp_path / "second"]
+    for folder in folders:
+        folder.mkdir()
+    return list(map(make, folders))
+
+
+def test_another_file_of_the_same_grid_makes_all_unknown(tmp_path: Path, table: CellTable) -> None:
+    """Though its writes be of the same numbers."""
+    env, other = two_of_one_grid(tmp_path)
+    write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
+    write_voxels(other.store, block((60, 60, 60), (70, 70, 70)))
+    residency = Residency(env.store, table)
+    residency.load(residency.missing(cells_of(env.grid))[:100])
+    residency.reopened(other.store)
+    check(residency, voxels_by_cell(other))
+    residency.load(residency.missing(cells_of(env.grid))[:100])
+    assert check(residency, voxels_by_cell(other)) > 0
+
+
+def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
+    tmp_path: Path, table: CellTable
+) -> None:
+    """Its environment may have been replaced by one with as many writes, by nobody knows whom.
+
+    What is urgent is known before and after, and in no version between.
+    """
+    env, other = two_of_one_grid(tmp_path)
+    write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
+    write_voxels(other.store, block((8, 8, 8), (70, 70, 70)))
+    cells = cells_of(env.grid)
+    residency = Residency(env.store, table)
+    residency.load(cells)
+    check(residency, voxels_by_cell(env))
+    before, urgent = table.version, cells[:9]
+    residency = Residency(other.store, table, urgent=urgent)
+    assert residency.revision == env.store.revision()
+    assert table.version == before + 1
+    assert check(residency, voxels_by_cell(other)) == len(urgent)
+    assert (residency.slots_of(urgent) != UNKNOWN).all()
+
+
+def test_there_is_room_to_read_the_urgent_again_in_a_full_table_that_a_writer_has_left(
+    tmp_path: Path, table: CellTable
+) -> None:
+    env = full_of_voxels(tmp_path)
+    residency = Residency(env.store, table)
+    cells = cells_of(env.grid)
+    for _ in range(20):
+        residency.round += 1
+        residency.load(residency.missing(cells))
+    assert residency.n_resident == table.n_slots - 1
+    urgent = cells[residency.slots_of(cells) > 0]
+    residency = Residency(env.store, table, urgent=urgent)
+    n_read = check(residency, voxels_by_cell(env))
+    assert n_read == table.n_slots // 3
+    assert (residency.slots_of(urgent[:n_read]) > 0).all()
+
+
+def test_an_order_without_cells_is_refused(tmp_path: Path, table: CellTable) -> None:
+    env = make(tmp_path, layout="voxel", curve="lexicographic")
+    with pytest.raises(
+        UsageError, match="lexicographic order, which has no cells: 'hapticdb copy'"
+    ):
+        Residency(env.store, table)
+
+
+def test_a_reader_that_died_in_a_frame_holds_the_writer_up_for_a_moment_only(
+    tmp_path: Path, table: CellTable
+) -> None:
+    env = full_of_voxels(tmp_path)
+    residency = Residency(env.store, table)
+    row = table.join()
+    table.desk.pids[row] = 2**22 + 1  # above the largest process id
+    table.cells.readers[row * READER_STRIDE] = table.version
+    cells = cells_of(env.grid)
+    for at in range(0, 400, 50):
+        residency.round += RECENT + 1
+        residency.load(cells[at : at + 50])
+    assert table.cells.readers[row * READER_STRIDE] == 0
+    check(residency, voxels_by_cell(env))
+
+
+# --- frames at the same time --------------------------------------------------------------------
+
+
+def shell_of(places: NDArray[np.int64], env: Environment) -> PointShell:
+    """A shell with a point in the middle of each of the voxels, when it is not moved."""
+    points = env.grid.centers(places)
+    return PointShell(
+        points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.zeros(3), is_closed=True
+    )
+
+
+def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) -> None:
+    """Frames in a thread, while the object moves and the writer loads, evicts and refreshes.
+
+    It has a voxel in each of several cells; all cells have some voxels in common, which must all be
+    there or the cell be unknown.
+    """
+    env = make(tmp_path, bits=8)
+    pattern = np.array([[5, 5, 5], [6, 6, 6], [20, 9, 31], [31, 31, 0]])
+    corners = 32 * block((0, 0, 0), (7, 7, 7))
+    write_voxels(env.store, (corners[:, None] + pattern).reshape(-1, 3), "patterns")
+    offsets = np.array([[30, 30, 30], [34, 30, 30], [30, 34, 34], [34, 34, 34]])
+    here, there = np.array([96, 64, 64]), np.array([160, 128, 128])
+    thing = write_voxels(env.store, here + offsets, "thing")
+    store = open_store(env.url, read_only=True)
+    probes = np.concatenate([here + offsets, there + offsets, corners[0] + pattern])
+    shell = shell_of(np.concatenate([probes, corners[77] + pattern]), env)
+    wrong: list[object] = []
+    seen: set[tuple[bool, ...]] = set()
+    done = threading.Event()
+    with CellTable.create(LEAST_BUDGET) as table:
+        residency = Residency(store, table)
+
+        def hammer() -> None:
+            reader = Reader(table, env.grid, shell)
+            while not done.is_set():
+                hits, _, unknown = reader.feel(np.eye(4))
+                met = [sum(4 * n <= hit < 4 * n + 4 for hit in hits) for n in range(4)]
+                if unknown == 0 and met[:2] not in ([4, 0], [0, 4]):
+                    wrong.append(("two places", met))
+                if met[2] not in {0, 4} or met[3] not in {0, 4}:
+                    wrong.append(("torn", met))
+                seen.add(tuple(count == 4 for count in met))
+            table.leave(reader.row)
+
+        thread = threading.Thread(target=hammer, daemon=True)
+        thread.start()
+        wanted = np.unique([cell_key(*v) for v in probes.tolist()])
+        cells = cells_of(env.grid)
+        rng = np.random.default_rng(1)
+        places = {(True, False), (False, True)}
+        for n in itertools.count():
+            if n >= 120 and {met[:2] for met in tuple(seen)} >= places:
+                break
+            assert n < 20_000
+            residency.round += 1
+            residency.load(residency.missing(wanted))
+            move(env.store, thing, (there if n % 2 == 0 else here) + offsets)
+            residency.refresh() if n % 3 else residency.load(residency.missing(wanted))
+            others = rng.permutation(cells)[:60]
+            residency.load(others[residency.slots_of(others) == UNKNOWN])
+        done.set()
+        joined(thread)
+        check(residency, voxels_by_cell(env))
+    assert wrong == []
+    assert residency.evicted > 0

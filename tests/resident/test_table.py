@@ -1,0 +1,120 @@
+"""A table of cells keeps to its budget, and readers of any process come and go."""
+
+import itertools
+import os
+import sys
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from children import child, joined, until
+from hapticdb import UsageError
+from hapticdb.kernels.resident.cells import READER_STRIDE
+from hapticdb.resident.table import (
+    ACTIVE,
+    FIRST_VERSION,
+    LEAST_BUDGET,
+    MOST_READERS,
+    CellTable,
+    is_alive,
+    slots_within,
+)
+
+
+@given(st.integers(LEAST_BUDGET, 1 << 33))
+@settings(deadline=None)
+def test_the_budget_is_used_and_never_exceeded(budget: int) -> None:
+    n_slots = slots_within(budget)
+    with CellTable.create(LEAST_BUDGET) as small:
+        a_cell = small.size_bytes / small.n_slots
+    assert 4096 * n_slots < budget
+    assert n_slots > 0.85 * budget / a_cell
+
+
+@given(st.integers(LEAST_BUDGET, 16 << 20))
+@settings(deadline=None, max_examples=10)
+def test_the_memory_is_as_large_as_it_says_and_within_the_budget(budget: int) -> None:
+    with CellTable.create(budget) as table:
+        assert os.fstat(table.descriptor).st_size == table.size_bytes <= budget
+        assert table.capacity >= 4 * table.n_slots
+        arrays: list[np.ndarray[Any, Any]] = [*table.cells, *table.desk]
+        ends = sorted((a.ctypes.data, a.ctypes.data + a.nbytes) for a in arrays)
+        assert all(a[1] <= b[0] for a, b in itertools.pairwise(ends))
+        assert ends[-1][1] - ends[0][0] <= table.size_bytes
+
+
+def test_a_budget_beyond_the_machines_memory_is_refused() -> None:
+    with pytest.raises(UsageError, match=r"^a budget of \d+ bytes .*: this machine has \d+$"):
+        CellTable.create(1 << 50)
+
+
+def test_a_budget_too_small_is_refused() -> None:
+    with pytest.raises(UsageError, match=f"give {LEAST_BUDGET} or more"):
+        CellTable.create(LEAST_BUDGET - 1)
+
+
+def test_all_is_unknown_at_first() -> None:
+    with CellTable.create(LEAST_BUDGET) as table:
+        assert table.version == FIRST_VERSION
+        assert (table.cells.keys == -1).all()
+
+
+def test_who_maps_the_same_memory_sees_the_same() -> None:
+    with CellTable.create(LEAST_BUDGET) as table:
+        other = CellTable(table.descriptor, table.n_slots)
+        table.cells.words[3, 5] = 7
+        other.desk.figures[2] = 1.5
+        assert other.cells.words[3, 5] == 7
+        assert table.desk.figures[2] == 1.5
+
+
+def test_sixteen_readers_have_rows_of_their_own_and_the_next_is_refused() -> None:
+    with CellTable.create(LEAST_BUDGET) as table:
+        rows: list[int] = []
+        threads = [threading.Thread(target=lambda: rows.append(table.join())) for _ in range(16)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            joined(thread)
+        assert sorted(rows) == list(range(MOST_READERS))
+        with pytest.raises(UsageError, match="16 readers at most"):
+            table.join()
+        table.leave(7)
+        with table.reading() as row:
+            assert row == 7
+        assert table.desk.pids[7] == 0
+
+
+def test_a_row_says_nothing_of_who_had_it_before() -> None:
+    """Even if that one ended in the middle of saying something."""
+    with CellTable.create(LEAST_BUDGET) as table:
+        row = table.join()
+        table.desk.sequence[row] = 5
+        table.desk.state[row] = 1.0
+        table.desk.missed[row] = table.desk.voxels[row] = table.desk.ids[row] = 3
+        table.leave(row)
+        assert table.join() == row
+        assert table.desk.sequence[row] == 6
+        for told in (table.desk.state, table.desk.missed, table.desk.voxels, table.desk.ids):
+            assert not told[row].any()
+
+
+def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
+    """Also while nobody has asked for its status; the living keep what they hold."""
+    with child([sys.executable, "-c", "pass"]) as gone, CellTable.create(LEAST_BUDGET) as table:
+        until(lambda: not is_alive(gone.pid))  # a zombie
+        dead, alive = table.join(), table.join()
+        table.desk.pids[dead] = gone.pid
+        table.cells.readers[[dead * READER_STRIDE, alive * READER_STRIDE]] = 9
+        table.desk.state[[dead, alive], ACTIVE] = 1.0
+        table.release_dead()
+        assert np.flatnonzero(table.cells.readers).tolist() == [alive * READER_STRIDE]
+        assert np.flatnonzero(table.desk.state[:, ACTIVE]).tolist() == [alive]
+        assert table.join() not in {dead, alive}
+    assert not is_alive(gone.pid)
+    assert is_alive(os.getpid())
+    assert is_alive(1)

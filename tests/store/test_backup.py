@@ -1,0 +1,365 @@
+"""Whole copies of SQLite environments: made while others write, put in place, never half."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import os
+import shutil
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import NoReturn
+
+import apsw
+import pytest
+
+import hapticdb
+from children import child, exit_code
+from command_line import Run, refused, run  # noqa: F401 - a fixture
+from hapticdb import Grid, backup_environment, restore_environment
+from hapticdb.store.sqlite import backup as sqlite_backup
+from hapticdb.store.sqlite import log as sqlite_log
+from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.testing import blob, floor_voxels, write_voxels
+from old_formats import make_old
+
+GRID = Grid(0.005, (0, 0, 0), 6)
+
+
+def write(store: SQLiteStore, *numbers: int) -> None:
+    for n in numbers:
+        write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
+
+
+def names(path: Path) -> list[str]:
+    with hapticdb.open(path) as env:
+        assert env.store.revision() == len(env.objects())
+        return [obj.name for obj in env.objects()]
+
+
+def make(path: Path, *numbers: int) -> Path:
+    with closing(SQLiteStore.create(path, GRID)) as store:
+        write_voxels(store, floor_voxels(GRID), "floor")
+        write(store, *numbers)
+    return path
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    """Contents of a folder, but for the empty log and its index that a reader leaves."""
+    found = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
+    return {
+        name: content
+        for name, content in found.items()
+        if not name.endswith("-shm") and (content or not name.endswith("-wal"))
+    }
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return make(tmp_path / "q.db", 1)
+
+
+@pytest.fixture
+def copy(path: Path, tmp_path: Path) -> Path:
+    """A copy of it, made before it was written again."""
+    backup_environment(path, tmp_path / "copy.db")
+    with closing(SQLiteStore.open(path)) as store:
+        write(store, 2)
+    return tmp_path / "copy.db"
+
+
+def test_a_copy_has_what_was_committed_and_nothing_beside_it(path: Path, tmp_path: Path) -> None:
+    with closing(SQLiteStore.open(path)) as store:
+        write(store, 2)  # into the log
+        report = backup_environment(path, tmp_path / "copy.db")
+        assert (report.revision, report.objects) == (3, 3)
+        assert report.bytes == (tmp_path / "copy.db").stat().st_size
+        assert hapticdb.diff_environments(path, tmp_path / "copy.db").is_equal
+    assert sorted(files(tmp_path)) == ["copy.db", "q.db"]
+    assert names(tmp_path / "copy.db") == ["floor", "blob 1", "blob 2"]
+
+
+def test_a_copy_is_as_of_one_moment_though_others_write_at_each_step(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sqlite_backup, "STEP_PAGES", 2)
+    heard: list[sqlite_backup.BackupProgress] = []
+    with closing(SQLiteStore.open(path)) as store:
+
+        def write_meanwhile(progress: sqlite_backup.BackupProgress) -> None:
+            heard.append(progress)
+            write(store, 10 + len(heard))
+
+        backup_environment(path, tmp_path / "copy.db", progress=write_meanwhile)
+    done = [progress.bytes_done for progress in heard]
+    assert len(heard) > 3
+    assert done == sorted(set(done))
+    assert done[-1] == heard[-1].bytes_total
+    assert names(tmp_path / "copy.db") == ["floor", "blob 1"]
+    assert len(names(path)) == 2 + len(heard)
+
+
+def test_a_copy_beside_a_writer_in_another_process_is_a_revision_of_it(
+    path: Path, tmp_path: Path
+) -> None:
+    script = (
+        "import sys\n"
+        "from hapticdb.store.sqlite.store import SQLiteStore\n"
+        "from hapticdb.testing import blob, write_voxels\n"
+        "store = SQLiteStore.open(sys.argv[1])\n"
+        "for n in range(10**6):\n"
+        "    write_voxels(store, blob(n, (30, 30, 30)), f'blob {n + 2}')\n"
+        "    print(n, flush=True)\n"
+    )
+    with child([sys.executable, "-c", script, str(path)]) as writer:
+        assert writer.stdout is not None
+        for n in range(5):
+            writer.stdout.readline()
+            backup_environment(path, tmp_path / f"{n}.db")
+        writer.kill()
+    for n in range(5):
+        found = names(tmp_path / f"{n}.db")
+        assert found == ["floor", *(f"blob {k}" for k in range(1, len(found)))]
+        assert len(found) > n + 2
+
+
+def test_a_file_that_is_there_is_replaced_only_when_that_is_said(copy: Path, path: Path) -> None:
+    before = files(copy.parent)
+    with pytest.raises(hapticdb.EnvironmentExistsError, match="exists already"):
+        backup_environment(path, copy)
+    assert files(copy.parent) == before
+    copy.chmod(0o640)
+    backup_environment(path, copy, replace=True)
+    assert names(copy) == ["floor", "blob 1", "blob 2"]
+    assert copy.stat().st_mode & 0o777 == 0o640
+
+
+def test_what_was_not_finished_is_left_out(path: Path, copy: Path) -> None:
+    def fail(_: object) -> NoReturn:
+        raise KeyboardInterrupt
+
+    before = files(path.parent)
+    with pytest.raises(KeyboardInterrupt):
+        backup_environment(path, path.with_name("new.db"), progress=fail)
+    with pytest.raises(KeyboardInterrupt):
+        restore_environment(copy, path, progress=fail)
+    assert files(path.parent) == before
+
+
+def test_a_copy_is_made_of_a_file_in_a_folder_that_cannot_be_written(
+    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticdb.store.sqlite.file.needs_immutable", lambda _: True)
+    backup_environment(path, tmp_path / "copy.db")
+    monkeypatch.undo()
+    assert names(tmp_path / "copy.db") == ["floor", "blob 1"]
+    assert not Path(f"{path}-shm").exists()
+
+
+def test_a_copy_of_a_file_of_format_1_is_of_the_newest(path: Path, tmp_path: Path) -> None:
+    make_old(path)
+    before = path.read_bytes()
+    backup_environment(path, tmp_path / "copy.db")
+    assert path.read_bytes() == before
+    assert sqlite_log.file_mark(tmp_path / "copy.db") not in {None, sqlite_log.NO_MARK}
+    assert names(tmp_path / "copy.db") == ["floor", "blob 1"]
+    restore_environment(tmp_path / "copy.db", path)
+    assert names(path) == ["floor", "blob 1"]
+
+
+def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[-5000] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(hapticdb.DamagedError, match="not what was written"):
+        backup_environment(path, tmp_path / "copy.db")
+    assert sorted(files(tmp_path)) == ["q.db"]
+
+
+def test_a_copy_under_the_log_of_what_it_was_copied_from_is_refused(
+    path: Path, tmp_path: Path
+) -> None:
+    """Even when not a commit lies between: its pages could be others."""
+    store = SQLiteStore.open(path)
+    backup_environment(path, tmp_path / "copy.db")
+    write(store, 2)
+    shutil.copy(f"{path}-wal", tmp_path / "copy.db-wal")
+    with pytest.raises(hapticdb.DamagedError, match=r"copy\.db-wal"):
+        hapticdb.open(tmp_path / "copy.db")
+    store.close()
+
+
+# --- putting it in place --------------------------------------------------------------------------
+
+
+def killed(path: Path, *numbers: int) -> None:
+    """Write in a process that dies of it and leaves its log."""
+    pid = os.fork()
+    if pid == 0:  # everything is imported, and nothing is started: safe here, as a test
+        try:
+            store = SQLiteStore.open(path)  # held until the end: whoever lets go of it closes it
+            write(store, *numbers)
+        finally:
+            os.kill(os.getpid(), signal.SIGKILL)
+    assert exit_code(pid) == -signal.SIGKILL
+
+
+def test_a_copy_takes_the_place_of_a_file_and_its_log(path: Path, copy: Path) -> None:
+    killed(path, 3, 4)
+    assert Path(f"{path}-wal").stat().st_size
+    kept = copy.read_bytes()
+    report = restore_environment(copy, path)
+    assert sorted(files(path.parent)) == ["copy.db", "q.db"]
+    assert (report.revision, report.objects) == (2, 2)
+    assert names(path) == ["floor", "blob 1"]
+    assert copy.read_bytes() == kept
+
+
+@pytest.mark.parametrize("what", ["nothing", "a log", "damaged"])
+def test_a_copy_goes_where_the_file_is_gone_or_damaged(path: Path, copy: Path, what: str) -> None:
+    if what == "damaged":
+        path.write_bytes(path.read_bytes()[:8192] + bytes(8192))
+    else:
+        if what == "a log":
+            killed(path, 3)
+        path.unlink()
+    restore_environment(copy, path)
+    assert sorted(files(path.parent)) == ["copy.db", "q.db"]
+    assert names(path) == ["floor", "blob 1"]
+
+
+def test_a_copy_goes_through_a_link(path: Path, copy: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "link.db"
+    link.symlink_to(path)
+    restore_environment(copy, link)
+    assert link.is_symlink()
+    assert names(path) == ["floor", "blob 1"]
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_a_file_that_is_open_is_not_replaced(path: Path, copy: Path, read_only: bool) -> None:
+    script = (
+        "import sys, hapticdb\n"
+        "env = hapticdb.open(sys.argv[1], read_only=sys.argv[2] == 'True')\n"
+        "print('open', flush=True)\n"
+        "sys.stdin.read()\n"
+    )
+    before = path.read_bytes()
+    with closing(SQLiteStore.open(path, read_only=read_only)) as store:  # in this process
+        with pytest.raises(hapticdb.BusyError, match="is open"):
+            restore_environment(copy, path)
+        assert len(store.objects()) == 3
+    command = [sys.executable, "-c", script, str(path), str(read_only)]
+    with child(command, stdin=-1) as holder:
+        assert holder.stdout is not None
+        assert holder.stdin is not None
+        holder.stdout.readline()
+        with pytest.raises(hapticdb.BusyError, match="is open"):
+            restore_environment(copy, path)
+        holder.stdin.close()
+        holder.stdin = None
+    assert path.read_bytes() == before
+    restore_environment(copy, path)
+    assert names(path) == ["floor", "blob 1"]
+
+
+def test_a_restore_killed_between_file_and_log_is_finished_by_the_same_command(
+    path: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    killed(path, 3)
+
+    def die(*_: object, **__: object) -> NoReturn:
+        raise SystemExit
+
+    monkeypatch.setattr(Path, "unlink", die)
+    with pytest.raises(SystemExit):
+        restore_environment(copy, path)
+    monkeypatch.undo()
+    with pytest.raises(hapticdb.DamagedError, match="-wal"):
+        hapticdb.open(path)
+    restore_environment(copy, path)
+    assert names(path) == ["floor", "blob 1"]
+
+
+def write_text(path: Path) -> None:
+    path.write_text("mine\n" * 3000)
+
+
+def write_database(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    with closing(apsw.Connection(str(path))) as other:
+        other.execute("CREATE TABLE t (a)")
+
+
+def make_folder(path: Path) -> None:
+    path.unlink(missing_ok=True)
+    path.mkdir()
+
+
+@pytest.mark.parametrize("make", [write_text, write_database, make_folder])
+def test_what_is_no_environment_is_neither_replaced_nor_copied(
+    copy: Path, tmp_path: Path, make: Callable[[Path], None]
+) -> None:
+    other = tmp_path / "other"
+    make(other)
+    before = files(tmp_path)
+    with pytest.raises(hapticdb.NotAnEnvironmentError):
+        restore_environment(copy, other)
+    with pytest.raises(hapticdb.NotAnEnvironmentError):
+        backup_environment(copy, other, replace=True)
+    with pytest.raises(hapticdb.NotAnEnvironmentError):
+        restore_environment(other, tmp_path / "q.db")
+    assert files(tmp_path) == before
+
+
+def test_a_log_without_its_file_is_not_given_to_a_new_one(path: Path, copy: Path) -> None:
+    killed(path, 3)
+    path.unlink()
+    with pytest.raises(hapticdb.EnvironmentExistsError, match=r"q\.db-wal was left"):
+        hapticdb.create(path, GRID)
+    with pytest.raises(hapticdb.EnvironmentExistsError, match=r"q\.db-wal was left"):
+        backup_environment(copy, path)
+    assert not path.exists()
+
+
+def test_every_copy_has_a_mark_of_its_own(path: Path, copy: Path, tmp_path: Path) -> None:
+    restore_environment(copy, tmp_path / "other.db")
+    marks = {sqlite_log.file_mark(p) for p in (path, copy, tmp_path / "other.db")}
+    assert len(marks - {None, sqlite_log.NO_MARK}) == 3
+
+
+# --- the command line -----------------------------------------------------------------------------
+
+
+def test_the_verbs_say_what_they_have_copied(run: Run, path: Path) -> None:
+    code, out, err = run("backup", path, "copy.db")
+    assert (code, err) == (0, "")
+    assert out.startswith(f"copy.db: {path} at revision 2, 2 objects, 0.")
+    code, out, err = run("restore", "copy.db", path, "--json")
+    assert (code, err) == (0, "")
+    size = path.stat().st_size
+    assert json.loads(out) == {
+        "source": "copy.db",
+        "target": str(path),
+        "revision": 2,
+        "objects": 2,
+        "bytes": size,
+    }
+
+
+def test_bad_places_are_one_line(run: Run, path: Path, tmp_path: Path) -> None:
+    before = files(tmp_path)
+    refused(run("backup", path, path), "itself")
+    refused(run("restore", path, path), "itself")
+    refused(run("backup", path, tmp_path / "no" / "copy.db"), "does not exist")
+    refused(run("backup", tmp_path / "no.db", "copy.db"), "no environment at")
+    refused(run("restore", tmp_path / "no.db", path), "no environment at")
+    server = "postgresql://me:secret@host/plant"
+    assert "secret" not in refused(run("backup", server, "copy.db"), "pg_dump")
+    refused(run("backup", path, server), "not a file")
+    refused(run("restore", path, server), "pg_restore")
+    refused(run("restore", server, path), "not a file")
+    assert files(tmp_path) == before

@@ -1,0 +1,223 @@
+"""What is stored is believed only as far as it can be; `hapticdb check` finds the rest."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+from collections.abc import Callable
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import apsw
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import hapticdb
+from command_line import Run, run  # noqa: F401 - a fixture
+from crafted import CRAFTED, GRID, OF_BRICKS, edited, made
+from hapticdb import Grid, PointShell
+from hapticdb.store import believed
+from hapticdb.store.base import Layout
+from hapticdb.store.sqlite.pages import LAYER, PAGE_BYTES
+from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.testing import KINDS, floor_voxels, write_voxels
+from store.test_sqlite_pages import without_checksums
+
+LAYOUTS: tuple[Layout, ...] = ("brick", "voxel")
+CASES = [(layout, name) for layout in LAYOUTS for name in CRAFTED] + [
+    ("brick", name) for name in OF_BRICKS
+]
+
+
+def told(ask: Callable[[], object]) -> str:
+    """What an error of ours says; nothing where there is none. Others pass."""
+    try:
+        ask()
+    except hapticdb.HapticDBError as error:
+        return str(error)
+    return ""
+
+
+def used(path: Path, sphere: PointShell) -> None:
+    """Everything that a user asks of an environment, each by itself; errors of ours may come."""
+    pose = np.eye(4)
+    pose[:3, 3] = 0.06, 0.06, 0.21
+    with hapticdb.open(path) as env:
+        for ask in (
+            env.objects,
+            lambda: env.touch(sphere, pose, "array").objects,
+            lambda: env.touch(sphere, pose, "statement").objects,
+            lambda: env.touch(sphere, pose, "cbgroup").objects,
+            lambda: env.touch(sphere, pose).pairs,
+            lambda: list(env.store.changes()),
+            lambda: env.voxels(2),
+            lambda: env.store.costs("elsewhere"),
+            lambda: env.quantiles(10),
+            env.size,
+            env.freshness,
+            lambda: env.remove(2),
+            env.analyze,
+        ):
+            said = told(ask)
+            assert "\n" not in said
+            assert len(said) < 500
+
+
+@pytest.mark.parametrize(("layout", "name"), CASES)
+def test_a_crafted_environment_is_told_in_one_line_and_found_by_check(
+    tmp_path: Path, sphere: PointShell, layout: Layout, name: str
+) -> None:
+    path = made(tmp_path / "e.db", layout)
+    edited(path, (CRAFTED | OF_BRICKS)[name], layout)
+    report = hapticdb.check_environment(path)
+    assert not report.is_sound
+    assert all("\n" not in finding for finding in report.findings)
+    assert "\n" not in told(lambda: used(path, sphere))
+
+
+@pytest.mark.parametrize(("layout", "curve"), KINDS)
+@pytest.mark.parametrize("bits", [1, 2, 6])
+def test_a_sound_environment_stays_sound_through_edits(
+    tmp_path: Path, layout: Layout, curve: hapticdb.grid.CurveName, bits: int
+) -> None:
+    grid = Grid(0.01, (-0.1, 0.2, 0.0), bits, curve)
+    rng = np.random.default_rng(bits)
+    with hapticdb.create(tmp_path / "e.db", grid, layout=layout) as env:
+        for seed in range(4):
+            voxels = rng.integers(0, grid.side, (40, 3))
+            write_voxels(env.store, np.unique(voxels, axis=0), f"{seed}")
+        env.remove(2)
+        env.analyze()
+        report = hapticdb.check_environment(env.url)
+        assert report.findings == []
+        assert report.voxels == sum(obj.voxels for obj in env.objects())
+        assert (report.objects, report.without_row_checksums) == (3, 0)
+        assert report.has_page_checksums
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_damaged_page_is_found(tmp_path: Path, layout: Layout) -> None:
+    """Those that nothing reads, too."""
+    path = made(tmp_path / "e.db", layout)
+    whole = path.read_bytes()
+    for number in range(1, len(whole) // PAGE_BYTES + 1):
+        content = bytearray(whole)
+        content[number * PAGE_BYTES - 100] ^= 1
+        path.write_bytes(content)
+        report = hapticdb.check_environment(path)
+        assert f"page {number} is not what was written" in report.findings
+
+
+def everything(path: Path) -> list[object]:
+    """Objects and rows of an environment."""
+    with hapticdb.open(path, read_only=True) as env:
+        rows = env.store.scan(np.zeros(1, np.int64), np.full(1, 1 << 62))
+        objects = [(o.id, o.name, o.voxels, o.bounds.tolist()) for o in env.objects()]
+        return [objects, rows.keys.tolist(), rows.ids.tolist()]
+
+
+def test_an_earlier_state_of_a_page_is_found(tmp_path: Path) -> None:
+    """Its checksum fits, since it was written there; what it holds does not fit the rest."""
+    path = made(tmp_path / "e.db", "voxel")
+    before = path.read_bytes()
+    with hapticdb.open(path) as env:
+        env.remove(1)
+        write_voxels(env.store, np.argwhere(np.ones((24, 24, 8))) + 60, "c")
+    after = path.read_bytes()
+    truth = everything(path)
+    n_found = n_stale = 0
+    for start in range(PAGE_BYTES, min(len(before), len(after)), PAGE_BYTES):
+        stop = start + PAGE_BYTES
+        if before[start:stop] != after[start:stop]:
+            path.write_bytes(after[:start] + before[start:stop] + after[stop:])
+            n_stale += 1
+            if hapticdb.check_environment(path).is_sound:
+                assert everything(path) == truth  # it is a free page, or one of statistics
+            else:
+                n_found += 1
+    assert n_found > n_stale / 2 > 5
+
+
+def test_commits_behind_a_broken_frame_of_the_log_are_found(tmp_path: Path) -> None:
+    """After a crash SQLite leaves them out in silence."""
+    path = tmp_path / "e.db"
+    with hapticdb.create(path, GRID) as env:
+        for name in "abc":
+            write_voxels(env.store, floor_voxels(GRID), name)
+        main, log = path.read_bytes(), bytearray(Path(f"{path}-wal").read_bytes())
+    log[32 + 24 + 300] ^= 1
+    path.write_bytes(main)
+    Path(f"{path}-wal").write_bytes(log)
+    report = hapticdb.check_environment(path)
+    assert any("frame 1 of its -wal" in finding for finding in report.findings)
+
+
+def test_check_speaks_by_its_exit_code(tmp_path: Path, run: Run) -> None:
+    path = made(tmp_path / "sound.db", "brick")
+    code, out, _ = run("check", path)
+    assert (code, out.count("\n")) == (0, 1)
+    assert "is sound: 2 objects" in out
+    edited(path, CRAFTED["a wrong count"], "brick")
+    code, out, _ = run("check", path)
+    assert code == 1
+    assert "object 2 (b) has" in out
+    assert "1 finding" in out
+    code, out, _ = run("check", path, "--json")
+    assert code == 1
+    assert json.loads(out)["sound"] is False
+    (tmp_path / "text.db").write_text("x,y\n" * 100)
+    assert run("check", tmp_path / "text.db")[0] == 2
+    assert run("check", tmp_path / "none.db")[0] == 2
+
+
+numbers = st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=3)
+values = numbers | st.binary(max_size=200) | st.lists(numbers, max_size=17)
+
+
+@given(row=st.lists(values, min_size=9, max_size=9))
+def test_whatever_a_row_holds_it_is_an_object_or_one_error(row: list[object]) -> None:
+    for read, wanted in (
+        (believed.object_of, row),
+        (believed.change_of, row[:4]),
+    ):
+        said = told(partial(read, "e.db", wanted))
+        assert "\n" not in said
+    for ask in (
+        lambda: believed.histogram_of("e.db", row[0], row[1]),
+        lambda: believed.figures_of("e.db", row[2]),
+        lambda: believed.grid_of("e.db", [row[:7]]),
+    ):
+        said = told(ask)
+        assert said == "" or said.startswith("e.db is damaged")
+
+
+def test_info_tells_of_checksums(tmp_path: Path, run: Run) -> None:
+    path = made(tmp_path / "e.db", "brick")
+    assert "checksums" in run("info", path)[1]
+    assert json.loads(run("info", path, "--json")[1])["page_checksums"] is True
+    old = without_checksums(path)
+    assert "none of pages; 'hapticdb copy'" in run("info", old)[1].replace("\n", " ")
+    assert "its pages carry no checksums" in run("check", old)[1]
+
+
+def test_a_store_says_how_to_get_checksums(tmp_path: Path, run: Run) -> None:
+    path = made(tmp_path / "e.db", "brick")
+    edited(path, "UPDATE object SET attributes = '{}' WHERE id = 1", "brick")
+    code, out, _ = run("check", path)
+    assert code == 0
+    assert "1 object without checksums: 'hapticdb copy'" in out
+    assert isinstance(SQLiteStore.open(path).objects()[0].attributes, dict)
+
+
+def test_damage_that_a_fetching_process_reads_is_one_line(tmp_path: Path) -> None:
+    path = made(tmp_path / "e.db", "brick")
+    with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
+        root = connection.execute("SELECT rootpage FROM sqlite_master WHERE name = 'brick'").get
+    content = bytearray(path.read_bytes())
+    content[int(root) * PAGE_BYTES - 4000] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(hapticdb.DamagedError, match="is not what was written") as caught:
+        hapticdb.ResidentCells(str(path))
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,275 @@
+"""A connection that ends, at any moment, costs no frame and no write, and none counts twice."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import contextlib
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import psycopg
+import pytest
+
+import hapticdb
+from assemblies import placement
+from children import PATIENCE, child, joined, until
+from command_line import command, command_that_halts, tool, wait_for_an_object
+from crashes import (  # noqa: F401 - fixtures among them
+    EDITS,
+    N_PARTS,
+    PLACE,
+    After,
+    edited,
+    felt,
+    file,
+    server,
+    small,
+    template,
+    undisturbed,
+    url,
+)
+from hapticdb import Environment, PointShell
+from hapticdb.cli import main
+from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.store.base import Layout
+from hapticdb.store.postgres import session
+from hapticdb.store.postgres.private_server import PrivateServer
+from servers import Place
+from validity import Contents, assert_valid, contents, valid_contents
+
+
+class Proxy:
+    """A socket between client and server that cuts the line when a COMMIT comes by.
+
+    forwarded : the server gets that COMMIT, and its answer is lost; not forwarded : it gets none;
+    late : it gets the COMMIT when the client has long been cut off.
+    """
+
+    def __init__(self, server: PrivateServer, folder: Path) -> None:
+        self._target = str((server.folder / "socket").resolve() / ".s.PGSQL.5432")
+        self.url = f"postgresql:///postgres?host={folder}&port=5432&user=hapticdb"
+        self.cut: str | None = None
+        self.n_cuts = 0
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(str(folder / ".s.PGSQL.5432"))
+        self._listener.listen()
+        self._accepting = threading.Thread(target=self._accept, daemon=True)
+        self._accepting.start()
+
+    def close(self) -> None:
+        self._listener.shutdown(socket.SHUT_RDWR)  # a close alone would not wake the other thread
+        joined(self._accepting)
+        self._listener.close()
+
+    def _accept(self) -> None:
+        while True:
+            try:
+                client, _ = self._listener.accept()
+            except OSError:
+                return
+            upstream = socket.socket(socket.AF_UNIX)
+            upstream.connect(self._target)
+            threading.Thread(target=self._up, args=(client, upstream), daemon=True).start()
+            threading.Thread(target=self._pass_on, args=(upstream, client), daemon=True).start()
+
+    def _up(self, client: socket.socket, upstream: socket.socket) -> None:
+        try:
+            while block := client.recv(1 << 16):
+                if b"COMMIT\0" in block and self.cut is not None:
+                    self._cut(client, upstream, block)
+                    return
+                upstream.sendall(block)
+        except OSError:
+            pass
+        with contextlib.suppress(OSError):
+            upstream.shutdown(socket.SHUT_RDWR)
+
+    def _cut(self, client: socket.socket, upstream: socket.socket, block: bytes) -> None:
+        how, self.cut = self.cut, None
+        self.n_cuts += 1
+        client.shutdown(socket.SHUT_RDWR)
+        if how == "late":
+            time.sleep(0.3)
+        if how != "not forwarded":
+            upstream.sendall(block)
+            time.sleep(0.05)
+        with contextlib.suppress(OSError):
+            upstream.shutdown(socket.SHUT_RDWR)
+
+    def _pass_on(self, upstream: socket.socket, client: socket.socket) -> None:
+        try:
+            while block := upstream.recv(1 << 16):
+                client.sendall(block)
+        except OSError:
+            pass
+        client.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", ["forwarded", "not forwarded", "late"])
+def test_a_write_whose_commit_is_not_answered_counts_once(
+    server: PrivateServer, file: Path, edited: list[Contents], how: str
+) -> None:
+    proxy = Proxy(server, server.folder.parent)
+    with small(proxy.url, file) as env:
+        for (_, edit), after in zip(EDITS, edited, strict=True):
+            proxy.cut = how
+            edit(env)
+            assert contents(env) == after
+        obj = env.object(3)
+        rows = env.store.rows_of(3, *(np.array([key]) for key in (0, 2**62)))
+        env.remove(3)
+        proxy.cut = how
+        assert env.store.add(obj, rows) == 3
+        # derived from a revision: done twice, the second would be a conflict
+        proxy.cut = how
+        env.move(3, placement(0.01, 0, 0), revision=env.object(3).revision)
+        assert_valid(env)
+        assert env.store.revision() == N_PARTS + 5
+    assert proxy.n_cuts == 4
+    proxy.close()
+
+
+def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
+    server: PrivateServer, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Ours is lost in its COMMIT; before we are back, another moves the same object."""
+    proxy = Proxy(server, server.folder.parent)
+    with small(url, file) as other, hapticdb.open(proxy.url) as env:
+        reconnect = session.Session._reconnect
+
+        def late(here: session.Session) -> None:
+            if here is env.store.session:  # type: ignore[attr-defined]
+                other.move(7, PLACE)
+            reconnect(here)
+
+        proxy.cut = "not forwarded"
+        with monkeypatch.context() as patch:
+            patch.setattr(session.Session, "_reconnect", late)
+            env.move(7, placement(-0.05, 0, 0))
+        np.testing.assert_array_equal(env.object(7).transform, placement(-0.05, 0, 0))
+        assert_valid(env)
+        assert env.store.revision() == N_PARTS + 2
+    proxy.close()
+
+
+# --- one connection -----------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cut_off(admin: psycopg.Connection) -> Callable[[Environment], None]:
+    """End the process behind an environment's connection, and wait until it is gone."""
+
+    def end(env: Environment) -> None:
+        pid = env.store.session.connection.info.backend_pid  # type: ignore[attr-defined]
+        admin.execute("SELECT pg_terminate_backend(%s, 5000)", (pid,))
+
+    return end
+
+
+CutOff = Callable[[Environment], None]
+
+
+def test_a_connection_that_ends_between_frames_is_made_anew(
+    place: Place, file: Path, sphere: PointShell, cut_off: CutOff
+) -> None:
+    with small(place(), file) as env:
+        for strategy in STRATEGIES:
+            expected = felt(env, sphere, np.eye(4), strategy)
+            cut_off(env)
+            assert felt(env, sphere, np.eye(4), strategy) == expected
+        for ask in (env.objects, env.size, lambda: env.voxels(2), env.quantiles, env.calibrate):
+            cut_off(env)
+            assert ask() is not None
+        for edit in (lambda: env.move(7, PLACE), lambda: env.remove(8), lambda: env.add(file)):
+            cut_off(env)
+            edit()
+        assert_valid(env)
+        assert len(env.objects()) == N_PARTS
+
+
+@pytest.mark.parametrize("strategy", ["points", "statement"])
+def test_a_connection_that_ends_inside_a_frame_costs_nothing_but_time(
+    place: Place,
+    file: Path,
+    sphere: PointShell,
+    cut_off: CutOff,
+    strategy: Strategy,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with small(place(), file) as env:
+        expected = felt(env, sphere, np.eye(4), strategy)
+        for n_statements in (1, 2):
+            with monkeypatch.context() as patch:
+                After(patch, session.Session, "fetch", lambda: cut_off(env), n_statements)
+                assert felt(env, sphere, np.eye(4), strategy) == expected
+
+
+def test_a_snapshot_does_not_go_on_over_another_connection(
+    place: Place, file: Path, cut_off: CutOff
+) -> None:
+    """What came before was read from the lost one, perhaps of another revision."""
+    with small(place(), file) as env:
+        with env.store.snapshot():
+            env.objects()
+            cut_off(env)
+            for _ in range(2):
+                with pytest.raises(hapticdb.ConnectionLostError, match="run the same again"):
+                    env.objects()
+        assert len(env.objects()) == N_PARTS
+        with env.store.snapshot():  # all was read: nothing is lost with the line
+            found = env.objects()
+            cut_off(env)
+        assert len(found) == len(env.objects()) == N_PARTS
+
+
+# --- Ctrl-C -------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_an_interrupted_import_is_finished_by_the_same_command(
+    place: Place, undisturbed: dict[Layout, Contents], tmp_path: Path, file: Path
+) -> None:
+    where = place()
+    text = file.read_text()
+    args = ("import", where, file, "--bits", 7, "--layout", "voxel", "--jobs", 1)
+    with child(command_that_halts(N_PARTS // 2, *args)) as importing:
+        wait_for_an_object(where, importing)
+        importing.send_signal(signal.SIGINT)
+        _, err = importing.communicate(timeout=PATIENCE)
+    assert importing.returncode == 130, err
+    assert err.strip().endswith("the same command goes on from there")
+    assert len(valid_contents(where)[0]) < N_PARTS
+    assert main(["import", where, str(file), "--bits", "7"]) == 0
+    assert valid_contents(where) == undisturbed["voxel"]
+    assert file.read_text() == text
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_interrupted_touch_leaves_nothing_behind(
+    place: Place, file: Path, tmp_path: Path, admin: psycopg.Connection
+) -> None:
+    where = place()
+    small(where, file).close()
+    many = tmp_path / "path.csv"
+    many.write_text("x,y,z,qw,qx,qy,qz\n" + "0,0,0,1,0,0,0\n" * 5_000)
+    stl = tool(tmp_path / "tool.stl")
+    with child(command("touch", where, "--tool", stl, "--poses", many, "--json")) as touching:
+        assert touching.stdout is not None
+        for _ in range(5):
+            touching.stdout.readline()
+        touching.send_signal(signal.SIGINT)
+        _, err = touching.communicate(timeout=PATIENCE)
+    assert touching.returncode == 130, err
+    far, interrupted = err.splitlines()
+    assert far.startswith("hapticdb: no pose comes within ")
+    assert interrupted == "hapticdb: interrupted"
+    left = (
+        "SELECT 1 FROM pg_stat_activity WHERE application_name = 'hapticdb'"
+        " AND query LIKE '%brick%'"
+    )
+    until(lambda: not admin.execute(left).fetchall())

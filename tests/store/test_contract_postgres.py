@@ -1,0 +1,254 @@
+"""PostgreSQL passes the contract, and what is only PostgreSQL's."""
+
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import psycopg
+import pytest
+
+import hapticdb
+from children import PATIENCE
+from hapticdb import Grid
+from hapticdb.query.frame import Strategy
+from hapticdb.store.base import Keys, Layout, Store
+from hapticdb.store.postgres import store as store_module
+from hapticdb.store.postgres.address import parse
+from hapticdb.store.postgres.histogram import exact_histogram
+from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.testing import StoreContract, blob, floor_voxels, write_voxels
+from servers import Place
+
+GRID = Grid(0.005, (0, 0, 0), 6)
+
+
+class TestPostgresStore(StoreContract):
+    @pytest.fixture(autouse=True)
+    def _place(self, place: Place) -> None:
+        self.place = place
+        self.urls: dict[str, str] = {}
+
+    def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
+        self.urls[name] = self.place()
+        return PostgresStore.create(self.urls[name], grid, layout)
+
+    def reopen(self, store: Store) -> Store:
+        return PostgresStore.open(store.url, read_only=True)
+
+
+@pytest.fixture
+def url(place: Place) -> str:
+    """A small environment, closed."""
+    where = place()
+    store = PostgresStore.create(where, GRID)
+    write_voxels(store, floor_voxels(GRID))
+    store.close()
+    return where
+
+
+def test_creating_never_replaces_an_environment(url: str) -> None:
+    with pytest.raises(hapticdb.EnvironmentExistsError, match="exists already"):
+        hapticdb.create(url, GRID)
+    with hapticdb.open(url) as env:
+        assert len(env.objects()) == 1
+
+
+def test_what_is_not_there_is_told(place: Place) -> None:
+    with pytest.raises(hapticdb.EnvironmentNotFoundError, match="hapticdb import"):
+        hapticdb.open(place())
+
+
+def test_a_foreign_schema_is_told_apart_and_left_alone(
+    place: Place, admin: psycopg.Connection
+) -> None:
+    where = place()
+    name = parse(where).environment
+    admin.execute(f"CREATE SCHEMA {name} CREATE TABLE theirs (a int)")
+    with pytest.raises(hapticdb.NotAnEnvironmentError, match="no hapticdb environment"):
+        hapticdb.open(where)
+    with pytest.raises(hapticdb.EnvironmentExistsError):
+        hapticdb.create(where, GRID)
+    assert admin.execute(f"SELECT count(*) FROM {name}.theirs").fetchone() == (0,)
+
+
+def test_a_newer_format_is_refused(url: str, admin: psycopg.Connection) -> None:
+    admin.execute(f"UPDATE {parse(url).environment}.environment SET format = 99")
+    with pytest.raises(hapticdb.NewerVersionError, match="install a newer"):
+        hapticdb.open(url)
+
+
+def test_an_environment_of_format_2_is_read_as_it_is_and_brought_up_to_date_by_its_owner(
+    url: str, admin: psycopg.Connection
+) -> None:
+    name = parse(url).environment
+    for what in ("TABLE {0}.removed", "FUNCTION {0}.note_removed", "FUNCTION {0}.removed_parts"):
+        admin.execute(f"DROP {what.format(name)} CASCADE")
+    admin.execute(f"UPDATE {name}.environment SET format = 2")
+    with hapticdb.open(url, read_only=True) as env:
+        (obj,) = env.objects()
+        assert env.store.removed(obj.link) == set()
+    with hapticdb.open(url) as env:
+        env.remove(obj.id)
+        assert env.store.removed(obj.link) == {obj.name}
+
+
+def test_a_dropped_table_is_damage(url: str, admin: psycopg.Connection) -> None:
+    admin.execute(f"DROP TABLE {parse(url).environment}.brick")
+    with pytest.raises(hapticdb.DamagedError, match="is damaged"):
+        hapticdb.open(url, read_only=True).store.lookup(np.arange(9))
+
+
+def test_a_read_only_environment_refuses_to_be_written(url: str) -> None:
+    env = hapticdb.open(url, read_only=True)
+    with pytest.raises(hapticdb.ReadOnlyError, match="opened to read"):
+        env.remove(1)
+    with pytest.raises(hapticdb.ReadOnlyError):
+        env.store.save_costs("here", {})
+
+
+def test_no_other_thread_may_use_it(url: str) -> None:
+    env = hapticdb.open(url, read_only=True)
+    with ThreadPoolExecutor(1) as pool, pytest.raises(hapticdb.UsageError, match="thread"):
+        pool.submit(env.objects).result(PATIENCE)
+
+
+def test_rows_that_come_without_an_index_are_sorted(url: str, admin: psycopg.Connection) -> None:
+    store = PostgresStore.open(url)
+    for n in range(3):
+        write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
+    everywhere = [np.array([b], dtype=np.int64) for b in (0, 2**62)]
+    before = store.scan(*everywhere)
+    admin.execute(f"DROP INDEX {parse(url).environment}.brick_key")
+    for found, expected in zip(store.scan(*everywhere), before, strict=True):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_a_left_out_index_is_made_when_it_is_opened_to_write(
+    url: str, admin: psycopg.Connection
+) -> None:
+    name = parse(url).environment
+    admin.execute(f"DROP INDEX {name}.brick_key")
+    hapticdb.open(url, read_only=True).close()
+    assert admin.execute("SELECT to_regclass(%s)", (f"{name}.brick_key",)).fetchone() == (None,)
+    hapticdb.open(url).close()
+    assert admin.execute("SELECT to_regclass(%s)", (f"{name}.brick_key",)).fetchone() != (None,)
+
+
+def test_two_loaders_that_end_together_both_succeed(place: Place) -> None:
+    where = place()
+    PostgresStore.create(where, GRID).close()
+    barrier = threading.Barrier(2)
+
+    def load(n: int) -> None:
+        store = PostgresStore.open(where)
+        with store.loading():
+            write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
+            barrier.wait(PATIENCE)
+        store.close()
+
+    with ThreadPoolExecutor(2) as pool:
+        list(pool.map(load, range(2), timeout=PATIENCE))
+    store = PostgresStore.open(where)
+    assert len(store.objects()) == 2
+    # no loader's lock is left: the next killed one can be mended
+    free = store.session.rows(
+        "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND classid::bigint = %s"
+        " AND objid::bigint = ('environment'::regclass::oid::bigint + 2147483648) %% 4294967296",
+        (0x48415054,),
+    )
+    assert free == [(0,)]
+
+
+def test_an_environment_that_another_has_written_to_is_not_discarded(place: Place) -> None:
+    where = place()
+    first = PostgresStore.create(where, GRID)
+    second = PostgresStore.open(where)
+    write_voxels(second, blob(1, (30, 30, 30)))
+    first.discard()
+    assert len(second.objects()) == 1
+
+
+def test_an_environment_that_another_is_loading_is_not_discarded(place: Place) -> None:
+    where = place()
+    first = PostgresStore.create(where, GRID)
+    second = PostgresStore.open(where)
+    with second.loading():
+        first.discard()
+        write_voxels(second, blob(1, (30, 30, 30)))
+    assert len(second.objects()) == 1
+
+
+@pytest.mark.parametrize("name", ["a%24%24b", "pg_mine", "public", "", "a%0Ab", "x\udcff"])
+def test_what_cannot_be_a_name_is_refused(database: str, name: str) -> None:
+    where = f"{database}{'&' if '?' in database else '?'}environment={name}"
+    with pytest.raises(hapticdb.UsageError, match="environment's name"):
+        hapticdb.create(where, GRID)
+
+
+def test_an_object_that_another_has_added_can_be_left_out(url: str) -> None:
+    """Also by a frame outside the grid, which asks the database nothing."""
+    env = hapticdb.open(url, read_only=True)
+    shell = hapticdb.PointShell(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros(3))
+    far = np.eye(4)
+    far[:3, 3] = 100
+    env.touch(shell, far)
+    added = write_voxels(PostgresStore.open(url), blob(1, (30, 30, 30)), "two")
+    strategies: list[Strategy] = ["array", "statement"]
+    for strategy in strategies:
+        assert not len(env.touch(shell, far, strategy, exclude=[added]).hits)
+
+
+def test_tiny_components_of_normals_end_as_in_the_kernels(url: str) -> None:
+    """PostgreSQL raises where a product underflows."""
+    env = hapticdb.open(url, read_only=True)
+    center = GRID.centers(np.array([[32, 32, 31]]))[0]
+    shell = hapticdb.PointShell(
+        np.array([[0, 0, -0.001], [0, 1e-200, -0.002]]),
+        np.array([[5e-324, -1e-160, 1.0], [1e-120, 0.0, 1.0]]),
+        np.array([0, 0, 1e-250]),
+    )
+    pose = np.eye(4)
+    pose[:3, 3] = center
+    by_kernel = env.touch(shell, pose, "array")
+    by_server = env.touch(shell, pose, "statement")
+    assert len(by_kernel.hits) == 2
+    assert by_kernel.force.tobytes() == by_server.force.tobytes()
+    assert by_kernel.torque.tobytes() == by_server.torque.tobytes()
+
+
+def test_names_may_be_long(url: str) -> None:
+    store = PostgresStore.open(url)
+    name = "".join(chr(0x4E00 + n % 20000) for n in range(4000))
+    write_voxels(store, blob(1, (30, 30, 30)), name)
+    with pytest.raises(hapticdb.EnvironmentExistsError):
+        write_voxels(store, blob(2, (30, 30, 30)), name)
+
+
+def test_statistics_carry_the_revision_that_they_were_made_at(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store, other = PostgresStore.open(url), PostgresStore.open(url)
+
+    def slow(session: Session, layout: Layout, resolution: int) -> tuple[Keys, int]:
+        found = exact_histogram(session, layout, resolution)
+        write_voxels(other, blob(1, (30, 30, 30)), "meanwhile")
+        return found
+
+    monkeypatch.setattr(store_module, "exact_histogram", slow)
+    store.analyze(10)
+    monkeypatch.undo()
+    assert store.freshness(10).changes == 1
+    assert store.quantiles(10).source == "computed"
+
+
+def test_a_database_of_another_encoding_serves(place: Place, admin: psycopg.Connection) -> None:
+    admin.execute("DROP DATABASE IF EXISTS other_encoding")
+    admin.execute(
+        "CREATE DATABASE other_encoding ENCODING 'SQL_ASCII' LOCALE 'C' TEMPLATE template0"
+    )
+    where = place().replace("/postgres?", "/other_encoding?")
+    with hapticdb.create(where, GRID) as env:
+        write_voxels(env.store, blob(1, (30, 30, 30)), "中")
+        assert [obj.name for obj in env.objects()] == ["中"]
+    admin.execute("DROP DATABASE other_encoding")

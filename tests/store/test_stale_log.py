@@ -1,0 +1,403 @@
+"""A log belongs to one file: no other is opened with it, and that one always is."""
+
+import os
+import shutil
+import signal
+import sqlite3
+import sys
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import apsw
+import numpy as np
+import pytest
+
+import hapticdb
+from children import child, exit_code, finished
+from hapticdb import Grid
+from hapticdb.store.schema import MIGRATIONS
+from hapticdb.store.sqlite import log as sqlite_log
+from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.testing import blob, floor_voxels, write_voxels
+from old_formats import make_old
+
+GRID = Grid(0.005, (0, 0, 0), 6)
+ALL = np.array([0]), np.array([2**62])
+
+
+def write(store: SQLiteStore, *numbers: int) -> None:
+    for n in numbers:
+        write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
+
+
+def killed(path: Path, work: Callable[[SQLiteStore], None]) -> None:
+    """Do something to a database in a process that dies of it."""
+    pid = os.fork()
+    if pid == 0:  # everything is imported, and nothing is started: safe here, as a test
+        try:
+            store = SQLiteStore.open(path)  # held until the end: whoever lets go of it closes it
+            work(store)
+        finally:
+            os.kill(os.getpid(), signal.SIGKILL)
+    assert exit_code(pid) == -signal.SIGKILL
+
+
+def names(path: Path, *, read_only: bool = True) -> list[str]:
+    with hapticdb.open(path, read_only=read_only) as env:
+        return [obj.name for obj in env.objects()]
+
+
+def folder_bytes(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """A small environment, closed."""
+    store = SQLiteStore.create(tmp_path / "q.db", GRID)
+    write_voxels(store, floor_voxels(GRID), "floor")
+    store.close()
+    return tmp_path / "q.db"
+
+
+@pytest.fixture
+def stale(path: Path, tmp_path: Path) -> Path:
+    """An old copy of an environment in its place, under the log of a writer that was killed."""
+    shutil.copy(path, tmp_path / "backup")
+    with closing(SQLiteStore.open(path)) as store:
+        write(store, 1, 2)
+    killed(path, lambda store: write(store, 3, 4))
+    shutil.copy(path, tmp_path / "former")
+    shutil.copy(tmp_path / "backup", path)
+    return path
+
+
+# --- a file in another's place --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("read_only", [False, True])
+def test_an_old_copy_under_a_newer_log_is_refused_and_left_alone(
+    stale: Path, read_only: bool
+) -> None:
+    before = folder_bytes(stale.parent)
+    with pytest.raises(hapticdb.DamagedError, match=r"q\.db-wal and q\.db-shm.*restore") as told:
+        hapticdb.open(stale, read_only=read_only)
+    assert "\n" not in str(told.value)
+    assert folder_bytes(stale.parent) == before
+
+
+def test_a_link_to_such_a_file_is_refused_too(stale: Path, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "elsewhere" / "link.db"
+    link.symlink_to(stale)
+    with pytest.raises(hapticdb.DamagedError, match=r"q\.db-wal"):
+        hapticdb.open(link)
+
+
+def test_it_is_the_copy_once_the_log_is_removed(stale: Path) -> None:
+    for suffix in ("-wal", "-shm"):
+        Path(f"{stale}{suffix}").unlink()
+    assert names(stale, read_only=False) == ["floor"]
+
+
+def test_nothing_is_lost_once_the_former_file_is_put_back(stale: Path) -> None:
+    shutil.copy(stale.with_name("former"), stale)
+    assert names(stale) == ["floor", "blob 1", "blob 2", "blob 3", "blob 4"]
+
+
+@pytest.mark.parametrize("other", ["environment", "database"])
+def test_another_database_under_a_log_is_refused(stale: Path, other: str) -> None:
+    stale.unlink()
+    if other == "environment":
+        SQLiteStore.create(stale.with_name("other.db"), GRID).close()
+        stale.with_name("other.db").rename(stale)
+    else:
+        with closing(sqlite3.connect(stale.with_name("other.db"))) as plain, plain:
+            plain.execute("PRAGMA page_size = 8192")
+            plain.execute("CREATE TABLE t (a)")
+        stale.with_name("other.db").rename(stale)
+    with pytest.raises(hapticdb.DatabaseError, match=r"-wal|no hapticdb environment"):
+        hapticdb.open(stale)
+
+
+def test_a_copy_from_before_format_2_is_refused_under_a_newer_log(stale: Path) -> None:
+    make_old(stale.with_name("backup"))
+    shutil.copy(stale.with_name("backup"), stale)
+    with pytest.raises(hapticdb.DamagedError, match="-wal"):
+        hapticdb.open(stale)
+
+
+def test_a_file_without_its_log_is_as_the_last_checkpoint_left_it(path: Path) -> None:
+    killed(path, lambda store: write(store, 1))
+    Path(f"{path}-wal").unlink()
+    assert names(path, read_only=False) == ["floor"]
+
+
+def test_a_file_copied_over_one_that_is_being_written_is_noticed_by_the_next_write(
+    path: Path, tmp_path: Path
+) -> None:
+    shutil.copy(path, tmp_path / "backup")
+    with closing(SQLiteStore.open(path)) as store:
+        write(store, 1)
+    store = SQLiteStore.open(path)
+    write(store, 2)
+    shutil.copy(tmp_path / "backup", path)  # into the same inode
+    with pytest.raises(hapticdb.DamagedError, match="-wal"):
+        write(store, 3)
+    store.close()
+    assert path.read_bytes() == (tmp_path / "backup").read_bytes()
+    with pytest.raises(hapticdb.DamagedError, match="-wal"):
+        hapticdb.open(path)
+
+
+# --- a file with its own log ----------------------------------------------------------------------
+
+
+def test_a_file_of_format_1_is_read_as_it_is_and_brought_up_to_date_by_a_writer(path: Path) -> None:
+    make_old(path)
+    before = path.read_bytes()
+    assert names(path) == ["floor"]
+    assert path.read_bytes() == before
+    assert sqlite_log.file_mark(path) == sqlite_log.NO_MARK
+    killed(path, lambda store: write(store, 1))
+    assert names(path) == ["floor", "blob 1"]
+    with closing(SQLiteStore.open(path)) as store:
+        write(store, 2)
+    assert sqlite_log.file_mark(path) != sqlite_log.NO_MARK
+    with closing(sqlite3.connect(path)) as plain:
+        assert plain.execute("PRAGMA user_version").fetchone() == (len(MIGRATIONS),)
+
+
+def test_a_log_of_format_1_is_applied_to_its_file(path: Path) -> None:
+    make_old(path)
+    script = (
+        "import os, sqlite3, sys\n"
+        "plain = sqlite3.connect(sys.argv[1])\n"
+        "plain.execute(\"UPDATE object SET name = 'ground'\")\n"
+        "plain.commit()\n"
+        "os.kill(os.getpid(), 9)\n"
+    )
+    finished([sys.executable, "-c", script, str(path)])
+    assert Path(f"{path}-wal").stat().st_size
+    assert names(path) == ["ground"]
+    assert names(path, read_only=False) == ["ground"]
+
+
+def test_a_log_with_a_vacuum_in_it_is_applied_to_its_file(path: Path) -> None:
+    def work(store: SQLiteStore) -> None:
+        write(store, 1)
+        store._connection.execute("VACUUM")
+        write(store, 2)
+        store._connection.execute("VACUUM")
+
+    killed(path, work)
+    assert names(path, read_only=False) == ["floor", "blob 1", "blob 2"]
+
+
+def test_every_commit_draws_a_new_mark(path: Path) -> None:
+    marks = set()
+    with closing(SQLiteStore.open(path)) as store:
+        works: list[Callable[[], object]] = [
+            lambda: write(store, 1),
+            lambda: store.remove(1, lambda _: [(0, 2**62)]),
+            lambda: store.save_costs("here", {}),
+            lambda: store.analyze(10),
+        ]
+        for work in works:
+            work()
+            ((lineage,),) = store._fetch("SELECT lineage FROM environment")
+            marks.add(lineage[:16])
+            assert lineage[16:] in {*marks, sqlite_log.file_mark(path)}
+    assert len(marks) == 4
+
+
+# --- crashes at every moment ----------------------------------------------------------------------
+
+
+class Tape(apsw.VFS):
+    """The operating system's files, with all writes to them in the order in which they came."""
+
+    def __init__(self) -> None:
+        self.steps: list[tuple[str, int, bytes | None]] = []
+        super().__init__("tape", "", makedefault=True)
+
+    def xOpen(self, name: Any, flags: Any) -> "TapedFile":  # noqa: ANN401, N802 - apsw's
+        return TapedFile(self, name, flags)
+
+
+class TapedFile(apsw.VFSFile):
+    """One file; a write of None is a sync, at -1 a truncation."""
+
+    def __init__(self, tape: Tape, name: Any, flags: Any) -> None:  # noqa: ANN401 - apsw's
+        super().__init__("unix", name, flags)
+        self._tape, self._name = tape, name if isinstance(name, str) else name.filename()
+
+    def xWrite(self, data: bytes, offset: int) -> None:  # noqa: N802 - apsw's
+        super().xWrite(data, offset)
+        self._tape.steps.append((self._name, offset, bytes(data)))
+
+    def xSync(self, flags: int) -> None:  # noqa: N802 - apsw's
+        super().xSync(flags)
+        self._tape.steps.append((self._name, 0, None))
+
+    def xTruncate(self, size: int) -> None:  # noqa: N802 - apsw's
+        super().xTruncate(size)
+        self._tape.steps.append((self._name, -1, size.to_bytes(8)))
+
+
+@pytest.fixture(scope="module")
+def taped(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], Tape]:
+    """A database before some writing, and all writes to it and its log.
+
+    Several connections, several generations of the log, checkpoints in the midst of one.
+    """
+    path = tmp_path_factory.mktemp("taped") / "q.db"
+    store = SQLiteStore.create(path, GRID)
+    write_voxels(store, floor_voxels(GRID), "floor")
+    store.close()
+    start = {"q.db": path.read_bytes(), "q.db-wal": b""}
+    tape = Tape()
+    try:
+        store, other = SQLiteStore.open(path), SQLiteStore.open(path)
+        reader = SQLiteStore.open(path, read_only=True)
+        for n in range(32):
+            writing = (store, other)[n % 3 == 0]
+            write(writing, n)
+            if n % 4 == 3:
+                writing.remove(writing.objects()[1].id, lambda _: [(0, 2**62)])
+            if n % 8 == 5:
+                with reader.snapshot():  # which keeps the log from being begun anew
+                    reader.objects()
+                    writing._connection.wal_checkpoint()
+                    write(writing, 100 + n)
+                    writing._connection.wal_checkpoint()
+                write(writing, 200 + n)
+            if n % 8 == 7:
+                writing._connection.wal_checkpoint()
+        for each in (reader, store, other):
+            each.close()
+    finally:
+        tape.unregister()
+    return start, tape
+
+
+def apply(files: dict[str, bytearray], step: tuple[str, int, bytes | None]) -> None:
+    name, offset, content = step
+    file = files.get(Path(name).name)
+    if file is None or content is None:
+        return
+    if offset < 0:
+        del file[int.from_bytes(content) :]
+        return
+    file.extend(bytes(max(offset + len(content) - len(file), 0)))
+    file[offset : offset + len(content)] = content
+
+
+def lay_out(folder: Path, files: dict[str, bytearray]) -> Path:
+    for name, content in files.items():
+        (folder / name).write_bytes(content)
+    (folder / "q.db-shm").unlink(missing_ok=True)
+    return folder / "q.db"
+
+
+def test_a_log_is_never_refused_after_a_kill_between_any_two_writes(
+    taped: tuple[dict[str, bytes], Tape], tmp_path: Path
+) -> None:
+    start, tape = taped
+    files = {name: bytearray(content) for name, content in start.items()}
+    n_objects: list[int] = []
+    generations = set()
+    for n, step in enumerate(tape.steps):
+        apply(files, step)
+        path = lay_out(tmp_path, files)
+        sqlite_log.check_log(path)
+        generations.add(bytes(files["q.db-wal"][16:24]))
+        if n % 25 == 0:
+            n_objects.append(len(names(path, read_only=False)))
+    assert len(tape.steps) > 500
+    assert len(generations) >= 3
+    assert len(set(n_objects)) > 10
+
+
+def test_a_log_is_never_refused_after_a_loss_of_power(
+    taped: tuple[dict[str, bytes], Tape], tmp_path: Path
+) -> None:
+    """Of what was written to a file since it was synced, any sectors of 512 bytes are there."""
+    start, tape = taped
+    rng = np.random.default_rng(0)
+    files = {name: bytearray(content) for name, content in start.items()}
+    pending: list[tuple[str, int, bytes | None]] = []
+    for n, step in enumerate(tape.steps):
+        name, offset, content = step
+        if content is None or offset < 0:
+            for late in [other for other in pending if other[0] == name]:
+                apply(files, late)
+            pending = [other for other in pending if other[0] != name]
+            apply(files, step)
+            continue
+        pending += [
+            (name, offset + at, content[at : at + 512]) for at in range(0, len(content), 512)
+        ]
+        if n % 3 == 0:
+            torn = {key: bytearray(value) for key, value in files.items()}
+            share = rng.uniform(0, 1)
+            for late in pending:
+                if rng.uniform() < share:
+                    apply(torn, late)
+            path = lay_out(tmp_path, torn)
+            sqlite_log.check_log(path)
+            if n % 60 == 0:
+                names(path, read_only=False)
+
+
+def test_every_older_copy_is_refused(taped: tuple[dict[str, bytes], Tape], tmp_path: Path) -> None:
+    """Under the last log, any file but the one that it was begun on."""
+    start, tape = taped
+    files = {name: bytearray(content) for name, content in start.items()}
+    last = max(
+        n
+        for n, (name, offset, content) in enumerate(tape.steps)
+        if name.endswith("-wal") and offset == 0 and content
+    )
+    olds, base = [], sqlite_log.NO_MARK
+    for n, step in enumerate(tape.steps):
+        if n == last:
+            base = sqlite_log.file_mark(lay_out(tmp_path, files)) or base
+        apply(files, step)
+        if n % 40 == 0 and n < last:
+            olds.append(bytes(files["q.db"]))
+    refused = 0
+    for old in olds:
+        path = lay_out(tmp_path, files | {"q.db": bytearray(old)})
+        if sqlite_log.file_mark(path) != base:
+            with pytest.raises(hapticdb.DamagedError):
+                sqlite_log.check_log(path)
+            refused += 1
+    assert refused > 5
+
+
+@pytest.mark.long
+def test_nothing_committed_is_refused_or_lost_by_kills_at_random(path: Path) -> None:
+    script = (
+        "import sys\n"
+        "from hapticdb.store.sqlite.store import SQLiteStore\n"
+        "from hapticdb.testing import blob, write_voxels\n"
+        "store = SQLiteStore.open(sys.argv[1])\n"
+        "store._connection.wal_autocheckpoint(20)\n"
+        "for n in range(10**6):\n"
+        "    write_voxels(store, blob(n, (30, 30, 30)), f'{sys.argv[2]} {n}')\n"
+        "    print(n, flush=True)\n"
+    )
+    rng = np.random.default_rng(1)
+    expected = {"floor"}
+    for turn in range(4):
+        with child([sys.executable, "-c", script, str(path), str(turn)]) as writer:
+            assert writer.stdout is not None
+            heard = [writer.stdout.readline() for _ in range(int(rng.integers(1, 60)))]
+            writer.kill()
+            heard += writer.stdout.readlines()
+        expected |= {f"{turn} {line.strip()}" for line in heard if line.endswith("\n")}
+        assert expected <= set(names(path))
+    assert len(expected) > 20

@@ -1,0 +1,419 @@
+"""A reader learns that others have written: what the contract leaves to each engine."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import contextlib
+import itertools
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import psycopg
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from psycopg import sql
+
+import hapticdb
+from children import finished, joined
+from crashes import server, template  # noqa: F401 - fixtures
+from hapticdb import Grid
+from hapticdb.store.base import SupportsWatch
+from hapticdb.store.connect import create_store, grant, open_store
+from hapticdb.store.postgres import watching
+from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment
+from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.postgres.schema_of import drop
+from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres.watching import channel_of
+from hapticdb.store.sqlite import place as sqlite_place
+from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.testing import is_noticed, write_voxels
+from servers import Place
+
+ROOT = Path(__file__).parent.parent.parent
+GRID = Grid(0.005, (0, 0, 0), 7)
+VOXEL = np.array([[1, 2, 3]])
+WRITE = """
+import sys
+import numpy as np
+from hapticdb.store.connect import open_store
+from hapticdb.testing import write_voxels
+write_voxels(open_store(sys.argv[1]), np.array([[4, 5, 6]]), "of another process")
+"""
+
+
+@pytest.fixture
+def url(place: Place) -> str:
+    """An empty environment on a server."""
+    where = place()
+    create_store(where, GRID).close()
+    return where
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> str:
+    """An empty environment in a file."""
+    create_store(tmp_path / "e.db", GRID).close()
+    return str(tmp_path / "e.db")
+
+
+numbers = itertools.count()
+
+
+def write(where: str) -> None:
+    with hapticdb.open(where) as env:
+        write_voxels(env.store, VOXEL, f"{next(numbers)}")
+
+
+# --- both engines -------------------------------------------------------------------------------
+
+
+def test_a_commit_of_another_process_is_noticed_by_one_that_only_watches(
+    file: str, url: str
+) -> None:
+    for where in (file, url):
+        with contextlib.closing(open_store(where, read_only=True)) as reader:
+            assert isinstance(reader, SupportsWatch)
+            reader.watch()
+            finished([sys.executable, "-c", WRITE, where], check=True)
+            assert is_noticed(reader)
+            assert not reader.has_changed()
+
+
+def test_who_did_not_begin_to_watch_is_told_to_look(file: str, url: str) -> None:
+    for where in (file, url):
+        with contextlib.closing(open_store(where, read_only=True)) as reader:
+            assert isinstance(reader, SupportsWatch)
+            assert reader.has_changed()
+            assert not reader.has_changed()
+
+
+def test_a_closed_reader_is_told_so(file: str, url: str) -> None:
+    for where in (file, url):
+        reader = open_store(where, read_only=True)
+        assert isinstance(reader, SupportsWatch)
+        reader.watch()
+        reader.close()
+        for ask in (reader.watch, reader.has_changed):
+            with pytest.raises(hapticdb.DatabaseError, match="has been closed: open it again"):
+                ask()
+
+
+# --- SQLite -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("change", [write, lambda path: Path(path).unlink()])
+def test_an_immutable_reader_is_told_by_the_files_stamp(
+    file: str, change: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticdb.store.sqlite.file.needs_immutable", lambda _: True)
+    reader = SQLiteStore.open(file, read_only=True)
+    monkeypatch.undo()
+    reader.watch()
+    assert not reader.has_changed()
+    change(file)
+    for _ in range(2):  # it cannot be read any more: for good
+        assert reader.has_changed()
+        with pytest.raises(hapticdb.BusyError, match="open it again"):
+            reader.objects()
+        with pytest.raises(hapticdb.BusyError, match="open it again"), reader.snapshot():
+            pass
+    reader.close()
+
+
+@pytest.mark.parametrize("is_replaced", [False, True])
+def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
+    file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_replaced: bool
+) -> None:
+    monkeypatch.setattr(sqlite_place, "LOOK_SECONDS", 0.0)
+    reader = SQLiteStore.open(file, read_only=True)
+    reader.watch()
+    assert not reader.has_changed()
+    kept = tmp_path / "kept"
+    Path(file).rename(kept)
+    words = "cannot be reached any more"
+    if is_replaced:
+        create_store(tmp_path / "other.db", GRID).close()
+        (tmp_path / "other.db").rename(file)
+        words = "is another file than before: open it again"
+    for _ in range(2):
+        with pytest.raises(hapticdb.ConnectionLostError, match=words):
+            reader.has_changed()
+    kept.replace(file)
+    assert not reader.has_changed()
+    reader.close()
+
+
+def test_the_changes_since_a_revision_are_found_by_the_primary_key_of_sqlite(file: str) -> None:
+    store = SQLiteStore.open(file)
+    statements: list[str] = []
+    store._connection.trace_v2(1, lambda event: statements.append(event["sql"]))
+    list(store.changes(since=1))
+    (text,) = statements
+    plan = store._connection.execute(f"EXPLAIN QUERY PLAN {text}", (1,)).fetchall()
+    assert [row[3] for row in plan] == ["SEARCH change USING INTEGER PRIMARY KEY (rowid>?)"]
+    store.close()
+
+
+# --- PostgreSQL ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def reader(url: str) -> Iterator[PostgresStore]:
+    """A reader that watches."""
+    store = PostgresStore.open(url, read_only=True)
+    store.watch()
+    yield store
+    store.close()
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Grows by one for each round trip that asks for the revision."""
+    found: list[int] = []
+    ask = watching.Watch._ask
+
+    def counted(watch: watching.Watch) -> bool:
+        found.append(1)
+        return ask(watch)
+
+    monkeypatch.setattr(watching.Watch, "_ask", counted)
+    return found
+
+
+def test_what_is_noticed_by_a_notification_costs_one_round_trip(
+    url: str, reader: PostgresStore, asked: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watching, "HEARING_S", 1e9)
+    reader.watch()
+    asked.clear()
+    for n in range(3):
+        write(url)
+        assert is_noticed(reader)
+        assert not reader.has_changed()
+        assert len(asked) == n + 1
+
+
+def test_notifications_during_reads_neither_disturb_nor_get_lost(
+    url: str, reader: PostgresStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watching, "HEARING_S", 1e9)
+    reader.watch()
+    key = GRID.encode(VOXEL) >> 9
+    n_writes = 50
+
+    def write_many() -> None:
+        with hapticdb.open(url) as env:
+            for _ in range(n_writes):
+                write_voxels(env.store, VOXEL, f"{next(numbers)}")
+
+    writer = threading.Thread(target=write_many, daemon=True)
+    writer.start()
+    seen = 0
+    while writer.is_alive():
+        for n_found in (len(reader.lookup(key)), len(reader.objects())):
+            assert n_found >= seen
+            seen = n_found
+    joined(writer)
+    assert len(reader.lookup(key)) == len(reader.objects()) == n_writes
+    assert is_noticed(reader)
+
+
+def test_a_reader_that_lost_its_connection_listens_again(
+    url: str, reader: PostgresStore, admin: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watching, "HEARING_S", 1e9)
+    for is_used_meanwhile in (False, True):
+        reader.watch()
+        pid = reader.session.connection.info.backend_pid
+        admin.execute("SELECT pg_terminate_backend(%s, 5000)", (pid,))
+        write(url)
+        if is_used_meanwhile:
+            reader.objects()
+        assert is_noticed(reader)
+        assert not reader.has_changed()
+        write(url)
+        assert is_noticed(reader)
+
+
+def test_a_server_that_comes_back_is_found_within_half_a_second(
+    reader: PostgresStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pauses: list[float] = []
+    connect = Session.connect
+
+    def refused_at_first(session: Session) -> None:
+        if len(pauses) < 8:
+            raise hapticdb.ConnectionLostError("refused")
+        connect(session)
+
+    monkeypatch.setattr(Session, "connect", refused_at_first)
+    monkeypatch.setattr(time, "sleep", pauses.append)
+    reader.session.connection.close()
+    assert reader.objects() == []
+    assert len(pauses) == 8
+    assert max(pauses) <= 0.5
+
+
+def test_a_writer_that_does_not_notify_is_noticed_too(
+    url: str, reader: PostgresStore, admin: psycopg.Connection
+) -> None:
+    schema = sql.Identifier(parse(url).environment)
+    raise_it = sql.SQL("UPDATE {}.environment SET revision = revision + 1").format(schema)
+    for _ in range(2):
+        admin.execute(raise_it)
+        assert is_noticed(reader)
+        assert not reader.has_changed()
+
+
+def test_a_server_that_refuses_to_be_listened_to_is_asked_instead(
+    url: str, asked: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    command = Session.command
+
+    def refuse(session: Session, text: str) -> None:
+        if text.startswith("LISTEN"):
+            raise psycopg.errors.ReadOnlySqlTransaction("cannot execute LISTEN during recovery")
+        command(session, text)
+
+    monkeypatch.setattr(Session, "command", refuse)
+    monkeypatch.setattr(watching, "HEARING_S", 1e9)
+    reader = PostgresStore.open(url, read_only=True)
+    reader.watch()
+    for _ in range(2):
+        asked.clear()
+        write(url)
+        assert is_noticed(reader)
+        assert asked
+    reader.close()
+
+
+@pytest.mark.long
+def test_a_standby_tells_of_the_commits_that_it_follows(
+    server: PrivateServer, tmp_path: Path
+) -> None:
+    (tmp_path / "lock").touch(mode=0o600)
+    tmp_path.chmod(0o700)
+    create_store(server.conninfo(), GRID).close()
+    finished(
+        [
+            *(server.binaries.path("pg_basebackup"), "--write-recovery-conf", "--checkpoint=fast"),
+            *(f"--pgdata={tmp_path / 'data'}", f"--dbname={server.conninfo()}"),
+        ],
+        check=True,
+    )
+    replica = PrivateServer.at(tmp_path, server.binaries, {})
+    try:
+        replica.start()
+        reader = PostgresStore.open(replica.conninfo(), read_only=True)
+        reader.watch()
+        for n in range(3):
+            assert not reader.has_changed()
+            write(server.conninfo())
+            assert is_noticed(reader)
+            assert reader.revision() == n + 1
+        reader.close()
+    finally:
+        replica.stop()
+
+
+def test_an_environment_made_anew_is_told_from_the_one_before(
+    url: str, reader: PostgresStore
+) -> None:
+    write(url)
+    assert is_noticed(reader)
+    with contextlib.closing(PostgresStore.open(url)) as store:
+        drop(store.session)
+    create_store(url, GRID).close()
+    write(url)  # the same revision as before
+    for _ in range(2):
+        with pytest.raises(hapticdb.ConnectionLostError, match="another environment than before"):
+            is_noticed(reader)
+    again = PostgresStore.open(url, read_only=True)
+    assert again.identity != reader.identity
+    again.close()
+
+
+def test_the_channel_and_its_payload_are_as_documented(url: str, admin: psycopg.Connection) -> None:
+    page = " ".join((ROOT / "docs" / "format.md").read_text().split())
+    assert "channel `hapticdb_NAME`, NAME being the schema's, with the revision as payload" in page
+    channel = f"hapticdb_{parse(url).environment}"
+    admin.execute(sql.SQL("LISTEN {}").format(sql.Identifier(channel)))
+    write(url)
+    write(url)
+    heard = admin.notifies(timeout=10, stop_after=2)
+    assert [(n.channel, n.payload) for n in heard] == [(channel, "1"), (channel, "2")]
+
+
+@given(st.lists(st.text(min_size=1, max_size=LONGEST_NAME), min_size=2, max_size=2, unique=True))
+def test_every_environment_has_a_channel_of_its_own_that_the_server_takes(names: list[str]) -> None:
+    fitting = [name.encode()[:LONGEST_NAME].decode(errors="ignore") for name in names]
+    channels = {channel_of(name) for name in fitting}
+    assert len(channels) == len(set(fitting))
+    assert all(len(channel.encode()) <= LONGEST_NAME for channel in channels)
+
+
+def test_environments_of_long_and_strange_names_do_not_hear_each_other(
+    database: str, admin: psycopg.Connection
+) -> None:
+    names = [f'{"ü" * 30}"%', f'{"ü" * 30}"s', "Ärger'; --"]
+    urls = [with_environment(database, name) for name in names]
+    readers = []
+    try:
+        for where in urls:
+            create_store(where, GRID).close()
+            readers.append(PostgresStore.open(where, read_only=True))
+            readers[-1].watch()
+        for n, where in enumerate(urls):
+            write(where)
+            assert is_noticed(readers[n])
+            assert not any(reader.has_changed() for reader in readers)
+    finally:
+        for reader in readers:
+            reader.close()
+        for name in names:
+            admin.execute("SET client_min_messages = warning")
+            drop = sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(sql.Identifier(name))
+            admin.execute(drop)
+
+
+def test_a_viewer_may_watch(url: str, admin: psycopg.Connection) -> None:
+    role = f"watching {next(numbers)}"
+    admin.execute(sql.SQL("CREATE ROLE {} LOGIN").format(sql.Identifier(role)))
+    try:
+        grant(url, role, "viewer")
+        reader = PostgresStore.open(url, read_only=True)
+        reader.session.execute(sql.SQL("SET SESSION AUTHORIZATION {}").format(sql.Identifier(role)))
+        reader.watch()
+        write(url)
+        assert is_noticed(reader)
+        with pytest.raises(hapticdb.ReadOnlyError):
+            reader.save_costs("here", {})
+        reader.close()
+    finally:
+        admin.execute(sql.SQL("DROP OWNED BY {}").format(sql.Identifier(role)))
+        admin.execute(sql.SQL("DROP ROLE {}").format(sql.Identifier(role)))
+
+
+def test_the_changes_since_a_revision_are_found_by_the_primary_key_of_postgres(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    store = PostgresStore.open(url)
+    asked: list[str] = []
+    rows = Session.rows
+
+    def noted(session: Session, text: str, parameters: object = ()) -> list[tuple[object, ...]]:
+        asked.append(text)
+        return rows(session, text, parameters)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(Session, "rows", noted)
+    list(store.changes(since=1))
+    (text,) = asked
+    plan = store.session.execute(f"EXPLAIN {text}", (1,)).fetchall()
+    assert "Index Scan using change_pkey on change" in plan[0][0]
+    store.close()

@@ -1,0 +1,202 @@
+"""What a sweep proves: a closed form of a box that moves along an axis is the oracle."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.sweeps.run import sweep
+from hapticdb.testing import voxel_object
+
+SIZE = 0.01
+GRID = Grid(SIZE, (0.0, 0.0, 0.0), 7)
+MIDDLE = 0.5 * GRID.edge
+EDGES = np.array([0.2, 0.12, 0.08])
+
+
+def scene(url: Path, **objects: list[Any]) -> Environment:
+    env = hapticdb.create(url, GRID)
+    for name, voxels in objects.items():
+        ijk = np.array(voxels, dtype=np.int64).reshape(-1, 3)
+        rows = rows_of_voxels(ijk, GRID, "brick")
+        env.store.add(voxel_object(GRID, ijk, name), rows)
+    return env
+
+
+def box(edges: Any = EDGES) -> trimesh.Trimesh:  # noqa: ANN401 - a triple
+    return trimesh.creation.box(edges)
+
+
+def box_shell(points: int | None = None, seed: int = 0, **options: Any) -> PointShell:  # noqa: ANN401
+    made = box()
+    return PointShell.from_mesh(made.vertices, made.faces, points, seed=seed, **options)
+
+
+def at(*places: Any) -> NDArray[np.float64]:  # noqa: ANN401 - triples
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    return poses
+
+
+voxels = st.lists(st.tuples(*[st.integers(40, 90)] * 3), min_size=1, max_size=4)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    placed=voxels,
+    start=st.tuples(*[st.floats(0.4, 0.9)] * 3),
+    axis=st.integers(0, 2),
+    way=st.floats(-0.3, 0.3),
+    n_points=st.sampled_from([30, 300, 3000]),
+    seed=st.integers(0, 3),
+)
+def test_what_comes_out_meets_no_voxel_on_its_way_and_what_keeps_away_comes_out(
+    tmp_path_factory: pytest.TempPathFactory,
+    placed: list[Any],
+    start: tuple[float, float, float],
+    axis: int,
+    way: float,
+    n_points: int,
+    seed: int,
+) -> None:
+    shell = box_shell(n_points, seed).with_cover()
+    end = np.array(start)
+    end[axis] += way
+    with scene(tmp_path_factory.mktemp("s") / "s.db", dots=placed) as env:
+        found = sweep(env, shell, at(start, end))
+    low = np.minimum(start, end) - 0.5 * EDGES
+    high = np.maximum(start, end) + 0.5 * EDGES
+    corner = np.array(placed) * SIZE
+    gaps = np.maximum(np.maximum(low - corner - SIZE, corner - high), 0.0)
+    apart = float(np.linalg.norm(gaps, axis=1).min())  # of the whole box swept and any voxel
+    if found.verdict == "comes out":
+        assert apart > 0.0
+        assert found.clearance is not None
+        assert found.clearance.at_least <= apart
+    if found.verdict == "hits":
+        assert apart == 0.0
+    assert shell.cover is not None
+    if apart > 1.001 * (shell.cover + 0.25 * SIZE):
+        assert found.verdict == "comes out"
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_rod_between_the_points_is_not_missed(tmp_path: Path, seed: int) -> None:
+    """A rod of a voxel's width passes through the tool's widest face, between its points."""
+    rod = [(i, 64, 64) for i in range(20, 100)]
+    aside = at((MIDDLE + 0.005, MIDDLE - 0.2, MIDDLE), (MIDDLE + 0.005, MIDDLE + 0.2, MIDDLE))
+    with scene(tmp_path / "s.db", rod=rod) as env:
+        coarse = sweep(env, box_shell(60, seed), aside)
+        assert coarse.verdict != "comes out"
+        dense = sweep(env, box_shell(seed=seed, spacing=0.5 * SIZE), aside)
+        assert dense.verdict == "hits"
+        assert [one.object.name for one in dense.objects] == ["rod"]
+
+
+def test_what_would_decide_does(tmp_path: Path) -> None:
+    with scene(tmp_path / "s.db", dot=[(64, 64, 64)]) as env:
+        poses = at((MIDDLE + 0.5 * SIZE, MIDDLE + 0.5 * SIZE, MIDDLE + 2.5 * SIZE + 0.04))
+        coarse = sweep(env, box_shell(300), poses)  # the box ends a voxel and a half above the dot
+        assert coarse.verdict == "not decided"
+        proof = coarse.proof
+        assert proof.cover is not None
+        assert 0.0 < proof.cover_needed < proof.cover
+        n_points = int(300 * (proof.cover / (0.5 * proof.cover_needed)) ** 2)
+        assert sweep(env, box_shell(n_points), poses).verdict == "comes out"
+
+
+def test_a_shell_of_unknown_cover_comes_out_nowhere(tmp_path: Path) -> None:
+    shell = PointShell(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros(3), is_closed=False)
+    with scene(tmp_path / "s.db", dot=[(5, 5, 5)]) as env:
+        found = sweep(env, shell, at((MIDDLE, MIDDLE, MIDDLE)))
+    assert (found.hits, found.verdict) == (0, "not decided")
+
+
+# --- what lies inside ----------------------------------------------------------------------------
+
+INSIDE = [(64, 64, 64), (65, 64, 64)]
+
+
+def test_what_lies_inside_a_closed_tool_is_hit(tmp_path: Path) -> None:
+    beside = [(64, 100, 64)]
+    with scene(tmp_path / "s.db", nut=INSIDE, beside=beside) as env:
+        poses = at((MIDDLE, MIDDLE, MIDDLE), (MIDDLE + 0.01, MIDDLE, MIDDLE))
+        found = sweep(env, box_shell(3000), poses)
+        assert (found.hits, found.verdict) == (0, "hits")
+        assert [obj.name for obj in found.enclosed] == ["nut"]
+        free = sweep(env, box_shell(3000), poses, exclude=[1])
+        assert (free.verdict, free.enclosed) == ("comes out", ())
+
+
+def test_an_open_tool_and_a_void_enclose_nothing(tmp_path: Path) -> None:
+    outer, void = box(), box(0.8 * EDGES)
+    hollow = trimesh.util.concatenate([outer, void])
+    with scene(tmp_path / "s.db", nut=INSIDE) as env:
+        poses = at((MIDDLE, MIDDLE, MIDDLE))
+        opened = PointShell.from_mesh(outer.vertices, outer.faces[:-1], 3000)
+        assert sweep(env, opened, poses).verdict == "comes out"
+        assert (
+            sweep(env, PointShell.from_mesh(hollow.vertices, hollow.faces, 6000), poses).verdict
+            == "comes out"
+        )
+
+
+def test_many_voxels_inside_are_found_by_bricks_and_by_voxels(tmp_path: Path) -> None:
+    """A block whose bricks are inside whole, or cut by the limit near the wall."""
+    block = [(i, j, k) for i in range(50, 78) for j in range(60, 69) for k in range(62, 67)]
+    with scene(tmp_path / "s.db", block=block, far=[(10, 10, 10)]) as env:
+        pose = at((MIDDLE, MIDDLE, MIDDLE + 0.5 * SIZE))
+        big = trimesh.creation.box((0.4, 0.3, 0.3))
+        for mesh in (big, box((0.33, 0.14, 0.1))):
+            shell = PointShell.from_mesh(mesh.vertices, mesh.faces, 20_000)
+            found = sweep(env, shell, pose)
+            assert [obj.name for obj in found.enclosed] == ["block"]
+
+
+def test_a_saved_shell_does_not_know_what_is_inside(tmp_path: Path) -> None:
+    box_shell(3000).with_cover().save(tmp_path / "tool.npz")
+    saved = PointShell.load(tmp_path / "tool.npz")
+    with scene(tmp_path / "s.db", nut=INSIDE) as env:
+        found = sweep(env, saved, at((MIDDLE, MIDDLE, MIDDLE)))
+        assert (found.verdict, found.proof.is_clear) == ("not decided", True)
+        assert sweep(env, saved, at((0.3, 0.3, 0.3))).verdict == "comes out"
+
+
+def test_a_ball_knows_its_inside(tmp_path: Path) -> None:
+    with scene(tmp_path / "s.db", nut=INSIDE) as env:
+        ball = PointShell.sphere(0.1, 3000)
+        assert sweep(env, ball, at((MIDDLE, MIDDLE, MIDDLE))).verdict == "hits"
+        beside = sweep(env, ball, at((MIDDLE + 0.08, MIDDLE + 0.08, MIDDLE + 0.08)))
+        assert beside.verdict == "comes out"
+
+
+# --- each object by itself -----------------------------------------------------------------------
+
+
+def test_each_object_has_its_own_intervals(tmp_path: Path) -> None:
+    """One is in the tool's wall where it starts, and left at once; the other is met later."""
+    begins, end = 20, 20 + round(EDGES[0] / SIZE)  # voxels along x that the tool's box takes up
+    with scene(tmp_path / "s.db", left=[(end - 1, 64, 64)], later=[(begins - 10, 64, 64)]) as env:
+        start = np.array([(0.5 * (begins + end) - 0.2) * SIZE, MIDDLE, MIDDLE])
+        there = start - np.array([0.3, 0.0, 0.0])
+        shell = box_shell(spacing=0.5 * SIZE)
+        left, later = sweep(env, shell, at(start, there)).objects
+        assert (left.object.name, later.object.name) == ("left", "later")
+        assert left.is_left_at_once
+        assert not later.is_left_at_once
+        assert left.first_contact is not None
+        assert left.first_contact.sample <= 1
+        assert left.length == pytest.approx(0.8 * SIZE, abs=0.51 * SIZE)
+        # the front face passes it, and at the end the back face
+        assert later.first == pytest.approx(8.8 * SIZE / 0.3, abs=0.51 * SIZE / 0.3)
+        assert len(later.intervals) == 2
+        again = sweep(env, shell, at(start, there, start)).objects
+        assert not any(one.is_left_at_once for one in again)

@@ -39,7 +39,7 @@ class Rows:
         (Path("path.csv"), r"Path\(file\)$"),
         (Rows(), r"of the type Rows .*Player\(\*recording\.poses\(\)\)$"),
         (Tumble, r"Tumble is a class"),
-        (Mute(), r"of the type Mute is none, it has no apply; see hapticdb\.realtime\.devices"),
+        (Mute(), r"of the type Mute is none, it has no apply; see hapticdb\.devices\.scripted"),
         (None, r"None is none, it has no read and no apply"),
     ],
 )

@@ -31,7 +31,8 @@ from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.testing import KINDS, floor_voxels, write_voxels
 
 def name(entry):
-    return f"{entry.py_func.__module__.rpartition('.')[2]}.{entry.py_func.__name__}"
+    module = entry.py_func.__module__.removeprefix("hapticdb.kernels.")
+    return f"{module}.{entry.py_func.__name__}"
 
 hapticdb.warm_up()
 folder = Path(sys.argv[1])
@@ -126,7 +127,8 @@ def test_a_verb_compiles_its_own_kernels_once_and_says_so(tmp_path: Path) -> Non
         n_new = len(wanted - so_far)
         assert done.stderr.count("compiling, once") == (n_new > 0), words
         found = {path.name.partition("-")[0] for path in (tmp_path / "cache").rglob("*.nbi")}
-        assert found == wanted, words
+        # numba leaves the packages out of a file's name
+        assert found == {".".join(entry.split(".")[-2:]) for entry in wanted}, words
         so_far = wanted
     done = finished(command("warm"), env=env)
     ready = f"{len(NAMES)} kernels ready:"

@@ -281,8 +281,8 @@ class Environment:
             world_from_tool, rigid, metres.
         strategy : str
             How the database is asked: ``statement``, ``array``, ``points``, ``maxgap``,
-            ``cbgroup``, or ``auto``, what the cost model expects to be fastest for this frame.
-            All find the same hits, ids and wrench, bit for bit.
+            ``cbgroup``, or ``auto``: ``cbgroup`` where a frame has many keys and few ranges hold
+            them, else ``array``. All find the same hits, ids and wrench, bit for bit.
         exclude : iterable of int
             Ids of objects that are not felt: a part taken out must not hit itself.
         maxgap : int

@@ -1,154 +1,183 @@
-"""The strategy `auto`: the model's choice, corrected by what frames took."""
+"""The strategy `auto`: a lookup of all keys, or a scan of ranges where many keys share few."""
 
-from collections import Counter
 from dataclasses import replace
+from pathlib import Path
+from typing import NoReturn
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from hapticdb.query.auto import FEW, LONG, MOST_KEPT, TRY_EVERY, Choice, Chooser
-from hapticdb.query.cost_model import CostModel
-from hapticdb.query.quantiles import QuantileVector
-
-KEYS = np.arange(0, 4000, 40, dtype=np.int64)
-QUANTILES = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 400)
-# of keys 110 us, of ranges 100 + 10 a range, of points 1000, Figure 3 never
-MODEL = CostModel(
-    statement=100.0,
-    descent=10.0,
-    block=0.0,
-    row=0.1,
-    rows_per_block=100.0,
-    lookup=100.0,
-    probe=0.1,
-    single=10.0,
-    aggregate=1e6,
-    point=1.0,
+import hapticdb
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.query.auto import (
+    DEFAULT_THRESHOLD,
+    KEYS_PER_RANGE,
+    grouping_threshold,
+    ranges_worth_scanning,
 )
+from hapticdb.query.cost_model import CostModel, machine_name
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.query.grouping import cbgroup
+from hapticdb.query.quantiles import QuantileVector
+from hapticdb.store.base import Keys, Layout, Store
+from hapticdb.testing import floor_voxels, write_voxels
+from servers import Place
+
+THRESHOLD = 100
+QUANTILES = QuantileVector(np.arange(0, 40_001, 100, dtype=np.int64), 40_000)
+CLOSE = CostModel(1.0, 10.0, 0.0, 1.0, 100.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+"""Gaps of at most 10 rows are closed; `QUANTILES` expects a row a key."""
+ONE_RANGE = replace(CLOSE, descent=1e9)
+NO_GAP_CLOSED = replace(CLOSE, descent=0.0, row=1e9)
 
 
-def run(
-    chooser: Chooser, took: dict[str, float], frames: int, rows: int | None = None
-) -> Counter[str]:
-    """Frames whose strategies take so many microseconds; what was chosen."""
-    chosen: Counter[str] = Counter()
-    for _ in range(frames):
-        kept = chooser.kept(len(KEYS))
-        if kept is None:
-            choice = chooser.choose(300, KEYS)
-            kept = choice.strategy
-            chooser.find(choice, round(choice.rows) if rows is None else rows)
-        elif chooser.is_listening:
-            ranges, expected = (1, 400) if kept == "cbgroup" else (len(KEYS), 10)
-            read = expected if rows is None else rows
-            chooser.hear(Choice(kept, 300, len(KEYS), ranges, read), took[kept])
-        chosen[kept] += 1
-    return chosen
+def clusters(*sizes: int) -> Keys:
+    """Runs of neighbouring keys, 100 keys apart: CBGroup makes a range of each."""
+    starts = np.cumsum([0, *(size + 100 for size in sizes)])
+    return np.concatenate([np.arange(n) + at for n, at in zip(sizes, starts, strict=False)])
 
 
-def test_the_first_frame_follows_the_model() -> None:
-    array_is_cheap = replace(MODEL, statement=500.0)
-    assert Chooser(QUANTILES, array_is_cheap).choose(300, KEYS).strategy == "array"
-    keys_are_dear = replace(MODEL, lookup=500.0)
-    assert Chooser(QUANTILES, keys_are_dear).choose(300, KEYS).strategy == "cbgroup"
-    points_are_cheap = replace(MODEL, single=0.1)
-    assert Chooser(QUANTILES, points_are_cheap).choose(300, KEYS).strategy == "points"
-    figure_3_is_cheap = replace(MODEL, aggregate=1.0, point=0.01)
-    assert Chooser(QUANTILES, figure_3_is_cheap).choose(300, KEYS).strategy == "statement"
+def forbidden(*_: object, **__: object) -> NoReturn:
+    pytest.fail("statistics were asked for")
 
 
-@pytest.mark.parametrize("faster", ["array", "cbgroup"])
-def test_a_model_that_is_wrong_by_half_is_corrected_by_what_frames_take(faster: str) -> None:
-    took = {"array": 150.0, "cbgroup": 150.0, "points": 1000.0}
-    took[faster] = 80.0
-    chooser = Chooser(QUANTILES, MODEL)
-    run(chooser, took, 10 * MOST_KEPT)
-    assert run(chooser, took, 400)[faster] > 370
+# --- the rule -----------------------------------------------------------------------------------
 
 
-def test_the_choice_follows_when_what_frames_take_changes() -> None:
-    chooser = Chooser(QUANTILES, MODEL)
-    before = {"array": 80.0, "cbgroup": 140.0, "points": 1000.0}
-    assert run(chooser, before, 1000)["array"] > 900
-    after = {"array": 150.0, "cbgroup": 100.0, "points": 1000.0}
-    run(chooser, after, 40 * MOST_KEPT)
-    assert run(chooser, after, 500)["cbgroup"] > 450
+def test_a_frame_below_the_threshold_is_looked_up_without_any_statistics() -> None:
+    keys = np.arange(THRESHOLD - 1, dtype=np.int64)
+    assert ranges_worth_scanning(keys, THRESHOLD, forbidden) is None
+    assert ranges_worth_scanning(keys[:0], THRESHOLD, forbidden) is None
 
 
-def test_what_is_far_too_dear_is_never_tried() -> None:
-    chosen = run(Chooser(QUANTILES, MODEL), {"array": 110.0, "cbgroup": 110.0}, 20 * TRY_EVERY)
-    assert set(chosen) == {"array", "cbgroup"}
+def test_an_engine_that_groups_keys_itself_always_looks_them_up() -> None:
+    assert ranges_worth_scanning(np.arange(10**6, dtype=np.int64), None, forbidden) is None
 
 
-def test_one_frame_that_waited_does_not_turn_the_choice() -> None:
-    chooser = Chooser(QUANTILES, MODEL)
-    took = {"array": 100.0, "cbgroup": 190.0}
-    run(chooser, took, 20 * MOST_KEPT)
-    chooser.hear(Choice("array", 300, len(KEYS), len(KEYS), 10), 1e6)
-    assert run(chooser, took, 300)["array"] > 250
+@pytest.mark.parametrize(
+    ("sizes", "is_scanned"),
+    [
+        ([THRESHOLD], True),
+        ([2] * 50, True),  # as many ranges as half the keys
+        ([2] * 50 + [3], True),
+        ([2] * 50 + [1], False),  # a range more than half the keys
+        ([1] * 100, False),
+    ],
+)
+def test_ranges_are_scanned_where_they_hold_two_keys_or_more(
+    sizes: list[int], *, is_scanned: bool
+) -> None:
+    keys = clusters(*sizes)
+    expected = cbgroup(keys, QUANTILES, CLOSE).ranges
+    assert len(expected.lows) == len(sizes)
+    assert KEYS_PER_RANGE == 2
+    ranges = ranges_worth_scanning(keys, THRESHOLD, lambda: (QUANTILES, CLOSE))
+    if not is_scanned:
+        assert ranges is None
+        return
+    assert ranges is not None
+    np.testing.assert_array_equal(ranges, expected)
 
 
-def test_a_choice_serves_only_frames_of_about_as_many_keys() -> None:
-    """A dear descent pays for one key, and not for a hundred."""
-    chooser = Chooser(QUANTILES, replace(MODEL, statement=1.0, descent=50.0, row=50.0, single=1e3))
-    run(chooser, {"array": 110.0, "cbgroup": 500.0}, 3 * FEW * MOST_KEPT)
-    while chooser.kept(len(KEYS)) is None:
-        run(chooser, {"array": 110.0, "cbgroup": 500.0}, 1)
-    assert chooser.kept(len(KEYS) - 5) == "array"
-    assert chooser.kept(1) is None
-    assert chooser.choose(3, KEYS[:1]).strategy == "cbgroup"
+def test_the_threshold_itself_is_grouped() -> None:
+    keys = np.arange(THRESHOLD, dtype=np.int64)
+    assert ranges_worth_scanning(keys, THRESHOLD, lambda: (QUANTILES, CLOSE)) is not None
 
 
-def test_where_gaps_turn_out_full_ranges_are_believed_to_cost_more() -> None:
-    """By the rows that are found, before times show it; and less again where they are empty."""
-    chooser = Chooser(QUANTILES, replace(MODEL, row=0.2, lookup=190.0))
-    first = chooser.choose(300, KEYS)
-    assert first.strategy == "cbgroup"
-    for _ in range(3):
-        chooser.find(first, 2000)
-    assert chooser.choose(300, KEYS).strategy == "array"
-    for _ in range(80):
-        chooser.find(first, 0)
-    assert chooser.choose(300, KEYS).strategy == "cbgroup"
+# --- the threshold of an engine -----------------------------------------------------------------
 
 
-def test_only_the_last_frame_of_a_turn_is_timed() -> None:
-    chooser = Chooser(QUANTILES, MODEL)
-    run(chooser, {"array": 110.0, "cbgroup": 150.0}, 400)
-    while chooser.kept(len(KEYS)) is not None:
-        pass
-    chooser.choose(300, KEYS)
-    listening = []
-    while chooser.kept(len(KEYS)) is not None:
-        listening.append(chooser.is_listening)
-    assert listening[-1]
-    assert not any(listening[:-1])
+def test_sqlite_groups_from_the_default_on(tmp_path: Path) -> None:
+    with make_scene(tmp_path / "e.db") as env:
+        assert grouping_threshold(env.store) == DEFAULT_THRESHOLD == 1024
 
 
-def test_a_strategy_that_was_disturbed_when_it_was_tried_gets_another_chance() -> None:
-    """Each of its first frames, or all of them: then it takes longer to come back."""
-    took = {"array": 80.0, "cbgroup": 160.0}
-    chooser = Chooser(QUANTILES, MODEL)
-    for spike in (1e4, 80.0, 1e4, 80.0):
-        chooser.hear(Choice("array", 300, len(KEYS), len(KEYS), 10), spike)
-    assert run(chooser, took, 500)["array"] > 400
-    chooser = Chooser(QUANTILES, MODEL)
-    for _ in range(FEW):
-        chooser.hear(Choice("array", 300, len(KEYS), len(KEYS), 10), 400.0)
-    run(chooser, took, 4 * LONG)
-    assert run(chooser, took, 500)["array"] > 400
+def test_postgres_groups_keys_itself_from_version_17_on(place: Place) -> None:
+    with make_scene(place()) as env:
+        major = int(env.engine.removeprefix("PostgreSQL ").split(".")[0])
+        assert grouping_threshold(env.store) == (None if major >= 17 else 256)
 
 
-def test_frames_that_ask_nothing_teach_nothing() -> None:
-    """A tool beside the grid has no keys; back on the part, all goes on."""
-    chooser = Chooser(QUANTILES, replace(MODEL, single=1e4))
-    took = {"array": 110.0, "cbgroup": 150.0}
-    run(chooser, took, 50)
-    none = KEYS[:0]
-    for _ in range(5 * FEW):
-        kept = chooser.kept(0)
-        if kept is None:
-            chooser.find(chooser.choose(300, none), 0)
-        elif chooser.is_listening:
-            chooser.hear(Choice(kept, 300, 0, 0, 0), 5.0)
-    assert run(chooser, took, 400)["array"] > 200
+# --- frames -------------------------------------------------------------------------------------
+
+BITS: dict[Layout, int] = {"voxel": 6, "brick": 9}
+
+
+def make_scene(url: Path | str, layout: Layout = "brick") -> Environment:
+    """A floor across the grid, its top in the middle."""
+    bits = BITS[layout]
+    env = hapticdb.create(url, Grid(0.005, (0, 0, 0), bits), layout=layout)
+    write_voxels(env.store, floor_voxels(env.grid, width=env.grid.side), "floor")
+    return env
+
+
+def cloud(env: Environment, n_points: int) -> PointShell:
+    """Points drawn from a slab as wide as the grid, about the tool's origin."""
+    rng = np.random.default_rng(n_points)
+    normals = rng.normal(size=(n_points, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = rng.uniform(-0.5, 0.5, (n_points, 3)) * env.grid.edge * (1, 1, 0.25)
+    return PointShell(points=points, normals=normals, center=np.zeros(3))
+
+
+def middle(env: Environment) -> NDArray[np.float64]:
+    pose = np.eye(4)
+    pose[:3, 3] = env.grid.edge / 2
+    return pose
+
+
+def keep_figures(store: Store, model: CostModel) -> None:
+    """Keep figures as if calibrated on this machine."""
+    store.save_costs(machine_name(), model.figures())
+
+
+@pytest.mark.parametrize("layout", BITS)
+@pytest.mark.parametrize(
+    ("model", "n_points", "used"),
+    [
+        (ONE_RANGE, 3000, "cbgroup"),
+        (NO_GAP_CLOSED, 3000, "array"),
+        (ONE_RANGE, 500, "array"),
+    ],
+)
+def test_auto_names_what_it_used_and_answers_as_every_strategy(
+    tmp_path: Path, layout: Layout, model: CostModel, n_points: int, used: str
+) -> None:
+    with make_scene(tmp_path / "e.db", layout) as env:
+        keep_figures(env.store, model)
+        shell, pose = cloud(env, n_points), middle(env)
+        auto = env.touch(shell, pose)
+        assert auto.query.strategy == used
+        assert len(auto.hits) > 10
+        for strategy in STRATEGIES:
+            touch = env.touch(shell, pose, strategy)
+            if strategy in {"auto", used}:
+                assert touch.query[:4] == auto.query[:4]  # strategy, statements, ranges, rows
+            assert touch.force.tobytes() == auto.force.tobytes()
+            assert touch.torque.tobytes() == auto.torque.tobytes()
+            assert touch.hits.tolist() == auto.hits.tolist()
+            assert touch.pairs.tolist() == auto.pairs.tolist()
+
+
+def test_a_small_first_frame_calibrates_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with make_scene(tmp_path / "e.db") as env:
+        monkeypatch.setattr("hapticdb.environment.calibrate", forbidden)
+        touch = env.touch(cloud(env, 300), middle(env))
+        assert touch.query.strategy == "array"
+        assert env.store.costs(machine_name()) is None
+
+
+def test_a_frame_is_asked_in_the_same_way_whatever_came_before_it(tmp_path: Path) -> None:
+    with make_scene(tmp_path / "e.db", "voxel") as env:
+        keep_figures(env.store, ONE_RANGE)
+        far = middle(env)
+        far[:3, 3] += 1e3
+        frames = [
+            (cloud(env, n_points), pose) for n_points in (300, 3000) for pose in (middle(env), far)
+        ]
+        asked = [[env.touch(*frame).query[:4] for frame in frames] for _ in range(20)]
+        assert all(queries == asked[0] for queries in asked)
+        assert [query[0] for query in asked[0]] == ["array", "array", "cbgroup", "array"]

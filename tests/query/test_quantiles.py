@@ -1,4 +1,4 @@
-"""The quantile vector against counted rows; the cost model, its calibration, and `auto`."""
+"""The quantile vector against counted rows; the cost model and its calibration."""
 
 import json
 import math
@@ -17,7 +17,6 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import UsageError
 from hapticdb.query.calibration import _cautious, _probes, calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.query.frame import Strategy
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, MAX_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, SupportsCaches, SupportsStatement, row_shift
@@ -232,7 +231,7 @@ def test_the_places_measured_touch_occupied_voxels(scene: Environment) -> None:
 def test_a_grid_smaller_than_a_tool_can_be_calibrated(
     tmp_path: Path, layout: Layout, bits: int
 ) -> None:
-    """Or the first touch, whose strategy is `auto`, would fail there."""
+    """Otherwise the first touch by `cbgroup` would fail there."""
     env = hapticdb.create(tmp_path / "e.db", Grid(0.005, (0, 0, 0), bits), layout=layout)
     write_voxels(env.store, np.full((1, 3), env.grid.side // 2))
     figures = calibrate(env.store, repeats=1, budget=0.0).figures()
@@ -263,15 +262,9 @@ def test_figures_that_are_not_to_be_kept_are_not(tmp_path: Path) -> None:
     assert env._statistics()[1] == model
 
 
-# --- auto ---------------------------------------------------------------------------------------
+# --- grouping by kept figures -------------------------------------------------------------------
 
 DEAR = CostModel(1e6, 1e6, 1e6, 1e6, 1.0, 1e6, 1e6, 1e6, 1e6, 1e6)
-CHEAP: dict[Strategy, CostModel] = {
-    "array": replace(DEAR, lookup=1.0, probe=1.0, row=0.0),
-    "points": replace(DEAR, single=1.0),
-    "cbgroup": replace(DEAR, statement=1.0, descent=1.0, block=1.0, row=0.0),
-    "statement": replace(DEAR, aggregate=1.0, point=1.0),
-}
 
 
 def resting() -> NDArray[np.float64]:
@@ -284,30 +277,6 @@ def opened_with(scene: Environment, model: CostModel) -> Environment:
     """The scene, opened anew, with figures as if calibrated on this machine."""
     scene.store.save_costs(machine_name(), model.figures())
     return hapticdb.open(scene.url, read_only=True)
-
-
-@pytest.mark.parametrize("cheapest", CHEAP)
-def test_auto_takes_the_cheapest_strategy(
-    scene: Environment, sphere: PointShell, cheapest: Strategy
-) -> None:
-    with opened_with(scene, CHEAP[cheapest]) as env:
-        auto = env.touch(sphere, resting(), "auto")
-        named = env.touch(sphere, resting(), cheapest)
-    assert auto.query.strategy == cheapest
-    assert auto.query[:4] == named.query[:4]  # statements, ranges, rows
-    assert auto.force.tobytes() == named.force.tobytes()
-
-
-def test_auto_weighs_the_frame_and_not_the_figures_alone(
-    scene: Environment, sphere: PointShell
-) -> None:
-    """A dear statement pays for many keys, and not for one."""
-    model = replace(DEAR, single=10.0, lookup=50.0, probe=0.1, row=0.0)
-    one = PointShell(points=sphere.points[:1], normals=sphere.normals[:1], center=np.zeros(3))
-    spread = PointShell(points=sphere.points * 8, normals=sphere.normals, center=np.zeros(3))
-    with opened_with(scene, model) as env:
-        assert env.touch(one, resting(), "auto").query.strategy == "points"
-        assert env.touch(spread, resting(), "auto").query.strategy == "array"
 
 
 def test_dear_descents_make_few_ranges_and_dear_rows_many(
@@ -323,17 +292,3 @@ def test_dear_descents_make_few_ranges_and_dear_rows_many(
     assert rows == sorted(rows)
     assert ranges[0] > ranges[-1] == 1
     assert all(q.statements == 1 for q in found)
-
-
-def test_auto_goes_on_after_the_tool_has_been_beside_the_grid(
-    scene: Environment, sphere: PointShell
-) -> None:
-    far = np.eye(4)
-    far[:3, 3] = 1e3
-    with opened_with(scene, replace(DEAR, lookup=1.0, probe=1.0, row=0.0)) as env:
-        before = env.touch(sphere, resting(), "auto")
-        beside = [env.touch(sphere, far, "auto") for _ in range(20)]
-        after = [env.touch(sphere, resting(), "auto") for _ in range(100)]
-    assert all(len(touch.hits) == 0 for touch in beside)
-    assert {touch.force.tobytes() for touch in after} == {before.force.tobytes()}
-    assert np.linalg.norm(before.force) > 0

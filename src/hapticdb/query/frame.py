@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.kernels.query import contact
 from hapticdb.poses import as_floats
-from hapticdb.query.auto import Choice, Chooser, Chosen
-from hapticdb.query.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
+from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
+from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
 from hapticdb.query.law import TangentPlane
 from hapticdb.store.base import Frame, Keys, Rows, Store, SupportsStatement, row_shift
 
@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
-MOST_SHELLS = 64
-"""Sizes of shells for which `auto` remembers what it has learned."""
 MOST_KEYS = 2048
 """Row keys of neighbouring poses that one statement asks for: each pose goes over the rows found
 between its first key and its last, so that more would save statements and cost time."""
@@ -80,7 +78,7 @@ class HapticQuery:
     ) -> None:
         self._store = store
         self._statistics = statistics
-        self._choosers: dict[int, Chooser] = {}
+        self._grouping_threshold = grouping_threshold(store)
         grid = store.grid
         self._shift = row_shift(store.layout)
         self._origin = np.array(grid.origin)
@@ -99,63 +97,10 @@ class HapticQuery:
         """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
         started = time.perf_counter_ns()
         _check_options(strategy, gap)
-        pose = as_floats(world_from_tool, "a pose")
-        located = self.locate(shell, pose)
-        if strategy == "auto" and not located.keys.size:
-            strategy = "array"  # nothing to ask: the tool is beside the grid
-        if strategy == "auto":
-            chooser = self._choosers.get(located.asked.shape[1])
-            kept = chooser.kept(len(located.keys)) if chooser is not None else None
-            if chooser is None or kept is None:
-                return self._choosing(located, exclude, law, started)
-            if chooser.is_listening:
-                return self._heard(chooser, kept, located, exclude, law, started)
-            strategy = kept
-        return self._answer(strategy, located, exclude, law, started, gap)
-
-    def _choosing(
-        self, located: "contact.Located", exclude: Keys, law: TangentPlane, started: int
-    ) -> Answer:
-        """The first frame of a turn: its strategy is chosen, and the rows that it reads told."""
-        n_points = located.asked.shape[1]
-        chooser = self._present_chooser(n_points)
-        choice = chooser.choose(n_points, located.keys)
-        answer = self._answer(choice.strategy, located, exclude, law, started)
-        chooser.find(choice, answer.query.rows)
-        return answer
-
-    def _heard(
-        self,
-        chooser: Chooser,
-        strategy: Chosen,
-        located: "contact.Located",
-        exclude: Keys,
-        law: TangentPlane,
-        started: int,
-    ) -> Answer:
-        """The last frame of a turn: it is timed."""
-        asking = time.perf_counter_ns()
-        answer = self._answer(strategy, located, exclude, law, started)
-        took_us = (time.perf_counter_ns() - asking) / 1000
-        query = answer.query
-        n_points, n_keys = located.asked.shape[1], len(located.keys)
-        chooser.hear(Choice(strategy, n_points, n_keys, query.ranges, query.rows), took_us)
-        return answer
-
-    def _answer(
-        self,
-        strategy: Strategy,
-        located: "contact.Located",
-        exclude: Keys,
-        law: TangentPlane,
-        started: int,
-        gap: int = DEFAULT_MAXGAP,
-    ) -> Answer:
-        """Rows fetched, false hits dropped, the wrench summed."""
+        located = self.locate(shell, as_floats(world_from_tool, "a pose"))
         if strategy == "statement":
             return self._by_statement(located, exclude, law, started)
-        n_statements, n_ranges, rows = self._fetch(strategy, located, gap)
-        query = Query(strategy, n_statements, n_ranges, len(rows[0]), 0.0)
+        query, rows = self._fetch(strategy, located, gap)
         return self._refined(located, rows, exclude, law, query, started)
 
     def _refined(
@@ -258,33 +203,27 @@ class HapticQuery:
 
     def _fetch(
         self, strategy: Strategy, located: "contact.Located", gap: int
-    ) -> tuple[int, int, Rows]:
-        """Statements, ranges and rows of a frame."""
+    ) -> tuple[Query, Rows]:
+        """Rows of a frame, and how they were asked for; the frame's time is not known yet."""
         _, asked, keys = located
-        if strategy == "array":
-            return 1, len(keys), self._store.lookup(keys)
         if strategy == "points":
             with self._store.snapshot():
-                return len(keys), len(keys), self._store.lookup_each(keys)
+                rows = self._store.lookup_each(keys)
+            return Query("points", len(keys), len(keys), len(rows), 0.0), rows
+        ranges: Ranges | None = None
         if strategy == "maxgap":
             first, last = contact.spans_of_keys(asked, keys, *self._curve)
             ranges = maxgap(keys, first, last, gap)
-        else:
+        elif strategy == "cbgroup":
             ranges = cbgroup(keys, *self._statistics()).ranges
-        return 1, len(ranges.lows), self._store.scan(*ranges)
-
-    def _present_chooser(self, n_points: int) -> Chooser:
-        """The one for such a shell that stands on the present statistics.
-
-        One for each size of shell: two tools in turns would never be alike.
-        """
-        quantiles, costs = self._statistics()
-        chooser = self._choosers.get(n_points)
-        if chooser is None or chooser.quantiles is not quantiles or chooser.costs is not costs:
-            if len(self._choosers) >= MOST_SHELLS:
-                self._choosers.clear()
-            self._choosers[n_points] = chooser = Chooser(quantiles, costs)
-        return chooser
+        elif strategy == "auto":
+            ranges = ranges_worth_scanning(keys, self._grouping_threshold, self._statistics)
+            strategy = "array" if ranges is None else "cbgroup"
+        if ranges is None:
+            rows = self._store.lookup(keys)
+            return Query("array", 1, len(keys), len(rows), 0.0), rows
+        rows = self._store.scan(*ranges)
+        return Query(strategy, 1, len(ranges.lows), len(rows), 0.0), rows
 
     def _by_statement(
         self,

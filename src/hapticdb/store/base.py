@@ -379,6 +379,15 @@ class SupportsCaches(Protocol):
         """Forget all pages: the connection's, and the file's in the operating system's cache."""
 
 
+@runtime_checkable
+class HasGroupingThreshold(Protocol):
+    """An engine that says from which size on the strategy `auto` groups a frame's keys."""
+
+    @property
+    def grouping_threshold(self) -> int | None:
+        """Distinct keys of a frame; None where a lookup reads each leaf page once by itself."""
+
+
 class Checker(Protocol):
     """What `hapticdb check` asks an engine: what is wrong below and beside the rows."""
 

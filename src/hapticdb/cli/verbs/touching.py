@@ -28,7 +28,10 @@ if TYPE_CHECKING:
 
 MOST_TOUCHED = 8
 FEW_POSES = 500
-"""Poses of a path for which measuring the database's costs, most of a second, does not pay."""
+"""Poses of a path below which it does not pay to measure the database's costs.
+
+Measuring takes most of a second, and `touch` opens the environment to read, so that it could not
+keep the figures. A larger value lets longer paths of large tools go without grouping."""
 
 
 def touch(
@@ -109,7 +112,7 @@ def touch(
 
 
 def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strategy":
-    """`array` for `auto` on a short path, where the costs that `auto` decides by are not kept."""
+    """`array` in place of `auto` on a short path where no costs are kept, else as wanted."""
     from hapticdb.query.cost_model import machine_name
 
     if wanted == "auto" and n_poses < FEW_POSES and not env.store.costs(machine_name()):

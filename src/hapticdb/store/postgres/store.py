@@ -45,6 +45,10 @@ from hapticdb.store.postgres.watching import Watch, channel_of
 Result = TypeVar("Result")
 
 COPY_CHUNK = 1 << 17
+GROUPS_KEYS_ITSELF = 170_000
+"""Server version, as libpq numbers it, from which `= ANY` reads each leaf page once."""
+GROUPING_THRESHOLD = 256
+"""Distinct keys from which `auto` groups on older servers: docs/decisions/0014."""
 
 # no sequence: it would count what was rolled back, and an import run again end with other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
@@ -60,6 +64,8 @@ class PostgresStore:
         self.url = session.shown
         self.name = session.address.environment
         self.engine = "PostgreSQL {}.{}".format(*divmod(session.server_version, 10_000))
+        groups_keys_itself = session.server_version >= GROUPS_KEYS_ITSELF
+        self.grouping_threshold = None if groups_keys_itself else GROUPING_THRESHOLD
         self.is_read_only = session.is_read_only
         try:
             self.grid, self.layout, self.identity = schema_of.read_environment(session)

@@ -4,7 +4,7 @@
 
 import json
 from collections.abc import Iterable
-from pathlib import Path as FilePath
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from command_line import Run, made, poses, refused, run, scene, tool  # noqa: F401 - fixtures
 from hapticdb import Object, PointShell, Proportions, UsageError, compare_proportions
 from hapticdb.poses import rotation_of
-from hapticdb.sweeps.path import Path
+from hapticdb.sweeps.path import SweepPath
 from hapticdb.units import UNITS
 
 TOOL = ("--tool", "tool.stl")
@@ -182,7 +182,7 @@ def test_no_point_of_the_tool_comes_nearer_than_the_gap(seed: int, pairs: int) -
         patch.setattr("hapticdb.proportions.PAIRS", pairs)
         gap = compare_proportions(scene, 0.01, shell, path).gap
     assert gap is not None
-    way = Path.of(path, shell, 0.3)
+    way = SweepPath.of(path, shell, 0.3)
     for pose in way.sample(0, len(way)):
         points = shell.points @ pose[:3, :3].T + pose[:3, 3]
         for low, high in boxes:
@@ -200,7 +200,7 @@ def test_wrong_paths_and_units_are_refused() -> None:
 # -- the command line ------------------------------------------------------------------------------
 
 
-def test_a_large_tool_is_named_and_not_the_poses(run: Run, scene: FilePath) -> None:
+def test_a_large_tool_is_named_and_not_the_poses(run: Run, scene: Path) -> None:
     trimesh.creation.box((20.0, 20.0, 20.0)).export(scene.parent / "mm.stl")
     for args in (("touch", scene, "--poses"), ("sweep", scene, "--path")):
         code, _, err = run(*args, "path.csv", "--tool", "mm.stl")
@@ -212,7 +212,7 @@ def test_a_large_tool_is_named_and_not_the_poses(run: Run, scene: FilePath) -> N
         assert (code, err) == (0 if args[0] == "touch" else 1, "")
 
 
-def test_a_path_in_millimetres_is_no_proof(run: Run, scene: FilePath) -> None:
+def test_a_path_in_millimetres_is_no_proof(run: Run, scene: Path) -> None:
     poses(scene.parent / "mm.csv", (0, 0, 55), (200, 0, 300))
     args = ("sweep", scene, *TOOL, "--path", "mm.csv", "--clearance", 0)
     code, out, err = run(*args)
@@ -228,7 +228,7 @@ def test_a_path_in_millimetres_is_no_proof(run: Run, scene: FilePath) -> None:
     assert (code, err) == (1, "")
 
 
-def test_touch_says_that_no_pose_is_near(run: Run, scene: FilePath) -> None:
+def test_touch_says_that_no_pose_is_near(run: Run, scene: Path) -> None:
     poses(scene.parent / "above.csv", (0, 0, 0.1))
     code, out, err = run("touch", scene, *TOOL, "--poses", "above.csv")
     assert (code, "0 hit" in out) == (0, True)
@@ -240,7 +240,7 @@ def test_touch_says_that_no_pose_is_near(run: Run, scene: FilePath) -> None:
     assert [json.loads(line)["misfits"][0]["unit"] for line in out.splitlines()] == ["mm", "mm"]
 
 
-def test_feel_says_what_does_not_fit(run: Run, scene: FilePath) -> None:
+def test_feel_says_what_does_not_fit(run: Run, scene: Path) -> None:
     poses(scene.parent / "mm.csv", (0, 0, 55), (200, 0, 300))
     args = ("feel", scene, *TOOL, "--device", "mm.csv", "--seconds", 0.1, "--rate", 200)
     code, out, err = run(*args, "--json")
@@ -250,7 +250,7 @@ def test_feel_says_what_does_not_fit(run: Run, scene: FilePath) -> None:
     assert "factor" not in run(*args, "--scale", 0.001)[2]
 
 
-def test_a_unit_of_a_path_that_is_none_is_refused(run: Run, scene: FilePath) -> None:
+def test_a_unit_of_a_path_that_is_none_is_refused(run: Run, scene: Path) -> None:
     line = refused(
         run("touch", scene, *TOOL, "--poses", "path.csv", "--path-unit", "furlong"), "--path-unit"
     )

@@ -21,7 +21,7 @@ from hapticdb.pointshell.shell import fibonacci_sphere
 from hapticdb.poses import rotation_of
 from hapticdb.store.base import Layout
 from hapticdb.sweeps import run as sweeping
-from hapticdb.sweeps.path import Path as Way
+from hapticdb.sweeps.path import SweepPath
 from hapticdb.sweeps.result import Swept
 from hapticdb.sweeps.run import sweep
 from hapticdb.testing import voxel_object
@@ -140,7 +140,7 @@ def test_no_point_moves_more_than_half_a_voxel_between_samples(
     inward = np.tile([0.0, 0.0, 1.0], (len(points), 1))
     shell = PointShell(np.array(points) + 10.0 * np.array(offset), inward, np.zeros(3))
     given_poses = np.array([pose_of(*pose) for pose in poses])
-    path = Way.of(given_poses, shell, size)
+    path = SweepPath.of(given_poses, shell, size)
     samples = path.sample(0, len(path))
     placed = np.einsum("nab,pb->npa", samples[:, :3, :3], shell.points) + samples[:, None, :3, 3]
     moved = np.linalg.norm(np.diff(placed, axis=0), axis=2)
@@ -153,7 +153,7 @@ def test_no_point_moves_more_than_half_a_voxel_between_samples(
 @settings(max_examples=30, deadline=None)
 @given(poses=st.lists(turned, min_size=2, max_size=4))
 def test_samples_are_rigid_and_blocks_of_them_are_the_same(poses: list[Any]) -> None:
-    path = Way.of(np.array([pose_of(*pose) for pose in poses]), ball(), 0.05)
+    path = SweepPath.of(np.array([pose_of(*pose) for pose in poses]), ball(), 0.05)
     samples = path.sample(0, len(path))
     rotations = samples[:, :3, :3]
     assert np.allclose(np.swapaxes(rotations, 1, 2) @ rotations, np.eye(3), atol=1e-12)
@@ -167,15 +167,15 @@ def test_a_tool_far_from_its_origin_turns_about_its_middle() -> None:
     near, far = ball(), ball(center=(5.0, 0.0, 0.0))
     start, end = pose_of((0, 0, 0)), pose_of((0, 0, 0), (0, 0, 0, 1))
     shift = pose_of((-5.0, 0.0, 0.0))
-    one = Way.of([start, end], near, SIZE)
-    other = Way.of([start @ shift, end @ shift], far, SIZE)
+    one = SweepPath.of([start, end], near, SIZE)
+    other = SweepPath.of([start @ shift, end @ shift], far, SIZE)
     assert len(one) == len(other)
     samples = other.sample(0, len(other))
     assert np.allclose(samples @ np.linalg.inv(shift), one.sample(0, len(one)), atol=1e-12)
 
 
 def test_fractions_go_by_the_way_and_not_by_the_number_of_poses() -> None:
-    path = Way.of(line((0, 0, 0), (0.001, 0, 0), (0.101, 0, 0)), ball(), SIZE)
+    path = SweepPath.of(line((0, 0, 0), (0.001, 0, 0), (0.101, 0, 0)), ball(), SIZE)
     assert path.fractions(path.starts) == pytest.approx([0.0, 0.001 / 0.101, 1.0])
     assert path.segments([0, int(path.starts[1]), len(path) - 1]).tolist() == [0, 1, 1]
 
@@ -478,4 +478,4 @@ def test_an_object_whose_file_has_changed_is_no_tool(boxes: Environment) -> None
 @pytest.mark.parametrize("far", [1e7, 1e30, 1e200, 1e307])
 def test_a_path_of_absurd_length_is_refused_in_one_line_before_work(far: float) -> None:
     with pytest.raises(UsageError, match=r"^the path moves \S+ m, and turns a tool"):
-        Way.of(line((0, 0, 0), (far, far, 0)), ball(), SIZE)
+        SweepPath.of(line((0, 0, 0), (far, far, 0)), ball(), SIZE)

@@ -70,7 +70,7 @@ class ClearanceSearch:
     def look(self, first: int, poses: Floats, travels: Floats, windows: Ints) -> None:
         """Look around at samples from `first` on.
 
-        poses (B, 4, 4); travels (B,), as `Path.travels` gives them; windows (B,) int64.
+        poses (B, 4, 4); travels (B,), as `SweepPath.travels` gives them; windows (B,) int64.
         """
         frames = self._frames
         residency, table = frames.residency, frames.residency.table

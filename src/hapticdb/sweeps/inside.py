@@ -7,12 +7,11 @@ the whole path.
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.resident import sweep as kernels
 from hapticdb.kernels.resident.cells import EMPTY_SLOT
 from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.resident.residency import Residency
-from hapticdb.sweeps.objects import objects_in
+from hapticdb.sweeps.objects import pairs_in_voxels
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -115,10 +114,8 @@ class _Search:
         inside = np.concatenate([whole, parts[self._interior.holds(centers)]])
         if not len(inside):
             return np.empty(0, dtype=np.int64)
-        i, j, k = inside.T
-        packed = (i << 2 * kernels.AXIS_BITS) | (j << kernels.AXIS_BITS) | k
         store, exclude = self._residency.store, self._residency.exclude
-        return np.unique(objects_in(store, packed, exclude).ids)
+        return np.unique(pairs_in_voxels(store, inside, exclude).ids)
 
     def _local(self, places: NDArray[np.floating]) -> Floats:
         """Places (n, 3) from voxels to the tool's frame, metres."""

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.curves import Z_ORDER, encode
 from hapticdb.kernels.resident import sweep as kernels
-from hapticdb.store.base import BRICK_BYTES, Keys, Store, row_shift
+from hapticdb.store.base import NO_KEYS, Keys, Store, row_shift
+from hapticdb.store.objects_at import pairs_of_voxels
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -75,44 +75,33 @@ class Met:
         self.deepest = max(self.deepest, float(depths.max()))
 
 
-def objects_in(store: Store, voxels: Ints, exclude: Keys) -> Pairs:
-    """Objects in voxels (V,), packed, those excluded left out; `hits` are indices into `voxels`.
+def pairs_in_voxels(store: Store, ijk: Ints, exclude: Keys) -> Pairs:
+    """Objects in voxels (V, 3), distinct; `hits` are indices into `ijk`.
 
-    Two objects in one voxel both count; one that only shares a brick does not.
+    Two objects in one voxel both count. An object that only shares a brick with the voxel does not.
+    Objects whose ids are in `exclude` (E,) are left out.
     """
-    ijk = np.empty((len(voxels), 3), dtype=np.int64)
-    kernels.unpack(voxels, ijk)
-    row_keys = store.grid.encode(ijk) >> row_shift(store.layout)
-    distinct = np.unique(row_keys)
-    found = [
-        _pairs_in(store, row_keys, ijk, distinct[at : at + KEYS_AT_ONCE])
-        for at in range(0, len(distinct), KEYS_AT_ONCE)
-    ]
-    which = np.concatenate([pairs.hits for pairs in found])
-    ids = np.concatenate([pairs.ids for pairs in found])
-    keep = ~np.isin(ids, exclude)
-    order = np.argsort(which[keep], kind="stable")
-    return Pairs(which[keep][order], ids[keep][order])
-
-
-def _pairs_in(store: Store, row_keys: Keys, ijk: Ints, asked: Keys) -> Pairs:
-    """Objects in voxels whose row keys (V,) are asked for."""
-    keys, row_ids, occupancy = store.lookup(asked)
-    starts = np.searchsorted(keys, row_keys)
-    counts = np.searchsorted(keys, row_keys, side="right") - starts
-    which = np.repeat(np.arange(len(row_keys)), counts)
-    rows = np.arange(len(which)) + np.repeat(starts - (np.cumsum(counts) - counts), counts)
-    if store.layout == "brick":
-        bit = encode(ijk[which] & 7, 3, Z_ORDER)
-        is_set = (occupancy[BRICK_BYTES * rows + (bit >> 3)] >> (bit & 7)) & 1
-        which, rows = which[is_set > 0], rows[is_set > 0]
-    return Pairs(which, row_ids[rows])
+    keys = store.grid.encode(ijk)
+    order = np.argsort(keys)
+    keys = keys[order]
+    first_of_row = np.flatnonzero(np.diff(keys >> row_shift(store.layout), prepend=-1))
+    cuts = [*first_of_row[::KEYS_AT_ONCE].tolist(), len(keys)]
+    which, ids = [NO_KEYS], [NO_KEYS]
+    for start, end in pairwise(cuts):
+        pairs = pairs_of_voxels(store, keys[start:end], exclude)
+        which.append(order[start + pairs[:, 0]])
+        ids.append(pairs[:, 1])
+    hits = np.concatenate(which)
+    by_hit = np.argsort(hits, kind="stable")
+    return Pairs(hits[by_hit], np.concatenate(ids)[by_hit])
 
 
 def pairs_of_hits(places: Ints, voxel_table: Ints, store: Store, exclude: Keys) -> Pairs:
     """Every hit (H,) with every object in its voxel; places (H,) are where the table has it."""
     filled = np.flatnonzero(voxel_table >= 0)
-    in_voxels = objects_in(store, voxel_table[filled], exclude)
+    ijk = np.empty((len(filled), 3), dtype=np.int64)
+    kernels.unpack(voxel_table[filled], ijk)
+    in_voxels = pairs_in_voxels(store, ijk, exclude)
     rank = np.empty(len(voxel_table), dtype=np.int64)
     rank[filled] = np.arange(len(filled))
     voxel_of_hit = rank[places]

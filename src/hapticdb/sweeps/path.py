@@ -20,7 +20,7 @@ RIGID = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Path:
+class SweepPath:
     """Poses M, and samples between them.
 
     No place of the tool's surface moves more than half a voxel between two samples, nor any within
@@ -54,7 +54,7 @@ class Path:
     _travels: Floats
 
     @classmethod
-    def of(cls, poses: ArrayLike, shell: PointShell, voxel_size: float) -> "Path":
+    def of(cls, poses: ArrayLike, shell: PointShell, voxel_size: float) -> "SweepPath":
         """Path through poses (M, 4, 4), at least one, of a shell over voxels of that size, metres.
 
         Raises

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hapticdb.proportions import Proportions
 from hapticdb.store.base import Object
-from hapticdb.sweeps.path import Path
+from hapticdb.sweeps.path import SweepPath
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -105,8 +105,8 @@ class MetObject(NamedTuple):
     intervals (K, 2) : fractions of the path, first and last hit of each run, gaps of a voxel's way
     closed; samples : that hit it; contacts : in which it was below a tangent plane; first_contact :
     the first of those, or None; length : of path from the first to the last hit of each run,
-    metres, as `Path.motion` counts them; points : most of the tool's points in its voxels at once;
-    deepest : of the deepest hit, as in `Deepest`.
+    metres, as `SweepPath.motion` counts them; points : most of the tool's points in its voxels at
+    once; deepest : of the deepest hit, as in `Deepest`.
     """
 
     object: Object
@@ -154,7 +154,7 @@ class Swept:
 
     Attributes
     ----------
-    path : Path
+    path : SweepPath
         The poses given and the samples between them.
     voxel_size : float
         Metres.
@@ -189,7 +189,7 @@ class Swept:
         "no hit" says nothing.
     """
 
-    path: Path
+    path: SweepPath
     voxel_size: float
     samples: int
     hits: int

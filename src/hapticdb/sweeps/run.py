@@ -19,7 +19,7 @@ from hapticdb.errors import (
 )
 from hapticdb.kernels.resident import sweep as kernels
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.proportions import compare_proportions
+from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.frame import as_ids
 from hapticdb.resident.frames import Felt, Frames
 from hapticdb.resident.residency import Residency
@@ -27,8 +27,8 @@ from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
 from hapticdb.store.base import Keys, Object
 from hapticdb.sweeps.clearance import ClearanceSearch
 from hapticdb.sweeps.inside import enclosed_ids
-from hapticdb.sweeps.objects import Met, Runs, objects_in, pairs_of_hits, tally
-from hapticdb.sweeps.path import Path
+from hapticdb.sweeps.objects import Met, Runs, pairs_in_voxels, pairs_of_hits, tally
+from hapticdb.sweeps.path import SweepPath
 from hapticdb.sweeps.result import Clearance, Deepest, MetObject, Moment, Profile, Proof, Swept
 
 DEFAULT_LIMIT = 32
@@ -57,6 +57,7 @@ def sweep(
     budget_bytes: int = DEFAULT_BUDGET,
     clearance_limit: float | None = None,
     profile: bool = False,
+    proportions: Proportions | None = None,
     progress: ProgressCallback | None = None,
 ) -> Swept:
     """Move a tool along a path and say what it hits, whatever the size of the environment.
@@ -80,6 +81,9 @@ def sweep(
         Metres up to which clearance is looked for, 32 voxels unless given; 0: not at all.
     profile : bool
         Look for clearance along the path, too, and not only for the least.
+    proportions : Proportions or None
+        What `compare_proportions` found for the same tool, path and scene, with the units that
+        their numbers were taken for. Unless given, they are compared here, as metres.
     progress : callable or None
         Called after each block with the samples done and their total.
 
@@ -91,12 +95,12 @@ def sweep(
         When an excluded object does not exist.
     """
     shell = shell.with_cover()
-    path = Path.of(poses, shell, env.grid.voxel_size)
+    path = SweepPath.of(poses, shell, env.grid.voxel_size)
     limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
     if not (np.isfinite(limit) and limit >= 0.0):
         raise UsageError(f"clearance up to {limit} m: give a finite length, 0 or more")
     excluded = as_ids(exclude)
-    run = _Run(env, shell, path, limit, profile, progress)
+    run = _Run(env, shell, path, limit, profile, proportions, progress)
     try:
         return run.swept(excluded, budget_bytes)
     except ConnectionLostError:  # in the middle of a snapshot: once more, from its start
@@ -110,9 +114,10 @@ class _Run:
         self,
         env: Environment,
         shell: PointShell,
-        path: Path,
+        path: SweepPath,
         limit: float,
         profile: bool,  # noqa: FBT001 - private
+        proportions: Proportions | None,
         progress: ProgressCallback | None,
     ) -> None:
         self.store = env.store
@@ -124,6 +129,7 @@ class _Run:
             limit = max(limit, LOOKED * (shell.cover + path.off))
         self.limit = limit
         self.is_profiled = profile and self.is_asked
+        self.proportions = proportions
         self.progress = progress
         self.n_windows = min(len(path), WINDOWS)
         self.begins = -(-np.arange(self.n_windows) * len(path) // self.n_windows)
@@ -244,10 +250,9 @@ class _Run:
         sample, point, voxel = self.search.nearest
         if sample < 0:
             return Clearance(self.limit, at_least, np.inf, is_beyond=True)
-        packed = np.array([voxel])
         ijk = np.empty((1, 3), dtype=np.int64)
-        kernels.unpack(packed, ijk)
-        moment = self._moment(sample, objects_in(self.store, packed, exclude).ids)
+        kernels.unpack(np.array([voxel]), ijk)
+        moment = self._moment(sample, pairs_in_voxels(self.store, ijk, exclude).ids)
         return Clearance(
             distance, at_least, distance + diagonal, is_beyond=False, moment=moment,
             point=self._world(moment.pose, point), voxel=self.grid.centers(ijk)[0],
@@ -299,14 +304,17 @@ class _Run:
             revision=frames.residency.revision,
             elapsed=elapsed,
             cells=frames.residency.loaded,
-            proportions=compare_proportions(
-                self.known.values(),
-                self.grid.voxel_size,
-                self.shell,
-                path.poses,
-                exclude=frames.residency.exclude.tolist(),
-            ),
+            proportions=self._compared(frames.residency.exclude),
         )
+
+    def _compared(self, exclude: Keys) -> Proportions:
+        """Compare tool, path and scene as metres, unless the caller has compared them."""
+        if self.proportions is not None:
+            return self.proportions
+        return compare_proportions(
+            self.known.values(), self.grid.voxel_size, self.shell, self.path.poses,
+            exclude=exclude.tolist(),
+        )  # fmt: skip
 
 
 def find_hits(frames: Frames, poses: Floats, n_hits: Ints) -> kernels.Found:

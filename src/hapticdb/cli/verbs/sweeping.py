@@ -11,7 +11,7 @@ from hapticdb.cli import fitting, render
 from hapticdb.cli.choosing import Exclude, Parts, ids_of
 from hapticdb.cli.root import Budget, Json, PathUnit, Seed, ToolUnit, UpName, Url, bytes_of
 from hapticdb.cli.verbs.touching import shell_of
-from hapticdb.cli.verdict import record, show, verdict_line
+from hapticdb.cli.verdict import show
 
 EXIT_CODES = {"comes out": 0, "hits": 1, "not decided": 3}
 DOUBTFUL = 3
@@ -89,7 +89,9 @@ def sweep(
     import hapticdb
     from hapticdb.errors import UsageError
     from hapticdb.poses import read_poses
+    from hapticdb.sweeps.record import sweep_record
     from hapticdb.sweeps.run import sweep as swept_by
+    from hapticdb.sweeps.verdict import verdict_line
 
     if (tool is None) == (not part):
         raise UsageError("give one of --tool and --part")
@@ -123,14 +125,14 @@ def sweep(
                 budget_bytes=budget_bytes,
                 clearance_limit=clearance,
                 profile=picture is not None,
+                proportions=fit,
                 progress=progress,
             )
         if env.store.revision() != found.revision:
             render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
         try:
             if json:
-                proportions = {"proportions": fit.record()}
-                render.say_json(record(found, shell, parts, excluded) | proportions)
+                render.say_json(sweep_record(found, shell, parts, excluded))
             else:
                 show(env, found, shell)
         finally:  # also when who reads, such as head, has enough

@@ -1,0 +1,110 @@
+"""A sweep's result for JSON: metres, fractions of the path, world frame."""
+
+from typing import Any
+
+import numpy as np
+
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.store.base import Object
+from hapticdb.sweeps.result import MetObject, Moment, Swept
+from hapticdb.sweeps.verdict import verdict_line
+
+
+def sweep_record(
+    found: Swept, shell: PointShell, parts: list[int], excluded: list[int]
+) -> dict[str, Any]:
+    """Put a sweep's result in numbers and words, as `hapticdb sweep --json` prints it.
+
+    shell : the tool; parts : ids of the objects that it was made of, none for a tool from a file;
+    excluded : ids of the objects that were left out of what is felt.
+    """
+    deepest, clearance, proof = found.deepest, found.clearance, found.proof
+    return {
+        "verdict": found.verdict,
+        "comes_out": found.comes_out,
+        "line": verdict_line(found, shell),
+        "proof": {
+            **proof._asdict(),
+            "is_clear": proof.is_clear,
+            "cover_needed": proof.cover_needed,
+        },
+        "poses": len(found.path.poses),
+        "samples": found.samples,
+        "hits": found.hits,
+        "contacts": found.contacts,
+        "first_hit": _moment(found.first_hit),
+        "first_contact": _moment(found.first_contact),
+        "deepest": deepest
+        and {
+            "depth": deepest.depth,
+            "point": deepest.point.tolist(),
+            "moment": _moment(deepest.moment),
+        },
+        "objects": [_met_object(one) for one in found.objects],
+        "enclosed": [_named(obj) for obj in found.enclosed],
+        "hit_intervals": found.hit_intervals.tolist(),
+        "contact_intervals": found.contact_intervals.tolist(),
+        "clearance": clearance
+        and {
+            "distance": clearance.distance,
+            "at_least": clearance.at_least,
+            "at_most": None if clearance.is_beyond else clearance.at_most,
+            "is_beyond": clearance.is_beyond,
+            "point": None if clearance.point is None else clearance.point.tolist(),
+            "voxel": None if clearance.voxel is None else clearance.voxel.tolist(),
+            "moment": _moment(clearance.moment),
+        },
+        "tool": {
+            "points": len(shell),
+            "spacing": median_spacing(shell),
+            "parts": parts,
+            "excluded": excluded,
+        },
+        "revision": found.revision,
+        "elapsed": found.elapsed,
+        "cells": found.cells,
+        "proportions": found.proportions.record(),
+    }
+
+
+def _met_object(one: MetObject) -> dict[str, object]:
+    return {
+        **_named(one.object),
+        "first": one.first,
+        "last": one.last,
+        "intervals": one.intervals.tolist(),
+        "first_contact": one.first_contact and one.first_contact.fraction,
+        "length": one.length,
+        "samples": one.samples,
+        "contacts": one.contacts,
+        "points": one.points,
+        "deepest": one.deepest,
+    }
+
+
+def _named(obj: Object) -> dict[str, object]:
+    return {"id": obj.id, "name": obj.name}
+
+
+def _moment(moment: Moment | None) -> dict[str, object] | None:
+    return moment and {
+        "sample": moment.sample,
+        "fraction": moment.fraction,
+        "segment": moment.segment,
+        "pose": moment.pose.tolist(),
+        "objects": [_named(obj) for obj in moment.objects],
+    }
+
+
+def median_spacing(shell: PointShell) -> float:
+    """Median distance from a point to its nearest neighbour, metres; 0 for a single point.
+
+    Taken over about a thousand of the shell's points, spread evenly by index.
+    """
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
+
+    if len(shell) < 2:
+        return 0.0
+    some = shell.points[:: max(1, len(shell) // 1000)]
+    distances, _ = cKDTree(shell.points).query(some, k=2)
+    return float(np.median(np.asarray(distances)[:, 1]))

@@ -1,0 +1,123 @@
+"""The verdict of a sweep in one line of words."""
+
+from collections.abc import Sequence
+
+from hapticdb.pointshell.coverage import COVER_OF_SPACING, points_for
+from hapticdb.pointshell.orientation import Surface
+from hapticdb.pointshell.shell import MAX_POINTS, PointShell
+from hapticdb.store.base import Object
+from hapticdb.sweeps.result import Clearance, MetObject, Moment, Swept
+from hapticdb.units import length_text
+
+MOST_NAMED = 3
+"""Objects that a line names; the others are counted."""
+
+
+def percent(fraction: float) -> str:
+    """Put a fraction of the path, 0 .. 1, in words: ``31.2 %``."""
+    return f"{100 * fraction:.3g} %"
+
+
+def names_of(objects: Sequence[Object]) -> str:
+    """Names of objects in one phrase, `MOST_NAMED` at most: ``seat, belt, door and 4 more``."""
+    names = [obj.name for obj in objects]
+    more = len(names) - MOST_NAMED
+    return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def verdict_line(found: Swept, shell: PointShell) -> str:
+    """Say in one line whether the tool comes out, what is in its way first, or what would decide.
+
+    shell : the tool as it was swept, with its covering radius where that is known.
+    """
+    samples = f"{found.samples:,} sample{'s' * (found.samples > 1)}"
+    if found.verdict == "comes out":
+        return f"comes out: no hit in {samples}{_clearance_clause(found.clearance)}"
+    if found.verdict == "not decided":
+        return f"not decided: no hit in {samples}, but {_doubt(found, shell)}"
+    left = [one for one in found.objects if one.is_left_at_once]
+    obstacles = [one for one in found.objects if not one.is_left_at_once]
+    within = [
+        obj for obj in found.enclosed if obj.id not in {one.object.id for one in found.objects}
+    ]
+    said = [_obstacle_clause(found, obstacles)] if obstacles else []
+    if left:
+        until = percent(max(one.last for one in left))
+        said.append(
+            f"touches {names_of([one.object for one in left])} where it starts"
+            + (
+                f", until {until} of the path"
+                if obstacles
+                else f"; no hit after {until} of the path"
+            )
+        )
+    if within:
+        said.append(f"{names_of(within)} inside the closed tool where it starts")
+        if len(said) == 1:
+            said = [f"hits {said[0]}"]
+    return "; ".join(said)
+
+
+def _obstacle_clause(found: Swept, obstacles: Sequence[MetObject]) -> str:
+    """What is first in the way, among objects that the tool does not only leave at the start."""
+    first_contact = found.caught
+    if first_contact is None:
+        first = min(one.first for one in obstacles)
+        grazed = [one.object for one in obstacles if one.first == first]
+        where = f"{percent(first)} of the path"
+        return f"grazes {names_of(grazed)} at {where}: within a voxel, without contact"
+    caught = [
+        one.object
+        for one in obstacles
+        if one.first_contact is not None and one.first_contact.sample == first_contact.sample
+    ]
+    return f"is caught: first contact at {_where(found, first_contact)} with {names_of(caught)}"
+
+
+def _doubt(found: Swept, shell: PointShell) -> str:
+    """Why neither verdict is proved, and what would decide it."""
+    proof = found.proof
+    if proof.cover is None:
+        return (
+            "how well the points cover the tool is not known: give its mesh, or save the shell "
+            "with its covering radius (PointShell.with_cover)"
+        )
+    if proof.is_clear:
+        return (
+            "it is not known what lies inside the closed tool where it starts: give its mesh"
+            if shell.surface is None
+            else "its closed tool is too large to see what lies inside it where it starts"
+        )
+    moment = None if found.clearance is None else found.clearance.moment
+    who = "a voxel" if moment is None else f"a voxel of {names_of(moment.objects)}"
+    text = (
+        f"{who} comes within {length_text(proof.nearest)} of a point, and the tool's surface "
+        f"lies up to {length_text(proof.cover)} beside its points"
+    )
+    n_points, spacing = 0, 0.0
+    if isinstance(shell.surface, Surface) and proof.cover_needed > 0.0:
+        spacing = proof.cover_needed / COVER_OF_SPACING
+        n_points = points_for(float(shell.surface.areas.sum()), spacing)
+    if not 0 < n_points <= MAX_POINTS:
+        return f"{text}: voxels of {length_text(0.5 * found.voxel_size)} may decide it"
+    return (
+        f"{text}: points {length_text(spacing)} apart would decide it, if none of them comes "
+        f"nearer (--points {n_points})"
+    )
+
+
+def _clearance_clause(clearance: Clearance | None) -> str:
+    if clearance is None:
+        return ""
+    if clearance.moment is None:
+        return f", nothing nearer than {length_text(clearance.distance)}"
+    return (
+        f", least clearance {length_text(clearance.distance)} "
+        f"from {names_of(clearance.moment.objects)}"
+    )
+
+
+def _where(found: Swept, moment: Moment) -> str:
+    """Where on the path: ``31 % of the path (segment 4)``."""
+    segment = f" (segment {moment.segment})" if len(found.path.poses) > 2 else ""
+    return f"{percent(moment.fraction)} of the path{segment}"

@@ -1,4 +1,4 @@
-"""Assemblies for the tests of importing: shapes, files of them, what a database then holds."""
+"""Assemblies for tests of the import: shapes, files, and what a database then holds."""
 
 import sqlite3
 from collections.abc import Iterable, Mapping
@@ -21,7 +21,7 @@ Rows = dict[str, list[tuple[Any, ...]]]
 SIZE = 0.01
 ORIGIN = (-0.16, -0.16, -0.16)
 BITS = 5
-"""A grid of 32 voxels of 10 mm an axis about the world's origin."""
+"""A grid around the world's origin: 32 voxels of 10 mm on each axis."""
 
 
 def small_grid(curve: CurveName = "z") -> Grid:
@@ -37,7 +37,7 @@ def small_options(
 
 
 def placement(x: float, y: float, z: float, turn: float = 0.0) -> NDArray[np.float64]:
-    """A shift in metres after a turn about z in radians, (4, 4)."""
+    """A pose (4, 4): a rotation about z in radians, then a translation in metres."""
     placed = np.eye(4)
     placed[:2, :2] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
     placed[:3, 3] = (x, y, z)
@@ -71,7 +71,7 @@ def ball(center: Iterable[float], radius: float, n_turns: int = 8) -> Mesh:
 
 
 def write_obj(path: Path, parts: Mapping[str, Mesh]) -> Path:
-    """An OBJ file of these parts, named so, in this order."""
+    """Write an OBJ file with these named parts, in this order."""
     lines: list[str] = []
     n_before = 1
     for name, (vertices, faces) in parts.items():
@@ -84,7 +84,7 @@ def write_obj(path: Path, parts: Mapping[str, Mesh]) -> Path:
 
 
 def assembly(n_parts: int = 3) -> dict[str, Mesh]:
-    """Boxes and balls that overlap, inside `small_grid`, on and off its voxels' borders."""
+    """Boxes and balls that overlap, inside `small_grid`; some faces lie on borders of voxels."""
     rng = np.random.default_rng(7)
     parts: dict[str, Mesh] = {}
     for n in range(n_parts):
@@ -98,12 +98,12 @@ def assembly(n_parts: int = 3) -> dict[str, Mesh]:
 
 
 def oracle_voxels(part: Part, grid: Grid) -> set[Voxel]:
-    """Voxels of a part by the slow definition."""
+    """Voxels of a part as the oracle finds them (`naive.voxels_of_triangles`)."""
     return voxels_of_triangles(grid.to_voxel_units(part.triangles()).tolist(), grid.bits)
 
 
 def voxel_set(ijk: NDArray[np.int64]) -> set[Voxel]:
-    """Voxels (n, 3), each once."""
+    """The set of voxels (n, 3)."""
     found = {(i, j, k) for i, j, k in ijk.tolist()}
     assert len(found) == len(ijk)
     return found
@@ -113,14 +113,14 @@ TABLES = ("environment", "object", "voxel", "brick", "change", "quantile")
 
 
 def rows_of(database: Path, *tables: str) -> Rows:
-    """Every row of an environment's tables, read by the standard library; no random marks."""
+    """Rows of an environment's tables without random marks, by the standard library."""
     with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as plain:
         assert plain.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
         found: Rows = {
             table: plain.execute(f"SELECT * FROM {table} ORDER BY 1, 2").fetchall()
             for table in tables or TABLES
         }
-        if "environment" in found:  # all but its lineage
+        if "environment" in found:  # without the column `lineage`, which is random
             found["environment"] = [row[:8] for row in found["environment"]]
         return found
 
@@ -139,6 +139,6 @@ def index_rows(env: Environment) -> set[tuple[int, int, bytes]]:
 
 
 def left_behind(folder: Path) -> list[str]:
-    """What lies in a folder besides input files."""
+    """Names in a folder that are not input files."""
     inputs = {".obj", ".ply", ".glb", ".gltf", ".stl", ".las"}
     return sorted(p.name for p in folder.iterdir() if p.suffix not in inputs)

@@ -1,7 +1,7 @@
-"""Child processes of tests, and all else that they wait for: nothing is waited for without an end.
+"""Child processes of tests and other waits: each wait has a limit.
 
-`child` and `finished` start processes; each is killed after `PATIENCE`, with its group. The script
-`watchdog` ends what outlives the run, however that ends.
+`child` and `finished` start processes and kill each with its group after `PATIENCE`. The script
+`watchdog` ends every process that is left when the run is over, however the run ended.
 """
 
 import atexit
@@ -21,8 +21,8 @@ from typing import IO, Any
 import pytest
 
 PATIENCE = 300.0
-"""Seconds after which a child is killed, and whoever waits gives up: many times what any test takes
-on a busy machine, and less than the 20 minutes after which pytest itself ends (pyproject.toml)."""
+"""Seconds after which a child is killed and a wait fails. It is many times what a test takes on a
+busy machine, and less than the 20 minutes after which pytest itself ends (pyproject.toml)."""
 RUN = "HAPTICDB_TEST_RUN"
 """Variable that names the run's folder in all processes that it starts."""
 PIPE = subprocess.PIPE
@@ -31,30 +31,30 @@ _line: list[IO[bytes]] = []
 
 
 def begin_run() -> None:
-    """Have all processes, servers and files of this run end with it; before anything is started.
+    """End all processes, servers and files of this run with it. To be called before any starts.
 
-    A run that was started with SIGINT ignored (``make test &`` in a script, cron) hears it from now
-    on, as one in the foreground does: children inherit what is ignored, and `feel` asks which
-    handler there is. So Ctrl-C in that script's terminal ends the run, too; ``setsid`` keeps it
-    away.
+    A run may have been started with SIGINT ignored (``make test &`` in a script, cron). From now on
+    it receives SIGINT as a run in the foreground does, because children inherit ignored signals
+    and `feel` asks which handler is set. So Ctrl-C in that script's terminal ends the run, too;
+    ``setsid`` prevents that.
     """
     if _line:
         return
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
-    # pytest's own folders stay where they were: a person looks into them after the run
+    # pytest's own folders stay: a person may look into them after the run
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", tempfile.gettempdir())
-    # beside that of a run that started this one: the path of a socket has room for 107 bytes
+    # not below the folder of a run that started this one: a socket's path has at most 107 bytes
     root = os.environ["PYTEST_DEBUG_TEMPROOT"]
     folder = Path(tempfile.mkdtemp(prefix="hapticdb-run-", dir=root)).resolve()
-    folder.chmod(0o711)  # servers of another account pass through
+    folder.chmod(0o711)  # servers run under another account and must be able to enter
     os.environ[RUN] = os.environ["TMPDIR"] = str(folder)
-    tempfile.tempdir = None  # found anew
+    tempfile.tempdir = None  # tempfile finds its folder again
     script = str(Path(__file__).with_name("watchdog.py"))
     dog = subprocess.Popen(
         [sys.executable, "-I", "-S", script, str(os.getpid()), str(folder)],
         stdin=PIPE,
-        start_new_session=True,  # neither Ctrl-C nor a kill of pytest's group reaches it
+        start_new_session=True,  # Ctrl-C and a kill of pytest's group do not reach the watchdog
     )
     assert dog.stdin is not None
     _line.append(dog.stdin)
@@ -62,7 +62,7 @@ def begin_run() -> None:
 
 
 def _end_run(dog: "subprocess.Popen[bytes]", pid: int) -> None:
-    if os.getpid() == pid:  # not in a copy that was forked
+    if os.getpid() == pid:  # a forked copy of this process must not do it
         assert dog.stdin is not None
         dog.stdin.close()
         dog.wait(PATIENCE)
@@ -95,10 +95,10 @@ def child(
     env: Mapping[str, str] | None = None,
     patience: float = PATIENCE,
 ) -> Iterator["subprocess.Popen[str]"]:
-    """A child process, in a group of its own; its end is waited for at the end of the block.
+    """A child process in a process group of its own. The end of the block waits for its end.
 
-    It is killed, with its group, when the block fails, and after `patience`: all its pipes close
-    then, so that no read of them waits for ever.
+    The child is killed with its group when the block fails, and after `patience`. Then all its
+    pipes close, so no read from them waits for ever.
     """
     process = subprocess.Popen(
         command,
@@ -149,7 +149,7 @@ def finished(
     check: bool = False,
     patience: float = PATIENCE,
 ) -> "subprocess.CompletedProcess[str]":
-    """A child process, run to its end: its exit code and what it has printed."""
+    """Run a child process to its end; return its exit code and what it printed."""
     keywords: dict[str, Any] = {"cwd": cwd, "env": env, "patience": patience}
     with child(command, stdin=stdin, stdout=stdout, stderr=stderr, **keywords) as process:
         out, err = process.communicate(timeout=patience)
@@ -159,7 +159,7 @@ def finished(
 
 
 def exit_code(pid: int) -> int:
-    """Wait for the end of a process that was forked: its exit code, or less than 0 by a signal."""
+    """Wait for the end of a forked process; return its exit code, negative after a signal."""
     end_forked(pid)
     found: list[int] = []
 
@@ -174,7 +174,7 @@ def exit_code(pid: int) -> int:
 
 
 def until(claim: Callable[[], object], every: float = 0.01, patience: float = PATIENCE) -> None:
-    """Wait until a claim holds."""
+    """Wait until a condition holds."""
     deadline = time.monotonic() + patience
     while not claim():
         assert time.monotonic() < deadline, f"it does not hold after {patience:g} s"

@@ -35,7 +35,7 @@ def run(capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_
 
 
 def command(*args: object) -> list[str]:
-    """The same in a process of its own."""
+    """Arguments that run that command line in a process of its own."""
     return [sys.executable, "-m", "hapticdb", *map(str, args)]
 
 
@@ -63,12 +63,12 @@ sys.exit(main())
 
 
 def command_that_halts(n_objects: int, *args: object) -> list[str]:
-    """The same, which writes so many objects and waits: no signal can come when it has ended."""
+    """Arguments of a command that writes so many objects and then waits until a signal ends it."""
     return [sys.executable, "-c", HALTING, str(n_objects), *map(str, args)]
 
 
 def wait_for_an_object(url: Path | str, child: "Popen[str]") -> None:
-    """Until an import or a copy has committed something."""
+    """Wait until an import or a copy has committed an object."""
 
     def is_there() -> bool:
         assert child.poll() is None, "it ended before it could be interrupted"
@@ -86,7 +86,7 @@ def count_objects(url: Path | str) -> int:
 
 
 def refused(result: tuple[int, str, str], *words: str) -> str:
-    """One line on standard error, exit code 2."""
+    """Check that a command was refused with exit code 2 and one line, which is returned."""
     code, _, err = result
     assert code == 2, result
     lines = err.splitlines()
@@ -111,7 +111,7 @@ def boxes(path: Path, count: int = 3, side: float = 0.1, subdivisions: int = 0) 
 
 
 def tool(path: Path, *, is_open: bool = False) -> Path:
-    """A cube of 2 cm, with a side missing if open."""
+    """A cube of 2 cm; an open one lacks a side."""
     cube = trimesh.creation.box((0.02, 0.02, 0.02))
     if is_open:
         cube.update_faces(np.arange(len(cube.faces)) > 1)
@@ -138,15 +138,15 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def scene(run: Run, made: Path, tmp_path: Path) -> Path:
-    """A copy of that environment, tool and path; the boxes' file stays where it was."""
-    assert callable(run)  # in the folder where it runs
+    """A copy of the environment, tool and path of `made`; the file of boxes stays in its folder."""
+    assert callable(run)  # the environment lies in the folder where the command runs
     for name in ("scene.db", "tool.stl", "tool.npz", "path.csv"):
         shutil.copy(made / name, tmp_path)
     return tmp_path / "scene.db"
 
 
 def rows_of(url: Path | str) -> list[tuple[Any, ...]]:
-    """Every row of the objects and of the index table, whichever it has."""
+    """Every row of the table of objects and of the index table, in either layout."""
     with hapticdb.open(url, read_only=True) as env:
         found = [(obj.id, obj.name, obj.digest, obj.voxels) for obj in env.objects()]
         keys, ids, bits = env.store.scan(np.zeros(1, np.int64), np.array([2**62]))

@@ -1,4 +1,4 @@
-"""What every test shares: the folder of real CAD, a few shells, and the header."""
+"""What tests share: the folder of real CAD files, a shell, and the header of the run."""
 
 import os
 import signal
@@ -26,7 +26,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Add the mark `long` to what runs on every PostgreSQL, but on the newest; not the contract."""
+    """Add the mark `long` to tests on older PostgreSQL versions, except to the contract suite."""
     older = set(map(named, FOUND[1:]))
     for item in items:
         params = getattr(getattr(item, "callspec", None), "id", "").split("-")
@@ -53,7 +53,7 @@ def pytest_report_header() -> list[str]:
 
 @pytest.fixture(autouse=True)
 def _signals_are_left_as_they_were() -> Iterator[None]:
-    """Or every process that a later test starts ignores them, too."""
+    """Otherwise every process that a later test starts would ignore these signals, too."""
     numbers = signal.SIGINT, signal.SIGTERM
     before = list(map(signal.getsignal, numbers))
     yield

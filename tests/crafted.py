@@ -1,4 +1,4 @@
-"""Environments that were damaged or made by somebody who means harm: what is edited in them."""
+"""Environments that were damaged, or crafted to do harm, and the edits that make them so."""
 
 from contextlib import closing
 from pathlib import Path
@@ -84,7 +84,7 @@ def made(path: Path, layout: Layout) -> Path:
 
 
 def edited(path: Path, statements: str, layout: Layout) -> None:
-    """Run statements as somebody does who means harm: no check holds, and pages fit."""
+    """Run statements as an attacker would: without CHECKs, and with correct page checksums."""
     with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
         connection.execute("PRAGMA ignore_check_constraints = ON")
         connection.execute("PRAGMA legacy_alter_table = ON")

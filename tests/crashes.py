@@ -1,4 +1,4 @@
-"""Servers that crash, and what is cut off by it: for the tests of recovery."""
+"""Servers that crash, and imports and edits that a crash interrupts, for tests of recovery."""
 
 import contextlib
 import shutil
@@ -24,7 +24,7 @@ from validity import Contents, contents, valid_contents
 
 N_PARTS = 30
 SOON_S = 0.2
-"""Patience with a server that stays away."""
+"""Seconds that a client waits for a server that does not come back."""
 
 
 def options(layout: Layout) -> ImportOptions:
@@ -43,7 +43,7 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def undisturbed(file: Path) -> dict[Layout, Contents]:
-    """What an import ends with when nothing happens: on SQLite, which ends with the same."""
+    """Contents after an import without a crash, made on SQLite: the rows are the same."""
     found: dict[Layout, Contents] = {}
     for layout in ("voxel", "brick"):
         database = file.with_name(f"{layout}.db")
@@ -56,7 +56,7 @@ def undisturbed(file: Path) -> dict[Layout, Contents]:
 def template(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Binaries]:
-    """A server set up and never started."""
+    """The folder of a server that was set up and never started."""
     folder = tmp_path_factory.mktemp("template")
     PrivateServer.at(folder, request.param)
     return folder, request.param
@@ -102,21 +102,21 @@ def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def moments(seed: int) -> list[tuple[int, float]]:
-    """Three moments of an import: so many parts are in, and so many seconds into the next."""
+    """Three moments of an import: the number of finished parts, and seconds into the next."""
     rng = np.random.default_rng(seed)
     parts = np.sort(rng.choice(np.arange(1, N_PARTS - 5, 5), 3, replace=False))
     return [(n, float(rng.uniform(0, 0.008))) for n in parts.tolist()]
 
 
 class Killer:
-    """Calls something while an import goes on: between that part and the fourth after it."""
+    """Calls a function during an import, between a part and the fourth part after it."""
 
     def __init__(self, n_parts: int, delay: float, event: Callable[[], object]) -> None:
         self._n_parts = n_parts
         self._timer = threading.Timer(delay, event)
 
     def __call__(self, progress: Progress) -> None:
-        """Hear how far the import is."""
+        """Take the import's progress; call the function when its part is reached."""
         if progress.parts_done == self._n_parts:
             self._timer.start()
         elif progress.parts_done == self._n_parts + 4:
@@ -124,13 +124,13 @@ class Killer:
 
 
 def crash(server: PrivateServer) -> None:
-    """End the server, and start it again: whoever waits for it meanwhile goes on."""
+    """Kill the server and start it again, so that clients that wait for it can go on."""
     server.kill()
     server.start()
 
 
 class After:
-    """Calls something once, when a method has been called so many times and has returned."""
+    """Calls a function once, when a method has returned for the given number of times."""
 
     def __init__(
         self,
@@ -154,7 +154,7 @@ class After:
 
 
 def small(url: str, file: Path, layout: Layout = "brick") -> Environment:
-    """An environment of those balls, open to be written."""
+    """An environment of those balls, opened for writing."""
     hapticdb.import_files(url, [file], options(layout))
     return hapticdb.open(url)
 
@@ -170,7 +170,7 @@ EDITS: list[tuple[str, Edit]] = [
 
 @pytest.fixture(scope="module")
 def edited(file: Path, undisturbed: dict[Layout, Contents]) -> list[Contents]:
-    """What the environment holds after each edit, when nothing happens."""
+    """Contents of the environment after each edit, without a crash."""
     assert undisturbed
     database = file.with_name("edited.db")
     shutil.copy(file.with_name("brick.db"), database)

@@ -1,7 +1,8 @@
-"""Damage to copies of small environments, and what is answered then: run it, or see test_damaged.
+"""Damages copies of small environments and compares what they answer.
 
-Each case takes one environment, damages a copy of it, and asks the copy all that a user asks: to
-open it, its facts, its objects, touches by every strategy, and `check`. Run it for many cases:
+`store/test_damaged.py` runs a few cases. Each case takes one environment, damages a copy, and asks
+the copy everything that a user asks: open, grid and size, objects, touches by every strategy, and
+`check`. For many cases:
 
     python tests/damaging.py 10000 --seed 0
 """
@@ -37,16 +38,16 @@ PLACES: tuple[tuple[tuple[float, float, float], tuple[Strategy, ...]], ...] = (
     ((0.045, 0.02, 0.04), ("array", "cbgroup")),
     ((0.015, 0.04, 0.045), ("maxgap",)),
 )
-"""Where tools are, metres, and how the database is asked there."""
+"""Positions of the tool in metres, and the strategies that are asked there."""
 LIMIT_S = 30
 MEMORY_BYTES = 4 << 30
-"""Of address space, most of which a process with numba takes before it begins."""
+"""Bytes of address space of a child. A process with numba takes most of it before it begins."""
 Content = dict[str, bytes]
-"""Files by what follows the environment's path: "" and "-wal"."""
+"""Contents of files by their suffix after the environment's path: "" and "-wal"."""
 
 
 class Sample(NamedTuple):
-    """An environment to damage: its files, what it answers, and what it answered before."""
+    """An environment to damage: its files, its answers now, and its answers one commit earlier."""
 
     name: str
     content: Content
@@ -55,7 +56,7 @@ class Sample(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What came of a case: of reading and of check, each right, told, silent or worse."""
+    """Result of a case, for reading and for `check`: right, told, silent or worse."""
 
     damage: str
     sample: str
@@ -68,7 +69,7 @@ class Outcome(NamedTuple):
 
 
 def answers(path: Path) -> str:
-    """All that a user sees of an environment, as text; raises what is told."""
+    """Everything that a user sees of an environment, as text; raises what a user is told."""
     shell = PointShell.sphere(0.012, 60)
     with hapticdb.open(path, read_only=True) as env:
         told: list[Any] = [env.layout, env.grid.describe(), env.size().rows]
@@ -85,7 +86,7 @@ def answers(path: Path) -> str:
 
 
 def made(folder: Path, layout: Layout, curve: CurveName, *, in_log: bool) -> Sample:
-    """An environment of three objects, in its file alone or with the last ones in its log."""
+    """An environment of three objects: all in its file, or the last ones still in its log."""
     grid = Grid(0.001, (0, 0, 0), 6, curve)
     path = folder / f"{layout}-{curve}-{'log' if in_log else 'file'}.db"
     other = folder / f"other-{path.name}"
@@ -205,7 +206,7 @@ def damage(sample: Sample, path: Path, rng: np.random.Generator) -> str:
     return f"{kind}{' of the log' if part else ''}"
 
 
-# -- what comes of it ----------------------------------------------------------------------------
+# -- what the copy answers -----------------------------------------------------------------
 
 
 def _reading(sample: Sample, path: Path) -> tuple[str, str]:
@@ -229,7 +230,7 @@ def _work(samples: list[Sample], folder: str, pipe: Connection) -> None:
         rng = np.random.default_rng(case)
         sample = samples[int(rng.integers(len(samples)))]
         kind = damage(sample, path, rng)
-        # check looks before anything is opened, as a user would who mistrusts the file
+        # `check` runs before the copy is opened, as for a user who mistrusts the file
         copy = Path(folder) / "checked.db"
         for suffix in ("", "-wal", "-shm"):
             Path(f"{copy}{suffix}").unlink(missing_ok=True)
@@ -252,7 +253,7 @@ def _checked(path: Path) -> tuple[str, str]:
 
 
 def samples_in(folder: Path) -> list[Sample]:
-    """Both layouts on every curve, each in its file alone and with a log."""
+    """Environments of both layouts on all their curves, each without and with a log."""
     return [
         made(folder, layout, curve, in_log=in_log)
         for layout, curve in KINDS
@@ -261,7 +262,7 @@ def samples_in(folder: Path) -> list[Sample]:
 
 
 def outcomes(samples: list[Sample], folder: Path, cases: range, seed: int) -> Iterator[Outcome]:
-    """One outcome a case; a child that hangs or dies is one, too, and another goes on."""
+    """One outcome for each case. After a child that hangs or dies a new child goes on."""
     context = get_context("forkserver")
     left = list(cases)
     while left:
@@ -298,12 +299,12 @@ _is_stopped: list[bool] = []
 
 
 def _stop(*_: object) -> None:
-    """Print what came of the cases so far: a handler."""
+    """Signal handler: print the outcomes so far."""
     _is_stopped.append(True)
 
 
 def main() -> int:
-    """Run many cases and print what came of them; 1 when one was silent or worse."""
+    """Run many cases and print their outcomes; return 1 if one was silent or worse."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("cases", type=int)
     parser.add_argument("--seed", type=int, default=0)
@@ -335,7 +336,7 @@ WRONG = ("silent", "traceback", "hang", "crash")
 
 
 def is_missed(found: Outcome) -> bool:
-    """Whether check calls sound what is not: all but ends of files that hold nothing needed."""
+    """Whether `check` missed damage. Damage to unused ends of files does not count."""
     may_end = found.damage.startswith("cut") or found.damage.endswith("of the log")
     harmless = found.read == "right" or (found.read == "earlier" and may_end)
     return found.check == "sound" and not (may_end and harmless)

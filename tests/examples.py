@@ -12,9 +12,9 @@ EXAMPLES = {"quick": 25, "thorough": 200}
 
 
 def choose() -> None:
-    """Take the profile that the environment names; before any test module is imported.
+    """Load the profile that the environment names. To be called before test modules are imported.
 
-    No example has a deadline: the first compiles kernels, and a busy machine is no error.
+    Examples have no deadline: the first one compiles kernels, and the machine may be busy.
     """
     for name, n_examples in EXAMPLES.items():
         settings.register_profile(name, max_examples=n_examples, deadline=None)

@@ -1,4 +1,4 @@
-"""Damages files: bytes, numbers, lines, and what JSON, XML and archives are made of."""
+"""Damages files: their bytes, numbers and lines, and the structure of JSON, XML and archives."""
 
 import io
 import json
@@ -30,7 +30,7 @@ _ELEMENT = re.compile(rb"<(\w+)[^<>]*(?:/>|>[^<]*</\1>)")
 
 
 def mutated(random: Random, suffix: str, content: bytes, other: bytes) -> bytes:
-    """Content with one to three damages; `other` is a file of the same format to take pieces of."""
+    """Content with one to three damages. `other` is a file of the same format."""
     for _ in range(random.choice((1, 1, 1, 2, 3))):
         choices: list[Callable[[Random, bytes], bytes]] = [_bytes_changed, _cut_or_grown]
         if suffix in TEXTS:
@@ -162,7 +162,7 @@ def _json_changed(random: Random, content: bytes) -> bytes:
 
 
 def _place(random: Random, tree: Any) -> tuple[Any, Any]:  # noqa: ANN401 - JSON
-    """List or object anywhere in a tree, and an index or key of it."""
+    """A list or object somewhere in a JSON tree, and one of its indices or keys."""
     holder: Any = {"": tree}
     key: Any = ""
     while isinstance(holder[key], (dict, list)) and holder[key] and random.random() < 0.8:
@@ -188,7 +188,7 @@ def _change(random: Random, holder: Any, key: Any) -> None:  # noqa: ANN401 - JS
 
 
 def _archive_changed(random: Random, content: bytes) -> bytes:
-    """Archive with one of its entries changed, or put in other words."""
+    """Archive with one of its entries changed or compressed in another way."""
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = [(name, archive.read(name)) for name in archive.namelist()]

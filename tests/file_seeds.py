@@ -1,6 +1,6 @@
-"""Small sound files of every format that is read: what `mutate_files` makes its files from.
+"""Small sound files of every format: `mutate_files` damages them.
 
-Libraries are imported where they are used: what a process has loaded, each of its forks copies.
+Libraries are imported where they are used, because each fork copies what its process has loaded.
 """
 
 import io
@@ -15,9 +15,9 @@ import numpy as np
 from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, threemf
 
 MOST_BYTES = 20_000
-"""Of a file of HAPTICDB_TEST_DATA that becomes a seed: larger ones take longer, and fail alike."""
+"""Size in bytes of the largest file of HAPTICDB_TEST_DATA that becomes a seed. Larger: slower."""
 OTHERS = (".npz", ".csv", ".hdbrec")
-"""Suffixes of saved shells, paths and recordings, which are read in the caller's process."""
+"""Suffixes of saved shells, paths and recordings. They are read in the caller's own process."""
 
 _DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema"
 version="1.4.1"><asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset><library_geometries>
@@ -91,9 +91,9 @@ END-ISO-10303-21;
 
 
 def seeds(suffix: str, folder: Path) -> list[bytes]:
-    """Contents of sound files of one suffix; `folder` is scratch.
+    """Contents of sound files with one suffix. `folder` is for temporary files.
 
-    Small files of the folder that HAPTICDB_TEST_DATA names come along, sound or not.
+    Small files of the folder HAPTICDB_TEST_DATA are added, whether sound or not.
     """
     wanted = ".step" if suffix == ".stp" else suffix
     if wanted in OTHERS:

@@ -1,4 +1,4 @@
-"""Results of an evaluation that never ran: every experiment, by formulas that look like timings."""
+"""Invented results of an evaluation, for tests of its pages: formulas that look like timings."""
 
 import math
 from collections.abc import Iterator

@@ -1,4 +1,4 @@
-"""Small mesh files, written for tests, and what a refused one says."""
+"""Small mesh files for tests, and the line with which a file is refused."""
 
 import base64
 import json
@@ -24,7 +24,7 @@ def gltf(
     vertices: NDArray[np.float32] = TRIANGLE,
     indices: Sequence[int] = (0, 1, 2),
 ) -> Path:
-    """A glTF file of one mesh (accessor 0 positions, 1 indices) unless `tree` says otherwise."""
+    """A glTF file of one mesh (accessor 0: positions, 1: indices); `tree` replaces parts of it."""
     positions = vertices
     corners = np.asarray(indices, dtype=np.uint32)
     content = positions.tobytes() + corners.tobytes()
@@ -90,7 +90,7 @@ def names(file: MeshFile) -> list[str]:
 
 
 def cause(path: Path, read: Callable[..., MeshFile] = parse_in_process, **options: float) -> str:
-    """The one line that a file is refused with."""
+    """The one line with which a file is refused; fails if the file is read."""
     with pytest.raises(FileError) as raised:
         read(path, **options)
     line = str(raised.value)

@@ -1,13 +1,13 @@
 """Damages sound files and reads them as an import does: ``python tests/mutate_files.py 50000``.
 
-Every file must be read, or be refused in one line: no traceback, no hang, no memory beyond ten
-times the file and its result, no geometry that is not sound. A table says what became of the files;
-the exit code is 1 where one of these fell. File number n of a seed is the same on every run:
-``--only n`` makes it again and says what became of it.
+Each file must be read or be refused in one line: without a traceback or a hang, with at most ten
+times the memory of the file and its result, and with sound geometry. A table counts what happened;
+the exit code is 1 if a file broke one of these rules. File number n of a seed is the same on every
+run: ``--only n`` makes it again and tells its result.
 
-Meshes go through `hapticdb.mesh.read_file` itself, but that its child is forked from this process,
-which has the reader loaded, instead of started: a file then takes milliseconds. Each format has a
-process of its own, since a fork copies what is loaded.
+Meshes are read by `hapticdb.mesh.read_file`, with one difference: its child is forked from this
+process, which has loaded the reader, instead of started anew, so a file takes milliseconds. Each
+format has a process of its own, because a fork copies everything that is loaded.
 """
 
 # ruff: noqa: T201 - a script that prints
@@ -41,9 +41,9 @@ from hapticdb.mesh.parse import reader_of
 FORMATS = (*SUFFIXES, *OTHERS)
 
 SLOWEST = 30.0
-"""Seconds from which reading a file counts as a hang."""
+"""Seconds after which reading a file counts as a hang."""
 BASE_BYTES = 64 << 20
-"""Memory that any file may take, beyond ten times its size and that of its result."""
+"""Bytes that a file may take beyond ten times its size and the size of its result."""
 SOUND = ("read", "refused", "library crashed, in one line")
 peak = 0
 """Bytes that the last forked child took beyond what it shared with this process."""
@@ -90,7 +90,7 @@ def _resident() -> int:
 
 
 def _run_child() -> None:
-    """What the interpreter does with `child.py`: never returns."""
+    """Run `child.py` as its own interpreter would. Never returns."""
     code = 1
     try:
         sys.stdin, sys.stderr = io.TextIOWrapper(io.FileIO(0)), io.TextIOWrapper(io.FileIO(2, "w"))
@@ -104,7 +104,7 @@ def _run_child() -> None:
 
 
 def in_fork(call: Callable[[], None], seconds: float) -> str:
-    """What became of a call in a forked child: for what is read in the caller's process."""
+    """Call a function in a forked child and return what happened."""
     global peak  # noqa: PLW0603
     before, ends = _resident(), os.pipe()
     pid = os.fork()
@@ -168,7 +168,7 @@ def _unsound(file: MeshFile) -> str | None:
 
 
 def verdict(path: Path) -> tuple[str, str]:
-    """What became of a file, and the line that says so."""
+    """The result of reading a file, and a line that describes it."""
     started, n_result, line = time.monotonic(), 0, ""
     if path.suffix in OTHERS:
         line = in_fork(lambda: _read_ours(path), SLOWEST)
@@ -202,7 +202,7 @@ def make(number: int, seed: int, known: list[bytes]) -> bytes:
 def run(
     suffix: str, numbers: Sequence[int], seed: int, folder: Path, kept: Path | None = None
 ) -> Counter[str]:
-    """Read damaged files of one format; counts what became of them."""
+    """Read damaged files of one format; return the counts of results."""
     known = seeds(suffix, folder)
     (folder / "beside.bin").write_bytes(bytes(48))
     path = folder / f"mutated{suffix}"
@@ -230,10 +230,10 @@ def run(
 
 
 def _run_apart(n_format: int, given: argparse.Namespace) -> Counter[str]:
-    """Run one format in a process of its own; its counts."""
+    """Run one format in a process of its own; return its counts."""
     command = [sys.executable, __file__, str(given.files), f"--format={n_format}"]
     command += [f"--seed={given.seed}", *([f"--keep={given.keep}"] if given.keep else [])]
-    # an end for a run that hangs, far beyond what the slowest files may take
+    # a limit for a run that hangs, far above what the slowest files may take
     limit = 60 + SLOWEST * given.files
     ended = finished(command, stderr=None, patience=limit)
     *lines, last = ended.stdout.splitlines() or [""]
@@ -245,7 +245,7 @@ def _run_apart(n_format: int, given: argparse.Namespace) -> Counter[str]:
 
 
 def table(counts: Counter[Any]) -> str:
-    """Counts, a line a format."""
+    """The counts as text, one line for each format."""
     words = [*SOUND, *sorted({word for _, word in counts} - set(SOUND))]
     lines = ["  ".join([f"{'format':8}", *(f"{word:>10}" for word in words)])]
     for suffix in (*sorted({suffix for suffix, _ in counts}), "all"):

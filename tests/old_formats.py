@@ -1,4 +1,4 @@
-"""Environments as earlier formats had them."""
+"""Environments in earlier versions of the format."""
 
 from contextlib import closing
 from pathlib import Path
@@ -10,7 +10,7 @@ from hapticdb.store.sqlite.store import SQLiteStore
 
 
 def make_old(path: Path) -> None:
-    """Make a file as format 1 had it of this one: no lineage, no checksums of pages."""
+    """Turn a file into one of format 1: no marks of commits, no checksums of pages."""
     with closing(SQLiteStore.open(path, read_only=True)) as new:
         tables = {
             name: new._fetch(f"SELECT * FROM {name}")

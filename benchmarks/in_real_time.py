@@ -139,12 +139,21 @@ def environments(folder: Path, model: Path) -> Iterator[dict[str, str]]:
         yield {"SQLite": file, f"PostgreSQL {binaries.major}": url}
 
 
+def about() -> dict[str, Any]:
+    """What both files of one run begin with."""
+    return {
+        "commit": records.commit(),
+        "machine": records.machine(),
+        "versions": records.versions(),
+    }
+
+
 def measure(
     folder: Path, model: Path | None, seconds: float, rates: Sequence[int]
 ) -> dict[str, Any]:
     """All of it, as records."""
     sample = write_sample(folder)
-    results: dict[str, Any] = {"machine": records.machine(), "seconds": seconds}
+    results: dict[str, Any] = about() | {"seconds": seconds}
     with environments(folder, model or sample.car) as urls:
         database = Path(urls["SQLite"])
         tool, path = sample.wrench, sample.path
@@ -236,8 +245,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="hapticdb-realtime-") as folder:
         rates = [int(word) for word in given.rates.split(",") if word]
         results = measure(Path(folder), given.model, given.seconds, rates)
-    given.out.write_text(json.dumps(results, indent=1) + "\n")
     print(table(results))
+    kept = about() | {"edits": results.pop("edits")}
+    given.out.write_text(json.dumps(results, indent=1) + "\n")
+    given.out.with_name("edits.json").write_text(json.dumps(kept, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -279,8 +279,9 @@ def everything() -> dict[str, dict[str, Any]]:
     return {
         name: {
             "name": name,
+            "commit": "0123abc",
             "machine": {"processor": "made up", "cores": 2, "memory": "8 GB"},
-            "versions": {"hapticdb": "0.1.0", "SQLite": "3.51.0", "PostgreSQL": ["15.18", "18.6"]},
+            "versions": {"SQLite": "3.51.0", "PostgreSQL": ["15.18", "18.6"]},
             "inputs": {"seed": 20, "poses": 1000, "window": 64},
             "notes": ["not measured: Apache Nowhere: not installed"] if name == "peers" else [],
             "cells": list(make()),

@@ -11,12 +11,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hapticdb.bench.cells import ORDERS, distinct, grouped
-from hapticdb.bench.evaluation.page import count, duration, log_ticks
-from hapticdb.bench.evaluation.paper_panels import gap_places
-from hapticdb.bench.evaluation.plots import PAINTERS, draw
-from hapticdb.bench.evaluation.sheets import KINDS, sheets, sheets_of
+from hapticdb.bench.drawing.canvas import count, duration, log_ticks
+from hapticdb.bench.drawing.draw import KINDS, draw
+from hapticdb.bench.drawing.paper_plots import gap_places
+from hapticdb.bench.drawing.plots import plots_among
 from hapticdb.errors import FileError
 from made_up import MAKERS, Cell, cell, everything
+from report.plots import REPORT_KINDS
 
 FILES = {
     "figure8",
@@ -41,7 +42,7 @@ few = settings(max_examples=25, deadline=None)
 @pytest.fixture(scope="session")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("plots")
-    return {path.stem: path for path in draw(everything(), folder)}
+    return {path.stem: path for path in draw(everything(), folder, REPORT_KINDS)}
 
 
 def words_of(path: Path) -> str:
@@ -56,8 +57,13 @@ def result(*cells: Cell) -> dict[str, Any]:
 
 def test_every_experiment_but_the_tables_is_drawn(drawn: dict[str, Path]) -> None:
     assert set(drawn) == FILES
-    assert {kind.experiment for kind in KINDS} == set(MAKERS) - {"table1", "costs"}
-    assert {kind.name for kind in KINDS} == set(PAINTERS)
+    assert {kind.experiment for kind in REPORT_KINDS} == set(MAKERS) - {"table1", "costs"}
+
+
+def test_bench_draws_no_experiment_of_the_evaluation_alone(tmp_path: Path) -> None:
+    ours = {path.stem for path in draw(everything(), tmp_path)}
+    assert ours == FILES - {"layouts", "peers", "voxelizing", "scale"}
+    assert REPORT_KINDS[: len(KINDS)] == KINDS
 
 
 def test_pictures_are_small_and_hold_text(drawn: dict[str, Path]) -> None:
@@ -67,7 +73,7 @@ def test_pictures_are_small_and_hold_text(drawn: dict[str, Path]) -> None:
 
 
 def test_the_same_results_give_the_same_bytes(drawn: dict[str, Path], tmp_path: Path) -> None:
-    for path in draw(everything(), tmp_path / "deep" / "again"):
+    for path in draw(everything(), tmp_path / "deep" / "again", REPORT_KINDS):
         assert path.read_bytes() == drawn[path.stem].read_bytes()
         assert not re.search(r"<dc:date>", path.read_text())
 
@@ -138,7 +144,7 @@ def test_one_engine_and_one_layout_are_enough(tmp_path: Path) -> None:
             if c.get("engine", "SQLite 3.51.0") == "SQLite 3.51.0"
             and c.get("layout", "brick") == "brick"
         ]
-    assert {path.stem for path in draw(cut, tmp_path)} == FILES
+    assert {path.stem for path in draw(cut, tmp_path, REPORT_KINDS)} == FILES
 
 
 def test_a_panel_without_cells_says_so(tmp_path: Path) -> None:
@@ -151,14 +157,14 @@ def test_a_panel_without_cells_says_so(tmp_path: Path) -> None:
 
 
 def test_nothing_is_drawn_of_nothing(tmp_path: Path) -> None:
-    assert draw({}, tmp_path) == []
+    assert draw({}, tmp_path, REPORT_KINDS) == []
     empty = {
         "figure9": {},
         "tail": result(),
         "peers": {"cells": None},
         "another": result({"us": 3}),
     }
-    assert draw(empty, tmp_path) == []
+    assert draw(empty, tmp_path, REPORT_KINDS) == []
 
 
 def test_a_name_with_a_dollar_sign_is_a_name(tmp_path: Path) -> None:
@@ -167,22 +173,22 @@ def test_a_name_with_a_dollar_sign_is_a_name(tmp_path: Path) -> None:
     assert "environment a $b_{ & <c>" in words_of(path)
 
 
-def test_sheets_of_two_environments_have_names_of_their_own() -> None:
+def test_plots_of_several_environments_have_names_of_their_own() -> None:
     names = ("car", "Käfer/1", "Käfer 1", "kafer-1")
     cells = [
         cell(9.0, environment=name, engine="SQLite", layout="brick", strategy="array")
         for name in names
     ]
-    found = [sheet.name for sheet in sheets_of({"tail": result(*cells)}, "tail")]
+    found = [plot.name for plot in plots_among({"tail": result(*cells)}, KINDS)]
     assert len(set(found)) == 4
     assert "tail" in found
     assert all(re.fullmatch(r"[a-z0-9-]+", name) for name in found)
 
 
 def test_the_paper_conditions_keep_the_plain_name() -> None:
-    for sheet in sheets(everything()):
-        caches = {one.get("cache") for one in sheet.cells}
-        if sheet.name in {"figure8", "figure9", "figure10"}:
+    for plot in plots_among(everything(), KINDS):
+        caches = {one.get("cache") for one in plot.cells}
+        if plot.name in {"figure8", "figure9", "figure10"}:
             assert caches == {"4 MB"}
 
 
@@ -222,7 +228,8 @@ def test_missing_numbers_are_passed_over(
             one[key] = None
         elif key in one:
             one[key] = value
-    for path in draw({experiment: result(*cells)}, tmp_path_factory.mktemp("lacks")):
+    folder = tmp_path_factory.mktemp("lacks")
+    for path in draw({experiment: result(*cells)}, folder, REPORT_KINDS):
         assert words_of(path)
 
 

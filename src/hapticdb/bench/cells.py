@@ -12,6 +12,8 @@ Result = Mapping[str, Any]
 Results = Mapping[str, Result]
 """Experiments by name."""
 
+FRAME_US = 1000.0
+"""Microseconds that a frame may take at 1000 frames a second; tables and plots mark it."""
 ONE_STATEMENT = "one statement"
 IN_THE_SERVER = "loop in the server"
 PAPER_POINT: Mapping[str, Any] = {

@@ -1,9 +1,10 @@
-"""Results as JSON: what was measured, on which machine, with which versions and inputs."""
+"""Results as JSON: what was measured, at which commit, machine, versions and inputs."""
 
 import json
 import os
 import platform
 import re
+import subprocess
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,7 +14,12 @@ from hapticdb.bench.measure import Cell
 from hapticdb.bench.workload import PERCENTILES, POINTS, RADIUS_VOXELS, SEED, WINDOW
 from hapticdb.errors import FileError
 
-PACKAGES = ("hapticdb", "numpy", "numba", "apsw", "psycopg")
+PACKAGES = ("numpy", "numba", "apsw", "psycopg")
+"""Whose versions a result names; hapticdb itself is named by its commit."""
+ROOT = Path(__file__).parents[3]
+"""The clone, where hapticdb runs from one."""
+GIT_S = 10.0
+"""Seconds that git may take to name the commit; a larger value waits longer for a slow disk."""
 INPUTS: Mapping[str, Any] = {
     "sphere": f"{POINTS} points spread evenly over a sphere, radius {RADIUS_VOXELS:g} voxels",
     "slide": "poses that slide the shell over the largest objects, from above",
@@ -36,6 +42,7 @@ def result(
     """One experiment as its file holds it."""
     return {
         "name": name,
+        "commit": commit(),
         "machine": machine(),
         "versions": versions(),
         "inputs": dict(inputs),
@@ -105,6 +112,24 @@ def _processor() -> str:
         return platform.processor()
     found = re.search(r"model name\s*:\s*(.+)", text)
     return found[1].strip() if found else platform.processor()
+
+
+def commit(root: Path = ROOT) -> str:
+    """Commit that runs, with ``-dirty`` where files differ from it; else hapticdb's version.
+
+    root : folder that holds `.git` when hapticdb runs from a clone. An installed package has none.
+    """
+    if (root / ".git").exists() and (root / "src" / "hapticdb").is_dir():
+        asked = ["git", "-C", str(root), "describe", "--always", "--dirty"]
+        try:
+            done = subprocess.run(  # noqa: S603 - fixed words
+                asked, capture_output=True, text=True, check=True, timeout=GIT_S
+            )
+        except (OSError, subprocess.SubprocessError):
+            pass
+        else:
+            return done.stdout.strip()
+    return f"unknown, version {version('hapticdb')}"
 
 
 def versions() -> dict[str, str]:

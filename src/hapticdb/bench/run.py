@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from hapticdb.bench import experiments, records
-from hapticdb.bench.evaluation.plots import draw
-from hapticdb.bench.evaluation.report import write_report
+from hapticdb.bench.drawing.draw import draw
 from hapticdb.bench.experiments import QUICK, Budget
 from hapticdb.bench.measure import Cell
+from hapticdb.bench.page import write_bench_page
 from hapticdb.bench.subject import PAPER_CACHE, Subject, limited
 from hapticdb.bench.workload import (
     Poses,
@@ -30,7 +30,8 @@ from hapticdb.warm import warm_up
 
 ALL_BYTES = 2 << 30
 """A cache that holds every page of most environments; memory is taken as it is filled."""
-REPORT = "evaluation.md"
+PAGE = "evaluation.md"
+"""Name of the page in the folder of results."""
 
 Say = Callable[[str], None]
 """Told, in a line, what comes next."""
@@ -105,7 +106,7 @@ def bench(
     poses: Poses | None = None,
     say: Say = lambda _: None,
 ) -> tuple[Path, dict[str, dict[str, Any]]]:
-    """Run the experiments on an environment, and write JSON, plots and a report.
+    """Run the experiments on an environment, and write JSON, plots and one page.
 
     Parameters
     ----------
@@ -122,8 +123,8 @@ def bench(
 
     Returns
     -------
-    report, results : Path and dict
-        The report's file, and each experiment by its name, as its own file holds it.
+    page, results : Path and dict
+        The page's file, and each experiment by its name, as its own file holds it.
     """
     budget = QUICK if quick else Budget()
     warm_up()
@@ -144,10 +145,10 @@ def bench(
                 found.setdefault(name, []).extend(more)
     results = {name: records.result(name, cells) for name, cells in found.items()}
     records.write(folder, results)
-    say("plots and report")
+    say("plots and page")
     draw(results, folder)
-    write_report(results, folder / REPORT, ".")
-    return folder / REPORT, results
+    write_bench_page(results, folder / PAGE)
+    return folder / PAGE, results
 
 
 def caches_of(env: Environment) -> Iterator[tuple[str, bool]]:

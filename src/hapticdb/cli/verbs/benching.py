@@ -27,7 +27,7 @@ def bench(
     ] = None,
     json: Json = False,
 ) -> None:
-    """Measure the paper's experiments on an environment: JSON, plots and a written report.
+    """Measure the paper's experiments on an environment: JSON, plots and one page of tables.
 
     With --json, every experiment's results are printed, too, as in its file.
 
@@ -44,9 +44,9 @@ def bench(
     shell = PointShell.from_file(tool) if tool else None
     path = read_poses(poses) if poses else None
     render.compile_kernels("everything")
-    report, results = run(url, folder, quick=quick, shell=shell, poses=path, say=render.note)
+    page, results = run(url, folder, quick=quick, shell=shell, poses=path, say=render.note)
     if not json:
-        render.say(str(report))
+        render.say(str(page))
         return
     for found in results.values():
         render.say_json(found)

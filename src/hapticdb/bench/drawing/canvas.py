@@ -84,7 +84,7 @@ CUT_SHORT = "Hollow marks: the time limit ended the cell early, so it has fewer 
 
 
 @dataclass(frozen=True)
-class Page:
+class Canvas:
     """A figure and its panels, row by row."""
 
     figure: Figure
@@ -97,7 +97,7 @@ class Page:
 
 
 @dataclass(frozen=True)
-class Frame:
+class Framing:
     """What surrounds the panels, and how large they are.
 
     title, subtitle, notes : text above and below; legend : handles; height : inches of a panel;
@@ -115,35 +115,35 @@ class Frame:
     above: float = 0.34
 
 
-def lay_out(frame: Frame, rows: int = 1, columns: int = 1) -> Page:
+def lay_out(framing: Framing, rows: int = 1, columns: int = 1) -> Canvas:
     """Make a page with rows x columns empty panels."""
-    subtitle = _lines_of(frame.subtitle)
-    notes = [line for note in frame.notes for line in textwrap.wrap(note, LETTERS)]
-    in_row = _entries_in_a_row(frame.legend)
-    legend_lines = -(-len(frame.legend) // in_row) if frame.legend else 0
+    subtitle = _lines_of(framing.subtitle)
+    notes = [line for note in framing.notes for line in textwrap.wrap(note, LETTERS)]
+    in_row = _entries_in_a_row(framing.legend)
+    legend_lines = -(-len(framing.legend) // in_row) if framing.legend else 0
     top = 0.4 + LINE * len(subtitle) + 0.22 * legend_lines
     bottom = 0.55 + LINE * len(notes) + (0.06 if notes else 0)
-    down = rows * (frame.height + frame.above) + (rows - 1) * 0.25
+    down = rows * (framing.height + framing.above) + (rows - 1) * 0.25
     height = top + down + bottom
     figure = Figure(figsize=(WIDTH, height), facecolor="white")
     FigureCanvasSVG(figure)
-    figure.text(0.12 / WIDTH, 1 - 0.25 / height, frame.title, fontsize=12.5, fontweight="bold")
+    figure.text(0.12 / WIDTH, 1 - 0.25 / height, framing.title, fontsize=12.5, fontweight="bold")
     for number, line in enumerate(subtitle):
         y = 1 - (0.46 + LINE * number) / height
         figure.text(0.12 / WIDTH, y, line, color=FAINT)
     for number, line in enumerate(reversed(notes)):
         figure.text(0.12 / WIDTH, (0.1 + LINE * number) / height, line, color=FAINT)
-    if frame.legend:
-        _place_legend(figure, frame.legend, in_row, 1 - (0.36 + LINE * len(subtitle)) / height)
-    room = WIDTH - frame.left - frame.right - (columns - 1) * frame.between
+    if framing.legend:
+        _place_legend(figure, framing.legend, in_row, 1 - (0.36 + LINE * len(subtitle)) / height)
+    room = WIDTH - framing.left - framing.right - (columns - 1) * framing.between
     width = room / columns
-    lefts = [frame.left + n * (width + frame.between) for n in range(columns)]
+    lefts = [framing.left + n * (width + framing.between) for n in range(columns)]
     panels = []
     for row in range(rows):
-        low = height - top - (row + 1) * (frame.height + frame.above) - row * 0.25
-        boxes = [(x / WIDTH, low / height, width / WIDTH, frame.height / height) for x in lefts]
+        low = height - top - (row + 1) * (framing.height + framing.above) - row * 0.25
+        boxes = [(x / WIDTH, low / height, width / WIDTH, framing.height / height) for x in lefts]
         panels.append([figure.add_axes(box) for box in boxes])
-    return Page(figure, panels)
+    return Canvas(figure, panels)
 
 
 def _lines_of(conditions: str) -> list[str]:

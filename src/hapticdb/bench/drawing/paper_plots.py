@@ -20,8 +20,8 @@ from hapticdb.bench.cells import (
     number,
     with_strategy,
 )
-from hapticdb.bench.evaluation.findings import contests
-from hapticdb.bench.evaluation.page import (
+from hapticdb.bench.contests import contests
+from hapticdb.bench.drawing.canvas import (
     BLUE,
     ENGINE_COLORS,
     FAINT,
@@ -41,19 +41,19 @@ from hapticdb.bench.evaluation.page import (
     lay_out,
     log_axis,
 )
-from hapticdb.bench.evaluation.panels import (
+from hapticdb.bench.drawing.panels import (
     TYPICAL,
     Panel,
     along,
     by_layout_and_engine,
-    framed,
+    framing_of,
     label_outer_y,
     level,
     line,
     share_times,
     times,
 )
-from hapticdb.bench.evaluation.sheets import Sheet
+from hapticdb.bench.drawing.plots import Plot
 
 Place = Callable[[float], float]
 STROKES: dict[str, Stroke] = {ONE_STATEMENT: "-", IN_THE_SERVER: "--"}
@@ -68,25 +68,25 @@ WITH_RATIO = (
 )
 
 
-def draw_figure8(sheet: Sheet) -> Figure:
+def draw_figure8(plot: Plot) -> Figure:
     """Time a frame and the grouping's own against the resolution: a panel a layout."""
-    layouts = distinct(sheet.cells, "layout") or [None]
-    engines = distinct(sheet.cells, "engine") or [None]
+    layouts = distinct(plot.cells, "layout") or [None]
+    engines = distinct(plot.cells, "engine") or [None]
     looks = dict(zip(engines, zip(ENGINE_COLORS * 9, MARKERS * 9, strict=True), strict=False))
     legend: list[Artist] = [
         entry(str(engine or "time a frame"), color, line="-", marker=marker)
         for engine, (color, marker) in looks.items()
     ]
     legend.append(entry("grouping alone", FAINT, line="--"))
-    frame = framed(sheet, legend, [TYPICAL], height=2.8)
-    page = lay_out(frame, 1, len(layouts))
-    grouping = [v for cell in sheet.cells if (v := number(cell, "grouping_us"))]
-    for column, (axes, layout) in enumerate(zip(page.panels[0], layouts, strict=True)):
+    framing = framing_of(plot, legend, [TYPICAL], height=2.8)
+    canvas = lay_out(framing, 1, len(layouts))
+    grouping = [v for cell in plot.cells if (v := number(cell, "grouping_us"))]
+    for column, (axes, layout) in enumerate(zip(canvas.panels[0], layouts, strict=True)):
         head(axes, named(layout or ""))
         for engine, (color, marker) in looks.items():
             own = [
                 cell
-                for cell in sheet.cells
+                for cell in plot.cells
                 if cell.get("layout") == layout and cell.get("engine") == engine
             ]
             line(axes, along(own, "resolution"), color, marker=marker)
@@ -96,14 +96,14 @@ def draw_figure8(sheet: Sheet) -> Figure:
                 if (x := number(cell, "resolution")) and (y := number(cell, "grouping_us"))
             )
             axes.plot([x for x, _ in alone], [y for _, y in alone], "--", color=color)
-        log_axis(axes, "x", [float(n) for n in distinct(sheet.cells, "resolution") if n > 0])
+        log_axis(axes, "x", [float(n) for n in distinct(plot.cells, "resolution") if n > 0])
         axes.set_xlabel("resolution of the quantile vector, buckets")
-        log_axis(axes, "y", times(sheet.cells) + grouping, unit="us")
+        log_axis(axes, "y", times(plot.cells) + grouping, unit="us")
         if column == 0:
             axes.set_ylabel("time a frame")
         else:
             axes.tick_params(axis="y", labelleft=False)
-    return page.figure
+    return canvas.figure
 
 
 # --- Figures 9 and 10 ---------------------------------------------------------------------------
@@ -140,7 +140,7 @@ def _curve(cells: Sequence[Cell], place: Place, form: str) -> list[tuple[float, 
     return [(place(x), y, hollow) for x, y, hollow in found]
 
 
-def draw_figure9(sheet: Sheet) -> Figure:
+def draw_figure9(plot: Plot) -> Figure:
     """MaxGap's curve and CBGroup's line, in both forms, for each layout and engine."""
     maxgap, cbgroup = STRATEGY_COLORS["maxgap"], STRATEGY_COLORS["cbgroup"]
     legend: list[Artist] = [
@@ -148,11 +148,11 @@ def draw_figure9(sheet: Sheet) -> Figure:
         entry("CBGroup", cbgroup, line="-"),
         entry("array: all keys, no ranges", STRATEGY_COLORS["array"], line=":", width=1.1),
     ]
-    if any(form_of(cell) == IN_THE_SERVER for cell in sheet.cells):
+    if any(form_of(cell) == IN_THE_SERVER for cell in plot.cells):
         legend.append(entry("dashed: a loop in the server", FAINT, line="--"))
-    frame = framed(sheet, legend, [f"{WITH_RATIO}."])
-    page, panels = by_layout_and_engine(sheet, frame)
-    places = gap_places(sheet.cells)
+    framing = framing_of(plot, legend, [f"{WITH_RATIO}."])
+    canvas, panels = by_layout_and_engine(plot, framing)
+    places = gap_places(plot.cells)
     for panel in panels:
         for form, stroke in STROKES.items():
             curve = _curve(panel.cells, places[0], form)
@@ -164,8 +164,8 @@ def draw_figure9(sheet: Sheet) -> Figure:
             )
         _gap_axis(panel, places)
         _tell_ratio(panel)
-    share_times(panels, "y", times(sheet.cells), "time a frame")
-    return page.figure
+    share_times(panels, "y", times(plot.cells), "time a frame")
+    return canvas.figure
 
 
 def _levels(axes: Axes, cells: Iterable[Cell], color: str, stroke: Stroke = "-") -> None:
@@ -181,16 +181,16 @@ def _tell_ratio(panel: Panel) -> None:
         head(panel.axes, panel.name, f"{max(ratios):.2f}")
 
 
-def draw_figure9_rows(sheet: Sheet) -> Figure:
+def draw_figure9_rows(plot: Plot) -> Figure:
     """Ranges, rows and false rows against MAXGAP, CBGroup's as lines."""
     legend: list[Artist] = [
         entry(label, color, line="-", marker=marker) for label, color, marker in COUNTED.values()
     ]
     legend.append(entry("dashed: CBGroup's", FAINT, line="--"))
-    page, panels = by_layout_and_engine(sheet, framed(sheet, legend))
-    places = gap_places(sheet.cells)
+    canvas, panels = by_layout_and_engine(plot, framing_of(plot, legend))
+    places = gap_places(plot.cells)
     most = max(
-        (v for cell in sheet.cells for key in COUNTED if (v := number(cell, key))), default=1.0
+        (v for cell in plot.cells for key in COUNTED if (v := number(cell, key))), default=1.0
     )
     for panel in panels:
         own = _counted_once(panel.cells)
@@ -209,7 +209,7 @@ def draw_figure9_rows(sheet: Sheet) -> Figure:
                     level(panel.axes, value, color, stroke="--")
         _gap_axis(panel, places)
         _count_axis(panel, most)
-    return page.figure
+    return canvas.figure
 
 
 def _counted_once(cells: Sequence[Cell]) -> Sequence[Cell]:
@@ -230,26 +230,26 @@ def _count_axis(panel: Panel, most: float) -> None:
     label_outer_y(panel, "a frame")
 
 
-def draw_figure10(sheet: Sheet) -> Figure:
+def draw_figure10(plot: Plot) -> Figure:
     """As Figure 9, a curve and a line for each region of other density."""
-    regions = distinct(sheet.cells, "region")
+    regions = distinct(plot.cells, "region")
     looks = {region: REGIONS.get(region, (INK, "^")) for region in regions}
     legend: list[Artist] = [
-        entry(_region_name(sheet.cells, region), color, line="-", marker=marker)
+        entry(_region_name(plot.cells, region), color, line="-", marker=marker)
         for region, (color, marker) in looks.items()
     ]
     legend.append(entry("CBGroup, in the region's colour", FAINT, line="-", width=2.2))
-    if any(form_of(cell) == IN_THE_SERVER for cell in sheet.cells):
+    if any(form_of(cell) == IN_THE_SERVER for cell in plot.cells):
         legend.append(entry("dashed: a loop in the server", FAINT, line="--"))
     notes = [f"{WITH_RATIO}; the largest of the regions."]
-    page, panels = by_layout_and_engine(sheet, framed(sheet, legend, notes))
-    places = gap_places(sheet.cells)
+    canvas, panels = by_layout_and_engine(plot, framing_of(plot, legend, notes))
+    places = gap_places(plot.cells)
     for panel in panels:
         _draw_regions(panel, looks, places[0])
         _gap_axis(panel, places)
         _tell_ratio(panel)
-    share_times(panels, "y", times(sheet.cells), "time a frame")
-    return page.figure
+    share_times(panels, "y", times(plot.cells), "time a frame")
+    return canvas.figure
 
 
 def _draw_regions(panel: Panel, looks: Mapping[str, tuple[str, str]], place: Place) -> None:

@@ -4,8 +4,7 @@ import math
 from collections.abc import Iterable, Sequence
 
 from hapticdb.bench.cells import Cell, distinct, frame_us, grouped, named, number, ratio, word
-from hapticdb.bench.evaluation.findings import OURS, asks_the_same, is_ours
-from hapticdb.bench.evaluation.prose import (
+from hapticdb.bench.markdown import (
     NONE,
     bullets,
     bytes_text,
@@ -17,6 +16,7 @@ from hapticdb.bench.evaluation.prose import (
     table,
     time_text,
 )
+from report.findings import OURS, asks_the_same, is_ours
 
 ALIKE = 1.1
 """Peers run one after another, and a machine drifts by as much meanwhile."""

@@ -1,12 +1,13 @@
 """What the paper leaves out, as plots: caches, strategies, curves, points, slow frames."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hapticdb.bench.cells import (
+    FRAME_US,
     Cell,
     distinct,
     frame_us,
@@ -15,7 +16,7 @@ from hapticdb.bench.cells import (
     named,
     with_strategy,
 )
-from hapticdb.bench.evaluation.page import (
+from hapticdb.bench.drawing.canvas import (
     FAINT,
     GREY,
     INK,
@@ -26,18 +27,14 @@ from hapticdb.bench.evaluation.page import (
     category_axis,
     entry,
     fix_ticks,
-    head,
-    lay_out,
     log_axis,
     marks,
 )
-from hapticdb.bench.evaluation.panels import (
-    MILLISECOND,
+from hapticdb.bench.drawing.panels import (
     TYPICAL,
-    Panel,
     along,
     by_layout_and_engine,
-    framed,
+    framing_of,
     line,
     look_of,
     mark_millisecond,
@@ -46,7 +43,7 @@ from hapticdb.bench.evaluation.panels import (
     strategy_entries,
     times,
 )
-from hapticdb.bench.evaluation.sheets import Sheet
+from hapticdb.bench.drawing.plots import Plot
 
 POINTS_SHOWN = ("points", "array", "cbgroup", "auto")
 CACHES = (
@@ -61,13 +58,13 @@ def dodged(number: int, among: int, room: float = 0.56) -> float:
     return 0.0 if among < 2 else room * (number / (among - 1) - 0.5)
 
 
-def draw_conditions(sheet: Sheet) -> Figure:
+def draw_conditions(plot: Plot) -> Figure:
     """Strategies beside each other at every combination of caches."""
-    strategies = distinct(sheet.cells, "strategy")
-    caches = list(grouped(sheet.cells, ("cache", "file")))
+    strategies = distinct(plot.cells, "strategy")
+    caches = list(grouped(plot.cells, ("cache", "file")))
     legend = [*strategy_entries(strategies), millisecond_entry()]
-    frame = framed(sheet, legend, [TYPICAL, CACHES])
-    page, panels = by_layout_and_engine(sheet, frame)
+    framing = framing_of(plot, legend, [TYPICAL, CACHES])
+    canvas, panels = by_layout_and_engine(plot, framing)
     for panel in panels:
         for place, cache in enumerate(caches):
             own = [c for c in panel.cells if (c.get("cache"), c.get("file")) == cache]
@@ -83,8 +80,8 @@ def draw_conditions(sheet: Sheet) -> Figure:
         for between in range(1, len(caches)):
             panel.axes.axvline(between - 0.5, color=RULE, linewidth=0.7)
         mark_millisecond(panel.axes, "y")
-    share_times(panels, "y", [*times(sheet.cells), MILLISECOND], "time a frame")
-    return page.figure
+    share_times(panels, "y", [*times(plot.cells), FRAME_US], "time a frame")
+    return canvas.figure
 
 
 def _mark(axes: Axes, cells: Iterable[Cell], strategy: str, x: float) -> None:
@@ -104,9 +101,9 @@ def whisker(axes: Axes, cell: Cell, y: float, color: str, marker: str = "o") -> 
     marks(axes, [(half, y, is_cut_short(cell))], color, marker, 6)
 
 
-def draw_strategies(sheet: Sheet) -> Figure:
+def draw_strategies(plot: Plot) -> Figure:
     """Half of the frames and 99 in 100 for each strategy."""
-    strategies = distinct(sheet.cells, "strategy")
+    strategies = distinct(plot.cells, "strategy")
     legend: list[Artist] = [
         entry("p50", INK, marker="o"),
         entry("up to p99", INK, line="-", marker="|"),
@@ -114,7 +111,7 @@ def draw_strategies(sheet: Sheet) -> Figure:
         millisecond_entry(),
     ]
     height = 0.3 * len(strategies) + 0.3
-    page, panels = by_layout_and_engine(sheet, framed(sheet, legend, height=height))
+    canvas, panels = by_layout_and_engine(plot, framing_of(plot, legend, height=height))
     for panel in panels:
         for y, strategy in enumerate(strategies):
             for cell in with_strategy(panel.cells, strategy):
@@ -123,57 +120,18 @@ def draw_strategies(sheet: Sheet) -> Figure:
             panel.axes.axvline(auto, color=INK, linestyle="--", linewidth=1.0, zorder=1)
         category_axis(panel.axes, [named(s) for s in strategies], is_labelled=panel.is_left)
         mark_millisecond(panel.axes, "x")
-    share_times(panels, "x", [*times(sheet.cells, "p50", "p99"), MILLISECOND], "time a frame")
-    return page.figure
+    share_times(panels, "x", [*times(plot.cells, "p50", "p99"), FRAME_US], "time a frame")
+    return canvas.figure
 
 
-def draw_layouts(sheet: Sheet) -> Figure:
-    """Curves on both layouts, a panel for each engine."""
-    engines = distinct(sheet.cells, "engine") or [None]
-    kinds = list(grouped(sheet.cells, ("layout", "curve")))
-    strategies = distinct(sheet.cells, "strategy")
-    frame = framed(
-        sheet,
-        strategy_entries(strategies),
-        [TYPICAL],
-        height=0.42 * len(kinds) + 0.3,
-        left=1.55,
-    )
-    page = lay_out(frame, 1, len(engines))
-    panels = []
-    for column, (axes, engine) in enumerate(zip(page.panels[0], engines, strict=True)):
-        cells = [cell for cell in sheet.cells if cell.get("engine") == engine]
-        panels.append(Panel(axes, cells, str(engine or ""), column == 0, is_lowest=True))
-        head(axes, str(engine or ""))
-        for place, kind in enumerate(kinds):
-            own = [cell for cell in cells if (cell.get("layout"), cell.get("curve")) == kind]
-            _mark_in_row(axes, own, strategies, place)
-            if place:
-                axes.axhline(place - 0.5, color=RULE, linewidth=0.7)
-        names = [", ".join(named(part) for part in kind if part is not None) for kind in kinds]
-        category_axis(axes, names, is_labelled=column == 0)
-    share_times(panels, "x", times(sheet.cells), "time a frame")
-    return page.figure
-
-
-def _mark_in_row(
-    axes: Axes, cells: Sequence[Cell], strategies: Sequence[str], place: float
-) -> None:
-    for number, strategy in enumerate(strategies):
-        y = place + dodged(number, len(strategies), 0.5)
-        own = with_strategy(cells, strategy)
-        found = [(frame_us(cell) or 0.0, y, is_cut_short(cell)) for cell in own]
-        marks(axes, found, *look_of(strategy), 6)
-
-
-def draw_points(sheet: Sheet) -> Figure:
+def draw_points(plot: Plot) -> Figure:
     """Time against the number of points, a line for each strategy."""
-    known = distinct(sheet.cells, "strategy")
+    known = distinct(plot.cells, "strategy")
     strategies = [s for s in POINTS_SHOWN if s in known] or known
     legend = [*strategy_entries(strategies, "-"), millisecond_entry()]
-    page, panels = by_layout_and_engine(sheet, framed(sheet, legend, [TYPICAL]))
-    numbers = [float(n) for n in distinct(sheet.cells, "points") if n > 0]
-    shown = [cell for cell in sheet.cells if cell.get("strategy") in strategies]
+    canvas, panels = by_layout_and_engine(plot, framing_of(plot, legend, [TYPICAL]))
+    numbers = [float(n) for n in distinct(plot.cells, "points") if n > 0]
+    shown = [cell for cell in plot.cells if cell.get("strategy") in strategies]
     for panel in panels:
         for strategy in strategies:
             own = along(with_strategy(panel.cells, strategy), "points")
@@ -185,32 +143,32 @@ def draw_points(sheet: Sheet) -> Figure:
         if panel.is_lowest:
             panel.axes.set_xlabel("points of the shell")
         mark_millisecond(panel.axes, "y")
-    share_times(panels, "y", [*times(shown), MILLISECOND], "time a frame")
-    return page.figure
+    share_times(panels, "y", [*times(shown), FRAME_US], "time a frame")
+    return canvas.figure
 
 
-def draw_tail(sheet: Sheet) -> Figure:
+def draw_tail(plot: Plot) -> Figure:
     """Half of the frames, 99 in 100, 999 in 1000 and the worst; what p99 makes a second."""
-    strategies = distinct(sheet.cells, "strategy")
+    strategies = distinct(plot.cells, "strategy")
     legend: list[Artist] = [entry(name, color, marker=marker) for name, color, marker in TAIL]
     legend += [entry("worst frame", GREY, marker="x"), millisecond_entry()]
     notes = ["At the right of each row: frames a second that follow from p99."]
-    if all(frame_us(cell, "p99.9") is None for cell in sheet.cells):
+    if all(frame_us(cell, "p99.9") is None for cell in plot.cells):
         legend.pop(2)
-    if any(frame_us(cell, "p99.9") is None for cell in sheet.cells):
+    if any(frame_us(cell, "p99.9") is None for cell in plot.cells):
         notes.append("p99.9 is left out below 10,000 frames a cell.")
     height = 0.32 * len(strategies) + 0.3
-    frame = framed(sheet, legend, notes, height=height, right=0.75, between=0.75)
-    page, panels = by_layout_and_engine(sheet, frame)
+    framing = framing_of(plot, legend, notes, height=height, right=0.75, between=0.75)
+    canvas, panels = by_layout_and_engine(plot, framing)
     for panel in panels:
         for y, strategy in enumerate(strategies):
             for cell in with_strategy(panel.cells, strategy):
                 _draw_tail_row(panel.axes, cell, y)
         category_axis(panel.axes, [named(s) for s in strategies], is_labelled=panel.is_left)
         mark_millisecond(panel.axes, "x")
-    spread = times(sheet.cells, "p50", "p99", "p99.9", "max")
-    share_times(panels, "x", [*spread, MILLISECOND], "time a frame")
-    return page.figure
+    spread = times(plot.cells, "p50", "p99", "p99.9", "max")
+    share_times(panels, "x", [*spread, FRAME_US], "time a frame")
+    return canvas.figure
 
 
 def _draw_tail_row(axes: Axes, cell: Cell, y: float) -> None:

@@ -1,33 +1,37 @@
 """The written evaluation: every experiment's chapter, from the numbers alone."""
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from hapticdb.bench.cells import Cell, Result, Results, cells_of
-from hapticdb.bench.evaluation.cost_chapter import costs, what_gaps_pay
-from hapticdb.bench.evaluation.findings import contests
-from hapticdb.bench.evaluation.paper_chapters import best_against_cbgroup, figure8, table1
-from hapticdb.bench.evaluation.peer_chapters import peers, scale, voxelizing
-from hapticdb.bench.evaluation.prose import bullets, listed, paragraphs, table
-from hapticdb.bench.evaluation.sheets import Sheet, sheets_of
-from hapticdb.bench.evaluation.strategy_chapters import (
-    auto,
-    by_strategy,
-    conditions,
-    layouts,
-    points,
-    tail,
+from hapticdb.bench.contests import contests
+from hapticdb.bench.drawing.plots import plots_among
+from hapticdb.bench.markdown import (
+    bullets,
+    fact_table,
+    image,
+    listed,
+    notes_of,
+    paragraphs,
+    section,
+    versions_of,
+    write_page,
 )
-from hapticdb.bench.evaluation.why import (
+from hapticdb.bench.page import READING
+from hapticdb.bench.tables import by_strategy, costs, figure8, tail
+from report.paper_chapters import best_against_cbgroup, table1
+from report.peer_chapters import peers, scale, voxelizing
+from report.plots import REPORT_KINDS
+from report.reasons import (
     how_regions_differ,
     how_resolution_matters,
+    what_gaps_pay,
     why_array_wins,
     why_cbgroup_is_off,
     why_loop_differs,
 )
-from hapticdb.errors import FileError
+from report.strategy_chapters import auto, conditions, layouts, points
 
 Reasons = Callable[[Sequence[Cell]], list[str]]
 LEFT_OUT = "The paper leaves this out."
@@ -119,30 +123,14 @@ CHAPTERS = (
     Chapter("voxelizing", "Voxelizing", LEFT_OUT, voxelizing),
     Chapter("scale", "Scale", LEFT_OUT, scale),
 )
-AUTO = "auto"
-"""Chapter of all experiments together; evidence may be given for it, too."""
 OPENING = (
     "Written by the benchmarks from the JSON beside the plots; edits are lost. A time is one "
     "frame: the tool's points placed, keys found, grouped, fetched from the database, false hits "
     "dropped, the wrench summed."
 )
-READING = """\
-- **Typical** is the mean of the frames between the 5th and the 95th percentile: as steady as a
-  median, and every kind of pose counts by its share. p99 is the time that 99 in 100 frames keep;
-  p99.9 is given from 10,000 frames on.
-- **Ratios** count more than times: machines differ and are noisy. Strategies on one environment ran
-  in turns.
-- **Database cache** is the engine's own: 4 MB, as in the paper, or large enough for all. **File**
-  cached: the operating system holds the database's pages; cold: before each frame that cache and
-  the database's own were emptied.
-- **Ranges, rows, false rows** are means a frame; false rows were read, but no point asked for them.
-  One session measures alone.
-- **Hollow marks** in plots, stars in tables: the time limit ended the cell early."""
 
 
-def write_report(
-    results: Results, path: Path, pictures: str, evidence: Mapping[str, str] | None = None
-) -> None:
+def write_report(results: Results, path: Path, pictures: str) -> None:
     """Write the evaluation as Markdown.
 
     Parameters
@@ -153,70 +141,45 @@ def write_report(
         The Markdown file; its folder is made when it does not exist.
     pictures : str
         Folder of the SVG files that `plots.draw` wrote, as seen from that file.
-    evidence : mapping, optional
-        Markdown paragraphs by experiment (or ``auto``) that explain more than the cells can.
 
     Raises
     ------
     FileError
         A file that cannot be written.
     """
-    told = evidence or {}
     parts = ["# Evaluation", OPENING, _how_to_read(results)]
-    parts += [_chapter(chapter, results, pictures, told) for chapter in CHAPTERS]
-    parts.insert(len(parts) - 3, _auto_chapter(results, told))
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(paragraphs(*parts) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise FileError(f"cannot write {path}: {error.strerror}") from error
+    parts += [_chapter(chapter, results, pictures) for chapter in CHAPTERS]
+    parts.insert(len(parts) - 3, _auto_chapter(results))
+    write_page(path, parts)
 
 
-def _chapter(chapter: Chapter, results: Results, pictures: str, evidence: Mapping[str, str]) -> str:
+def _chapter(chapter: Chapter, results: Results, pictures: str) -> str:
     """One experiment; empty when it has neither cells nor notes."""
     cells = cells_of(results, chapter.experiment)
-    notes = _notes(results.get(chapter.experiment, {}))
+    notes = notes_of(results.get(chapter.experiment, {}))
     if not cells and not notes:
         return ""
     folder = pictures.rstrip("/")
     drawn = [
-        f"![{_alternative(sheet)}]({folder}/{sheet.name}.svg)"
-        for sheet in sheets_of(results, chapter.experiment)
+        image(plot.caption, f"{folder}/{plot.name}.svg")
+        for plot in plots_among(results, REPORT_KINDS)
+        if plot.kind.experiment == chapter.experiment
     ]
     here = paragraphs(*drawn, chapter.here(cells)) if cells else ""
     reasons = chapter.why(cells) if chapter.why and cells else []
-    why = paragraphs(bullets(reasons), evidence.get(chapter.experiment, ""))
     return paragraphs(
         f"## {chapter.title}",
-        _section("The paper", chapter.paper),
-        _section("Here", paragraphs(here, bullets(notes))),
-        _section("Why it differs", why),
+        section("The paper", chapter.paper),
+        section("Here", paragraphs(here, bullets(notes))),
+        section("Why it differs", bullets(reasons)),
     )
 
 
-def _alternative(sheet: Sheet) -> str:
-    """What stands for a picture that is not seen; brackets would end it."""
-    text = ": ".join(filter(None, [sheet.kind.title, sheet.conditions]))
-    return text.replace("[", "(").replace("]", ")")
-
-
-def _section(title: str, text: str) -> str:
-    return f"### {title}\n\n{text}" if text.strip() else ""
-
-
-def _notes(result: Result) -> list[str]:
-    return [" ".join(str(note).split()) for note in result.get("notes") or ()]
-
-
-def _auto_chapter(results: Results, evidence: Mapping[str, str]) -> str:
+def _auto_chapter(results: Results) -> str:
     here = auto(results)
     if not here:
         return ""
-    return paragraphs(
-        "## `auto`: does the cost model choose well?",
-        _section("Here", here),
-        _section("Why it differs", evidence.get(AUTO, "")),
-    )
+    return paragraphs("## `auto`: does the cost model choose well?", section("Here", here))
 
 
 # --- how to read --------------------------------------------------------------------------------
@@ -224,21 +187,22 @@ def _auto_chapter(results: Results, evidence: Mapping[str, str]) -> str:
 
 def _how_to_read(results: Results) -> str:
     facts = [
-        _section(title, _facts(results, key))
-        for title, key in (("Machine", "machine"), ("Versions", "versions"), ("Inputs", "inputs"))
+        section("Machine", _facts(results, lambda result: result.get("machine"))),
+        section("Versions", _facts(results, versions_of)),
+        section("Inputs", _facts(results, lambda result: result.get("inputs"))),
     ]
     missing = [chapter.title for chapter in CHAPTERS if not cells_of(results, chapter.experiment)]
     absent = f"Not measured in this run: {listed(missing)}." if missing else ""
     return paragraphs("## How to read", READING, *facts, absent)
 
 
-def _facts(results: Results, key: str) -> str:
+def _facts(results: Results, facts_of: Callable[[Result], object]) -> str:
     """What the experiments say of themselves: once when they all say the same."""
     said: dict[str, list[str]] = {}
     for chapter in CHAPTERS:
-        found = results.get(chapter.experiment, {}).get(key)
+        found = facts_of(results.get(chapter.experiment, {}))
         if isinstance(found, Mapping) and found:
-            said.setdefault(_fact_table(found), []).append(chapter.title)
+            said.setdefault(fact_table(found), []).append(chapter.title)
     if len(said) == 1:
         return next(iter(said))
     most = max(said, key=lambda facts: len(said[facts]), default="")
@@ -246,17 +210,3 @@ def _facts(results: Results, key: str) -> str:
     labels = {facts: listed(titles) for facts, titles in said.items()}
     labels[most] = f"All but {listed(others)}"
     return paragraphs(*(f"{labels[facts]}:\n\n{facts}" for facts in said))
-
-
-def _fact_table(facts: Mapping[str, object]) -> str:
-    return table(["", ""], [[str(name), _plain(value)] for name, value in facts.items()])
-
-
-def _plain(value: object) -> str:
-    if isinstance(value, list | tuple):
-        return ", ".join(_plain(each) for each in value)
-    if isinstance(value, Mapping):
-        return "; ".join(f"{name}: {_plain(each)}" for name, each in value.items())
-    if isinstance(value, bool) or value is None:
-        return json.dumps(value)
-    return f"{value:,}" if isinstance(value, int) else str(value)

@@ -1,6 +1,6 @@
-"""What cells say: CBGroup against the best MAXGAP, `auto` against the best strategy."""
+"""What cells say of `auto` against the best strategy, of repeated cells, and of peers."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +10,6 @@ from hapticdb.bench.cells import (
     Cell,
     Results,
     cells_of,
-    distinct,
     form_of,
     frame_us,
     grouped,
@@ -22,8 +21,6 @@ from hapticdb.bench.cells import (
     word,
 )
 
-CLOSE = 1.05
-"""CBGroup is as good as the best MAXGAP up to this ratio."""
 AUTO_CLOSE = 1.10
 """`auto` is as good as the best strategy up to this ratio."""
 CHOOSABLE = ("array", "cbgroup", "points", "statement")
@@ -33,82 +30,7 @@ OURS = "hapticdb"
 
 
 @dataclass(frozen=True)
-class Contest:
-    """MaxGap and CBGroup side by side in one form, under the same conditions.
-
-    where : conditions by name; form : of both; curve : MaxGap's cells by ascending MAXGAP; best :
-    the fastest of them; cbgroup, array : the cells of these strategies, `array` if any.
-    """
-
-    where: Mapping[str, Any]
-    form: str
-    curve: Sequence[Cell]
-    best: Cell
-    cbgroup: Cell
-    array: Cell | None
-
-    @property
-    def cbgroup_ratio(self) -> float:
-        """CBGroup's time as a multiple of the best MAXGAP's."""
-        return (frame_us(self.cbgroup) or 0.0) / (frame_us(self.best) or 1.0)
-
-    @property
-    def array_ratio(self) -> float | None:
-        """Time of `array` as a multiple of CBGroup's."""
-        return ratio(frame_us(self.array), frame_us(self.cbgroup)) if self.array else None
-
-    @property
-    def is_close(self) -> bool:
-        """Whether CBGroup is within 5 % of the best MAXGAP, or better."""
-        return self.cbgroup_ratio <= CLOSE
-
-    @property
-    def best_maxgap(self) -> int:
-        """MAXGAP of the fastest cell."""
-        return int(number(self.best, "maxgap") or 0)
-
-    @property
-    def plateau(self) -> tuple[int, int]:
-        """Least and largest MAXGAP around the best one whose times are within 5 % of its."""
-        limit = CLOSE * (frame_us(self.best) or 0.0)
-        at = self.curve.index(self.best)
-        first = last = at
-        while first > 0 and (frame_us(self.curve[first - 1]) or 0.0) <= limit:
-            first -= 1
-        while last + 1 < len(self.curve) and (frame_us(self.curve[last + 1]) or 0.0) <= limit:
-            last += 1
-        gaps = [int(number(self.curve[n], "maxgap") or 0) for n in (first, last)]
-        return gaps[0], gaps[1]
-
-    def at(self, maxgap: int) -> Cell | None:
-        """MaxGap's cell for one MAXGAP."""
-        return next((cell for cell in self.curve if number(cell, "maxgap") == maxgap), None)
-
-
-def contests(cells: Iterable[Cell]) -> list[Contest]:
-    """Every set of conditions and form in which both MaxGap and CBGroup have a time."""
-    found = []
-    every = list(cells)
-    for values, group in grouped(every, WHERE).items():
-        where = dict(zip(WHERE, values, strict=True))
-        for form in distinct([{"form": form_of(cell)} for cell in group], "form"):
-            curve = [
-                c for c in with_strategy(group, "maxgap", form) if number(c, "maxgap") is not None
-            ]
-            best = least(curve, frame_us)
-            cbgroup = least(with_strategy(group, "cbgroup", form), frame_us)
-            if best is None or cbgroup is None:
-                continue
-            curve.sort(key=lambda cell: number(cell, "maxgap") or 0.0)
-            array = (
-                least(with_strategy(group, "array"), frame_us) if form == ONE_STATEMENT else None
-            )
-            found.append(Contest(where, form, tuple(curve), best, cbgroup, array))
-    return found
-
-
-@dataclass(frozen=True)
-class Choice:
+class AutoChoice:
     """`auto` beside every other strategy under the same conditions, in the same run.
 
     experiment : its name; where : conditions by name; auto, best : cells; best_choosable : the
@@ -159,7 +81,7 @@ class Choice:
         return {name: n / total for name, n in known.items()}
 
 
-def choices(results: Results) -> list[Choice]:
+def choices(results: Results) -> list[AutoChoice]:
     """Every set of conditions in which `auto` and another strategy have a time.
 
     Cells that the time limit cut short are left out: they hold other poses than their neighbours.
@@ -188,7 +110,7 @@ def choices(results: Results) -> list[Choice]:
                 for c in others
                 if number(c, "maxgap") is None and (us := frame_us(c)) is not None
             }
-            found.append(Choice(experiment, where, auto, best, choosable, own_us))
+            found.append(AutoChoice(experiment, where, auto, best, choosable, own_us))
     return found
 
 

@@ -1,8 +1,10 @@
-"""Which pictures there are: one for each set of conditions that a plot does not show itself."""
+"""Which plots there are: one for each set of conditions that a plot does not show itself."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
+
+from matplotlib.figure import Figure
 
 from hapticdb.bench.cells import (
     PAPER_POINT,
@@ -13,7 +15,6 @@ from hapticdb.bench.cells import (
     frame_us,
     named,
     number,
-    word,
 )
 
 CONDITIONS = ("environment", "curve", "cache", "file", "poses", "shell", "points")
@@ -29,12 +30,12 @@ FILES = {
 
 
 @dataclass(frozen=True)
-class Kind:
-    """A way to draw an experiment.
+class PlotKind:
+    """One way to draw an experiment.
 
-    name : of the pictures' files, and of what draws it; experiment : whose cells; title : headline;
-    shown : conditions that the plot itself shows, the others stand on a sheet each; can_show :
-    whether a cell has what is drawn.
+    name : how the names of its files begin; experiment : whose cells it draws; title : headline;
+    shown : conditions that the plot itself shows (each combination of the others gets a plot of its
+    own); can_show : whether a cell has the values that are drawn; paint : draws one plot.
     """
 
     name: str
@@ -42,19 +43,20 @@ class Kind:
     title: str
     shown: Sequence[str]
     can_show: Callable[[Cell], bool]
+    paint: "Callable[[Plot], Figure]"
 
     @property
     def parted(self) -> list[str]:
-        """Conditions that stand on a sheet each."""
+        """Conditions of which each combination gets a plot of its own."""
         return [key for key in CONDITIONS if key not in self.shown]
 
 
 @dataclass(frozen=True)
-class Sheet:
-    """One picture: its file's name without the ending, how it is drawn, and of which cells."""
+class Plot:
+    """One plot: its file's name without the ending, how it is drawn, and of which cells."""
 
     name: str
-    kind: Kind
+    kind: PlotKind
     cells: Sequence[Cell]
 
     @property
@@ -62,115 +64,52 @@ class Sheet:
         """What all its cells share, in words."""
         return "; ".join(conditions(self.cells, self.kind.shown))
 
+    @property
+    def caption(self) -> str:
+        """Title and conditions, for a reader who does not see the plot."""
+        return ": ".join(filter(None, [self.kind.title, self.conditions]))
 
-def _has_time(cell: Cell) -> bool:
+
+def has_time(cell: Cell) -> bool:
+    """Whether a cell has a typical time of a frame."""
     return frame_us(cell) is not None
 
 
-def _has_median(cell: Cell) -> bool:
+def has_median(cell: Cell) -> bool:
+    """Whether a cell has a median time of a frame."""
     return frame_us(cell, "p50") is not None
 
 
-def _has_gap(cell: Cell) -> bool:
+def has_gap(cell: Cell) -> bool:
+    """Whether a cell is MaxGap's with a known MAXGAP, or one that MaxGap is compared with."""
     strategy = cell.get("strategy")
     known = strategy in {"cbgroup", "array"} or number(cell, "maxgap") is not None
-    return known and _has_time(cell)
+    return known and has_time(cell)
 
 
-def _has_rows(cell: Cell) -> bool:
-    return _has_gap(cell) and number(cell, "rows") is not None and cell.get("strategy") != "array"
+def has_rows(cell: Cell) -> bool:
+    """Whether a cell counts the ranges and rows of a grouping."""
+    return has_gap(cell) and number(cell, "rows") is not None and cell.get("strategy") != "array"
 
 
-def _has_key(key: str) -> Callable[[Cell], bool]:
-    return lambda cell: _has_time(cell) and number(cell, key) is not None
+def has_number(key: str) -> Callable[[Cell], bool]:
+    """Whether a cell has a typical time, and a number under that key."""
+    return lambda cell: has_time(cell) and number(cell, key) is not None
 
 
-def _is_speed(cell: Cell) -> bool:
-    return (number(cell, "voxels_per_second") or 0) > 0
-
-
-KINDS = (
-    Kind(
-        "figure8",
-        "figure8",
-        "Figure 8: resolution of the quantile vector",
-        ("resolution",),
-        _has_key("resolution"),
-    ),
-    Kind("figure9", "figure9", "Figure 9: MaxGap against CBGroup, time a frame", (), _has_gap),
-    Kind(
-        "figure9-rows",
-        "figure9",
-        "Figure 9: MaxGap against CBGroup, ranges and rows",
-        ("cache", "file"),
-        _has_rows,
-    ),
-    Kind(
-        "figure10",
-        "figure10",
-        "Figure 10: MaxGap against CBGroup by voxel density",
-        (),
-        lambda cell: _has_gap(cell) and bool(word(cell, "region")),
-    ),
-    Kind(
-        "conditions",
-        "conditions",
-        "Database's cache and operating system's cache",
-        ("cache", "file"),
-        _has_time,
-    ),
-    Kind(
-        "strategies",
-        "strategies",
-        "Strategies: half of the frames, and 99 in 100",
-        (),
-        _has_median,
-    ),
-    Kind("layouts", "layouts", "Curves and layouts", ("curve",), _has_time),
-    Kind(
-        "points",
-        "points",
-        "Time a frame against the shell's points",
-        ("points",),
-        _has_key("points"),
-    ),
-    Kind("tail", "tail", "The slowest frames", (), _has_median),
-    Kind(
-        "peers",
-        "peers",
-        "hapticdb beside its peers",
-        ("cache", "file", "curve"),
-        lambda cell: _has_median(cell) and bool(word(cell, "peer")),
-    ),
-    Kind("voxelizing", "voxelizing", "Voxelizing CAD parts", (), _is_speed),
-    Kind(
-        "scale",
-        "scale",
-        "Time a frame and storage against the environment's size",
-        ("environment", "poses"),
-        lambda cell: (number(cell, "object_voxels") or 0) > 0,
-    ),
-)
-
-
-def sheets(results: Results) -> list[Sheet]:
-    """Pictures that can be drawn of some results, the paper's conditions first."""
+def plots_among(results: Results, kinds: Iterable[PlotKind]) -> list[Plot]:
+    """Plots of some kinds that the results have cells for, the paper's conditions first."""
     return [
-        sheet
-        for kind in KINDS
-        for sheet in _parted(
+        plot
+        for kind in kinds
+        for plot in _parted(
             kind, [c for c in cells_of(results, kind.experiment) if kind.can_show(c)]
         )
     ]
 
 
-def sheets_of(results: Results, experiment: str) -> list[Sheet]:
-    """Pictures of one experiment."""
-    return [sheet for sheet in sheets(results) if sheet.kind.experiment == experiment]
-
-
-def _parted(kind: Kind, cells: Sequence[Cell]) -> Iterable[Sheet]:
-    """A sheet for each combination of conditions; its name tells what differs from the first."""
+def _parted(kind: PlotKind, cells: Sequence[Cell]) -> Iterable[Plot]:
+    """A plot for each combination of conditions; its name tells what differs from the first."""
     base = {key: _base(cells, key) for key in kind.parted}
     parts: dict[tuple[object, ...], list[Cell]] = {}
     for cell in cells:
@@ -188,7 +127,7 @@ def _parted(kind: Kind, cells: Sequence[Cell]) -> Iterable[Sheet]:
         while name in taken:
             name += "-x"
         taken.add(name)
-        yield Sheet(name, kind, tuple(parts[own]))
+        yield Plot(name, kind, tuple(parts[own]))
 
 
 def _base(cells: Sequence[Cell], key: str) -> object:

@@ -1,9 +1,12 @@
 """Markdown of numbers: tables, times, ratios, lists in words."""
 
+import json
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 from hapticdb.bench.cells import WHERE, Cell, frame_us, is_cut_short, named
+from hapticdb.errors import FileError
 
 NONE = "-"
 """Stands where nothing was measured."""
@@ -63,6 +66,57 @@ def _escaped(text: str) -> str:
 
 def _is_number(text: str) -> bool:
     return text == NONE or text[:1].isdigit()
+
+
+def fact_table(facts: Mapping[str, object]) -> str:
+    """Table of names and what each says; lists and mappings in words."""
+    return table(["", ""], [[str(name), _in_words(value)] for name, value in facts.items()])
+
+
+def _in_words(value: object) -> str:
+    if isinstance(value, list | tuple):
+        return ", ".join(_in_words(each) for each in value)
+    if isinstance(value, Mapping):
+        return "; ".join(f"{name}: {_in_words(each)}" for name, each in value.items())
+    if isinstance(value, bool) or value is None:
+        return json.dumps(value)
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def section(title: str, text: str) -> str:
+    """Text under a heading of the third level; empty without text."""
+    return f"### {title}\n\n{text}" if text.strip() else ""
+
+
+def image(caption: str, target: str) -> str:
+    """Image with the text that stands for it where it is not seen; brackets would end that."""
+    return f"![{caption.replace('[', '(').replace(']', ')')}]({target})"
+
+
+def versions_of(result: Mapping[str, Any]) -> dict[str, Any]:
+    """Commit of hapticdb, then the versions of what it ran with; empty when none is named."""
+    commit = result.get("commit")
+    return ({"hapticdb": f"commit {commit}"} if commit else {}) | dict(result.get("versions") or {})
+
+
+def notes_of(result: Mapping[str, Any]) -> list[str]:
+    """Notes of a result, each on one line."""
+    return [" ".join(str(note).split()) for note in result.get("notes") or ()]
+
+
+def write_page(path: Path, parts: Iterable[str]) -> None:
+    """Write a Markdown file; its folder is made when it does not exist.
+
+    Raises
+    ------
+    FileError
+        A file that cannot be written.
+    """
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(paragraphs(*parts) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"cannot write {path}: {error.strerror}") from error
 
 
 def listed(words: Iterable[str]) -> str:

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hapticdb.bench.cells import Cell, distinct, frame_us, grouped, number, word
-from hapticdb.bench.evaluation.findings import OURS, asks_the_same, is_ours
-from hapticdb.bench.evaluation.page import (
+from hapticdb.bench.cells import FRAME_US, Cell, distinct, frame_us, grouped, number, word
+from hapticdb.bench.drawing.canvas import (
     BLUE,
     ENGINE_COLORS,
     FAINT,
@@ -24,11 +23,10 @@ from hapticdb.bench.evaluation.page import (
     log_axis,
     not_measured,
 )
-from hapticdb.bench.evaluation.panels import (
-    MILLISECOND,
+from hapticdb.bench.drawing.panels import (
     TYPICAL,
     along,
-    framed,
+    framing_of,
     line,
     look_of,
     mark_millisecond,
@@ -36,8 +34,9 @@ from hapticdb.bench.evaluation.panels import (
     strategy_entries,
     times,
 )
-from hapticdb.bench.evaluation.sheets import POSES, Sheet
-from hapticdb.bench.evaluation.strategy_panels import whisker
+from hapticdb.bench.drawing.plots import POSES, Plot
+from hapticdb.bench.drawing.strategy_plots import whisker
+from report.findings import OURS, asks_the_same, is_ours
 
 PEER_LOOKS = {
     "ours": (RED, "D", "hapticdb"),
@@ -53,9 +52,9 @@ def _look(cell: Cell) -> str:
     return "same" if asks_the_same(cell) else "another"
 
 
-def draw_peers(sheet: Sheet) -> Figure:
+def draw_peers(plot: Plot) -> Figure:
     """All systems by half of their frames, the fastest on top."""
-    cells = sorted(sheet.cells, key=lambda cell: frame_us(cell, "p50") or 0.0)
+    cells = sorted(plot.cells, key=lambda cell: frame_us(cell, "p50") or 0.0)
     legend = [
         entry(label, color, marker=marker)
         for look, (color, marker, label) in PEER_LOOKS.items()
@@ -63,15 +62,15 @@ def draw_peers(sheet: Sheet) -> Figure:
     ]
     legend += [entry("up to p99", INK, line="-", marker="|")]
     longest = max(len(word(cell, "peer")) for cell in cells)
-    frame = framed(
-        sheet,
+    framing = framing_of(
+        plot,
         [*legend, millisecond_entry()],
         ["Mark: half of the frames (p50)."],
         height=0.27 * len(cells) + 0.2,
         left=min(4.0, 0.3 + 0.078 * longest),
         above=0.12,
     )
-    axes = lay_out(frame).panels[0][0]
+    axes = lay_out(framing).panels[0][0]
     for y, cell in enumerate(cells):
         color, marker, _ = PEER_LOOKS[_look(cell)]
         whisker(axes, cell, y, color, marker)
@@ -79,24 +78,24 @@ def draw_peers(sheet: Sheet) -> Figure:
     for label, cell in zip(axes.get_yticklabels(), cells, strict=True):
         label.set_fontweight("bold" if is_ours(cell) else "normal")
     mark_millisecond(axes, "x")
-    log_axis(axes, "x", [*times(cells, "p50", "p99"), MILLISECOND], unit="us")
+    log_axis(axes, "x", [*times(cells, "p50", "p99"), FRAME_US], unit="us")
     axes.set_xlabel("time a frame")
     return _figure(axes)
 
 
 def _figure(axes: Axes) -> Figure:
     figure = axes.get_figure(root=True)
-    assert figure is not None  # noqa: S101 - the panel was laid out on one
+    assert figure is not None
     return figure
 
 
-def draw_voxelizing(sheet: Sheet) -> Figure:
+def draw_voxelizing(plot: Plot) -> Figure:
     """Object voxels a second, the fastest on top."""
-    cells = sorted(sheet.cells, key=lambda cell: -(number(cell, "voxels_per_second") or 0.0))
+    cells = sorted(plot.cells, key=lambda cell: -(number(cell, "voxels_per_second") or 0.0))
     names = [_tool(cell, cells) for cell in cells]
     left = min(4.0, 0.3 + 0.078 * max(len(name) for name in names))
-    frame = framed(sheet, height=0.34 * len(cells) + 0.2, left=left, right=0.6, above=0.12)
-    axes = lay_out(frame).panels[0][0]
+    framing = framing_of(plot, height=0.34 * len(cells) + 0.2, left=left, right=0.6, above=0.12)
+    axes = lay_out(framing).panels[0][0]
     speeds = [(number(cell, "voxels_per_second") or 0.0) / 1e6 for cell in cells]
     colors = [RED if word(cell, "tool").startswith(OURS) else GREY for cell in cells]
     axes.barh(range(len(cells)), speeds, color=colors, height=0.62)
@@ -115,34 +114,34 @@ def _tool(cell: Cell, among: Sequence[Cell]) -> str:
     return word(cell, "tool") + (f", {known:,.0f} parts" if differ and known is not None else "")
 
 
-def draw_scale(sheet: Sheet) -> Figure:
+def draw_scale(plot: Plot) -> Figure:
     """Time a frame for each engine, and storage, against the number of object voxels."""
-    engines = distinct(sheet.cells, "engine") or [None]
-    strategies = distinct(sheet.cells, "strategy")
-    poses = distinct(sheet.cells, "poses")
+    engines = distinct(plot.cells, "engine") or [None]
+    strategies = distinct(plot.cells, "strategy")
+    poses = distinct(plot.cells, "poses")
     strokes = {None: STROKES[0], **dict(zip(poses, STROKES * 9, strict=False))}
     legend = [*strategy_entries(strategies, "-")]
     legend += [entry(POSES.get(p, str(p)), FAINT, line=strokes[p]) for p in poses]
-    frame = framed(sheet, [*legend, millisecond_entry()], [TYPICAL], height=2.5, right=0.6)
-    page = lay_out(frame, 1, len(engines) + 1)
-    sizes = [float(n) for n in distinct(sheet.cells, "object_voxels")]
-    for column, (axes, engine) in enumerate(zip(page.panels[0], engines, strict=False)):
+    framing = framing_of(plot, [*legend, millisecond_entry()], [TYPICAL], height=2.5, right=0.6)
+    canvas = lay_out(framing, 1, len(engines) + 1)
+    sizes = [float(n) for n in distinct(plot.cells, "object_voxels")]
+    for column, (axes, engine) in enumerate(zip(canvas.panels[0], engines, strict=False)):
         head(axes, str(engine or ""))
-        cells = [cell for cell in sheet.cells if cell.get("engine") == engine]
+        cells = [cell for cell in plot.cells if cell.get("engine") == engine]
         for (strategy, pose), own in grouped(cells, ("strategy", "poses")).items():
             color, marker = look_of(strategy)
             line(axes, along(own, "object_voxels"), color, stroke=strokes[pose], marker=marker)
         mark_millisecond(axes, "y")
-        log_axis(axes, "y", [*times(sheet.cells), MILLISECOND], unit="us")
+        log_axis(axes, "y", [*times(plot.cells), FRAME_US], unit="us")
         if column == 0:
             axes.set_ylabel("time a frame")
         else:
             axes.tick_params(axis="y", labelleft=False)
-    _draw_storage(page.panels[0][-1], sheet.cells, engines)
-    for axes in page.every:
+    _draw_storage(canvas.panels[0][-1], plot.cells, engines)
+    for axes in canvas.every:
         log_axis(axes, "x", sizes, ticks=sizes if len(sizes) <= 5 else ())
         axes.set_xlabel("object voxels")
-    return page.figure
+    return canvas.figure
 
 
 def _draw_storage(axes: Axes, cells: Sequence[Cell], engines: Sequence[str | None]) -> None:

@@ -13,8 +13,8 @@ from hapticdb.bench.cells import (
     number,
     ratio,
 )
-from hapticdb.bench.evaluation.findings import CLOSE, Contest
-from hapticdb.bench.evaluation.prose import count_text, listed, place_of, ratio_text, us_text
+from hapticdb.bench.contests import CLOSE, Contest
+from hapticdb.bench.markdown import count_text, listed, place_of, ratio_text, us_text
 
 UNLIKE = 1.25
 """Ranges of one over the other's from which they ask differently."""
@@ -230,3 +230,25 @@ def _grouping_costs(cells: Iterable[Cell]) -> str:
         f"The grouping alone takes {us_text(short)} us with {fewest:,.0f} buckets and "
         f"{us_text(long)} with {most:,.0f}"
     )
+
+
+def what_gaps_pay(cells: Sequence[Cell]) -> list[str]:
+    """What a range more costs beside a row, and beside a key of `array`."""
+    said = []
+    for cell in cells:
+        descent, row, probe = (number(cell, key) for key in ("descent", "row_scanned", "probe"))
+        if not descent or not row or probe is None:
+            continue
+        said.append(
+            f"{place_of(cell, cells)}: a range more costs as much as {descent / row:,.1f} rows, "
+            f"and {_beside(descent, probe)}."
+        )
+    return said
+
+
+def _beside(descent: float, probe: float) -> str:
+    if probe <= 0.0:
+        return "a key of `array` too little to be measured"
+    if descent > probe:
+        return f"{descent / probe:,.1f} times a key of `array`"
+    return f"{descent / probe:,.2f} of a key of `array`, so that a range of two keys pays"

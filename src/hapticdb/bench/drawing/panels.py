@@ -7,14 +7,14 @@ from typing import Literal
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 
-from hapticdb.bench.cells import Cell, distinct, frame_us, is_cut_short, named, number
-from hapticdb.bench.evaluation.page import (
+from hapticdb.bench.cells import FRAME_US, Cell, distinct, frame_us, is_cut_short, named, number
+from hapticdb.bench.drawing.canvas import (
     CUT_SHORT,
     INK,
     STRATEGY_COLORS,
     STRATEGY_MARKERS,
-    Frame,
-    Page,
+    Canvas,
+    Framing,
     Stroke,
     entry,
     head,
@@ -23,9 +23,8 @@ from hapticdb.bench.evaluation.page import (
     marks,
     not_measured,
 )
-from hapticdb.bench.evaluation.sheets import Sheet
+from hapticdb.bench.drawing.plots import Plot
 
-MILLISECOND = 1000.0
 TYPICAL = "Times are typical ones: the mean between the 5th and the 95th percentile."
 MILLISECOND_ENTRY = "1 ms: 1000 frames a second"
 
@@ -41,8 +40,8 @@ class Panel:
     is_lowest: bool
 
 
-def framed(
-    sheet: Sheet,
+def framing_of(
+    plot: Plot,
     legend: Sequence[Artist] = (),
     notes: Sequence[str] = (),
     *,
@@ -51,25 +50,25 @@ def framed(
     right: float = 0.15,
     between: float = 0.2,
     above: float = 0.34,
-) -> Frame:
-    """Title, conditions and footnotes of a sheet around panels of some size."""
-    said = [*notes, CUT_SHORT] if any(is_cut_short(cell) for cell in sheet.cells) else notes
+) -> Framing:
+    """Title, conditions and footnotes of a plot around panels of some size."""
+    said = [*notes, CUT_SHORT] if any(is_cut_short(cell) for cell in plot.cells) else notes
     sizes = (height, left, right, between, above)
-    return Frame(sheet.kind.title, sheet.conditions, said, legend, *sizes)
+    return Framing(plot.kind.title, plot.conditions, said, legend, *sizes)
 
 
-def by_layout_and_engine(sheet: Sheet, frame: Frame) -> tuple[Page, list[Panel]]:
+def by_layout_and_engine(plot: Plot, framing: Framing) -> tuple[Canvas, list[Panel]]:
     """A row for each layout, a column for each engine; those without cells say so."""
-    layouts = distinct(sheet.cells, "layout") or [None]
-    engines = distinct(sheet.cells, "engine") or [None]
-    page = lay_out(frame, len(layouts), len(engines))
+    layouts = distinct(plot.cells, "layout") or [None]
+    engines = distinct(plot.cells, "engine") or [None]
+    canvas = lay_out(framing, len(layouts), len(engines))
     panels = []
     for row, layout in enumerate(layouts):
         for column, engine in enumerate(engines):
-            axes = page.panels[row][column]
+            axes = canvas.panels[row][column]
             cells = [
                 cell
-                for cell in sheet.cells
+                for cell in plot.cells
                 if cell.get("layout") == layout and cell.get("engine") == engine
             ]
             name = ", ".join(named(part) for part in (engine, layout) if part is not None)
@@ -77,7 +76,7 @@ def by_layout_and_engine(sheet: Sheet, frame: Frame) -> tuple[Page, list[Panel]]
             if not cells:
                 not_measured(axes)
             panels.append(Panel(axes, cells, name, column == 0, row == len(layouts) - 1))
-    return page, panels
+    return canvas, panels
 
 
 def share_times(
@@ -160,7 +159,7 @@ def level(
 def mark_millisecond(axes: Axes, name: Literal["x", "y"]) -> None:
     """Draw the time that a frame may take at 1000 a second."""
     draw = axes.axvline if name == "x" else axes.axhline
-    draw(MILLISECOND, color=INK, linestyle=":", linewidth=1.2, zorder=1)
+    draw(FRAME_US, color=INK, linestyle=":", linewidth=1.2, zorder=1)
 
 
 def millisecond_entry() -> Artist:

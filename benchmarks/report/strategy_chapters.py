@@ -1,29 +1,20 @@
 """The evaluation's chapters on what the paper leaves out: strategies, caches, curves, tails."""
 
-from collections import Counter
 from collections.abc import Sequence
 
 from hapticdb.bench.cells import (
+    FRAME_US,
     WHERE,
     Cell,
     Results,
-    distinct,
     frame_us,
     grouped,
     least,
     named,
     number,
-    with_strategy,
     word,
 )
-from hapticdb.bench.evaluation.findings import (
-    AUTO_CLOSE,
-    CHOOSABLE,
-    Choice,
-    choices,
-    repeats,
-)
-from hapticdb.bench.evaluation.prose import (
+from hapticdb.bench.markdown import (
     bullets,
     count_text,
     listed,
@@ -32,35 +23,18 @@ from hapticdb.bench.evaluation.prose import (
     ratio_text,
     table,
     time_text,
-    us_text,
+)
+from hapticdb.bench.tables import by_strategy
+from report.findings import (
+    AUTO_CLOSE,
+    CHOOSABLE,
+    AutoChoice,
+    choices,
+    repeats,
 )
 
-FRAME = 1000.0
 WORST_SHOWN = 12
-
-
-def by_strategy(cells: Sequence[Cell]) -> str:
-    """Typical time and p99 of every strategy, and which is fastest how often."""
-    known = [cell for cell in cells if frame_us(cell) is not None and word(cell, "strategy")]
-    strategies = distinct(known, "strategy")
-    rows, fastest = [], Counter[str]()
-    for group in grouped(known, WHERE).values():
-        by = {strategy: least(with_strategy(group, strategy), frame_us) for strategy in strategies}
-        rows.append([place_of(group[0], known), *(_typical_and_p99(by[s]) for s in strategies)])
-        best = least(group, frame_us)
-        if best is not None and len(group) > 1:
-            fastest[named(best["strategy"])] += 1
-    counts = listed(f"{name} in {n}" for name, n in fastest.most_common())
-    said = "Microseconds a frame: typical, and in brackets p99."
-    told = f"Fastest by the typical frame: {counts} of {fastest.total()} rows." if fastest else ""
-    return paragraphs(said, table(["", *map(named, strategies)], rows), told) if rows else ""
-
-
-def _typical_and_p99(cell: Cell | None) -> str:
-    if cell is None:
-        return "-"
-    slow = frame_us(cell, "p99")
-    return time_text(cell) + (f" ({us_text(slow)})" if slow is not None else "")
+"""Rows of the table in which `auto` is slow; more rows make a longer page."""
 
 
 def conditions(cells: Sequence[Cell]) -> str:
@@ -108,7 +82,9 @@ def points(cells: Sequence[Cell]) -> str:
     rest = [name for name in WHERE if name != "points"]
     known = [{k: v for k, v in cell.items() if k != "points"} for cell in cells]
     for group in grouped(cells, rest).values():
-        quick = [c for c in group if (frame_us(c) or FRAME) < FRAME and c.get("points") is not None]
+        quick = [
+            c for c in group if (frame_us(c) or FRAME_US) < FRAME_US and c.get("points") is not None
+        ]
         place = place_of({k: v for k, v in group[0].items() if k != "points"}, known)
         if quick:
             most = max(quick, key=lambda cell: (cell["points"], -(frame_us(cell) or 0.0)))
@@ -119,25 +95,6 @@ def points(cells: Sequence[Cell]) -> str:
         else:
             sentences.append(f"{place}: no typical frame took less than 1 ms.")
     return paragraphs(by_strategy(cells), bullets(sentences))
-
-
-def tail(cells: Sequence[Cell]) -> str:
-    """Percentiles and the worst frame, and the frames a second that follow from p99."""
-    known = [cell for cell in cells if frame_us(cell, "p50") is not None]
-    rows = []
-    for group in grouped(known, (*WHERE, "strategy")).values():
-        for cell in group:
-            slow = frame_us(cell, "p99")
-            times = [time_text(cell, m) for m in ("p50", "p99", "p99.9", "max")]
-            second = count_text(1e6 / slow if slow is not None else None)
-            frames = count_text(cell.get("frames"))
-            strategy = named(word(cell, "strategy"))
-            rows.append([place_of(cell, known), strategy, *times, second, frames])
-    head = ["", "strategy", "p50", "p99", "p99.9", "worst", "frames a second by p99", "frames"]
-    slows = [slow for cell in known if (slow := frame_us(cell, "p99")) is not None]
-    quick = sum(slow <= FRAME for slow in slows)
-    told = f"99 in 100 frames take 1 ms or less in {quick} of {len(slows)} rows." if slows else ""
-    return paragraphs(table(head, rows), told)
 
 
 # --- auto ---------------------------------------------------------------------------------------
@@ -156,7 +113,7 @@ def auto(results: Results) -> str:
     )
 
 
-def _auto_sentences(found: Sequence[Choice]) -> str:
+def _auto_sentences(found: Sequence[AutoChoice]) -> str:
     close = sum(choice.ratio <= AUTO_CLOSE for choice in found)
     own = [r for choice in found if (r := choice.choosable_ratio) is not None]
     told = f"`auto` is within 10 % of the fastest strategy, or faster, in {close} of {len(found)}"
@@ -168,7 +125,7 @@ def _auto_sentences(found: Sequence[Choice]) -> str:
     return bullets(said)
 
 
-def _auto_summary(found: Sequence[Choice]) -> str:
+def _auto_summary(found: Sequence[AutoChoice]) -> str:
     rows = []
     for (engine, layout), places in grouped([c.where for c in found], ("engine", "layout")).items():
         own = [choice for choice in found if any(choice.where is place for place in places)]
@@ -186,7 +143,7 @@ def _auto_summary(found: Sequence[Choice]) -> str:
     return table(["engine", "layout", "groups", "within 10 %", "middle ratio", "worst"], rows)
 
 
-def _auto_worst(found: Sequence[Choice]) -> str:
+def _auto_worst(found: Sequence[AutoChoice]) -> str:
     off = sorted((c for c in found if c.ratio > AUTO_CLOSE), key=lambda c: -c.ratio)
     if not off:
         return ""
@@ -213,7 +170,7 @@ def _auto_worst(found: Sequence[Choice]) -> str:
     return paragraphs(told, table(head, rows), meant)
 
 
-def _auto_noise(results: Results, found: Sequence[Choice]) -> str:
+def _auto_noise(results: Results, found: Sequence[AutoChoice]) -> str:
     """How far the numbers themselves can be trusted, as the run shows it."""
     said = []
     apart = repeats(results)

@@ -1,0 +1,1 @@
+"""The written evaluation (docs/evaluation.md): its chapters, reasons and plots, from results/."""

@@ -1,0 +1,1 @@
+"""Plots of measured cells as SVG files."""

@@ -10,7 +10,8 @@ import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.motion import poses_of
-from hapticdb.kernels.resident.cells import HITS, MOST_MISSED, RESULTS
+from hapticdb.kernels.records import MOST_MISSED
+from hapticdb.kernels.resident.cells import HITS, RESULTS
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.resident.frames import clusters_of
 from hapticdb.resident.residency import Residency

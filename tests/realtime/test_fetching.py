@@ -19,21 +19,16 @@ from children import PATIENCE
 from hapticdb import DatabaseError, Environment, Grid, HapticDBError, PointShell
 from hapticdb.devices.scripted import RandomHand
 from hapticdb.kernels.hand import servo
+from hapticdb.kernels.records import TOLD
 from hapticdb.kernels.resident.cells import cell_key
 from hapticdb.realtime.fetching import (
     CONFIRM_EVERY,
-    HANDLE,
-    HEARD,
-    MISSING,
-    RADIUS,
-    TOOL,
-    VELOCITY,
     Fetching,
     FetchRequest,
 )
 from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.realtime.wishes import Wish
-from hapticdb.resident.table import ACTIVE, AWAY, HEARTBEAT, LEAST_BUDGET, CellTable
+from hapticdb.realtime.wishes import Motion, Wish
+from hapticdb.resident.table import AWAY, HEARTBEAT, LEAST_BUDGET, CellTable
 from hapticdb.testing import write_voxels
 from realtime.troubled import refuse, refuse_strangely, troubled
 from realtime.worlds import Reader, block, expected, ids_by_voxel, make, move, scatter
@@ -58,13 +53,10 @@ class Side:
 
     def __init__(self, table: CellTable, grid: Grid, shell: PointShell) -> None:
         self.reader = Reader(table, grid, shell)
-        self.grid, self.desk = grid, table.desk
-        row = self.row = self.reader.row
-        self.signal = servo.Signal(
-            self.desk.sequence[row : row + 1], self.desk.state[row], self.desk.missed[row],
-            self.desk.voxels[row],
-        )  # fmt: skip
-        self.told = np.zeros(servo.TOLD)
+        self.grid = grid
+        self.row = self.reader.row
+        self.session = table.desk.sessions[self.row, ...]
+        self.told = np.zeros((), TOLD)
         self.radius = RADIUS_M
 
     def be_at(
@@ -72,29 +64,28 @@ class Side:
     ) -> tuple[list[int], bytes, int]:
         """Run a frame and tell; returns what the frame found."""
         found = self.reader.feel(pose)
-        self.told[ACTIVE] = 1.0
-        self.told[TOOL : TOOL + 3] = self.told[HANDLE : HANDLE + 3] = pose[:3, 3]
-        self.told[VELOCITY : VELOCITY + 3] = 0.0 if velocity is None else velocity[:3]
-        self.told[RADIUS] = self.radius
-        servo.tell(self.signal, self.told, self.reader.missed)
+        self.told["is_active"] = True
+        self.told["tool"] = self.told["handle"] = pose[:3, 3]
+        self.told["velocity"] = 0.0 if velocity is None else velocity[:3]
+        self.told["radius"] = self.radius
+        servo.tell(self.session, self.told, self.reader.missed)
         return found
 
     def name(self, pose: Pose, n_hits: int) -> None:
         """Ask for the objects at the last frame's hits."""
         servo.name_voxels(
-            self.signal, self.reader.clusters, pose, self.reader.place, self.grid.bits,
+            self.session, self.reader.clusters, pose, self.reader.place, self.grid.bits,
             self.grid.curve_code, self.reader.met, n_hits,
         )  # fmt: skip
 
     @property
     def is_served(self) -> bool:
-        state = self.desk.state[self.row]
-        return bool(state[HEARD] >= self.desk.sequence[self.row] and state[MISSING] == 0)
+        row = self.session
+        return bool(row["heard"] >= row["sequence"] and row["n_missing"] == 0)
 
     @property
     def ids(self) -> list[int]:
-        ids = self.desk.ids[self.row]
-        return sorted(ids[1 : 1 + int(ids[0])].tolist())
+        return sorted(self.session["objects"][: int(self.session["n_objects"])].tolist())
 
 
 class LockStep:
@@ -185,7 +176,7 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
     handle = tool + rng.normal(0, 0.02, 3)
     velocity = rng.normal(0, 0.5, 3)
     lookahead, radius = float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.0, 0.05))
-    motion = np.concatenate([tool, handle, velocity, [radius]])
+    motion = Motion(tool, handle, velocity, radius)
     wish = Wish.of_motion(grid, motion, lookahead, 1.0)
     assert wish is not None
     cells, urgency = wish.cells(grid)
@@ -210,7 +201,7 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
 def test_a_wish_too_large_keeps_what_is_near() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 16)
     tool = np.array([grid.edge * 0.9, 0.1, grid.edge / 2])
-    motion = np.concatenate([tool, tool, [40.0, 0.0, 0.0], [0.05]])
+    motion = Motion(tool, tool, np.array([40.0, 0.0, 0.0]), 0.05)
     wish = Wish.of_motion(grid, motion, 0.5, 40.0)
     assert wish is not None
     cells, _ = wish.cells(grid)
@@ -221,9 +212,11 @@ def test_a_wish_too_large_keeps_what_is_near() -> None:
 def test_a_motion_that_is_none_wants_nothing() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
     for broken in (np.nan, np.inf):
-        motion = np.zeros(10)
-        motion[4] = broken
-        assert Wish.of_motion(grid, motion, 0.1, 1.0) is None
+        still = Motion.at_rest(np.zeros(3))
+        for name in ("tool", "handle", "velocity"):
+            motion = still._replace(**{name: np.array([0.0, broken, 0.0])})  # type: ignore[arg-type]
+            assert Wish.of_motion(grid, motion, 0.1, 1.0) is None
+        assert Wish.of_motion(grid, still._replace(radius=broken), 0.1, 1.0) is None
 
 
 # --- in lock step -------------------------------------------------------------------------------

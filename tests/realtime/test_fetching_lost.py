@@ -205,7 +205,7 @@ def test_a_connection_lost_while_warming_up_puts_ready_off(
         fetching.fetch(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid), listener)
         assert listener.said == ["ready"]
         assert next(losses, None) is None
-        assert table.desk.figures[fetching.LOSSES] == 1
+        assert table.desk.figures["losses"] == 1
 
 
 def test_a_table_goes_when_its_process_does_not_start(

@@ -159,18 +159,18 @@ def test_objects_are_no_longer_asked_for_once_the_tool_has_left_and_was_answered
 ) -> None:
     hand = Pressing(0.02)
     loop = pressed(world, hand)
-    asked, control = loop.signal.voxels, world.table.cells.control
+    asked, control = loop.session["n_asked"], world.table.cells.control
     loop._ask_or_withdraw(1000)
-    assert asked[0] > 0
+    assert asked > 0
     hand.z = 0.02
     for _ in range(100):
         frame(loop, hand)
     control[HEARTBEAT] = 1000 + WITHDRAWN_NS  # the database may still be naming them
     loop._ask_or_withdraw(2000)
-    assert asked[0] > 0
+    assert asked > 0
     control[HEARTBEAT] += 1
     loop._ask_or_withdraw(3000)
-    assert asked[0] == 0
+    assert asked == 0
 
 
 def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
@@ -181,7 +181,7 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
             super().apply(wrench)
             world.table.cells.control[HEARTBEAT] = time.monotonic_ns() + 2 * WITHDRAWN_NS
             if wrench.any():
-                self.n_asked = int(world.table.desk.voxels[:, 0].max())
+                self.n_asked = int(world.table.desk.sessions["n_asked"].max())
                 self.z = 0.02 if len(self.sent) > 30 else self.z
 
         @property
@@ -192,7 +192,7 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
     work(requested(world, hand, is_waiting=False, seconds=60.0), Voice(io.BytesIO()))
     assert hand.n_asked > 0
     assert not hand.sent[-1].any()
-    assert not world.table.desk.voxels[:, 0].any()
+    assert not world.table.desk.sessions["n_asked"].any()
 
 
 def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:

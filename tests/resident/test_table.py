@@ -15,7 +15,6 @@ from children import child, joined, until
 from hapticdb import UsageError
 from hapticdb.kernels.resident.cells import READER_STRIDE
 from hapticdb.resident.table import (
-    ACTIVE,
     FIRST_VERSION,
     LEAST_BUDGET,
     MOST_READERS,
@@ -67,9 +66,9 @@ def test_who_maps_the_same_memory_sees_the_same() -> None:
     with CellTable.create(LEAST_BUDGET) as table:
         other = CellTable(table.descriptor, table.n_slots)
         table.cells.words[3, 5] = 7
-        other.desk.figures[2] = 1.5
+        other.desk.figures["worst_latency"] = 1.5
         assert other.cells.words[3, 5] == 7
-        assert table.desk.figures[2] == 1.5
+        assert table.desk.figures["worst_latency"] == 1.5
 
 
 def test_sixteen_readers_have_rows_of_their_own_and_the_next_is_refused() -> None:
@@ -93,14 +92,14 @@ def test_a_row_says_nothing_of_who_had_it_before() -> None:
     """Even if that one ended in the middle of saying something."""
     with CellTable.create(LEAST_BUDGET) as table:
         row = table.join()
-        table.desk.sequence[row] = 5
-        table.desk.state[row] = 1.0
-        table.desk.missed[row] = table.desk.voxels[row] = table.desk.ids[row] = 3
+        sessions = table.desk.sessions
+        sessions[row] = 3  # all of its fields
+        sessions["sequence"][row] = 5
         table.leave(row)
         assert table.join() == row
-        assert table.desk.sequence[row] == 6
-        for told in (table.desk.state, table.desk.missed, table.desk.voxels, table.desk.ids):
-            assert not told[row].any()
+        assert sessions["sequence"][row] == 6
+        sessions["sequence"][row] = 0
+        assert sessions[row] == np.zeros((), sessions.dtype)
 
 
 def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
@@ -110,10 +109,11 @@ def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
         dead, alive = table.join(), table.join()
         table.desk.pids[dead] = gone.pid
         table.cells.readers[[dead * READER_STRIDE, alive * READER_STRIDE]] = 9
-        table.desk.state[[dead, alive], ACTIVE] = 1.0
+        is_active = table.desk.sessions["told"]["is_active"]
+        is_active[[dead, alive]] = True
         table.release_dead()
         assert np.flatnonzero(table.cells.readers).tolist() == [alive * READER_STRIDE]
-        assert np.flatnonzero(table.desk.state[:, ACTIVE]).tolist() == [alive]
+        assert np.flatnonzero(is_active).tolist() == [alive]
         assert table.join() not in {dead, alive}
     assert not is_alive(gone.pid)
     assert is_alive(os.getpid())

@@ -13,6 +13,7 @@ from typing import Any
 
 import numba
 from numba import config, types
+from numba.np.numpy_support import from_dtype
 
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
@@ -38,6 +39,11 @@ SIGNATURES: dict[str, tuple[Any, ...]] = {}
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped
     """Type of a NamedTuple whose fields have those types."""
     return types.BaseTuple.from_types(fields, kind)
+
+
+def record_of(layout: Any, axes: int = 0) -> Any:  # noqa: ANN401 - likewise
+    """Type of an array of records of a layout (`records`): one without axes, or rows of them."""
+    return types.Array(from_dtype(layout), axes, "C")
 
 
 def entry(*signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:  # noqa: ANN401

@@ -15,16 +15,15 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import GridError, HapticDBError
 from hapticdb.grid import Grid
+from hapticdb.kernels.records import MOST_ASKED
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
 from hapticdb.realtime.processes import Voice, parent_is_gone
-from hapticdb.realtime.wishes import Wish
+from hapticdb.realtime.wishes import Motion, Wish
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
-    ACTIVE,
     AWAY,
     FIRST_VERSION,
     HEARTBEAT,
-    MOST_ASKED,
     STOP,
     CellTable,
 )
@@ -32,12 +31,6 @@ from hapticdb.store.base import NO_KEYS, Keys, Store, SupportsWatch
 from hapticdb.store.connect import open_store
 from hapticdb.store.objects_at import ids_of_voxels
 
-TOOL, HANDLE, VELOCITY, RADIUS = 1, 4, 7, 10
-MISSING, HEARD, ASKED_TO_END, DONE = 16, 17, 18, 19
-"""Where a row of `Desk.state` has what, beside `ACTIVE`: centre of the tool and of where
-the hand wants it (3 each), the hand's velocity (3), the shell's radius, metres; written by the
-fetching process, wanted cells that are still missing, and for which sequence number; whether the
-loop shall end, and how many frames it has done."""
 LOOKAHEAD = 0.05
 """Seconds that cells are fetched ahead of the hand, at least."""
 MOST_LOOKAHEAD = 0.5
@@ -57,12 +50,6 @@ RELEASE_EVERY = 1.0
 """Seconds between looks for sessions whose processes have ended."""
 RETRY = (0.05, 0.5)
 """Seconds until a lost database is tried again: at first, and at most."""
-LOADED, ROWS, RANGES, EVICTED, BATCHES, LATENCY, WORST, RESIDENT, EMPTY, WISHES, GRANTED, LOSSES = (
-    range(12)
-)
-"""Where `Desk.figures` has what: cells, rows, ranges and statements so far, cells evicted; seconds
-of a median and of the slowest recent fetch; cells resident and known to be empty; cells wanted and
-those of them that were there; how often the database was lost."""
 
 Wrap = Callable[[Store], Store]
 Clock = Callable[[], float]
@@ -109,7 +96,7 @@ class Fetching:
         self.table = CellTable(request.descriptor, request.n_slots)
         self.clock = clock
         self.figures = self.table.desk.figures
-        self._evicted_before = self.figures[EVICTED]
+        self._evicted_before = int(self.figures["evicted"])
         self._latencies: list[float] = [0.0]
         self._headings: dict[int, _Heading] = {}
         self._seen = -1
@@ -144,7 +131,7 @@ class Fetching:
     def warm_up(self) -> None:
         """Do once, on one cell, all that rounds do: nothing is compiled after the first of them."""
         grid = self.request.grid
-        wish = Wish.of_motion(grid, np.array([*grid.origin] * 2 + [0.0] * 4), LOOKAHEAD, 0.0)
+        wish = Wish.of_motion(grid, Motion.at_rest(np.array(grid.origin)), LOOKAHEAD, 0.0)
         assert wish is not None  # noqa: S101 - the origin is a place
         self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
         self.residency.warm_up()
@@ -192,19 +179,20 @@ class Fetching:
 
     def _read_desk(self, elapsed: float) -> bool:
         """Learn where sessions are; whether any is elsewhere than before."""
-        desk = self.table.desk
-        active = set(np.flatnonzero(desk.state[:, ACTIVE]).tolist())
+        sessions = self.table.desk.sessions
+        told = sessions["told"]
+        active = set(np.flatnonzero(told["is_active"]).tolist())
         is_moved = active != set(self._headings)
         self._headings = {row: self._headings.get(row, _Heading()) for row in sorted(active)}
         for row, heading in self._headings.items():
             for _ in range(100):
-                heading.sequence = int(desk.sequence[row])
-                motion = desk.state[row, TOOL : RADIUS + 1].copy()
-                if heading.sequence % 2 == 0 and heading.sequence == desk.sequence[row]:
+                heading.sequence = int(sessions["sequence"][row])
+                motion = Motion.of_told(told[row, ...].copy())
+                if heading.sequence % 2 == 0 and heading.sequence == sessions["sequence"][row]:
                     break
             else:
                 continue  # it died while it wrote
-            speed = float(np.linalg.norm(motion[VELOCITY - TOOL : RADIUS - TOOL]))
+            speed = float(np.linalg.norm(motion.velocity))
             if np.isfinite(speed):
                 heading.speed = max(speed, heading.speed * 0.5 ** (elapsed / MEMORY))
             grid = self.request.grid
@@ -218,16 +206,16 @@ class Fetching:
 
     def _bring_in(self, elapsed: float) -> bool:
         """Fetch the most urgent missing cells of all sessions, a batch; whether any came."""
-        residency, desk = self.residency, self.table.desk
+        residency, sessions = self.residency, self.table.desk.sessions
         is_moved = self._read_desk(elapsed)
         rows = list(self._headings)
-        if is_moved or self._seen != self.table.version or desk.missed[rows, 0].any():
+        if is_moved or self._seen != self.table.version or sessions["n_missed"][rows].any():
             missing = self._missing()
         else:
             missing = NO_KEYS
         for row, heading in self._headings.items():
-            desk.state[row, MISSING] = heading.n_missing
-            desk.state[row, HEARD] = heading.sequence
+            sessions["n_missing"][row] = heading.n_missing
+            sessions["heard"][row] = heading.sequence
         if not len(missing):
             return False
         loaded = residency.load(missing[:BATCH])
@@ -255,45 +243,45 @@ class Fetching:
         cells, slots = cells[:n_kept], slots[:n_kept]
         yield cells, heading.urgency[:n_kept]
         n_unknown = int(np.count_nonzero(slots == UNKNOWN))
-        self.figures[WISHES] += len(cells)
-        self.figures[GRANTED] += len(cells) - n_unknown
+        self.figures["wanted"] += len(cells)
+        self.figures["granted"] += len(cells) - n_unknown
         heading.n_missing = n_unknown
-        n_missed = int(table.desk.missed[row, 0])
+        n_missed = int(table.desk.sessions["n_missed"][row])
         if n_missed:  # what a frame has met already comes before everything
-            missed = np.unique(table.desk.missed[row, 1 : 1 + n_missed])
+            missed = np.unique(table.desk.sessions["missed"][row, :n_missed])
             heading.n_missing += int(np.count_nonzero(residency.slots_of(missed) == UNKNOWN))
             yield missed, np.full(len(missed), -1.0)
 
     def _note(self, loaded: Loaded) -> None:
         self._latencies = [*self._latencies[-31:], loaded.elapsed]
         figures, residency = self.figures, self.residency
-        figures[LOADED] += loaded.cells
-        figures[ROWS] += loaded.rows
-        figures[RANGES] += loaded.ranges
-        figures[BATCHES] += 1
-        figures[LATENCY] = np.median(self._latencies)
-        figures[WORST] = max(figures[WORST], loaded.elapsed)
-        figures[EVICTED] = self._evicted_before + residency.evicted
-        figures[RESIDENT] = residency.n_resident
-        figures[EMPTY] = residency.n_empty
+        figures["cells"] += loaded.cells
+        figures["rows"] += loaded.rows
+        figures["ranges"] += loaded.ranges
+        figures["batches"] += 1
+        figures["median_latency"] = np.median(self._latencies)
+        figures["worst_latency"] = max(float(figures["worst_latency"]), loaded.elapsed)
+        figures["evicted"] = self._evicted_before + residency.evicted
+        figures["resident"] = residency.n_resident
+        figures["empty"] = residency.n_empty
 
     # -- objects -----------------------------------------------------------------------------
 
     def _name_objects(self) -> None:
         """Answer which objects are in the voxels that each session's tool touches."""
-        desk = self.table.desk
+        sessions = self.table.desk.sessions
         for row, heading in self._headings.items():
-            n_voxels = int(desk.voxels[row, 0])
-            if n_voxels <= 0:
-                desk.ids[row, 0] = 0
+            n_asked = int(sessions["n_asked"][row])
+            if n_asked <= 0:
+                sessions["n_objects"][row] = 0
                 heading.asked = b""
                 continue
-            keys = np.unique(desk.voxels[row, 1 : 1 + n_voxels])
+            keys = np.unique(sessions["asked"][row, :n_asked])
             if heading.asked == keys.tobytes():
                 continue
             ids = ids_of_voxels(self.store, keys, self.residency.exclude)[:MOST_ASKED]
-            desk.ids[row, 1 : 1 + len(ids)] = ids
-            desk.ids[row, 0] = len(ids)
+            sessions["objects"][row, : len(ids)] = ids
+            sessions["n_objects"][row] = len(ids)
             heading.asked = keys.tobytes()
 
     # -- when the database is away -----------------------------------------------------------
@@ -301,7 +289,7 @@ class Fetching:
     def lost(self) -> None:
         """Note that the database cannot be reached: sessions let their forces fall."""
         self.table.cells.control[AWAY] = 1
-        self.figures[LOSSES] += 1
+        self.figures["losses"] += 1
 
     def reopen(self) -> None:
         """Open the database anew and catch up with what was written meanwhile."""

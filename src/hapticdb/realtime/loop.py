@@ -30,11 +30,11 @@ from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.hand import servo
 from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.motion import poses_of
+from hapticdb.kernels.records import MOST_MISSED, TOLD
 from hapticdb.kernels.resident.cells import (
     CONTACTS,
     DEEPEST,
     HITS,
-    MOST_MISSED,
     RESULTS,
     UNKNOWNS,
     Place,
@@ -42,22 +42,12 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
-from hapticdb.realtime.fetching import (
-    ASKED_TO_END,
-    DONE,
-    HANDLE,
-    HEARD,
-    MISSING,
-    RADIUS,
-    TOOL,
-    VELOCITY,
-)
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import Voice, parent_is_gone
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
 from hapticdb.recording.frame import State
 from hapticdb.resident.frames import clusters_of
-from hapticdb.resident.table import ACTIVE, HEARTBEAT, STOP, CellTable
+from hapticdb.resident.table import HEARTBEAT, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
 """Length of the empty loop, at most: shorter sessions have shorter ones."""
@@ -110,7 +100,7 @@ class Loop:
         self.reader = Reader(request.device)
         self.table = CellTable(request.descriptor, request.n_slots)
         self.cells = self.table.cells
-        grid, row, desk = request.grid, request.row, self.table.desk
+        grid = request.grid
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
         self.clusters = clusters_of(request.shell, grid.voxel_size)
         self.body = request.coupling.body(request.shell, self.place, request.stiffness)
@@ -120,11 +110,13 @@ class Loop:
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self.frame = np.zeros(RESULTS)
         self.out = np.zeros(kernels.OUT)
-        self.told = np.zeros(servo.TOLD)
+        self.told = np.zeros((), TOLD)
         self.pose = np.eye(4)
         self.ring = ring_of(request.ring, request.n_ring)
-        self.signal = servo.Signal(
-            desk.sequence[row : row + 1], desk.state[row], desk.missed[row], desk.voxels[row]
+        self.session = self.table.desk.sessions[request.row, ...]
+        self._n_frames, self._is_asked_to_end = (
+            self.session["n_frames"],
+            self.session["is_asked_to_end"],
         )
         self.counts = Counts()
         self.is_warm = False
@@ -136,19 +128,18 @@ class Loop:
     def prepare(self) -> float:
         """Place the tool at the hand, wait for its cells; returns the seconds that took."""
         started = time.monotonic()
-        state = self.signal.state
-        asked = 0
+        session, asked = self.session, 0
         self._place()
         while time.monotonic() - started < WARM_PATIENCE and not self._is_left():
-            if asked and state[HEARD] >= asked:
-                if state[MISSING] == 0:
+            if asked and session["heard"] >= asked:
+                if session["n_missing"] == 0:
                     self.is_warm = True
                     break
                 asked = 0
             if not asked:  # a hand of flesh does not wait: where it is by now is what counts
                 self._place()
                 self._tell()
-                asked = int(self.signal.sequence[0])
+                asked = int(session["sequence"])
             time.sleep(1e-3)
         self._place()
         self._tell()
@@ -190,7 +181,7 @@ class Loop:
             self._ask(0)
             self._note(at, 0.0, 0.0, 0.0, 0.0, 0, 0)
             self._tell()
-        self.signal.state[ACTIVE] = 0.0
+        self.session["told"]["is_active"] = False
         self.device.apply(np.zeros(6))
 
     # -- one frame ---------------------------------------------------------------------------
@@ -236,19 +227,19 @@ class Loop:
         """Say where tool and hand are, and which cells the last frame missed."""
         told, center = self.told, self.request.shell.center
         poses_of(self.state[None, :7], self.pose[None])
-        told[ACTIVE] = 1.0
-        told[TOOL : TOOL + 3] = self.pose[:3, :3] @ center + self.pose[:3, 3]
-        told[HANDLE : HANDLE + 3] = self.hand[:3] + self.pose[:3, :3] @ center
-        told[VELOCITY : VELOCITY + 3] = self.hand[7:10]
-        told[RADIUS] = self.body.radius
-        servo.tell(self.signal, told, self.missed)
+        told["is_active"] = True
+        told["tool"] = self.pose[:3, :3] @ center + self.pose[:3, 3]
+        told["handle"] = self.hand[:3] + self.pose[:3, :3] @ center
+        told["velocity"] = self.hand[7:10]
+        told["radius"] = self.body.radius
+        servo.tell(self.session, told, self.missed)
 
     def _ask(self, n_hits: int) -> None:
         """Have the objects named that the last frame's hits are in."""
         grid = self.request.grid
         poses_of(self.state[None, :7], self.pose[None])
         servo.name_voxels(
-            self.signal, self.clusters, self.pose, self.place, grid.bits, grid.curve_code,
+            self.session, self.clusters, self.pose, self.place, grid.bits, grid.curve_code,
             self.met[0], n_hits,
         )  # fmt: skip
 
@@ -281,7 +272,7 @@ class Loop:
         )  # fmt: skip
 
     def _is_stopped(self) -> bool:
-        return bool(self.cells.control[STOP]) or self.signal.state[ASKED_TO_END] != 0.0
+        return bool(self.cells.control[STOP]) or bool(self._is_asked_to_end)
 
     def _is_left(self) -> bool:
         return self._is_stopped() or parent_is_gone()
@@ -326,7 +317,7 @@ class Loop:
                 reading.buttons,
                 state,
             )
-            self.signal.state[DONE] = at + 1
+            self._n_frames[()] = at + 1
             deadlines.done()
             if self._is_stopped() or (ends is not None and ends.is_over):
                 break

@@ -11,7 +11,6 @@ from hapticdb.errors import GridError, HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.query.frame import as_ids
-from hapticdb.realtime import fetching
 from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.processes import Process
 from hapticdb.resident.residency import check_cells
@@ -206,20 +205,20 @@ class ResidentCells:
     def figures(self) -> CacheFigures:
         """What the fetching process has done so far."""
         counted = self.table.desk.figures
-        wishes = float(counted[fetching.WISHES])
+        wanted = float(counted["wanted"])
         return CacheFigures(
             budget_bytes=self.table.size_bytes,
-            resident=int(counted[fetching.RESIDENT]),
-            empty=int(counted[fetching.EMPTY]),
-            loaded=int(counted[fetching.LOADED]),
-            evicted=int(counted[fetching.EVICTED]),
-            rows=int(counted[fetching.ROWS]),
-            ranges=int(counted[fetching.RANGES]),
-            statements=int(counted[fetching.BATCHES]),
-            latency=float(counted[fetching.LATENCY]),
-            worst=float(counted[fetching.WORST]),
-            hit_rate=float(counted[fetching.GRANTED]) / wishes if wishes else 1.0,
-            losses=int(counted[fetching.LOSSES]),
+            resident=int(counted["resident"]),
+            empty=int(counted["empty"]),
+            loaded=int(counted["cells"]),
+            evicted=int(counted["evicted"]),
+            rows=int(counted["rows"]),
+            ranges=int(counted["ranges"]),
+            statements=int(counted["batches"]),
+            latency=float(counted["median_latency"]),
+            worst=float(counted["worst_latency"]),
+            hit_rate=float(counted["granted"]) / wanted if wanted else 1.0,
+            losses=int(counted["losses"]),
             restarts=self.restarts,
         )
 

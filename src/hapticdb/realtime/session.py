@@ -19,7 +19,6 @@ from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.law import TangentPlane
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
-from hapticdb.realtime.fetching import ASKED_TO_END, DONE
 from hapticdb.realtime.hand_path import way_of
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
@@ -257,7 +256,7 @@ class Session:
     @property
     def n_frames(self) -> int:
         """Frames so far."""
-        return int(self.cells.table.desk.state[self._open_row, DONE])
+        return int(self.cells.table.desk.sessions["n_frames"][self._open_row])
 
     @property
     def pid(self) -> int:
@@ -310,7 +309,7 @@ class Session:
 
     def ask_to_end(self) -> None:
         """Have the loop end after its next frame; `wait` then gives the report."""
-        self.cells.table.desk.state[self._open_row, ASKED_TO_END] = 1.0
+        self.cells.table.desk.sessions["is_asked_to_end"][self._open_row] = True
 
     def stop(self) -> Report:
         """End the session; its report."""
@@ -322,9 +321,9 @@ class Session:
 
     def _drain(self) -> None:
         """Record the frames that have come, and learn what they touched."""
-        desk, done = self.cells.table.desk, self.n_frames
-        ids = desk.ids[self._row]
-        self._objects.update(ids[1 : 1 + int(ids[0])].tolist())
+        sessions, done = self.cells.table.desk.sessions, self.n_frames
+        n_objects = int(sessions["n_objects"][self._row])
+        self._objects.update(sessions["objects"][self._row, :n_objects].tolist())
         if self._recorder is None or not self._is_recording:
             return
         self._is_recording = False  # unless this goes well: one that failed takes no more

@@ -18,6 +18,34 @@ MOST_CELLS_WANTED = 1 << 15
 Floats = NDArray[np.float64]
 
 
+class Motion(NamedTuple):
+    """Where a loop's tool is and where its hand wants it: metres and m/s, world frame.
+
+    tool (3,): the shell's centre; handle (3,): where the hand wants that centre; velocity (3,): of
+    the handle; radius: of the shell's point farthest from its centre.
+    """
+
+    tool: Floats
+    handle: Floats
+    velocity: Floats
+    radius: float
+
+    @classmethod
+    def of_told(cls, told: NDArray[np.void]) -> "Motion":
+        """Motion in what a loop told: told () of `kernels.records.TOLD`, which is not copied."""
+        return cls(told["tool"], told["handle"], told["velocity"], float(told["radius"]))
+
+    @classmethod
+    def at_rest(cls, position: Floats) -> "Motion":
+        """Motion of a single point that stays at a position (3,)."""
+        return cls(position, position, np.zeros(3), 0.0)
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether all of its numbers are."""
+        return all(bool(np.isfinite(part).all()) for part in self)
+
+
 class Wish(NamedTuple):
     """Where a tool is and may soon be, in voxels of the grid.
 
@@ -32,24 +60,23 @@ class Wish(NamedTuple):
 
     @classmethod
     def of_motion(
-        cls, grid: Grid, motion: Floats, lookahead: float, peak_speed: float
+        cls, grid: Grid, motion: Motion, lookahead: float, peak_speed: float
     ) -> "Wish | None":
-        """Wish of a session's motion, or None when that is no motion.
+        """Wish of a session's motion, or None when not all of its numbers are finite.
 
-        motion (10,): centre of the tool and of where the hand wants it, the hand's velocity, the
-        shell's radius; metres, m/s. The sphere is swept from the tool to the hand and on along the
+        The sphere is swept from the tool to the hand and on along the
         velocity for `lookahead` seconds; the hand may be elsewhere by then at 1.5 times the speed
         (m/s) that it has shown of late or, from rest, `REACH_VOXELS`.
         """
-        if not np.isfinite(motion).all():
+        if not motion.is_finite:
             return None
         size = grid.voxel_size
-        tool, handle, velocity = motion[:3], motion[3:6], motion[6:9]
+        tool, handle, velocity, radius = motion
         margin = max(1.5 * peak_speed / size, REACH_VOXELS) * lookahead
         return cls(
             (tool - np.array(grid.origin)) / size,
             (handle - tool + velocity * lookahead) / size,
-            float(motion[9]) / size,
+            radius / size,
             margin,
         )
 

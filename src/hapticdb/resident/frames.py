@@ -6,13 +6,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import (
     CONTACTS,
     DEEPEST,
     GROUP,
     HITS,
-    MOST_MISSED,
     RESULTS,
     UNKNOWN,
     UNKNOWNS,

@@ -15,15 +15,14 @@ from pathlib import Path
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.records import FIGURES, SESSION
 from hapticdb.kernels.resident import cells as kernels
 
 DEFAULT_BUDGET = 256 << 20
 LEAST_BUDGET = 1 << 20
-ACTIVE = 0
-"""Where a row of `Desk.state` says whether a session is there."""
 FIRST_VERSION = 1
 """Of a table into which nothing was written."""
 MOST_READERS = 16
@@ -31,35 +30,25 @@ CONTROL_WORDS = 16
 HEARTBEAT, AWAY, LOADING, STOP = 8, 9, 10, 11
 """Words of the control block beside `kernels.cells`': when the database last answered (ns,
 CLOCK_MONOTONIC), whether it is away, cells being fetched, and whether all shall end."""
-N_FIGURES = 16
-MOST_ASKED = 64
-STATE_WORDS = 32
 _PAGE = 4096
 _joining = threading.Lock()
 
 
 class Desk(NamedTuple):
-    """What sessions and the fetching process tell one another, a row a session.
+    """What sessions and the fetching process tell one another; `kernels.records` has the fields.
 
-    sequence (16,) int64, odd while a session writes its row; state (16, 32) float64, see
-    `hapticdb.realtime.fetching`; missed (16, 64) int64: unknown cells of the last frame, their
-    number first; voxels (16, 65) int64: keys of voxels that the tool touches, their number first;
-    ids (16, 65) int64: the objects there, their number first; pids (16,) int64; figures (16,)
-    float64: what the fetching process counts.
+    sessions (16,) of SESSION, a row a session; pids (16,) int64: the processes that hold the rows,
+    0 for none; figures () of FIGURES: what the fetching process counts.
     """
 
-    sequence: NDArray[np.int64]
-    state: NDArray[np.float64]
-    missed: NDArray[np.int64]
-    voxels: NDArray[np.int64]
-    ids: NDArray[np.int64]
+    sessions: NDArray[np.void]
     pids: NDArray[np.int64]
-    figures: NDArray[np.float64]
+    figures: NDArray[np.void]
 
 
 class _Field(NamedTuple):
     name: str
-    dtype: type[np.generic]
+    dtype: DTypeLike
     shape: tuple[int, ...]
 
 
@@ -69,13 +58,9 @@ def _fields(n_slots: int, capacity: int) -> list[_Field]:
     return [
         _Field("control", np.int64, (CONTROL_WORDS,)),
         _Field("readers", np.int64, (rows * kernels.READER_STRIDE,)),
-        _Field("sequence", np.int64, (rows,)),
-        _Field("state", np.float64, (rows, STATE_WORDS)),
-        _Field("missed", np.int64, (rows, kernels.MOST_MISSED + 1)),
-        _Field("voxels", np.int64, (rows, MOST_ASKED + 1)),
-        _Field("ids", np.int64, (rows, MOST_ASKED + 1)),
+        _Field("sessions", SESSION, (rows,)),
         _Field("pids", np.int64, (rows,)),
-        _Field("figures", np.float64, (N_FIGURES,)),
+        _Field("figures", FIGURES, ()),
         _Field("keys", np.int64, (kernels.BUFFERS, capacity)),
         _Field("slots", np.int32, (kernels.BUFFERS, capacity)),
         _Field("words", np.uint32, (n_slots, kernels.CELL_WORDS)),
@@ -200,7 +185,8 @@ class CellTable:
             if len(free):
                 row = int(free[0])
                 self._clear(row)
-                self.desk.sequence[row] += self.desk.sequence[row] % 2  # its last may have died
+                sequence = self.desk.sessions["sequence"]
+                sequence[row] += sequence[row] % 2  # odd where the last session died as it wrote
                 self.desk.pids[row] = os.getpid()
                 return row
         raise UsageError(f"a table of cells has {MOST_READERS} readers at most: end one first")
@@ -215,12 +201,13 @@ class CellTable:
         for row in np.flatnonzero(self.desk.pids).tolist():
             if not is_alive(int(self.desk.pids[row])):
                 self.cells.readers[row * kernels.READER_STRIDE] = 0
-                self.desk.state[row, ACTIVE] = 0.0
+                self.desk.sessions["told"]["is_active"][row] = False
 
     def _clear(self, row: int) -> None:
         self.cells.readers[row * kernels.READER_STRIDE] = 0
-        for told in (self.desk.state, self.desk.missed, self.desk.voxels, self.desk.ids):
-            told[row] = 0
+        for name in SESSION.names or ():
+            if name != "sequence":
+                self.desk.sessions[name][row] = 0
 
     @contextmanager
     def reading(self) -> Iterator[int]:

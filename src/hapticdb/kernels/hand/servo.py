@@ -1,55 +1,57 @@
 """One period of the servo loop around the coupling: what is told, and what is recorded."""
 
-from typing import NamedTuple
-
 import numpy as np
-from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, INTS, entry, fields_of
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, INTS, entry, record_of
 from hapticdb.kernels.curves import key_of
 from hapticdb.kernels.query.contact import turn
-from hapticdb.kernels.resident.cells import CLUSTERS, CONTACTS, DEEPEST, HITS, PLACE, UNKNOWNS
+from hapticdb.kernels.records import MOST_ASKED, SESSION, TOLD
+from hapticdb.kernels.resident.cells import (
+    CLUSTERS,
+    CONTACTS,
+    DEEPEST,
+    HITS,
+    LISTED,
+    PLACE,
+    UNKNOWNS,
+)
 from hapticdb.kernels.resident.fence import fence
 
 WIDTH = 43
 """Numbers of a recorded frame, in the order of the fields of `realtime.recorded.FRAME`."""
-TOLD = 11
-"""Words of a session's state that the loop writes; `realtime.prefetch` names them."""
 
 
-class Signal(NamedTuple):
-    """A session's row of the desk.
+@entry(record_of(SESSION), record_of(TOLD), INTS)
+def tell(session_row, told_row, missed):
+    """Write what a loop tells, and the unknown cells of its last frame, into its row of the desk.
 
-    sequence (1,) int64; state (32,) float64; missed, voxels (64 or 65,) int64, their number first.
+    missed (1 + MOST_MISSED,) int64, as `felt` fills it. The row's sequence number is odd meanwhile.
     """
-
-    sequence: NDArray[np.int64]
-    state: NDArray[np.float64]
-    missed: NDArray[np.int64]
-    voxels: NDArray[np.int64]
-
-
-SIGNAL = fields_of(Signal, INTS, FLOATS, INTS, INTS)
-
-
-@entry(SIGNAL, FLOATS, INTS)
-def tell(signal, told, missed):
-    """Write what a session tells: `told` (TOLD,) and the unknown cells of its last frame."""
-    signal.sequence[0] += 1
+    session, told = session_row[()], told_row[()]
+    session.sequence += 1
     fence()
-    for n in range(TOLD):
-        signal.state[n] = told[n]
-    for n in range(missed[0] + 1):
-        signal.missed[n] = missed[n]
+    session.told.is_active = told.is_active
+    for axis in range(3):
+        session.told.tool[axis] = told.tool[axis]
+        session.told.handle[axis] = told.handle[axis]
+        session.told.velocity[axis] = told.velocity[axis]
+    session.told.radius = told.radius
+    session.n_missed = missed[LISTED]
+    for n in range(missed[LISTED]):
+        session.missed[n] = missed[LISTED + 1 + n]
     fence()
-    signal.sequence[0] += 1
+    session.sequence += 1
 
 
-@entry(SIGNAL, CLUSTERS, FLOATS2, PLACE, INT, INT, INTS, INT)
-def name_voxels(signal, shell, pose, place, bits, curve, met, n_hits):
-    """Write the keys of some of the voxels that hits (n_hits,) of a placed shell are in."""
-    most = signal.voxels.shape[0] - 1
-    step = max((n_hits + most - 1) // most, 1)
+@entry(record_of(SESSION), CLUSTERS, FLOATS2, PLACE, INT, INT, INTS, INT)
+def name_voxels(session_row, shell, pose, place, bits, curve, met, n_hits):
+    """Ask for the objects in voxels that a placed shell hits: write the voxels' keys.
+
+    met (n_hits,): indices of the points that hit. Of more than MOST_ASKED hits, evenly spread ones
+    are taken.
+    """
+    session = session_row[()]
+    step = max((n_hits + MOST_ASKED - 1) // MOST_ASKED, 1)
     count = 0
     for hit in range(0, n_hits, step):
         n = met[hit]
@@ -63,9 +65,9 @@ def name_voxels(signal, shell, pose, place, bits, curve, met, n_hits):
         k = np.int64(
             (turn(pose[2, 0], pose[2, 1], pose[2, 2], x, y, z) + pose[2, 3] - place.z) / place.size
         )
+        session.asked[count] = key_of(i, j, k, bits, curve)
         count += 1
-        signal.voxels[count] = key_of(i, j, k, bits, curve)
-    signal.voxels[0] = count
+    session.n_asked = count
 
 
 @entry(FLOATS2, INT, FLOAT, FLOAT, FLOAT, FLOAT, FLOATS, FLOATS, FLOATS, FLOATS, FLOAT, INT, INT)

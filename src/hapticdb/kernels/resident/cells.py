@@ -41,6 +41,7 @@ from hapticdb.kernels.query.contact import (
     moment,
     turn,
 )
+from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident.fence import fence
 
 Floats = NDArray[np.float64]
@@ -56,8 +57,8 @@ REVISION = 1
 """And, from there on, the database's revision of each buffer."""
 READER_STRIDE = 8
 """Readers stand a cache line apart."""
-MOST_MISSED = 63
-"""Unknown cells that a frame names, for whoever fetches them."""
+LISTED = 0
+"""Where a frame's list of unknown cells has their number; their keys follow."""
 GROUP = 4
 """Runs of a group, which are skipped together."""
 MOST_COLUMNS = 64
@@ -395,7 +396,7 @@ def felt(cells, which, shell, pose, place, stiffness, met, missed, out):
     out[CONTACTS] = n_contacts
     out[UNKNOWNS] = n_unknown
     out[DEEPEST] = deepest
-    missed[0] = n_missed
+    missed[LISTED] = n_missed
 
 
 @entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, FLOAT, INTS, INTS, FLOATS2)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import apsw
 
-from hapticdb.store.schema import MIGRATIONS, SQLITE_APPLICATION_ID
+from hapticdb.store.sqlite.migrations import APPLICATION_ID, MIGRATIONS
 from hapticdb.store.sqlite.store import SQLiteStore
 
 
@@ -19,12 +19,12 @@ def make_old(path: Path) -> None:
     path.unlink()
     with closing(apsw.Connection(str(path))) as old:
         old.execute("PRAGMA page_size = 8192")
-        for statement in MIGRATIONS[0].sqlite:
+        for statement in MIGRATIONS["tables"]:
             old.execute(statement)
         tables["environment"] = [row[:8] for row in tables["environment"]]
         for name, rows in tables.items():
             for row in rows:
                 old.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
-        old.execute(f"PRAGMA application_id = {SQLITE_APPLICATION_ID}")
+        old.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         old.execute("PRAGMA user_version = 1")
         old.execute("PRAGMA journal_mode = WAL").fetchall()

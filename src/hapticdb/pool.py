@@ -6,26 +6,12 @@ import time
 from collections.abc import Iterator
 from threading import Condition
 from types import TracebackType
-from typing import Protocol, Self, cast
+from typing import Self
 
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import BusyError, ConnectionLostError, DatabaseError, UsageError
-from hapticdb.store.base import this_thread
-
-NOBODY = 0
-"""No thread has this number."""
-
-
-class SupportsHandOver(Protocol):
-    """An engine whose opened store may belong to one thread after the other."""
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether `close` was called."""
-
-    def give_to(self, thread: int) -> None:
-        """Belong to another thread from now on, or to nobody (0); only while nobody uses it."""
+from hapticdb.store.base import NOBODY, this_thread
 
 
 class Pool:
@@ -81,7 +67,7 @@ class Pool:
         self._is_closed = False
         first = self._opened()
         self._shown = first.url
-        self._give(first, NOBODY)
+        first.store.give_to(NOBODY)
         self._free.append(first)
 
     def __repr__(self) -> str:
@@ -143,7 +129,7 @@ class Pool:
             while not self._is_closed:
                 if self._free:
                     env = self._free.pop()
-                    self._give(env, this_thread())
+                    env.store.give_to(this_thread())
                     return env
                 if self._n_members < self._size:
                     self._n_members += 1
@@ -164,8 +150,8 @@ class Pool:
     def _take_back(self, env: Environment, *, is_sound: bool) -> None:
         """Make a member free again; one that is broken or closed is replaced when needed."""
         with self._changed:
-            if is_sound and not _store_of(env).is_closed and not self._is_closed:
-                self._give(env, NOBODY)  # whoever still holds it is refused
+            if is_sound and not env.store.is_closed and not self._is_closed:
+                env.store.give_to(NOBODY)  # whoever still holds it is refused
                 self._free.append(env)
                 self._changed.notify()
                 return
@@ -180,14 +166,7 @@ class Pool:
     def _opened(self) -> Environment:
         return open_environment(self._url, read_only=self._is_read_only)
 
-    def _give(self, env: Environment, thread: int) -> None:
-        _store_of(env).give_to(thread)
-
-
-def _store_of(env: Environment) -> SupportsHandOver:
-    return cast("SupportsHandOver", env.store)
-
 
 def _close(env: Environment) -> None:
-    _store_of(env).give_to(this_thread())
+    env.store.give_to(this_thread())
     env.close()

@@ -19,6 +19,7 @@ import hapticdb
 from children import child, exit_code
 from command_line import Run, refused, run  # noqa: F401 - a fixture
 from hapticdb import Grid, backup_environment, restore_environment
+from hapticdb.store.engines import BackupProgress
 from hapticdb.store.sqlite import backup as sqlite_backup
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite.store import SQLiteStore
@@ -85,10 +86,10 @@ def test_a_copy_is_as_of_one_moment_though_others_write_at_each_step(
     path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(sqlite_backup, "STEP_PAGES", 2)
-    heard: list[sqlite_backup.BackupProgress] = []
+    heard: list[BackupProgress] = []
     with closing(SQLiteStore.open(path)) as store:
 
-        def write_meanwhile(progress: sqlite_backup.BackupProgress) -> None:
+        def write_meanwhile(progress: BackupProgress) -> None:
             heard.append(progress)
             write(store, 10 + len(heard))
 

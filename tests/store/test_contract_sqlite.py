@@ -15,7 +15,8 @@ import hapticdb
 from children import PATIENCE, child, exit_code
 from hapticdb import Grid
 from hapticdb.store.base import Layout, Store
-from hapticdb.store.schema import CHECKED_VERSION, FORMAT_VERSION
+from hapticdb.store.schema import FORMAT_VERSION
+from hapticdb.store.sqlite.migrations import CHECKED_VERSION
 from hapticdb.store.sqlite.pages import LAYER
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import StoreContract, blob, floor_voxels, write_voxels

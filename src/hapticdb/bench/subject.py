@@ -15,7 +15,7 @@ from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.frame import HapticQuery, Query, Strategy
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import Store, SupportsCaches
+from hapticdb.store.base import Store, SupportsCaches, SupportsServer
 
 PAPER_CACHE = 4 << 20
 """500 blocks of 8 KB."""
@@ -49,12 +49,10 @@ class Subject:
     @cached_property
     def looping(self) -> Store | None:
         """The same store, its ranges scanned by a loop inside the server; None without one."""
-        if not self.env.engine.startswith("PostgreSQL"):
+        if not isinstance(self.env.store, SupportsServer):
             return None
-        from hapticdb.bench.in_server import LoopInServer  # noqa: PLC0415 - its driver is an extra
-
         try:
-            return LoopInServer(self.env.store)
+            return self.env.store.looping()
         except DatabaseError:  # a user who may not make temporary functions
             return None
 
@@ -128,8 +126,6 @@ def limited(env: Environment, size_bytes: int) -> str:
     """
     if isinstance(env.store, SupportsCaches):
         env.store.limit_cache(size_bytes)
-    else:
-        from hapticdb.bench.in_server import server_cache  # noqa: PLC0415 - its driver is an extra
-
-        size_bytes = server_cache(env.store)
+    elif isinstance(env.store, SupportsServer):
+        size_bytes = env.store.server_cache()
     return ALL_CACHED if size_bytes >= env.size().bytes else f"{size_bytes / (1 << 20):.0f} MB"

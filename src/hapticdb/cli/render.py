@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from hapticdb import check, transfer
     from hapticdb.ingest.files import ProgressCallback
-    from hapticdb.store.sqlite import backup as sqlite_backup
+    from hapticdb.store.engines import BackupCallback
 
 _UNPRINTABLE = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"
@@ -174,7 +174,7 @@ def copy_bar(doing: str) -> "Iterator[transfer.ProgressCallback | None]":
 
 
 @contextmanager
-def file_bar(doing: str) -> "Iterator[sqlite_backup.ProgressCallback | None]":
+def file_bar(doing: str) -> "Iterator[BackupCallback | None]":
     """Show a bar with megabytes and time left; nothing where nobody looks."""
     if not sys.stderr.isatty():
         yield None

@@ -130,6 +130,8 @@ def present_already(record: Object, url: str) -> EnvironmentExistsError:
     )
 
 
+NOBODY = 0
+"""Thread of a store that is lent to nobody: no thread has this number."""
 _forked_as = 0
 """Process id of a process that was forked since this module was loaded, else 0."""
 
@@ -246,8 +248,18 @@ class Store(Protocol):
     def identity(self) -> object:
         """What tells it from another environment that has taken its place, by comparing."""
 
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called; a lost connection that comes back by itself is not closed."""
+
     def close(self) -> None:
         """Give back what the connection holds."""
+
+    def give_to(self, thread: int) -> None:
+        """Belong to another thread from now on (`this_thread`), or to `NOBODY`.
+
+        Called by any thread, while no call of another is under way.
+        """
 
     def discard(self) -> None:
         """Close and delete an environment that nothing went into."""
@@ -386,6 +398,21 @@ class HasGroupingThreshold(Protocol):
     @property
     def grouping_threshold(self) -> int | None:
         """Distinct keys of a frame; None where a lookup reads each leaf page once by itself."""
+
+
+@runtime_checkable
+class SupportsServer(Protocol):
+    """An engine whose rows and caches another process holds: what a benchmark asks of it."""
+
+    def looping(self) -> "Store":
+        """The same store, but its `scan` loops over the ranges inside the server, one at a time.
+
+        The paper's own form. It needs the right to make a temporary function: raises DatabaseError
+        without it, and when the store was opened to read only.
+        """
+
+    def server_cache(self) -> int:
+        """Bytes of pages that the server keeps in memory, for all its connections."""
 
 
 class Checker(Protocol):

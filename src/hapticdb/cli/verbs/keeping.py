@@ -8,7 +8,7 @@ from hapticdb.cli import render
 from hapticdb.cli.root import Interrupted, Json, Url
 
 if TYPE_CHECKING:
-    from hapticdb.store.sqlite.backup import BackupReport
+    from hapticdb.store.engines import BackupReport
 
 Copy = Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")]
 

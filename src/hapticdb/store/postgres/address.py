@@ -11,15 +11,11 @@ from typing import NamedTuple
 from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
 
 from hapticdb.errors import UsageError
+from hapticdb.store.urls import redact
 
-SCHEMES = ("postgresql", "postgres")
 DEFAULT_ENVIRONMENT = "hapticdb"
-SECRET = re.compile(r"password|secret|passphrase|token|scram", re.IGNORECASE)
 SEARCH_PATH = re.compile(r"(?:-c\s*|--)search_path=(?:\"([^\"]+)\"|([^\s,]+))")
 LONE_PERCENT = re.compile(r"%(?![0-9a-fA-F]{2})|%00")
-PASSWORD = re.compile(r"(?P<user>\w+://[^:/?@\[]*):(?P<password>.*)@", re.DOTALL)
-PORTS = re.compile(r"\d*(?:,[^@/?]*)?(?:/[^@?]*)?\?(?:.*&)?[a-z_]+=")
-"""Not a password's begin, but a port's: host:5432/database?user=me@there."""
 LONGEST_NAME = 63
 
 
@@ -34,11 +30,6 @@ class Address(NamedTuple):
     environment: str
     data: str | None
     shown: str
-
-
-def is_postgres(url: str) -> bool:
-    """Whether a URL names a PostgreSQL server."""
-    return url.split("://", 1)[0].lower() in SCHEMES and "://" in url
 
 
 def parse(url: str) -> Address:
@@ -116,24 +107,6 @@ def with_environment(url: str, name: str) -> str:
             kept[n] = f"options={quote(rest, safe='')}"
     named = f"environment={quote(name, safe='')}"
     return f"{head}?{'&'.join([*kept, named])}"
-
-
-def redact(url: str) -> str:
-    """Leave out of a URL what nobody may read over a shoulder: passwords, wherever they stand.
-
-    Those that should have been escaped, too: up to the last @ that may end them.
-    """
-    if "://" not in url:
-        return url
-    secret = PASSWORD.match(url)
-    if secret and not PORTS.match(secret["password"]):
-        url = secret["user"] + url[secret.end() - 1 :]
-    head, mark, query = url.partition("?")
-    pairs = [
-        f"{key}=***" if SECRET.search(unquote(key)) else f"{key}={value}" if equals else "***"
-        for key, equals, value in (pair.partition("=") for pair in query.split("&") if pair)
-    ]
-    return head + mark + "&".join(pairs)
 
 
 def check_name(name: str, what: str) -> None:

@@ -4,15 +4,12 @@ A viewer reads and touches; a toucher also keeps fitted cost figures; an editor 
 removes objects. The grid, the tables and the rights are the owner's, who made the environment.
 """
 
-from typing import Literal
-
 from psycopg import sql
 
 from hapticdb.errors import AccessError, UsageError
+from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import check_name
 from hapticdb.store.postgres.session import Session, identifier
-
-Right = Literal["viewer", "toucher", "editor", "nobody"]
 
 WITHDRAWN = (
     "REVOKE ALL ON SCHEMA {schema} FROM {role}",

@@ -21,9 +21,10 @@ from hapticdb.store import believed
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import failures
 from hapticdb.store.postgres.address import Address, parse
+from hapticdb.store.postgres.migrations import MIGRATIONS
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.session import Session, identifier
-from hapticdb.store.schema import FORMAT_VERSION, MIGRATIONS
+from hapticdb.store.schema import FORMAT_VERSION, migrations_after
 
 DEFAULT_DATABASE = "hapticdb"
 SERVER_IS_OURS = re.compile(r"(?:^|&)(?:host|hostaddr|port|user|service)=")
@@ -132,10 +133,10 @@ def check(session: Session) -> None:
             f"{shown} has format {version}, newer than the {FORMAT_VERSION} known here: "
             "install a newer hapticdb"
         )
-    missing = [migration for migration in MIGRATIONS[version:] if migration.postgres]
+    missing = [step for step in migrations_after(version, MIGRATIONS) if step.statements]
     if missing and not session.is_read_only and session.is_owner():
         session.write(lambda: _migrate_once(session))
-    elif any(migration.readers_need_it for migration in missing):
+    elif any(step.readers_need_it for step in missing):
         raise ReadOnlyError(
             f"{shown} has the older format {version}: its owner has to open it once to "
             "write, and it is brought up to date"
@@ -216,8 +217,8 @@ def _migrate_once(session: Session) -> None:
 def _migrate(session: Session, version: int) -> None:
     """Run the migrations after `version`, inside a transaction."""
     schema = identifier(session.address.environment)
-    for migration in MIGRATIONS[version:]:
-        for statement in migration.postgres:
+    for migration in migrations_after(version, MIGRATIONS):
+        for statement in migration.statements:
             session.execute(sql.SQL(statement).format(schema=schema))
     if version:
         session.execute("UPDATE environment SET format = %s", (FORMAT_VERSION,))

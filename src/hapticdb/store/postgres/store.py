@@ -3,7 +3,7 @@
 import contextlib
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +24,7 @@ from hapticdb.store.base import (
     Object,
     Rows,
     Size,
+    Store,
     check_unwritten,
     no_object,
     present_already,
@@ -39,6 +40,7 @@ from hapticdb.store.postgres.histogram import (
     server_histogram,
 )
 from hapticdb.store.postgres.loading import Loading
+from hapticdb.store.postgres.looping import LoopInServer
 from hapticdb.store.postgres.session import Session
 from hapticdb.store.postgres.watching import Watch, channel_of
 
@@ -210,6 +212,17 @@ class PostgresStore:
         ordinals, ids, seen = self._session.fetch(text, *parameters)
         self._seen = wire.read_int8(seen or b"")
         return wire.read_int8s(ordinals) - 1, wire.read_int8s(ids)
+
+    # -- what benchmarks ask -----------------------------------------------------------------
+
+    def looping(self) -> Store:
+        """The same store, but its `scan` loops over the ranges inside the server, one at a time."""
+        return cast("Store", LoopInServer(self, self._session))
+
+    def server_cache(self) -> int:
+        """Bytes of pages that the server keeps in memory, for all its connections."""
+        rows = self._session.rows("SELECT pg_size_bytes(current_setting('shared_buffers'))")
+        return int(rows[0][0])
 
     # -- objects -----------------------------------------------------------------------------
 

@@ -9,9 +9,8 @@ VACUUM INTO, the other way, orders all rows anew in one statement that tells no 
 import contextlib
 import os
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
 
 import apsw
 
@@ -24,12 +23,13 @@ from hapticdb.errors import (
     ReadOnlyError,
     UsageError,
 )
-from hapticdb.store.schema import SQLITE_APPLICATION_ID
+from hapticdb.store.engines import BackupCallback, BackupProgress, BackupReport
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import pages as sqlite_pages
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.file import named_errors
+from hapticdb.store.sqlite.migrations import APPLICATION_ID
 
 STEP_PAGES = 512
 """Copied between two reports of progress: 4 MiB."""
@@ -37,31 +37,8 @@ SOURCE_CACHE_KIB = 4096
 """Each page is read once."""
 
 
-class BackupProgress(NamedTuple):
-    """How far a copy is: sent after each step."""
-
-    bytes_done: int
-    bytes_total: int
-
-
-class BackupReport(NamedTuple):
-    """What a backup or restore has copied.
-
-    revision : of the environment in the copy; objects : how many it holds; bytes : of its file.
-    """
-
-    source: str
-    target: str
-    revision: int
-    objects: int
-    bytes: int
-
-
-ProgressCallback = Callable[[BackupProgress], object]
-
-
 def back_up(
-    source: Path, target: Path, *, replace: bool, progress: ProgressCallback | None
+    source: Path, target: Path, *, replace: bool, progress: BackupCallback | None
 ) -> BackupReport:
     """Copy an environment as of one moment into a file, which appears whole or not at all."""
     real = target.resolve()
@@ -96,7 +73,7 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
                 first = sqlite_bytes.read_bytes(target, sqlite_pages.PAGE_BYTES)
             except OSError as error:
                 raise ReadOnlyError(f"{target} cannot be read: {error.strerror}") from error
-        is_ours = int.from_bytes(first[68:72], "big") == SQLITE_APPLICATION_ID
+        is_ours = int.from_bytes(first[68:72], "big") == APPLICATION_ID
         if not (is_ours or sqlite_pages.is_marked(first)):
             raise NotAnEnvironmentError(
                 f"{target} is no hapticdb environment, so it is not replaced; give another path"
@@ -108,7 +85,7 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
     sqlite_file.check_folder(target)
 
 
-def _copied(source: Path, unfinished: Path, progress: ProgressCallback | None) -> tuple[int, int]:
+def _copied(source: Path, unfinished: Path, progress: BackupCallback | None) -> tuple[int, int]:
     """Copy all pages as of one moment; returns the revision and the number of objects."""
     connection, file = sqlite_file.open_file(source, read_only=True)
     with contextlib.closing(file), named_errors(str(source)):
@@ -134,7 +111,7 @@ def _copied(source: Path, unfinished: Path, progress: ProgressCallback | None) -
 def _copy_pages(
     source: apsw.Connection,
     made: apsw.Connection,
-    progress: ProgressCallback | None,
+    progress: BackupCallback | None,
     *,
     is_checked: bool,
 ) -> None:

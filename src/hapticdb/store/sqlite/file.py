@@ -19,14 +19,10 @@ from hapticdb.errors import (
     NotAnEnvironmentError,
     ReadOnlyError,
 )
-from hapticdb.store.schema import (
-    CHECKED_VERSION,
-    FORMAT_VERSION,
-    MIGRATIONS,
-    SQLITE_APPLICATION_ID,
-)
+from hapticdb.store.schema import FORMAT_VERSION, migrations_after
 from hapticdb.store.sqlite import pages as sqlite_pages
 from hapticdb.store.sqlite import raw as sqlite_bytes
+from hapticdb.store.sqlite.migrations import APPLICATION_ID, CHECKED_VERSION, MIGRATIONS
 from hapticdb.store.sqlite.place import OpenedFile
 
 BUSY_TIMEOUT_MS = 10_000
@@ -98,7 +94,7 @@ def check_kind(path: Path) -> None:
         raise foreign
     if len(header) < HEADER_BYTES:
         raise damaged(str(path), "its header is cut off")
-    if int.from_bytes(header[68:72], "big") != SQLITE_APPLICATION_ID:
+    if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
         raise foreign
     _check_known(path, int.from_bytes(header[60:64], "big"))
     wal = Path(f"{path.resolve()}-wal")
@@ -213,14 +209,14 @@ def _sweep_unfinished(path: Path) -> None:
 
 def migrate(connection: apsw.Connection, version: int) -> None:
     """Run the migrations after `version`, each in one transaction with the number it leads to."""
-    for number, migration in enumerate(MIGRATIONS[version:], start=version + 1):
+    for number, statements, _ in migrations_after(version, MIGRATIONS):
         connection.execute("BEGIN IMMEDIATE")
         try:
             marked, done = divmod(_pragma(connection, "user_version"), CHECKED_VERSION)
             if done < number:  # another process may have been faster
-                for statement in migration.sqlite:
+                for statement in statements:
                     connection.execute(statement)
-                connection.execute(f"PRAGMA application_id = {SQLITE_APPLICATION_ID}")
+                connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
                 connection.execute(f"PRAGMA user_version = {marked * CHECKED_VERSION + number}")
             connection.execute("COMMIT")
         except BaseException:
@@ -290,7 +286,7 @@ def _settle(connection: apsw.Connection) -> None:
 def _version(connection: apsw.Connection, path: Path) -> int:
     """Version of a file's tables; refuses what is no environment, or newer."""
     found = _pragma(connection, "user_version")
-    if _pragma(connection, "application_id") != SQLITE_APPLICATION_ID:
+    if _pragma(connection, "application_id") != APPLICATION_ID:
         raise _foreign(path)
     version = _check_known(path, found)
     if version < 1:
@@ -304,7 +300,7 @@ def _bring_up_to_date(
     """Run the migrations that an older file lacks; a reader does without some of them."""
     if not read_only:
         migrate(connection, version)
-    elif any(migration.readers_need_it for migration in MIGRATIONS[version:]):
+    elif any(step.readers_need_it for step in migrations_after(version, MIGRATIONS)):
         raise ReadOnlyError(
             f"{path} has the older format {version}: open it once to write, "
             "and it is brought up to date"

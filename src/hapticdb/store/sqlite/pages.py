@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import DamagedError
-from hapticdb.store.schema import CHECKED_VERSION
+from hapticdb.store.sqlite.migrations import CHECKED_VERSION
 
 LAYER = "hapticdb"
 """Name under which SQLite knows the layer."""

@@ -1,4 +1,4 @@
-"""The paper's own form on PostgreSQL: a loop inside the server that scans one range at a time.
+"""The paper's own form of a scan: a loop inside the server that reads one range at a time.
 
 The paper ran its loop in PL/SQL, so that its figures count descents of the index and no round
 trips. Here the loop is PL/pgSQL, sent the same ranges that the one statement gets.
@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from hapticdb.store.base import NO_OCCUPANCY, NO_ROWS, Keys, Layout, Rows, Store
-from hapticdb.store.postgres import wire
-from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres import failures, wire
+from hapticdb.store.postgres.session import Session
 
 NAME = "pg_temp.scan_ranges"
 # a temporary function: the environment itself stays as it is
@@ -54,10 +54,11 @@ END $$""",
 class LoopInServer:
     """A PostgreSQL store whose `scan` loops over its ranges inside the server."""
 
-    def __init__(self, store: Store) -> None:
-        assert isinstance(store, PostgresStore)  # noqa: S101 - narrows the type for mypy
+    def __init__(self, store: Store, session: Session) -> None:
         self._store = store
-        store.session.command(MAKE[store.layout])
+        self._session = session
+        with failures.named_errors(session.shown):
+            session.command(MAKE[store.layout])
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - all else is the store's own
         return getattr(self._store, name)
@@ -68,7 +69,7 @@ class LoopInServer:
             return NO_ROWS
         columns = "keys, ids, bits" if self._store.layout == "brick" else "keys, ids"
         text = f"SELECT {columns} FROM {NAME}($1, $2)"
-        found = self._store.session.fetch(text, wire.int8s(lows), wire.int8s(highs))
+        found = self._session.fetch(text, wire.int8s(lows), wire.int8s(highs))
         if found[0] is None:
             return NO_ROWS
         occupancy = (
@@ -77,10 +78,3 @@ class LoopInServer:
             else NO_OCCUPANCY
         )
         return Rows(wire.read_int8s(found[0]), wire.read_int8s(found[1]), occupancy)
-
-
-def server_cache(store: Store) -> int:
-    """Bytes of pages that the server of a store keeps in memory."""
-    assert isinstance(store, PostgresStore)  # noqa: S101 - narrows the type for mypy
-    rows = store.session.rows("SELECT pg_size_bytes(current_setting('shared_buffers'))")
-    return int(rows[0][0])

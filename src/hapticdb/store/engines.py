@@ -1,0 +1,181 @@
+"""Which engine a URL means: a registry from URL schemes to engines.
+
+The engines of this package stand in `BUILT_IN`. Another distribution adds its own by an entry point
+of the group `hapticdb.engines`, whose name is the scheme and whose object is an `Engine`
+(docs/engines.md). An entry point, and not a function to call: the command line and the processes of
+a session find the engine, too, and no program has to import it first.
+
+An engine's module is imported when a URL first names it, so that a verb on a file loads no driver
+of a server.
+"""
+
+import os
+from collections.abc import Callable
+from functools import cache
+from importlib import import_module
+from importlib.metadata import entry_points
+from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
+
+from hapticdb.errors import MissingExtraError, UsageError
+from hapticdb.grid import Grid
+from hapticdb.store.base import Layout, Store
+from hapticdb.store.urls import redact, scheme_of
+
+Url = str | os.PathLike[str]
+Capability = Literal["grant", "backup", "restore"]
+"""What only some engines can do with an environment that is not open."""
+Right = Literal["viewer", "toucher", "editor", "nobody"]
+"""What a role may do with an environment: read and touch; keep cost figures, too; edit; nothing."""
+GROUP = "hapticdb.engines"
+"""Entry points of other distributions that name an engine."""
+
+
+class BackupProgress(NamedTuple):
+    """How far a copy is: sent after each step."""
+
+    bytes_done: int
+    bytes_total: int
+
+
+class BackupReport(NamedTuple):
+    """What a backup or restore has copied.
+
+    revision : of the environment in the copy; objects : how many it holds; bytes : of its file.
+    """
+
+    source: str
+    target: str
+    revision: int
+    objects: int
+    bytes: int
+
+
+BackupCallback = Callable[[BackupProgress], object]
+
+
+class Engine(Protocol):
+    """What an engine does with URLs, before a store is open.
+
+    URLs come as the user wrote them. Only the methods that say so connect to anything.
+
+    Attributes
+    ----------
+    title : str
+        Its name in messages: ``PostgreSQL``.
+    lacks : mapping of str to str
+        For each of the capabilities `grant`, `backup` and `restore` that this engine has not: how
+        the refusal goes on after the URL. It says why, and what to use instead.
+    """
+
+    title: str
+    lacks: dict[Capability, str]
+
+    def open(self, url: str, *, read_only: bool) -> Store:
+        """Open an existing environment.
+
+        Raises EnvironmentNotFoundError, NotAnEnvironmentError, NewerVersionError or DamagedError.
+        """
+
+    def create(self, url: str, grid: Grid, layout: Layout) -> Store:
+        """Make a new environment; raises EnvironmentExistsError when something is there."""
+
+    def exists(self, url: str) -> bool:
+        """Whether something is there already, an environment or not. May connect."""
+
+    def beside(self, url: str, name: str) -> str:
+        """URL of another environment at the same place."""
+
+    def name_of(self, url: str) -> str:
+        """Name of the environment that a URL means, among others at the same place."""
+
+
+@runtime_checkable
+class SupportsGrant(Protocol):
+    """An engine that knows users, and keeps what each of them may do."""
+
+    def grant(self, url: str, role: str, right: Right) -> None:
+        """Give a role one right on an environment; it replaces the role's former one."""
+
+
+@runtime_checkable
+class SupportsBackup(Protocol):
+    """An engine that copies a whole environment as of one moment, and puts a copy in its place."""
+
+    def back_up(
+        self, url: str, copy: str, *, replace: bool, progress: BackupCallback | None
+    ) -> BackupReport:
+        """Copy an environment while others read and write it; `copy` is an environment, too."""
+
+    def restore(self, copy: str, url: str, *, progress: BackupCallback | None) -> BackupReport:
+        """Put a copy in an environment's place, whole or not at all."""
+
+
+@runtime_checkable
+class SupportsFirstFindings(Protocol):
+    """An engine that finds damage in an environment that may not even open."""
+
+    def findings_before_opening(self, url: str) -> list[str]:
+        """What is wrong, a line each."""
+
+
+class BuiltIn(NamedTuple):
+    """An engine of this package, not imported yet.
+
+    module : its attribute `ENGINE` is the engine; driver : module that it needs and that may be
+    missing, or empty; extra : what pip installs to bring that driver.
+    """
+
+    module: str
+    driver: str = ""
+    extra: str = ""
+
+
+FILE_SCHEME = "sqlite"
+"""The engine of paths, which have no scheme."""
+POSTGRES = BuiltIn("hapticdb.store.postgres.engine", "psycopg", "hapticdb[postgres]")
+BUILT_IN = {
+    FILE_SCHEME: BuiltIn("hapticdb.store.sqlite.engine"),
+    "postgresql": POSTGRES,
+    "postgres": POSTGRES,
+}
+
+
+def engine_of(url: Url) -> Engine:
+    """Engine that a URL or a path means.
+
+    Raises
+    ------
+    UsageError
+        When no engine has the URL's scheme.
+    MissingExtraError
+        When the engine's driver is not installed.
+    """
+    # an object of a path is a path, whatever its name looks like
+    scheme = scheme_of(url) if isinstance(url, str) else ""
+    built_in = BUILT_IN.get(scheme or FILE_SCHEME)
+    if built_in is None:
+        return _installed(scheme)
+    if built_in.driver:
+        try:
+            import_module(built_in.driver)
+        except ImportError as error:  # it is not there, or finds no library of its own
+            raise MissingExtraError(
+                f"{redact(os.fspath(url))} needs {built_in.driver}: install it with "
+                f"pip install '{built_in.extra}'"
+            ) from error
+    return cast("Engine", import_module(built_in.module).ENGINE)
+
+
+@cache
+def _installed(scheme: str) -> Engine:
+    """Engine of another distribution; looked for only when a URL has an unknown scheme."""
+    for found in entry_points(group=GROUP, name=scheme):
+        return cast("Engine", found.load())
+    raise unknown_scheme(scheme)
+
+
+def unknown_scheme(scheme: str) -> UsageError:
+    """Build the error for a URL that no engine opens."""
+    return UsageError(
+        f"scheme {scheme!r}: give a path, sqlite:///path, or postgresql://host/database"
+    )

@@ -1,0 +1,81 @@
+"""SQLite as an engine: paths and ``sqlite:///path``, one file an environment."""
+
+import re
+from pathlib import Path
+
+from hapticdb.errors import UsageError
+from hapticdb.grid import Grid
+from hapticdb.store.base import Layout, Store
+from hapticdb.store.engines import BackupCallback, BackupReport, Capability, unknown_scheme
+from hapticdb.store.sqlite.checking import first_findings
+from hapticdb.store.sqlite.store import SQLiteStore
+
+PREFIX = "sqlite:///"
+# what libpq takes beside URLs, and a URL without its slashes: it may hold a password
+KEYWORDS = re.compile(r"^postgres(ql)?:|(^|\s)\w*password\s*=", re.IGNORECASE)
+
+
+class SQLiteEngine:
+    """Environments in files."""
+
+    title = "SQLite"
+    lacks: dict[Capability, str] = {  # noqa: RUF012 - nobody writes to it
+        "grant": ": a file has no roles: use the file system's rights"
+    }
+
+    def open(self, url: str, *, read_only: bool) -> Store:
+        """Open an existing file."""
+        return SQLiteStore.open(path_of(url), read_only=read_only)
+
+    def create(self, url: str, grid: Grid, layout: Layout) -> Store:
+        """Make a new file, which appears whole or not at all."""
+        return SQLiteStore.create(path_of(url), grid, layout)
+
+    def exists(self, url: str) -> bool:
+        """Whether a file of that name is there."""
+        return path_of(url).exists()
+
+    def beside(self, url: str, name: str) -> str:
+        """Path of another file in the same folder."""
+        return str(path_of(url).with_name(f"{name}.db"))
+
+    def name_of(self, url: str) -> str:
+        """Name of a file without its ending."""
+        return path_of(url).stem
+
+    def findings_before_opening(self, url: str) -> list[str]:
+        """What is wrong with a file's pages and its log."""
+        return first_findings(path_of(url))
+
+    def back_up(
+        self, url: str, copy: str, *, replace: bool, progress: BackupCallback | None
+    ) -> BackupReport:
+        """Copy a file whole, as of one moment."""
+        from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
+
+        return back_up(path_of(url), path_of(copy), replace=replace, progress=progress)
+
+    def restore(self, copy: str, url: str, *, progress: BackupCallback | None) -> BackupReport:
+        """Put a copy in a file's place, and remove the log of what was there."""
+        from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
+
+        return back_up(path_of(copy), path_of(url), replace=True, progress=progress)
+
+
+ENGINE = SQLiteEngine()
+
+
+def path_of(url: str) -> Path:
+    """Path of the file that a URL or a path means."""
+    text = url
+    if text.startswith(PREFIX):
+        text = text.removeprefix(PREFIX)
+    elif "://" in text:
+        raise unknown_scheme(text.split("://", 1)[0])
+    if KEYWORDS.search(text):  # not shown: it holds a password
+        raise UsageError("libpq's keywords are not read here: give postgresql://user@host/database")
+    if not text:
+        raise UsageError("an empty path: name the environment's file")
+    if text.startswith((":memory:", "file:")):
+        raise UsageError(f"{text!r}: an environment is a file; give its path")
+    return Path(text)

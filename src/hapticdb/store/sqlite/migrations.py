@@ -1,0 +1,104 @@
+"""The tables of an environment in SQLite, and how older ones become newer ones.
+
+Each step runs in one transaction with the number that it leads to (`hapticdb.store.schema`).
+"""
+
+from hapticdb.store.schema import Dialect
+
+APPLICATION_ID = 0x48415054  # "HAPT"
+"""In the header of each of our files: tells it from another program's database."""
+CHECKED_VERSION = 1000
+"""Added to the version of a file whose pages carry checksums: who writes none must refuse it."""
+
+ENVIRONMENT = """
+CREATE TABLE environment (
+  id         INTEGER PRIMARY KEY CHECK (id = 1),
+  voxel_size REAL NOT NULL,
+  origin_x   REAL NOT NULL,
+  origin_y   REAL NOT NULL,
+  origin_z   REAL NOT NULL,
+  bits       INTEGER NOT NULL,
+  curve      TEXT NOT NULL,
+  layout     TEXT NOT NULL
+) STRICT"""
+
+# AUTOINCREMENT: the id of a removed object is never given to another
+OBJECT = """
+CREATE TABLE object (
+  id         INTEGER PRIMARY KEY AUTOINCREMENT,
+  name       TEXT NOT NULL,
+  link       TEXT NOT NULL,
+  digest     TEXT NOT NULL,
+  transform  BLOB NOT NULL CHECK (length(transform) = 128),
+  voxels     INTEGER NOT NULL,
+  bounds     BLOB NOT NULL CHECK (length(bounds) = 48),
+  attributes TEXT NOT NULL,
+  revision   INTEGER NOT NULL,
+  UNIQUE (link, name)
+) STRICT"""
+
+VOXEL = """
+CREATE TABLE voxel (
+  z_val INTEGER NOT NULL,
+  id    INTEGER NOT NULL,
+  PRIMARY KEY (z_val, id)
+) STRICT, WITHOUT ROWID"""
+
+BRICK = """
+CREATE TABLE brick (
+  z_val     INTEGER NOT NULL,
+  id        INTEGER NOT NULL,
+  occupancy BLOB NOT NULL CHECK (length(occupancy) = 64),
+  PRIMARY KEY (z_val, id)
+) STRICT, WITHOUT ROWID"""
+
+CHANGE = """
+CREATE TABLE change (
+  revision INTEGER PRIMARY KEY,
+  action   TEXT NOT NULL,
+  id       INTEGER NOT NULL,
+  ranges   BLOB NOT NULL
+) STRICT"""
+
+QUANTILE = """
+CREATE TABLE quantile (
+  resolution INTEGER PRIMARY KEY,
+  revision   INTEGER NOT NULL,
+  n_rows     INTEGER NOT NULL,
+  bounds     BLOB NOT NULL
+) STRICT"""
+
+COST = """
+CREATE TABLE cost (
+  machine TEXT PRIMARY KEY,
+  figures TEXT NOT NULL
+) STRICT"""
+
+LINEAGE = (
+    "ALTER TABLE environment ADD COLUMN lineage BLOB CHECK (length(lineage) = 32)",
+    "UPDATE environment SET lineage = CAST(randomblob(16) || zeroblob(16) AS BLOB)",
+)
+
+# names of removed parts, for who imports their file again: kept by triggers, whoever removes
+REMOVED = (
+    """
+CREATE TABLE removed (
+  link TEXT NOT NULL,
+  name TEXT NOT NULL,
+  PRIMARY KEY (link, name)
+) STRICT, WITHOUT ROWID""",
+    """
+CREATE TRIGGER part_removed AFTER DELETE ON object BEGIN
+  INSERT OR IGNORE INTO removed VALUES (old.link, old.name);
+END""",
+    """
+CREATE TRIGGER part_added AFTER INSERT ON object BEGIN
+  DELETE FROM removed WHERE link = new.link AND name = new.name;
+END""",
+)
+
+MIGRATIONS: Dialect = {
+    "tables": (ENVIRONMENT, OBJECT, VOXEL, BRICK, CHANGE, QUANTILE, COST),
+    "lineage": LINEAGE,
+    "removed parts": REMOVED,
+}

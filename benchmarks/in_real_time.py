@@ -91,7 +91,7 @@ def measure_frames(
             "poses": len(poses),
             "extent_m": np.ptp(shell.points, axis=0).round(3).tolist(),
             "hits": float(found["dense"][:, 6].mean()),
-            "cells": residency.n_resident,
+            "cells": residency.writer.n_resident,
             "bitmap_mb": bitmap.nbytes / 1e6,
             "us_per_frame": medians,
             "ratio": {name: medians[name] / medians["dense"] for name in RUNS},

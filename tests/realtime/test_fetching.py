@@ -370,10 +370,10 @@ def test_a_tool_too_large_for_the_budget_is_fetched_for_as_far_as_it_goes(
     step.frame()
     for _ in range(60):
         step.round()
-    loaded = step.fetching.residency.loaded
+    loaded = step.fetching.residency.n_loaded
     for _ in range(20):
         assert not step.fetching.round()
-    assert step.fetching.residency.loaded == loaded
+    assert step.fetching.residency.n_loaded == loaded
     assert step.side.reader.feel(step.pose)[2] == 0
 
 

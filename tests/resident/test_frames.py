@@ -105,7 +105,7 @@ def test_a_path_longer_than_the_table_is_felt_in_parts(tmp_path: Path) -> None:
         residency = Residency(env.store, table)
         assert table.n_slots < 512
         felt = Frames(residency, shell).feel(poses)
-        assert residency.evicted > 0
+        assert residency.writer.n_evicted > 0
     assert not felt.unknown.any()
     for n in range(0, 200, 7):
         touch = env.touch(shell, poses[n])

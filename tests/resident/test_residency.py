@@ -16,8 +16,10 @@ from children import joined
 from hapticdb import Environment, PointShell, UsageError
 from hapticdb.errors import GridError
 from hapticdb.kernels.resident.cells import BUFFERS, READER_STRIDE, UNKNOWN, cell_key
+from hapticdb.resident import changes
 from hapticdb.resident import residency as module
-from hapticdb.resident.residency import RECENT, Residency
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.slots import ROUNDS_KEPT
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.connect import open_store
 from hapticdb.testing import write_voxels
@@ -50,10 +52,13 @@ def check(residency: Residency, wanted: dict[int, set[Voxel]]) -> int:
     cells, slots = table.cells.keys[which][entries], table.cells.slots[which][entries]
     filled = slots[slots > 0].tolist()
     assert len(set(filled)) == len(filled)
-    assert not set(filled) & set(residency._free)
-    limbo = {slot for _, held in residency._limbo for slot in held}
-    assert len(filled) + len(residency._free) + len(limbo) == table.n_slots - 1
-    assert (residency.n_resident, residency.n_empty) == (len(filled), len(slots) - len(filled))
+    assert not set(filled) & set(residency.writer.slots._free)
+    retired = {slot for _, held in residency.writer.slots._retired for slot in held}
+    assert len(filled) + len(residency.writer.slots._free) + len(retired) == table.n_slots - 1
+    assert (residency.writer.n_resident, residency.writer.n_empty) == (
+        len(filled),
+        len(slots) - len(filled),
+    )
     assert len(entries) <= table.capacity // 2
     for key, slot in zip(cells.tolist(), slots.tolist(), strict=True):
         low = (key >> 32 << 5, (key >> 16 & 0xFFFF) << 5, (key & 0xFFFF) << 5)
@@ -93,7 +98,7 @@ def test_what_is_resident_is_what_the_database_holds(
         residency = Residency(store, table)
         for kind, first, second in steps:
             if kind == "load":
-                residency.round += 1
+                residency.begin_round()
                 asked = residency.missing(cells[first : first + second])
                 residency.load(asked)
             elif kind == "move":
@@ -137,12 +142,12 @@ def test_what_is_wanted_stays_and_the_rest_makes_way(tmp_path: Path, table: Cell
     while len(missing := residency.missing(kept)):
         residency.load(missing)
     for at in range(100, 512, 40):
-        residency.round += 1
+        residency.begin_round()
         assert not len(residency.missing(kept))
         residency.load(cells[at : at + 40])
         assert (residency.slots_of(cells[at : at + 40]) > 0).all()
     assert (residency.slots_of(kept) > 0).all()
-    assert residency.evicted > 0
+    assert residency.writer.n_evicted > 0
     check(residency, voxels_by_cell(env))
 
 
@@ -152,13 +157,13 @@ def test_nothing_is_thrown_out_that_is_wanted_just_now(tmp_path: Path, table: Ce
     residency = Residency(env.store, table)
     cells = cells_of(env.grid)
     for _ in range(20):
-        residency.round += 1
+        residency.begin_round()
         residency.load(residency.missing(cells))
     resident = residency.slots_of(cells) > 0
     assert resident.sum() == table.n_slots - 1
-    assert residency.evicted == 0
-    for _ in range(2 * RECENT):
-        residency.round += 1
+    assert residency.writer.n_evicted == 0
+    for _ in range(2 * ROUNDS_KEPT):
+        residency.begin_round()
         assert residency.load(residency.missing(cells)).cells == 0
     assert (residency.slots_of(cells) > 0).tolist() == resident.tolist()
 
@@ -175,7 +180,7 @@ def test_empty_cells_beyond_number_do_not_push_out_those_at_the_tool(
         residency.want(near, residency.slots_of(near))
         residency.load(residency.missing(near))
         assert (residency.slots_of(near) == 0).all()
-    assert residency.n_empty <= table.capacity // 2 - table.n_slots
+    assert residency.writer.n_empty <= table.capacity // 2 - table.n_slots
     assert check(residency, {}) > 200
 
 
@@ -213,7 +218,7 @@ def test_writes_elsewhere_leave_cells_as_they_are(
     tmp_path: Path, table: CellTable, few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However the cells of a write are found."""
-    monkeypatch.setattr(module, "FEW_CELLS", few)
+    monkeypatch.setattr(changes, "FEW_CELLS", few)
     env = full_of_voxels(tmp_path, bits=7)
     second = write_voxels(env.store, block((1, 1, 1), (3, 3, 3)), "second")
     residency = Residency(open_store(env.url, read_only=True), table)
@@ -237,13 +242,13 @@ def test_a_server_that_lost_its_last_commits_makes_all_unknown(
     residency._revision += 1
     residency.refresh()
     assert residency.revision == env.store.revision()
-    assert (residency.n_resident, residency.n_empty) == (0, 0)
+    assert (residency.writer.n_resident, residency.writer.n_empty) == (0, 0)
 
 
 def test_after_more_writes_than_one_looks_at_all_is_unknown(
     tmp_path: Path, table: CellTable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(module, "MOST_CHANGES", 2)
+    monkeypatch.setattr(changes, "MOST_CHANGES", 2)
     env = make(tmp_path)
     scatter(env)
     residency = Residency(open_store(env.url, read_only=True), table)
@@ -263,13 +268,13 @@ def test_slots_of_a_load_that_failed_are_used_again(
     cells = cells_of(env.grid)
     residency.load(residency.missing(cells[:30]))
     move(env.store, 1, block((0, 0, 0), (127, 127, 10)))
-    bring = residency._bring
+    read_batch = residency._read_batch
 
-    def bring_and_fail(asked: NDArray[np.int64]) -> None:
-        bring(asked)
+    def read_and_fail(asked: NDArray[np.int64]) -> None:
+        read_batch(asked)
         raise hapticdb.ConnectionLostError("gone")
 
-    monkeypatch.setattr(residency, "_bring", bring_and_fail)
+    monkeypatch.setattr(residency, "_read_batch", read_and_fail)
     with pytest.raises(hapticdb.ConnectionLostError):
         residency.load(cells[30:40])
     monkeypatch.undo()
@@ -332,9 +337,9 @@ def test_there_is_room_to_read_the_urgent_again_in_a_full_table_that_a_writer_ha
     residency = Residency(env.store, table)
     cells = cells_of(env.grid)
     for _ in range(20):
-        residency.round += 1
+        residency.begin_round()
         residency.load(residency.missing(cells))
-    assert residency.n_resident == table.n_slots - 1
+    assert residency.writer.n_resident == table.n_slots - 1
     urgent = cells[residency.slots_of(cells) > 0]
     residency = Residency(env.store, table, urgent=urgent)
     n_read = check(residency, voxels_by_cell(env))
@@ -360,7 +365,8 @@ def test_a_reader_that_died_in_a_frame_holds_the_writer_up_for_a_moment_only(
     table.cells.readers[row * READER_STRIDE] = table.version
     cells = cells_of(env.grid)
     for at in range(0, 400, 50):
-        residency.round += RECENT + 1
+        for _ in range(ROUNDS_KEPT + 1):
+            residency.begin_round()
         residency.load(cells[at : at + 50])
     assert table.cells.readers[row * READER_STRIDE] == 0
     check(residency, voxels_by_cell(env))
@@ -421,7 +427,7 @@ def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) ->
             if n >= 120 and {met[:2] for met in tuple(seen)} >= places:
                 break
             assert n < 20_000
-            residency.round += 1
+            residency.begin_round()
             residency.load(residency.missing(wanted))
             move(env.store, thing, (there if n % 2 == 0 else here) + offsets)
             residency.refresh() if n % 3 else residency.load(residency.missing(wanted))
@@ -431,4 +437,4 @@ def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) ->
         joined(thread)
         check(residency, voxels_by_cell(env))
     assert wrong == []
-    assert residency.evicted > 0
+    assert residency.writer.n_evicted > 0

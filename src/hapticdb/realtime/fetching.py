@@ -226,7 +226,7 @@ class Fetching:
     def _missing(self) -> Keys:
         """Unknown cells of all sessions' wishes, most urgent first; the others are kept."""
         residency = self.residency
-        residency.round += 1
+        residency.begin_round()
         self._seen = self.table.version
         return residency.missing(
             _ranked([part for row in self._headings for part in self._wanted(row)])
@@ -261,9 +261,9 @@ class Fetching:
         figures["batches"] += 1
         figures["median_latency"] = np.median(self._latencies)
         figures["worst_latency"] = max(float(figures["worst_latency"]), loaded.elapsed)
-        figures["evicted"] = self._evicted_before + residency.evicted
-        figures["resident"] = residency.n_resident
-        figures["empty"] = residency.n_empty
+        figures["evicted"] = self._evicted_before + residency.writer.n_evicted
+        figures["resident"] = residency.writer.n_resident
+        figures["empty"] = residency.writer.n_empty
 
     # -- objects -----------------------------------------------------------------------------
 

@@ -195,7 +195,7 @@ class Frames:
             if count <= most:
                 break
         cells = found[found >= 0]
-        residency.bring(cells)
+        residency.make_resident(cells)
         return int(n_poses)
 
     def _run(self, poses: Floats, out: Floats, start: int, n_poses: int) -> None:

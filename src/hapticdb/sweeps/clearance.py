@@ -105,4 +105,4 @@ class ClearanceSearch:
             places, poses, residency.place, self._frames.surroundings.place_of(point), self._stride,
             self._reach * residency.grid.voxel_size, found, self._most,
         )  # fmt: skip
-        residency.bring(np.sort(found[found >= 0]))
+        residency.make_resident(np.sort(found[found >= 0]))

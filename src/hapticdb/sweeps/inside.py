@@ -71,7 +71,7 @@ def _cells_around(residency: Residency, shell: PointShell, pose: Floats) -> Ints
 
 def _bricks_of(residency: Residency, cells: Ints) -> tuple[Ints, Ints]:
     """Occupied bricks in cells, made resident: the slot (B,) of each and its least voxel (B, 3)."""
-    residency.bring(cells)
+    residency.make_resident(cells)
     slots = residency.slots_of(cells)
     filled = slots != EMPTY_SLOT
     cells, slots = cells[filled], slots[filled]

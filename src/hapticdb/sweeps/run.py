@@ -303,7 +303,7 @@ class _Run:
             profile=Profile(path.fractions(self.begins), self.hits_in, self.depth_in, near),
             revision=frames.residency.revision,
             elapsed=elapsed,
-            cells=frames.residency.loaded,
+            cells=frames.residency.n_loaded,
             proportions=self._compared(frames.residency.exclude),
         )
 

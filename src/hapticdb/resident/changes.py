@@ -1,0 +1,68 @@
+"""Which cells the writes of others have touched."""
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import Grid
+from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident.cells import UNKNOWN
+from hapticdb.store.base import CELL_SHIFT, NO_KEYS, Change, Keys, Store
+
+MOST_CHANGES = 4096
+"""Writes that are followed one by one; after more, every cell counts as touched. A larger value
+keeps cells over long absences and takes longer to catch up."""
+FEW_CELLS = 1 << 14
+"""Cells in the ranges of writes up to which each of them is looked up. Where there are more, the
+known cells are searched for those in the ranges. The result is the same; the value decides only
+which way is faster."""
+
+
+def writes_since(store: Store, known_revision: int, revision: int) -> list[Change] | None:
+    """Writes after the known revision up to the present one, or None where they cannot be told.
+
+    That is so where nothing is known (below 0), where a server came back without its last commits
+    (the known revision is ahead), where there are more than `MOST_CHANGES`, or where the store has
+    not kept them all.
+    """
+    n_missed = revision - known_revision
+    if known_revision < 0 or not 0 <= n_missed <= MOST_CHANGES:
+        return None
+    changes = list(store.changes(known_revision)) if n_missed else []
+    return changes if len(changes) >= n_missed else None
+
+
+def known_cells_touched(
+    changes: list[Change],
+    grid: Grid,
+    slots_of: Callable[[Keys], Keys],
+    known: Callable[[], Keys],
+) -> Keys:
+    """Cells (n,) that are known, resident or empty, and that writes have touched.
+
+    slots_of : slots of cells, UNKNOWN for the unknown ones; known : all known cells.
+    """
+    if not changes:
+        return NO_KEYS
+    spans: NDArray[np.int64] = np.concatenate([change.ranges for change in changes])
+    if not len(spans):
+        return NO_KEYS
+    bits, curve = grid.bits, grid.curve_code
+    first, last = spans[:, 0] >> CELL_SHIFT, spans[:, 1] >> CELL_SHIFT
+    if (last - first + 1).sum() <= FEW_CELLS:
+        met = np.concatenate([np.arange(a, b + 1) for a, b in zip(first, last, strict=True)])
+        met = np.unique(met)
+        cells = np.empty(len(met), dtype=np.int64)
+        kernels.cells_of_curve_keys(met, bits, curve, cells)
+        return np.compress(slots_of(cells) != UNKNOWN, cells)
+    cells = known()
+    on_curve = np.empty(len(cells), dtype=np.int64)
+    kernels.curve_keys_of_cells(cells, bits, curve, on_curve)
+    order = np.argsort(on_curve)
+    on_curve = on_curve[order]
+    # how many spans hold each cell: one more from where a span begins, one less from its end on
+    n_holding = np.zeros(len(cells) + 1, dtype=np.int64)
+    np.add.at(n_holding, np.searchsorted(on_curve, first), 1)
+    np.add.at(n_holding, np.searchsorted(on_curve, last, side="right"), -1)
+    return np.compress(np.cumsum(n_holding[:-1]) > 0, cells[order])

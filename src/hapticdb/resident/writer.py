@@ -1,0 +1,111 @@
+"""What a cell table holds, written by one: slots, empty cells and the directory agree.
+
+Every change is published as one version of the directory, which frames see whole. Slots and copies
+of the directory are used again when no frame can see them any more.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticdb.kernels.resident.cells import EMPTY_SLOT
+from hapticdb.resident.directory import CellDirectory, DirectoryChange
+from hapticdb.resident.empty_cells import EmptyCells
+from hapticdb.resident.slots import CellSlots
+from hapticdb.resident.table import CellTable
+from hapticdb.store.base import NO_KEYS, Keys
+
+
+class UnpublishedCells(NamedTuple):
+    """Cells (n,) in slots (n,) that no directory names yet, and what it took to read them.
+
+    The slot of a cell without a voxel is EMPTY_SLOT.
+    """
+
+    cells: Keys = NO_KEYS
+    slots: Keys = NO_KEYS
+    n_rows: int = 0
+    n_ranges: int = 0
+
+
+class CellWriter:
+    """The one writer of a table's cells.
+
+    Parameters
+    ----------
+    table : CellTable
+        Nobody else writes to it.
+
+    Attributes
+    ----------
+    slots : CellSlots
+        Cells with voxels.
+    empty : EmptyCells
+        Cells without.
+    directory : CellDirectory
+        What frames see of both.
+    n_evicted : int
+        Cells that left for want of room, so far.
+    """
+
+    def __init__(self, table: CellTable) -> None:
+        self.slots = CellSlots(table)
+        self.empty = EmptyCells(table.capacity // 2 - table.n_slots)
+        self.directory = CellDirectory(table)
+        self.n_evicted = 0
+
+    @property
+    def n_resident(self) -> int:
+        """Cells with voxels, each in a slot."""
+        return self.slots.n_filled
+
+    @property
+    def n_empty(self) -> int:
+        """Cells known to be empty."""
+        return len(self.empty)
+
+    def known(self) -> Keys:
+        """All resident and empty cells, (n,)."""
+        return np.concatenate([self.slots.cells(), self.empty.keys()])
+
+    def take_over(self) -> None:
+        """Go on with the cells that another writer, which has ended, published last."""
+        cells, slots = self.directory.entries()
+        is_filled = slots > EMPTY_SLOT
+        self.slots.take_over(cells[is_filled], slots[is_filled])
+        self.empty.add(cells[~is_filled].tolist())
+        self.directory.take_over()
+        # slots that only older versions name are free once no frame reads those
+        self.directory.wait_for_readers(self.directory.version)
+
+    def evict_for(self, n_free: int, surplus: int, urgent: Keys, revision: int) -> None:
+        """Evict cells until `n_free` slots are free, as far as cells are not wanted just now.
+
+        surplus : as `CellSlots.cells_to_evict` has it; urgent, revision : as for `publish`.
+        """
+        self.slots.free_retired(self.directory.oldest_version_read())
+        leaving = self.slots.cells_to_evict(n_free, surplus)
+        if len(leaving):
+            self.n_evicted += len(leaving)
+            self.publish(leaving, UnpublishedCells(), urgent, revision)
+            self.directory.wait_for_readers(self.directory.version)
+            self.slots.free_retired(self.directory.oldest_version_read())
+
+    def publish(self, leaving: Keys, read: UnpublishedCells, urgent: Keys, revision: int) -> None:
+        """Take cells out and others in, in one version; cells in both have new slots.
+
+        urgent : cells that are forgotten last where too many are empty; revision : of the database,
+        that all cells are of.
+        """
+        slots = self.directory.slots_of(leaving)
+        self.empty.discard(leaving[slots == EMPTY_SLOT].tolist())
+        cleared: list[int] = slots[slots > EMPTY_SLOT].tolist()
+        self.slots.clear(cleared)
+        is_filled = read.slots > EMPTY_SLOT
+        new_empty = read.cells[~is_filled].tolist()
+        forgotten = self.empty.forget_for(len(new_empty), urgent)
+        self.slots.fill(read.slots[is_filled], read.cells[is_filled])
+        self.empty.add(new_empty)
+        change = DirectoryChange(np.concatenate([leaving, forgotten]), read.cells, read.slots)
+        self.directory.publish(change, revision)
+        self.slots.retire(cleared, self.directory.version)

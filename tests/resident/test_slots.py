@@ -1,0 +1,100 @@
+"""Slots and empty cells: who leaves first, and when a slot is used again."""
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
+from hapticdb.resident.empty_cells import EmptyCells
+from hapticdb.resident.slots import ROUNDS_KEPT, CellSlots
+from hapticdb.resident.table import LEAST_BUDGET, CellTable
+
+
+def ints(*values: int) -> NDArray[np.int64]:
+    return np.array(values, dtype=np.int64)
+
+
+@pytest.fixture
+def table() -> Iterator[CellTable]:
+    with CellTable.create(LEAST_BUDGET) as made:
+        yield made
+
+
+def filled(table: CellTable) -> CellSlots:
+    """Slots of which each has a cell, wanted long ago and used by no frame since."""
+    slots = CellSlots(table)
+    free = slots.next_free(table.n_slots)
+    slots.take(free)
+    slots.fill(free, 1000 + free)
+    for _ in range(ROUNDS_KEPT + 1):
+        slots.begin_round()
+    table.cells.used[:] = 0
+    return slots
+
+
+def test_slots_that_are_looked_at_stay_free_until_they_are_taken(table: CellTable) -> None:
+    slots = CellSlots(table)
+    first = slots.next_free(5)
+    assert slots.n_free == table.n_slots - 1
+    assert (first > EMPTY_SLOT).all()
+    slots.take(first)
+    assert slots.n_free == table.n_slots - 6
+    assert not set(first.tolist()) & set(slots.next_free(table.n_slots).tolist())
+    slots.give_back(np.append(first, [EMPTY_SLOT, UNKNOWN]))
+    assert slots.n_free == table.n_slots - 1
+
+
+def test_a_slot_is_free_once_no_frame_reads_an_older_version(table: CellTable) -> None:
+    slots = filled(table)
+    slots.clear([3, 4])
+    slots.retire([3, 4], version=9)
+    slots.free_retired(oldest_version_read=8)
+    assert slots.n_free == 0
+    slots.free_retired(oldest_version_read=9)
+    assert sorted(slots.next_free(9).tolist()) == [3, 4]
+
+
+def test_what_frames_use_and_what_is_wanted_leaves_last(table: CellTable) -> None:
+    slots = filled(table)
+    slots.want(ints(1, 2))
+    table.cells.used[[3, 4]] = 1
+    leaving = slots.cells_to_evict(table.n_slots - 5, 0)
+    assert len(leaving) == table.n_slots - 5
+    assert not set(leaving.tolist()) & {1001, 1002, 1003, 1004}
+
+
+def test_slots_of_a_load_that_failed_are_found_again(table: CellTable) -> None:
+    slots = filled(table)
+    slots.clear([3, 4, 5])
+    slots.retire([3], version=9)
+    slots.free_lost()
+    assert sorted(slots.next_free(9).tolist()) == [4, 5]
+
+
+def test_there_is_nothing_to_evict_while_slots_are_free(table: CellTable) -> None:
+    assert not len(CellSlots(table).cells_to_evict(table.n_slots - 1, 100))
+
+
+@given(
+    st.lists(st.lists(st.integers(0, 99), unique=True, max_size=20), max_size=12),
+    st.lists(st.integers(0, 99), unique=True, max_size=15),
+)
+def test_empty_cells_keep_to_their_limit_and_the_urgent_ones_stay(
+    arrivals: list[list[int]], urgent: list[int]
+) -> None:
+    """As long as others can leave; the order of the others is that of their arrival."""
+    empty = EmptyCells(40)
+    held: list[int] = []
+    for cells in arrivals:
+        new = [cell for cell in cells if cell not in held]
+        leaving = empty.forget_for(len(new), np.array(urgent, dtype=np.int64)).tolist()
+        others = [cell for cell in held if cell not in urgent]
+        assert leaving[: len(others)] == others[: len(leaving)]
+        held = [cell for cell in held if cell not in leaving] + new
+        empty.add(new)
+        assert empty.keys().tolist() == held
+        assert len(empty) <= 40

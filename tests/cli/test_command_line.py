@@ -27,7 +27,7 @@ from command_line import (  # noqa: F401 - fixtures among them
     scene,
     wait_for_an_object,
 )
-from hapticdb.cli import root
+from hapticdb.cli import options
 from hapticdb.grid import CURVE_NAMES
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store import connect
@@ -73,10 +73,10 @@ def test_version(run: Run) -> None:
 
 
 def test_choices_are_those_of_the_library() -> None:
-    assert get_args(root.StrategyName) == STRATEGIES
-    assert set(get_args(root.CurveName)) == set(CURVE_NAMES)
-    assert set(get_args(root.LayoutName)) == set(LAYOUTS)
-    assert set(get_args(root.UnitName)) == set(UNITS)
+    assert get_args(options.StrategyName) == STRATEGIES
+    assert set(get_args(options.CurveName)) == set(CURVE_NAMES)
+    assert set(get_args(options.LayoutName)) == set(LAYOUTS)
+    assert set(get_args(options.UnitName)) == set(UNITS)
 
 
 @pytest.mark.parametrize(

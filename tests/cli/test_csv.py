@@ -13,7 +13,7 @@ import pytest
 
 import hapticdb
 from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
-from hapticdb.cli.csv_files import CONTACTS, FRAME_COLUMNS, TOUCHED, Sheet, text_cell
+from hapticdb.cli.csv_files import CONTACTS, FRAME_COLUMNS, TOUCHED, CsvWriter, text_cell
 from hapticdb.recording.file import Header, Recorder, Recording
 from hapticdb.recording.frame import FRAME
 from hapticdb.testing import floor_voxels, write_voxels
@@ -160,10 +160,10 @@ def test_a_damaged_recording_leaves_no_file_unless_it_may_end_there(
 
 
 def test_a_full_disk_leaves_no_file(run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(_: Sheet, __: object) -> None:
+    def full(_: CsvWriter, __: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(Sheet, "write", full)
+    monkeypatch.setattr(CsvWriter, "write", full)
     refused(run(*TOUCH, "--csv", "felt.csv"), "--csv: cannot write felt.csv: No space left")
     assert not list(scene.parent.glob("*felt.csv*"))
 

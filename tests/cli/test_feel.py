@@ -15,7 +15,7 @@ import pytest
 import hapticdb
 from children import PATIENCE, child, until
 from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
-from hapticdb.cli.root import size_of
+from hapticdb.cli.values import size_bytes
 from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
 
@@ -282,7 +282,7 @@ def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Pat
     ],
 )
 def test_a_size_is_mib_or_has_its_unit(text: str, n_bytes: int) -> None:
-    assert size_of(text, "--record-limit") == n_bytes
+    assert size_bytes(text, "--record-limit") == n_bytes
 
 
 def recorded(path: Path) -> Frames:

@@ -10,9 +10,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, TextIO
-
-import typer
+from typing import TYPE_CHECKING, TextIO
 
 from hapticdb.cli import render
 from hapticdb.errors import FileError, UsageError
@@ -58,13 +56,8 @@ FRAME_COLUMNS: dict[str, tuple[str, ...]] = {
 }
 """Columns of `replay --csv`, by the fields of a recorded frame: a row for each frame."""
 
-CsvFile = Annotated[
-    str | None,
-    typer.Option("--csv", metavar="FILE", help="Write it as CSV: a new file; - is stdout."),
-]
 
-
-class Sheet:
+class CsvWriter:
     """Rows that are written as CSV.
 
     Parameters
@@ -92,8 +85,8 @@ class Sheet:
 
 
 @contextmanager
-def sheet(target: str | None, option: str, columns: Sequence[str]) -> Iterator[Sheet | None]:
-    """Open a sheet; what went wrong within leaves no file. None where no target is given.
+def open_csv(target: str | None, option: str, columns: Sequence[str]) -> Iterator[CsvWriter | None]:
+    """Open a CSV file for writing; None where no target is given. After an error no file is left.
 
     Raises
     ------
@@ -105,20 +98,20 @@ def sheet(target: str | None, option: str, columns: Sequence[str]) -> Iterator[S
     if target is None:
         yield None
     elif target == STDOUT:
-        made = Sheet(sys.stdout, columns)
+        made = CsvWriter(sys.stdout, columns)
         yield made
         made.begin()
     else:
         yield from _in_a_file(Path(target), option, columns)
 
 
-def _in_a_file(target: Path, option: str, columns: Sequence[str]) -> Iterator[Sheet]:
+def _in_a_file(target: Path, option: str, columns: Sequence[str]) -> Iterator[CsvWriter]:
     if not target.name or os.path.lexists(target):
         raise UsageError(f"{option} '{target}': give the name of a file that is not there yet")
     part = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
         with part.open("x", encoding="utf-8", newline="") as stream:
-            made = Sheet(stream, columns)
+            made = CsvWriter(stream, columns)
             yield made
             made.begin()
         part.replace(target)

@@ -16,7 +16,7 @@ PAGE = 40
 """Objects on a page of a terminal, unless asked otherwise."""
 
 
-class Page(NamedTuple):
+class ListingPage(NamedTuple):
     """A part of a listing.
 
     objects : those shown; first : number of the first of them, from 1; total : of all chosen.
@@ -73,7 +73,7 @@ ORDERS: dict[Order, tuple[Callable[["Object"], Any], bool]] = {
 """By what, and whether the largest comes first."""
 
 
-def page_of(objects: "Sequence[Object]", limit: int | None, page: int | None) -> Page:
+def page_of(objects: "Sequence[Object]", limit: int | None, page: int | None) -> ListingPage:
     """Return one page; all of them where neither is asked for and nobody looks."""
     if limit is not None and limit < 0:
         raise UsageError(f"--limit {limit}: give 1 or more, or 0 for all")
@@ -85,9 +85,9 @@ def page_of(objects: "Sequence[Object]", limit: int | None, page: int | None) ->
         is_whole = page is None and not sys.stdout.isatty()
         limit = 0 if is_whole else PAGE
     if limit == 0:
-        return Page(objects, 1, len(objects))
+        return ListingPage(objects, 1, len(objects))
     first = limit * ((page or 1) - 1)
     if first >= len(objects) and first:
         last = -(-len(objects) // limit)
         raise UsageError(f"--page {page}: the last page of {len(objects):,} objects is {last}")
-    return Page(objects[first : first + limit], first + 1, len(objects))
+    return ListingPage(objects[first : first + limit], first + 1, len(objects))

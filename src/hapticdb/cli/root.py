@@ -1,45 +1,15 @@
-"""The typer application, its global options, and the options that several verbs share."""
+"""The typer application, its global options, and how a signal ends it."""
 
-import re
 import signal
 import threading
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import typer
 import typer.core
 
 from hapticdb import interrupting
-
-StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
-CurveName = Literal["z", "hilbert", "lexicographic"]
-LayoutName = Literal["brick", "voxel"]
-UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
-UpName = Literal["x", "y", "z"]
-
-Url = Annotated[
-    str,
-    typer.Argument(
-        metavar="URL", help="The environment: a path, sqlite:///path, postgresql://host/database."
-    ),
-]
-ToolUnit = Annotated[
-    UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
-]
-PathUnit = Annotated[
-    UnitName | None,
-    typer.Option(help="Unit of the positions of the poses.", show_default="m"),
-]
-Points = Annotated[
-    int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
-]
-Seed = Annotated[
-    int | None, typer.Option(metavar="N", help="Seed of their places.", show_default="0")
-]
-SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
-Budget = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
-Json = Annotated[bool, typer.Option("--json", help="Print JSON, an object a line.")]
 
 
 class Interrupted(Exception):  # noqa: N818 - no error: the user pressed Ctrl-C
@@ -135,51 +105,3 @@ def root(
     del version, debug  # seen by their callbacks and by `main`
     if context.invoked_subcommand is None:
         print(context.get_help())
-
-
-def numbers_of(text: str, counts: Iterable[int], option: str, example: str) -> list[float]:
-    """Finite numbers of an option, separated by commas or blanks.
-
-    Raises
-    ------
-    UsageError
-        When they are no numbers, or not as many as one of `counts`.
-    """
-    from math import isfinite
-
-    from hapticdb.errors import UsageError
-
-    try:
-        numbers = [float(word) for word in text.replace(",", " ").split()]
-    except ValueError:
-        numbers = []
-    if len(numbers) not in counts or not all(map(isfinite, numbers)):
-        raise UsageError(f"{option} {text[:80]!r}: give {example}")
-    return numbers
-
-
-def bytes_of(budget: float) -> int:
-    """Bytes of a `Budget`."""
-    from hapticdb.errors import UsageError
-
-    if not 1.0 <= budget <= 1e6:
-        raise UsageError(f"--budget {budget}: give MiB, 1 to a million")
-    return int(budget * (1 << 20))
-
-
-def size_of(text: str, option: str) -> int:
-    """Bytes of a size in MiB, or with its unit.
-
-    Raises
-    ------
-    UsageError
-        When it is none, or beyond sense.
-    """
-    from hapticdb.errors import UsageError
-
-    match = SIZE.fullmatch(text.strip())
-    unit = (match[2] or "M")[0].upper() if match else "M"
-    mib = float(match[1]) * (1024.0 if unit == "G" else 1.0) if match else 0.0
-    if not 1.0 <= mib <= 1e6:
-        raise UsageError(f"{option} {text[:80]!r}: give MiB, 1 to a million, or such as 4GiB")
-    return int(mib * (1 << 20))

@@ -6,12 +6,12 @@ from typing import Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Json, Url
+from hapticdb.cli.options import JsonOption, UrlArgument
 from hapticdb.errors import UsageError
 
 
 def bench(
-    url: Url,
+    url: UrlArgument,
     *,
     out: Annotated[
         Path | None,
@@ -25,7 +25,7 @@ def bench(
     poses: Annotated[
         str | None, typer.Option(metavar="CSV", help="Its path, as for 'hapticdb touch'.")
     ] = None,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure the paper's experiments on an environment: JSON, plots and one page of tables.
 

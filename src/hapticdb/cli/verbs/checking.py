@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Json, Url
+from hapticdb.cli.options import JsonOption, UrlArgument
 
 if TYPE_CHECKING:
     from hapticdb.check import CheckReport
 
 
-def check(url: Url, *, json: Json = False) -> None:
+def check(url: UrlArgument, *, json: JsonOption = False) -> None:
     """Read all of an environment and say what is wrong with it, a line each.
 
     Pages, rows, objects and the log of changes are compared. The exit code

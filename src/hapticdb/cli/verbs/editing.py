@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import Chosen, chosen
-from hapticdb.cli.root import Json, Url, numbers_of
+from hapticdb.cli.choosing import chosen
+from hapticdb.cli.options import JsonOption, ObjectsArgument, UrlArgument
+from hapticdb.cli.values import numbers_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -15,8 +16,8 @@ if TYPE_CHECKING:
 
 
 def move(
-    url: Url,
-    objects: Chosen,
+    url: UrlArgument,
+    objects: ObjectsArgument,
     *,
     translate: Annotated[
         str | None,
@@ -33,7 +34,7 @@ def move(
             help="New placement: 16 numbers, row by row, in a text file or separated by commas.",
         ),
     ] = None,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Place objects anew; their geometry is read from their files again.
 
@@ -53,7 +54,7 @@ def move(
     if len(given) != 1:
         raise UsageError("give one of --translate, --pose and --matrix")
     placed = _placement(pose, matrix)
-    shift = translate and numbers_of(translate, [3], "--translate", "X,Y,Z in metres")
+    shift = translate and numbers_of(translate, 3, "--translate", "X,Y,Z in metres")
     with hapticdb.open(url) as env:
         found = chosen(env, objects, "ID|NAME")
         if not shift and len(found) > 1:
@@ -100,7 +101,7 @@ def _placement(pose: str | None, matrix: str | None) -> "NDArray[np.float64]":
 
     placed = np.eye(4)
     if pose is not None:
-        numbers = np.array(numbers_of(pose, [7], "--pose", "X,Y,Z,QW,QX,QY,QZ"))
+        numbers = np.array(numbers_of(pose, 7, "--pose", "X,Y,Z,QW,QX,QY,QZ"))
         norm = float(np.linalg.norm(numbers[3:]))
         if not norm > 1e-9:
             raise UsageError(f"--pose {pose!r}: the quaternion is no rotation")
@@ -108,7 +109,7 @@ def _placement(pose: str | None, matrix: str | None) -> "NDArray[np.float64]":
         placed[:3, 3] = numbers[:3]
     elif matrix is not None:
         text = _matrix_text(matrix)
-        placed = np.array(numbers_of(text, [16], "--matrix", "a file of 16 numbers")).reshape(4, 4)
+        placed = np.array(numbers_of(text, 16, "--matrix", "a file of 16 numbers")).reshape(4, 4)
     return placed
 
 
@@ -126,7 +127,7 @@ def _matrix_text(matrix: str) -> str:
         raise FileError(f"--matrix: cannot read {matrix}: {error}") from None
 
 
-def remove(url: Url, objects: Chosen, *, json: Json = False) -> None:
+def remove(url: UrlArgument, objects: ObjectsArgument, *, json: JsonOption = False) -> None:
     """Remove objects, each in a transaction of its own.
 
     'hapticdb objects --help' says how names choose objects.

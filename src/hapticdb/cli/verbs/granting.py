@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Json, Url
+from hapticdb.cli.options import JsonOption, UrlArgument
 
 RightName = Literal["viewer", "toucher", "editor", "nobody"]
 MEANINGS: dict[RightName, str] = {
@@ -17,13 +17,13 @@ MEANINGS: dict[RightName, str] = {
 
 
 def grant(
-    url: Url,
+    url: UrlArgument,
     role: Annotated[str, typer.Argument(metavar="ROLE", help="A role of the server.")],
     *,
     right: Annotated[
         RightName, typer.Option("--as", help="What ROLE may do from now on; replaces the former.")
     ],
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Say what a role may do with an environment on PostgreSQL; the server holds it to that.
 

@@ -1,98 +1,96 @@
 """The verb import."""
 
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import (
-    CurveName,
-    Interrupted,
-    Json,
-    LayoutName,
-    UnitName,
-    Url,
-    numbers_of,
-)
+from hapticdb.cli.options import CurveOption, JsonOption, LayoutOption, UnitName, UrlArgument
+from hapticdb.cli.root import Interrupted
+from hapticdb.cli.values import numbers_of
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb.ingest.files import FileReport
+    from hapticdb.ingest.files import FileReport, ImportOptions
+
+FilesArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="FILE...",
+        help="GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP, LAS and LAZ with their extras.",
+    ),
+]
+UnitOption = Annotated[
+    UnitName | None, typer.Option(help="Unit of files that name none; metres otherwise.")
+]
+BitsOption = Annotated[
+    int | None,
+    typer.Option(metavar="1..21", help="Bits an axis: 2^bits voxels.", show_default="10"),
+]
+VoxelSizeOption = Annotated[float | None, typer.Option(metavar="METRES", help="Edge of a voxel.")]
+ExtentOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="FACTOR",
+        help="Edge of the grid in longest sides of the first file's box.",
+        show_default="1.6",
+    ),
+]
+OriginOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z", help="Lower corner in metres; without it the first file is centred."
+    ),
+]
+JobsOption = Annotated[
+    int | None, typer.Option(metavar="N", help="Threads.", show_default="one a processor")
+]
+KeepRemovedOption = Annotated[
+    bool, typer.Option("--keep-removed", help="Leave parts out that were removed.")
+]
+TimeLimitOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        help="That reading one file may take.",
+        show_default="20 and more by its size",
+    ),
+]
+MemoryLimitOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="MIB",
+        help="Memory that reading one file may take.",
+        show_default="512 and more by its size",
+    ),
+]
+ReplaceOption = Annotated[
+    bool,
+    typer.Option("--replace", help="Replace objects of these files by what the files hold now."),
+]
 
 
 def import_(
-    url: Url,
-    files: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="FILE...",
-            help="GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP, LAS and LAZ with their extras.",
-        ),
-    ],
+    url: UrlArgument,
+    files: FilesArgument,
     *,
-    unit: Annotated[
-        UnitName | None, typer.Option(help="Unit of files that name none; metres otherwise.")
-    ] = None,
-    bits: Annotated[
-        int | None,
-        typer.Option(metavar="1..21", help="Bits an axis: 2^bits voxels.", show_default="10"),
-    ] = None,
-    voxel_size: Annotated[
-        float | None, typer.Option(metavar="METRES", help="Edge of a voxel.")
-    ] = None,
-    extent: Annotated[
-        float | None,
-        typer.Option(
-            metavar="FACTOR",
-            help="Edge of the grid in longest sides of the first file's box.",
-            show_default="1.6",
-        ),
-    ] = None,
-    origin: Annotated[
-        str | None,
-        typer.Option(
-            metavar="X,Y,Z", help="Lower corner in metres; without it the first file is centred."
-        ),
-    ] = None,
-    layout: Annotated[
-        LayoutName | None,
-        typer.Option(help="Index table of a new environment.", show_default="brick"),
-    ] = None,
-    curve: Annotated[
-        CurveName | None, typer.Option(help="Order of the keys of a new one.", show_default="z")
-    ] = None,
-    jobs: Annotated[
-        int | None, typer.Option(metavar="N", help="Threads.", show_default="one a processor")
-    ] = None,
-    keep_removed: Annotated[
-        bool, typer.Option("--keep-removed", help="Leave parts out that were removed.")
-    ] = False,
-    time_limit: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            help="That reading one file may take.",
-            show_default="20 and more by its size",
-        ),
-    ] = None,
-    memory_limit: Annotated[
-        int | None,
-        typer.Option(
-            metavar="MIB",
-            help="Memory that reading one file may take.",
-            show_default="512 and more by its size",
-        ),
-    ] = None,
-    replace: Annotated[
-        bool,
-        typer.Option(
-            "--replace", help="Replace objects of these files by what the files hold now."
-        ),
-    ] = False,
-    json: Json = False,
+    unit: UnitOption = None,
+    bits: BitsOption = None,
+    voxel_size: VoxelSizeOption = None,
+    extent: ExtentOption = None,
+    origin: OriginOption = None,
+    layout: LayoutOption = None,
+    curve: CurveOption = None,
+    jobs: JobsOption = None,
+    keep_removed: KeepRemovedOption = False,
+    time_limit: TimeLimitOption = None,
+    memory_limit: MemoryLimitOption = None,
+    replace: ReplaceOption = False,
+    json: JsonOption = False,
 ) -> None:
     """Import files into an environment, which is made when it does not exist.
 
@@ -111,21 +109,30 @@ def import_(
     Example: hapticdb import 'postgresql://me@host/plant?environment=hall' plant.glb
     """
     from hapticdb.grid import GridOptions
-    from hapticdb.ingest.files import ImportOptions, import_files
+    from hapticdb.ingest.files import ImportOptions
 
-    corner = None if origin is None else numbers_of(origin, [3], "--origin", "X,Y,Z in metres")
+    corner = None if origin is None else numbers_of(origin, 3, "--origin", "X,Y,Z in metres")
+    grid = GridOptions(bits=bits, voxel_size=voxel_size, extent=extent, origin=corner, curve=curve)
     options = ImportOptions(
-        unit=unit,
-        grid=GridOptions(
-            bits=bits, voxel_size=voxel_size, extent=extent, origin=corner, curve=curve
-        ),
-        layout=layout,
-        jobs=jobs,
-        keep_removed=keep_removed,
-        time_limit=time_limit,
-        memory_limit=None if memory_limit is None else memory_limit << 20,
+        unit=unit, grid=grid, layout=layout, jobs=jobs, keep_removed=keep_removed,
+        time_limit=time_limit, memory_limit=None if memory_limit is None else memory_limit << 20,
         replace=replace,
-    )
+    )  # fmt: skip
+    reports, elapsed = _imported(url, files, options)
+    if json:
+        _say_records(url, reports)
+    else:
+        _say_lines(url, files, reports, elapsed)
+    if any(report.error for report in reports):
+        raise typer.Exit(2)
+
+
+def _imported(
+    url: str, files: Sequence[str], options: "ImportOptions"
+) -> "tuple[list[FileReport], float]":
+    """Import files: a report of each, and seconds."""
+    from hapticdb.ingest.files import import_files
+
     try:
         render.compile_kernels("import", files=files)
         started = time.perf_counter()
@@ -135,19 +142,30 @@ def import_(
         raise Interrupted(
             "interrupted; what went in is whole, and the same command goes on from there"
         ) from None
-    elapsed = time.perf_counter() - started
-    scene = _scene(url) if json and any(report.error is None for report in reports) else None
-    for file, report in zip(files, reports, strict=True):
-        if json:
-            render.say_json(_record(report) | {"scene": render.box_record(scene)})
-        elif report.error is None:
-            _say(file, report)
+    return reports, time.perf_counter() - started
+
+
+def _say_records(url: str, reports: "Sequence[FileReport]") -> None:
+    """Print what became of each file, as JSON."""
+    is_any_in = any(report.error is None for report in reports)
+    scene = render.box_record(_scene(url) if is_any_in else None)
+    for report in reports:
+        render.say_json(_record(report) | {"scene": scene})
         if report.error is not None:
             render.note(str(report.error))
-    if not json and any(report.status == "imported" for report in reports):
+
+
+def _say_lines(
+    url: str, files: Sequence[str], reports: "Sequence[FileReport]", elapsed: float
+) -> None:
+    """Print what became of each file, in words, and what the environment holds now."""
+    for file, report in zip(files, reports, strict=True):
+        if report.error is None:
+            _say(file, report)
+        else:
+            render.note(str(report.error))
+    if any(report.status == "imported" for report in reports):
         _say_total(url, elapsed)
-    if any(report.error for report in reports):
-        raise typer.Exit(2)
 
 
 def _record(report: "FileReport") -> dict[str, object]:

@@ -5,22 +5,23 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Interrupted, Json, Url
+from hapticdb.cli.options import JsonOption, UrlArgument
+from hapticdb.cli.root import Interrupted
 
 if TYPE_CHECKING:
     from hapticdb.store.engines import BackupReport
 
-Copy = Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")]
+CopyArgument = Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")]
 
 
 def backup(
-    url: Url,
-    file: Copy,
+    url: UrlArgument,
+    file: CopyArgument,
     *,
     replace: Annotated[
         bool, typer.Option("--replace", help="Replace a copy that is there.")
     ] = False,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Copy an environment whole into a file, while others go on working with it.
 
@@ -40,7 +41,7 @@ def backup(
     _say(report, json=json)
 
 
-def restore(file: Copy, url: Url, *, json: Json = False) -> None:
+def restore(file: CopyArgument, url: UrlArgument, *, json: JsonOption = False) -> None:
     """Put a copy in an environment's place, and remove the log of what was there.
 
     What is there stays until the copy is whole beside it, and is replaced

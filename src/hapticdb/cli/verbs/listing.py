@@ -1,18 +1,22 @@
 """The verbs that look at an environment: info, objects, calibrate, analyze."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
 import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.columns import Columns
-from hapticdb.cli.pages import PAGE, Corners, Order, page_of, selected
-from hapticdb.cli.root import Json, Url
+from hapticdb.cli.options import JsonOption, UrlArgument
+from hapticdb.cli.pages import PAGE, Corners, ListingPage, Order, page_of, selected
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hapticdb.grid import Grid
     from hapticdb.query.cost_model import CostModel
-    from hapticdb.store.base import Freshness, Object
+    from hapticdb.store.base import Freshness, Layout, Object, Size, Store
 
 MEANINGS = {
     "statement": "a statement of ranges, whatever it reads",
@@ -37,99 +41,141 @@ SOURCES = {
 
 NO_CHECKSUMS = "none of pages; 'hapticdb copy' makes an environment that has them"
 
+NameOption = Annotated[
+    list[str] | None,
+    typer.Option(metavar="ID|NAME", help="Only these: 7 or 3,4 or 'wheel*'; again for more."),
+]
+BoxOption = Annotated[
+    Corners | None,
+    typer.Option(
+        metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only those whose bounds meet this box, metres."
+    ),
+]
+SortOption = Annotated[
+    Order, typer.Option(help="By name; or by voxels or longest side, the largest first.")
+]
+ReverseOption = Annotated[bool, typer.Option("--reverse", help="The other way round.")]
+LimitOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        help="Objects on a page; 0: all.",
+        show_default=f"{PAGE} on a terminal, all in a pipe",
+    ),
+]
+PageOption = Annotated[int | None, typer.Option(metavar="N", help="Which page, from 1.")]
 
-def info(url: Url, *, json: Json = False) -> None:
+
+def info(url: UrlArgument, *, json: JsonOption = False) -> None:
     """Show an environment's engine, grid, layout, scene, size and statistics.
 
     Example: hapticdb info car.db --json
     """
     from contextlib import closing
 
-    from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
-    from hapticdb.store.base import scene_bounds
     from hapticdb.store.connect import open_store
 
     # the store: an Environment brings what touches and imports, a tenth of a second
-    with closing(open_store(url, read_only=True)) as env:
-        grid, size, objects, layout = env.grid, env.size(), env.objects(), env.layout
-        freshness = env.freshness(DEFAULT_RESOLUTION)
-        quantiles = QuantileVector.of(env, DEFAULT_RESOLUTION)
-        has_checksums = env.checker().has_page_checksums()
-    voxels = sum(obj.voxels for obj in objects)
-    scene = scene_bounds(objects)
+    with closing(open_store(url, read_only=True)) as store:
+        looked_at = _Overview.of(store)
     if json:
-        render.say_json(
-            {
-                "name": env.name,
-                "engine": env.engine,
-                "voxel_size": grid.voxel_size,
-                "bits": grid.bits,
-                "origin": list(grid.origin),
-                "curve": grid.curve,
-                "layout": layout,
-                "objects": len(objects),
-                "scene": render.box_record(scene),
-                "voxels": voxels,
-                "rows": size.rows,
-                "bytes": size.bytes,
-                "page_checksums": has_checksums,
-                "statistics": {"source": quantiles.source, **freshness._asdict()},
-            }
+        render.say_json(looked_at.record())
+    else:
+        render.show(render.facts(looked_at.facts()))
+
+
+class _Overview(NamedTuple):
+    """What `info` tells of an environment."""
+
+    url: str
+    name: str
+    engine: str
+    grid: "Grid"
+    layout: "Layout"
+    size: "Size"
+    n_objects: int
+    voxels: int
+    scene: "NDArray[np.float64] | None"
+    freshness: "Freshness"
+    source: str
+    has_checksums: bool
+
+    @classmethod
+    def of(cls, store: "Store") -> Self:
+        """Ask a store."""
+        from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+        from hapticdb.store.base import scene_bounds
+
+        size, objects = store.size(), store.objects()
+        return cls(
+            url=store.url,
+            name=store.name,
+            engine=store.engine,
+            grid=store.grid,
+            layout=store.layout,
+            size=size,
+            n_objects=len(objects),
+            voxels=sum(obj.voxels for obj in objects),
+            scene=scene_bounds(objects),
+            freshness=store.freshness(DEFAULT_RESOLUTION),
+            source=QuantileVector.of(store, DEFAULT_RESOLUTION).source,
+            has_checksums=store.checker().has_page_checksums(),
         )
-        return
-    origin = ", ".join(f"{x:.6g}" for x in grid.origin)
-    a_voxel = f" ({size.bytes / voxels:.3g} a voxel)" if voxels else ""
-    render.show(
-        render.facts(
-            [
-                ("environment", env.url),
-                ("name", env.name),
-                ("engine", env.engine),
-                ("voxel size", render.metres(grid.voxel_size)),
-                ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
-                ("edge", render.metres(grid.edge)),
-                ("origin", f"({origin}) m"),
-                ("curve", grid.curve),
-                ("layout", layout),
-                ("objects", f"{len(objects):,}"),
-                ("scene", "nothing in it" if scene is None else render.box(scene)),
-                ("voxels", f"{voxels:,}"),
-                ("rows", f"{size.rows:,}"),
-                ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
-                ("checksums", "of pages" if has_checksums else NO_CHECKSUMS),
-                ("statistics", f"{SOURCES[quantiles.source]}; {_age(freshness)}"),
-            ]
-        )
-    )
+
+    def record(self) -> dict[str, object]:
+        """Put it in JSON."""
+        return {
+            "name": self.name,
+            "engine": self.engine,
+            "voxel_size": self.grid.voxel_size,
+            "bits": self.grid.bits,
+            "origin": list(self.grid.origin),
+            "curve": self.grid.curve,
+            "layout": self.layout,
+            "objects": self.n_objects,
+            "scene": render.box_record(self.scene),
+            "voxels": self.voxels,
+            "rows": self.size.rows,
+            "bytes": self.size.bytes,
+            "page_checksums": self.has_checksums,
+            "statistics": {"source": self.source, **self.freshness._asdict()},
+        }
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Put it in words."""
+        grid, size = self.grid, self.size
+        origin = ", ".join(f"{x:.6g}" for x in grid.origin)
+        a_voxel = f" ({size.bytes / self.voxels:.3g} a voxel)" if self.voxels else ""
+        return [
+            ("environment", self.url),
+            ("name", self.name),
+            ("engine", self.engine),
+            ("voxel size", render.metres(grid.voxel_size)),
+            ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
+            ("edge", render.metres(grid.edge)),
+            ("origin", f"({origin}) m"),
+            ("curve", grid.curve),
+            ("layout", self.layout),
+            ("objects", f"{self.n_objects:,}"),
+            ("scene", "nothing in it" if self.scene is None else render.box(self.scene)),
+            ("voxels", f"{self.voxels:,}"),
+            ("rows", f"{size.rows:,}"),
+            ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
+            ("checksums", "of pages" if self.has_checksums else NO_CHECKSUMS),
+            ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),
+        ]
 
 
 def objects(
-    url: Url,
+    url: UrlArgument,
     *,
-    name: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ID|NAME", help="Only these: 7 or 3,4 or 'wheel*'; again for more."),
-    ] = None,
-    box: Annotated[
-        Corners | None,
-        typer.Option(
-            metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only those whose bounds meet this box, metres."
-        ),
-    ] = None,
-    sort: Annotated[
-        Order, typer.Option(help="By name; or by voxels or longest side, the largest first.")
-    ] = "id",
-    reverse: Annotated[bool, typer.Option("--reverse", help="The other way round.")] = False,
-    limit: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N",
-            help="Objects on a page; 0: all.",
-            show_default=f"{PAGE} on a terminal, all in a pipe",
-        ),
-    ] = None,
-    page: Annotated[int | None, typer.Option(metavar="N", help="Which page, from 1.")] = None,
-    json: Json = False,
+    name: NameOption = None,
+    box: BoxOption = None,
+    sort: SortOption = "id",
+    reverse: ReverseOption = False,
+    limit: LimitOption = None,
+    page: PageOption = None,
+    json: JsonOption = False,
 ) -> None:
     """List the objects of an environment.
 
@@ -148,10 +194,10 @@ def objects(
     from hapticdb.errors import ObjectNotFoundError
     from hapticdb.store.connect import open_store
 
-    with closing(open_store(url, read_only=True)) as env:
-        shown = env.url
+    with closing(open_store(url, read_only=True)) as store:
+        shown_url = store.url
         try:
-            found = selected(env, name, box, sort, reverse=reverse)
+            found = selected(store, name, box, sort, reverse=reverse)
         except ObjectNotFoundError as error:
             raise ObjectNotFoundError(f"--name: {error}") from None
     is_whole = json and limit is None and page is None
@@ -159,20 +205,25 @@ def objects(
     if json:
         for obj in part.objects:
             render.say_json(record_of(obj))
-        return
-    if not found:
-        nothing = f"{shown} is empty; 'hapticdb import URL FILE' fills it"
-        render.note(nothing if box is None else f"{shown}: no object meets the box")
-        return
+    elif found:
+        _show_page(part)
+    elif box is None:
+        render.note(f"{shown_url} is empty; 'hapticdb import URL FILE' fills it")
+    else:
+        render.note(f"{shown_url}: no object meets the box")
+
+
+def _show_page(page: ListingPage) -> None:
+    """Print a page as a table, and where the next one begins."""
     rows = [
-        (str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in part.objects
+        (str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in page.objects
     ]
     render.show(render.table(("id>", "name", "voxels>", "size, mm>", "file"), rows))
-    last = part.first + len(rows) - 1
-    if len(rows) < part.total:
-        more = "" if last == part.total else f"; --page {last // len(rows) + 1} goes on"
+    last = page.first + len(rows) - 1
+    if len(rows) < page.total:
+        more = "" if last == page.total else f"; --page {last // len(rows) + 1} goes on"
         render.note(
-            f"objects {part.first:,} to {last:,} of {part.total:,}{more}, --limit 0 shows all"
+            f"objects {page.first:,} to {last:,} of {page.total:,}{more}, --limit 0 shows all"
         )
 
 
@@ -200,7 +251,7 @@ def size_text(obj: "Object") -> str:
 
 
 def calibrate(
-    url: Url,
+    url: UrlArgument,
     *,
     cold: Annotated[
         bool,
@@ -208,7 +259,7 @@ def calibrate(
             "--cold", help="With empty caches, on SQLite; these figures are then the ones kept."
         ),
     ] = False,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Measure what statements, descents and rows cost on this database and machine.
 
@@ -244,7 +295,7 @@ def calibrate(
     )
 
 
-def analyze(url: Url, *, json: Json = False) -> None:
+def analyze(url: UrlArgument, *, json: JsonOption = False) -> None:
     """Renew the statistics of the keys, by which cbgroup and auto expect how many rows a gap holds.
 
     An import does so at its end, PostgreSQL's autovacuum now and then: this

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import CurveName, Interrupted, Json, LayoutName
+from hapticdb.cli.options import JsonOption, SameCurveOption, SameLayoutOption
+from hapticdb.cli.root import Interrupted
 
 if TYPE_CHECKING:
     from hapticdb.difference import Difference
@@ -22,15 +23,9 @@ def copy(
         str, typer.Argument(metavar="DST", help="Made when it does not exist; of any engine.")
     ],
     *,
-    layout: Annotated[
-        LayoutName | None,
-        typer.Option(help="Index table of a new environment.", show_default="that of SRC"),
-    ] = None,
-    curve: Annotated[
-        CurveName | None,
-        typer.Option(help="Order of the keys of a new one.", show_default="that of SRC"),
-    ] = None,
-    json: Json = False,
+    layout: SameLayoutOption = None,
+    curve: SameCurveOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Copy an environment, also to another engine, layout or curve.
 
@@ -75,7 +70,7 @@ def diff(
     a: Annotated[str, typer.Argument(metavar="A", help="An environment.")],
     b: Annotated[str, typer.Argument(metavar="B", help="Another one; of any engine.")],
     *,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Say whether two environments hold the same objects and voxels, and by how much they differ.
 

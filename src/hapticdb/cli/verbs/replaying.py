@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.csv_files import FRAME_COLUMNS, STDOUT, CsvFile, rows_of_frames, sheet
-from hapticdb.cli.root import Json
+from hapticdb.cli.csv_files import FRAME_COLUMNS, STDOUT, open_csv, rows_of_frames
+from hapticdb.cli.options import CsvOption, JsonOption
 
 if TYPE_CHECKING:
     from hapticdb.recording.file import Recording
@@ -23,8 +23,8 @@ def replay(
     until_damage: Annotated[
         bool, typer.Option("--until-damage", help="Take a damaged recording to end there.")
     ] = False,
-    csv: CsvFile = None,
-    json: Json = False,
+    csv: CsvOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Compute a recorded session's contact wrenches again, and say where they part.
 
@@ -94,7 +94,7 @@ def _write_frames(session: "Recording", target: str, *, until_damage: bool) -> N
     """Write recorded frames as CSV, chunk by chunk."""
     columns = [name for names in FRAME_COLUMNS.values() for name in names]
     n_frames = 0
-    with sheet(target, "--csv", columns) as rows:
+    with open_csv(target, "--csv", columns) as rows:
         assert rows is not None  # noqa: S101 - a target was given
         for frames in session.frames(until_damage=until_damage):
             rows.write(rows_of_frames(frames))

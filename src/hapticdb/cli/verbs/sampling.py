@@ -6,24 +6,24 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.root import Json
+from hapticdb.cli.options import JsonOption
 
 if TYPE_CHECKING:
     from hapticdb.demo import Comparison, Imported, Measured, Scene
 
-Folder = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
-Frames = Annotated[int, typer.Option(metavar="N", help="Poses of the path.")]
+FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
+FramesOption = Annotated[int, typer.Option(metavar="N", help="Poses of the path.")]
 
 
 def sample(
-    folder: Folder,
+    folder: FolderArgument,
     *,
     along: Annotated[
         str | None,
         typer.Option(metavar="URL", help="Slide over this environment instead of the sample."),
     ] = None,
-    frames: Frames = 1000,
-    json: Json = False,
+    frames: FramesOption = 1000,
+    json: JsonOption = False,
 ) -> None:
     """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
 
@@ -47,7 +47,7 @@ def sample(
         render.say(str(path))
 
 
-def warm(*, json: Json = False) -> None:
+def warm(*, json: JsonOption = False) -> None:
     """Compile every kernel that this machine has not compiled yet, so that no verb has to.
 
     Half a minute on two processors; kept in the user's cache folder until
@@ -72,7 +72,7 @@ def warm(*, json: Json = False) -> None:
 
 
 def demo(
-    folder: Folder = Path("demo"),
+    folder: FolderArgument = Path("demo"),
     *,
     url: Annotated[
         str | None,
@@ -82,9 +82,9 @@ def demo(
         ),
     ] = None,
     bits: Annotated[int, typer.Option(metavar="1..21", help="Bits an axis of the grid.")] = 10,
-    frames: Frames = 1000,
+    frames: FramesOption = 1000,
     points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
-    json: Json = False,
+    json: JsonOption = False,
 ) -> None:
     """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
 

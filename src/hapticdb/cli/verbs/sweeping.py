@@ -3,15 +3,32 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from hapticdb.cli import fitting, render
-from hapticdb.cli.choosing import Exclude, Parts, ids_of
-from hapticdb.cli.root import Budget, Json, PathUnit, Seed, ToolUnit, UpName, Url, bytes_of
-from hapticdb.cli.verbs.touching import shell_of
+from hapticdb.cli.choosing import ids_of
+from hapticdb.cli.options import (
+    BudgetOption,
+    ExcludeOption,
+    JsonOption,
+    OptionalToolOption,
+    PathUnitOption,
+    PosesOption,
+    SeedOption,
+    ToolUnitOption,
+    UrlArgument,
+)
+from hapticdb.cli.tools import shell_of
+from hapticdb.cli.values import budget_bytes
 from hapticdb.cli.verdict import show
+from hapticdb.errors import UsageError
+
+if TYPE_CHECKING:
+    from hapticdb.environment import Environment
+    from hapticdb.pointshell.shell import PointShell
+    from hapticdb.sweeps.result import Swept
 
 EXIT_CODES = {"comes out": 0, "hits": 1, "not decided": 3}
 DOUBTFUL = 3
@@ -19,115 +36,105 @@ DOUBTFUL = 3
 DENSE = 0.5
 """Voxels from point to point of the tool, unless --points are given."""
 
+UpName = Literal["x", "y", "z"]
+PartsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--part",
+        metavar="ID|NAME",
+        help="Instead of --tool: the objects that move, all together; as for --exclude.",
+    ),
+]
+ClearanceOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="M", help="Look so far for what is near; 0: not at all.", show_default="32 voxels"
+    ),
+]
+DensePointsOption = Annotated[
+    int | None,
+    typer.Option(metavar="N", help="Points of the shell.", show_default="half a voxel apart"),
+]
+AsGivenOption = Annotated[
+    bool,
+    typer.Option("--as-given", help="Sizes and places are as they should be: exit code 0 or 1."),
+]
+PictureOption = Annotated[
+    str | None, typer.Option(metavar="PNG", help="Draw the path, its hits and clearance.")
+]
+UpOption = Annotated[
+    UpName | None,
+    typer.Option(help="Axis that points up in the picture.", show_default="the files'"),
+]
+
+HELP = """Say whether a tool or part comes out along a path: what it hits, where, how near it comes.
+
+Hits: a point of the tool is in a voxel of an object, or something lies inside
+the tool, whose mesh is closed there. Comes out: proved for the whole surface
+and the whole path. Not decided: neither, and the line says what would decide.
+
+Between two poses the tool's middle moves straight while the tool turns about
+it, in steps in which no point moves more than half a voxel. Segment 0 leads
+from pose 0 to pose 1.
+
+With --part, objects are the tool: all of them together, rigid, left out of
+what is felt. The poses are displacements from where they sit: x,y,z 0 and
+qw 1 is their place. A sub-assembly's name means all that is below it;
+'hapticdb objects --help' says how names choose objects.
+
+The points are half a voxel apart, 200,000 at most, unless --points are given.
+
+The exit code is 0 when it comes out, 1 when it hits, 3 when not decided; 3,
+too, when it comes out, but the sizes or places of tool, path and scene do not
+fit, as a line then says: --as-given if they are meant so.
+
+Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
+"""
+"""The verb's help text: longer than a function of this house may be."""
+
 
 def sweep(
-    url: Url,
+    url: UrlArgument,
     *,
-    tool: Annotated[
-        str | None, typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
-    ] = None,
-    part: Parts = None,
-    path: Annotated[
-        str,
-        typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header."),
-    ],
-    exclude: Exclude = None,
-    clearance: Annotated[
-        float | None,
-        typer.Option(
-            metavar="M",
-            help="Look so far for what is near; 0: not at all.",
-            show_default="32 voxels",
-        ),
-    ] = None,
-    budget: Budget = 256.0,
-    tool_unit: ToolUnit = None,
-    path_unit: PathUnit = None,
-    points: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Points of the shell.", show_default="half a voxel apart"),
-    ] = None,
-    seed: Seed = None,
-    as_given: Annotated[
-        bool,
-        typer.Option(
-            "--as-given", help="Sizes and places are as they should be: exit code 0 or 1."
-        ),
-    ] = False,
-    picture: Annotated[
-        str | None, typer.Option(metavar="PNG", help="Draw the path, its hits and clearance.")
-    ] = None,
-    up: Annotated[
-        UpName | None,
-        typer.Option(help="Axis that points up in the picture.", show_default="the files'"),
-    ] = None,
-    json: Json = False,
+    tool: OptionalToolOption = None,
+    part: PartsOption = None,
+    path: PosesOption,
+    exclude: ExcludeOption = None,
+    clearance: ClearanceOption = None,
+    budget: BudgetOption = 256.0,
+    tool_unit: ToolUnitOption = None,
+    path_unit: PathUnitOption = None,
+    points: DensePointsOption = None,
+    seed: SeedOption = None,
+    as_given: AsGivenOption = False,
+    picture: PictureOption = None,
+    up: UpOption = None,
+    json: JsonOption = False,
 ) -> None:
-    """Say whether a tool or part comes out along a path: what it hits, where, how near it comes.
-
-    Hits: a point of the tool is in a voxel of an object, or something lies inside
-    the tool, whose mesh is closed there. Comes out: proved for the whole surface
-    and the whole path. Not decided: neither, and the line says what would decide.
-
-    Between two poses the tool's middle moves straight while the tool turns about
-    it, in steps in which no point moves more than half a voxel. Segment 0 leads
-    from pose 0 to pose 1.
-
-    With --part, objects are the tool: all of them together, rigid, left out of
-    what is felt. The poses are displacements from where they sit: x,y,z 0 and
-    qw 1 is their place. A sub-assembly's name means all that is below it;
-    'hapticdb objects --help' says how names choose objects.
-
-    The points are half a voxel apart, 200,000 at most, unless --points are given.
-
-    The exit code is 0 when it comes out, 1 when it hits, 3 when not decided; 3,
-    too, when it comes out, but the sizes or places of tool, path and scene do not
-    fit, as a line then says: --as-given if they are meant so.
-
-    Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
-    """
+    """Sweep a tool or parts along a path; the help text is `HELP`."""
     import hapticdb
-    from hapticdb.errors import UsageError
     from hapticdb.poses import read_poses
     from hapticdb.sweeps.record import sweep_record
-    from hapticdb.sweeps.run import sweep as swept_by
-    from hapticdb.sweeps.verdict import verdict_line
+    from hapticdb.sweeps.run import sweep as sweep_path
 
-    if (tool is None) == (not part):
-        raise UsageError("give one of --tool and --part")
-    if part and tool_unit is not None:
-        raise UsageError("--tool-unit is of a --tool; a part has the unit that it was imported in")
-    if picture is not None and Path(picture).suffix.lower() != ".png":
-        raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
-    budget_bytes = bytes_of(budget)
+    _check(tool, part, tool_unit, picture)
+    n_bytes = budget_bytes(budget)
     poses = read_poses(path, unit=path_unit or "m")
     with hapticdb.open(url, read_only=True) as env:
         parts = ids_of(env, part, "--part")
         excluded = sorted({*parts, *ids_of(env, exclude, "--exclude")})
         render.compile_kernels("sweep", files=[tool] if tool else [])
-        spacing = DENSE * env.grid.voxel_size if points is None else None
-        with _bar("spreading points"):
-            if tool is not None:
-                shell = shell_of(tool, tool_unit, points, seed, spacing)
-            else:
-                shell = env.shell(*parts, points=points, spacing=spacing, seed=seed or 0)
-            shell = shell.with_cover()
+        shell = _shell(env, tool, parts, tool_unit, points, seed)
         fit = fitting.compare(
             env, shell, poses, exclude=excluded, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=True,
         )  # fmt: skip
         with _bar("sweeping") as progress:
-            found = swept_by(
-                env,
-                shell,
-                poses,
-                exclude=excluded,
-                budget_bytes=budget_bytes,
-                clearance_limit=clearance,
-                profile=picture is not None,
-                proportions=fit,
+            found = sweep_path(
+                env, shell, poses, exclude=excluded, budget_bytes=n_bytes,
+                clearance_limit=clearance, profile=picture is not None, proportions=fit,
                 progress=progress,
-            )
+            )  # fmt: skip
         if env.store.revision() != found.revision:
             render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
         try:
@@ -137,18 +144,58 @@ def sweep(
                 show(env, found, shell)
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
-                from hapticdb.pictures.sweep import draw_sweep
-
-                draw_sweep(
-                    picture, env, shell, found, exclude=excluded,
-                    verdict=verdict_line(found, shell), up=up,
-                )  # fmt: skip
+                _draw(picture, env, shell, found, excluded, up)
     if not json and picture is not None:
         render.say(f"picture: {picture}")
     if found.verdict != "comes out":
         raise typer.Exit(EXIT_CODES[found.verdict])
     if fit.misfits and not as_given:
         raise typer.Exit(DOUBTFUL)
+
+
+def _check(
+    tool: str | None, part: list[str] | None, tool_unit: str | None, picture: str | None
+) -> None:
+    """Refuse options that contradict one another."""
+    if (tool is None) == (not part):
+        raise UsageError("give one of --tool and --part")
+    if part and tool_unit is not None:
+        raise UsageError("--tool-unit is of a --tool; a part has the unit that it was imported in")
+    if picture is not None and Path(picture).suffix.lower() != ".png":
+        raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
+
+
+def _shell(
+    env: "Environment",
+    tool: str | None,
+    parts: list[int],
+    tool_unit: str | None,
+    points: int | None,
+    seed: int | None,
+) -> "PointShell":
+    """Shell of the tool's file, or of the parts, with its covering radius."""
+    spacing = DENSE * env.grid.voxel_size if points is None else None
+    with _bar("spreading points"):
+        if tool is not None:
+            shell = shell_of(tool, tool_unit, points, seed, spacing)
+        else:
+            shell = env.shell(*parts, points=points, spacing=spacing, seed=seed or 0)
+        return shell.with_cover()
+
+
+def _draw(
+    picture: str,
+    env: "Environment",
+    shell: "PointShell",
+    found: "Swept",
+    excluded: list[int],
+    up: UpName | None,
+) -> None:
+    from hapticdb.pictures.sweep import draw_sweep
+    from hapticdb.sweeps.verdict import verdict_line
+
+    verdict = verdict_line(found, shell)
+    draw_sweep(picture, env, shell, found, exclude=excluded, verdict=verdict, up=up)
 
 
 @contextmanager

@@ -1,65 +1,87 @@
 """The verb touch."""
 
 from collections import Counter
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import partial
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hapticdb.cli import fitting, render
-from hapticdb.cli.choosing import Exclude, ids_of
+from hapticdb.cli.choosing import ids_of
 from hapticdb.cli.csv_files import (
     CONTACTS,
     STDOUT,
     TOUCHED,
-    CsvFile,
+    CsvWriter,
+    open_csv,
     row_of_pose,
     rows_of_contacts,
-    sheet,
 )
-from hapticdb.cli.root import Json, PathUnit, Points, Seed, StrategyName, ToolUnit, Url
+from hapticdb.cli.options import (
+    CsvOption,
+    ExcludeOption,
+    JsonOption,
+    PathUnitOption,
+    PointsOption,
+    PosesOption,
+    SeedOption,
+    StiffnessOption,
+    StrategyName,
+    ToolOption,
+    ToolUnitOption,
+    UrlArgument,
+)
+from hapticdb.cli.tools import shell_of
+from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
+    from hapticdb.proportions import Misfit
     from hapticdb.query.frame import Strategy
     from hapticdb.query.touches import Touch
     from hapticdb.store.base import Object
 
 MOST_TOUCHED = 8
+"""Objects in the table of those that were touched in most frames."""
 FEW_POSES = 500
 """Poses of a path below which it does not pay to measure the database's costs.
 
 Measuring takes most of a second, and `touch` opens the environment to read, so that it could not
 keep the figures. A larger value lets longer paths of large tools go without grouping."""
 
+StrategyOption = Annotated[StrategyName, typer.Option(help="How the database is asked.")]
+MaxgapOption = Annotated[
+    int, typer.Option(metavar="KEYS", help="Of the strategy maxgap, in voxel keys.")
+]
+ContactsCsvOption = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Write every contact as CSV: a new file; - is stdout."),
+]
+
 
 def touch(
-    url: Url,
+    url: UrlArgument,
     *,
-    tool: Annotated[
-        str, typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
-    ],
-    poses: Annotated[
-        str,
-        typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header."),
-    ],
-    tool_unit: ToolUnit = None,
-    path_unit: PathUnit = None,
-    points: Points = None,
-    seed: Seed = None,
-    strategy: Annotated[StrategyName, typer.Option(help="How the database is asked.")] = "auto",
-    maxgap: Annotated[
-        int, typer.Option(metavar="KEYS", help="Of the strategy maxgap, in voxel keys.")
-    ] = 500,
-    exclude: Exclude = None,
-    stiffness: Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")] = 1000.0,
-    csv: CsvFile = None,
-    contacts_csv: Annotated[
-        str | None,
-        typer.Option(metavar="FILE", help="Write every contact as CSV: a new file; - is stdout."),
-    ] = None,
-    json: Json = False,
+    tool: ToolOption,
+    poses: PosesOption,
+    tool_unit: ToolUnitOption = None,
+    path_unit: PathUnitOption = None,
+    points: PointsOption = None,
+    seed: SeedOption = None,
+    strategy: StrategyOption = "auto",
+    maxgap: MaxgapOption = 500,
+    exclude: ExcludeOption = None,
+    stiffness: StiffnessOption = 1000.0,
+    csv: CsvOption = None,
+    contacts_csv: ContactsCsvOption = None,
+    json: JsonOption = False,
 ) -> None:
     """Touch an environment with a tool along a path: force, torque and objects of every pose.
 
@@ -69,18 +91,12 @@ def touch(
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
     import hapticdb
-    from hapticdb.errors import UsageError
     from hapticdb.poses import read_poses
 
     law = hapticdb.TangentPlane(stiffness)
     path = read_poses(poses, unit=path_unit or "m")
-    summary = _Summary()
-    to_stdout = [csv == STDOUT, contacts_csv == STDOUT, json]
-    if sum(to_stdout) > 1:
-        raise UsageError("--csv -, --contacts-csv - and --json: only one may be standard output")
     with (
-        sheet(csv, "--csv", TOUCHED) as rows,
-        sheet(contacts_csv, "--contacts-csv", CONTACTS) as contact_rows,
+        _output(csv, contacts_csv, json=json) as output,
         hapticdb.open(url, read_only=True) as env,
     ):
         excluded = ids_of(env, exclude, "--exclude")
@@ -90,25 +106,27 @@ def touch(
             env, shell, path, exclude=excluded, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=False,
         )  # fmt: skip
-        misfits = [misfit._asdict() for misfit in fit.misfits]
         asked = _strategy_of(strategy, env, len(path))
+        touch_at = partial(
+            env.touch, shell, strategy=asked, exclude=excluded, maxgap=maxgap, law=law
+        )
+        touch_at(path[0])  # compiles kernels and reads statistics, which belong to no frame's time
+        for index, pose in enumerate(path):
+            output.add(index, touch_at(pose), shell, pose, fit.misfits)
+    output.finish()
 
-        def felt(index: int) -> "Touch":
-            return env.touch(shell, path[index], asked, exclude=excluded, maxgap=maxgap, law=law)
 
-        felt(0)  # compiles kernels and reads statistics, which belong to no frame's time
-        for index in range(len(path)):
-            touched = felt(index)
-            if rows is not None:
-                rows.write([row_of_pose(index, touched)])
-            if contact_rows is not None:
-                contact_rows.write(rows_of_contacts(index, touched, shell, path[index]))
-            if json:
-                render.say_json(_record(index, touched) | {"misfits": misfits})
-            elif not any(to_stdout):
-                summary.add(touched)
-    if not any(to_stdout):
-        summary.show()
+@contextmanager
+def _output(csv: str | None, contacts_csv: str | None, *, json: bool) -> "Iterator[_Output]":
+    """Open the files that the options name; at most one result goes to standard output."""
+    to_stdout = [csv == STDOUT, contacts_csv == STDOUT, json]
+    if sum(to_stdout) > 1:
+        raise UsageError("--csv -, --contacts-csv - and --json: only one may be standard output")
+    with (
+        open_csv(csv, "--csv", TOUCHED) as poses,
+        open_csv(contacts_csv, "--contacts-csv", CONTACTS) as contacts,
+    ):
+        yield _Output(poses, contacts, json, None if any(to_stdout) else _Summary())
 
 
 def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strategy":
@@ -120,25 +138,38 @@ def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strat
     return wanted
 
 
-def shell_of(
-    tool: str,
-    unit: str | None,
-    points: int | None,
-    seed: int | None,
-    spacing: float | None = None,
-) -> "PointShell":
-    """Shell of a tool's file, its defects told; --points and --seed as they were given."""
-    from hapticdb.errors import UsageError
-    from hapticdb.pointshell.shell import PointShell
+@dataclass(frozen=True)
+class _Output:
+    """Where the results of a path go: CSV files, JSON, or a summary at the end."""
 
-    if tool.lower().endswith(".npz") and (points is not None or seed is not None):
-        raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
-    shell = PointShell.from_file(tool, points, spacing=spacing, unit=unit, seed=seed or 0)
-    if shell.defects:
-        render.note(f"{tool}: found in the file: {shell.defects}")
-    if not shell.is_closed:
-        render.note(f"{tool}: the tool's mesh is open, so its inside is a guess")
-    return shell
+    poses: CsvWriter | None
+    contacts: CsvWriter | None
+    is_json: bool
+    summary: "_Summary | None"
+
+    def add(
+        self,
+        index: int,
+        touched: "Touch",
+        shell: "PointShell",
+        pose: "NDArray[np.float64]",
+        misfits: "Sequence[Misfit]",
+    ) -> None:
+        """Write the touch at one pose of the path."""
+        if self.poses is not None:
+            self.poses.write([row_of_pose(index, touched)])
+        if self.contacts is not None:
+            self.contacts.write(rows_of_contacts(index, touched, shell, pose))
+        if self.is_json:
+            found = [misfit._asdict() for misfit in misfits]
+            render.say_json(_record(index, touched) | {"misfits": found})
+        if self.summary is not None:
+            self.summary.add(touched)
+
+    def finish(self) -> None:
+        """Print the summary, unless standard output has been taken for something else."""
+        if self.summary is not None:
+            self.summary.show()
 
 
 def _record(index: int, touched: "Touch") -> dict[str, object]:

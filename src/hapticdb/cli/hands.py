@@ -1,0 +1,131 @@
+"""The hand that `feel --device` names."""
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hapticdb.cli.values import numbers_of
+from hapticdb.errors import UsageError
+
+if TYPE_CHECKING:
+    from hapticdb.devices.scripted import Device
+
+VENDORS = {
+    "force-dimension": ("hapticdb.devices.vendors.force_dimension", "ForceDimensionDevice"),
+    "openhaptics": ("hapticdb.devices.vendors.openhaptics", "OpenHapticsDevice"),
+    "haply": ("hapticdb.devices.vendors.haply", "HaplyDevice"),
+}
+"""Module and class of each device that can be bought, by its word."""
+MADE_UP = {"random", "tumble"}
+"""Words of the hands whose motion is computed around one place."""
+RANDOM_SPEED = 0.3
+"""Greatest speed of a random hand unless --speed is given, m/s."""
+PATH_SPEED = 0.1
+"""Speed along a path without times unless --speed is given, m/s."""
+
+
+@dataclass(frozen=True)
+class HandOptions:
+    """What the options of `feel` say of the hand.
+
+    Attributes
+    ----------
+    word : str
+        --device: a file, the name of a computed motion, or the name of a vendor's device.
+    speed : float or None
+        --speed, m/s.
+    place : str or None
+        --at, three numbers, metres.
+    seed : int
+        --seed, of a random hand.
+    loops : bool
+        --loop: a path begins again at its end.
+    is_simulated : bool
+        --simulate: the force moves the hand.
+    """
+
+    word: str
+    speed: float | None
+    place: str | None
+    seed: int
+    loops: bool
+    is_simulated: bool
+
+    def path_speed(self) -> float | None:
+        """Speed, m/s, that is assumed for a path without times; None where none is assumed."""
+        from hapticdb.poses import read_timed_poses
+
+        if self.speed is not None or not self._ends_with(".csv"):
+            return None
+        return PATH_SPEED if read_timed_poses(self.word)[0] is None else None
+
+    def open(self, path_speed: float | None) -> "Device":
+        """Open the device, or read the file of the motion.
+
+        Raises
+        ------
+        UsageError
+            When options contradict one another, or `word` names no hand.
+        DeviceError, FileError, MissingExtraError
+            When the device or the file cannot be used.
+        """
+        self._check()
+        if self.word in VENDORS:
+            return self._vendor_device()
+        from hapticdb.devices.simulated import SimulatedDevice
+
+        hand = self._scripted(path_speed)
+        return SimulatedDevice(hand) if self.is_simulated else hand
+
+    def _ends_with(self, suffix: str) -> bool:
+        return self.word.lower().endswith(suffix)
+
+    def _check(self) -> None:
+        """Refuse options that the hand does not take."""
+        word = self.word
+        if self.seed < 0:
+            raise UsageError(f"--seed {self.seed}: give 0 or more")
+        if self.place is not None:
+            self._position()
+        if word in MADE_UP and self.place is None:
+            raise UsageError(f"--device {word}: give --at, where the hand is")
+        if word not in MADE_UP and self.place is not None:
+            raise UsageError(f"--at belongs to random and tumble, not to {word}")
+        if self.loops and word in MADE_UP:
+            raise UsageError(f"--loop: --device {word} has no end; leave it out")
+        if self.speed is not None and (word == "tumble" or self._ends_with(".hdbrec")):
+            raise UsageError(f"--speed: --device {word} has its own; leave it out")
+        if word in VENDORS and (self.is_simulated or self.loops or self.speed is not None):
+            raise UsageError(
+                f"--device {word} is a real hand: leave out --simulate, --loop, --speed"
+            )
+
+    def _position(self) -> list[float]:
+        return numbers_of(self.place or "", 3, "--at", "metres, such as 0.5,0,1.2")
+
+    def _vendor_device(self) -> "Device":
+        from importlib import import_module
+
+        module, name = VENDORS[self.word]
+        device: Device = getattr(import_module(module), name)()
+        return device
+
+    def _scripted(self, path_speed: float | None) -> "Device":
+        """The hand that a motion moves."""
+        from hapticdb.devices import scripted
+        from hapticdb.recording.file import Recording
+
+        speed = self.speed if path_speed is None else path_speed
+        if self.word == "random":
+            greatest = RANDOM_SPEED if speed is None else speed
+            return scripted.RandomHand(self._position(), self.seed, greatest)
+        if self.word == "tumble":
+            return scripted.Tumble(self._position())
+        if self._ends_with(".hdbrec"):
+            times, poses = Recording(self.word).poses()
+            return scripted.Player(times, poses, loops=self.loops)
+        if self._ends_with(".csv"):
+            return scripted.Path(self.word, speed=speed, loops=self.loops)
+        raise UsageError(
+            f"--device {self.word!r}: give poses in a .csv, a .hdbrec, random, tumble, "
+            f"{', '.join(VENDORS)}"
+        )

@@ -1,0 +1,75 @@
+"""Arguments and options of the verbs that more than one verb takes, each declared once."""
+
+from typing import Annotated, Literal
+
+import typer
+
+StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
+CurveName = Literal["z", "hilbert", "lexicographic"]
+LayoutName = Literal["brick", "voxel"]
+UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
+
+_TOOL = typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
+_LAYOUT = "Index table of a new environment."
+_CURVE = "Order of the keys of a new one."
+
+# -- environments ---------------------------------------------------------------------------------
+
+UrlArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="URL", help="The environment: a path, sqlite:///path, postgresql://host/database."
+    ),
+]
+LayoutOption = Annotated[LayoutName | None, typer.Option(help=_LAYOUT, show_default="brick")]
+CurveOption = Annotated[CurveName | None, typer.Option(help=_CURVE, show_default="z")]
+SameLayoutOption = Annotated[
+    LayoutName | None, typer.Option(help=_LAYOUT, show_default="that of SRC")
+]
+SameCurveOption = Annotated[CurveName | None, typer.Option(help=_CURVE, show_default="that of SRC")]
+
+# -- objects --------------------------------------------------------------------------------------
+
+ObjectsArgument = Annotated[
+    list[str],
+    typer.Argument(
+        metavar="ID|NAME...", help="As 'hapticdb objects' lists them: 7 or 3,4 or 'wheel*'."
+    ),
+]
+ExcludeOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ID|NAME", help="Objects that are not felt; 7 or 3,4 or 'wheel*'; again for more."
+    ),
+]
+
+# -- tools and paths ------------------------------------------------------------------------------
+
+ToolOption = Annotated[str, _TOOL]
+OptionalToolOption = Annotated[str | None, _TOOL]
+ToolUnitOption = Annotated[
+    UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
+]
+PosesOption = Annotated[
+    str, typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header.")
+]
+PathUnitOption = Annotated[
+    UnitName | None,
+    typer.Option(help="Unit of the positions of the poses.", show_default="m"),
+]
+PointsOption = Annotated[
+    int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
+]
+SeedOption = Annotated[
+    int | None, typer.Option(metavar="N", help="Seed of their places.", show_default="0")
+]
+StiffnessOption = Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")]
+BudgetOption = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
+
+# -- results --------------------------------------------------------------------------------------
+
+CsvOption = Annotated[
+    str | None,
+    typer.Option("--csv", metavar="FILE", help="Write it as CSV: a new file; - is stdout."),
+]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, an object a line.")]

@@ -1,0 +1,148 @@
+"""What a session was like, as `feel` prints it."""
+
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from hapticdb.cli import render
+
+if TYPE_CHECKING:
+    from hapticdb.cli.columns import Columns
+    from hapticdb.realtime.report import Report, Spread
+    from hapticdb.realtime.resident_cells import ResidentCells
+
+MOST_NAMED = 8
+"""Objects that were touched whose names are printed; more are counted."""
+PERCENTILES = (("p50", "p50"), ("p99", "p99"), ("p99.9", "p999"), ("worst", "worst"))
+"""Heading of each, and the field of a `Spread`."""
+
+Facts = list[tuple[str, str]]
+
+
+def show(
+    report: "Report", cells: "ResidentCells", recording: str | None, path_speed: float | None
+) -> None:
+    """Print how the loop kept its time, beside the empty loop, and what happened in it.
+
+    Parameters
+    ----------
+    recording : str or None
+        File that the session was recorded to.
+    path_speed : float or None
+        Speed assumed for a path without times, m/s.
+    """
+    render.show(_loop_table(report))
+    facts = [*_frame_facts(report), *_cell_facts(report)]
+    facts.append(("warm start", f"{1e3 * report.warm_up:.3g} ms" + _cold_clause(report)))
+    facts.append(("peak", _peak_text(report)))
+    facts.append(("objects", _object_names(report, cells)))
+    facts += _exceptional_facts(report)
+    if path_speed is not None:
+        facts.append(("played at", f"{path_speed} m/s: the path has no times (column t); --speed"))
+    if recording is not None:
+        facts.append(("recorded", _recording_text(report, recording)))
+    facts += sorted(report.conditions.items())
+    render.show(render.facts(facts))
+
+
+def _loop_table(report: "Report") -> "Columns":
+    """Frames, deadlines and times of the session, and of the empty loop where it ran."""
+    loops = [loop for loop in (report.loop, report.empty) if loop is not None]
+    headings = ("", "session>", "empty loop>")[: 1 + len(loops)]
+    rows = [
+        ("frames", *(f"{loop.frames:,}" for loop in loops)),
+        ("rate, Hz", *(f"{loop.rate:,.1f}" for loop in loops)),
+        ("missed deadlines", *(f"{loop.missed:,}" for loop in loops)),
+        *_percentile_rows("late", [loop.lateness for loop in loops]),
+        *_percentile_rows("computing", [loop.elapsed for loop in loops]),
+    ]
+    return render.table(headings, rows)
+
+
+def _percentile_rows(what: str, spreads: "Sequence[Spread]") -> list[tuple[str, ...]]:
+    """A row for each percentile, microseconds."""
+    return [
+        (f"{what} {name}, µs", *(f"{1e6 * getattr(spread, field):,.1f}" for spread in spreads))
+        for name, field in PERCENTILES
+    ]
+
+
+def _frame_facts(report: "Report") -> Facts:
+    """Frames that touched, that knew too little, and whose force was held."""
+    touching = (
+        f"{render.counted(report.hit_frames, 'frame')} with a hit, "
+        f"{report.contact_frames:,} in contact, {report.cut_frames:,} held back at surfaces"
+    )
+    unknown = (
+        f"{render.counted(report.unknown_frames, 'frame')}, "
+        f"of {report.points:,} points {100 * (1 - report.hit_rate):.3g} %"
+    )
+    held = (
+        f"{render.counted(report.held_frames, 'frame')}, "
+        f"{report.stale_frames:,} while the database was silent"
+    )
+    return [("touching", touching), ("not known", unknown), ("force held", held)]
+
+
+def _cell_facts(report: "Report") -> Facts:
+    """Cells in memory, and what it cost to fetch them."""
+    cache = report.cache
+    resident = (
+        f"{render.counted(cache.resident, 'cell')}, and {cache.empty:,} known to be empty, "
+        f"in {cache.budget_bytes / 2**20:.4g} MiB"
+    )
+    fetched = (
+        f"{render.counted(cache.loaded, 'cell')} in "
+        f"{render.counted(cache.statements, 'statement')}, "
+        f"{1e3 * cache.latency:.3g} ms each, {1e3 * cache.worst:.3g} ms at worst; "
+        f"{cache.evicted:,} evicted"
+    )
+    return [("resident", resident), ("fetched", fetched)]
+
+
+def _exceptional_facts(report: "Report") -> Facts:
+    """What most sessions have not: no baseline, bad readings, outages."""
+    facts: Facts = []
+    if report.empty is None:
+        facts.append(("empty loop", "not measured (--no-baseline)"))
+    if report.bad_reading is not None:
+        held = render.counted(report.nowhere_frames, "frame")
+        facts.append(("hand nowhere", f"{held}: {report.bad_reading}"))
+    losses, restarts = report.cache.losses, report.cache.restarts
+    if losses or restarts:
+        outages = f"{losses:,} of the database, {restarts:,} of the process that fetches"
+        facts.append(("outages", outages))
+    return facts
+
+
+def _cold_clause(report: "Report") -> str:
+    return "" if report.is_warm else ", and begun although cells were missing"
+
+
+def _peak_text(report: "Report") -> str:
+    return (
+        f"{report.peak_force:.4g} N, {report.peak_torque:.4g} N m, "
+        f"{render.metres(report.deepest)} deep"
+    )
+
+
+def _recording_text(report: "Report", recording: str) -> str:
+    lost = f", {report.lost_records:,} lost" if report.lost_records else ""
+    ended = ", not to the end" if report.recording_ended else ""
+    return f"{report.recorded_frames:,} frames in {recording}{lost}{ended}"
+
+
+def _object_names(report: "Report", cells: "ResidentCells") -> str:
+    """Names of the objects that were touched; their ids where the database does not answer."""
+    import hapticdb
+    from hapticdb.errors import DatabaseError
+
+    names: dict[int, str] = {}
+    with suppress(DatabaseError):
+        if not cells.is_away:
+            with hapticdb.open(cells.url, read_only=True) as env:
+                names = {obj.id: obj.name for obj in env.objects()}
+    touched = [names.get(i, f"object {i}") for i in report.objects]
+    shown = ", ".join(touched[:MOST_NAMED])
+    more = f" and {len(touched) - MOST_NAMED} more" if len(touched) > MOST_NAMED else ""
+    return f"{len(touched)} touched" + (f": {shown}{more}" if shown else "")

@@ -1,0 +1,59 @@
+"""Values of options: numbers and sizes in memory or on disk."""
+
+import re
+from math import isfinite
+
+from hapticdb.errors import UsageError
+
+MIB = 1 << 20
+LARGEST_MIB = 1e6
+"""Largest size that an option takes, MiB: a typing error beyond it is refused."""
+SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
+"""A size as an option takes it; a number without a unit is MiB."""
+
+
+def numbers_of(text: str, count: int, option: str, example: str) -> list[float]:
+    """Finite numbers of an option, separated by commas or blanks.
+
+    Raises
+    ------
+    UsageError
+        When the text holds anything else, or not `count` numbers; it names `option`, and `example`
+        as what to give.
+    """
+    try:
+        numbers = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not all(map(isfinite, numbers)):
+        raise UsageError(f"{option} {text[:80]!r}: give {example}")
+    return numbers
+
+
+def budget_bytes(mib: float) -> int:
+    """Bytes of ``--budget``, which is given in MiB.
+
+    Raises
+    ------
+    UsageError
+        When it is below 1 MiB or above `LARGEST_MIB`.
+    """
+    if not 1.0 <= mib <= LARGEST_MIB:
+        raise UsageError(f"--budget {mib}: give MiB, 1 to a million")
+    return int(mib * MIB)
+
+
+def size_bytes(text: str, option: str) -> int:
+    """Bytes of a size that is given in MiB, or with its unit, such as ``4GiB``.
+
+    Raises
+    ------
+    UsageError
+        When the text is no size, or one below 1 MiB or above `LARGEST_MIB`; it names `option`.
+    """
+    match = SIZE.fullmatch(text.strip())
+    unit = (match[2] or "M")[0].upper() if match else "M"
+    mib = float(match[1]) * (1024.0 if unit == "G" else 1.0) if match else 0.0
+    if not 1.0 <= mib <= LARGEST_MIB:
+        raise UsageError(f"{option} {text[:80]!r}: give MiB, 1 to a million, or such as 4GiB")
+    return int(mib * MIB)

@@ -253,6 +253,12 @@ def add_seats(car: Assembly) -> None:
 
 def dashboard() -> Mesh:
     """Dashboard: one body across the car with a binnacle, vents, glove box, radio."""
+    glove = moved(box(0.02, 0.38, 0.12, 0.008), shift(0.465, -0.40, 0.765) @ turn("y", -18.0))
+    return join([_dashboard_body(), *map(_vent, (-0.60, -0.08, 0.08, 0.60)), glove, _radio()])
+
+
+def _dashboard_body() -> Mesh:
+    """One outline, drawn across the car and swollen into a binnacle before the driver."""
     outline = np.array(
         [
             (0.70, 0.925),
@@ -271,7 +277,7 @@ def dashboard() -> Mesh:
     y = np.linspace(0.70, -0.70, 45)
     swell = 0.030 * np.exp(-(((y - 0.36) / 0.17) ** 2))
     centre = outline.mean(axis=0)
-    body = loft(
+    return loft(
         [
             np.column_stack(
                 [
@@ -283,44 +289,34 @@ def dashboard() -> Mesh:
             for v, s in zip(y, swell, strict=True)
         ]
     )
-    vents = [
-        moved(
-            join(
-                [
-                    ring_plate(
-                        rounded_rectangle(0.15, 0.055, 0.012, 4),
-                        rounded_rectangle(0.138, 0.043, 0.008, 4),
-                        -0.012,
-                        0.008,
-                    ),
-                    *(
-                        moved(slab(0.138, 0.003, 0.014), shift(0.0, v))
-                        for v in (-0.012, 0.0, 0.012)
-                    ),
-                ]
-            ),
-            shift(0.433, u, 0.85) @ turn("z", -90.0) @ turn("x", 80.0),
-        )
-        for u in (-0.60, -0.08, 0.08, 0.60)
-    ]
-    glove = moved(box(0.02, 0.38, 0.12, 0.008), shift(0.465, -0.40, 0.765) @ turn("y", -18.0))
-    radio = moved(
-        join(
-            [
-                box(0.02, 0.19, 0.06, 0.006),
-                *(
-                    moved(cylinder(0.012, 0.03, 20), shift(-0.012, s * 0.075) @ turn("y", 90.0))
-                    for s in (-1, 1)
-                ),
-                *(
-                    moved(box(0.012, 0.016, 0.010, 0.002), shift(-0.010, u, -0.016))
-                    for u in np.linspace(-0.045, 0.045, 5)
-                ),
-            ]
-        ),
-        shift(0.452, 0.0, 0.785) @ turn("y", -14.0),
+
+
+def _vent(across: float) -> Mesh:
+    """A frame with three slats; `across` is its y."""
+    frame = ring_plate(
+        rounded_rectangle(0.15, 0.055, 0.012, 4),
+        rounded_rectangle(0.138, 0.043, 0.008, 4),
+        -0.012,
+        0.008,
     )
-    return join([body, *vents, glove, radio])
+    slats = [moved(slab(0.138, 0.003, 0.014), shift(0.0, v)) for v in (-0.012, 0.0, 0.012)]
+    return moved(
+        join([frame, *slats]), shift(0.433, across, 0.85) @ turn("z", -90.0) @ turn("x", 80.0)
+    )
+
+
+def _radio() -> Mesh:
+    """A box with two knobs and five buttons."""
+    body = box(0.02, 0.19, 0.06, 0.006)
+    knobs = [
+        moved(cylinder(0.012, 0.03, 20), shift(-0.012, s * 0.075) @ turn("y", 90.0))
+        for s in (-1, 1)
+    ]
+    buttons = [
+        moved(box(0.012, 0.016, 0.010, 0.002), shift(-0.010, u, -0.016))
+        for u in np.linspace(-0.045, 0.045, 5)
+    ]
+    return moved(join([body, *knobs, *buttons]), shift(0.452, 0.0, 0.785) @ turn("y", -14.0))
 
 
 def cluster() -> Mesh:

@@ -1,0 +1,101 @@
+"""matplotlib is loaded by the verbs that draw, and by no other."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from children import finished
+from command_line import command, made, run, scene  # noqa: F401 - fixtures
+from hapticdb.cli import VERBS
+
+STAND_IN = """
+import os
+open(os.environ["LOADED"], "w").close()
+raise ImportError("nothing is to be drawn")
+"""
+"""A package of matplotlib's name that leaves a mark in whichever process imports it."""
+
+TOOL = "--tool tool.npz"
+LINES = {
+    "import": "new.db file.obj --bits 5",
+    "info": "scene.db",
+    "objects": "scene.db",
+    "touch": f"scene.db {TOOL} --poses path.csv",
+    "feel": f"scene.db {TOOL} --device path.csv --seconds 0.2 --no-baseline --record s.hdbrec",
+    "replay": "s.hdbrec scene.db",
+    "sweep": f"scene.db {TOOL} --path path.csv",
+    "move": "scene.db 1 --translate 0,0,0",
+    "remove": "scene.db 1",
+    "copy": "scene.db copied.db",
+    "diff": "scene.db scene.db",
+    "check": "scene.db",
+    "backup": "scene.db whole.db",
+    "restore": "scene.db put.db",
+    "calibrate": "scene.db",
+    "analyze": "scene.db",
+    "grant": "scene.db anna --as viewer",
+    "sample": "made --frames 2",
+    "warm": "",
+}
+"""What each verb without a picture is asked to do."""
+REFUSED = {"grant": 2}
+"""Exit codes that are not 0: an SQLite file knows no roles."""
+DRAWING = {"demo", "bench"}
+"""Verbs that always draw."""
+LONG = {"feel", "replay", "sweep", "calibrate", "sample", "warm"}
+TRIANGLE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n"
+
+
+@pytest.fixture
+def variables(tmp_path: Path) -> dict[str, str]:
+    """Environment of a process in which matplotlib is the stand-in."""
+    package = tmp_path / "shadow" / "matplotlib"
+    package.mkdir(parents=True)
+    (package / "__init__.py").write_text(STAND_IN)
+    folders = [str(package.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
+    paths = {"PYTHONPATH": os.pathsep.join(folders), "LOADED": str(tmp_path / "loaded")}
+    return os.environ | paths
+
+
+def test_every_verb_is_tried() -> None:
+    assert set(LINES) | DRAWING == {verb.__name__.rstrip("_") for verb in VERBS}
+
+
+@pytest.mark.parametrize(
+    "verb", [pytest.param(v, marks=[pytest.mark.long] if v in LONG else []) for v in LINES]
+)
+def test_a_verb_without_a_picture_loads_no_matplotlib(
+    variables: dict[str, str], scene: Path, tmp_path: Path, verb: str
+) -> None:
+    """Nor does a process that it starts."""
+    (tmp_path / "file.obj").write_text(TRIANGLE)
+    if verb == "replay":
+        recorded = command("feel", *LINES["feel"].split())
+        finished(recorded, cwd=scene.parent, env=variables, check=True)
+    done = finished(command(verb, *LINES[verb].split()), cwd=scene.parent, env=variables)
+    wanted = {"sweep": {1, 3}, **{name: {code} for name, code in REFUSED.items()}}.get(verb, {0})
+    assert done.returncode in wanted, done.stderr
+    assert not (tmp_path / "loaded").exists()
+
+
+@pytest.mark.parametrize("words", ["hapticdb", "hapticdb.cli, hapticdb.environment"])
+def test_importing_the_package_loads_no_matplotlib(
+    variables: dict[str, str], tmp_path: Path, words: str
+) -> None:
+    finished([sys.executable, "-c", f"import {words}"], env=variables, check=True)
+    assert not (tmp_path / "loaded").exists()
+
+
+@pytest.mark.long
+def test_a_verb_with_a_picture_loads_it(
+    variables: dict[str, str], scene: Path, tmp_path: Path
+) -> None:
+    """So that the mark is known to be left."""
+    line = f"{LINES['sweep']} --picture sweep.png"
+    done = finished(command("sweep", *line.split()), cwd=scene.parent, env=variables)
+    assert "nothing is to be drawn" in done.stderr
+    assert (tmp_path / "loaded").exists()

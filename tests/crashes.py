@@ -15,7 +15,7 @@ import hapticdb
 from assemblies import Mesh, ball, placement, write_obj
 from children import joined
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
-from hapticdb.ingest.files import Progress
+from hapticdb.ingest.files import ImportProgress
 from hapticdb.query.frame import Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import session
@@ -115,7 +115,7 @@ class Killer:
         self._n_parts = n_parts
         self._timer = threading.Timer(delay, event)
 
-    def __call__(self, progress: Progress) -> None:
+    def __call__(self, progress: ImportProgress) -> None:
         """Take the import's progress; call the function when its part is reached."""
         if progress.parts_done == self._n_parts:
             self._timer.start()

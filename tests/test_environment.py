@@ -416,7 +416,7 @@ def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointS
     assert costs.statement > 0
     with hapticdb.open(env.url, read_only=True) as reader:
         assert reader.touch(sphere, placement(0, 0, 0), "cbgroup").query.strategy == "cbgroup"
-        assert reader._statistics()[1] == costs
+        assert reader._figures.both()[1] == costs
         reader.calibrate()  # measured, and not kept
     assert env.store.costs(machine_name()) == costs.figures()
     env.calibrate(seed=1, keep=False)

@@ -27,7 +27,7 @@ from hapticdb.store.base import Layout
 from hapticdb.store.sqlite.pages import LAYER
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import KINDS, blob, voxel_object, write_voxels
-from hapticdb.transfer import CopyReport, Progress
+from hapticdb.transfer import CopyProgress, CopyReport
 
 Kind = tuple[Layout, CurveName]
 PAIRS = [(a, b) for a in KINDS for b in KINDS]
@@ -314,7 +314,7 @@ def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
     source = make_blobs(tmp_path / "a.db")
     copy_environment(source, tmp_path / "before.db")
 
-    def edit(progress: Progress) -> None:
+    def edit(progress: CopyProgress) -> None:
         if progress.objects_done == 1:
             with hapticdb.open(source) as env:
                 env.remove(9)
@@ -339,7 +339,7 @@ def test_two_copies_at_once_make_one(tmp_path: Path) -> None:
     """The slower one finds what the faster one has written."""
     source = make_blobs(tmp_path / "a.db")
 
-    def overtake(progress: Progress) -> None:
+    def overtake(progress: CopyProgress) -> None:
         if progress.objects_done == 1:
             assert copy_environment(source, tmp_path / "b.db").copied == 3
 
@@ -352,8 +352,8 @@ def test_progress_counts_objects_and_voxels(tmp_path: Path) -> None:
     source = make_blobs(tmp_path / "a.db")
     with hapticdb.open(source) as env:
         voxels = np.cumsum([obj.voxels for obj in env.objects()]).tolist()
-    expected = [Progress(n + 1, 4, voxels[n]) for n in range(4)]
-    seen: list[Progress] = []
+    expected = [CopyProgress(n + 1, 4, voxels[n]) for n in range(4)]
+    seen: list[CopyProgress] = []
     copy_environment(source, tmp_path / "b.db", progress=seen.append)
     assert seen == expected
     seen.clear()

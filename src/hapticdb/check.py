@@ -30,14 +30,14 @@ MOST_FINDINGS = 1000
 BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
 
 
-class Progress(NamedTuple):
+class CheckProgress(NamedTuple):
     """How far a check is: rows read of those there are."""
 
     done: int
     total: int
 
 
-ProgressCallback = Callable[[Progress], None]
+CheckCallback = Callable[[CheckProgress], None]
 
 
 @dataclass
@@ -84,7 +84,7 @@ class CheckReport:
 
 
 def check_environment(
-    url: str | os.PathLike[str], *, progress: ProgressCallback | None = None
+    url: str | os.PathLike[str], *, progress: CheckCallback | None = None
 ) -> CheckReport:
     """Read all of an environment and say what is wrong with it.
 
@@ -99,7 +99,7 @@ def check_environment(
     url : str or path
         The environment; it is only read.
     progress : callable or None
-        Called after each batch of rows with a `Progress`.
+        Called after each batch of rows with a `CheckProgress`.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def check_environment(
     return report
 
 
-def _check(store: Store, report: CheckReport, progress: ProgressCallback | None) -> None:
+def _check(store: Store, report: CheckReport, progress: CheckCallback | None) -> None:
     with store.snapshot():
         checker = store.checker()
         report.has_page_checksums = checker.has_page_checksums()
@@ -203,7 +203,7 @@ def _row_findings(
     store: Store,
     objects: dict[int, Object],
     report: CheckReport,
-    progress: ProgressCallback | None,
+    progress: CheckCallback | None,
 ) -> Iterator[str]:
     checker = store.checker()
     sums = _Sums()
@@ -219,7 +219,7 @@ def _row_findings(
         sums.add(rows)
         yield from places.findings(rows)
         if progress is not None:
-            progress(Progress(min(report.rows, total), total))
+            progress(CheckProgress(min(report.rows, total), total))
     report.voxels = sum(sums.voxels.values())
     if report.rows != total:
         yield f"{report.rows:,} rows were read, and {total:,} counted"

@@ -18,7 +18,7 @@ from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError, GridError, UsageError
 from hapticdb.grid import GridOptions
-from hapticdb.ingest.files import FileReport, ImportOptions, ProgressCallback, import_files
+from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, import_files
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import read_poses, write_poses
@@ -156,7 +156,7 @@ def prepare(
     bits: int = 10,
     frames: int = 1000,
     points: int = 300,
-    progress: ProgressCallback | None = None,
+    progress: ImportCallback | None = None,
 ) -> Scene:
     """Write the sample and import it in both layouts.
 
@@ -195,7 +195,7 @@ def prepare(
 
 
 def _import(
-    url: str, car: Path, layout: Layout, grid: GridOptions, progress: ProgressCallback | None
+    url: str, car: Path, layout: Layout, grid: GridOptions, progress: ImportCallback | None
 ) -> Imported:
     started = time.perf_counter()
     try:

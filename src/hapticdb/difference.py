@@ -17,8 +17,8 @@ from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import BRICK_BYTES, Object, Store
 from hapticdb.store.connect import open_store
 from hapticdb.transfer import (
-    Progress,
-    ProgressCallback,
+    CopyCallback,
+    CopyProgress,
     Url,
     are_few_rows,
     is_same_grid,
@@ -141,7 +141,7 @@ class Difference:
 
 
 def diff_environments(
-    a_url: Url, b_url: Url, *, progress: ProgressCallback | None = None
+    a_url: Url, b_url: Url, *, progress: CopyCallback | None = None
 ) -> Difference:
     """Compare two environments: their grids, their objects, and every voxel of each object.
 
@@ -199,7 +199,7 @@ def _is_described_otherwise(a: Object, b: Object) -> bool:
 
 
 def _compared(
-    a: Store, b: Store, pairs: Sequence[Pair], progress: ProgressCallback | None
+    a: Store, b: Store, pairs: Sequence[Pair], progress: CopyCallback | None
 ) -> list[VoxelDifference]:
     found = []
     n_voxels = 0
@@ -209,7 +209,7 @@ def _compared(
         found.append(_compare_voxels(stores, vectors, pair))
         n_voxels += pair[0].voxels
         if progress is not None:
-            progress(Progress(done, len(pairs), n_voxels))
+            progress(CopyProgress(done, len(pairs), n_voxels))
     return found
 
 

@@ -8,17 +8,17 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, ReadOnlyError
+from hapticdb.errors import ConnectionLostError, ReadOnlyError
 from hapticdb.finding import find_objects
 from hapticdb.grid import Grid
-from hapticdb.ingest.files import FileReport, ImportOptions, ProgressCallback, ingest_file
+from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
 from hapticdb.ingest.layout import voxels_of_rows
 from hapticdb.ingest.originals import shell_of_objects
 from hapticdb.ingest.placing import move_object, shift_objects
 from hapticdb.mesh import read_file
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.calibration import calibrate
-from hapticdb.query.cost_model import CostModel, machine_name
+from hapticdb.query.cost_model import CostModel
+from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import (
     NOTHING_EXCLUDED,
     Answer,
@@ -29,11 +29,11 @@ from hapticdb.query.frame import (
     as_poses,
 )
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
+from hapticdb.query.known_objects import KnownObjects
 from hapticdb.query.law import TangentPlane
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.query.touches import Touch, Touches
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
-from hapticdb.store.believed import damaged
 from hapticdb.store.connect import create_store, open_store
 
 _NOBODY: tuple[int, ...] = ()
@@ -47,11 +47,9 @@ class Environment:
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self._query = HapticQuery(store, self._statistics)
-        self._quantiles: QuantileVector | None = None
-        self._costs: CostModel | None = None
-        self._known: dict[int, Object] = {}
-        self._known_at: int | None = None
+        self._figures = QueryFigures(store)
+        self._query = HapticQuery(store, self._figures.both)
+        self._known = KnownObjects(store)
 
     def __repr__(self) -> str:
         return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
@@ -163,7 +161,7 @@ class Environment:
         jobs: int | None = None,
         keep_removed: bool = False,
         replace: bool = False,
-        progress: ProgressCallback | None = None,
+        progress: ImportCallback | None = None,
     ) -> FileReport:
         """Import a file's parts on this environment's grid, each in a transaction of its own.
 
@@ -180,7 +178,7 @@ class Environment:
         replace : bool
             Replace objects of the file that it holds otherwise now, and remove those it lacks.
         progress : callable or None
-            Called after each part with a `hapticdb.ingest.files.Progress`.
+            Called after each part with a `hapticdb.ingest.files.ImportProgress`.
 
         Raises
         ------
@@ -308,11 +306,9 @@ class Environment:
         except ConnectionLostError:  # in the middle of a snapshot: once more, from its start
             answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
         if ids.size:
-            self._check_known(ids)
-        for object_id in answer.ids:
-            if object_id not in self._known:
-                raise damaged(self.url, f"rows of object {object_id}, which is not there")
-        return Touch(answer, self._known)
+            self._known.check_excluded(ids)
+        self._known.check_answer(answer.ids)
+        return Touch(answer, self._known.by_id)
 
     def _felt(
         self,
@@ -323,9 +319,9 @@ class Environment:
         ids: Keys,
         law: TangentPlane,
     ) -> Answer:
-        """Answer of a frame, and the objects of the revision that it has seen."""
+        """Answer of a frame; afterwards the objects of the revision that it saw are known."""
         answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
-        if self._store.version() != self._known_at:
+        if self._store.version() != self._known.version:
             with self._store.snapshot():
                 answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
                 self._learn_objects()
@@ -333,22 +329,8 @@ class Environment:
 
     def _learn_objects(self) -> None:
         """Know the objects of the revision that this snapshot sees."""
-        if self._store.version() == self._known_at:
-            return
-        self._known = {obj.id: obj for obj in self._store.objects()}
-        self._known_at = self._store.version()
-        if self._quantiles is not None and not self._quantiles.n_rows:
-            self._quantiles = None  # it was empty when it was opened
-
-    def _check_known(self, ids: Keys) -> None:
-        if not set(ids.tolist()) <= set(self._known):  # a frame that asked nothing saw nothing new
-            self._known = {obj.id: obj for obj in self._store.objects()}
-        for i in ids.tolist():
-            if i not in self._known:
-                raise ObjectNotFoundError(
-                    f"no object {i} in {self.url} to exclude; 'hapticdb objects {self.url}' "
-                    "lists them"
-                )
+        if self._known.learn():
+            self._figures.drop_empty_statistics()
 
     def touch_many(
         self,
@@ -391,14 +373,14 @@ class Environment:
             return touches
 
         if strategy == "cbgroup":
-            self._statistics()  # measured outside the snapshot
+            self._figures.both()  # measured outside the snapshot
         try:
             touches = felt()
         except ConnectionLostError:  # once more, from its start
             touches = felt()
         if ids.size:
-            self._check_known(ids)
-        return touches.name(self._known, (perf_counter_ns() - started) / 1000)
+            self._known.check_excluded(ids)
+        return touches.name(self._known.by_id, (perf_counter_ns() - started) / 1000)
 
     # -- statistics --------------------------------------------------------------------------
 
@@ -413,9 +395,7 @@ class Environment:
     def analyze(self) -> QuantileVector:
         """Renew those statistics, however fresh they are."""
         self._check_writable()
-        self._store.analyze(DEFAULT_RESOLUTION, anew=True)
-        self._quantiles = self.quantiles()
-        return self._quantiles
+        return self._figures.analyze()
 
     def calibrate(self, *, seed: int = 0, keep: bool = True, cold: bool = False) -> CostModel:
         """Measure what queries cost here; used from now on, and kept for this machine.
@@ -429,27 +409,12 @@ class Environment:
         cold : bool
             With empty caches, where this process can empty them: for what is beyond memory.
         """
-        costs = calibrate(self._store, seed=seed, cold=cold)
-        if keep and not self._store.is_read_only:
-            self._store.save_costs(machine_name(), costs.figures())
-        self._costs = costs
-        return costs
-
-    def _statistics(self) -> tuple[QuantileVector, CostModel]:
-        """What grouping by cost needs, fitted when first asked for: under a second."""
-        if self._quantiles is None:
-            self._quantiles = self.quantiles()
-        if not self._quantiles.n_rows:
-            return self._quantiles, CostModel.of_equal_parts()
-        if self._costs is None:
-            kept = self._store.costs(machine_name())
-            self._costs = CostModel.from_figures(kept) if kept else calibrate(self._store)
-        return self._quantiles, self._costs
+        return self._figures.calibrate(seed=seed, keep=keep, cold=cold)
 
     def _forget(self) -> None:
         """Drop what an edit of our own has made stale."""
-        self._quantiles = None
-        self._known_at = None
+        self._figures.drop_statistics()
+        self._known.forget()
 
     def _check_writable(self) -> None:
         if self._store.is_read_only:

@@ -30,7 +30,7 @@ MOST_ROWS = 1 << 19
 Url = str | os.PathLike[str]
 
 
-class Progress(NamedTuple):
+class CopyProgress(NamedTuple):
     """How far a copy or a comparison is: sent after each object.
 
     voxels : of the objects that were copied or compared until now.
@@ -41,7 +41,7 @@ class Progress(NamedTuple):
     voxels: int
 
 
-ProgressCallback = Callable[[Progress], None]
+CopyCallback = Callable[[CopyProgress], None]
 
 
 @dataclass(frozen=True)
@@ -74,7 +74,7 @@ def copy_environment(
     *,
     layout: Layout | None = None,
     curve: CurveName | None = None,
-    progress: ProgressCallback | None = None,
+    progress: CopyCallback | None = None,
 ) -> CopyReport:
     """Copy an environment's objects into another, which is made when it does not exist.
 
@@ -167,7 +167,7 @@ def is_same_kind(a: Store, b: Store) -> bool:
     return (a.layout, a.grid.curve) == (b.layout, b.grid.curve)
 
 
-def _copy_objects(source: Store, target: Store, progress: ProgressCallback | None) -> CopyReport:
+def _copy_objects(source: Store, target: Store, progress: CopyCallback | None) -> CopyReport:
     copied = voxels = renumbered = 0
     # left after the source's snapshot: an engine cannot tidy up behind the back of a reader
     with ExitStack() as loading, source.snapshot():
@@ -187,7 +187,7 @@ def _copy_objects(source: Store, target: Store, progress: ProgressCallback | Non
             copied += 1
             voxels += obj.voxels
             if progress is not None:
-                progress(Progress(done, len(objects), voxels))
+                progress(CopyProgress(done, len(objects), voxels))
     present = len(objects) - copied
     return CopyReport(source.url, target.url, copied, voxels, present, renumbered)
 

@@ -30,7 +30,7 @@ from children import finished
 from hapticdb import FileReport, GridOptions, ImportOptions
 from hapticdb.grid import ROOM, CurveName
 from hapticdb.ingest import files
-from hapticdb.ingest.files import Progress
+from hapticdb.ingest.files import ImportProgress
 from hapticdb.kernels.surfaces.voxelize import brick_voxels, voxelize
 from hapticdb.mesh import MeshFile, Part, parse_in_process, read_file
 from hapticdb.store import base
@@ -415,7 +415,7 @@ def test_rows_do_not_depend_on_the_number_of_jobs(tmp_path: Path) -> None:
 
 
 def test_progress_grows_to_the_whole(tmp_path: Path, file: Path) -> None:
-    seen: list[Progress] = []
+    seen: list[ImportProgress] = []
     (report,) = hapticdb.import_files(tmp_path / "e.db", [file], small_options(), seen.append)
     assert [p.parts_done for p in seen] == list(range(1, 8))
     assert {(p.link, p.parts_total) for p in seen} == {(str(file), 7)}

@@ -19,7 +19,7 @@ import hapticdb
 from assemblies import Mesh, Rows, ball, left_behind, rows_of, small_options, write_obj
 from children import PATIENCE, child, until
 from hapticdb import GridOptions, ImportOptions
-from hapticdb.ingest.files import Progress
+from hapticdb.ingest.files import ImportProgress
 from hapticdb.resident.table import is_alive
 from hapticdb.store.sqlite.store import SQLiteStore
 
@@ -184,7 +184,7 @@ def test_an_error_out_of_the_progress_callback_keeps_what_is_committed(
     class StoppedError(Exception):
         pass
 
-    def stop(progress: Progress) -> None:
+    def stop(progress: ImportProgress) -> None:
         if progress.parts_done == n_parts:
             raise StoppedError
 
@@ -204,7 +204,7 @@ def test_a_later_file_of_an_interrupted_command_goes_in_when_it_is_run_again(
     ]
     hapticdb.import_files(tmp_path / "whole.db", files, small_options())
 
-    def stop(progress: Progress) -> None:
+    def stop(progress: ImportProgress) -> None:
         if progress.link.endswith("2.obj"):
             raise KeyboardInterrupt
 

@@ -8,7 +8,7 @@ import pytest
 
 from hapticdb.errors import FileError
 from hapticdb.grid import GridOptions
-from hapticdb.ingest.files import ImportOptions, Progress, import_files
+from hapticdb.ingest.files import ImportOptions, ImportProgress, import_files
 from hapticdb.ingest.layout import Bricks
 from hapticdb.ingest.voxelizing import bricks_of_triangles, merged_in_turn
 from hapticdb.kernels.surfaces import voxelize
@@ -77,14 +77,14 @@ def test_an_import_tells_the_share_of_a_part(
     tmp_path: Path, layout: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     told = threading.Event()
-    heard: list[Progress] = []
+    heard: list[ImportProgress] = []
 
     def slow(*given: object) -> "object":
         given[3](0.5)  # type: ignore[operator]
         assert told.wait(60)
         return Bricks(*voxelize.voxelize(HUGE, BITS))
 
-    def progress(now: Progress) -> None:
+    def progress(now: ImportProgress) -> None:
         heard.append(now)
         if now.share:
             told.set()

@@ -164,7 +164,7 @@ def test_a_small_first_frame_calibrates_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with make_scene(tmp_path / "e.db") as env:
-        monkeypatch.setattr("hapticdb.environment.calibrate", forbidden)
+        monkeypatch.setattr("hapticdb.query.figures.calibrate", forbidden)
         touch = env.touch(cloud(env, 300), middle(env))
         assert touch.query.strategy == "array"
         assert env.store.costs(machine_name()) is None

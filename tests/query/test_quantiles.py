@@ -249,9 +249,9 @@ def test_calibrated_figures_are_kept_for_this_machine(tmp_path: Path) -> None:
     model = env.calibrate()
     assert env.store.costs(machine_name()) == model.figures()
     with hapticdb.open(tmp_path / "e.db", read_only=True) as reader:
-        assert reader._statistics()[1] == model
+        assert reader._figures.both()[1] == model
         renewed = reader.calibrate()
-        assert reader._statistics()[1] == renewed
+        assert reader._figures.both()[1] == renewed
     assert env.store.costs(machine_name()) == model.figures()
 
 
@@ -259,7 +259,7 @@ def test_figures_that_are_not_to_be_kept_are_not(tmp_path: Path) -> None:
     env = make_scene(tmp_path / "e.db")
     model = env.calibrate(keep=False)
     assert env.store.costs(machine_name()) is None
-    assert env._statistics()[1] == model
+    assert env._figures.both()[1] == model
 
 
 # --- grouping by kept figures -------------------------------------------------------------------

@@ -39,7 +39,7 @@ from crashes import (  # noqa: F401 - fixtures among them
     url,
 )
 from hapticdb import Environment, PointShell
-from hapticdb.ingest.files import Progress
+from hapticdb.ingest.files import ImportProgress
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.private_server import PrivateServer
@@ -85,7 +85,7 @@ def test_an_import_goes_on_by_itself_when_the_server_comes_back(
 ) -> None:
     crashes = [Killer(n, delay, lambda: crash(server)) for n, delay in moments(2)]
 
-    def crash_soon(progress: Progress) -> None:
+    def crash_soon(progress: ImportProgress) -> None:
         for killer in crashes:
             killer(progress)
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hapticdb import check, transfer
-    from hapticdb.ingest.files import ProgressCallback
+    from hapticdb.ingest.files import ImportCallback
     from hapticdb.store.engines import BackupCallback
 
 _UNPRINTABLE = re.compile(
@@ -154,7 +154,7 @@ def compile_kernels(*purposes: str, files: Sequence[str] = ()) -> int:
 
 
 @contextmanager
-def import_bar() -> "Iterator[ProgressCallback | None]":
+def import_bar() -> "Iterator[ImportCallback | None]":
     """Show a bar with parts, voxels a second and time left; nothing where nobody looks."""
     if not sys.stderr.isatty():
         yield None
@@ -164,7 +164,7 @@ def import_bar() -> "Iterator[ProgressCallback | None]":
 
 
 @contextmanager
-def copy_bar(doing: str) -> "Iterator[transfer.ProgressCallback | None]":
+def copy_bar(doing: str) -> "Iterator[transfer.CopyCallback | None]":
     """Show a bar with objects, voxels a second and time left; nothing where nobody looks."""
     if not sys.stderr.isatty():
         yield None
@@ -184,7 +184,7 @@ def file_bar(doing: str) -> "Iterator[BackupCallback | None]":
 
 
 @contextmanager
-def check_bar(doing: str) -> "Iterator[check.ProgressCallback | None]":
+def check_bar(doing: str) -> "Iterator[check.CheckCallback | None]":
     """Show a bar with rows and time left; nothing where nobody looks."""
     if not sys.stderr.isatty():
         yield None

@@ -39,7 +39,7 @@ EVERY = 0.2
 """Seconds after which the share of a part that takes long is told again."""
 
 
-class Progress(NamedTuple):
+class ImportProgress(NamedTuple):
     """How far an import is: sent after each part, and five times a second while one takes long.
 
     share: of the part that is waited for, 0 to 1; 0 after a part.
@@ -52,7 +52,7 @@ class Progress(NamedTuple):
     share: float = 0.0
 
 
-ProgressCallback = Callable[[Progress], None]
+ImportCallback = Callable[[ImportProgress], None]
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ def import_files(
     url: str | os.PathLike[str],
     files: Sequence[str | os.PathLike[str]],
     options: ImportOptions | None = None,
-    progress: ProgressCallback | None = None,
+    progress: ImportCallback | None = None,
 ) -> list[FileReport]:
     """Import files into an environment, which is made when it does not exist.
 
@@ -166,7 +166,7 @@ def import_files(
     options : ImportOptions or None
         Units, grid, layout, jobs.
     progress : callable or None
-        Called after each part with a `Progress`.
+        Called after each part with a `ImportProgress`.
 
     Returns
     -------
@@ -247,7 +247,7 @@ def ingest_file(
     store: Store,
     mesh_file: MeshFile,
     options: ImportOptions,
-    progress: ProgressCallback | None = None,
+    progress: ImportCallback | None = None,
 ) -> FileReport:
     """Write those parts of a file that the environment does not hold yet.
 
@@ -292,7 +292,7 @@ def ingest_file(
 
     def tell(share: float) -> None:
         if progress is not None:
-            progress(Progress(mesh_file.link, n_done, n_parts, voxels, share))
+            progress(ImportProgress(mesh_file.link, n_done, n_parts, voxels, share))
 
     for obj, rows in _voxelized(still_missing(), mesh_file, store, options.unit, jobs, tell):
         n_done += 1

@@ -14,7 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.environment import Environment
 from hapticdb.errors import (
     ConnectionLostError,
-    ObjectNotFoundError,
     UsageError,
 )
 from hapticdb.kernels.resident import sweep as kernels
@@ -24,7 +23,7 @@ from hapticdb.query.frame import as_ids
 from hapticdb.resident.frames import Felt, Frames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
-from hapticdb.store.base import Keys, Object
+from hapticdb.store.base import Keys, Object, unknown_exclusion
 from hapticdb.sweeps.clearance import ClearanceSearch
 from hapticdb.sweeps.inside import enclosed_ids
 from hapticdb.sweeps.objects import Met, Runs, pairs_in_voxels, pairs_of_hits, tally
@@ -44,7 +43,7 @@ BLOCK_POINTS = 1 << 21
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-ProgressCallback = Callable[[int, int], None]
+SampleCallback = Callable[[int, int], None]
 """Called after each block with the samples done and their total."""
 
 
@@ -58,7 +57,7 @@ def sweep(
     clearance_limit: float | None = None,
     profile: bool = False,
     proportions: Proportions | None = None,
-    progress: ProgressCallback | None = None,
+    progress: SampleCallback | None = None,
 ) -> Swept:
     """Move a tool along a path and say what it hits, whatever the size of the environment.
 
@@ -118,7 +117,7 @@ class _Run:
         limit: float,
         profile: bool,  # noqa: FBT001 - private
         proportions: Proportions | None,
-        progress: ProgressCallback | None,
+        progress: SampleCallback | None,
     ) -> None:
         self.store = env.store
         self.grid = env.grid
@@ -155,10 +154,7 @@ class _Run:
         self.known = {obj.id: obj for obj in self.store.objects()}
         for i in residency.exclude.tolist():
             if i not in self.known:
-                raise ObjectNotFoundError(
-                    f"no object {i} in {self.store.url} to exclude; 'hapticdb objects "
-                    f"{self.store.url}' lists them"
-                )
+                raise unknown_exclusion(i, self.store.url)
         voxels = self.limit / self.grid.voxel_size
         self.search = ClearanceSearch(frames, voxels) if voxels > 0.0 else None
         self.along = ClearanceSearch(frames, voxels, self.n_windows) if self.is_profiled else None

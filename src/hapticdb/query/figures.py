@@ -1,0 +1,49 @@
+"""Statistics and costs of an opened database, which grouping by cost decides by."""
+
+from hapticdb.query.calibration import calibrate
+from hapticdb.query.cost_model import CostModel, machine_name
+from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+from hapticdb.store.base import Store
+
+
+class QueryFigures:
+    """The quantile vector and the cost model of a store, read or measured when first needed."""
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self._quantiles: QuantileVector | None = None
+        self._costs: CostModel | None = None
+
+    def both(self) -> tuple[QuantileVector, CostModel]:
+        """Quantile vector and cost model; a cost model is fitted in less than a second."""
+        if self._quantiles is None:
+            self._quantiles = QuantileVector.of(self._store, DEFAULT_RESOLUTION)
+        if not self._quantiles.n_rows:
+            return self._quantiles, CostModel.of_equal_parts()
+        if self._costs is None:
+            kept = self._store.costs(machine_name())
+            self._costs = CostModel.from_figures(kept) if kept else calibrate(self._store)
+        return self._quantiles, self._costs
+
+    def analyze(self) -> QuantileVector:
+        """Make the store's statistics anew, however fresh they are."""
+        self._store.analyze(DEFAULT_RESOLUTION, anew=True)
+        self._quantiles = QuantileVector.of(self._store, DEFAULT_RESOLUTION)
+        return self._quantiles
+
+    def calibrate(self, *, seed: int, keep: bool, cold: bool) -> CostModel:
+        """Measure the costs; see `hapticdb.environment.Environment.calibrate`."""
+        costs = calibrate(self._store, seed=seed, cold=cold)
+        if keep and not self._store.is_read_only:
+            self._store.save_costs(machine_name(), costs.figures())
+        self._costs = costs
+        return costs
+
+    def drop_statistics(self) -> None:
+        """Read the statistics again when they are needed next: the rows have changed."""
+        self._quantiles = None
+
+    def drop_empty_statistics(self) -> None:
+        """Read the statistics again if they are those of an environment without rows."""
+        if self._quantiles is not None and not self._quantiles.n_rows:
+            self._quantiles = None

@@ -10,11 +10,13 @@ import numba
 import numpy as np
 import pytest
 
+import capabilities
 import children
 import examples
 from hapticdb import PointShell
 from hapticdb.kernels.compiling import NAMES, compile_missing
 from hapticdb.pointshell.shell import fibonacci_sphere
+from installed import toy_is_installed  # noqa: F401 - a fixture
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 
 
@@ -48,7 +50,10 @@ def pytest_report_header() -> list[str]:
     where = f"real CAD from {folder}" if folder else "the sample stands in for real CAD"
     jit = "off" if numba.config.DISABLE_JIT else "on"
     servers = ", ".join(map(named, FOUND))
-    return [f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, {servers}, JIT {jit}"]
+    return [
+        f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, {servers}, JIT {jit}",
+        *capabilities.header(),
+    ]
 
 
 @pytest.fixture(autouse=True)

@@ -8,6 +8,7 @@ import psycopg
 import pytest
 
 import hapticdb
+from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import PATIENCE
 from hapticdb import Grid
 from hapticdb.query.frame import Strategy
@@ -17,13 +18,15 @@ from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.histogram import exact_histogram
 from hapticdb.store.postgres.session import Session
 from hapticdb.store.postgres.store import PostgresStore
-from hapticdb.testing import StoreContract, blob, floor_voxels, write_voxels
+from hapticdb.testing import EngineContract, StoreContract, blob, floor_voxels, write_voxels
 from servers import Place
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 
 
 class TestPostgresStore(StoreContract):
+    lacks = STORE_LACKS["PostgreSQL"]
+
     @pytest.fixture(autouse=True)
     def _place(self, place: Place) -> None:
         self.place = place
@@ -35,6 +38,17 @@ class TestPostgresStore(StoreContract):
 
     def reopen(self, store: Store) -> Store:
         return PostgresStore.open(store.url, read_only=True)
+
+
+class TestPostgresEngine(EngineContract):
+    lacks = ENGINE_LACKS["PostgreSQL"]
+
+    @pytest.fixture(autouse=True)
+    def _place(self, place: Place) -> None:
+        self.place = place
+
+    def url(self) -> str:
+        return self.place()
 
 
 @pytest.fixture

@@ -1,5 +1,6 @@
 """SQLite passes the contract, and what is only SQLite's."""
 
+import itertools
 import os
 import sqlite3
 import sys
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 
 import hapticdb
+from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import PATIENCE, child, exit_code
 from hapticdb import Grid
 from hapticdb.store.base import Layout, Store
@@ -19,12 +21,14 @@ from hapticdb.store.schema import FORMAT_VERSION
 from hapticdb.store.sqlite.migrations import CHECKED_VERSION
 from hapticdb.store.sqlite.pages import LAYER
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import StoreContract, blob, floor_voxels, write_voxels
+from hapticdb.testing import EngineContract, StoreContract, blob, floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 
 
 class TestSQLiteStore(StoreContract):
+    lacks = STORE_LACKS["SQLite"]
+
     @pytest.fixture(autouse=True)
     def _folder(self, tmp_path: Path) -> None:
         self.folder = tmp_path
@@ -34,6 +38,17 @@ class TestSQLiteStore(StoreContract):
 
     def reopen(self, store: Store) -> Store:
         return SQLiteStore.open(store.url, read_only=True)
+
+
+class TestSQLiteEngine(EngineContract):
+    lacks = ENGINE_LACKS["SQLite"]
+
+    @pytest.fixture(autouse=True)
+    def _folder(self, tmp_path: Path) -> None:
+        self.paths = (tmp_path / f"e{n}.db" for n in itertools.count())
+
+    def url(self) -> str:
+        return f"sqlite:///{next(self.paths)}"
 
 
 @pytest.fixture

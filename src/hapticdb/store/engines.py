@@ -10,7 +10,7 @@ of a server.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -68,7 +68,7 @@ class Engine(Protocol):
     """
 
     title: str
-    lacks: dict[Capability, str]
+    lacks: Mapping[Capability, str]
 
     def open(self, url: str, *, read_only: bool) -> Store:
         """Open an existing environment.

@@ -1,5 +1,8 @@
 """PostgreSQL as an engine: ``postgresql://...``, one schema an environment."""
 
+from collections.abc import Mapping
+from types import MappingProxyType
+
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.engines import Capability, Right
@@ -12,10 +15,12 @@ class PostgresEngine:
     """Environments on servers."""
 
     title = "PostgreSQL"
-    lacks: dict[Capability, str] = {  # noqa: RUF012 - nobody writes to it
-        "backup": " is on PostgreSQL, not a file: pg_dump copies it",
-        "restore": " is on PostgreSQL, not a file: pg_restore puts a copy into it",
-    }
+    lacks: Mapping[Capability, str] = MappingProxyType(
+        {
+            "backup": " is on PostgreSQL, not a file: pg_dump copies it",
+            "restore": " is on PostgreSQL, not a file: pg_restore puts a copy into it",
+        }
+    )
 
     def open(self, url: str, *, read_only: bool) -> Store:
         """Connect to an existing environment; ``?data=FOLDER`` starts its private server."""

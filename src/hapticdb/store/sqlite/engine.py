@@ -1,7 +1,9 @@
 """SQLite as an engine: paths and ``sqlite:///path``, one file an environment."""
 
 import re
+from collections.abc import Mapping
 from pathlib import Path
+from types import MappingProxyType
 
 from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
@@ -19,9 +21,9 @@ class SQLiteEngine:
     """Environments in files."""
 
     title = "SQLite"
-    lacks: dict[Capability, str] = {  # noqa: RUF012 - nobody writes to it
-        "grant": ": a file has no roles: use the file system's rights"
-    }
+    lacks: Mapping[Capability, str] = MappingProxyType(
+        {"grant": ": a file has no roles: use the file system's rights"}
+    )
 
     def open(self, url: str, *, read_only: bool) -> Store:
         """Open an existing file."""

@@ -1,0 +1,55 @@
+"""What every engine must pass: the contract suites, and scenes with a closed form.
+
+An engine's tests subclass `StoreContract` and say how a store is made and opened again::
+
+    class TestMyStore(StoreContract):
+        lacks = frozenset({"caches", "server"})
+
+        def make(self, grid, layout, name="environment"):
+            return MyStore.create(..., grid, layout)
+
+        def reopen(self, store):
+            return MyStore.open(store.url)
+
+They subclass `EngineContract`, too, for what an engine does with URLs. `lacks` names the
+capabilities that the engine has not: the tests of those are skipped, each with its reason, and
+every other capability is tested. docs/engines.md leads from the first line to a tested engine.
+
+Needs pytest.
+"""
+
+from hapticdb.testing.capabilities import STORE_CAPABILITIES, CapabilitiesContract
+from hapticdb.testing.engines import ENGINE_CAPABILITIES, EngineContract
+from hapticdb.testing.lifecycle import LifecycleContract
+from hapticdb.testing.objects import ObjectsContract
+from hapticdb.testing.rows import RowsContract
+from hapticdb.testing.scenes import KINDS, blob, floor_voxels, voxel_object, write_voxels
+from hapticdb.testing.statistics import StatisticsContract
+from hapticdb.testing.watching import WatchContract, is_noticed
+
+__all__ = [
+    "ENGINE_CAPABILITIES",
+    "KINDS",
+    "STORE_CAPABILITIES",
+    "EngineContract",
+    "StoreContract",
+    "blob",
+    "floor_voxels",
+    "is_noticed",
+    "voxel_object",
+    "write_voxels",
+]
+
+
+class StoreContract(
+    RowsContract,
+    ObjectsContract,
+    LifecycleContract,
+    StatisticsContract,
+    WatchContract,
+    CapabilitiesContract,
+):
+    """Tests of one engine's store, over every layout and curve.
+
+    Subclass, override `make` and `reopen`, and name in `lacks` what the engine lacks.
+    """

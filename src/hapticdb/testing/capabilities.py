@@ -1,0 +1,97 @@
+"""What only some engines have: each is tested where it is claimed."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hapticdb.grid import Grid
+from hapticdb.store.base import (
+    Frame,
+    HasGroupingThreshold,
+    Store,
+    SupportsCaches,
+    SupportsServer,
+    SupportsStatement,
+    SupportsWatch,
+)
+from hapticdb.testing.case import StoreCase
+from hapticdb.testing.scenes import (
+    everything,
+)
+
+STORE_CAPABILITIES: dict[str, Any] = {
+    "statement": SupportsStatement,
+    "caches": SupportsCaches,
+    "watch": SupportsWatch,
+    "server": SupportsServer,
+    "grouping threshold": HasGroupingThreshold,
+}
+"""What only some stores can do, by the words of `StoreContract.lacks`: a protocol each."""
+
+
+class CapabilitiesContract(StoreCase):
+    """The capabilities but `watch`."""
+
+    @pytest.mark.parametrize("capability", sorted(STORE_CAPABILITIES))
+    def test_the_engine_has_what_it_does_not_say_to_lack(self, capability: str) -> None:
+        """And lacks what it says to lack, so that no test is skipped without need."""
+        store = self.make(Grid(0.01, (0, 0, 0), 5), "brick")
+        has_it = isinstance(store, STORE_CAPABILITIES[capability])
+        store.discard()
+        assert has_it != (capability in self.lacks)
+
+    def test_figure_3_finds_the_hits_and_leaves_out_the_excluded(self, store: Store) -> None:
+        """EXISTS and force() inside the engine, where it can."""
+        self.need("statement")
+        assert isinstance(store, SupportsStatement)
+        both = np.array([[22, 20, 20], [16, 20, 20], [60, 60, 60]], dtype=np.int64)
+        keys = store.grid.encode(both)
+        if store.layout == "brick":
+            places = both & 7
+            order = Grid(1.0, (0, 0, 0), 3).encode(places)
+            keys = (keys >> 9 << 9) | order
+        placed = np.zeros((4, 6))
+        placed[:3, :3] = store.grid.centers(both) - np.array([0.0, 0.0, 0.002])
+        placed[:3, 5] = 1.0
+        none = np.empty(0, dtype=np.int64)
+        frame = Frame(placed, keys, 1000.0, none)
+        ordinals, ids = store.statement_hits(frame)
+        assert sorted(zip(ordinals.tolist(), ids.tolist(), strict=True)) == [(0, 1), (0, 2), (1, 1)]
+        np.testing.assert_allclose(store.statement(frame)[:3], [0, 0, 4.0])
+        without = frame._replace(exclude=np.array([1], dtype=np.int64))
+        np.testing.assert_allclose(store.statement(without)[:3], [0, 0, 2.0])
+        nothing = frame._replace(exclude=np.array([1, 2], dtype=np.int64))
+        assert not store.statement(nothing).any()
+        assert not len(store.statement_hits(nothing)[0])
+
+    def test_caches_are_emptied_and_limited_without_a_row_lost(self, store: Store) -> None:
+        """The same rows, from less memory."""
+        self.need("caches")
+        assert isinstance(store, SupportsCaches)
+        before = everything(store)
+        store.limit_cache(1 << 20)
+        store.drop_caches()
+        for found, expected in zip(everything(store), before, strict=True):
+            np.testing.assert_array_equal(found, expected)
+
+    def test_a_loop_inside_the_server_scans_the_same_rows(
+        self, store: Store, plain: dict[int, set[int]]
+    ) -> None:
+        """One range at a time, and many of them."""
+        self.need("server")
+        assert isinstance(store, SupportsServer)
+        known = np.array(sorted(plain), dtype=np.int64)
+        lows, highs = known[::9].copy(), known[4::9].copy()
+        lows = lows[: len(highs)].copy()
+        pairs = zip(store.looping().scan(lows, highs), store.scan(lows, highs), strict=True)
+        for found, expected in pairs:
+            np.testing.assert_array_equal(found, expected)
+        assert store.server_cache() > 0
+
+    def test_a_grouping_threshold_is_a_number_of_keys(self, store: Store) -> None:
+        """Or None, where grouping never pays."""
+        self.need("grouping threshold")
+        assert isinstance(store, HasGroupingThreshold)
+        threshold = store.grouping_threshold
+        assert threshold is None or threshold > 1

@@ -1,0 +1,162 @@
+"""URLs of an engine: opened, made, named, refused."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from hapticdb.errors import (
+    EnvironmentExistsError,
+    EnvironmentNotFoundError,
+    UsageError,
+)
+from hapticdb.grid import Grid
+from hapticdb.store.connect import backup_environment, grant, open_store, restore_environment
+from hapticdb.store.engines import (
+    Engine,
+    SupportsBackup,
+    SupportsFirstFindings,
+    SupportsGrant,
+    engine_of,
+)
+from hapticdb.testing.scenes import (
+    blob,
+    everything,
+    floor_voxels,
+    write_voxels,
+)
+
+ENGINE_CAPABILITIES: dict[str, Any] = {
+    "grant": SupportsGrant,
+    "backup": SupportsBackup,
+    "first findings": SupportsFirstFindings,
+}
+"""What only some engines can do with a URL, by the words of `EngineContract.lacks`."""
+
+
+class EngineContract:
+    """Tests of what one engine does with URLs. Subclass and override `url`."""
+
+    lacks: frozenset[str] = frozenset()
+    """Keys of `ENGINE_CAPABILITIES`; tests of these capabilities are skipped."""
+    grid = Grid(0.01, (0, 0, 0), 6)
+
+    def url(self) -> str:
+        """URL of an environment that does not exist yet; another one at each call."""
+        raise NotImplementedError
+
+    def need(self, capability: str) -> None:
+        """Skip a test where the engine says that it lacks a capability."""
+        if capability in self.lacks:
+            pytest.skip(f"{type(self).__name__}: the engine lacks the capability {capability!r}")
+
+    def make(self) -> str:
+        """URL of a small environment, which is closed."""
+        url = self.url()
+        store = self.engine().create(url, self.grid, "brick")
+        write_voxels(store, floor_voxels(self.grid), "floor")
+        store.close()
+        return url
+
+    def engine(self) -> Engine:
+        """Engine that the URLs lead to."""
+        return engine_of(self.url())
+
+    def test_what_was_made_is_opened(self) -> None:
+        """To read only, and to write."""
+        url = self.url()
+        assert not self.engine().exists(url)
+        self.engine().create(url, self.grid, "voxel").close()
+        assert self.engine().exists(url)
+        for read_only in (True, False):
+            store = open_store(url, read_only=read_only)
+            assert (store.grid, store.layout) == (self.grid, "voxel")
+            assert store.is_read_only == read_only
+            store.close()
+
+    def test_what_is_not_there_is_not_opened(self) -> None:
+        """And not made by the way."""
+        url = self.url()
+        with pytest.raises(EnvironmentNotFoundError):
+            self.engine().open(url, read_only=True)
+        assert not self.engine().exists(url)
+
+    def test_nothing_is_made_twice(self) -> None:
+        """What is there stays."""
+        url = self.make()
+        with pytest.raises(EnvironmentExistsError):
+            self.engine().create(url, self.grid, "brick")
+        store = self.engine().open(url, read_only=True)
+        assert [obj.name for obj in store.objects()] == ["floor"]
+        store.close()
+
+    def test_another_environment_stands_beside(self) -> None:
+        """Of its own name, at a URL that leads to it alone."""
+        url = self.make()
+        other = self.engine().beside(url, f"{self.engine().name_of(url)}_beside")
+        assert self.engine().name_of(other) == f"{self.engine().name_of(url)}_beside"
+        assert not self.engine().exists(other)
+        store, first = self.engine().create(other, self.grid, "brick"), open_store(url)
+        assert store.identity != first.identity
+        first.close()
+        store.discard()
+        assert not self.engine().exists(other)
+        assert self.engine().exists(url)
+
+    @pytest.mark.parametrize("capability", sorted(ENGINE_CAPABILITIES))
+    def test_the_engine_has_what_it_does_not_say_to_lack(self, capability: str) -> None:
+        """And lacks what it says to lack, so that no test is skipped without need."""
+        has_it = isinstance(self.engine(), ENGINE_CAPABILITIES[capability])
+        assert has_it != (capability in self.lacks)
+
+    def test_what_the_engine_lacks_is_refused_with_a_reason(self) -> None:
+        """Its own words follow the URL."""
+        url, engine = self.make(), self.engine()
+        refusals: dict[str, Callable[[], object]] = {
+            "grant": lambda: grant(url, "anna", "viewer"),
+            "backup": lambda: backup_environment(url, "copy.db"),
+            "restore": lambda: restore_environment("copy.db", url),
+        }
+        has_backup = isinstance(engine, SupportsBackup)
+        wanted = {"grant"} - ({"grant"} if isinstance(engine, SupportsGrant) else set())
+        assert set(engine.lacks) == wanted | (set() if has_backup else {"backup", "restore"})
+        for capability, words in engine.lacks.items():
+            with pytest.raises(UsageError) as refused:
+                refusals[capability]()
+            assert str(refused.value).endswith(words)
+
+    def test_a_right_is_given_to_a_role_that_is_there(self) -> None:
+        """No other role is made by the way."""
+        self.need("grant")
+        engine = self.engine()
+        assert isinstance(engine, SupportsGrant)
+        with pytest.raises(UsageError, match="no role"):
+            engine.grant(self.make(), "nobody of that name", "viewer")
+
+    def test_a_copy_holds_the_same_and_is_put_back(self) -> None:
+        """Whole, though the environment has changed since."""
+        self.need("backup")
+        engine = self.engine()
+        assert isinstance(engine, SupportsBackup)
+        url, copy = self.make(), self.url()
+        before = open_store(url)
+        expected = everything(before)
+        report = engine.back_up(url, copy, replace=False, progress=None)
+        assert (report.revision, report.objects) == (1, 1)
+        write_voxels(before, blob(1, (20, 20, 20)), "later")
+        before.close()
+        assert engine.restore(copy, url, progress=None).revision == 1
+        for place in (copy, url):
+            store = open_store(place, read_only=True)
+            assert [obj.name for obj in store.objects()] == ["floor"]
+            for found, wanted in zip(everything(store), expected, strict=True):
+                np.testing.assert_array_equal(found, wanted)
+            store.close()
+
+    def test_a_sound_environment_has_no_findings_before_it_is_opened(self) -> None:
+        """Damage is each engine's own: its tests make some."""
+        self.need("first findings")
+        engine = self.engine()
+        assert isinstance(engine, SupportsFirstFindings)
+        assert engine.findings_before_opening(self.make()) == []

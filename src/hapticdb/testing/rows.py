@@ -1,0 +1,86 @@
+"""Rows: looked up, scanned, counted, by key and by object."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from hapticdb.grid import Grid
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.store.base import (
+    Keys,
+    Store,
+)
+from hapticdb.testing.case import StoreCase
+from hapticdb.testing.scenes import (
+    EVERYWHERE,
+    blob,
+    kind,
+)
+
+
+class RowsContract(StoreCase):
+    """What a frame asks."""
+
+    def test_lookup_finds_every_row_of_a_key_and_no_other(
+        self, store: Store, plain: dict[int, set[int]]
+    ) -> None:
+        """Both forms of asking for keys."""
+        keys = np.arange(0, max(plain) + 3, dtype=np.int64)[::3].copy()
+        expected = [(k, i) for k in keys.tolist() for i in sorted(plain.get(k, ()))]
+        asking: list[Callable[[Keys], object]] = [store.lookup, store.lookup_each]
+        for ask in asking:
+            rows = ask(keys)
+            assert sorted(zip(rows.keys.tolist(), rows.ids.tolist(), strict=True)) == expected  # type: ignore[attr-defined]
+
+    def test_scan_reads_closed_ranges_in_order(
+        self, store: Store, plain: dict[int, set[int]]
+    ) -> None:
+        """Also ranges of one key, and many at once."""
+        known = sorted(plain)
+        cuts = np.array(known, dtype=np.int64)
+        lows, highs = cuts[::5].copy(), cuts[2::5].copy()
+        lows = lows[: len(highs)].copy()
+        expected = [
+            (k, i)
+            for lo, hi in zip(lows.tolist(), highs.tolist(), strict=True)
+            for k in known
+            if lo <= k <= hi
+            for i in sorted(plain[k])
+        ]
+        rows = store.scan(lows, highs)
+        assert rows.keys.tolist() == sorted(rows.keys.tolist())
+        assert sorted(zip(rows.keys.tolist(), rows.ids.tolist(), strict=True)) == sorted(expected)
+        assert store.count(lows, highs) == len(expected)
+
+    def test_occupancy_returns_as_written(self, store: Store) -> None:
+        """Each brick's 512 bits."""
+        if store.layout == "voxel":
+            assert not store.lookup(np.zeros(1, dtype=np.int64)).occupancy.size
+            return
+        written = rows_of_voxels(blob(1, (20, 20, 20)), *kind(store))
+        rows = store.scan(written.keys[:1].copy(), written.keys[-1:].copy())
+        mine = rows.occupancy.reshape(-1, 64)[rows.ids == 1]
+        np.testing.assert_array_equal(mine, written.occupancy.reshape(-1, 64))
+
+    def test_nothing_asked_is_nothing_found(self, store: Store) -> None:
+        """Empty arrays cannot be bound by every engine."""
+        none = np.empty(0, dtype=np.int64)
+        assert len(store.lookup(none)) == len(store.scan(none, none)) == 0
+        assert len(store.lookup_each(none)) == store.count(none, none) == 0
+
+    def test_rows_of_leaves_the_others_out(self, store: Store) -> None:
+        """Of two objects that overlap."""
+        written = rows_of_voxels(blob(2, (24, 20, 20)), *kind(store))
+        rows = store.rows_of(2, *EVERYWHERE)
+        np.testing.assert_array_equal(rows.keys, written.keys)
+        np.testing.assert_array_equal(rows.occupancy, written.occupancy)
+        assert set(rows.ids.tolist()) == {2}
+        assert not len(store.rows_of(3, *EVERYWHERE))
+
+    def test_an_empty_environment_answers(self) -> None:
+        """No rows, no objects, no revision."""
+        store = self.make(Grid(0.01, (0, 0, 0), 5), "brick")
+        assert store.revision() == store.size().rows == len(store.objects()) == 0
+        assert not list(store.changes())
+        assert store.quantiles(10)[1] == 0
+        store.discard()

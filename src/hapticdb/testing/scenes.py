@@ -1,0 +1,79 @@
+"""Scenes with a closed form, and what tests ask of a store again and again."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import CurveName, Grid
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.grouping import object_ranges
+from hapticdb.store.base import Covering, Layout, Object, Rows, Store
+
+KINDS: list[tuple[Layout, CurveName]] = [
+    ("voxel", "z"),
+    ("voxel", "hilbert"),
+    ("voxel", "lexicographic"),
+    ("brick", "z"),
+    ("brick", "hilbert"),
+]
+"""Every layout with every curve that it can have."""
+EVERYWHERE = [np.array([bound], dtype=np.int64) for bound in (0, 2**62)]
+"""Lows and highs of one range that holds every key."""
+
+
+def write_voxels(store: Store, ijk: NDArray[np.int64], name: str = "voxels") -> int:
+    """Write voxels (n, 3) as an object of no file; returns its id."""
+    return store.add(voxel_object(store.grid, ijk, name), rows_of_voxels(ijk, *kind(store)))
+
+
+def voxel_object(grid: Grid, ijk: NDArray[np.int64], name: str = "voxels") -> Object:
+    """Record of an object made of voxels (n, 3)."""
+    bounds = np.array(grid.origin) + grid.voxel_size * np.stack([ijk.min(0), ijk.max(0) + 1])
+    return Object(
+        name=name,
+        link="made",
+        digest=f"{len(ijk)} voxels",
+        transform=np.eye(4),
+        voxels=len(ijk),
+        bounds=bounds,
+        attributes={"made": True},
+    )
+
+
+def floor_voxels(grid: Grid, depth: int = 8, width: int = 32) -> NDArray[np.int64]:
+    """Voxels (n, 3) of a solid floor: its top is the plane between k = side/2 - 1 and side/2."""
+    middle = grid.side // 2
+    half = min(width // 2, middle)
+    across = np.arange(middle - half, middle + half)
+    down = np.arange(max(middle - depth, 0), middle)
+    return np.stack(np.meshgrid(across, across, down, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def blob(seed: int, center: tuple[int, int, int], radius: int = 8) -> NDArray[np.int64]:
+    """Distinct voxels (n, 3) around a centre: dense inside, random at the rim."""
+    rng = np.random.default_rng(seed)
+    span = np.arange(-radius, radius + 1)
+    offsets = np.stack(np.meshgrid(span, span, span, indexing="ij"), axis=-1).reshape(-1, 3)
+    distance = np.linalg.norm(offsets, axis=1)
+    inside = distance < rng.uniform(radius / 2, radius, len(offsets))
+    found: NDArray[np.int64] = offsets[inside] + np.array(center)
+    return found
+
+
+def kind(store: Store) -> tuple[Grid, Layout]:
+    """Grid and layout of a store: what rows are made with."""
+    return store.grid, store.layout
+
+
+def covering(store: Store) -> Covering:
+    """What tells a write where the rows of an object are."""
+
+    def ranges(obj: Object) -> list[tuple[int, int]]:
+        found = object_ranges(store.grid, store.layout, obj.bounds)
+        return list(zip(found.lows.tolist(), found.highs.tolist(), strict=True))
+
+    return ranges
+
+
+def everything(store: Store) -> Rows:
+    """All rows of a store."""
+    return store.scan(*EVERYWHERE)

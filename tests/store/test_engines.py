@@ -1,0 +1,116 @@
+"""A URL leads to its engine: those of this package, and those that others install."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import os
+import sys
+from pathlib import Path
+
+import pytest
+import trimesh
+
+import hapticdb
+from children import finished
+from command_line import Run, boxes, poses, refused, run  # noqa: F401 - fixtures
+from hapticdb import UsageError
+from hapticdb.store.engines import BUILT_IN, engine_of
+from hapticdb.store.urls import scheme_of
+from installed import PAGE, install_toy
+
+ROOT = Path(__file__).parent.parent.parent
+CONTRACT, USE = [text for kind, text in PAGE if kind == "python"]
+
+
+@pytest.mark.parametrize(
+    ("url", "scheme"),
+    [
+        ("car.db", ""),
+        ("sqlite:///car.db", "sqlite"),
+        ("PostgreSQL://host/plant", "postgresql"),
+        ("memory://x?y=z://", "memory"),
+    ],
+)
+def test_a_scheme_stands_before_its_slashes(url: str, scheme: str) -> None:
+    assert scheme_of(url) == scheme
+
+
+def test_every_engine_of_this_package_is_found_by_its_schemes(tmp_path: Path) -> None:
+    assert engine_of("car.db") is engine_of("sqlite:///car.db") is engine_of(tmp_path)
+    assert engine_of("postgres://host/plant") is engine_of("postgresql:///plant")
+    titles = {scheme: engine_of(f"{scheme}:///x").title for scheme in BUILT_IN}
+    assert titles == {"sqlite": "SQLite", "postgresql": "PostgreSQL", "postgres": "PostgreSQL"}
+
+
+def test_a_scheme_that_no_engine_has_is_told() -> None:
+    for url in ("memory://x", "http://host/x", "://x"):
+        with pytest.raises(UsageError, match=r"give a path, sqlite:///path, or postgresql://"):
+            hapticdb.open(url)
+
+
+def test_a_file_is_opened_without_any_server_driver(tmp_path: Path) -> None:
+    """Nor is the kernels' compiler loaded to ask whether one is there."""
+    script = (
+        "import sys; from hapticdb.store import connect;"
+        f"assert not connect.exists({str(tmp_path / 'no.db')!r});"
+        "print(*sys.modules)"
+    )
+    loaded = finished([sys.executable, "-c", script], check=True).stdout.split()
+    assert "apsw" in loaded
+    assert not {"psycopg", "numba", "pytest"} & set(loaded)
+
+
+def test_an_engine_whose_driver_is_missing_says_what_brings_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    with pytest.raises(
+        hapticdb.MissingExtraError, match=r"pip install 'hapticdb\[postgres\]'"
+    ) as e:
+        hapticdb.open("postgresql://me:secret@host/plant")
+    assert "secret" not in str(e.value)
+
+
+@pytest.mark.usefixtures("toy_is_installed")
+def test_an_installed_engine_is_used_from_the_command_line(run: Run, tmp_path: Path) -> None:
+    """Imported into, listed, touched and checked, by its URL."""
+    boxes(tmp_path / "bracket.glb")
+    trimesh.creation.icosphere(radius=0.02).export(tmp_path / "probe.stl")
+    url = f"memory://{tmp_path.name}-line"
+    code, _, err = run("import", url, "bracket.glb", "--voxel-size", "0.01")
+    assert code == 0, err
+    assert len(run("objects", url, "--json")[1].splitlines()) == 3
+    where = poses(tmp_path / "path.csv", (0.0, 0.0, 0.055))
+    code, out, err = run("touch", url, "--tool", "probe.stl", "--poses", where, "--json")
+    assert code == 0, err
+    assert out.count("force") >= 1
+    assert run("check", url)[0] == 0
+    assert run("copy", url, "copy.db")[0] == 0
+    assert run("diff", url, "copy.db")[0] == 0
+    refused(run("grant", url, "anna", "--as", "viewer"), "only this process can reach it")
+    refused(run("backup", url, "other.db"), "hapticdb copy")
+    refused(run("backup", "copy.db", url), "is on memory, not a file")
+
+
+@pytest.mark.usefixtures("toy_is_installed")
+def test_a_pool_lends_environments_of_an_installed_engine(tmp_path: Path) -> None:
+    url = f"memory://{tmp_path.name}-pool"
+    hapticdb.create(url, hapticdb.Grid(0.01, (0, 0, 0), 5)).close()
+    with hapticdb.Pool(url, size=2) as pool, pool.environment() as one, pool.environment() as two:
+        assert one.store.identity is two.store.identity
+
+
+def test_the_page_shows_the_contract_that_the_toy_passes() -> None:
+    assert (ROOT / "tests" / "store" / "test_contract_memory.py").read_text() == CONTRACT
+
+
+def test_what_the_page_says_runs(tmp_path: Path) -> None:
+    """The entry point in a fresh process, and the page's last block."""
+    install_toy(tmp_path)
+    boxes(tmp_path / "bracket.glb", count=1)
+    trimesh.creation.icosphere(radius=0.06).export(tmp_path / "probe.stl")
+    ways = os.pathsep.join([str(tmp_path), str(ROOT / "tests"), os.environ.get("PYTHONPATH", "")])
+    done = finished(
+        [sys.executable, "-c", USE], cwd=tmp_path, env={**os.environ, "PYTHONPATH": ways}
+    )
+    assert done.returncode == 0, done.stderr
+    assert "box0" in done.stdout

@@ -1,0 +1,366 @@
+"""The smallest engine: environments in this process's memory, opened by ``memory://name``.
+
+docs/engines.md leads here. Every commit makes a new, immutable `State`, so that a snapshot is a
+reference to one. It has what each engine must have, and none of the capabilities that only some
+engines have.
+"""
+
+# ruff: noqa: ARG002 - a store takes what the protocol gives, needed or not
+
+import contextlib
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from functools import cached_property
+from threading import Lock
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from hapticdb.errors import (
+    DatabaseError,
+    EnvironmentExistsError,
+    EnvironmentNotFoundError,
+    ReadOnlyError,
+)
+from hapticdb.grid import Grid
+from hapticdb.store.base import (
+    NO_OCCUPANCY,
+    NO_ROWS,
+    Change,
+    Covering,
+    Freshness,
+    Histogram,
+    Keys,
+    Layout,
+    Object,
+    Rows,
+    Size,
+    Store,
+    check_thread,
+    check_unwritten,
+    no_object,
+    present_already,
+    this_thread,
+    touched_ranges,
+)
+from hapticdb.store.believed import rows_crc
+from hapticdb.store.engines import Capability
+
+
+class State:
+    """What an environment holds at one revision; never changed."""
+
+    def __init__(
+        self,
+        objects: Mapping[int, tuple[Object, Rows]],
+        changes: tuple[Change, ...] = (),
+        removed: frozenset[tuple[str, str]] = frozenset(),
+    ) -> None:
+        self.objects = objects
+        self.changes = changes
+        self.removed = removed
+
+    @property
+    def revision(self) -> int:
+        return len(self.changes)
+
+    @cached_property
+    def rows(self) -> Rows:
+        """Rows of all objects, in order of key and id."""
+        parts = [rows for _, rows in self.objects.values() if len(rows)]
+        if not parts:
+            return NO_ROWS
+        keys = np.concatenate([part.keys for part in parts])
+        ids = np.concatenate([part.ids for part in parts])
+        order = np.lexsort((ids, keys))
+        bits = np.concatenate([part.occupancy for part in parts])
+        return picked(Rows(keys, ids, bits), order)
+
+
+def picked(rows: Rows, which: Keys) -> Rows:
+    """Rows by their places in a batch."""
+    if not len(which):
+        return NO_ROWS
+    bits = NO_OCCUPANCY
+    if rows.occupancy.size:
+        bits = np.frombuffer(rows.occupancy.reshape(-1, 64)[which].tobytes(), np.uint8)
+    return Rows(rows.keys[which], rows.ids[which], bits)
+
+
+class Contents:
+    """One environment: its grid, its newest state, and what is kept about it."""
+
+    def __init__(self, name: str, grid: Grid, layout: Layout) -> None:
+        self.name = name
+        self.grid = grid
+        self.layout = layout
+        self.state = State({})
+        self.n_ids = 0
+        self.histograms: dict[int, tuple[int, Histogram]] = {}
+        self.costs: dict[str, Mapping[str, float]] = {}
+        self.write_lock = Lock()
+
+
+class MemoryStore:
+    """One opened environment."""
+
+    engine = "memory 1.0"
+
+    def __init__(self, contents: Contents, url: str, *, read_only: bool) -> None:
+        self._contents = contents
+        self.url = url
+        self.name = contents.name
+        self.grid = contents.grid
+        self.layout = contents.layout
+        self.is_read_only = read_only
+        self.identity = contents
+        self.is_closed = False
+        self._thread = this_thread()
+        self._snapshot: State | None = None
+        self._depth = 0
+        self._seen = -1
+
+    def close(self) -> None:
+        self.is_closed = True
+
+    def give_to(self, thread: int) -> None:
+        self._thread = thread
+
+    def discard(self) -> None:
+        if not self._contents.state.revision:
+            ENVIRONMENTS.pop(self.name, None)
+        self.close()
+
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        if self._depth == 0:
+            self._snapshot = self._state()
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            if self._depth == 0:
+                self._snapshot = None
+
+    def _state(self) -> State:
+        """What a read sees: the newest state, or the snapshot's."""
+        self._check()
+        state = self._snapshot or self._contents.state
+        self._seen = state.revision
+        return state
+
+    def _check(self) -> None:
+        check_thread(self._thread, self.url)
+        if self.is_closed:
+            raise DatabaseError(f"{self.url} has been closed: open it again")
+
+    def version(self) -> int:
+        return self._seen
+
+    def revision(self) -> int:
+        return self._state().revision
+
+    # -- rows --------------------------------------------------------------------------------
+
+    def lookup(self, keys: Keys) -> Rows:
+        rows = self._state().rows
+        return picked(rows, np.flatnonzero(np.isin(rows.keys, keys)))
+
+    def lookup_each(self, keys: Keys) -> Rows:
+        return self.lookup(keys)
+
+    def scan(self, lows: Keys, highs: Keys) -> Rows:
+        rows = self._state().rows
+        starts = np.searchsorted(rows.keys, lows)
+        ends = np.searchsorted(rows.keys, highs, side="right")
+        pairs = zip(starts.tolist(), ends.tolist(), strict=True)
+        return picked(rows, np.concatenate([[], *(np.arange(*pair) for pair in pairs)]).astype(int))
+
+    def count(self, lows: Keys, highs: Keys) -> int:
+        return len(self.scan(lows, highs))
+
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
+        rows = self.scan(lows, highs)
+        return picked(rows, np.flatnonzero(rows.ids == object_id))
+
+    def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
+        rows = self._state().rows
+        later = (rows.keys > key) | ((rows.keys == key) & (rows.ids > object_id))
+        return picked(rows, np.flatnonzero(later)[:limit])
+
+    # -- objects -----------------------------------------------------------------------------
+
+    def objects(self) -> list[Object]:
+        objects = self._state().objects
+        return [objects[object_id][0] for object_id in sorted(objects)]
+
+    def object(self, object_id: int) -> Object:
+        objects = self._state().objects
+        if object_id not in objects:
+            raise no_object(object_id, self.url)
+        return objects[object_id][0]
+
+    def removed(self, link: str) -> set[str]:
+        return {name for of_link, name in self._state().removed if of_link == link}
+
+    def changes(self, since: int = 0) -> Iterator[Change]:
+        yield from self._state().changes[since:]
+
+    def loading(self) -> contextlib.AbstractContextManager[None]:
+        return contextlib.nullcontext()
+
+    def add(self, record: Object, rows: Rows) -> int:
+        with self._contents.write_lock:
+            state = self._newest()
+            part = (record.link, record.name)
+            if any((known.link, known.name) == part for known, _ in state.objects.values()):
+                raise present_already(record, self.url)
+            is_free = record.id > 0 and record.id not in state.objects
+            object_id = record.id if is_free else self._contents.n_ids + 1
+            self._contents.n_ids = max(self._contents.n_ids, object_id)
+            self._commit("add", object_id, rows.keys, replace(record, id=object_id), rows)
+        return object_id
+
+    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+        with self._contents.write_lock:
+            known, old = self._known(record.id)
+            check_unwritten(record, known, self.url)
+            touched = np.concatenate([old.keys, rows.keys])
+            self._commit("move", record.id, touched, record, rows)
+
+    def remove(self, object_id: int, covering: Covering) -> None:
+        with self._contents.write_lock:
+            _, old = self._known(object_id)
+            self._commit("remove", object_id, old.keys, None, NO_ROWS)
+
+    def _newest(self) -> State:
+        """What a write begins from."""
+        self._check_writable()
+        return self._contents.state
+
+    def _check_writable(self) -> None:
+        self._check()
+        if self.is_read_only:
+            raise ReadOnlyError(f"{self.url} was opened to read: open it without read_only")
+
+    def _known(self, object_id: int) -> tuple[Object, Rows]:
+        objects = self._newest().objects
+        if object_id not in objects:
+            raise no_object(object_id, self.url)
+        return objects[object_id]
+
+    def _commit(
+        self,
+        action: Literal["add", "move", "remove"],
+        object_id: int,
+        touched: Keys,
+        record: Object | None,
+        rows: Rows,
+    ) -> None:
+        """Put the next state in place of the newest. The write lock is held."""
+        state = self._contents.state
+        revision = state.revision + 1
+        objects, removed = dict(state.objects), set(state.removed)
+        if record is None:
+            gone = objects.pop(object_id)[0]
+            removed.add((gone.link, gone.name))
+        else:
+            written = replace(record, revision=revision, rows_crc=rows_crc(rows))
+            ids = np.full(len(rows), object_id, np.int64)
+            objects[object_id] = (written, Rows(rows.keys, ids, rows.occupancy))
+            removed.discard((record.link, record.name))
+        ranges = touched_ranges(self.grid, self.layout, touched)
+        change = Change(revision, action, object_id, ranges)
+        self._contents.state = State(objects, (*state.changes, change), frozenset(removed))
+
+    # -- statistics --------------------------------------------------------------------------
+
+    def size(self) -> Size:
+        rows = self._state().rows
+        n_bytes = sum(column.nbytes for column in rows)
+        return Size(len(rows), n_bytes, 1 + n_bytes // 8192)
+
+    def quantiles(self, resolution: int) -> Histogram:
+        state = self._state()
+        kept = self._contents.histograms.get(resolution)
+        if kept and kept[0] == state.revision:
+            return kept[1]._replace(source="kept")
+        keys = state.rows.keys
+        if not len(keys):
+            return Histogram(np.zeros(2, np.int64), 0, "computed")
+        ranks = -(-np.arange(resolution + 1) * len(keys) // resolution)
+        return Histogram(keys[np.maximum(ranks, 1) - 1], len(keys), "computed")
+
+    def freshness(self, resolution: int) -> Freshness:
+        state = self._state()
+        kept = self._contents.histograms.get(resolution)
+        since = kept[0] if kept else 0
+        written = sum(obj.voxels for obj, _ in state.objects.values() if obj.revision > since)
+        return Freshness(since if kept else None, state.revision - since, written)
+
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
+        self._check_writable()
+        with self.snapshot():
+            self._contents.histograms[resolution] = (self.revision(), self.quantiles(resolution))
+
+    def costs(self, machine: str) -> Mapping[str, float] | None:
+        return self._contents.costs.get(machine)
+
+    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
+        self._check_writable()
+        self._contents.costs[machine] = dict(figures)
+
+    # -- hapticdb check ----------------------------------------------------------------------
+
+    def checker(self) -> "MemoryStore":
+        return self
+
+    def has_page_checksums(self) -> bool:
+        return False
+
+    def findings(self) -> Iterator[str]:
+        yield from ()
+
+
+ENVIRONMENTS: dict[str, Contents] = {}
+"""All environments of this process, by name."""
+
+
+class MemoryEngine:
+    """What the scheme ``memory`` means."""
+
+    title = "memory"
+    lacks: Mapping[Capability, str] = MappingProxyType(
+        {
+            "grant": " is in memory: only this process can reach it",
+            "backup": " is in memory, not a file: copy it with 'hapticdb copy'",
+            "restore": " is in memory, not a file: copy into it with 'hapticdb copy'",
+        }
+    )
+
+    def open(self, url: str, *, read_only: bool) -> Store:
+        contents = ENVIRONMENTS.get(self.name_of(url))
+        if contents is None:
+            raise EnvironmentNotFoundError(f"no environment at {url} in this process")
+        return MemoryStore(contents, url, read_only=read_only)
+
+    def create(self, url: str, grid: Grid, layout: Layout) -> Store:
+        name = self.name_of(url)
+        contents = Contents(name, grid, layout)
+        if ENVIRONMENTS.setdefault(name, contents) is not contents:
+            raise EnvironmentExistsError(f"{url} exists already; open it, or give another name")
+        return MemoryStore(contents, url, read_only=False)
+
+    def exists(self, url: str) -> bool:
+        return self.name_of(url) in ENVIRONMENTS
+
+    def beside(self, url: str, name: str) -> str:
+        return f"memory://{name}"
+
+    def name_of(self, url: str) -> str:
+        return url.partition("://")[2]
+
+
+ENGINE = MemoryEngine()

@@ -10,6 +10,10 @@ FRAME_HEAD = """\
 | frames | points | dense bitmap in memory, us | flat loop over cells | with clusters |
 | --- | --- | --- | --- | --- |"""
 
+EDIT_HEAD = """\
+| engine | moves | voxels | median, ms | 90 % within, ms | worst, ms |
+| --- | --- | --- | --- | --- | --- |"""
+
 
 def session_table(results: Mapping[str, Any]) -> str:
     """Rates reached, and times in microseconds, p50 / p99 / p99.9, beside the empty loop's."""
@@ -43,17 +47,22 @@ def frame_table(results: Mapping[str, Any]) -> str:
     return "\n".join([FRAME_HEAD, *rows])
 
 
-def model_words(results: Mapping[str, Any]) -> str:
-    """Size of the model and length of a session."""
-    millions = results["object_voxels"] / 1e6
-    return f"a car of {millions:.1f} million object voxels, {results['seconds']:.0f} s each"
-
-
-def edit_words(results: Mapping[str, Any]) -> Sequence[str]:
-    """How soon edits were felt, milliseconds: an item for each engine."""
-    return [
-        f"{one['engine']}: {one['edits']} moves of {one['voxels']:,} voxels were felt after "
-        f"{one['felt_after_ms']['p50']:.1f} ms (median), {one['felt_after_ms']['p90']:.1f} ms "
-        f"(90 %) and {one['felt_after_ms']['worst']:.1f} ms (worst)"
+def edit_table(results: Mapping[str, Any]) -> str:
+    """Milliseconds from the commit of an edit to the first frame that felt it."""
+    rows = [
+        f"| {one['engine']} | {one['edits']} | {one['voxels']:,} | "
+        f"{' | '.join(f'{ms:.1f}' for ms in one['felt_after_ms'].values())} |"
         for one in results["edits"]
     ]
+    return "\n".join([EDIT_HEAD, *rows])
+
+
+def model_words(results: Mapping[str, Any]) -> Sequence[str]:
+    """Size of the model, points of the tool and length of a session."""
+    millions = results["object_voxels"] / 1e6
+    (points,) = {one["conditions"]["points"] for one in results["sessions"]}
+    return (
+        f"a car of {millions:.1f} million object voxels",
+        f"{points} points sliding",
+        f"{results['seconds']:.0f} s each",
+    )

@@ -1,0 +1,147 @@
+"""Every measured figure of the pages is one of results/, or says that its results were not kept."""
+
+import json
+import re
+import xml.etree.ElementTree as ET
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hapticdb.bench import records
+from hapticdb.bench.drawing.draw import draw
+from hapticdb.bench.drawing.plots import plots_among
+from report.page import write_report
+from report.plots import REPORT_KINDS
+from report.realtime_page import edit_table, frame_table, model_words, session_table
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "results"
+FILES = sorted(RESULTS.glob("*.json"))
+# docs/evaluation.md is written from results; docs/format.md has a file's layout and no measurement
+PAGES = [
+    ROOT / "README.md",
+    *(p for p in sorted((ROOT / "docs").glob("*.md")) if p.stem not in {"evaluation", "format"}),
+]
+CLAIM = re.compile(
+    r"\b(medians?|microseconds|p99|reached|took|were felt|of their time|on disk|actual time)\b",
+    re.IGNORECASE,
+)
+MARKER = re.compile(
+    r"<!-- (?:measured: (?P<file>results/[\w-]+\.json)|observed: [0-9a-f]{7}) -->\s*"
+)
+
+
+def blocks(text: str) -> Iterator[str]:
+    """Paragraphs, items of lists and tables of a page, fenced code left out."""
+    prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    prose = re.sub(r" -->\n\n(?=    )", " -->\n", prose)  # a marker of indented code
+    yield from (block for block in re.split(r"\n\s*\n|\n(?=- |\d+\. )", prose) if block.strip())
+
+
+def is_claim(block: str) -> bool:
+    """Whether a block speaks of a measurement and holds a number."""
+    words = re.sub(r"`[^`\n]*`|\]\([^)]*\)|PostgreSQL \d+", "", MARKER.sub("", block))
+    return bool(CLAIM.search(words) and re.search(r"\d", words))
+
+
+def loaded(name: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((ROOT / name).read_text())
+    return found
+
+
+# --- the evaluation -----------------------------------------------------------------------------
+
+
+def test_the_evaluation_is_what_the_results_say(tmp_path: Path) -> None:
+    """Byte for byte: every figure in its tables and sentences is computed from results/."""
+    page = tmp_path / "evaluation.md"
+    write_report(records.read(RESULTS), page, "../results")
+    assert page.read_text() == (ROOT / "docs" / "evaluation.md").read_text()
+
+
+def test_every_plot_is_kept_and_no_other() -> None:
+    wanted = {plot.name for plot in plots_among(records.read(RESULTS), REPORT_KINDS)}
+    assert {path.stem for path in RESULTS.glob("*.svg")} == wanted
+
+
+@pytest.mark.long
+def test_the_words_of_every_plot_are_what_the_results_say(tmp_path: Path) -> None:
+    for path in draw(records.read(RESULTS), tmp_path, REPORT_KINDS):
+        assert words_of(path) == words_of(RESULTS / path.name), path.name
+
+
+def words_of(path: Path) -> list[str]:
+    root = ET.fromstring(path.read_text())  # noqa: S314 - our own file
+    return ["".join(node.itertext()) for node in root.iter() if node.tag.endswith("text")]
+
+
+# --- results ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: path.stem)
+def test_a_result_names_the_one_commit_that_was_measured(path: Path) -> None:
+    text = path.read_text()
+    assert len(re.findall(r'"commit":', text)) == 1
+    assert re.match(r"[0-9a-f]{7,40}(-dirty)?( \(.*\))?$", json.loads(text)["commit"])
+    assert "hapticdb" not in json.loads(text).get("versions", {})
+
+
+def test_a_result_written_in_a_clone_names_its_commit(tmp_path: Path) -> None:
+    found = records.result("tail", [])
+    assert found["commit"] == records.commit()
+    assert re.match(r"[0-9a-f]{7,40}(-dirty)?$|unknown, version \d", found["commit"])
+    assert re.match(r"unknown, version \d", records.commit(tmp_path))
+
+
+# --- the other pages ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+def test_a_measured_figure_says_where_it_comes_from(page: Path) -> None:
+    """By a comment before it: of which file of results/, or which commit brought it."""
+    bare = [b for b in blocks(page.read_text()) if is_claim(b) and not MARKER.match(b)]
+    assert bare == []
+
+
+def test_every_figure_that_is_said_to_be_measured_is_in_its_file() -> None:
+    realtime, edits = loaded("results/realtime.json"), loaded("results/edits.json")
+    tables = {
+        "results/realtime.json": [session_table(realtime), frame_table(realtime)],
+        "results/edits.json": [edit_table(edits)],
+    }
+    for one in (*realtime["sessions"], *edits["edits"]):
+        assert one["unknown_frames"] == 0  # as the page says
+    shown: list[str] = []
+    for page in PAGES:
+        for block in blocks(page.read_text()):
+            found = MARKER.match(block)
+            if found is None or found["file"] is None:
+                continue
+            text = block[found.end() :]
+            if text.startswith("|"):
+                assert text.strip() in tables[found["file"]], f"{page.name}: {text}"
+                shown.append(text.strip())
+            else:
+                words = " ".join(text.split())
+                for phrase in model_words(realtime):
+                    assert phrase in words
+    assert sorted(shown) == sorted(table for found in tables.values() for table in found)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_caught"),
+    [
+        ("A frame took 57 us.", True),
+        ("| strategy | p99 |\n| --- | --- |\n| array | 90.8 |", True),
+        ("Medians over 100 poses.", True),
+        ("A frame took longer.", False),
+        ("The wrench falls to zero within 20 ms.", False),
+        ("`took 5` is a word of SQL.", False),
+        ("<!-- observed: 0123abc -->\nA frame took 57 us.", False),
+    ],
+)
+def test_a_figure_without_a_source_is_seen(text: str, *, is_caught: bool) -> None:
+    found = [b for b in blocks(text) if is_claim(b) and not MARKER.match(b)]
+    assert bool(found) == is_caught

@@ -217,11 +217,11 @@ def test_only_the_command_line_draws_on_terminals() -> None:
             assert not words & {"rich", "typer", "click"}, named(path)
 
 
-def test_only_the_stores_know_their_engine() -> None:
+def test_the_package_imports_no_benchmark() -> None:
+    benchmarks = {path.stem for path in (ROOT / "benchmarks").iterdir()} - {"__pycache__"}
     for path in modules():
-        if domain(path) != "store":
-            words = {name.split(".")[0] for name in imported(path)}
-            assert not words & {"apsw", "sqlite3", "psycopg"}, named(path)
+        words = {name.split(".")[0] for name in imported(path)}
+        assert not words & benchmarks, named(path)
 
 
 def test_importing_the_package_stays_light() -> None:

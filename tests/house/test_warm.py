@@ -23,6 +23,7 @@ import json, sys
 from pathlib import Path
 import numpy as np
 import hapticdb
+from hapticdb.devices.scripted import Line
 from hapticdb.kernels import _jit, compiling
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.resident.frames import Frames
@@ -70,6 +71,11 @@ for n, (layout, curve) in enumerate(KINDS):
                 frames = Frames(Residency(env.store, table), shell, run=4)
                 frames.feel(np.eye(4)[None])
                 frames.close()
+hand = Line(np.zeros(3), np.ones(3), 0.1)
+url = str(folder / "0.db")
+with hapticdb.Session(url, shell, hand, seconds=0.3, has_baseline=False) as session:
+    report = session.wait(60)
+assert report is not None and report.loop.frames > 0
 assert set(_jit.SIGNATURES) == set(compiling.NAMES)
 found = {name(entry): [tuple(s) == _jit.SIGNATURES[name(entry)] for s in entry.signatures]
          for entry in _jit.ENTRIES}
@@ -84,7 +90,8 @@ NEEDS_JIT = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="without J
 def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
     """Every entry has the one signature that it names, whatever is done after.
 
-    A session's loop tells itself when a kernel is compiled while it runs (`realtime.loop.work`).
+    A session's loop is a process of its own, which ends in an error when a kernel is compiled while
+    it runs (`realtime.loop.work`).
     """
     done = finished([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True)
     found = json.loads(done.stdout)

@@ -27,6 +27,7 @@ PAPER_POINT: Mapping[str, Any] = {
 }
 """What holds where an experiment varies something else: the point that all others stand around."""
 ORDERS: Mapping[str, Sequence[str]] = {
+    "engine": ("SQLite", "PostgreSQL"),
     "layout": ("brick", "voxel"),
     "curve": ("z-order", "hilbert", "lexicographic"),
     "cache": ("4 MB", "all cached"),
@@ -125,26 +126,22 @@ def with_strategy(cells: Iterable[Cell], strategy: str, form: str = ONE_STATEMEN
 
 
 def distinct(cells: Iterable[Cell], key: str) -> list[Any]:
-    """Values that cells have, each once: in the house's order, else by name and number."""
+    """Values that cells have, each once: in the order of `ORDERS`, else by name and number."""
     found = {cell[key]: None for cell in cells if cell.get(key) is not None}
     known = list(ORDERS.get(key, ()))
 
     def place(value: object) -> tuple[int, list[tuple[int, float, str]]]:
-        if value in known:
-            return known.index(str(value)), []
-        return len(known), _pieces(value, sqlite_first=key == "engine")
+        name = re.sub(r" [\d.]+$", "", str(value))  # an engine without its version
+        return known.index(name) if name in known else len(known), _pieces(value)
 
     return sorted(found, key=place)
 
 
-def _pieces(value: object, *, sqlite_first: bool) -> list[tuple[int, float, str]]:
+def _pieces(value: object) -> list[tuple[int, float, str]]:
     """Numbers in a name as numbers, so that 15 stands before 18 and 300 before 1000."""
     if isinstance(value, int | float):
         return [(0, float(value), "")]
-    text = str(value)
-    if sqlite_first and text.startswith("SQLite"):
-        return []
-    parts = re.split(r"(\d+)", text)
+    parts = re.split(r"(\d+)", str(value))
     return [(0, float(p), "") if p.isdigit() else (1, 0.0, p.lower()) for p in parts if p]
 
 

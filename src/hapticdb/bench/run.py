@@ -25,7 +25,7 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import SupportsCaches
+from hapticdb.store.base import SupportsCaches, SupportsServer
 from hapticdb.warm import warm_up
 
 ALL_BYTES = 2 << 30
@@ -202,12 +202,18 @@ def table_1_row(env: Environment, **more: object) -> Cell:
 def opened(url: str) -> Environment:
     """Open an environment to read it.
 
-    On a server to write, where that is allowed: a loop of the paper's kind is a temporary function,
-    which no reader may make.
+    On a server it is opened to write where that is allowed: the paper's loop inside the server is a
+    temporary function, which no reader may make.
     """
-    if "://" not in url or url.startswith("sqlite:"):
-        return open_environment(url, read_only=True)
+    reader = open_environment(url, read_only=True)
+    if not isinstance(reader.store, SupportsServer):
+        return reader
     try:
-        return open_environment(url)
+        writer = open_environment(url)
     except ReadOnlyError:
-        return open_environment(url, read_only=True)
+        return reader
+    except BaseException:
+        reader.close()
+        raise
+    reader.close()
+    return writer

@@ -1,0 +1,64 @@
+"""No module outside store/ knows which engine it speaks to: it asks for a protocol."""
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "src" / "hapticdb"
+DRIVERS = {"apsw", "sqlite3", "psycopg"}
+ASKS_OF_TEXT = {"startswith", "endswith", "partition", "removeprefix", "match", "search"}
+
+
+def test_only_the_stores_know_their_engine() -> None:
+    """Neither its driver, nor its modules, nor a branch on its name: others ask for protocols."""
+    folders = {f"hapticdb.store.{path.parent.name}" for path in PACKAGE.glob("store/*/store.py")}
+    assert len(folders) == 2
+    for path in sorted(PACKAGE.rglob("*.py")):
+        if path.is_relative_to(PACKAGE / "store"):
+            continue
+        names = set(imported(path))
+        assert not {name.split(".")[0] for name in names} & DRIVERS, path
+        assert not {".".join(name.split(".")[:3]) for name in names} & folders, path
+        assert list(branches_on_engines(path.read_text())) == [], path
+
+
+def imported(path: Path) -> Iterator[str]:
+    """Dotted names of what a source imports, at its top or inside a function."""
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def branches_on_engines(source: str) -> Iterator[str]:
+    """Comparisons with a text that names an engine, and questions whether a text begins so."""
+    engine = re.compile("sqlite|postgres", re.IGNORECASE)
+    for node in ast.walk(ast.parse(source)):
+        asked: list[ast.expr] = []
+        if isinstance(node, ast.Compare):
+            asked = [node.left, *node.comparators]
+        elif isinstance(node, ast.MatchValue):
+            asked = [node.value]
+        elif isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            asked = node.args if node.func.attr in ASKS_OF_TEXT else []
+        parts = [part for one in asked for part in ast.walk(one) if isinstance(part, ast.Constant)]
+        if any(isinstance(part.value, str) and engine.search(part.value) for part in parts):
+            yield ast.unparse(node)
+
+
+@pytest.mark.parametrize(
+    ("line", "is_branch"),
+    [
+        ('if engine == "sqlite": pass', True),
+        ('url.startswith("postgresql://")', True),
+        ('kind in {"sqlite", "toy"}', True),
+        ('"match" if isinstance(store, SupportsCaches) else None', False),
+        ('message = "PostgreSQL, 15 or newer"', False),
+    ],
+)
+def test_a_branch_on_an_engine_is_seen(line: str, is_branch: bool) -> None:
+    assert bool(list(branches_on_engines(line))) == is_branch

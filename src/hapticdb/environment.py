@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ConnectionLostError, ReadOnlyError
-from hapticdb.finding import find_objects
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
 from hapticdb.ingest.layout import voxels_of_rows
@@ -35,6 +34,7 @@ from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.query.touches import Touch, Touches
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
+from hapticdb.store.finding import find_objects
 
 _NOBODY: tuple[int, ...] = ()
 
@@ -118,7 +118,7 @@ class Environment:
         """Objects that ids, names and patterns choose, each once, ordered by id.
 
         ``env.find(7, "wheel*", "body/door_*")``: the rules, and the errors, are those of
-        `hapticdb.finding.find_objects`. A sub-assembly's name chooses all that is below it.
+        `hapticdb.store.finding.find_objects`. A sub-assembly's name chooses all that is below it.
         """
         return find_objects(self._store, words)
 

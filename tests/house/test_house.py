@@ -1,4 +1,4 @@
-"""Rules of the house, read off the sources: which way imports point, sizes, names, what is public.
+"""Rules of the house, read off the sources: which way imports point, texts, waits, what is public.
 
 ARCHITECTURE.md draws the floors; this file keeps them.
 """
@@ -22,9 +22,7 @@ import hapticdb
 from children import finished
 from hapticdb import errors
 from hapticdb.kernels._cache import cache_folder, sources_digest
-
-ROOT = Path(__file__).parent.parent.parent
-PACKAGE = ROOT / "src" / "hapticdb"
+from sources import PACKAGE, ROOT, modules, named, python_files
 
 # from the top; a module imports its own floor and those below it
 FLOORS: list[set[str]] = [
@@ -35,7 +33,7 @@ FLOORS: list[set[str]] = [
     {"realtime", "sweeps"},
     {"recording", "devices"},
     {"environment", "resident", "sample", "testing"},
-    {"check", "difference", "finding", "ingest", "proportions", "transfer"},
+    {"check", "difference", "ingest", "proportions", "transfer"},
     {"query"},
     {"pointshell", "mesh", "poses"},
     {"store"},
@@ -120,19 +118,6 @@ PUBLIC = [
 ]
 
 
-def modules() -> list[Path]:
-    return sorted(PACKAGE.rglob("*.py"))
-
-
-def python_files() -> list[Path]:
-    folders = ("src", "tests", "benchmarks")
-    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
-
-
-def named(path: Path) -> str:
-    return path.relative_to(ROOT).as_posix()
-
-
 def domain(path: Path) -> str:
     """Module or folder directly below the package that a source belongs to."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
@@ -195,7 +180,7 @@ def test_no_two_domains_import_each_other() -> None:
 
 def test_kernels_import_numpy_numba_and_their_own_folder() -> None:
     # llvmlite is numba's own lower half
-    for path in (PACKAGE / "kernels").glob("*.py"):
+    for path in (PACKAGE / "kernels").rglob("*.py"):
         found = {
             name for name in imported(path) if name.split(".")[0] not in sys.stdlib_module_names
         }
@@ -240,17 +225,7 @@ def run_python(script: str, *arguments: str, **variables: str) -> str:
     ).stdout
 
 
-# --- sizes and names ----------------------------------------------------------------------------
-
-
-def test_no_file_is_longer_than_500_lines() -> None:
-    lengths = {named(path): len(path.read_text().splitlines()) for path in python_files()}
-    assert {name: n for name, n in lengths.items() if n > 500} == {}
-
-
-def test_files_are_named_by_the_words_of_the_domain() -> None:
-    vague = re.compile(r"util|helper|manager|(^|_)data(_|$)|common|misc")
-    assert [named(p) for p in python_files() if vague.search(p.stem)] == []
+# --- texts --------------------------------------------------------------------------------------
 
 
 def test_nothing_is_left_to_do_in_the_sources() -> None:
@@ -422,7 +397,7 @@ def test_any_edit_of_a_kernel_moves_the_cache(tmp_path: Path) -> None:
     first = sources_digest(folder)
     assert first == sources_digest(PACKAGE / "kernels")
     assert first in cache_folder()
-    for source in sorted(folder.glob("*.py")):
+    for source in sorted(folder.rglob("*.py")):
         content, status = source.read_bytes(), source.stat()
         source.write_bytes(content[:-1] + b" ")
         os.utime(source, ns=(status.st_atime_ns, status.st_mtime_ns))

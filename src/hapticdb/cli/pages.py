@@ -34,7 +34,7 @@ def selected(
 
     The box is closed: lower corner, upper corner, metres, world frame.
     """
-    from hapticdb.finding import find_objects
+    from hapticdb.store.finding import find_objects
 
     if box is not None and not all(a <= b for a, b in zip(box[:3], box[3:], strict=True)):
         corners = " ".join(f"{x:.6g}" for x in box)

@@ -1,0 +1,117 @@
+"""Rules of the house, read off the sources: sizes of files, functions and folders, and names."""
+
+import ast
+import re
+from collections import Counter
+from collections.abc import Iterator
+
+from sources import modules, named, python_files
+
+
+def test_no_file_is_longer_than_500_lines() -> None:
+    lengths = {named(path): len(path.read_text().splitlines()) for path in python_files()}
+    assert {name: n for name, n in lengths.items() if n > 500} == {}
+
+
+MOST_LINES = 60
+"""Of a function, its signature and docstring counted."""
+LONG_FUNCTIONS = {
+    "src/hapticdb/kernels/hand/coupling.py:advance": "one step of the coupling: smooth forces "
+    "replace it",
+    "src/hapticdb/kernels/hand/coupling.py:cut_back": "likewise",
+    "src/hapticdb/kernels/query/contact.py:locate_kernel": "one pass over the points",
+    "src/hapticdb/kernels/resident/cells.py:felt": "one pass over the points",
+    "src/hapticdb/kernels/resident/sweep.py:find_clearance": "one pass over the points",
+    "src/hapticdb/kernels/resident/sweep.py:find_hits": "one pass over the points",
+    "src/hapticdb/kernels/surfaces/voxelize.py:fill_runs": "one pass over the triangles",
+    "src/hapticdb/ingest/files.py:import_files": "",
+    "src/hapticdb/ingest/files.py:ingest_file": "",
+    "src/hapticdb/realtime/session.py:__init__": "",
+}
+"""Functions that may be longer, and why."""
+
+
+def lengths(source: str) -> Iterator[tuple[str, int]]:
+    """Name and lines of each function of a source."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            assert node.end_lineno is not None
+            yield node.name, node.end_lineno - node.lineno + 1
+
+
+def test_no_function_is_longer_than_60_lines() -> None:
+    long = {
+        f"{named(path)}:{name}": n_lines
+        for path in modules()
+        for name, n_lines in lengths(path.read_text())
+        if n_lines > MOST_LINES
+    }
+    assert {name: n for name, n in long.items() if name not in LONG_FUNCTIONS} == {}
+
+
+def test_the_lines_of_a_function_are_counted() -> None:
+    source = "def first():\n    def second():\n        return 1\n    return second\n"
+    assert dict(lengths(source)) == {"first": 4, "second": 2}
+
+
+MOST_FILES = 15
+"""Python files in a folder, ``__init__`` aside."""
+CROWDED: dict[str, int] = {"src/hapticdb/mesh": 16, "src/hapticdb/store/postgres": 18}
+"""Folders that hold more, and how many."""
+SHARED = 4
+"""Files of a folder whose names begin with one word: so many of them are a folder of that name."""
+
+
+def folders() -> dict[str, list[str]]:
+    """Names of the modules in each folder of the package."""
+    found: dict[str, list[str]] = {}
+    for path in modules():
+        if path.stem != "__init__":
+            found.setdefault(named(path.parent), []).append(path.stem)
+    return found
+
+
+def first_words(names: list[str]) -> Counter[str]:
+    """How many names begin with each word; an underscore ends a word."""
+    return Counter(name.partition("_")[0] for name in names if not name.startswith("_"))
+
+
+def test_no_folder_holds_more_than_15_files() -> None:
+    counts = {folder: len(names) for folder, names in folders().items()}
+    crowded = {name: n for name, n in counts.items() if n > CROWDED.get(name, MOST_FILES)}
+    assert crowded == {}
+
+
+def test_names_that_begin_alike_are_a_folder() -> None:
+    assert first_words(["sweep_a", "sweep_b", "sweep", "sweeper"]) == {"sweep": 3, "sweeper": 1}
+    shared = {
+        (folder, word): n
+        for folder, names in folders().items()
+        for word, n in first_words(names).items()
+        if n >= SHARED
+    }
+    assert shared == {}
+
+
+def public_classes(source: str) -> list[str]:
+    """Names of the classes at the top of a source, private ones left out."""
+    body = ast.parse(source).body
+    names = [node.name for node in body if isinstance(node, ast.ClassDef)]
+    return [name for name in names if not name.startswith("_")]
+
+
+TWINS: set[str] = {"Bricks", "Felt", "Session"}
+"""Public classes whose names stand in two modules."""
+
+
+def test_a_public_class_name_stands_once() -> None:
+    homes: dict[str, list[str]] = {}
+    for path in modules():
+        for name in public_classes(path.read_text()):
+            homes.setdefault(name, []).append(named(path))
+    assert {n: paths for n, paths in homes.items() if len(paths) > 1 and n not in TWINS} == {}
+
+
+def test_files_are_named_by_the_words_of_the_domain() -> None:
+    vague = re.compile(r"util|helper|manager|(^|_)data(_|$)|common|misc")
+    assert [named(p) for p in python_files() if vague.search(p.stem)] == []

@@ -29,13 +29,18 @@ def test_import(
         folder.mkdir()
 
     def run() -> None:
-        hapticdb.import_files(folder / "car.db", [scene.files.car], options)
+        (report,) = hapticdb.import_files(folder / "car.db", [scene.files.car], options)
+        assert report.status == "imported"
 
     benchmark.group = "import"
     benchmark.pedantic(run, setup=fresh, rounds=3, warmup_rounds=1)
     with hapticdb.open(folder / "car.db") as env:
-        voxels = sum(obj.voxels for obj in env.objects())
+        counted = {obj.name: obj.voxels for obj in env.objects()}
         size = env.size()
+    wanted = scene.environments[layout]
+    assert counted == {obj.name: obj.voxels for obj in wanted.objects()}
+    assert size.rows == wanted.size().rows
+    voxels = sum(counted.values())
     benchmark.extra_info["object_voxels"] = voxels
     benchmark.extra_info["bytes_per_voxel"] = round(size.bytes / voxels, 2)
     if benchmark.stats is not None:

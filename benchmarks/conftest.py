@@ -11,7 +11,7 @@ from hapticdb import Environment, PointShell
 from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
 from hapticdb.store.base import LAYOUTS, Layout
-from scene import Scene, is_measuring
+from scene import BenchScene, is_measuring
 
 PAPER_BITS = 11
 TINY_BITS = 7
@@ -33,7 +33,7 @@ def bits(pytestconfig: pytest.Config) -> int:
 
 
 @pytest.fixture(scope="session")
-def scene(bits: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene]:
+def scene(bits: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[BenchScene]:
     """Sample car, extent 1.6; 300 points of the wrench; poses spread over the sample's path."""
     folder = tmp_path_factory.mktemp("bench")
     files = write_sample(folder, count=400)
@@ -46,6 +46,6 @@ def scene(bits: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Scene
         assert report.status == "imported"
         environments[layout] = hapticdb.open(folder / f"{layout}.db", read_only=True)
     shell = PointShell.from_file(files.wrench, points=300)
-    yield Scene(files, environments, shell, list(read_poses(files.path)))
+    yield BenchScene(files, environments, shell, list(read_poses(files.path)))
     for env in environments.values():
         env.close()

@@ -40,7 +40,7 @@ from hapticdb.store.base import LAYOUTS, Layout
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import Binaries, find_binaries
 from peers import Peer, PeerWork, all_bricks
-from peers.run import Measured, measure_peers
+from peers.run import PeerResults, measure_peers
 from peers.voxelizers import measure_voxelizers, read_assembly
 from places import serving
 from report.page import write_report
@@ -79,7 +79,7 @@ class Evaluation:
         """Tell what comes next, and how long it has been going on."""
         print(f"{time.perf_counter() - self.seconds:6.0f} s  {line}", file=sys.stderr, flush=True)
 
-    def keep(self, name: str, measured: Measured) -> None:
+    def keep(self, name: str, measured: PeerResults) -> None:
         """Keep what was measured, and what was not."""
         self.add(name, measured.cells)
         self.notes += measured.notes
@@ -245,7 +245,7 @@ def compare(evaluation: Evaluation, env: Environment, among: Sequence[Peer] | No
     measured = measure_peers(work, task.poses, 2 * evaluation.budget.cell_s, among)
     conditions = {"environment": "sample", "poses": "slide", "shell": "sphere"}
     cells = [cell | conditions for cell in measured.cells]
-    evaluation.keep("peers", Measured(cells, measured.notes))
+    evaluation.keep("peers", PeerResults(cells, measured.notes))
 
 
 PARTS: dict[str, Callable[[Evaluation], None]] = {"curves": curves, "peers": peers}

@@ -17,7 +17,7 @@ CACHE = "4 MB"
 SETTINGS = {"shared_buffers": "4MB", "max_wal_size": "2GB"}
 
 
-class Place(Protocol):
+class EnginePlace(Protocol):
     """Where one engine keeps the environments of all sizes."""
 
     kind: str
@@ -62,7 +62,7 @@ class Server:
 
 
 @contextlib.contextmanager
-def place_of(engine: str, folder: Path) -> Iterator[Place]:
+def place_of(engine: str, folder: Path) -> Iterator[EnginePlace]:
     """Make ready where an engine keeps its environments: ``sqlite``, or a PostgreSQL's major."""
     if engine == "sqlite":
         yield Files(folder)

@@ -39,7 +39,7 @@ from hapticdb.sample import write_sample
 from hapticdb.store.base import SupportsCaches
 from hapticdb.store.connect import create_store, exists
 from hapticdb.store.sqlite.file import remove_file
-from places import CACHE, SETTINGS, Place, place_of
+from places import CACHE, SETTINGS, EnginePlace, place_of
 
 SIZES = (1.4e6, 1.4e7, 1.4e8, 1.4e9)
 ENGINES = ("sqlite", "18")
@@ -74,7 +74,7 @@ def say(line: str) -> None:
 
 
 @dataclass(frozen=True)
-class Size:
+class ScaleSize:
     """One size of environment.
 
     plan : what stands where; copies : how many, below 1 that part of one car; home : the
@@ -113,24 +113,24 @@ def car_at_home(folder: Path, bits: int) -> tuple[Source, Path]:
         return Source.of(env), home
 
 
-def sizes_of(folder: Path, wanted: Sequence[float], bits: int) -> list[Size]:
+def sizes_of(folder: Path, wanted: Sequence[float], bits: int) -> list[ScaleSize]:
     """Sizes nearest to those wanted, in voxels: whole cars, or part of one."""
     car, home = car_at_home(folder, bits)
     return [
-        Size(Plan.of(car, round(voxels / car.voxels)), round(voxels / car.voxels), home)
+        ScaleSize(Plan.of(car, round(voxels / car.voxels)), round(voxels / car.voxels), home)
         if voxels >= car.voxels / 2
         else _part(car, voxels, folder)
         for voxels in wanted
     ]
 
 
-def _part(car: Source, voxels: float, folder: Path) -> Size:
+def _part(car: Source, voxels: float, folder: Path) -> ScaleSize:
     plan = Plan.of(car.within(voxels), 1)
     home = folder / f"part_{plan.voxels}.db"
     remove_file(home)
     with contextlib.closing(create_store(home, plan.grid, car.layout)) as store:
         write_copies(store, plan, lambda _: None)
-    return Size(plan, round(plan.voxels / car.voxels, 3), home)
+    return ScaleSize(plan, round(plan.voxels / car.voxels, 3), home)
 
 
 @dataclass(frozen=True)
@@ -138,8 +138,8 @@ class Built:
     """The environment of one size on one engine, there or yet to be built."""
 
     engine: str
-    place: Place
-    size: Size
+    place: EnginePlace
+    size: ScaleSize
     folder: Path
 
     @property
@@ -300,7 +300,7 @@ def measure(builds: Sequence[Built], n_poses: int, limit_s: float) -> list[Cell]
 
 def evaluate(
     folder: Path,
-    sizes: Sequence[Size],
+    sizes: Sequence[ScaleSize],
     engines: Sequence[str],
     steps: Sequence[str],
     *,

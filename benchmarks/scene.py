@@ -12,7 +12,7 @@ from hapticdb.store.base import Layout
 
 
 @dataclass(frozen=True)
-class Scene:
+class BenchScene:
     """The sample car in both layouts, a tool, and where it goes."""
 
     files: SampleFiles

@@ -21,14 +21,14 @@ from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import LAYOUTS, Layout
 from peers import PeerWork, Pose
 from peers.memory import DenseBitmap
-from scene import Scene, is_measuring
+from scene import BenchScene, is_measuring
 
 ROUNDS = 10
 CACHE_KIB = 256 * 1024
 
 
 def measure(
-    benchmark: BenchmarkFixture, scene: Scene, frame: Callable[[Pose], object], group: str
+    benchmark: BenchmarkFixture, scene: BenchScene, frame: Callable[[Pose], object], group: str
 ) -> None:
     """Time passes over all poses, after one that warms up."""
 
@@ -46,7 +46,7 @@ def measure(
 
 
 @pytest.fixture(scope="module")
-def dense(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Iterator[DenseBitmap]:
+def dense(scene: BenchScene, tmp_path_factory: pytest.TempPathFactory) -> Iterator[DenseBitmap]:
     env, folder = scene.environments["brick"], tmp_path_factory.mktemp("dense")
     bitmap = DenseBitmap()
     bitmap.build(PeerWork.of_sample(env, scene.shell, scene.files, folder))
@@ -57,7 +57,7 @@ def dense(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> Iterator[De
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_touch(
-    benchmark: BenchmarkFixture, scene: Scene, strategy: Strategy, layout: Layout
+    benchmark: BenchmarkFixture, scene: BenchScene, strategy: Strategy, layout: Layout
 ) -> None:
     env = scene.environments[layout]
     env.calibrate(keep=False)
@@ -74,7 +74,7 @@ def test_touch(
         assert found.hits.tolist() == wanted.hits.tolist()
 
 
-def test_dense_bitmap(benchmark: BenchmarkFixture, scene: Scene, dense: DenseBitmap) -> None:
+def test_dense_bitmap(benchmark: BenchmarkFixture, scene: BenchScene, dense: DenseBitmap) -> None:
     measure(benchmark, scene, dense.felt, "frame")
     for pose in scene.poses[::20]:
         touch = scene.environments["brick"].touch(scene.shell, pose)
@@ -83,7 +83,7 @@ def test_dense_bitmap(benchmark: BenchmarkFixture, scene: Scene, dense: DenseBit
         assert wrench[:3].tobytes() == touch.force.tobytes()
 
 
-def point_statements(scene: Scene, cache_kib: int) -> Callable[[Pose], int]:
+def point_statements(scene: BenchScene, cache_kib: int) -> Callable[[Pose], int]:
     """One warm statement a shell point, by the standard library, keys already computed."""
     env = scene.environments["voxel"]
     connection = sqlite3.connect(f"{Path(env.url).resolve().as_uri()}?mode=ro", uri=True)
@@ -107,7 +107,7 @@ def point_statements(scene: Scene, cache_kib: int) -> Callable[[Pose], int]:
 
 @pytest.mark.parametrize("cache_kib", [2000, CACHE_KIB], ids=["default cache", "all cached"])
 def test_one_statement_a_point_by_the_standard_library(
-    benchmark: BenchmarkFixture, scene: Scene, cache_kib: int
+    benchmark: BenchmarkFixture, scene: BenchScene, cache_kib: int
 ) -> None:
     look_up = point_statements(scene, cache_kib)
     measure(benchmark, scene, look_up, "frame")
@@ -117,7 +117,7 @@ def test_one_statement_a_point_by_the_standard_library(
 
 
 def test_touch_and_one_statement_a_point_in_turns(
-    benchmark: BenchmarkFixture, scene: Scene, pytestconfig: pytest.Config
+    benchmark: BenchmarkFixture, scene: BenchScene, pytestconfig: pytest.Config
 ) -> None:
     """The ratio that holds while a machine's speed drifts: pass by pass, medians of the ratios."""
     env = scene.environments["brick"]

@@ -11,13 +11,18 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 import hapticdb
 from hapticdb.store.base import LAYOUTS, Layout
-from scene import Scene
+from scene import BenchScene
 
 
 @pytest.mark.parametrize("jobs", [1, 2])
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_import(
-    benchmark: BenchmarkFixture, scene: Scene, bits: int, tmp_path: Path, layout: Layout, jobs: int
+    benchmark: BenchmarkFixture,
+    scene: BenchScene,
+    bits: int,
+    tmp_path: Path,
+    layout: Layout,
+    jobs: int,
 ) -> None:
     options = hapticdb.ImportOptions(
         grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout, jobs=jobs

@@ -14,7 +14,7 @@ from peers import FAMILIES, SAME, Missing, Peer, PeerMissingError, PeerWork, all
 from peers.rows import RowPeer
 from peers.run import measure_peers
 from peers.voxelizers import TOOLS, measure_voxelizers, read_assembly
-from scene import Scene
+from scene import BenchScene
 
 NAMES = [name for names in FAMILIES.values() for name in names]
 SECONDS = 0.2
@@ -22,7 +22,7 @@ LEFT_OUT = {"LMDB", "pgpointcloud"}
 
 
 @pytest.fixture(scope="module")
-def work(scene: Scene, tmp_path_factory: pytest.TempPathFactory) -> PeerWork:
+def work(scene: BenchScene, tmp_path_factory: pytest.TempPathFactory) -> PeerWork:
     binaries = next((found for found in find_binaries() if found.major == 15), None)
     folder = tmp_path_factory.mktemp("peers")
     env = scene.environments["brick"]
@@ -47,7 +47,7 @@ def test_every_peer_is_there_once_under_its_name() -> None:
 
 
 def test_who_answers_the_same_question_finds_the_same_hits(
-    scene: Scene, work: PeerWork, peer: Peer
+    scene: BenchScene, work: PeerWork, peer: Peer
 ) -> None:
     counts = [peer.frame(pose) for pose in scene.poses]
     assert any(counts)
@@ -56,7 +56,7 @@ def test_who_answers_the_same_question_finds_the_same_hits(
 
 
 def test_who_answers_the_same_question_gives_the_same_wrench(
-    scene: Scene, work: PeerWork, peer: Peer
+    scene: BenchScene, work: PeerWork, peer: Peer
 ) -> None:
     assert (peer.question == SAME) == isinstance(peer, RowPeer)
     if isinstance(peer, RowPeer):
@@ -84,7 +84,7 @@ def test_voxels_of_the_work_are_those_of_the_objects(work: PeerWork) -> None:
     assert np.array_equal(work.voxels, np.unique(np.concatenate(keys)))
 
 
-def test_the_runner_gives_a_cell_for_each_peer(scene: Scene, work: PeerWork) -> None:
+def test_the_runner_gives_a_cell_for_each_peer(scene: BenchScene, work: PeerWork) -> None:
     chosen = [one for one in all_peers() if one.name not in LEFT_OUT]
     found = measure_peers(work, np.array(scene.poses[:20]), SECONDS, chosen)
     own, *cells = found.cells
@@ -101,14 +101,14 @@ def test_the_runner_gives_a_cell_for_each_peer(scene: Scene, work: PeerWork) -> 
         assert ("memory_bytes" in cell) != ("file_bytes" in cell)
 
 
-def test_a_time_limit_cuts_short(scene: Scene, work: PeerWork) -> None:
+def test_a_time_limit_cuts_short(scene: BenchScene, work: PeerWork) -> None:
     (own,) = measure_peers(work, np.array(scene.poses), 0.0, []).cells
     assert own["frames"] == 1
     assert own["cut_short"]
 
 
 def test_a_package_that_does_not_load_is_named(
-    scene: Scene, work: PeerWork, monkeypatch: pytest.MonkeyPatch
+    scene: BenchScene, work: PeerWork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "lmdb", None)
     monkeypatch.delitem(sys.modules, "peers.lmdb_bricks", raising=False)
@@ -119,7 +119,7 @@ def test_a_package_that_does_not_load_is_named(
     assert "requirements/figures.txt" in peers.INSTALL
 
 
-def test_a_server_without_the_extensions_is_named(scene: Scene, work: PeerWork) -> None:
+def test_a_server_without_the_extensions_is_named(scene: BenchScene, work: PeerWork) -> None:
     bare = PeerWork(work.env, work.shell, work.mesh_path, work.tool_mesh, work.folder)
     poses = np.array(scene.poses[:2])
     lost = [one for one in all_peers() if one.name == "pgpointcloud"]
@@ -127,7 +127,7 @@ def test_a_server_without_the_extensions_is_named(scene: Scene, work: PeerWork) 
     assert "apt-get install" in note
 
 
-def test_voxelizers_count_alike(scene: Scene) -> None:
+def test_voxelizers_count_alike(scene: BenchScene) -> None:
     whole = read_assembly(Path(scene.files.car))
     few = whole._replace(parts=sorted(whole.parts, key=len)[:3])
     found = measure_voxelizers(few, SECONDS)

@@ -35,7 +35,7 @@ from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.session import Session
 from hapticdb.store.postgres.store import PostgresStore
-from scene import Scene, is_measuring
+from scene import BenchScene, is_measuring
 from servers import FOUND, named
 
 ROUNDS = 5
@@ -74,7 +74,7 @@ def _awake(pytestconfig: pytest.Config) -> Iterator[None]:
 class Served:
     """The benchmark's scene on one server, in both layouts."""
 
-    def __init__(self, found: Binaries | str, scene: Scene, bits: int) -> None:
+    def __init__(self, found: Binaries | str, scene: BenchScene, bits: int) -> None:
         self._server: PrivateServer | None = None
         if isinstance(found, str):
             url = found
@@ -110,7 +110,7 @@ class Served:
 
 
 @pytest.fixture(scope="module", params=FOUND, ids=named)
-def served(request: pytest.FixtureRequest, scene: Scene, bits: int) -> Iterator[Served]:
+def served(request: pytest.FixtureRequest, scene: BenchScene, bits: int) -> Iterator[Served]:
     made = Served(request.param, scene, bits)
     yield made
     made.end()
@@ -138,7 +138,11 @@ def measure(
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("strategy", STRATEGIES)
 def test_touch(
-    benchmark: BenchmarkFixture, scene: Scene, served: Served, strategy: Strategy, layout: Layout
+    benchmark: BenchmarkFixture,
+    scene: BenchScene,
+    served: Served,
+    strategy: Strategy,
+    layout: Layout,
 ) -> None:
     env = served.environments[layout]
     if env.store.costs("bench") is None:
@@ -163,7 +167,7 @@ def wrench_of(touch: Touch) -> NDArray[np.float64]:
     return np.concatenate([touch.force, touch.torque])
 
 
-def frames_of(scene: Scene, env: Environment) -> list[Frame]:
+def frames_of(scene: BenchScene, env: Environment) -> list[Frame]:
     """Located shells along the path, as a store gets them."""
     grid = env.grid
     origin = np.array(grid.origin)
@@ -183,7 +187,7 @@ def frames_of(scene: Scene, env: Environment) -> list[Frame]:
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("form", ["exists alone", "built-in sums", "force()"])
 def test_figure_3(
-    benchmark: BenchmarkFixture, scene: Scene, served: Served, form: str, layout: Layout
+    benchmark: BenchmarkFixture, scene: BenchScene, served: Served, form: str, layout: Layout
 ) -> None:
     """What the paper's aggregate costs, beside the hits alone and beside sums of the engine's."""
     session = served.session(layout)
@@ -222,7 +226,7 @@ def test_figure_3(
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("form", ["any", "join"])
 def test_forms_of_a_lookup(
-    benchmark: BenchmarkFixture, scene: Scene, served: Served, form: str, layout: Layout
+    benchmark: BenchmarkFixture, scene: BenchScene, served: Served, form: str, layout: Layout
 ) -> None:
     """Keys as an array that the index scan takes, or as rows that a join descends for."""
     session = served.session(layout)
@@ -239,7 +243,7 @@ def test_forms_of_a_lookup(
 
 @pytest.mark.parametrize("form", ["key alone", "including occupancy"])
 def test_occupancy_in_the_index(
-    benchmark: BenchmarkFixture, scene: Scene, served: Served, form: str
+    benchmark: BenchmarkFixture, scene: BenchScene, served: Served, form: str
 ) -> None:
     """Whether bricks read from the index alone are worth an index that holds them all."""
     env = served.environments["brick"]
@@ -288,7 +292,7 @@ def test_snapshot(benchmark: BenchmarkFixture, served: Served, form: str) -> Non
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_import_beside_sqlite(
     benchmark: BenchmarkFixture,
-    scene: Scene,
+    scene: BenchScene,
     served: Served,
     bits: int,
     tmp_path: Path,

@@ -20,8 +20,8 @@ from hapticdb.errors import DatabaseError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.surfaces.voxelize import brick_voxels
-from places import Place, place_of
-from scale import Built, Size, stored
+from places import EnginePlace, place_of
+from scale import Built, ScaleSize, stored
 from servers import FOUND
 from validity import assert_valid
 
@@ -37,8 +37,8 @@ class Car(NamedTuple):
     home: Path
     folder: Path
 
-    def size(self, copies: int) -> Size:
-        return Size(Plan.of(self.source, copies), copies, self.home)
+    def size(self, copies: int) -> ScaleSize:
+        return ScaleSize(Plan.of(self.source, copies), copies, self.home)
 
 
 @pytest.fixture(scope="module")
@@ -53,13 +53,13 @@ def engine(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.fixture(scope="module")
-def place(engine: str, car: Car) -> Iterator[Place]:
+def place(engine: str, car: Car) -> Iterator[EnginePlace]:
     with place_of(engine, car.folder) as found:
         yield found
 
 
 @pytest.fixture(scope="module")
-def builds(engine: str, place: Place, car: Car) -> dict[int, Built]:
+def builds(engine: str, place: EnginePlace, car: Car) -> dict[int, Built]:
     """An environment of each number of copies."""
     found = {n: Built(engine, place, car.size(n), car.folder) for n in COUNTS}
     for built in found.values():
@@ -103,7 +103,7 @@ def test_an_environment_of_copies_is_valid(car: Car, builds: dict[int, Built], c
         assert all((obj.bounds >= low).all() and (obj.bounds <= high).all() for obj in objects)
 
 
-def test_a_copy_can_be_taken_out(engine: str, place: Place, car: Car) -> None:
+def test_a_copy_can_be_taken_out(engine: str, place: EnginePlace, car: Car) -> None:
     built = Built(engine, place, car.size(3), car.folder)
     built.build()
     with hapticdb.open(built.url) as env:
@@ -168,7 +168,11 @@ def test_part_of_a_car_is_some_of_its_objects(car: Car) -> None:
 
 
 def test_what_is_built_is_not_built_again(
-    engine: str, place: Place, car: Car, builds: dict[int, Built], monkeypatch: pytest.MonkeyPatch
+    engine: str,
+    place: EnginePlace,
+    car: Car,
+    builds: dict[int, Built],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     def refuse(_: Built) -> None:
         pytest.fail("built again")
@@ -179,7 +183,7 @@ def test_what_is_built_is_not_built_again(
 
 
 def test_what_was_cut_off_is_built_anew(
-    engine: str, place: Place, car: Car, monkeypatch: pytest.MonkeyPatch
+    engine: str, place: EnginePlace, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     built = Built(engine, place, car.size(5), car.folder)
 

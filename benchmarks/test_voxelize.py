@@ -23,7 +23,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from hapticdb.kernels.surfaces.voxelize import count_voxels, voxelize
 from peers import PeerMissingError
-from peers.voxelizers import BITS, EDGE, Assembly, Triangles, by_open3d, read_assembly, tight
+from peers.voxelizers import BITS, EDGE, CadAssembly, Triangles, by_open3d, read_assembly, tight
 
 T = TypeVar("T")
 Bricks = tuple[NDArray[np.int64], NDArray[np.uint8]]
@@ -41,7 +41,7 @@ def tori() -> trimesh.Scene:
 
 
 @pytest.fixture(scope="module")
-def assembly() -> Assembly:
+def assembly() -> CadAssembly:
     folder = os.environ.get("HAPTICDB_TEST_DATA")
     if folder:
         return read_assembly(Path(folder) / "assembly_vw_t1" / "vw_t1.glb")
@@ -55,7 +55,7 @@ def assembly() -> Assembly:
     return tight("a ring of 60 tori", parts)
 
 
-def subset(assembly: Assembly, benchmark: BenchmarkFixture, one_in: int = 1) -> list[Triangles]:
+def subset(assembly: CadAssembly, benchmark: BenchmarkFixture, one_in: int = 1) -> list[Triangles]:
     """Every n-th part; of all a few small ones where benchmarks only run as tests."""
     if benchmark.disabled:
         return sorted(assembly.parts, key=len)[:3]
@@ -68,7 +68,9 @@ def measure(benchmark: BenchmarkFixture, run: Callable[[], list[T]], rounds: int
     return result
 
 
-def report(benchmark: BenchmarkFixture, assembly: Assembly, parts: list[Any], voxels: int) -> None:
+def report(
+    benchmark: BenchmarkFixture, assembly: CadAssembly, parts: list[Any], voxels: int
+) -> None:
     """Print the speed beside the conditions, and keep both with the benchmark's results."""
     benchmark.extra_info.update(
         model=assembly.name,
@@ -144,7 +146,7 @@ def plain(part: Triangles) -> int:
     return int(dense[low[0] : high[0], low[1] : high[1], low[2] : high[2]].sum())
 
 
-def test_hapticdb(benchmark: BenchmarkFixture, assembly: Assembly) -> None:
+def test_hapticdb(benchmark: BenchmarkFixture, assembly: CadAssembly) -> None:
     parts = subset(assembly, benchmark)
 
     def run() -> list[Bricks]:
@@ -157,7 +159,7 @@ def test_hapticdb(benchmark: BenchmarkFixture, assembly: Assembly) -> None:
     report(benchmark, assembly, parts, voxels)
 
 
-def test_plain_separating_axes(benchmark: BenchmarkFixture, assembly: Assembly) -> None:
+def test_plain_separating_axes(benchmark: BenchmarkFixture, assembly: CadAssembly) -> None:
     parts = subset(assembly, benchmark)
 
     def run() -> list[int]:
@@ -168,7 +170,7 @@ def test_plain_separating_axes(benchmark: BenchmarkFixture, assembly: Assembly) 
     report(benchmark, assembly, parts, sum(counts))
 
 
-def test_open3d(benchmark: BenchmarkFixture, assembly: Assembly) -> None:
+def test_open3d(benchmark: BenchmarkFixture, assembly: CadAssembly) -> None:
     try:
         tool = by_open3d()
     except PeerMissingError as error:

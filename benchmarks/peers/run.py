@@ -15,7 +15,7 @@ from peers.own import Own
 WARM_FRAMES = 50
 
 
-class Measured(NamedTuple):
+class PeerResults(NamedTuple):
     """A cell for each peer that can be had, and a note for each other."""
 
     cells: list[Cell]
@@ -24,7 +24,7 @@ class Measured(NamedTuple):
 
 def measure_peers(
     work: PeerWork, poses: NDArray[np.float64], seconds: float, peers: Sequence[Peer] | None = None
-) -> Measured:
+) -> PeerResults:
     """Measure hapticdb and its peers.
 
     Parameters
@@ -40,13 +40,13 @@ def measure_peers(
 
     Returns
     -------
-    Measured
+    PeerResults
         `hits_agree` is the share of frames with as many hits as `Environment.touch` finds, None
         for a peer that answers another question.
     """
     work.prepare()
     wanted = [len(work.env.touch(work.shell, pose).hits) for pose in poses]
-    measured = Measured([], [])
+    measured = PeerResults([], [])
     for peer in (Own(work), *(all_peers() if peers is None else peers)):
         try:
             measured.cells.append(_measure(peer, work, list(poses), wanted, seconds))

@@ -19,7 +19,7 @@ from hapticdb.bench.measure import Cell
 from hapticdb.kernels.surfaces.voxelize import count_voxels, voxelize
 from hapticdb.mesh import read_file
 from peers import INSTALL, PeerMissingError
-from peers.run import Measured
+from peers.run import PeerResults
 
 BITS = 10
 EDGE = 2.0**BITS
@@ -30,7 +30,7 @@ MOST_HALVINGS = 24
 Triangles = NDArray[np.float64]
 
 
-class Tool(NamedTuple):
+class VoxelizingTool(NamedTuple):
     """A voxelizer; only `make` is timed.
 
     take : a part (T, 3, 3), in voxels of the grid, into the tool's own mesh; make : the mesh into
@@ -42,32 +42,32 @@ class Tool(NamedTuple):
     count: Callable[[Any], int]
 
 
-class Assembly(NamedTuple):
+class CadAssembly(NamedTuple):
     """Parts (T, 3, 3) in voxels of the tight cube, and the name of the model that they make."""
 
     name: str
     parts: list[Triangles]
 
 
-def tight(name: str, parts: Sequence[Triangles]) -> Assembly:
+def tight(name: str, parts: Sequence[Triangles]) -> CadAssembly:
     """Parts in metres into the tight cube: its edge is the longest side, a hair larger."""
     low = np.min([part.min(axis=(0, 1)) for part in parts], axis=0)
     high = np.max([part.max(axis=(0, 1)) for part in parts], axis=0)
     scale = EDGE * (1 - 1e-9) / float((high - low).max())
-    return Assembly(name, [(part - low) * scale for part in parts])
+    return CadAssembly(name, [(part - low) * scale for part in parts])
 
 
-def read_assembly(path: Path) -> Assembly:
+def read_assembly(path: Path) -> CadAssembly:
     """All parts of a file, every instance a part of its own."""
     parts = [part.triangles() for part in read_file(path).parts]
     return tight(path.name, [part for part in parts if len(part)])
 
 
-def by_hapticdb() -> Tool:
-    return Tool(lambda part: part, lambda part: voxelize(part, BITS)[1], count_voxels)
+def by_hapticdb() -> VoxelizingTool:
+    return VoxelizingTool(lambda part: part, lambda part: voxelize(part, BITS)[1], count_voxels)
 
 
-def by_open3d() -> Tool:
+def by_open3d() -> VoxelizingTool:
     """Open3D's grid, one a part.
 
     Raises
@@ -87,14 +87,14 @@ def by_open3d() -> Tool:
         faces = np.arange(3 * len(part), dtype=np.int32).reshape(-1, 3)
         return open3d.geometry.TriangleMesh(points, open3d.utility.Vector3iVector(faces))
 
-    return Tool(
+    return VoxelizingTool(
         take,
         lambda mesh: voxels_within(mesh, 1.0, corner, far),
         lambda grid: len(grid.get_voxels()),
     )
 
 
-def by_trimesh() -> Tool:
+def by_trimesh() -> VoxelizingTool:
     """trimesh's own way: cut triangles until they are small, then take the voxels of corners."""
 
     def take(part: Triangles) -> trimesh.Trimesh:
@@ -102,23 +102,23 @@ def by_trimesh() -> Tool:
         return trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
 
     cut = trimesh.voxel.creation.voxelize_subdivide
-    return Tool(
+    return VoxelizingTool(
         take,
         lambda mesh: cut(mesh, 1.0, max_iter=MOST_HALVINGS),
         lambda grid: int(grid.filled_count),
     )
 
 
-TOOLS: Mapping[str, Callable[[], Tool]] = {
+TOOLS: Mapping[str, Callable[[], VoxelizingTool]] = {
     "hapticdb": by_hapticdb,
     "Open3D": by_open3d,
     "trimesh": by_trimesh,
 }
 
 
-def measure_voxelizers(assembly: Assembly, seconds: float) -> Measured:
+def measure_voxelizers(assembly: CadAssembly, seconds: float) -> PeerResults:
     """Object voxels a second of each tool; about `seconds` for each."""
-    measured = Measured([], [])
+    measured = PeerResults([], [])
     for name, get in TOOLS.items():
         try:
             tool = get()
@@ -129,7 +129,7 @@ def measure_voxelizers(assembly: Assembly, seconds: float) -> Measured:
     return measured
 
 
-def _measure(name: str, tool: Tool, assembly: Assembly, seconds: float) -> Cell:
+def _measure(name: str, tool: VoxelizingTool, assembly: CadAssembly, seconds: float) -> Cell:
     """Median of some rounds over the parts that a first one, which warms up, had time for."""
     order = np.random.default_rng(SEED).permutation(len(assembly.parts))
     meshes = []

@@ -55,7 +55,7 @@ class Imported(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Scene:
+class DemoScene:
     """What the demo works on: the sample's files and the environments made from them."""
 
     folder: Path
@@ -67,7 +67,7 @@ class Scene:
 
 
 @dataclass
-class Felt:
+class StrategyFigures:
     """What one strategy did and took, frame by frame."""
 
     elapsed_us: list[float] = field(default_factory=list)
@@ -97,11 +97,11 @@ class Felt:
 
 
 @dataclass(frozen=True)
-class Measured:
+class LayoutFigures:
     """All strategies on one layout."""
 
     imported: Imported
-    felt: dict[Strategy, Felt]
+    felt: dict[Strategy, StrategyFigures]
 
 
 @dataclass
@@ -124,7 +124,7 @@ class Trace:
 class Comparison:
     """All strategies on all layouts, and whether they agreed."""
 
-    layouts: tuple[Measured, ...]
+    layouts: tuple[LayoutFigures, ...]
     trace: Trace
     compared: int
     disagreed: tuple[str, ...]
@@ -157,7 +157,7 @@ def prepare(
     frames: int = 1000,
     points: int = 300,
     progress: ImportCallback | None = None,
-) -> Scene:
+) -> DemoScene:
     """Write the sample and import it in both layouts.
 
     Parameters
@@ -191,7 +191,7 @@ def prepare(
     with open_environment(imported[0].url, read_only=True) as env:
         grid_text = env.grid.describe()
     poses = read_poses(files.path)
-    return Scene(home, files, tuple(imported), shell, poses, grid_text)
+    return DemoScene(home, files, tuple(imported), shell, poses, grid_text)
 
 
 def _import(
@@ -226,7 +226,7 @@ def _import(
     )
 
 
-def compare(scene: Scene) -> Comparison:
+def compare(scene: DemoScene) -> Comparison:
     """Touch every pose by every strategy on every layout; time it, and compare what was found."""
     disagreed: list[str] = []
     layouts = []
@@ -234,7 +234,7 @@ def compare(scene: Scene) -> Comparison:
     trace: Trace | None = None
     for imported in scene.imported:
         with open_environment(imported.url, read_only=True) as env:
-            layouts.append(Measured(imported, _race(env, scene, reference, disagreed)))
+            layouts.append(LayoutFigures(imported, _race(env, scene, reference, disagreed)))
             if trace is None:
                 trace = trace_of(env, scene.shell, scene.poses)
     assert trace is not None  # noqa: S101 - the demo has two layouts
@@ -243,13 +243,13 @@ def compare(scene: Scene) -> Comparison:
 
 
 def _race(
-    env: Environment, scene: Scene, reference: list[Any], disagreed: list[str]
-) -> dict[Strategy, Felt]:
+    env: Environment, scene: DemoScene, reference: list[Any], disagreed: list[str]
+) -> dict[Strategy, StrategyFigures]:
     """Time of every strategy; what each pose found is held against `reference`, filled first."""
     for strategy in COMPARED:
         for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
             env.touch(scene.shell, pose, strategy)
-    felt: dict[Strategy, Felt] = {strategy: Felt() for strategy in COMPARED}
+    felt: dict[Strategy, StrategyFigures] = {strategy: StrategyFigures() for strategy in COMPARED}
     for index, pose in enumerate(scene.poses):
         # whoever goes first at a pose brings its pages in for the others: they take turns
         turn = index % len(COMPARED)

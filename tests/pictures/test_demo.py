@@ -20,12 +20,12 @@ from hapticdb.poses import read_poses
 
 
 @pytest.fixture(scope="session")
-def scene(tmp_path_factory: pytest.TempPathFactory) -> demo.Scene:
+def scene(tmp_path_factory: pytest.TempPathFactory) -> demo.DemoScene:
     return demo.prepare(tmp_path_factory.mktemp("demo"), bits=7, frames=60, points=120)
 
 
 @pytest.fixture(scope="session")
-def comparison(scene: demo.Scene) -> demo.Comparison:
+def comparison(scene: demo.DemoScene) -> demo.Comparison:
     return demo.compare(scene)
 
 
@@ -43,7 +43,7 @@ def test_every_strategy_agrees_on_both_layouts(comparison: demo.Comparison) -> N
 
 
 def test_a_disagreement_is_told(
-    scene: demo.Scene, comparison: demo.Comparison, monkeypatch: pytest.MonkeyPatch
+    scene: demo.DemoScene, comparison: demo.Comparison, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     found = demo._found
     calls = Counter[str]()
@@ -69,7 +69,7 @@ def test_the_path_touches_the_sample(comparison: demo.Comparison) -> None:
 
 
 def test_hits_of_the_trace_lie_in_voxels_of_their_objects(
-    scene: demo.Scene, comparison: demo.Comparison
+    scene: demo.DemoScene, comparison: demo.Comparison
 ) -> None:
     trace = comparison.trace
     with hapticdb.open(scene.imported[0].url, read_only=True) as env:
@@ -80,7 +80,7 @@ def test_hits_of_the_trace_lie_in_voxels_of_their_objects(
 
 
 def test_the_picture_shows_the_scene(
-    scene: demo.Scene, comparison: demo.Comparison, tmp_path: Path
+    scene: demo.DemoScene, comparison: demo.Comparison, tmp_path: Path
 ) -> None:
     demo_picture.draw(tmp_path / "demo.png", scene, comparison)
     image = matplotlib.image.imread(tmp_path / "demo.png")
@@ -91,7 +91,7 @@ def test_the_picture_shows_the_scene(
 
 @pytest.mark.long
 def test_a_second_demo_finds_its_environments_there(
-    scene: demo.Scene, capfd: pytest.CaptureFixture[str]
+    scene: demo.DemoScene, capfd: pytest.CaptureFixture[str]
 ) -> None:
     code = main(["demo", str(scene.folder), "--bits", "7", "--frames", "20", "--points", "60"])
     out, err = capfd.readouterr()
@@ -105,7 +105,7 @@ def test_a_second_demo_finds_its_environments_there(
     assert len(err.splitlines()) == 1
 
 
-def test_another_grid_in_the_same_folder_is_refused(scene: demo.Scene) -> None:
+def test_another_grid_in_the_same_folder_is_refused(scene: demo.DemoScene) -> None:
     with pytest.raises(UsageError, match="give another folder"):
         demo.prepare(scene.folder, bits=6, frames=20)
 

@@ -23,7 +23,7 @@ from hapticdb.pictures.splat import Camera, Depths, shade, splat
 from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
-    from hapticdb.demo import Comparison, Scene, Trace
+    from hapticdb.demo import Comparison, DemoScene, Trace
 
 SIZE = (1600, 1000)
 """Pixels of the picture; the scene fills the upper part."""
@@ -60,7 +60,7 @@ class Palette:
         return self.colors.get(object_id, REST)
 
 
-def draw(path: Path, scene: "Scene", comparison: "Comparison") -> None:
+def draw(path: Path, scene: "DemoScene", comparison: "Comparison") -> None:
     """Draw the first environment of a demo, what its tool felt, and write it as a PNG."""
     with open_environment(scene.imported[0].url, read_only=True) as env:
         figure = compose(env, scene, comparison)
@@ -70,7 +70,7 @@ def draw(path: Path, scene: "Scene", comparison: "Comparison") -> None:
         raise FileError(f"cannot write {path}: {error.strerror}") from error
 
 
-def compose(env: Environment, scene: "Scene", comparison: "Comparison") -> Figure:
+def compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> Figure:
     """Lay out the figure: the scene above, the force along the path below."""
     trace = comparison.trace
     palette = _palette(env, trace)
@@ -139,7 +139,7 @@ def mixed(one: str, other: str, share: float) -> tuple[float, float, float]:
 
 
 def _draw_path(
-    axes: Axes, camera: Camera, scene: "Scene", trace: "Trace", palette: Palette
+    axes: Axes, camera: Camera, scene: "DemoScene", trace: "Trace", palette: Palette
 ) -> None:
     """Hits as points in the colour of their object, the tool at a few poses, and its way."""
     step = max(1, len(trace.points) // HITS_SHOWN)
@@ -157,7 +157,7 @@ def _draw_path(
         )
 
 
-def _tool_triangles(scene: "Scene") -> NDArray[np.float64]:
+def _tool_triangles(scene: "DemoScene") -> NDArray[np.float64]:
     from hapticdb.mesh import read_file  # noqa: PLC0415 - pictures alone need the tool's surface
 
     return np.concatenate([part.triangles() for part in read_file(scene.files.wrench).parts])
@@ -186,7 +186,7 @@ def _draw_tool(
     )
 
 
-def _draw_words(figure: Figure, scene: "Scene", comparison: "Comparison") -> None:
+def _draw_words(figure: Figure, scene: "DemoScene", comparison: "Comparison") -> None:
     one, felt = comparison.layouts[0].imported, comparison.layouts[0].felt["auto"]
     figure.text(0.022, 0.955, "hapticdb", color="white", fontsize=25, weight="bold", va="center")
     lines = (

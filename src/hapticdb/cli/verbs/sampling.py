@@ -9,7 +9,7 @@ from hapticdb.cli import render
 from hapticdb.cli.options import JsonOption
 
 if TYPE_CHECKING:
-    from hapticdb.demo import Comparison, Imported, Measured, Scene
+    from hapticdb.demo import Comparison, DemoScene, Imported, LayoutFigures
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
 FramesOption = Annotated[int, typer.Option(metavar="N", help="Poses of the path.")]
@@ -119,7 +119,7 @@ def demo(
         raise typer.Exit(1)
 
 
-def _record(scene: "Scene", comparison: "Comparison", picture: Path) -> dict[str, object]:
+def _record(scene: "DemoScene", comparison: "Comparison", picture: Path) -> dict[str, object]:
     from hapticdb.store.connect import redact
 
     return {
@@ -150,7 +150,7 @@ def _record(scene: "Scene", comparison: "Comparison", picture: Path) -> dict[str
     }
 
 
-def _show_scene(scene: "Scene") -> None:
+def _show_scene(scene: "DemoScene") -> None:
     rows = [
         ("sample", ", ".join(str(path) for path in scene.files)),
         ("grid", scene.grid_text),
@@ -174,7 +174,7 @@ def _import_text(one: "Imported") -> str:
     return f"{where}: {size}; {one.seconds:.1f} s, {rate} a second"
 
 
-def _show_layout(measured: "Measured", scene: "Scene", hits: float) -> None:
+def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> None:
     import numpy as np
 
     from hapticdb.demo import YARDSTICK

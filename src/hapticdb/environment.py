@@ -12,8 +12,8 @@ from hapticdb.errors import ConnectionLostError, ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
 from hapticdb.ingest.layout import voxels_of_rows
+from hapticdb.ingest.moving import move_object, shift_objects
 from hapticdb.ingest.originals import shell_of_objects
-from hapticdb.ingest.placing import move_object, shift_objects
 from hapticdb.mesh import read_file
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.cost_model import CostModel

@@ -1,17 +1,14 @@
-"""Parts -> voxels -> rows: parallel over parts, one transaction an object, in the file's order.
+"""Files -> objects and their rows: one transaction an object, in the order of the file.
 
-Threads suffice: the voxelizer and the engine both run without the interpreter lock. Objects are
-written in the order of the files and of their parts, whatever the number of jobs, so that an
-interrupted import that is run again ends with the same rows and ids as an undisturbed one.
+Objects are written in the order of the files and of their parts, whatever the number of jobs. So an
+import that was interrupted and is run again ends with the same rows and ids as an undisturbed one.
 """
 
 import contextlib
 import os
-from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,21 +19,16 @@ from hapticdb.errors import (
     GeometryChangedError,
     HapticDBError,
     MissingExtraError,
-    OutsideGridError,
     UsageError,
 )
 from hapticdb.grid import Grid, GridOptions
+from hapticdb.ingest.checking import check_inside, check_names
 from hapticdb.ingest.known_parts import KnownParts, added_or_present, drop_others, replace_changed
-from hapticdb.ingest.voxelizing import ShareCallback, rows_of_part
+from hapticdb.ingest.voxelizing import voxelize_parts
 from hapticdb.mesh import Defects, MeshFile, Part, read_file
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
-from hapticdb.store.base import Layout, Object, Rows, Store
+from hapticdb.store.base import Layout, Object, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
-
-AT_BORDER = 1e-6
-"""Voxels by which rounding may carry a part across the grid's border without an error."""
-EVERY = 0.2
-"""Seconds after which the share of a part that takes long is told again."""
 
 
 class ImportProgress(NamedTuple):
@@ -166,7 +158,7 @@ def import_files(
     options : ImportOptions or None
         Units, grid, layout, jobs.
     progress : callable or None
-        Called after each part with a `ImportProgress`.
+        Called after each part with an `ImportProgress`.
 
     Returns
     -------
@@ -186,61 +178,99 @@ def import_files(
         raise UsageError(f"files {files!r}: give a list of files")
     if not files:
         raise UsageError("no files: name at least one to import")
-    store = open_store(url) if exists(url) else None
-    if store is None:
-        check_curve(chosen.grid.curve or "z", chosen.layout or "brick")
-    else:
-        with _closing_on_error(store):
-            _check_layout(store, chosen.layout)
-            chosen.grid.check_matches(store.grid)
-    is_new = False
     reports: list[FileReport] = []
-    n_written = 0
-    try:
-        is_loading = False
-        with contextlib.ExitStack() as loading:
-            for n, file in enumerate(files):
-                try:
-                    mesh_file = read_file(file, unit=chosen.unit, **chosen.limits)
-                    if store is None:
-                        grid = chosen.grid.fit(mesh_file.bounds)
-                        _check_inside(mesh_file, grid)
-                        store, is_new = _created_or_joined(url, grid, chosen)
-                    elif n == 0 and not is_new:
-                        chosen.grid.check_matches(store.grid, _first_bounds(store, mesh_file))
-                    if not is_loading:
-                        loading.enter_context(store.loading())
-                        is_loading = True
-                    report = ingest_file(store, mesh_file, chosen, progress)
-                except (FileError, MissingExtraError) as error:
-                    report = FileReport(os.fspath(file), "failed", error=error)
-                n_written += len(report.added)
-                reports.append(report)
-        if store is not None and store.revision():
-            store.analyze(DEFAULT_RESOLUTION)
-    finally:
-        if store is not None:
-            if is_new and not n_written and not store.revision():
-                store.discard()
-            else:
-                store.close()
+    with _Target(url, chosen) as target:
+        with target.loading:
+            for file in files:
+                reports.append(_import_file(target, file, chosen, progress))
+                target.is_first_file = False
+                target.has_written |= bool(reports[-1].added)
+        if target.store is not None and target.store.revision():
+            target.store.analyze(DEFAULT_RESOLUTION)
     return reports
 
 
-def _created_or_joined(
-    url: str | os.PathLike[str], grid: Grid, options: ImportOptions
-) -> tuple[Store, bool]:
-    """Make the environment, or join one that another has made meanwhile; whether it was made."""
+def _import_file(
+    target: "_Target",
+    file: str | os.PathLike[str],
+    options: ImportOptions,
+    progress: ImportCallback | None,
+) -> FileReport:
+    """Import one file; one that cannot be used gets a report that says why."""
     try:
-        return create_store(url, grid, options.layout or "brick"), True
-    except EnvironmentExistsError:
-        store = open_store(url)
-        with _closing_on_error(store):
-            _check_layout(store, options.layout or "brick")
-            GridOptions(
-                bits=grid.bits, voxel_size=grid.voxel_size, origin=grid.origin, curve=grid.curve
-            ).check_matches(store.grid)
-        return store, False
+        mesh_file = read_file(file, unit=options.unit, **options.limits)
+        return ingest_file(target.store_for(mesh_file), mesh_file, options, progress)
+    except (FileError, MissingExtraError) as error:
+        return FileReport(os.fspath(file), "failed", error=error)
+
+
+class _Target:
+    """The environment that files are imported into: opened, or made for the first usable file.
+
+    Attributes
+    ----------
+    store : Store or None
+        None until the environment exists.
+    loading : ExitStack
+        Holds `Store.loading` from the first file that can be written.
+    is_first_file, has_written : bool
+        Whether no file came before; whether any object was written.
+    """
+
+    def __init__(self, url: str | os.PathLike[str], options: ImportOptions) -> None:
+        self._url, self._options = url, options
+        self._is_new = self._is_loading = False
+        self.loading = contextlib.ExitStack()
+        self.is_first_file, self.has_written = True, False
+        self.store: Store | None = None
+        if not exists(url):
+            check_curve(options.grid.curve or "z", options.layout or "brick")
+            return
+        self.store = open_store(url)
+        with _closing_on_error(self.store):
+            _check_layout(self.store, options.layout)
+            options.grid.check_matches(self.store.grid)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the store; an environment that was made here and got nothing is removed."""
+        if self.store is None:
+            return
+        if self._is_new and not self.has_written and not self.store.revision():
+            self.store.discard()
+        else:
+            self.store.close()
+
+    def store_for(self, mesh_file: MeshFile) -> Store:
+        """Give the store, ready to load a file; the first usable file makes the environment."""
+        grid_options = self._options.grid
+        if self.store is None:
+            grid = grid_options.fit(mesh_file.bounds)
+            check_inside(mesh_file.parts, mesh_file.link, grid)
+            self._create_or_join(grid)
+        elif self.is_first_file and not self._is_new:
+            grid_options.check_matches(self.store.grid, _first_bounds(self.store, mesh_file))
+        assert self.store is not None  # noqa: S101 - opened or made above
+        if not self._is_loading:
+            self.loading.enter_context(self.store.loading())
+            self._is_loading = True
+        return self.store
+
+    def _create_or_join(self, grid: Grid) -> None:
+        """Make the environment, or open the one that another process has made meanwhile."""
+        layout = self._options.layout or "brick"
+        try:
+            self.store, self._is_new = create_store(self._url, grid, layout), True
+        except EnvironmentExistsError:
+            store = open_store(self._url)
+            with _closing_on_error(store):
+                _check_layout(store, layout)
+                GridOptions(
+                    bits=grid.bits, voxel_size=grid.voxel_size, origin=grid.origin, curve=grid.curve
+                ).check_matches(store.grid)
+            self.store = store
 
 
 def ingest_file(
@@ -259,7 +289,45 @@ def ingest_file(
         When the environment holds a part of that name with another geometry, unless it is to be
         replaced.
     """
-    _check_names(mesh_file)
+    plan = _planned(store, mesh_file, options)
+    jobs = options.jobs or os.cpu_count() or 1
+    anew = voxelize_parts(plan.changed.values(), mesh_file, store, options.unit, jobs)
+    n_replaced = replace_changed(store, anew, {part.name: i for i, part in plan.changed.items()})
+    added = _add_missing(store, mesh_file, plan, (options.unit, jobs), progress)
+    n_dropped = drop_others(store, mesh_file) if options.replace else 0
+    written = tuple(obj for obj in store.objects() if obj.id in added) if added else ()
+    n_kept = len(plan.removed) if options.keep_removed else 0
+    return FileReport(
+        mesh_file.link,
+        "imported" if added or n_replaced or n_dropped else "complete",
+        written,
+        len(mesh_file.parts) - len(added) - n_kept - n_replaced,
+        restored=sum(obj.name in plan.removed for obj in written),
+        kept_removed=n_kept,
+        replaced=n_replaced,
+        dropped=n_dropped,
+        defects=mesh_file.defects,
+        is_unit_assumed=options.unit is None and not mesh_file.names_unit,
+    )
+
+
+class _Plan(NamedTuple):
+    """What is to be done with a file's parts.
+
+    known : parts that the environment holds; missing : parts to add, in the file's order; removed :
+    names of the file's parts that were removed from the environment; changed : parts to put in the
+    place of objects, by the ids of those.
+    """
+
+    known: KnownParts
+    missing: list[Part]
+    removed: set[str]
+    changed: dict[int, Part]
+
+
+def _planned(store: Store, mesh_file: MeshFile, options: ImportOptions) -> _Plan:
+    """Compare a file with the environment; refuses what cannot be written, before any write."""
+    check_names(mesh_file)
     known = KnownParts(store, mesh_file.link)
     missing = [part for part in mesh_file.parts if known.digest_of(part.name) is None]
     removed = {part.name for part in missing} & store.removed(mesh_file.link)
@@ -271,146 +339,44 @@ def ingest_file(
                 f"{mesh_file.link}: part {part.name!r} has changed since it was imported, or was "
                 "read with another --unit; --replace puts the file's in its place"
             )
-    jobs = options.jobs or os.cpu_count() or 1
     changed = known.changed(mesh_file.parts, options.unit) if options.replace else {}
-    _check_inside(mesh_file, store.grid, [*missing, *changed.values()])
-    anew = _voxelized(changed.values(), mesh_file, store, options.unit, jobs)
-    n_replaced = replace_changed(store, anew, {part.name: i for i, part in changed.items()})
+    check_inside([*missing, *changed.values()], mesh_file.link, store.grid)
+    return _Plan(known, missing, removed, changed)
+
+
+def _add_missing(
+    store: Store,
+    mesh_file: MeshFile,
+    plan: _Plan,
+    unit_and_jobs: tuple[str | None, int],
+    progress: ImportCallback | None,
+) -> set[int]:
+    """Add the missing parts, but those that another process adds meanwhile; ids of the added."""
     added: set[int] = set()
     n_parts = len(mesh_file.parts)
-    n_kept = len(removed) if options.keep_removed else 0
-    n_done = n_parts - len(missing)
+    n_done = n_parts - len(plan.missing)
     voxels = 0
 
     def still_missing() -> Iterator[Part]:
         nonlocal n_done
-        for part in missing:
-            if known.digest_of(part.name) == part.digest:
+        for part in plan.missing:
+            if plan.known.digest_of(part.name) == part.digest:
                 n_done += 1  # another process imports the same file
             else:
                 yield part
 
-    def tell(share: float) -> None:
+    def report_share(share: float) -> None:
         if progress is not None:
             progress(ImportProgress(mesh_file.link, n_done, n_parts, voxels, share))
 
-    for obj, rows in _voxelized(still_missing(), mesh_file, store, options.unit, jobs, tell):
+    parts = voxelize_parts(still_missing(), mesh_file, store, *unit_and_jobs, report_share)
+    for obj, rows in parts:
         n_done += 1
-        if (new_id := added_or_present(store, obj, rows, known)) is not None:
+        if (new_id := added_or_present(store, obj, rows, plan.known)) is not None:
             added.add(new_id)
         voxels += obj.voxels
-        tell(0.0)
-    n_dropped = drop_others(store, mesh_file) if options.replace else 0
-    written = tuple(obj for obj in store.objects() if obj.id in added) if added else ()
-    return FileReport(
-        mesh_file.link,
-        "imported" if added or n_replaced or n_dropped else "complete",
-        written,
-        n_parts - len(added) - n_kept - n_replaced,
-        restored=sum(obj.name in removed for obj in written),
-        kept_removed=n_kept,
-        replaced=n_replaced,
-        dropped=n_dropped,
-        defects=mesh_file.defects,
-        is_unit_assumed=options.unit is None and not mesh_file.names_unit,
-    )
-
-
-def _voxelized(
-    parts: Iterable[Part],
-    file: MeshFile,
-    store: Store,
-    unit: str | None,
-    jobs: int,
-    tell: ShareCallback = lambda _share: None,
-) -> Iterator[tuple[Object, Rows]]:
-    """Objects and rows of parts, in their order, a few parts ahead of the writer.
-
-    tell: called in this thread with the share of the part that is waited for.
-    """
-    shares: dict[str, float] = {}
-    attributes = {"unit": unit, "up": file.up}
-    known = {name: value for name, value in attributes.items() if value}
-
-    def work(part: Part) -> tuple[Object, Rows]:
-        def done(share: float) -> None:
-            shares[part.name] = share
-
-        try:
-            rows, n_voxels = rows_of_part(part, store.grid, store.layout, progress=done)
-        except FileError as error:
-            raise FileError(f"{file.link}: {error}") from None
-        return (
-            Object(
-                name=part.name,
-                link=file.link,
-                digest=part.digest,
-                transform=part.world_from_part,
-                voxels=n_voxels,
-                bounds=part.bounds,
-                attributes=known,
-            ),
-            rows,
-        )
-
-    waiting: deque[tuple[str, Future[tuple[Object, Rows]]]] = deque()
-
-    def finished() -> tuple[Object, Rows]:
-        name, future = waiting.popleft()
-        while not wait([future], EVERY).done:
-            tell(shares.get(name, 0.0))
-        return future.result()
-
-    pool = ThreadPoolExecutor(jobs, thread_name_prefix="voxelize")
-    try:
-        for part in parts:
-            waiting.append((part.name, pool.submit(work, part)))
-            if len(waiting) > 2 * jobs:
-                yield finished()
-        while waiting:
-            yield finished()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def check_placed_inside(
-    part: Part, link: str, grid: Grid, world_from_part: NDArray[np.float64] | None = None
-) -> NDArray[np.float64]:
-    """Bounds (2, 3) of a placed part in metres; refuses one that leaves the grid."""
-    points = part.world_points(world_from_part)
-    bounds = np.stack([points.min(axis=0), points.max(axis=0)])
-    scaled = grid.to_voxel_units(bounds)
-    # a point on the upper border has no voxel; a surface there still touches the last one
-    over = scaled[1] >= grid.side if part.is_cloud else scaled[1] > grid.side + AT_BORDER
-    if not np.isfinite(bounds).all() or (scaled[0] < -AT_BORDER).any() or over.any():
-        raise OutsideGridError(
-            f"{link}: part {part.name!r} spans {_box(bounds)} m, outside the grid's "
-            f"{_box(grid.bounds)} m; move it, or make an environment with a larger --extent"
-        )
-    return bounds
-
-
-def _check_names(mesh_file: MeshFile) -> None:
-    """Refuse names that not every engine can hold as text."""
-    for name in (mesh_file.link, *(part.name for part in mesh_file.parts)):
-        try:
-            name.encode()
-        except UnicodeEncodeError:
-            is_text = False
-        else:
-            is_text = "\0" not in name
-        if not is_text:
-            raise FileError(f"{mesh_file.link!a}: the name {name!a} is no text: rename it")
-
-
-def _check_inside(mesh_file: MeshFile, grid: Grid, parts: Sequence[Part] | None = None) -> None:
-    for part in mesh_file.parts if parts is None else parts:
-        check_placed_inside(part, mesh_file.link, grid)
-
-
-def _box(bounds: NDArray[np.float64]) -> str:
-    low, high = (", ".join(f"{x:.6g}" for x in corner) for corner in bounds)
-    return f"({low}) to ({high})"
+        report_share(0.0)
+    return added
 
 
 def _check_layout(store: Store, layout: Layout | None) -> None:
@@ -421,7 +387,7 @@ def _check_layout(store: Store, layout: Layout | None) -> None:
 
 
 def _first_bounds(store: Store, mesh_file: MeshFile) -> NDArray[np.float64] | None:
-    """Bounds that `--extent` was meant for: only the first file decided on the grid."""
+    """Bounds of a file if it is the one that decided on the grid: `--extent` is meant for it."""
     first = next(iter(store.objects()), None)
     if first is None or first.link == mesh_file.link:
         return mesh_file.bounds
@@ -430,6 +396,7 @@ def _first_bounds(store: Store, mesh_file: MeshFile) -> NDArray[np.float64] | No
 
 @contextlib.contextmanager
 def _closing_on_error(store: Store) -> Iterator[None]:
+    """Close a store when the block raises."""
     try:
         yield
     except BaseException:

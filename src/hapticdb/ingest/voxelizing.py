@@ -1,6 +1,8 @@
-"""A part -> its rows, in pieces of bounded size, with word of how far it is."""
+"""Parts -> their rows: each part in pieces of bounded size, several parts at once in threads."""
 
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,15 +11,19 @@ from hapticdb.errors import FileError
 from hapticdb.grid import Grid
 from hapticdb.ingest.layout import Bricks, rows_of_bricks
 from hapticdb.kernels.surfaces import voxelize
-from hapticdb.mesh import Part
+from hapticdb.mesh import MeshFile, Part
 from hapticdb.mesh.child import bytes_available
-from hapticdb.store.base import BRICK_BYTES, Layout, Rows
+from hapticdb.store.base import BRICK_BYTES, Layout, Object, Rows, Store
 
 ShareCallback = Callable[[float], None]
-"""Hears of the share of a part that is done, 0 to 1; from any thread."""
+"""Called with the share of a part that is done, 0 to 1; from any thread."""
+SHARE_EVERY_S = 0.2
+"""Seconds between two calls with the share of a part that takes long."""
 BYTES_A_BRICK = 8 + BRICK_BYTES
+"""Memory of a brick: its key and its occupancy."""
 _MERGE_FROM = 8 * voxelize.MOST_BRICKS
-"""Bricks that wait before they are merged for the first time."""
+"""Bricks in pieces after which the pieces are merged for the first time. A larger value merges less
+often and takes more memory."""
 
 
 def rows_of_part(
@@ -111,3 +117,80 @@ def check_room(n_bytes: int, what: str) -> None:
             f"{what}: its voxels take more than {n_bytes / 2**30:.1f} GiB of memory, and "
             f"{left / 2**30:.1f} are left; import it into a grid of fewer --bits"
         )
+
+
+def voxelize_parts(
+    parts: Iterable[Part],
+    file: MeshFile,
+    store: Store,
+    unit: str | None,
+    jobs: int,
+    progress: ShareCallback = lambda _share: None,
+) -> Iterator[tuple[Object, Rows]]:
+    """Objects and rows of parts, in their order; threads voxelize a few parts ahead of the caller.
+
+    Threads suffice: the voxelizer runs without the interpreter lock.
+
+    Parameters
+    ----------
+    unit : str or None
+        That the file was read with; kept with the objects.
+    jobs : int
+        Threads that voxelize.
+    progress : callable
+        Called in the caller's thread with the share of the part that it waits for.
+    """
+    shares: dict[str, float] = {}
+    given = {"unit": unit, "up": file.up}
+    attributes = {name: value for name, value in given.items() if value}
+
+    def voxelize_part(part: Part) -> tuple[Object, Rows]:
+        def note_share(share: float) -> None:
+            shares[part.name] = share
+
+        return _object_of(part, file, store, attributes, note_share)
+
+    waiting: deque[tuple[str, Future[tuple[Object, Rows]]]] = deque()
+
+    def next_result() -> tuple[Object, Rows]:
+        name, future = waiting.popleft()
+        while not wait([future], SHARE_EVERY_S).done:
+            progress(shares.get(name, 0.0))
+        return future.result()
+
+    pool = ThreadPoolExecutor(jobs, thread_name_prefix="voxelize")
+    try:
+        for part in parts:
+            waiting.append((part.name, pool.submit(voxelize_part, part)))
+            if len(waiting) > 2 * jobs:
+                yield next_result()
+        while waiting:
+            yield next_result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _object_of(
+    part: Part,
+    file: MeshFile,
+    store: Store,
+    attributes: Mapping[str, object],
+    progress: ShareCallback,
+) -> tuple[Object, Rows]:
+    """Object and rows of a part where its file places it."""
+    try:
+        rows, n_voxels = rows_of_part(part, store.grid, store.layout, progress=progress)
+    except FileError as error:
+        raise FileError(f"{file.link}: {error}") from None
+    return (
+        Object(
+            name=part.name,
+            link=file.link,
+            digest=part.digest,
+            transform=part.world_from_part,
+            voxels=n_voxels,
+            bounds=part.bounds,
+            attributes=attributes,
+        ),
+        rows,
+    )

@@ -1,15 +1,15 @@
-"""Bricks under construction: a hash table from a brick's place to its 512 bits.
+"""Bricks under construction: a hash table from a brick's packed key to its 512 bits.
 
 A brick is a cube of 8 x 8 x 8 voxels, and bit number n of its occupancy is the Z-order of (i, j, k)
 modulo 8. So each of its eight 64-bit words is a cube of 4 x 4 x 4 voxels, and a run of voxels along
 any axis sets its bits in a word by one OR with a shifted mask.
 
-An axis is named by its *place*: 2 for i, 1 for j, 0 for k, where its bit stands in each group of
-three. While bricks are being filled, their key is *packed*, (i >> 3, j >> 3, k >> 3) in 18 bits
-each: cheaper to form than the Z-order key, which is needed once a brick, at the end.
+The number of an axis here is that of its bit in each group of three: 2 for i, 1 for j, 0 for k.
+While bricks are being filled, their key is *packed*: (i >> 3, j >> 3, k >> 3) in 18 bits each. That
+is cheaper to compute than the Z-order key, which each brick needs once, at the end.
 
-The table grows by doubling, so memory is in proportion to the bricks that exist and never to the
-grid. It lives in the arrays of one `Bricks`; how many of them are in use is counted by the caller.
+The table grows by doubling, so its memory is in proportion to the bricks that exist and never to
+the grid. Its arrays are those of one `BrickTable`; the caller counts the bricks in use.
 """
 
 from typing import NamedTuple
@@ -21,16 +21,23 @@ from hapticdb.kernels._jit import FLOATS2, INT, INTS, INTS2, entry, leaf
 from hapticdb.kernels.curves import compact, z_encode
 
 FIRST_CAPACITY = np.int64(256)
+"""Bricks for which a new table has room. A larger value costs each small part time to clear it."""
 RUNS_AT_ONCE = 1024
-PLACE_BITS = 18
-PLACE_MASK = (1 << PLACE_BITS) - 1
+"""Runs that are collected before they are marked: 40 kB. Fewer would pass arrays between kernels
+more often, more would leave the processor's first cache."""
+RUN_AXIS, RUN_LAST = 3, 4
+"""Columns of a run behind its first voxel (i, j, k): the axis along which it goes on, and its last
+coordinate on that axis."""
+PACKED_BITS = 18
+"""Bits of each coordinate in a packed key: a grid has at most 2^21 voxels an axis, 2^18 bricks."""
+PACKED_MASK = (1 << PACKED_BITS) - 1
 
 
-class Bricks(NamedTuple):
-    """Arrays of the table. Capacity C grows; slots are twice as many, so probes stay short.
+class BrickTable(NamedTuple):
+    """A hash table of bricks of capacity C. It has 2 C slots, so that probes stay short.
 
     keys (C,) int64, packed; words (C, 8) int64, zero where unused; slots (2 C,) int32, the index of
-    the brick whose hash ends here or -1; recent (256, 2) int64, a key and its index.
+    the brick whose hash leads here, or -1; recent (256, 2) int64, a key and its brick's index.
     """
 
     keys: NDArray[np.int64]
@@ -40,13 +47,13 @@ class Bricks(NamedTuple):
 
 
 def _run_masks() -> NDArray[np.int64]:
-    """Masks (3, 4, 4): bits of the voxels first..last of a word along the axis of a place."""
+    """Masks (3, 4, 4): bits of the voxels first..last of a word along an axis."""
     masks = np.zeros((3, 4, 4), dtype=np.int64)
-    for place in range(3):
+    for axis in range(3):
         for first in range(4):
             for last in range(first, 4):
-                bits = sum(1 << ((n + 6 * (n >> 1)) << place) for n in range(first, last + 1))
-                masks[place, first, last] = bits
+                bits = sum(1 << ((n + 6 * (n >> 1)) << axis) for n in range(first, last + 1))
+                masks[axis, first, last] = bits
     return masks
 
 
@@ -55,13 +62,13 @@ RUN_MASKS = _run_masks()
 
 @leaf
 def first_slot(key, mask):
-    """Where the search for a packed key begins. No product leaves 63 bits, so none overflows."""
+    """Slot where the search for a packed key begins. No product has more than 63 bits."""
     mixed = (key & 0x7FFFFFF) * 0x5BD1E995 + (key >> 27) * 0x2545F491
     return (mixed >> 20 ^ mixed) & mask
 
 
 @leaf
-def new_bricks(capacity):
+def new_table(capacity):
     """Return an empty table for that many bricks, a power of two."""
     keys = np.empty(capacity, np.int64)
     words = np.zeros((capacity, 8), np.int64)
@@ -72,21 +79,21 @@ def new_bricks(capacity):
     for n in range(256):
         recent[n, 0] = -1
         recent[n, 1] = -1
-    return Bricks(keys, words, slots, recent)
+    return BrickTable(keys, words, slots, recent)
 
 
 @leaf
-def grown(bricks, n_bricks, wanted):
+def grown(table, n_bricks, wanted):
     """Copy the first `n_bricks` bricks into a larger table, with room for `wanted`."""
-    capacity = 2 * bricks.keys.shape[0]
+    capacity = 2 * table.keys.shape[0]
     while capacity < wanted:
         capacity *= 2
-    larger = new_bricks(capacity)
+    larger = new_table(capacity)
     mask = 2 * capacity - 1
     for n in range(n_bricks):
-        larger.keys[n] = bricks.keys[n]
+        larger.keys[n] = table.keys[n]
         for word in range(8):
-            larger.words[n, word] = bricks.words[n, word]
+            larger.words[n, word] = table.words[n, word]
         slot = first_slot(larger.keys[n], mask)
         while larger.slots[slot] >= 0:
             slot = (slot + 1) & mask
@@ -95,31 +102,31 @@ def grown(bricks, n_bricks, wanted):
 
 
 @leaf
-def mark_while_room(bricks, n_bricks, runs, done, n_runs):
-    """Mark rows done..n_runs of runs until the table is full; return rows done and its count.
+def mark_while_room(table, n_bricks, runs, done, n_runs):
+    """Mark runs done..n_runs until the table is full; return the runs done and the bricks in use.
 
-    No array is replaced or handed on in here: numba counts references atomically where it is, and
-    that took half of the time of voxelizing when a run was one call.
+    No array is replaced or passed on in this function, since numba would count references to it
+    atomically: that took half of the time of voxelizing when each run was one call.
     """
-    keys, words, slots, recent = bricks
+    keys, words, slots, recent = table
     mask = slots.shape[0] - 1
     while done < n_runs:
-        place = runs[done, 3]
-        last = runs[done, 4]
-        first = runs[done, 2 - place]
+        axis = runs[done, RUN_AXIS]
+        last = runs[done, RUN_LAST]
+        first = runs[done, 2 - axis]
         if n_bricks + bricks_of_run(first, last) > keys.shape[0]:
             break
-        runs[done, 2 - place] = 0
+        runs[done, 2 - axis] = 0
         i, j, k = runs[done, 0], runs[done, 1], runs[done, 2]
-        runs[done, 2 - place] = first
-        column = ((i >> 3) << (2 * PLACE_BITS)) | ((j >> 3) << PLACE_BITS) | (k >> 3)
+        runs[done, 2 - axis] = first
+        column = ((i >> 3) << (2 * PACKED_BITS)) | ((j >> 3) << PACKED_BITS) | (k >> 3)
         column_word = (i & 4) | ((j & 4) >> 1) | ((k & 4) >> 2)
         i, j, k = i & 3, j & 3, k & 3
         shift = ((i + 6 * (i >> 1)) << 2) + ((j + 6 * (j >> 1)) << 1) + k + 6 * (k >> 1)
         last_word = last >> 2
         start = first & 3
         for at in range(first >> 2, last_word + 1):
-            key = column | ((at >> 1) << (PLACE_BITS * place))
+            key = column | ((at >> 1) << (PACKED_BITS * axis))
             memo = (key ^ (key >> 15) ^ (key >> 30)) & 255
             if recent[memo, 0] != key:
                 slot = first_slot(key, mask)
@@ -132,8 +139,8 @@ def mark_while_room(bricks, n_bricks, runs, done, n_runs):
                 recent[memo, 0] = key
                 recent[memo, 1] = slots[slot]
             end = (last & 3) if at == last_word else 3
-            word = column_word | ((at & 1) << place)
-            words[recent[memo, 1], word] |= RUN_MASKS[place, start, end] << shift
+            word = column_word | ((at & 1) << axis)
+            words[recent[memo, 1], word] |= RUN_MASKS[axis, start, end] << shift
             start = 0
         done += 1
     return done, n_bricks
@@ -141,24 +148,23 @@ def mark_while_room(bricks, n_bricks, runs, done, n_runs):
 
 @leaf
 def bricks_of_run(first, last):
-    """At most so many bricks are crossed by a run."""
+    """Return how many bricks a run crosses at most."""
     return ((last - first) >> 3) + 2
 
 
 @leaf
-def mark_runs(bricks, n_bricks, runs, n_runs):
-    """Mark the first `n_runs` rows of runs (R, 5) int64; return the table and its new count.
+def mark_runs(table, n_bricks, runs, n_runs):
+    """Mark the first `n_runs` rows of runs (R, 5) int64; return the table and the bricks in use.
 
-    A row is a voxel (i, j, k), the place of the axis along which the run goes on, and its last
-    coordinate there.
+    A row is the first voxel (i, j, k) of the run, then `RUN_AXIS` and `RUN_LAST`.
     """
     done = np.int64(0)
     while True:
-        done, n_bricks = mark_while_room(bricks, n_bricks, runs, done, n_runs)
+        done, n_bricks = mark_while_room(table, n_bricks, runs, done, n_runs)
         if done == n_runs:
-            return bricks, n_bricks
-        first, last = runs[done, 2 - runs[done, 3]], runs[done, 4]
-        bricks = grown(bricks, n_bricks, n_bricks + bricks_of_run(first, last))
+            return table, n_bricks
+        first, last = runs[done, 2 - runs[done, RUN_AXIS]], runs[done, RUN_LAST]
+        table = grown(table, n_bricks, n_bricks + bricks_of_run(first, last))
 
 
 @entry(INTS, INTS)
@@ -167,7 +173,7 @@ def z_keys_kernel(packed, out):
     for n in range(out.shape[0]):
         key = packed[n]
         out[n] = z_encode(
-            key >> (2 * PLACE_BITS), (key >> PLACE_BITS) & PLACE_MASK, key & PLACE_MASK
+            key >> (2 * PACKED_BITS), (key >> PACKED_BITS) & PACKED_MASK, key & PACKED_MASK
         )
 
 
@@ -175,23 +181,23 @@ def z_keys_kernel(packed, out):
 def mark_points_kernel(points, bits):
     """Mark the voxels that hold points (N, 3), half-open. Returns packed keys, words, count."""
     edge = float(1 << bits)
-    bricks, n_bricks = new_bricks(FIRST_CAPACITY), np.int64(0)
+    table, n_bricks = new_table(FIRST_CAPACITY), np.int64(0)
     runs, n_runs = np.empty((RUNS_AT_ONCE, 5), np.int64), np.int64(0)
     for n in range(points.shape[0]):
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         if not (0.0 <= x < edge and 0.0 <= y < edge and 0.0 <= z < edge):
             continue
         if n_runs == RUNS_AT_ONCE:
-            bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)
+            table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
             n_runs = np.int64(0)
         runs[n_runs, 0] = int(x)
         runs[n_runs, 1] = int(y)
         runs[n_runs, 2] = int(z)
-        runs[n_runs, 3] = 0
-        runs[n_runs, 4] = int(z)
+        runs[n_runs, RUN_AXIS] = 0
+        runs[n_runs, RUN_LAST] = int(z)
         n_runs += 1
-    bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)
-    return bricks.keys, bricks.words, n_bricks
+    table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
+    return table.keys, table.words, n_bricks
 
 
 @leaf
@@ -269,8 +275,8 @@ def mark_points(
     -----
     Boxes are half-open here: voxel (i, j, k) holds the points of [i, i + 1) x ...
     """
-    places = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-    return sorted_bricks(*mark_points_kernel(places, bits))
+    in_voxels = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
+    return sorted_bricks(*mark_points_kernel(in_voxels, bits))
 
 
 def _words_of(occupancy: NDArray[np.uint8]) -> NDArray[np.int64]:

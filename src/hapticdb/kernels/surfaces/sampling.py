@@ -14,8 +14,12 @@ from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS32, INTS32_3, entry, 
 
 Floats = NDArray[np.float64]
 
-CHUNK = 1 << 18  # candidates drawn at a time
-CROWD = 500  # candidates looked at for one, on average: several sheets at one place have half
+CHUNK = 1 << 18
+"""Candidates that are drawn at a time. Another value draws the random numbers in another order, so
+that every shell changes; a larger one takes more memory."""
+CROWD = 500
+"""Candidates that one is compared with, on average; above it the reach is shortened. Several sheets
+at one place have half as many. A larger value makes folded surfaces slower to sample."""
 
 
 @leaf
@@ -47,8 +51,11 @@ def pair_weight(points, face_of, normals, a, b, reach, nearest, opposite):
 
 
 @leaf
-def sift_down(heap, place, weights, at, size):
-    """Restore the heap, heaviest first, below `at`, whose weight may have fallen."""
+def sift_down(heap, rank, weights, at, size):
+    """Restore the heap, heaviest first, below `at`, whose weight may have fallen.
+
+    rank (M,) int32 is the position of each candidate in the heap, -1 of one that was dropped.
+    """
     item = heap[at]
     weight = weights[item]
     while True:
@@ -60,10 +67,10 @@ def sift_down(heap, place, weights, at, size):
         if weights[heap[child]] <= weight:
             break
         heap[at] = heap[child]
-        place[heap[at]] = at
+        rank[heap[at]] = at
         at = child
     heap[at] = item
-    place[item] = at
+    rank[item] = at
 
 
 @entry(FLOATS2, INTS32, FLOATS2, INTS32, INTS32_3, INT, FLOAT, FLOAT, FLOAT)
@@ -71,12 +78,13 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
     """Drop the most crowded candidate, again and again, until `n_keep` are left.
 
     points (M, 3), sorted by cell; face_of (M,) int32; normals (F, 3); cell_of (M,) int32; ranges
-    (C, 9, 2) int32, the candidates in the cells around each -> (M,) int32, -1 for those dropped.
+    (C, 9, 2) int32, the candidates in the cells around each.
+    Returns (M,) int32, -1 for the candidates that were dropped.
     """
     n_points = points.shape[0]
     weights = np.empty(n_points, dtype=np.float64)
     heap = np.empty(n_points, dtype=np.int32)
-    place = np.empty(n_points, dtype=np.int32)
+    rank = np.empty(n_points, dtype=np.int32)
     for a in range(n_points):
         weight = 0.0
         cell = cell_of[a]
@@ -86,28 +94,28 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
                     weight += pair_weight(points, face_of, normals, a, b, reach, nearest, opposite)
         weights[a] = weight
         heap[a] = a
-        place[a] = a
+        rank[a] = a
     for at in range(n_points // 2 - 1, -1, -1):
-        sift_down(heap, place, weights, at, n_points)
+        sift_down(heap, rank, weights, at, n_points)
     size = n_points
     while size > n_keep:
         item = np.int64(heap[0])
-        place[item] = -1
+        rank[item] = -1
         size -= 1
         if size > 0:
             heap[0] = heap[size]
-            place[heap[0]] = 0
-            sift_down(heap, place, weights, np.int64(0), size)
+            rank[heap[0]] = 0
+            sift_down(heap, rank, weights, np.int64(0), size)
         cell = cell_of[item]
         for row in range(9):
             for b in range(ranges[cell, row, 0], ranges[cell, row, 1]):
-                if place[b] < 0:
+                if rank[b] < 0:
                     continue
                 weight = pair_weight(points, face_of, normals, item, b, reach, nearest, opposite)
                 if weight > 0.0:
                     weights[b] -= weight
-                    sift_down(heap, place, weights, np.int64(place[b]), size)
-    return place
+                    sift_down(heap, rank, weights, np.int64(rank[b]), size)
+    return rank
 
 
 class _Cells(NamedTuple):
@@ -164,12 +172,12 @@ def spread_points(
     (n_keep,) indices, ascending.
     """
     cells = _sort_into_cells(points, spacing)
-    while cells.crowd > CROWD:  # a soup folded upon itself: a shorter reach, or it takes for ever
+    while cells.crowd > CROWD:  # sheets folded upon one another
         spacing *= 0.75
         cells = _sort_into_cells(points, spacing)
     # Yuksel 2015, equation 4: beta = 0.65, gamma = 1.5
     nearest = spacing * (1.0 - (n_keep / len(points)) ** 1.5) * 0.65
-    place = eliminate_kernel(
+    rank = eliminate_kernel(
         points[cells.order],
         face_of[cells.order],
         normals,
@@ -180,7 +188,7 @@ def spread_points(
         nearest,
         opposite,
     )
-    return np.sort(cells.order[place >= 0])
+    return np.sort(cells.order[rank >= 0])
 
 
 def sample_surface(

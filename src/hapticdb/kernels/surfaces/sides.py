@@ -1,10 +1,11 @@
-"""Which side of a surface is inside, and which body encloses which, asked of lines through them.
+"""Which side of a surface is inside, and which body encloses which: by votes of lines.
 
-A line that leaves a closed surface crosses it once more than it enters it (Jordan's theorem), so
-the parity of its crossings ahead of a face and behind it tells the face's inside, whatever the
-winding of the triangles. One line may meet an edge, a hole or a rounding, so several vote. A tree
-of boxes keeps a line from asking every triangle. Lengths are in metres, in one frame of the
-caller's choice.
+A ray that begins inside a closed surface crosses it an odd number of times, one that begins outside
+an even number (Jordan's theorem). So a line through a face tells which side of the face is inside,
+by the parity of its crossings ahead of the face and behind it, whatever the winding of the
+triangles. A line may meet an edge, a hole or a rounding error, so several lines vote. A tree of
+boxes spares a line from testing every triangle. Lengths are in metres, in one frame of the caller's
+choice. docs/decisions/0015 says why it is done like this.
 """
 
 from typing import NamedTuple
@@ -28,12 +29,20 @@ from hapticdb.kernels.curves import Z_ORDER, encode
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-LEAF_SIZE = 4  # triangles in a leaf of the tree
-STACK = 64  # more than the height of a tree over 2^31 leaves
-TOUCH = 2  # a crossing at the line's own start
-PATIENCE = 32  # lines asked for one group of faces, at most
-ENOUGH = 5  # a side that leads by this many lines is not asked further
-LABOUR = 2e8  # nodes visited for all votes, a few seconds: past it, patches fall silent
+LEAF_SIZE = 4
+"""Triangles in a leaf of the tree. A larger value: a lower tree, and more triangles are tested."""
+STACK = 64
+"""Nodes that wait to be visited: more than the height of a tree over 2^31 leaves."""
+TOUCH = 2
+"""Told of a crossing at the line's own start: such a line has no vote."""
+PATIENCE = 32
+"""Most lines that vote on one patch or body. A larger value decides more doubtful ones, slower."""
+ENOUGH = 5
+"""Votes by which one side has to lead for the voting to end early. A larger value is slower and
+errs less often."""
+LABOUR = 2e8
+"""Nodes of the tree that all votes together may visit: a few seconds. Beyond it patches get fewer
+votes, or none. A larger value lets dense, tangled surfaces take longer."""
 
 
 class TriangleTree(NamedTuple):
@@ -65,7 +74,7 @@ def triangle_tree(triangles: Floats, bodies: Ints) -> TriangleTree:
     n_leaves = 1
     while n_leaves * LEAF_SIZE < len(triangles):
         n_leaves *= 2
-    # A line in the plane of a flat box would miss it by a rounding: the boxes are grown by more.
+    # A rounding error could make a line in the plane of a flat box miss it, so boxes are larger.
     slack = 1e-11 * float(np.abs(triangles).max())
     boxes = np.empty((2 * n_leaves - 1, 2, 3))
     spans = np.empty((2 * n_leaves - 1, 2), dtype=np.int64)
@@ -139,8 +148,8 @@ def crossing_side(ox, oy, oz, dx, dy, dz, corners, n, slack):
 def crossings(origin, direction, body, skip, tree, stack):
     """Crossings of a line with one body, ahead of the origin and behind it, and nodes visited.
 
-    A line that starts on face `skip` leaves it out, and so needs no offset: walls may be as thin as
-    they like. Both counts are -1 where the start lies on yet another triangle.
+    Face `skip`, on which the line starts, is not tested. So the start needs no offset from it, and
+    walls may be of any thinness. Both counts are -1 where the start lies on another triangle.
     """
     ox, oy, oz = origin[0], origin[1], origin[2]
     dx, dy, dz = direction[0], direction[1], direction[2]
@@ -181,13 +190,13 @@ def crossings(origin, direction, body, skip, tree, stack):
 
 @entry(TREE, INTS2, FLOATS2, FLOATS2, FLOATS2, INTS, INTS)
 def side_votes_kernel(tree, picks, directions, centroids, normals, body_of, out):
-    """For each patch, lines that see the inside where the normals point, less those that do not.
+    """For each patch, the votes that its normals point inside less the votes that they do not.
 
     picks (P, L) int64 faces, -1 for none; directions (L, 3); centroids, normals (F, 3); body_of
-    (F,) int64; out (P,) int64. A line across a closed surface crosses it, the start not counted, an
-    odd number of times on one side of its start, and that side is inside, and an even number on the
-    other; anything else is a hole or a rounding and has no vote. A dense soup, where each line
-    crosses thousands, runs out of `LABOUR` evenly: some of its patches get fewer lines, or none.
+    (F,) int64; out (P,) int64. A line that starts on a closed surface crosses the rest of it an odd
+    number of times on the side of its start that is inside, and an even number on the other side.
+    Any other count comes of a hole or a rounding error and has no vote. `LABOUR` is shared evenly:
+    where each line crosses thousands of triangles, some patches get fewer lines, or none.
     """
     stack = np.empty(STACK, dtype=np.int64)
     spent = 0
@@ -216,9 +225,10 @@ def side_votes_kernel(tree, picks, directions, centroids, normals, body_of, out)
 
 @entry(TREE, INTS2, INTS2, FLOATS2, FLOATS2, BYTES)
 def nesting_kernel(tree, pairs, picks, directions, centroids, out):
-    """For each pair (inner, outer) of bodies, whether the outer one encloses the inner one whole.
+    """For each pair (inner, outer) of bodies, whether the outer one encloses all of the inner one.
 
-    pairs (Q, 2) int64; picks (B, L) int64 faces of each body, -1 for none; out (Q,) uint8.
+    pairs (Q, 2) int64; picks (B, L) int64 faces of each body, -1 for none; out (Q,) uint8. One line
+    that starts outside decides against it.
     """
     stack = np.empty(STACK, dtype=np.int64)
     for q in range(pairs.shape[0]):
@@ -256,16 +266,17 @@ def normals_of(triangles: Floats) -> tuple[Floats, Floats]:
 
 
 def _pick_faces(group: Ints, areas: Floats, n_groups: int) -> Ints:
-    """For each group (F,) of faces some of them, in proportion to area; (n_groups, PATIENCE).
+    """Pick `PATIENCE` faces of each group in proportion to their area, (n_groups, PATIENCE).
 
-    Small groups repeat their faces; a group without area has none: -1.
+    group (F,) is the group of each face. Small groups repeat their faces; a group without area has
+    none: -1.
     """
     totals = np.bincount(group, areas, n_groups)
     order = np.argsort(group, kind="stable")
     order = order[areas[order] > 0.0]
     filled = np.cumsum(areas[order] / totals[group[order]])  # a filled group takes up 1
     starts = np.cumsum(totals > 0.0) - 1.0
-    # The golden ratio's multiples spread any number of first picks over the whole group.
+    # Multiples of the golden ratio: the first few picks, however many, cover the whole group.
     wanted = starts[:, None] + (np.arange(PATIENCE) * 0.6180339887498949 + 0.5) % 1.0
     picks = order[np.minimum(np.searchsorted(filled, wanted), len(order) - 1)]
     is_own = group[picks] == np.arange(n_groups)[:, None]
@@ -273,7 +284,7 @@ def _pick_faces(group: Ints, areas: Floats, n_groups: int) -> Ints:
 
 
 def _directions(n: int) -> Floats:
-    """`n` fixed directions, all over the sphere, none along an axis."""
+    """Return `n` fixed directions, spread over the sphere, none along an axis."""
     directions = np.random.default_rng(2015).normal(size=(n, 3))
     directions[np.abs(directions) < 1e-3] = 1e-3
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -312,11 +323,11 @@ def enclosures(
     return out.astype(np.bool_)
 
 
-def encloses(tree: TriangleTree, body: int, places: Floats) -> NDArray[np.bool_]:
-    """Tell whether a closed body of the tree encloses places (Q, 3), (Q,)."""
-    asked = np.arange(len(places))
-    pairs = np.stack([asked, np.full(len(places), body)], axis=1)
-    picks = np.repeat(asked[:, None], PATIENCE, axis=1)
-    out = np.zeros(len(places), dtype=np.uint8)
-    nesting_kernel(tree, pairs, picks, _directions(PATIENCE), places, out)
+def encloses(tree: TriangleTree, body: int, positions: Floats) -> NDArray[np.bool_]:
+    """Tell whether a closed body of the tree encloses positions (Q, 3), (Q,)."""
+    numbers = np.arange(len(positions))
+    pairs = np.stack([numbers, np.full(len(positions), body)], axis=1)
+    picks = np.repeat(numbers[:, None], PATIENCE, axis=1)
+    out = np.zeros(len(positions), dtype=np.uint8)
+    nesting_kernel(tree, pairs, picks, _directions(PATIENCE), positions, out)
     return out.astype(np.bool_)

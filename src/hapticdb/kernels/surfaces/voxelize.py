@@ -35,15 +35,17 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS3, INT, INTS, entry, leaf
+from hapticdb.kernels._jit import FLOATS3, INT, INTS, entry, inlined, leaf
 from hapticdb.kernels.surfaces.bricks import (
     FIRST_CAPACITY,
+    RUN_AXIS,
+    RUN_LAST,
     RUNS_AT_ONCE,
     brick_voxels,
     count_voxels,
     mark_points,
     mark_runs,
-    new_bricks,
+    new_table,
     sorted_bricks,
 )
 
@@ -52,21 +54,28 @@ __all__ = ["brick_voxels", "count_voxels", "mark_points", "voxelize", "voxelize_
 TOUCH = 1e-9
 """Separations up to this, in voxels, count as touching."""
 NULL_EDGE = 1e-30
-"""Cross products of an edge and a box normal up to this length, in voxels, are null."""
+"""Cross products of an edge and a box normal up to this length, in voxels, are skipped as null."""
 NULL_NORMAL = 2.0**-50
-"""Normals up to this length, in squares of the longest edge, are null."""
+"""Normals up to this length, in squares of the longest edge, are skipped as null."""
 THIN = 2.0**14
-"""Above this edge^3 / |normal| the normal's rounding would show at 1e-11 voxel."""
+"""Above this edge^3 / |normal| the normal is computed in twice the precision: its rounding would
+move the result by 1e-11 voxel. A larger value is faster and less exact."""
 FAR = 2.0**60
-"""Coordinates beyond are pulled to this: no product of three of them overflows."""
+"""Coordinates beyond it, in voxels, are set to it, so that no product of three overflows."""
 AXIS_X, AXIS_Y, AXIS_Z = np.int64(0), np.int64(1), np.int64(2)
+"""Axes as leaves take them: a bare 0 would be a type of its own to numba."""
 OUTSIDE, CUT, WHOLE = 0, 1, 2
-"""How much of a triangle's bounding box the grid has."""
+"""How much of a triangle's bounding box lies in the grid: nothing, a part, all."""
+AT_TRIANGLE, AT_ROW, AT_COLUMN, ROWS_DONE = 0, 1, 2, 3
+"""Fields of `resume`, where voxelizing goes on: the triangle; the row and the column in it, the row
+-1 where the triangle is new; thousandths of its rows that are done."""
 MOST_BRICKS = 1 << 17
-"""Bricks of a piece: 10 MB, and as much again while they are put in order."""
+"""Bricks of a piece: 10 MB, and as much again while they are sorted. A larger value takes more
+memory and reports progress less often; a smaller one sorts and merges more pieces."""
 RUNS_A_BRICK = 64
-"""Runs of voxels that a piece may take for each brick that it may have: so that a piece ends, and
-its share is told, where many triangles meet few bricks, too."""
+"""Runs of voxels after which a piece ends, for each brick that it may have. So a piece ends, and
+progress is reported, also where many triangles meet few bricks. A larger value reports less
+often."""
 STEEP = 1e40
 """Stands for 1 / 0 in the slope of an axis that is square to the direction solved for."""
 
@@ -284,82 +293,85 @@ def set_spans(axes, spans, box, v, w):
         spans[at_v - box[0, v], 1] = high
 
 
+@inlined
+def row_intervals(axes, x, box_intervals):
+    """Narrow a bounding box's intervals of v and of w, both lowest first, to those of the row x."""
+    low, high, low_row, high_row = box_intervals
+    for n in range(3):
+        value = axes[n, 0] * x
+        low = max(low, (axes[n, 1] - value) * axes[n, 3])
+        high = min(high, (axes[n, 2] - value) * axes[n, 3])
+        value = axes[n + 3, 0] * x
+        low_row = max(low_row, (axes[n + 3, 1] - value) * axes[n + 3, 3])
+        high_row = min(high_row, (axes[n + 3, 2] - value) * axes[n + 3, 3])
+    return low, high, low_row, high_row
+
+
+@inlined
+def write_run(runs, n, axes, voxel, last):
+    """Write run n: it begins at a voxel, given on the axes (u, v, w), and ends at `last` on w."""
+    u, v, w = axes
+    runs[n, u], runs[n, v], runs[n, w] = voxel
+    runs[n, RUN_AXIS] = 2 - w
+    runs[n, RUN_LAST] = last
+
+
 @leaf
 def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
     """Write the runs of voxels of triangles from resume on until `runs` is full; return how many.
 
-    resume (3,) int64 is where it stopped: the triangle, and row and column in it, or -1 where the
+    resume (4,) int64 is where it stopped: the triangle, and row and column in it, or -1 where the
     triangle is new. The other arrays keep what was computed for the triangle.
     """
     n_runs = 0
-    capacity = runs.shape[0]
-    for t in range(resume[0], triangles.shape[0]):
-        is_new = resume[1] < 0
+    for t in range(resume[AT_TRIANGLE], triangles.shape[0]):
+        is_new = resume[AT_ROW] < 0
         placed = place_in_grid(triangles, t, edge, corners, box) if is_new else CUT
         if placed == OUTSIDE:
             continue
-        if n_runs == capacity:
-            resume[0] = t
+        if n_runs == runs.shape[0]:
+            resume[AT_TRIANGLE] = t
             return n_runs
         normal = normal_of(corners)
-        u, v, w = order_axes(box, normal)
-        first_u, last_u = box[0, u], box[1, u]
-        first_v, last_v = box[0, v], box[1, v]
+        u, v, w = uvw = order_axes(box, normal)
+        first_u, first_v = box[0, u], box[0, v]
         move_u, move_v, move_w = box[2, u], box[2, v], box[2, w]
-        if placed == WHOLE and first_u == last_u and first_v == last_v:
+        if placed == WHOLE and first_u == box[1, u] and first_v == box[1, v]:
             # a triangle that lies in one column meets every voxel of it that its bounding box does
-            runs[n_runs, u] = first_u + move_u
-            runs[n_runs, v] = first_v + move_v
-            runs[n_runs, w] = box[0, w] + move_w
-            runs[n_runs, 3] = 2 - w
-            runs[n_runs, 4] = box[1, w] + move_w
+            start = (first_u + move_u, first_v + move_v, box[0, w] + move_w)
+            write_run(runs, n_runs, uvw, start, box[1, w] + move_w)
             n_runs += 1
             continue
-        low_w, high_w = float(box[0, w]), float(box[1, w])
         if is_new:
             set_axes(axes, plane, corners, normal, u, v, w)
             set_spans(axes, spans, box, v, w)
         else:
-            first_u = resume[1]
-        for at_u in range(first_u, last_u + 1):
+            first_u = resume[AT_ROW]
+        box_intervals = (float(first_v), float(box[1, v]), float(box[0, w]), float(box[1, w]))
+        for at_u in range(first_u, box[1, u] + 1):
             x = float(at_u)
-            low, high = float(first_v), float(last_v)
-            low_row, high_row = low_w, high_w
-            for n in range(3):
-                value = axes[n, 0] * x
-                low = max(low, (axes[n, 1] - value) * axes[n, 3])
-                high = min(high, (axes[n, 2] - value) * axes[n, 3])
-                value = axes[n + 3, 0] * x
-                low_row = max(low_row, (axes[n + 3, 1] - value) * axes[n + 3, 3])
-                high_row = min(high_row, (axes[n + 3, 2] - value) * axes[n + 3, 3])
+            low, high, low_row, high_row = row_intervals(axes, x, box_intervals)
             if low_row > high_row or low > high:
-                resume[1] = -1
+                resume[AT_ROW] = -1
                 continue
             low_v = int(np.ceil(low))
-            if resume[1] >= 0:
-                low_v = resume[2]
-                resume[1] = -1
-            value_row = plane[0] * x
+            if resume[AT_ROW] >= 0:
+                low_v = resume[AT_COLUMN]
+                resume[AT_ROW] = -1
             for at_v in range(low_v, int(np.floor(high)) + 1):
-                value = value_row + plane[1] * float(at_v)
-                low_w_here = max(low_row, spans[at_v - first_v, 0], (plane[2] - value) * plane[4])
-                high_w_here = min(high_row, spans[at_v - first_v, 1], (plane[3] - value) * plane[4])
-                first = int(np.ceil(low_w_here))
-                last = int(np.floor(high_w_here))
-                if first > last or low_w_here > high_w_here:
+                value = plane[0] * x + plane[1] * float(at_v)
+                low_w = max(low_row, spans[at_v - first_v, 0], (plane[2] - value) * plane[4])
+                high_w = min(high_row, spans[at_v - first_v, 1], (plane[3] - value) * plane[4])
+                first, last = int(np.ceil(low_w)), int(np.floor(high_w))
+                if first > last or low_w > high_w:
                     continue
-                if n_runs == capacity:
-                    resume[0] = t
-                    resume[1] = at_u
-                    resume[2] = at_v
+                if n_runs == runs.shape[0]:
+                    resume[AT_TRIANGLE], resume[AT_ROW], resume[AT_COLUMN] = t, at_u, at_v
                     return n_runs
-                runs[n_runs, u] = at_u + move_u
-                runs[n_runs, v] = at_v + move_v
-                runs[n_runs, w] = first + move_w
-                runs[n_runs, 3] = 2 - w
-                runs[n_runs, 4] = last + move_w
+                start = (at_u + move_u, at_v + move_v, first + move_w)
+                write_run(runs, n_runs, uvw, start, last + move_w)
                 n_runs += 1
-    resume[0] = triangles.shape[0]
+    resume[AT_TRIANGLE] = triangles.shape[0]
     return n_runs
 
 
@@ -368,11 +380,11 @@ def voxelize_kernel(triangles, bits, resume, most):
     """Bricks of the voxels that triangles (T, 3, 3) meet: packed keys, words (C, 8), count.
 
     Stops after `most` bricks or so, or many times as many runs of voxels. resume (4,) int64 is
-    where it begins and then where it has stopped: triangle, row and column in it (row -1: none),
-    thousandths of its rows that are done. All is done when the triangle is T.
+    where it begins and then where it has stopped: `AT_TRIANGLE`, `AT_ROW`, `AT_COLUMN` and
+    `ROWS_DONE`. All is done when the triangle is T.
     """
     edge = float(1 << bits)
-    bricks, n_bricks = new_bricks(FIRST_CAPACITY), np.int64(0)
+    table, n_bricks = new_table(FIRST_CAPACITY), np.int64(0)
     runs = np.empty((RUNS_AT_ONCE, 5), np.int64)
     corners = np.empty((3, 3))
     box = np.empty((3, 3), np.int64)
@@ -380,22 +392,26 @@ def voxelize_kernel(triangles, bits, resume, most):
     plane = np.empty(5)
     spans = np.empty((longest_box(triangles, edge), 2))
     n_done = np.int64(0)
-    if resume[1] >= 0:  # within a triangle: what was computed for it is computed again
-        place_in_grid(triangles, resume[0], edge, corners, box)
+    if resume[AT_ROW] >= 0:  # in the middle of a triangle: compute its axes again
+        place_in_grid(triangles, resume[AT_TRIANGLE], edge, corners, box)
         normal = normal_of(corners)
         u, v, w = order_axes(box, normal)
         set_axes(axes, plane, corners, normal, u, v, w)
         set_spans(axes, spans, box, v, w)
-    while resume[0] < triangles.shape[0] and n_bricks < most and n_done < RUNS_A_BRICK * most:
+    while (
+        resume[AT_TRIANGLE] < triangles.shape[0]
+        and n_bricks < most
+        and n_done < RUNS_A_BRICK * most
+    ):
         n_runs = fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs)
-        bricks, n_bricks = mark_runs(bricks, n_bricks, runs, n_runs)
+        table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
         n_done += n_runs
-    resume[3] = 0
-    if resume[1] >= 0:
+    resume[ROWS_DONE] = 0
+    if resume[AT_ROW] >= 0:
         u, v, w = order_axes(box, normal_of(corners))
         span = box[1, u] - box[0, u] + 1
-        resume[3] = (1000 * (resume[1] - box[0, u])) // span
-    return bricks.keys, bricks.words, n_bricks
+        resume[ROWS_DONE] = (1000 * (resume[AT_ROW] - box[0, u])) // span
+    return table.keys, table.words, n_bricks
 
 
 def voxelize_pieces(
@@ -416,10 +432,10 @@ def voxelize_pieces(
     resume = np.array([0, -1, 0, 0], dtype=np.int64)
     while True:
         piece = sorted_bricks(*voxelize_kernel(corners, bits, resume, most))
-        if resume[0] >= len(corners):
+        if resume[AT_TRIANGLE] >= len(corners):
             yield 1.0, *piece
             return
-        yield float(resume[0] + resume[3] / 1000) / len(corners), *piece
+        yield float(resume[AT_TRIANGLE] + resume[ROWS_DONE] / 1000) / len(corners), *piece
 
 
 def voxelize(

@@ -1,4 +1,4 @@
-"""Objects placed anew: their geometry is read again, voxelized, and exchanged in a transaction."""
+"""Objects moved: their geometry is read again, voxelized, and exchanged in one transaction."""
 
 from collections.abc import Iterable
 
@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ConflictError, UsageError
-from hapticdb.ingest.files import check_placed_inside
+from hapticdb.ingest.checking import bounds_inside
 from hapticdb.ingest.originals import parts_of
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import Part
@@ -15,6 +15,7 @@ from hapticdb.query.frame import as_ids
 from hapticdb.store.base import Covering, Object, Store
 
 RESTORE = "restore the file, or remove the object and import it again"
+"""What a message advises where an object's file has changed."""
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +26,7 @@ def move_object(
     """Place an object anew, as `Environment.move` documents it."""
     placed = _as_transform(transform)
     ((_, part),) = parts_of([old], "moved", RESTORE)
-    _place(store, old, part, placed, revision or 0, covering)
+    _write_moved(store, old, part, placed, revision or 0, covering)
 
 
 def shift_objects(
@@ -36,24 +37,25 @@ def shift_objects(
     shift[:3, 3] = _as_way(way)
     pairs = list(parts_of([store.object(int(i)) for i in as_ids(ids)], "moved", RESTORE))
     for obj, part in pairs:
-        check_placed_inside(part, obj.link, store.grid, shift @ obj.transform)
+        bounds_inside(part, obj.link, store.grid, shift @ obj.transform)
     for known, part in pairs:
         obj = known
         while True:
             try:
-                _place(store, obj, part, shift @ obj.transform, obj.revision, covering)
+                _write_moved(store, obj, part, shift @ obj.transform, obj.revision, covering)
                 break
-            except ConflictError:  # another has moved it: from there, then
+            except ConflictError:  # another has moved it meanwhile: shift it from there
                 obj = store.object(obj.id)
                 if obj.digest != part.digest:
                     raise
     return [store.object(obj.id) for obj, _ in sorted(pairs, key=lambda pair: pair[0].id)]
 
 
-def _place(
+def _write_moved(
     store: Store, old: Object, part: Part, placed: Floats, revision: int, covering: Covering
 ) -> None:
-    bounds = check_placed_inside(part, old.link, store.grid, placed)
+    """Exchange an object's rows for those of its part at the placement `placed` (4, 4)."""
+    bounds = bounds_inside(part, old.link, store.grid, placed)
     rows, n_voxels = rows_of_part(part, store.grid, store.layout, placed)
     new = Object(
         id=old.id,

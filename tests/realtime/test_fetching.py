@@ -23,7 +23,7 @@ from hapticdb.kernels.records import TOLD
 from hapticdb.kernels.resident.cells import cell_key
 from hapticdb.realtime.fetching import (
     CONFIRM_EVERY,
-    Fetching,
+    Fetcher,
     FetchRequest,
 )
 from hapticdb.realtime.resident_cells import ResidentCells
@@ -110,7 +110,7 @@ class LockStep:
         self.pose = np.eye(4)
         self.pose[:3, 3] = np.array(env.grid.origin) + env.grid.edge / 2
         self.side = Side(self.table, env.grid, shell)
-        self.fetching = Fetching(
+        self.fetcher = Fetcher(
             FetchRequest(env.url, self.table.descriptor, self.table.n_slots, env.grid, wrap=wrap),
             clock=lambda: self.now,
         )
@@ -136,7 +136,7 @@ class LockStep:
                 self.side.name(self.pose, len(hits))
 
     def round(self) -> None:
-        self.fetching.round()
+        self.fetcher.round()
         self.is_served = self.side.is_served  # the next frame tells anew
         self.wait(1e-3)
 
@@ -239,7 +239,7 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
     step = LockStep(world, sphere)
     step.warm_start()
     trouble = functools.partial(troubled, wait=step.wait, latency=0.002, errors=0.1, seed=3)
-    step.fetching.request = FetchRequest(
+    step.fetcher.request = FetchRequest(
         world.url, step.table.descriptor, step.table.n_slots, world.grid, wrap=trouble
     )
     step.hand = RandomHand(step.pose, 1, speed=0.6, clock=lambda: step.now)
@@ -247,12 +247,12 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
     while step.now < 4.0:
         try:
             if is_lost:
-                step.fetching.reopen()
+                step.fetcher.reopen()
             step.round()
             is_lost = False
             assert not step.table.cells.control[AWAY]
         except DatabaseError:
-            step.fetching.lost()
+            step.fetcher.report_lost()
             is_lost = True
             n_lost += 1
             before = step.table.cells.control[HEARTBEAT]
@@ -260,10 +260,10 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
             assert step.table.cells.control[HEARTBEAT] == before
     assert n_lost > 3
     step.hand = None
-    step.fetching.request = FetchRequest(
+    step.fetcher.request = FetchRequest(
         world.url, step.table.descriptor, step.table.n_slots, world.grid
     )
-    step.fetching.reopen()
+    step.fetcher.reopen()
     step.warm_start()
     naive = expected(ids_by_voxel(world), world.grid, sphere, step.pose)
     assert step.side.reader.feel(step.pose)[0] == naive.hits
@@ -278,13 +278,13 @@ def test_the_heartbeat_waits_for_an_answer(
     step.run(0.2)
     control = step.table.cells.control
     asked: list[float] = []
-    revision = step.fetching.store.revision
+    revision = step.fetcher.store.revision
 
     def counted() -> int:
         asked.append(step.now)
         return revision()
 
-    monkeypatch.setattr(step.fetching.store, "revision", counted, raising=False)
+    monkeypatch.setattr(step.fetcher.store, "revision", counted, raising=False)
     assert until(lambda: bool(asked), step.round)
     heard = int(control[HEARTBEAT])
     step.run(0.5 * CONFIRM_EVERY)
@@ -296,7 +296,7 @@ def test_the_heartbeat_waits_for_an_answer(
     def unanswered() -> int:
         raise hapticdb.ConnectionLostError("gone")
 
-    monkeypatch.setattr(step.fetching.store, "revision", unanswered, raising=False)
+    monkeypatch.setattr(step.fetcher.store, "revision", unanswered, raising=False)
     heard = int(control[HEARTBEAT])
     with pytest.raises(hapticdb.ConnectionLostError):
         step.run(2 * CONFIRM_EVERY)
@@ -314,8 +314,8 @@ def test_a_round_asks_nothing_when_nothing_has_moved(
         raise AssertionError
 
     for name in ("scan", "lookup", "revision", "snapshot"):
-        monkeypatch.setattr(step.fetching.store, name, forbidden, raising=False)
-    monkeypatch.setattr(step.fetching.residency, "missing", forbidden)
+        monkeypatch.setattr(step.fetcher.store, name, forbidden, raising=False)
+    monkeypatch.setattr(step.fetcher.residency, "missing", forbidden)
     for _ in range(20):
         step.round()
     assert step.is_served
@@ -355,7 +355,7 @@ def test_sessions_share_a_table(world: Environment, sphere: PointShell) -> None:
     assert other.reader.feel(pose)[2] == step.side.reader.feel(step.pose)[2] == 0
     step.table.leave(other.row)
     step.round()
-    assert len(step.fetching._headings) == 1
+    assert len(step.fetcher.tracker.sessions) == 1
 
 
 def test_a_tool_too_large_for_the_budget_is_fetched_for_as_far_as_it_goes(
@@ -370,10 +370,10 @@ def test_a_tool_too_large_for_the_budget_is_fetched_for_as_far_as_it_goes(
     step.frame()
     for _ in range(60):
         step.round()
-    loaded = step.fetching.residency.n_loaded
+    loaded = step.fetcher.residency.n_loaded
     for _ in range(20):
-        assert not step.fetching.round()
-    assert step.fetching.residency.n_loaded == loaded
+        assert not step.fetcher.round()
+    assert step.fetcher.residency.n_loaded == loaded
     assert step.side.reader.feel(step.pose)[2] == 0
 
 

@@ -17,7 +17,7 @@ from children import PATIENCE, joined
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import GridError
 from hapticdb.realtime import fetching, resident_cells
-from hapticdb.realtime.fetching import Fetching, FetchRequest
+from hapticdb.realtime.fetching import Fetcher, FetchRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.resident.table import LEAST_BUDGET, STOP, CellTable
@@ -114,7 +114,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
     pose = np.eye(4)
     with CellTable.create(LEAST_BUDGET) as table:
         side = Side(table, env.grid, sphere)
-        fetching = Fetching(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid))
+        fetching = Fetcher(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid))
         side.be_at(pose)
         assert until(lambda: side.is_served, fetching.round)
         before, grid = side.reader.feel(pose)[0], env.grid
@@ -175,15 +175,15 @@ def test_another_grid_ends_the_fetching_and_is_told(
 
 
 class Listener:
-    """Stands in for a `Voice`: what was said, and ends the fetching after it."""
+    """Stands in for a `MessageSender`: notes what is sent, and ends the fetching after it."""
 
     def __init__(self, table: CellTable) -> None:
         self.table = table
-        self.said: list[str] = []
+        self.sent: list[str] = []
 
-    def say(self, word: str, content: object = None) -> None:
+    def send(self, word: str, content: object = None) -> None:
         assert content
-        self.said.append(word)
+        self.sent.append(word)
         self.table.cells.control[STOP] = 1
 
 
@@ -191,19 +191,19 @@ def test_a_connection_lost_while_warming_up_puts_ready_off(
     env: Environment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     losses = iter([hapticdb.ConnectionLostError("gone")] * 2)
-    warm_up: Callable[[Fetching], None] = Fetching.warm_up
+    warm_up: Callable[[Fetcher], None] = Fetcher.warm_up
 
-    def lost_at_first(fetching: Fetching) -> None:
+    def lost_at_first(fetcher: Fetcher) -> None:
         for error in losses:
             raise error
-        warm_up(fetching)
+        warm_up(fetcher)
 
-    monkeypatch.setattr(Fetching, "warm_up", lost_at_first)
+    monkeypatch.setattr(Fetcher, "warm_up", lost_at_first)
     monkeypatch.setattr(fetching, "parent_is_gone", lambda: False)
     with CellTable.create(LEAST_BUDGET) as table:
         listener: Any = Listener(table)
         fetching.fetch(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid), listener)
-        assert listener.said == ["ready"]
+        assert listener.sent == ["ready"]
         assert next(losses, None) is None
         assert table.desk.figures["losses"] == 1
 
@@ -222,7 +222,7 @@ def test_a_table_goes_when_its_process_does_not_start(
         raise hapticdb.ConnectionLostError("gone")
 
     monkeypatch.setattr(CellTable, "create", noted)
-    monkeypatch.setattr(ResidentCells, "_started", refuse)
+    monkeypatch.setattr(ResidentCells, "_start_process", refuse)
     with pytest.raises(hapticdb.ConnectionLostError):
         ResidentCells(env.url)
     assert [table.descriptor for table in made] == [-1]

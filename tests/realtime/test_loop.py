@@ -23,7 +23,7 @@ from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of, work
-from hapticdb.realtime.processes import Message, Voice
+from hapticdb.realtime.processes import Message, MessageSender
 from hapticdb.realtime.report import LoopAnswer
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import frames_of
@@ -81,7 +81,7 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
                 is_waiting=False,
             )
             heard = io.BytesIO()
-            work(dataclasses.replace(request, **(given | options)), Voice(heard))  # type: ignore[arg-type]
+            work(dataclasses.replace(request, **(given | options)), MessageSender(heard))  # type: ignore[arg-type]
             said = list(messages(heard.getvalue()))
             assert [message.word for message in said] == ["running", "done"]
             answer = said[-1].content

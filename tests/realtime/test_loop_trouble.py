@@ -19,7 +19,7 @@ from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import WITHDRAWN_NS, Loop, LoopRequest, ring_bytes, work
-from hapticdb.realtime.processes import Voice
+from hapticdb.realtime.processes import MessageSender
 from hapticdb.realtime.session import frames_of
 from hapticdb.resident.table import HEARTBEAT, anonymous_memory
 from realtime.coupled import SIDE, World, punch
@@ -189,7 +189,7 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
             return len(self.sent) > 120
 
     hand = Leaving(-0.004)
-    work(requested(world, hand, is_waiting=False, seconds=60.0), Voice(io.BytesIO()))
+    work(requested(world, hand, is_waiting=False, seconds=60.0), MessageSender(io.BytesIO()))
     assert hand.n_asked > 0
     assert not hand.sent[-1].any()
     assert not world.table.desk.sessions["n_asked"].any()
@@ -245,6 +245,6 @@ def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
     signal.signal(signal.SIGTERM, end)
     hand = Told(0.02)
     with pytest.raises(DeviceError, match="unplugged"):
-        work(requested(world, hand), Voice(io.BytesIO()))
+        work(requested(world, hand), MessageSender(io.BytesIO()))
     assert hand.is_closed
     assert not hand.sent[-1].any()

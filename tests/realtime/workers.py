@@ -5,33 +5,33 @@ import sys
 import time
 
 from hapticdb import DatabaseError
-from hapticdb.realtime.processes import Voice, parent_is_gone
+from hapticdb.realtime.processes import MessageSender, parent_is_gone
 
 
-def work(request: tuple[str, object], voice: Voice) -> None:
+def work(request: tuple[str, object], sender: MessageSender) -> None:
     word, content = request
     if word == "echo":
         print("a driver's words")  # noqa: T201 - they must not mix with messages
-        voice.say("heard", content)
-        voice.say("again", (content, os.getpid()))
+        sender.send("heard", content)
+        sender.send("again", (content, os.getpid()))
     elif word == "fail":
         raise DatabaseError("no such place: make it first")
     elif word == "break":
         raise ZeroDivisionError("one\ntwo")
     elif word == "wait":
-        voice.say("waiting")
+        sender.send("waiting")
         while not parent_is_gone():
             time.sleep(1e-3)
     elif word == "tidy":
         try:
-            voice.say("waiting")
+            sender.send("waiting")
             time.sleep(1000)
         finally:
-            voice.say("tidied")
+            sender.send("tidied")
     elif word == "end of file":
         raise EOFError("of something else")
     elif word == "hang":
-        voice.say("hanging")
+        sender.send("hanging")
         time.sleep(1000)
     elif word == "exit":
         sys.exit(3)

@@ -1,4 +1,4 @@
-"""Where a hand will go, as far as its class says so before it moves."""
+"""The path of a scripted hand, known before the session begins."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +9,14 @@ from hapticdb.poses import rotation_of
 from hapticdb.realtime.handle import Handle
 
 SWAY = 1.0
-"""Metres that a hand which moves about a place may leave it by, more than any does."""
+"""Metres that a hand which moves about one place stays within. No scripted hand goes farther."""
 
 
-def way_of(device: Device, handle: Handle) -> tuple[NDArray[np.float64] | None, float]:
-    """Poses (M, 4, 4) of the handle, scene metres, and how far it leaves them; None: not known."""
+def path_of_hand(device: Device, handle: Handle) -> tuple[NDArray[np.float64] | None, float]:
+    """Poses (M, 4, 4) that the tool will take, and how far it may leave them; metres of the scene.
+
+    None and 0 where nobody knows the path before: a device, or a handle that starts elsewhere.
+    """
     hand = device.hand if isinstance(device, SimulatedDevice) else device
     if isinstance(hand, Player):
         poses = np.tile(np.eye(4), (len(hand._knots), 1, 1))  # noqa: SLF001 - same room

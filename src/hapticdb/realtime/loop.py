@@ -43,7 +43,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
 from hapticdb.realtime.handle import Handle
-from hapticdb.realtime.processes import Voice, parent_is_gone
+from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
 from hapticdb.recording.frame import State
 from hapticdb.resident.frames import clusters_of
@@ -386,7 +386,7 @@ def n_compiled() -> int:
     return sum(len(entry.signatures) for entry in ENTRIES if hasattr(entry, "signatures"))
 
 
-def work(request: LoopRequest, voice: Voice) -> None:
+def work(request: LoopRequest, sender: MessageSender) -> None:
     """Run a session's loop in this process, and say how it went."""
     loop = Loop(request)
     try:
@@ -397,12 +397,12 @@ def work(request: LoopRequest, voice: Voice) -> None:
                 empty = empty_loop(request.timing, min(EMPTY_SECONDS, request.seconds))
             warm_up = loop.prepare()
             compiled = n_compiled()
-            voice.say("running", warm_up)
+            sender.send("running", warm_up)
             figures = loop.run()
             if n_compiled() != compiled:
                 raise HapticDBError("a kernel was compiled while the loop ran: report this")
         loop.counts.conditions.update(granted)
-        voice.say("done", LoopAnswer(figures, empty, loop.counts, warm_up, loop.is_warm))
+        sender.send("done", LoopAnswer(figures, empty, loop.counts, warm_up, loop.is_warm))
     finally:
         try:  # whoever asks for the end has it: the device is not to be left half closed for that
             before = signal.signal(signal.SIGTERM, signal.SIG_IGN)

@@ -1,7 +1,8 @@
-"""Processes of a real-time session: started with a request, heard over a pipe, ended for sure.
+"""Processes of a real-time session: started with a request, sending messages over a pipe.
 
-Each is a plain ``python -c`` that calls a function of this package: a script needs no guard
-around its main part. Request and messages are pickles between a process and its own child.
+Each is a plain ``python -c`` that calls a function of this package, so that a user's script needs
+no guard around its main part. The request and the messages are pickles between a process and its
+own child.
 """
 
 import contextlib
@@ -20,13 +21,14 @@ from typing import Any, BinaryIO, NamedTuple, Self
 from hapticdb.errors import HapticDBError, UsageError
 
 END_PATIENCE = 5.0
-"""Seconds in which a process that was told to end may do so."""
+"""Seconds that a process has to end by itself before it is killed. A device may take long to
+close."""
 _starter = 0
 """Process id of the one that started this one."""
 
 
 class Message(NamedTuple):
-    """What a process says: a word, and what goes with it."""
+    """What a process sends: a word that says which message it is, and its content."""
 
     word: str
     content: Any = None
@@ -39,7 +41,7 @@ class Process:
     ----------
     work : str
         What it does: a function of a module, as ``package.module:function``, that takes the request
-        and a `Voice`.
+        and a `MessageSender`.
     request : object
         What it is to do; picklable.
     descriptors : sequence of int
@@ -54,15 +56,15 @@ class Process:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=tuple(descriptors),
-            # Ctrl-C in a terminal goes to the whole group; who started this decides what follows
+            # Ctrl-C in a terminal goes to the whole group: the parent alone decides what follows
             start_new_session=True,
         )
         assert self._popen.stdin is not None  # noqa: S101 - asked for above
-        with contextlib.suppress(BrokenPipeError):  # it died at once: `receive` says so
+        with contextlib.suppress(BrokenPipeError):  # it died at once, which `receive` reports
             self._popen.stdin.write(content)
             self._popen.stdin.flush()
-        # left open: when it closes, the process knows that the one that started it is gone; by
-        # itself, a Popen that is dropped would live on, and its pipes with it
+        # The input stays open: when it closes, the child knows that this process is gone. A Popen
+        # that nobody refers to any more would keep its pipes open, so they are closed here.
         weakref.finalize(self, _close, self._popen)
 
     def __enter__(self) -> Self:
@@ -87,7 +89,7 @@ class Process:
         Raises
         ------
         HapticDBError
-            One that the process ended with, of the same class.
+            The error that the process ended with.
         """
         assert self._popen.stdout is not None  # noqa: S101 - asked for above
         descriptor = self._popen.stdout.fileno()
@@ -129,7 +131,7 @@ class Process:
         return True
 
     def end(self) -> None:
-        """See to it that it has ended: told by its closed input, then by force."""
+        """Make it end: by closing its input, and by force where that is not enough."""
         _close(self._popen)
         if not self.wait(END_PATIENCE):
             self._popen.kill()
@@ -137,29 +139,29 @@ class Process:
 
 
 def _close(popen: "subprocess.Popen[bytes]") -> None:
-    """Close the pipes to a process, whereupon it ends."""
+    """Close the pipes to a process. It ends when it sees its input closed."""
     for stream in (popen.stdin, popen.stdout):
         if stream is not None:
             with contextlib.suppress(OSError):
                 stream.close()
 
 
-class _Ended(SystemExit):
-    """To end without a word: asked to by the system, or nobody is there who would hear it."""
+class _EndQuietly(SystemExit):
+    """Ends the process without a message: the system asked for it, or the parent is gone."""
 
     def __init__(self, status: int) -> None:
         super().__init__(status)
         self.status = status
 
 
-class Voice:
-    """What a process says to the one that started it."""
+class MessageSender:
+    """Sends messages from a process to the one that started it."""
 
     def __init__(self, stream: BinaryIO) -> None:
         self._stream = stream
 
-    def say(self, word: str, content: object = None) -> None:
-        """Send a message; nothing happens when nobody is there to hear it."""
+    def send(self, word: str, content: object = None) -> None:
+        """Send a message. Where nobody can receive it any more, nothing happens."""
         packed = pickle.dumps(Message(word, content))
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(len(packed).to_bytes(8, "little") + packed)
@@ -172,42 +174,42 @@ def serve(work: str, starter: int) -> None:
     _starter = starter
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     status = 0
-    voice = Voice(os.fdopen(os.dup(1), "wb"))
-    os.dup2(2, 1)  # drivers print; their words must not mix with messages
+    sender = MessageSender(os.fdopen(os.dup(1), "wb"))
+    os.dup2(2, 1)  # what drivers print must not mix with messages
     try:
         signal.signal(signal.SIGTERM, _end)
         sys.path[:] = _load()
         module, name = work.split(":")
-        function: Callable[[Any, Voice], None] = getattr(import_module(module), name)
-        function(_request(), voice)
-    except _Ended as ended:
+        function: Callable[[Any, MessageSender], None] = getattr(import_module(module), name)
+        function(_request(), sender)
+    except _EndQuietly as ended:
         status = ended.status
     except HapticDBError as error:
-        voice.say("error", error)
-    except BaseException as error:  # noqa: BLE001 - whatever it is, who waits must hear of it
+        sender.send("error", error)
+    except BaseException as error:  # noqa: BLE001 - the parent waits, and must learn of any error
         import traceback  # noqa: PLC0415 - only now
 
         traceback.print_exc()
         cause = str(error).partition("\n")[0]
-        voice.say(
+        sender.send(
             "error", HapticDBError(f"the session's process ended: {type(error).__name__}: {cause}")
         )
     sys.stderr.flush()
-    os._exit(status)  # no tidying up of drivers and buffers that another process still uses
+    os._exit(status)  # exit handlers would tidy up what another process still uses
 
 
 def _end(number: int, _: object) -> None:
-    """Leave by way of every `finally`: a device must not keep its force."""
-    signal.signal(number, signal.SIG_IGN)  # nor be left half closed by a second one
-    raise _Ended(128 + number)
+    """End by way of every `finally`, so that no device keeps its force; a signal handler."""
+    signal.signal(number, signal.SIG_IGN)  # a second signal must not interrupt the tidying up
+    raise _EndQuietly(128 + number)
 
 
 def _load() -> Any:  # noqa: ANN401 - whatever was sent
-    """Next of what the parent has sent."""
+    """Read the next object that the parent has sent."""
     try:
         return pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
-    except (EOFError, pickle.UnpicklingError):  # it has gone before all was said
-        raise _Ended(0) from None
+    except (EOFError, pickle.UnpicklingError):  # the parent ended while it was sending
+        raise _EndQuietly(0) from None
 
 
 def _request() -> object:
@@ -222,8 +224,8 @@ def _request() -> object:
 
 
 def parent_is_gone() -> bool:
-    """Whether the process that started this one has ended, or has closed the line."""
-    if os.getppid() != _starter:  # others that it forked may still hold the line open
+    """Whether the process that started this one has ended, or has closed the pipe."""
+    if os.getppid() != _starter:  # children that it forked may still hold the pipe open
         return True
     ready, _, _ = select.select([0], [], [], 0)
     return bool(ready)

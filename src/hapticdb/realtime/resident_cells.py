@@ -18,8 +18,10 @@ from hapticdb.resident.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellT
 from hapticdb.store.connect import open_store
 
 START_PATIENCE = 60.0
-"""Seconds until a fetching process must be ready: it may have to calibrate."""
+"""Seconds in which a fetching process must be ready. It may have to calibrate, which takes seconds.
+A larger value keeps a caller waiting longer for a process that hangs."""
 RESTART_EVERY = 1.0
+"""Seconds between two starts, at least. A smaller value tries more often where none can live."""
 SILENCE_NS = 1_000_000_000
 """Nanoseconds after which a database that was asked and has not answered counts as away."""
 
@@ -49,8 +51,8 @@ class CacheFigures(NamedTuple):
     restarts: int
 
 
-def never_began(process: Process, name: str, seconds: float) -> HapticDBError:
-    """End a process that has not said in that time that it is ready, and say why it has not."""
+def start_error(process: Process, name: str, seconds: float) -> HapticDBError:
+    """End a process that was not ready in that time, and make the error that says why."""
     is_slow = process.is_alive
     process.end()
     if is_slow:
@@ -86,7 +88,7 @@ class ResidentCells:
     """
 
     _pid = 0
-    """Of the process that made these; in another, forked from it, they are not to be ended."""
+    """Process id of the maker. In a process forked from it, `close` must not end anything."""
 
     def __init__(
         self,
@@ -98,15 +100,15 @@ class ResidentCells:
     ) -> None:
         self.url = url
         self.exclude: tuple[int, ...] = tuple(as_ids(exclude).tolist())
-        self.grid = self._looked_up()
-        compile_missing(entries_for("resident"))  # here: two processes would do it twice
+        self.grid = self._read_environment()
+        compile_missing(entries_for("resident"))  # now: two processes would each compile them
         self.table = CellTable.create(budget_bytes)
         self.restarts = 0
         self._request = FetchRequest(
             url, self.table.descriptor, self.table.n_slots, self.grid, self.exclude, wrap
         )
         try:
-            self._process = self._started()
+            self._process = self._start_process()
         except BaseException:
             self.table.close()
             raise
@@ -115,8 +117,8 @@ class ResidentCells:
         self._supervising = threading.Lock()
         self._pid = os.getpid()
 
-    def _looked_up(self) -> Grid:
-        """Grid of the environment, which must have cells, and the objects that are left out."""
+    def _read_environment(self) -> Grid:
+        """Grid of the environment. It must have cells, and the objects that are left out."""
         store = open_store(self.url, read_only=True)
         try:
             check_cells(store)
@@ -127,7 +129,7 @@ class ResidentCells:
         finally:
             store.close()
 
-    def _started(self) -> Process:
+    def _start_process(self) -> Process:
         process = Process(
             "hapticdb.realtime.fetching:fetch", self._request, [self.table.descriptor]
         )
@@ -137,7 +139,7 @@ class ResidentCells:
             process.end()
             raise
         if not is_ready:
-            raise never_began(process, "fetching", START_PATIENCE)
+            raise start_error(process, "fetching", START_PATIENCE)
         return process
 
     def __enter__(self) -> Self:
@@ -152,7 +154,7 @@ class ResidentCells:
 
     @property
     def is_closed(self) -> bool:
-        """Whether they were given back."""
+        """Whether `close` was called."""
         return self.table.descriptor < 0
 
     @property
@@ -167,7 +169,7 @@ class ResidentCells:
         return bool(control[AWAY]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
 
     def supervise(self) -> None:
-        """Start the fetching process again if it has ended; to be called now and then.
+        """Start the fetching process again if it has ended. Sessions call it in `wait`.
 
         Raises
         ------
@@ -177,21 +179,21 @@ class ResidentCells:
         with self._supervising:
             if self._process.is_alive or self.table.cells.control[STOP]:
                 return
-            self._hear_last_words()
+            self._raise_fatal_error()
             now = time.monotonic()
             if now - self._restarted_at < RESTART_EVERY:
                 return
             self._restarted_at = now
             self.restarts += 1
             ended = self._process
-            # the table goes on as it is until the new one has read again: its last version is whole
+            # The table stays in use until the new process has read again: its version is whole.
             self._process = Process(
                 "hapticdb.realtime.fetching:fetch", self._request, [self.table.descriptor]
             )
             ended.end()
 
-    def _hear_last_words(self) -> None:
-        """Raise what no new process would get over; what else ended one is tried again."""
+    def _raise_fatal_error(self) -> None:
+        """Raise the error that ended the process, if a new one would end with it, too."""
         try:
             while self._failure is None and self._process.receive(0.0):
                 pass

@@ -19,12 +19,12 @@ from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.law import TangentPlane
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
-from hapticdb.realtime.hand_path import way_of
+from hapticdb.realtime.hand_path import path_of_hand
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report
-from hapticdb.realtime.resident_cells import ResidentCells, never_began
+from hapticdb.realtime.resident_cells import ResidentCells, start_error
 from hapticdb.recording.file import DEFAULT_LIMIT, Header, Recorder
 from hapticdb.recording.frame import FRAME, Frames
 from hapticdb.resident.table import DEFAULT_BUDGET, anonymous_memory
@@ -171,7 +171,7 @@ class Session:
             raise
 
     def _compared(self, device: Device) -> Proportions:
-        poses, sway = way_of(device, self.handle)
+        poses, sway = path_of_hand(device, self.handle)
         cells = self.cells
         return compare_proportions(
             cells.first_objects, cells.grid.voxel_size, self.shell, poses,
@@ -218,7 +218,7 @@ class Session:
         )
         table.desk.pids[self._row] = self._process.pid
         if self._process.receive(START_PATIENCE) is None:
-            raise never_began(self._process, "loop's", START_PATIENCE)
+            raise start_error(self._process, "loop's", START_PATIENCE)
 
     def _begin_recording(self, path: Path, how: dict[str, bool]) -> None:
         # noted before the file is made: a signal may end the making at any moment

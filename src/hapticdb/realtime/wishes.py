@@ -1,4 +1,4 @@
-"""Which cells a tool may soon meet: what the fetching process brings in, and in which order."""
+"""Which cells a tool may meet soon. The fetching process brings them in, most urgent first."""
 
 from typing import NamedTuple
 
@@ -10,10 +10,15 @@ from hapticdb.kernels.resident.cell_table import cells_ahead
 from hapticdb.store.base import Keys
 
 REACH_VOXELS = 500.0
-"""Voxels a second that a hand may reach from rest: 1 m/s at 2 mm."""
+"""Voxels a second that a hand may reach from rest: 1 m/s in voxels of 2 mm. A larger value fetches
+more cells around a resting hand."""
 SLACK_VOXELS = 1.0
-"""How far a wish may move until its cells are looked for anew."""
+"""Voxels that a wish may move until its cells are searched anew. A larger value searches less often
+and fetches a wider margin."""
 MOST_CELLS_WANTED = 1 << 15
+"""Cells of one wish, at most: the box around a faster or larger tool is cut at its far ends."""
+CELL = float(1 << CELL_BITS)
+"""Voxels on a cell's edge."""
 
 Floats = NDArray[np.float64]
 
@@ -64,9 +69,9 @@ class Wish(NamedTuple):
     ) -> "Wish | None":
         """Wish of a session's motion, or None when not all of its numbers are finite.
 
-        The sphere is swept from the tool to the hand and on along the
-        velocity for `lookahead` seconds; the hand may be elsewhere by then at 1.5 times the speed
-        (m/s) that it has shown of late or, from rest, `REACH_VOXELS`.
+        The bounding sphere moves from the tool to the hand, and on with the hand's velocity for
+        `lookahead` seconds. The margin is the distance that the hand can leave this way by in that
+        time, at 1.5 times `peak_speed` (m/s, shown of late), at least at `REACH_VOXELS`.
         """
         if not motion.is_finite:
             return None
@@ -81,7 +86,7 @@ class Wish(NamedTuple):
         )
 
     def is_near(self, other: "Wish") -> bool:
-        """Whether cells found for one serve the other."""
+        """Whether the cells of one wish serve for the other."""
         away = [
             *(self.start - other.start),
             *(self.start + self.move - other.start - other.move),
@@ -92,14 +97,14 @@ class Wish(NamedTuple):
     def cells(self, grid: Grid) -> tuple[Keys, Floats]:
         """Cells within reach, most urgent first, and their urgency in voxels.
 
-        That is how far the sphere is from a cell at its nearest, and how far it has to go until
-        there.
+        The urgency of a cell is the least distance between it and the moving sphere, plus the
+        distance that the sphere moves until it is nearest.
         """
         n_cells = max(grid.side >> CELL_BITS, 1)
         reach = self.radius + self.margin + 2.0 * SLACK_VOXELS
         end = self.start + self.move
-        low = np.floor((np.minimum(self.start, end) - reach) / 32.0)
-        high = np.floor((np.maximum(self.start, end) + reach) / 32.0)
+        low = np.floor((np.minimum(self.start, end) - reach) / CELL)
+        high = np.floor((np.maximum(self.start, end) + reach) / CELL)
         first = np.clip(low, 0, n_cells).astype(np.int64)
         last = np.clip(high, -1, n_cells - 1).astype(np.int64)
         if (first > last).any():
@@ -113,11 +118,11 @@ class Wish(NamedTuple):
         return keys[:count][order], urgency[:count][order]
 
     def _trim(self, first: Keys, last: Keys) -> None:
-        """Cut a box of too many cells at its far ends: what is near stays in it."""
+        """Cut a box of too many cells, first .. last, at its far ends; in place."""
         spans = last - first + 1
         while np.prod(spans) > MOST_CELLS_WANTED:
             axis = int(np.argmax(spans))
-            middle = self.start[axis] / 32.0
+            middle = self.start[axis] / CELL
             if middle - first[axis] > last[axis] - middle:
                 first[axis] += max(spans[axis] // 4, 1)
             else:

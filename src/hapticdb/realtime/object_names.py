@@ -1,0 +1,47 @@
+"""Which objects the tools touch: loops ask, and the fetching process answers."""
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from hapticdb.kernels.records import MOST_ASKED
+from hapticdb.resident.table import CellTable
+from hapticdb.store.base import Keys, Store
+from hapticdb.store.objects_at import ids_of_voxels
+
+
+class ObjectAnswers:
+    """Answers on the desk of a table: ids of the objects in the voxels that loops ask for.
+
+    Parameters
+    ----------
+    table : CellTable
+        Of the sessions.
+    exclude : (E,) int64
+        Ids of objects that are not felt, and are not named.
+    """
+
+    def __init__(self, table: CellTable, exclude: Keys) -> None:
+        self._desk = table.desk.sessions
+        self._exclude = exclude
+        self._answered: dict[int, bytes] = {}
+
+    def forget(self) -> None:
+        """Answer every question again: the database has changed."""
+        self._answered.clear()
+
+    def answer(self, store: Store, rows: Iterable[int]) -> None:
+        """Answer the sessions in these rows that ask for other voxels than before."""
+        before, self._answered = self._answered, {}
+        for row in rows:
+            n_asked = int(self._desk["n_asked"][row])
+            if n_asked <= 0:
+                self._desk["n_objects"][row] = 0
+                continue
+            keys = np.unique(self._desk["asked"][row, :n_asked])
+            question = keys.tobytes()
+            if before.get(row) != question:
+                ids = ids_of_voxels(store, keys, self._exclude)[:MOST_ASKED]
+                self._desk["objects"][row, : len(ids)] = ids
+                self._desk["n_objects"][row] = len(ids)
+            self._answered[row] = question

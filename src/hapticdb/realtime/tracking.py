@@ -1,0 +1,155 @@
+"""Sessions as the fetching process sees them: where their tools are, and which cells they need."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import Grid
+from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
+from hapticdb.realtime.wishes import Motion, Wish
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
+from hapticdb.store.base import NO_KEYS, Keys
+
+SPEED_HALF_LIFE = 0.7
+"""Seconds after which the greatest speed that a hand has shown counts half. A larger value fetches
+more cells around a hand that has slowed down."""
+SHARE_OF_TABLE = 0.75
+"""Share of the table that all sessions together may want. What is left lets cells of a moment ago
+stay. A larger value serves larger tools and evicts more."""
+READ_ATTEMPTS = 100
+"""Attempts to read a row that a loop is writing. Writing takes microseconds: a row that stays
+unfinished is one of a loop that died."""
+MET = -1.0
+"""Urgency of cells that a frame has met already. All others have 0 or more and come after them."""
+
+Ranked = tuple[Keys, NDArray[np.float64]]
+"""Cells (n,) int64 and their urgency (n,), smallest first."""
+
+
+@dataclass
+class TrackedSession:
+    """What is known of one session.
+
+    sequence : of the row on the desk, as read last; wish : from which its cells were found; cells,
+    urgency (n,) : most urgent first; speed : m/s that the hand has shown of late; n_missing : cells
+    wanted and unknown at the last look.
+    """
+
+    sequence: int = 0
+    wish: Wish | None = None
+    cells: Keys = field(default_factory=lambda: NO_KEYS)
+    urgency: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
+    speed: float = 0.0
+    n_missing: int = 0
+
+
+class SessionTracker:
+    """All sessions of one table.
+
+    Parameters
+    ----------
+    table : CellTable
+        On its desk, sessions say where their tools are.
+    grid : Grid
+        Of the environment.
+
+    Attributes
+    ----------
+    sessions : dict
+        By row of the desk, ascending.
+    """
+
+    def __init__(self, table: CellTable, grid: Grid) -> None:
+        self._table = table
+        self._grid = grid
+        self.sessions: dict[int, TrackedSession] = {}
+
+    def read_desk(self, elapsed: float, lookahead: float) -> bool:
+        """Read where the tools are; whether any has moved so far that other cells are wanted.
+
+        elapsed : seconds since the last time; lookahead : seconds that cells are fetched ahead.
+        """
+        desk = self._table.desk.sessions
+        active = set(np.flatnonzero(desk["told"]["is_active"]).tolist())
+        has_moved = active != set(self.sessions)
+        self.sessions = {row: self.sessions.get(row, TrackedSession()) for row in sorted(active)}
+        for row, session in self.sessions.items():
+            motion = self._read_motion(row, session)
+            if motion is None:
+                continue
+            speed = float(np.linalg.norm(motion.velocity))
+            if np.isfinite(speed):
+                session.speed = max(speed, session.speed * 0.5 ** (elapsed / SPEED_HALF_LIFE))
+            wish = Wish.of_motion(self._grid, motion, lookahead, session.speed)
+            if wish is None or (session.wish is not None and wish.is_near(session.wish)):
+                continue
+            session.wish = wish
+            session.cells, session.urgency = wish.cells(self._grid)
+            has_moved = True
+        return has_moved
+
+    def _read_motion(self, row: int, session: TrackedSession) -> Motion | None:
+        """Motion on a row of the desk, read whole; None where its loop died while it wrote."""
+        desk = self._table.desk.sessions
+        for _ in range(READ_ATTEMPTS):
+            session.sequence = int(desk["sequence"][row])
+            motion = Motion.of_told(desk["told"][row, ...].copy())
+            if session.sequence % 2 == 0 and session.sequence == desk["sequence"][row]:
+                return motion
+        return None
+
+    def has_met_unknown_cells(self) -> bool:
+        """Whether any session's last frame has met cells that are not resident."""
+        return bool(self._table.desk.sessions["n_missed"][list(self.sessions)].any())
+
+    def urgent_cells(self) -> Keys:
+        """Cells of all sessions, distinct, most urgent first."""
+        return ranked([(one.cells, one.urgency) for one in self.sessions.values()])
+
+    def missing_cells(self, residency: Residency) -> Keys:
+        """Unknown cells that sessions want, most urgent first. The known ones are kept resident."""
+        residency.begin_round()
+        wanted = [part for row in self.sessions for part in self._wanted(row, residency)]
+        return residency.missing(ranked(wanted))
+
+    def _wanted(self, row: int, residency: Residency) -> Iterator[Ranked]:
+        """Cells of one session: as many as its share of the table has room for."""
+        table, session = self._table, self.sessions[row]
+        share = SHARE_OF_TABLE / len(self.sessions)
+        cells = session.cells[: int(share * (table.capacity // 2 - table.n_slots))]
+        slots = residency.slots_of(cells)
+        # a cell that is known to be empty takes no slot
+        n_kept = np.searchsorted(np.cumsum(slots != EMPTY_SLOT), share * table.n_slots, "right")
+        cells, slots = cells[:n_kept], slots[:n_kept]
+        yield cells, session.urgency[:n_kept]
+        n_unknown = int(np.count_nonzero(slots == UNKNOWN))
+        table.desk.figures["wanted"] += len(cells)
+        table.desk.figures["granted"] += len(cells) - n_unknown
+        session.n_missing = n_unknown
+        n_missed = int(table.desk.sessions["n_missed"][row])
+        if n_missed:
+            missed = np.unique(table.desk.sessions["missed"][row, :n_missed])
+            session.n_missing += int(np.count_nonzero(residency.slots_of(missed) == UNKNOWN))
+            yield missed, np.full(len(missed), MET)
+
+    def report_missing(self) -> None:
+        """Tell each session how many of its cells are missing, and of which position that holds."""
+        desk = self._table.desk.sessions
+        for row, session in self.sessions.items():
+            desk["n_missing"][row] = session.n_missing
+            desk["heard"][row] = session.sequence
+
+
+def ranked(wanted: Sequence[Ranked]) -> Keys:
+    """Distinct cells of several wishes, most urgent first."""
+    if not wanted:
+        return NO_KEYS
+    cells = np.concatenate([cells for cells, _ in wanted])
+    order = np.argsort(np.concatenate([urgency for _, urgency in wanted]), kind="stable")
+    if len(wanted) > 1:
+        _, first = np.unique(cells[order], return_index=True)
+        order = order[np.sort(first)]
+    return cells[order]

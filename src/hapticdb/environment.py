@@ -61,7 +61,7 @@ class Environment:
         self.close()
 
     def close(self) -> None:
-        """Give the database back."""
+        """Close the connection to the database."""
         self._store.close()
 
     @property
@@ -71,7 +71,7 @@ class Environment:
 
     @property
     def name(self) -> str:
-        """What it is called among others at the same place."""
+        """Its name among the environments at the same place."""
         return self._store.name
 
     @property
@@ -81,7 +81,7 @@ class Environment:
 
     @property
     def grid(self) -> Grid:
-        """Metres <-> voxels <-> keys."""
+        """Converts between metres, voxels and keys."""
         return self._store.grid
 
     @property
@@ -389,30 +389,31 @@ class Environment:
         return QuantileVector.of(self._store, resolution)
 
     def freshness(self) -> Freshness:
-        """How old the statistics are that grouping by cost stands on."""
+        """How old the statistics are that grouping by cost uses."""
         return self._store.freshness(DEFAULT_RESOLUTION)
 
     def analyze(self) -> QuantileVector:
-        """Renew those statistics, however fresh they are."""
+        """Renew the statistics that grouping by cost uses, however fresh they are."""
         self._check_writable()
         return self._figures.analyze()
 
     def calibrate(self, *, seed: int = 0, keep: bool = True, cold: bool = False) -> CostModel:
-        """Measure what queries cost here; used from now on, and kept for this machine.
+        """Measure what queries cost here; the figures are used from now on, and kept.
 
         Parameters
         ----------
         seed : int
-            Of the places that are measured.
+            Of the random choice of the places that are measured.
         keep : bool
             Write the figures into the database, when it can be written.
         cold : bool
-            With empty caches, where this process can empty them: for what is beyond memory.
+            Measure with empty caches, where this process can empty them: for environments that
+            are larger than memory.
         """
         return self._figures.calibrate(seed=seed, keep=keep, cold=cold)
 
     def _forget(self) -> None:
-        """Drop what an edit of our own has made stale."""
+        """Forget what an edit of this environment has made stale."""
         self._figures.drop_statistics()
         self._known.forget()
 

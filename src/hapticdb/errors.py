@@ -7,11 +7,11 @@
     │   └── GridError                         a grid that cannot be, or does not match
     ├── FileError (ValueError)                an input file that cannot be used
     │   ├── OutsideGridError                  a part that does not fit the grid
-    │   └── GeometryChangedError              an object's file is gone or another
+    │   └── GeometryChangedError              an object's file is gone or has changed
     ├── MissingExtraError (ImportError)       a format or device needs an extra
     ├── ObjectNotFoundError (LookupError)     no object of that id
     ├── DeviceError (OSError)                 a haptic device that is not there, or went away
-    └── DatabaseError                         the database, not the question
+    └── DatabaseError                         the database cannot do what was asked
         ├── EnvironmentNotFoundError (FileNotFoundError)
         ├── EnvironmentExistsError (FileExistsError)
         ├── NotAnEnvironmentError             a file of another kind

@@ -1,8 +1,8 @@
 """Ctrl-C at any moment of the command line: one line, exit code 130, no traceback.
 
-An exception that a signal raises comes anywhere: within an import it may end as another error, or
-as a traceback that Python prints and forgets. So, until a verb begins, Ctrl-C ends the process at
-once, since nothing is open yet; later it waits until no import is under way.
+A signal may raise its exception in any line of code. Within an import it may turn into another
+error, or into a traceback that Python prints and ignores. So Ctrl-C ends the process at once until
+a verb begins, since nothing is open yet; afterwards it waits until no import is running.
 """
 
 import os
@@ -13,16 +13,16 @@ from types import FrameType
 from typing import Literal
 
 EXIT_CODE = 130
-WORDS = b"hapticdb: interrupted\n"
+MESSAGE = b"hapticdb: interrupted\n"
 AGAIN_S = 0.01
-"""Seconds after which an interrupt that met an import is tried again."""
+"""Seconds until an interrupt that came within an import is raised again. Longer: a later answer."""
 
 Phase = Literal["not ours", "starting", "working", "leaving"]
 _phase: Phase = "not ours"
 
 
 def begin() -> None:
-    """Answer Ctrl-C from now on; nothing is changed where somebody else does, or nobody is to."""
+    """Handle Ctrl-C from now on, unless it has another handler already, or is ignored."""
     global _phase  # noqa: PLW0603 - a process has one Ctrl-C
     is_main = threading.current_thread() is threading.main_thread()
     if is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -32,28 +32,30 @@ def begin() -> None:
 
 
 def work() -> None:
-    """Raise KeyboardInterrupt from now on: a verb begins, and has to leave in order."""
+    """Raise KeyboardInterrupt from now on: a verb begins, and cleans up when it is interrupted."""
     global _phase  # noqa: PLW0603
     if _phase == "starting":
         _phase = "working"
 
 
 def leave() -> None:
-    """Take no notice of one more Ctrl-C: the verb has ended, and its exit code stands."""
+    """Ignore one more Ctrl-C: the verb has ended, and its exit code is decided."""
     global _phase  # noqa: PLW0603
     if _phase != "not ours":
         _phase = "leaving"
-        signal.setitimer(signal.ITIMER_REAL, 0.0)  # an alarm ends what has no handler any more
+        signal.setitimer(
+            signal.ITIMER_REAL, 0.0
+        )  # without a handler the alarm would end the process
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Answer a signal; a handler."""
+    """Raise KeyboardInterrupt, or end the process, as the phase asks: a signal handler."""
     global _phase  # noqa: PLW0603
     if _phase == "starting":
-        os.write(2, WORDS)
+        os.write(2, MESSAGE)
         os._exit(EXIT_CODE)
     if _phase == "leaving":
-        _phase = "starting"  # who asks twice is not kept waiting
+        _phase = "starting"  # a second Ctrl-C ends the process at once
     elif _is_importing(frame) and _try_again():
         pass
     else:
@@ -69,7 +71,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 def _try_again() -> bool:
-    """Have the handler called again soon; whether that can be."""
+    """Have the handler called again after `AGAIN_S`; False if the alarm is taken by another."""
     if signal.getsignal(signal.SIGALRM) not in {signal.SIG_DFL, interrupt}:
         return False
     signal.signal(signal.SIGALRM, interrupt)
@@ -78,7 +80,7 @@ def _try_again() -> bool:
 
 
 def _note_unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Try an interrupt again that Python could not raise, from a finalizer; print all else."""
+    """Raise an interrupt again that came within a finalizer; print every other exception."""
     is_interrupt = issubclass(unraisable.exc_type, KeyboardInterrupt)
     if not is_interrupt or (_phase == "working" and not _try_again()):
         sys.__unraisablehook__(unraisable)

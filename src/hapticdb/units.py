@@ -25,8 +25,9 @@ NAMES = {
     "us-ft": "US survey feet",
     "yd": "yards",
 }
-
+"""Each unit in words."""
 _READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
+"""Units that lengths are printed in: metres, sign, and the least number that is printed in it."""
 
 
 def length_text(length: float) -> str:

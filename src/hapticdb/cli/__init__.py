@@ -59,7 +59,7 @@ VERBS: dict[Callable[..., None], str] = {
     demo: "Make, import, touch and draw the sample.",
     warm: "Compile every kernel now, so that no verb has to.",
 }
-"""The verbs, and what the list of them says of each in one line."""
+"""The verbs, and the line about each in the list of verbs."""
 HELP = {sweep: SWEEP_HELP}
 """Help texts that are too long for a docstring, so that no function is over 60 lines."""
 for verb, summary in VERBS.items():
@@ -88,10 +88,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(str(error) or "interrupted", INTERRUPTED)
     except HapticDBError as error:
         return _fail(str(error), USER_ERROR, show_trace=is_debugging)
-    except Exception as error:  # noqa: BLE001 - whatever it is, a user sees one line
+    except Exception as error:  # noqa: BLE001 - a user sees one line, whatever happened
         if hasattr(error, "format_message"):  # typer's own, under the name of each version
             return _fail(_usage(error), USER_ERROR, show_trace=is_debugging)
-        cause = str(error).partition("\n")[0] or "no further word"
+        cause = str(error).partition("\n")[0] or "no message"
         hint = "" if is_debugging else "; 'hapticdb --debug ...' shows where"
         message = f"{type(error).__name__}: {cause}{hint}"
         return _fail(message, UNFORESEEN, show_trace=is_debugging)
@@ -115,13 +115,13 @@ def _usage(error: Exception) -> str:
 
 
 def _print_anything() -> None:
-    """Let names of parts and files be printed that the terminal's encoding cannot express."""
+    """Print characters that the terminal's encoding lacks as escapes, and not as an error."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="backslashreplace")
 
 
 def _close_stdout() -> None:
-    """Whoever read the output is gone (``| head``): nothing more is to be written to it."""
+    """Send what is left to nowhere: the reader of standard output (``| head``) has closed it."""
     with contextlib.suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

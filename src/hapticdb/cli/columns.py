@@ -9,19 +9,21 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 GAP = 3
-"""Columns between two of a table; `FACTS_GAP` of names and values."""
+"""Blanks between two columns of a table."""
 FACTS_GAP = 2
+"""Blanks between a name and its value."""
 LEAST = 12
-"""Columns that a text is folded to at least."""
+"""Width, in characters, below which no column of texts is narrowed."""
 BOLD, DIM, PLAIN = "\x1b[1m", "\x1b[2m", "\x1b[0m"
+"""What switches a terminal's style."""
 
 
 @dataclass(frozen=True)
 class Columns:
     """Rows of printable text in columns.
 
-    headings : of a table, a rule below them; none of names and values
-    numbers : which columns stand on the right, and are never folded
+    headings : of a table, which has a rule below them; without any, names and values
+    numbers : indices of the columns that are aligned to the right and never folded
     """
 
     rows: Sequence[Sequence[str]]
@@ -29,7 +31,7 @@ class Columns:
     numbers: frozenset[int] = frozenset()
 
     def lines(self, width: int | None, *, is_styled: bool) -> list[str]:
-        """Lines of at most that width, where texts can be folded to it; None: without an end."""
+        """Lines of at most `width` characters, if texts can be folded to it; None: of any width."""
         grid = [*([self.headings] if self.headings else []), *self.rows]
         if not grid:
             return []
@@ -56,7 +58,7 @@ class Columns:
         return laid
 
     def _narrow(self, widths: list[int], room: int) -> None:
-        """Take columns from the widest texts until all fit, or none can give more."""
+        """Narrow the widest columns of texts until all columns fit, or none can be narrowed."""
         while (over := sum(widths) - room) > 0:
             texts = [i for i in range(len(widths)) if i not in self.numbers and widths[i] > LEAST]
             if not texts:
@@ -72,7 +74,7 @@ class Columns:
 
 
 def _styled(line: str, style: str, name_ends: int) -> str:
-    """Headings as a whole; of facts their name."""
+    """Style a line of headings as a whole, and of a fact its name alone."""
     if not style:
         return line
     end = name_ends if style == DIM else len(line)
@@ -93,7 +95,7 @@ def _columns_of(character: str) -> int:
 
 
 def folded(text: str, width: int) -> list[str]:
-    """Lines of at most so many columns: between words where that can be, else within them."""
+    """Lines of at most `width` columns, broken between words if the text is ASCII."""
     if text.isascii():
         return textwrap.wrap(text, width, break_on_hyphens=False) or [""]
     lines, used = [""], 0

@@ -11,7 +11,7 @@ UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
 
 _TOOL = typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
 _LAYOUT = "Index table of a new environment."
-_CURVE = "Order of the keys of a new one."
+_CURVE = "Order of the keys of a new environment."
 
 # -- environments ---------------------------------------------------------------------------------
 
@@ -39,7 +39,8 @@ ObjectsArgument = Annotated[
 ExcludeOption = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="ID|NAME", help="Objects that are not felt; 7 or 3,4 or 'wheel*'; again for more."
+        metavar="ID|NAME",
+        help="Objects that are not felt: 7 or 3,4 or 'wheel*'. Give it again for more.",
     ),
 ]
 
@@ -48,7 +49,8 @@ ExcludeOption = Annotated[
 ToolOption = Annotated[str, _TOOL]
 OptionalToolOption = Annotated[str | None, _TOOL]
 ToolUnitOption = Annotated[
-    UnitName | None, typer.Option(help="Unit of a tool that names none; metres otherwise.")
+    UnitName | None,
+    typer.Option(help="Unit of a tool whose file names no unit; metres unless given."),
 ]
 PosesOption = Annotated[
     str, typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header.")
@@ -61,15 +63,17 @@ PointsOption = Annotated[
     int | None, typer.Option(metavar="N", help="Points of the shell.", show_default="300")
 ]
 SeedOption = Annotated[
-    int | None, typer.Option(metavar="N", help="Seed of their places.", show_default="0")
+    int | None, typer.Option(metavar="N", help="Seed of the points' places.", show_default="0")
 ]
-StiffnessOption = Annotated[float, typer.Option(metavar="N/M", help="Of the force law.")]
+StiffnessOption = Annotated[float, typer.Option(metavar="N/M", help="Stiffness of the force law.")]
 BudgetOption = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
 
 # -- results --------------------------------------------------------------------------------------
 
 CsvOption = Annotated[
     str | None,
-    typer.Option("--csv", metavar="FILE", help="Write it as CSV: a new file; - is stdout."),
+    typer.Option(
+        "--csv", metavar="FILE", help="Write the result as CSV to a new file; - is standard output."
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON, an object a line.")]

@@ -19,7 +19,8 @@ PAGE = 40
 class ListingPage(NamedTuple):
     """A part of a listing.
 
-    objects : those shown; first : number of the first of them, from 1; total : of all chosen.
+    objects : what the page shows; first : number of the first of them, counted from 1;
+    total : how many objects the listing has.
     """
 
     objects: "Sequence[Object]"
@@ -52,7 +53,7 @@ def _meets(obj: "Object", box: Corners) -> bool:
 
 
 def _in_order_of_names(obj: "Object") -> tuple[list[tuple[int, str]], int]:
-    """So that bolt_2 comes before bolt_10."""
+    """Key by which bolt_2 comes before bolt_10."""
     words = re.split(r"(\d+)", obj.name, flags=re.ASCII)
     return [
         (len(word.lstrip("0")), word) if word.isdigit() else (0, word) for word in words
@@ -60,7 +61,7 @@ def _in_order_of_names(obj: "Object") -> tuple[list[tuple[int, str]], int]:
 
 
 def longest_side(obj: "Object") -> float:
-    """Of an object's bounding box, metres."""
+    """Longest side of an object's bounding box, metres."""
     return float((obj.bounds[1] - obj.bounds[0]).max())
 
 
@@ -70,11 +71,11 @@ ORDERS: dict[Order, tuple[Callable[["Object"], Any], bool]] = {
     "voxels": (lambda obj: (obj.voxels, -obj.id), True),
     "size": (lambda obj: (longest_side(obj), -obj.id), True),
 }
-"""By what, and whether the largest comes first."""
+"""Key of each order, and whether the largest comes first."""
 
 
 def page_of(objects: "Sequence[Object]", limit: int | None, page: int | None) -> ListingPage:
-    """Return one page; all of them where neither is asked for and nobody looks."""
+    """One page of a listing; all objects if no page is asked for and no terminal shows them."""
     if limit is not None and limit < 0:
         raise UsageError(f"--limit {limit}: give 1 or more, or 0 for all")
     if page is not None and page < 1:

@@ -6,8 +6,8 @@ import re
 import shutil
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from contextlib import AbstractContextManager, contextmanager
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from hapticdb.cli.columns import Columns
 from hapticdb.units import length_text
@@ -16,19 +16,22 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb import check, transfer
+    from hapticdb.check import CheckCallback
     from hapticdb.ingest.files import ImportCallback
     from hapticdb.store.engines import BackupCallback
+    from hapticdb.transfer import CopyCallback
 
 _UNPRINTABLE = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"
 )
 """Controls of a terminal, and of the direction of writing; a line's end is neither."""
 NEW_LINE = "\n"
+Progressed = TypeVar("Progressed")
+"""What a callback of the library is called with."""
 
 
 def printable(text: str) -> str:
-    r"""Text from anywhere, names of parts and files among it, as a terminal may have it.
+    r"""Text that is safe to print on a terminal; names of parts and files may hold anything.
 
     What would move the cursor, change colours or turn the direction of writing is shown as an
     escape, such as ``\x1b``.
@@ -118,7 +121,7 @@ def box_record(bounds: "NDArray[np.float64] | None") -> dict[str, list[float]] |
 
 
 def percent(share: float) -> str:
-    """Put a share in words; one that is not all is never rounded to all, nor some to nothing."""
+    """Put a share in words; a share below 1 is never shown as 100 %."""
     text = f"{100 * share:.3g}"
     if share < 1.0 and text == "100":
         text = ">99.9"
@@ -133,10 +136,11 @@ def shares(counts: Mapping[str, int]) -> str:
 
 
 def compile_kernels(*purposes: str, files: Sequence[str] = ()) -> int:
-    """Compile what those purposes call, where this machine has not done so: with a bar or a line.
+    """Compile the kernels of those purposes that this machine has not compiled yet, and say so.
 
-    purposes: as `hapticdb.kernels.compiling.PURPOSES` names them; files: what they are for, so that
-    nobody waits to hear that none of them is there. Returns how many were compiled.
+    purposes: as `hapticdb.kernels.compiling.PURPOSES` names them; files: what the verb is going to
+    read: if none of them exists, nothing is compiled, so that the error about them comes at once.
+    Returns how many kernels were compiled.
     """
     if files and not any(map(os.path.exists, files)):
         return 0
@@ -153,44 +157,48 @@ def compile_kernels(*purposes: str, files: Sequence[str] = ()) -> int:
         return compile_missing(names, lambda now: advance(doing, now.done, now.total, 0))
 
 
-@contextmanager
-def import_bar() -> "Iterator[ImportCallback | None]":
-    """Show a bar with parts, voxels a second and time left; nothing where nobody looks."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    with _bar("reading", "parts") as advance:
-        yield lambda now: advance(now.link, now.parts_done + now.share, now.parts_total, now.voxels)
+def import_bar() -> "AbstractContextManager[ImportCallback | None]":
+    """Show how many parts are imported; see `_progress_bar`."""
+    return _progress_bar(
+        "reading",
+        "parts",
+        lambda now: (now.link, now.parts_done + now.share, now.parts_total, now.voxels),
+    )
+
+
+def copy_bar(doing: str) -> "AbstractContextManager[CopyCallback | None]":
+    """Show how many objects are copied or compared; see `_progress_bar`."""
+    return _progress_bar(
+        doing, "objects", lambda now: (doing, now.objects_done, now.objects_total, now.voxels)
+    )
+
+
+def file_bar(doing: str) -> "AbstractContextManager[BackupCallback | None]":
+    """Show how many megabytes are copied; see `_progress_bar`."""
+    return _progress_bar(
+        doing, "MB", lambda now: (doing, now.bytes_done // 10**6, now.bytes_total // 10**6, 0)
+    )
+
+
+def check_bar(doing: str) -> "AbstractContextManager[CheckCallback | None]":
+    """Show how many rows are read; see `_progress_bar`."""
+    return _progress_bar(doing, "rows", lambda now: (doing, now.done, now.total, 0))
 
 
 @contextmanager
-def copy_bar(doing: str) -> "Iterator[transfer.CopyCallback | None]":
-    """Show a bar with objects, voxels a second and time left; nothing where nobody looks."""
+def _progress_bar(
+    doing: str, noun: str, figures: "Callable[[Progressed], tuple[str, float, int, int]]"
+) -> "Iterator[Callable[[Progressed], None] | None]":
+    """Show a bar with counts, voxels a second and time left while standard error is a terminal.
+
+    figures : of a progress: what is being done, how much of it, of how much, voxels so far.
+    Yields the library's callback; None where standard error is no terminal.
+    """
     if not sys.stderr.isatty():
         yield None
         return
-    with _bar(doing, "objects") as advance:
-        yield lambda now: advance(doing, now.objects_done, now.objects_total, now.voxels)
-
-
-@contextmanager
-def file_bar(doing: str) -> "Iterator[BackupCallback | None]":
-    """Show a bar with megabytes and time left; nothing where nobody looks."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    with _bar(doing, "MB") as advance:
-        yield lambda now: advance(doing, now.bytes_done // 10**6, now.bytes_total // 10**6, 0)
-
-
-@contextmanager
-def check_bar(doing: str) -> "Iterator[check.CheckCallback | None]":
-    """Show a bar with rows and time left; nothing where nobody looks."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    with _bar(doing, "rows") as advance:
-        yield lambda now: advance(doing, now.done, now.total, 0)
+    with _bar(doing, noun) as advance:
+        yield lambda now: advance(*figures(now))
 
 
 @contextmanager

@@ -17,7 +17,7 @@ class Interrupted(Exception):  # noqa: N818 - no error: the user pressed Ctrl-C
 
 
 class PipeClosedError(Exception):
-    """Whoever read the output is gone: ``| head``."""
+    """The reader of standard output has closed it, as ``| head`` does."""
 
 
 class Verbs(typer.core.TyperGroup):
@@ -47,10 +47,10 @@ app = typer.Typer(
 
 @contextmanager
 def leaving_in_order() -> Iterator[None]:
-    """Let SIGTERM end the program by way of every clean-up: servers and devices are let go."""
+    """Let SIGTERM end the program through every clean-up: servers are stopped, devices released."""
     is_ours = threading.current_thread() is threading.main_thread()
     if not is_ours or signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
-        yield  # somebody wants it otherwise
+        yield  # another handler stays
         return
     signal.signal(signal.SIGTERM, leave)
     try:
@@ -60,7 +60,7 @@ def leaving_in_order() -> Iterator[None]:
 
 
 def leave(number: int, _: object) -> None:
-    """End the program after a signal; a handler."""
+    """End the program with the exit code of a signal: a signal handler."""
     raise SystemExit(128 + number)
 
 

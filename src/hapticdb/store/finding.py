@@ -10,6 +10,7 @@ from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.store.base import Object, Store, no_object
 
 MOST_IDS = 1 << 63
+"""Ids lie below it: they are 64-bit integers in the databases."""
 
 
 def find_objects(store: Store, words: Iterable[int | str]) -> list[Object]:
@@ -67,7 +68,7 @@ def named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
 
 
 def _branches(name: str, *, is_path: bool) -> list[str]:
-    """What of an object's path a pattern is compared with: elements, or the ways down to it."""
+    """What a pattern is compared with: a path's elements, or each beginning of the path."""
     elements = name.split("/")
     if not is_path:
         return elements
@@ -75,14 +76,14 @@ def _branches(name: str, *, is_path: bool) -> list[str]:
 
 
 def _checked(words: Iterable[int | str]) -> list[int | str]:
-    """Ids and texts; refuses what is neither before anything is looked up."""
+    """Words as ids and texts; what is neither is refused before anything is looked up."""
     if isinstance(words, (str, bytes)) or not isinstance(words, Iterable):
         raise UsageError(f"objects {words!r}: give ids, names and patterns in a list")
     checked: list[int | str] = []
     for word in words:
         try:
             if isinstance(word, bool):
-                raise TypeError  # noqa: TRY301 - no id, though Python counts it among the integers
+                raise TypeError  # noqa: TRY301 - to Python a bool is an int, but it is no id
             checked.append(word if isinstance(word, str) else index(word))
         except TypeError:
             raise UsageError(f"object {word!r}: give an id, a name or a pattern") from None

@@ -15,7 +15,9 @@ def bench(
     *,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="DIR", help="For results; NAME-bench unless given, made if missing."),
+        typer.Option(
+            metavar="DIR", help="Folder for results, made if missing; NAME-bench unless given."
+        ),
     ] = None,
     quick: Annotated[bool, typer.Option("--quick", help="Fewer frames: a first look.")] = False,
     tool: Annotated[
@@ -23,7 +25,7 @@ def bench(
         typer.Option(metavar="FILE", help="A tool of your own, measured beside a sphere."),
     ] = None,
     poses: Annotated[
-        str | None, typer.Option(metavar="CSV", help="Its path, as for 'hapticdb touch'.")
+        str | None, typer.Option(metavar="CSV", help="Path of that tool, as for 'hapticdb touch'.")
     ] = None,
     json: JsonOption = False,
 ) -> None:

@@ -21,7 +21,7 @@ def move(
     *,
     translate: Annotated[
         str | None,
-        typer.Option(metavar="X,Y,Z", help="Shift from where it is, metres, world frame."),
+        typer.Option(metavar="X,Y,Z", help="Shift from the present place, metres, world frame."),
     ] = None,
     pose: Annotated[
         str | None,
@@ -38,8 +38,8 @@ def move(
 ) -> None:
     """Place objects anew; their geometry is read from their files again.
 
-    --translate shifts all that are chosen, or none where one would leave the
-    grid; --pose and --matrix place one. 'hapticdb objects --help' says how
+    --translate shifts all objects that are chosen, or none of them when one would
+    leave the grid; --pose and --matrix place one object. 'hapticdb objects --help' says how
     names choose objects.
 
     Example: hapticdb move car.db 17 --translate 0,0,0.25

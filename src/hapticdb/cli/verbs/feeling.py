@@ -48,31 +48,36 @@ DeviceOption = Annotated[
 ]
 RateOption = Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")]
 SecondsOption = Annotated[
-    float | None, typer.Option(metavar="S", help="Until the device ends, or Ctrl-C, without.")
+    float | None,
+    typer.Option(metavar="S", help="How long; unless given, until the device ends or Ctrl-C."),
 ]
 SpeedOption = Annotated[
-    float | None, typer.Option(metavar="M/S", help="Of a path, and the fastest of a random hand.")
+    float | None,
+    typer.Option(metavar="M/S", help="Speed along a path, or greatest speed of a random hand."),
 ]
 PlaceOption = Annotated[
-    str | None, typer.Option(metavar="X,Y,Z", help="Where random and tumble are, metres.")
+    str | None, typer.Option(metavar="X,Y,Z", help="Where the hands random and tumble are, metres.")
 ]
 SimulateOption = Annotated[
-    bool, typer.Option("--simulate", help="Let the force push back a simulated device.")
+    bool, typer.Option("--simulate", help="Let the force push the hand, as a simulated device.")
 ]
-LoopOption = Annotated[bool, typer.Option("--loop", help="Begin a path anew at its end.")]
-ScaleOption = Annotated[float, typer.Option(metavar="N", help="Scene metres a metre of the hand.")]
+LoopOption = Annotated[bool, typer.Option("--loop", help="Begin a path again at its end.")]
+ScaleOption = Annotated[
+    float, typer.Option(metavar="N", help="Metres in the scene for each metre of the hand.")
+]
 ClutchOption = Annotated[
     int | None,
-    typer.Option(metavar="BUTTON", help="While it is down, 0 the first, only the hand moves."),
+    typer.Option(
+        metavar="BUTTON", help="While this button is down, only the hand moves; 0 is the first."
+    ),
 ]
 RecordOption = Annotated[
     str | None, typer.Option(metavar="FILE", help="Record the session: a new .hdbrec.")
 ]
-AppendOption = Annotated[
-    bool, typer.Option("--append", help="Go on with a recording that is there.")
-]
+AppendOption = Annotated[bool, typer.Option("--append", help="Add to a recording that exists.")]
 ReplaceOption = Annotated[
-    bool, typer.Option("--replace", help="Record anew in its place, once there is a first frame.")
+    bool,
+    typer.Option("--replace", help="Replace a recording that exists, once there is a first frame."),
 ]
 RecordLimitOption = Annotated[
     str | None,
@@ -86,15 +91,21 @@ RecordLimitOption = Annotated[
 PolicyOption = Annotated[
     PolicyName,
     typer.Option(
-        help="Where cells are not there yet: hold the force for 20 ms and let it fall, or wait."
+        help="What a frame does whose cells are not in memory yet: it holds the force for 20 ms "
+        "and lets it fall, or it waits."
     ),
 ]
 StalenessOption = Annotated[
-    float, typer.Option(metavar="S", help="Silence of the database after which force falls.")
+    float,
+    typer.Option(
+        metavar="S", help="Seconds without an answer of the database, after which the force falls."
+    ),
 ]
 HandSeedOption = Annotated[
     int | None,
-    typer.Option(metavar="N", help="Of the points, and of a random hand.", show_default="0"),
+    typer.Option(
+        metavar="N", help="Seed of the points' places, and of a random hand.", show_default="0"
+    ),
 ]
 FifoOption = Annotated[bool, typer.Option("--fifo", help="Ask the system for SCHED_FIFO.")]
 ProcessorOption = Annotated[
@@ -102,7 +113,9 @@ ProcessorOption = Annotated[
 ]
 NoBaselineOption = Annotated[
     bool,
-    typer.Option("--no-baseline", help="Skip the empty loop that is run before, 2 s at most."),
+    typer.Option(
+        "--no-baseline", help="Skip the empty loop that is measured before, for 2 s at most."
+    ),
 ]
 
 

@@ -21,15 +21,16 @@ def grant(
     role: Annotated[str, typer.Argument(metavar="ROLE", help="A role of the server.")],
     *,
     right: Annotated[
-        RightName, typer.Option("--as", help="What ROLE may do from now on; replaces the former.")
+        RightName,
+        typer.Option("--as", help="What ROLE may do from now on, instead of what it may do now."),
     ],
     json: JsonOption = False,
 ) -> None:
     """Say what a role may do with an environment on PostgreSQL; the server holds it to that.
 
     A viewer reads and touches; a toucher also keeps cost figures; an editor
-    also imports, moves and removes objects; nobody has no right. The grid is
-    the owner's, and so is granting.
+    also imports, moves and removes objects; nobody has no right. The grid
+    and the rights belong to the owner, who made the environment.
 
     Example: hapticdb grant postgresql://me@host/plant anna --as editor
     """

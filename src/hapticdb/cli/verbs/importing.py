@@ -25,38 +25,39 @@ FilesArgument = Annotated[
     ),
 ]
 UnitOption = Annotated[
-    UnitName | None, typer.Option(help="Unit of files that name none; metres otherwise.")
+    UnitName | None, typer.Option(help="Unit of files that name no unit; metres unless given.")
 ]
 BitsOption = Annotated[
     int | None,
-    typer.Option(metavar="1..21", help="Bits an axis: 2^bits voxels.", show_default="10"),
+    typer.Option(metavar="1..21", help="Bits of each axis: 2^bits voxels.", show_default="10"),
 ]
 VoxelSizeOption = Annotated[float | None, typer.Option(metavar="METRES", help="Edge of a voxel.")]
 ExtentOption = Annotated[
     float | None,
     typer.Option(
         metavar="FACTOR",
-        help="Edge of the grid in longest sides of the first file's box.",
+        help="Edge of the grid: so many times the longest side of the first file's bounding box.",
         show_default="1.6",
     ),
 ]
 OriginOption = Annotated[
     str | None,
     typer.Option(
-        metavar="X,Y,Z", help="Lower corner in metres; without it the first file is centred."
+        metavar="X,Y,Z",
+        help="Lower corner of the grid, metres; unless given, the first file is in its middle.",
     ),
 ]
 JobsOption = Annotated[
     int | None, typer.Option(metavar="N", help="Threads.", show_default="one a processor")
 ]
 KeepRemovedOption = Annotated[
-    bool, typer.Option("--keep-removed", help="Leave parts out that were removed.")
+    bool, typer.Option("--keep-removed", help="Leave out parts that were removed.")
 ]
 TimeLimitOption = Annotated[
     float | None,
     typer.Option(
         metavar="SECONDS",
-        help="That reading one file may take.",
+        help="Time that reading one file may take.",
         show_default="20 and more by its size",
     ),
 ]
@@ -99,7 +100,7 @@ def import_(
     used is named and skipped, and the others go in. Parts that were removed
     come in again, and are counted, unless --keep-removed leaves them out.
 
-    Into an environment that is there, files are added. With --replace it holds
+    To an environment that exists, files are added. With --replace it holds
     what they hold now: objects of another geometry, place or unit are replaced
     under their ids, moved ones go back, and those that the file lacks are
     removed; each in a transaction, so that an interruption loses none.

@@ -18,9 +18,7 @@ def backup(
     url: UrlArgument,
     file: CopyArgument,
     *,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace a copy that is there.")
-    ] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Replace a copy that exists.")] = False,
     json: JsonOption = False,
 ) -> None:
     """Copy an environment whole into a file, while others go on working with it.
@@ -44,8 +42,8 @@ def backup(
 def restore(file: CopyArgument, url: UrlArgument, *, json: JsonOption = False) -> None:
     """Put a copy in an environment's place, and remove the log of what was there.
 
-    What is there stays until the copy is whole beside it, and is replaced
-    then; nobody may have it open. FILE stays as it is. On PostgreSQL
+    The environment stays as it is until the copy is whole beside it, and is
+    replaced then; nobody may have it open. FILE stays as it is. On PostgreSQL
     pg_restore does this.
 
     Example: hapticdb restore backups/monday.db car.db

@@ -19,42 +19,45 @@ if TYPE_CHECKING:
     from hapticdb.store.base import Freshness, Layout, Object, Size, Store
 
 MEANINGS = {
-    "statement": "a statement of ranges, whatever it reads",
-    "descent": "each range in it: a descent of the index",
+    "statement": "a statement of ranges, without what it reads",
+    "descent": "each range of a statement: a descent of the index",
     "block": "each leaf block scanned in the engine",
     "row": "each row handed to the client",
     "lookup": "a statement of keys",
-    "probe": "each key in it",
-    "single": "a point query of the sequence",
-    "aggregate": "Figure 3, with the statement for ids",
-    "point": "each shell point in it",
-    "group": "grouping by cost, a frame",
-    "group_key": "and each key in it",
+    "probe": "each key of a statement of keys",
+    "single": "a statement of the strategy points: one key",
+    "aggregate": "a frame of the strategy statement, without its points",
+    "point": "each shell point of the strategy statement",
+    "group": "grouping by cost: a frame",
+    "group_key": "grouping by cost: each key of a frame",
 }
+"""Figures of a cost model that are times, microseconds, and what each is the time of."""
 RATIOS = ("rows_per_block", "crowding", "presence", "caution")
-"""Of the figures, those that are no times."""
+"""Figures of a cost model that are ratios, and not times."""
 SOURCES = {
     "server statistics": "the server's own statistics",
     "kept": "computed and kept",
     "computed": "computed when needed",
 }
-
+"""Where the statistics of the keys come from, in words."""
 NO_CHECKSUMS = "none of pages; 'hapticdb copy' makes an environment that has them"
 
 NameOption = Annotated[
     list[str] | None,
-    typer.Option(metavar="ID|NAME", help="Only these: 7 or 3,4 or 'wheel*'; again for more."),
+    typer.Option(
+        metavar="ID|NAME", help="Only these objects: 7 or 3,4 or 'wheel*'. Give it again for more."
+    ),
 ]
 BoxOption = Annotated[
     Corners | None,
     typer.Option(
-        metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only those whose bounds meet this box, metres."
+        metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only objects whose bounding boxes meet this box, metres."
     ),
 ]
 SortOption = Annotated[
-    Order, typer.Option(help="By name; or by voxels or longest side, the largest first.")
+    Order, typer.Option(help="By id or name; or by voxels or longest side, the largest first.")
 ]
-ReverseOption = Annotated[bool, typer.Option("--reverse", help="The other way round.")]
+ReverseOption = Annotated[bool, typer.Option("--reverse", help="Reverse the order.")]
 LimitOption = Annotated[
     int | None,
     typer.Option(
@@ -180,8 +183,8 @@ def objects(
     """List the objects of an environment.
 
     Verbs take objects by id, by name and by pattern. A name is a path, such as
-    body/door/handle. One without / fits any element of a path, one with / the
-    path from its start; where it ends at a sub-assembly, it means all below.
+    body/door/handle. A name without / fits any element of a path, a name with /
+    the path from its start. The name of a sub-assembly means all objects below it.
     In a pattern * stands for anything, ? for one character, [ab] for a or b;
     case counts.
 
@@ -256,7 +259,7 @@ def calibrate(
     cold: Annotated[
         bool,
         typer.Option(
-            "--cold", help="With empty caches, on SQLite; these figures are then the ones kept."
+            "--cold", help="Measure with empty caches, on SQLite; these figures are then kept."
         ),
     ] = False,
     json: JsonOption = False,
@@ -296,10 +299,10 @@ def calibrate(
 
 
 def analyze(url: UrlArgument, *, json: JsonOption = False) -> None:
-    """Renew the statistics of the keys, by which cbgroup and auto expect how many rows a gap holds.
+    """Renew the statistics of the keys: cbgroup and auto estimate from them what a gap holds.
 
-    An import does so at its end, PostgreSQL's autovacuum now and then: this
-    is for after many edits.
+    An import renews them at its end, PostgreSQL's autovacuum from time to time.
+    This verb is for after many edits.
 
     Example: hapticdb analyze car.db
     """

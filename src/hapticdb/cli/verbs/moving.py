@@ -1,4 +1,4 @@
-"""The verbs of moving house: copy, diff."""
+"""The verbs that copy and compare environments: copy, diff."""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from hapticdb.transfer import CopyReport
 
 MOST_LINES = 20
+"""Differences that are listed; more are counted."""
 
 
 def copy(
@@ -147,7 +148,7 @@ def _equal(difference: "Difference") -> str:
 
 
 def _show(difference: "Difference") -> None:
-    """Print differences, most important first, a row each, and their totals."""
+    """Print differences, a row each, the most important first, and their totals."""
     a, b = difference.a, difference.b
     if not difference.is_same_grid:
         grid_a, grid_b = (grid.describe() for grid in difference.grids)

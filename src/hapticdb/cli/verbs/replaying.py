@@ -17,16 +17,21 @@ def replay(
     recording: Annotated[str, typer.Argument(metavar="FILE", help="A session's .hdbrec.")],
     url: Annotated[
         str | None,
-        typer.Argument(metavar="URL", help="The environment; the recorded one without."),
+        typer.Argument(
+            metavar="URL", help="The environment; unless given, the one that was recorded."
+        ),
     ] = None,
     *,
     until_damage: Annotated[
-        bool, typer.Option("--until-damage", help="Take a damaged recording to end there.")
+        bool,
+        typer.Option(
+            "--until-damage", help="Take a damaged recording to end where the damage begins."
+        ),
     ] = False,
     csv: CsvOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Compute a recorded session's contact wrenches again, and say where they part.
+    """Compute a recorded session's contact wrenches again, and say whether they are equal.
 
     Ends with exit code 0 when all are equal bit for bit, 1 when some differ
     or there was none to compare. With --csv, the recorded frames are written

@@ -20,7 +20,9 @@ def sample(
     *,
     along: Annotated[
         str | None,
-        typer.Option(metavar="URL", help="Slide over this environment instead of the sample."),
+        typer.Option(
+            metavar="URL", help="Slide the wrench over this environment instead of the sample."
+        ),
     ] = None,
     frames: FramesOption = 1000,
     json: JsonOption = False,
@@ -78,10 +80,10 @@ def demo(
         str | None,
         typer.Option(
             metavar="URL",
-            help="Import beside this environment, instead of into DIR: postgresql://host/database.",
+            help="Make the environments beside the one that this URL names, instead of in DIR.",
         ),
     ] = None,
-    bits: Annotated[int, typer.Option(metavar="1..21", help="Bits an axis of the grid.")] = 10,
+    bits: Annotated[int, typer.Option(metavar="1..21", help="Bits of each axis of the grid.")] = 10,
     frames: FramesOption = 1000,
     points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
     json: JsonOption = False,

@@ -42,13 +42,15 @@ PartsOption = Annotated[
     typer.Option(
         "--part",
         metavar="ID|NAME",
-        help="Instead of --tool: the objects that move, all together; as for --exclude.",
+        help="Instead of --tool: objects that move, all together; chosen as for --exclude.",
     ),
 ]
 ClearanceOption = Annotated[
     float | None,
     typer.Option(
-        metavar="M", help="Look so far for what is near; 0: not at all.", show_default="32 voxels"
+        metavar="M",
+        help="Distance up to which clearance is looked for; 0: not at all.",
+        show_default="32 voxels",
     ),
 ]
 DensePointsOption = Annotated[
@@ -57,7 +59,9 @@ DensePointsOption = Annotated[
 ]
 AsGivenOption = Annotated[
     bool,
-    typer.Option("--as-given", help="Sizes and places are as they should be: exit code 0 or 1."),
+    typer.Option(
+        "--as-given", help="The sizes and places are right: exit code 0 when it comes out."
+    ),
 ]
 PictureOption = Annotated[
     str | None, typer.Option(metavar="PNG", help="Draw the path, its hits and clearance.")
@@ -70,23 +74,23 @@ UpOption = Annotated[
 HELP = """Say whether a tool or part comes out along a path: what it hits, where, how near it comes.
 
 Hits: a point of the tool is in a voxel of an object, or something lies inside
-the tool, whose mesh is closed there. Comes out: proved for the whole surface
-and the whole path. Not decided: neither, and the line says what would decide.
+a closed body of the tool. Comes out: proved for the whole surface and the whole
+path. Not decided: neither; a line says what would decide it.
 
 Between two poses the tool's middle moves straight while the tool turns about
 it, in steps in which no point moves more than half a voxel. Segment 0 leads
 from pose 0 to pose 1.
 
-With --part, objects are the tool: all of them together, rigid, left out of
-what is felt. The poses are displacements from where they sit: x,y,z 0 and
-qw 1 is their place. A sub-assembly's name means all that is below it;
-'hapticdb objects --help' says how names choose objects.
+With --part, objects of the environment are the tool: all of them together are
+one rigid body, which is not felt. The poses are displacements from where the
+objects are: x,y,z 0 and qw 1 is their present place. A sub-assembly's name means
+all that is below it; 'hapticdb objects --help' says how names choose objects.
 
 The points are half a voxel apart, 200,000 at most, unless --points are given.
 
-The exit code is 0 when it comes out, 1 when it hits, 3 when not decided; 3,
-too, when it comes out, but the sizes or places of tool, path and scene do not
-fit, as a line then says: --as-given if they are meant so.
+The exit code is 0 when it comes out, 1 when it hits, 3 when it is not decided.
+It is 3, too, when it comes out but the sizes or places of tool, path and scene do
+not fit together; a line then says so. With --as-given they are taken as right.
 
 Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
 """
@@ -160,7 +164,9 @@ def _check(
     if (tool is None) == (not part):
         raise UsageError("give one of --tool and --part")
     if part and tool_unit is not None:
-        raise UsageError("--tool-unit is of a --tool; a part has the unit that it was imported in")
+        raise UsageError(
+            "--tool-unit belongs to --tool: a part has the unit that it was imported in"
+        )
     if picture is not None and Path(picture).suffix.lower() != ".png":
         raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
 
@@ -200,7 +206,7 @@ def _draw(
 
 @contextmanager
 def _bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
-    """Show a bar with samples a second and time left; nothing where nobody looks."""
+    """Show a bar with time left; nothing where standard error is no terminal."""
     import sys
 
     if not sys.stderr.isatty():

@@ -58,11 +58,16 @@ keep the figures. A larger value lets longer paths of large tools go without gro
 
 StrategyOption = Annotated[StrategyName, typer.Option(help="How the database is asked.")]
 MaxgapOption = Annotated[
-    int, typer.Option(metavar="KEYS", help="Of the strategy maxgap, in voxel keys.")
+    int,
+    typer.Option(
+        metavar="KEYS", help="Widest gap that the strategy maxgap reads across, in voxel keys."
+    ),
 ]
 ContactsCsvOption = Annotated[
     str | None,
-    typer.Option(metavar="FILE", help="Write every contact as CSV: a new file; - is stdout."),
+    typer.Option(
+        metavar="FILE", help="Write every contact as CSV to a new file; - is standard output."
+    ),
 ]
 
 
@@ -85,8 +90,8 @@ def touch(
 ) -> None:
     """Touch an environment with a tool along a path: force, torque and objects of every pose.
 
-    Where tool, path and scene do not fit in size or place, a line says what is
-    off and by which factor: then no hit says little.
+    Where the sizes or places of tool, path and scene do not fit together, a line
+    says what is wrong, and by which factor. A path without hits then means little.
 
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """

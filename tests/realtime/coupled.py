@@ -9,9 +9,9 @@ from numpy.typing import ArrayLike, NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.kernels.hand import coupling as kernels
+from hapticdb.kernels.hand.anchors import MET_ROWS
 from hapticdb.kernels.motion import poses_of
-from hapticdb.kernels.records import MOST_MISSED
-from hapticdb.kernels.resident.cells import HITS, RESULTS
+from hapticdb.kernels.records import MOST_MISSED, SERVO, pose_numbers, views_of
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.resident.frames import clusters_of
 from hapticdb.resident.residency import Residency
@@ -73,19 +73,19 @@ class Tool:
         self.clusters = clusters_of(shell, SIZE)
         self.body = (coupling or Coupling()).body(shell, self.place, contact)
         self.row = world.table.join()
-        self.state = np.zeros(kernels.STATE)
-        self.state[:3], self.state[3:7] = position, quaternion
-        self.hand = np.zeros(kernels.HAND)
-        self.hand[:7] = self.state[:7]
-        self.met = np.empty((kernels.MET_ROWS, len(shell)), dtype=np.int64)
+        self.servo = np.zeros((), SERVO)
+        views = views_of(self.servo)
+        self.state, self.hand, self.sent = views.tool, views.hand, views.sent
+        self.state.position[:] = self.hand.position[:] = position
+        self.state.quaternion[:] = self.hand.quaternion[:] = quaternion
+        self.frame: Floats = self.state.felt
+        self.met = np.empty((MET_ROWS, len(shell)), dtype=np.int64)
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-        self.frame = np.zeros(RESULTS)
-        self.out = np.zeros(kernels.OUT)
 
     def advance(self, dt: float = 1e-3) -> None:
         kernels.advance(
-            self.world.table.cells, self.row, self.clusters, self.place, self.body, self.state,
-            self.hand, dt, self.met, self.missed, self.frame, self.out,
+            self.world.table.cells, self.row, self.clusters, self.place, self.body, self.servo, dt,
+            self.met, self.missed,
         )  # fmt: skip
 
     def settle(self, seconds: float, rate: float = 1000.0) -> None:
@@ -95,7 +95,7 @@ class Tool:
     @property
     def pose(self) -> Floats:
         pose: Floats = np.empty((1, 4, 4))
-        poses_of(self.state[None, :7], pose)
+        poses_of(self.placed[None], pose)
         return pose.reshape(4, 4)
 
     @property
@@ -106,18 +106,31 @@ class Tool:
         return voxels
 
     @property
+    def placed(self) -> Floats:
+        """Position and unit quaternion (7,)."""
+        return pose_numbers(self.servo["tool"])
+
+    @property
     def n_hits(self) -> int:
-        return int(self.out[HITS])
+        return int(self.sent.hits)
 
     @property
     def flags(self) -> int:
-        return int(self.out[kernels.FLAGS])
+        return int(self.sent.flags)
 
     @property
     def is_at_rest(self) -> bool:
-        speed = np.linalg.norm(self.state[7:10])
-        turning = np.linalg.norm(self.state[10:13]) * self.body.radius
+        speed = np.linalg.norm(self.state.velocity[:3])
+        turning = np.linalg.norm(self.state.velocity[3:]) * self.body.radius
         return bool(speed + turning < 1e-4)
+
+
+def numbers_in(record: NDArray[np.void]) -> Floats:
+    """All numbers of a record (), those of the records in it, too."""
+    fields = [record[name] for name in record.dtype.names or ()]
+    return np.concatenate(
+        [numbers_in(field) if field.dtype.names else field.ravel() for field in fields]
+    )
 
 
 def box(size: ArrayLike, points: int = 200) -> PointShell:

@@ -13,9 +13,7 @@ from hapticdb import PointShell, UsageError
 from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
-    DEEPEST,
     REVISION,
-    UNKNOWNS,
     VERSION,
     WRENCH,
     Cells,
@@ -66,13 +64,13 @@ def test_nothing_is_felt_while_every_point_is_free() -> None:
     tool = Tool(World(FLOOR), PointShell.sphere(0.012), (0.0, 0.0, 0.05))
     rng = np.random.default_rng(0)
     for _ in range(300):
-        tool.hand[:3] = rng.uniform((-0.03, -0.03, 0.05), (0.03, 0.03, 0.11))
-        tool.hand[3:7] = rng.normal(size=4)
-        tool.hand[3:7] /= np.linalg.norm(tool.hand[3:7])
-        tool.hand[7:13] = rng.normal(size=6)
+        tool.hand.position[:] = rng.uniform((-0.03, -0.03, 0.05), (0.03, 0.03, 0.11))
+        tool.hand.quaternion[:] = rng.normal(size=4)
+        tool.hand.quaternion[:] /= np.linalg.norm(tool.hand.quaternion)
+        tool.hand.velocity[:] = rng.normal(size=6)
         tool.advance()
         assert tool.n_hits == 0
-        assert tool.out[:6].tolist() == [0.0] * 6
+        assert tool.sent.wrench.tolist() == [0.0] * 6
         assert tool.frame[:6].tolist() == [0.0] * 6
 
 
@@ -83,12 +81,12 @@ def test_free_motion_follows_the_damped_oscillator(step: float) -> None:
     worst = []
     for dt in (1e-4, 5e-5):
         tool = Tool(world, PointShell.sphere(0.012), (0.0, 0.0, 0.0))
-        tool.hand[0] = step
+        tool.hand.position[0] = step
         errors = []
         for n in range(1, round(0.02 / dt)):
             tool.advance(dt)
-            errors.append(abs(tool.state[0] - critically_damped(n * dt, step)))
-        assert np.allclose(tool.state[1:3], 0.0, atol=1e-15)
+            errors.append(abs(tool.state.position[0] - critically_damped(n * dt, step)))
+        assert np.allclose(tool.state.position[1:3], 0.0, atol=1e-15)
         worst.append(max(errors) / step)
     assert worst[0] < 0.02
     assert 1.7 < worst[0] / worst[1] < 2.3
@@ -96,11 +94,11 @@ def test_free_motion_follows_the_damped_oscillator(step: float) -> None:
 
 def test_a_free_turn_follows_the_damped_oscillator() -> None:
     tool = Tool(World(), PointShell.sphere(0.012), (0.0, 0.0, 0.0))
-    tool.hand[3:7] = math.cos(0.4), 0.0, math.sin(0.4), 0.0
+    tool.hand.quaternion[:] = math.cos(0.4), 0.0, math.sin(0.4), 0.0
     errors = []
     for n in range(1, 200):
         tool.advance(1e-4)
-        turned = 2.0 * math.atan2(tool.state[5], tool.state[3])
+        turned = 2.0 * math.atan2(tool.state.quaternion[2], tool.state.quaternion[0])
         errors.append(abs(turned - critically_damped(n * 1e-4, 0.8)))
     assert max(errors) < 0.02 * 0.8
 
@@ -111,19 +109,21 @@ def test_the_tool_turns_about_its_centre() -> None:
     shifted = PointShell(shell.points + away, shell.normals, away)
     tool = Tool(World(), shifted, (0.0, 0.0, 0.0))
     half = math.sqrt(0.5)
-    tool.hand[:7] = 0.1, -0.1, 0.0, half, 0.0, 0.0, half  # about the centre by a quarter
+    tool.hand.position[:] = 0.1, -0.1, 0.0
+    tool.hand.quaternion[:] = half, 0.0, 0.0, half  # about the centre by a quarter
     for _ in range(50):
         tool.advance()
         assert np.allclose(tool.pose[:3, :3] @ shifted.center + tool.pose[:3, 3], (0.1, 0, 0))
-    assert np.allclose(tool.state[:7], tool.hand[:7], atol=1e-4)
+    assert np.allclose(tool.state.position, tool.hand.position, atol=1e-4)
+    assert np.allclose(tool.state.quaternion, tool.hand.quaternion, atol=1e-4)
 
 
 def test_a_fast_hand_is_followed_in_free_motion() -> None:
     tool = Tool(World(), PointShell.sphere(0.012), (-0.1, 0.0, 0.0))
     for n in range(200):
-        tool.hand[0], tool.hand[7] = -0.1 + 2.0 * n * 1e-3, 2.0
+        tool.hand.position[0], tool.hand.velocity[0] = -0.1 + 2.0 * n * 1e-3, 2.0
         tool.advance()
-    assert abs(tool.state[0] - tool.hand[0]) < SIZE
+    assert abs(tool.state.position[0] - tool.hand.position[0]) < SIZE
 
 
 def test_quaternions_stay_normal_over_a_million_steps() -> None:
@@ -133,10 +133,10 @@ def test_quaternions_stay_normal_over_a_million_steps() -> None:
     worst = 0.0
     while n_steps < 1_000_000:
         q = rng.normal(size=4)
-        tool.hand[3:7] = q / np.linalg.norm(q)
+        tool.hand.quaternion[:] = q / np.linalg.norm(q)
         tool.advance(0.5)
-        n_steps += int(tool.out[kernels.SUBSTEPS])
-        worst = max(worst, abs(float(np.linalg.norm(tool.state[3:7])) - 1.0))
+        n_steps += int(tool.sent.n_steps)
+        worst = max(worst, abs(float(np.linalg.norm(tool.state.quaternion)) - 1.0))
     assert worst < 1e-12
 
 
@@ -168,14 +168,14 @@ def test_a_hand_at_rest_brings_the_tool_to_rest(
     n_periods = round(0.2 * rate)
     way = (np.array(goal) - start) / n_periods
     for _ in range(n_periods):
-        tool.hand[:3] += way
-        tool.hand[7:10] = way * rate
+        tool.hand.position[:] += way
+        tool.hand.velocity[:3] = way * rate
         tool.advance(1.0 / rate)
-    tool.hand[7:10] = 0.0
+    tool.hand.velocity[:3] = 0.0
     tool.settle(0.3, rate)
     assert tool.n_hits > 0
     assert tool.is_at_rest
-    assert np.linalg.norm(tool.out[:3]) <= Coupling().stiffness * SIZE / 2 + 1e-3
+    assert np.linalg.norm(tool.sent.wrench[:3]) <= Coupling().stiffness * SIZE / 2 + 1e-3
 
 
 @pytest.mark.parametrize("n_across", [2, 3, 6])
@@ -184,7 +184,7 @@ def test_energy_at_rest_never_grows(n_across: int, dt: float) -> None:
     """Its maximum over successive windows, while all points stay in one layer of voxels."""
     shell = punch(n_across)
     tool = Tool(World(FLOOR), shell, (0.0, 0.0, -0.6 * SIZE))
-    tool.hand[:3] = 0.0003, 0.0, -0.95 * SIZE
+    tool.hand.position[:] = 0.0003, 0.0, -0.95 * SIZE
     share = min(1.0, 10.0 / len(shell))
     body = tool.body
     energies = []
@@ -193,11 +193,11 @@ def test_energy_at_rest_never_grows(n_across: int, dt: float) -> None:
         assert tool.n_hits == len(shell)
         placed = shell.points @ tool.pose[:3, :3].T + tool.pose[:3, 3]
         depths = np.maximum(-0.5 * SIZE - placed[:, 2], 0.0)
-        spring = np.linalg.norm(tool.hand[:3] - tool.state[:3])
-        turned = 2.0 * np.linalg.norm(tool.state[4:7])
+        spring = np.linalg.norm(tool.hand.position - tool.state.position)
+        turned = 2.0 * np.linalg.norm(tool.state.quaternion[1:])
         energies.append(
-            0.5 * body.mass * np.square(tool.state[7:10]).sum()
-            + 0.5 * body.inertia * np.square(tool.state[10:13]).sum()
+            0.5 * body.mass * np.square(tool.state.velocity[:3]).sum()
+            + 0.5 * body.inertia * np.square(tool.state.velocity[3:]).sum()
             + 0.5 * share * body.stiffness * np.square(depths).sum()
             + 0.5 * body.spring * spring**2
             + 0.5 * body.turn_spring * turned**2
@@ -223,10 +223,10 @@ def test_a_centred_peg_is_pushed_neither_aside_nor_round(voxels: NDArray[np.int6
     )
     tool.advance()
     assert tool.n_hits == len(points)
-    assert tool.out[DEEPEST] == pytest.approx(0.2 * SIZE)
+    assert tool.sent.deepest == pytest.approx(0.2 * SIZE)
     assert np.abs(tool.frame[:3]).max() < 1e-12
     assert np.abs(tool.frame[3:6]).max() < 1e-14
-    assert np.abs(tool.out[:6]).max() < 1e-12
+    assert np.abs(tool.sent.wrench).max() < 1e-12
 
 
 def test_a_wedge_on_its_axis_is_only_lifted() -> None:
@@ -253,18 +253,18 @@ def test_a_wedge_on_its_axis_is_only_lifted() -> None:
 def test_the_spring_is_clamped_while_a_point_hits() -> None:
     tool = Tool(World(FLOOR), box((0.02, 0.02, 0.02)), (0.0, 0.0, 0.02))
     for depth in (0.01, 0.1, 1.0):
-        tool.hand[2] = 0.01 - depth
+        tool.hand.position[2] = 0.01 - depth
         tool.settle(0.3)
         assert tool.n_hits > 0
         push = tool.body.spring * SIZE / 2
-        assert np.linalg.norm(tool.out[:3]) == pytest.approx(push, rel=0.02)
-        assert tool.out[2] > 0.9 * push
+        assert np.linalg.norm(tool.sent.wrench[:3]) == pytest.approx(push, rel=0.02)
+        assert tool.sent.wrench[2] > 0.9 * push
 
 
 def test_the_contact_wrench_is_that_of_the_recorded_pose() -> None:
     tool = Tool(World(FLOOR), PointShell.sphere(0.012), (0.001, 0.002, 0.02), contact=3000.0)
-    tool.hand[:3] = 0.02, 0.0, 0.0
-    tool.hand[10] = 1.0
+    tool.hand.position[:] = 0.02, 0.0, 0.0
+    tool.hand.velocity[3] = 1.0
     again = np.zeros((1, len(tool.frame)))
     n_felt = 0
     for _ in range(100):
@@ -292,46 +292,46 @@ def half_known() -> World:
 def test_the_wrench_is_held_then_fades_while_cells_are_unknown() -> None:
     world = half_known()
     tool = Tool(world, PointShell.sphere(0.004, 100), (0.0, 0.0, -0.03))
-    tool.hand[2] = 0.0
+    tool.hand.position[2] = 0.0
     tool.settle(0.3)
-    pushed = tool.out[:6].copy()
+    pushed = tool.sent.wrench.copy()
     assert pushed[2] < -1.0
-    tool.hand[kernels.IS_STALE] = 1.0
-    resting, shares = tool.state[:7].copy(), []
+    tool.hand.is_stale[()] = 1.0
+    resting, shares = tool.placed.copy(), []
     for _ in range(60):
         tool.advance()
-        assert tool.state[:7].tolist() == resting.tolist()
-        assert tool.state[7:13].tolist() == [0.0] * 6
+        assert tool.placed.tolist() == resting.tolist()
+        assert tool.state.velocity.tolist() == [0.0] * 6
         assert tool.flags & kernels.IS_HELD
-        shares.append(tool.out[2] / pushed[2])
+        shares.append(tool.sent.wrench[2] / pushed[2])
     assert shares[:20] == pytest.approx([1.0] * 20)
     assert shares[29] == pytest.approx(0.5)
     assert shares[40:] == [0.0] * 20
     assert bool(tool.flags & kernels.IS_FADING)
-    tool.hand[kernels.IS_STALE] = 0.0
+    tool.hand.is_stale[()] = 0.0
     tool.settle(0.1)
-    assert np.allclose(tool.out[:6], pushed, atol=1e-2)
+    assert np.allclose(tool.sent.wrench, pushed, atol=1e-2)
     assert tool.flags & kernels.IS_HELD == 0
 
 
 def test_the_tool_waits_at_unknown_cells_and_goes_on_when_they_come() -> None:
     world = half_known()
     tool = Tool(world, PointShell.sphere(0.004, 100), (0.15, 0.0, -0.03))
-    tool.hand[2] = 0.05
+    tool.hand.position[2] = 0.05
     tool.settle(0.2)
-    waiting = tool.state[:7].copy()
+    waiting = tool.placed.copy()
     assert -0.005 - 0.5 * SIZE < waiting[2] <= -0.003
     for _ in range(5):
         tool.advance()
-        assert tool.out[UNKNOWNS] > 0
-        assert tool.state[:7].tolist() == waiting.tolist()
+        assert tool.sent.unknown > 0
+        assert tool.placed.tolist() == waiting.tolist()
         assert tool.flags & kernels.IS_HELD
         wanted = tool.missed[1 : 1 + tool.missed[0]]
         assert (wanted & 0xFFFF == 1).all()
     world.load(wanted)
     tool.settle(0.3)
-    assert tool.out[UNKNOWNS] == 0
-    assert tool.state[2] == pytest.approx(0.05, abs=1e-4)
+    assert tool.sent.unknown == 0
+    assert tool.state.position[2] == pytest.approx(0.05, abs=1e-4)
 
 
 def test_a_frame_has_the_revision_of_the_version_that_it_read(
@@ -348,21 +348,22 @@ def test_a_frame_has_the_revision_of_the_version_that_it_read(
 
     monkeypatch.setattr(kernels, "end_frame", end_frame_and_lose_it)
     monkeypatch.setattr(kernels, "advance", getattr(kernels.advance, "py_func", kernels.advance))
-    tool.hand[kernels.IS_STALE] = 1.0  # most of a frame is left out
+    tool.hand.is_stale[()] = 1.0  # most of a frame is left out
     tool.advance()
-    assert tool.out[kernels.OUT_REVISION] == read
+    assert tool.sent.revision == read
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
 def test_a_hand_that_is_nowhere_moves_nothing(bad: float) -> None:
     tool = Tool(World(FLOOR), PointShell.sphere(0.012), (0.0, 0.0, 0.05))
+    numbers = np.ndarray((13,), np.float64, tool.servo["hand"])
     for at in range(13):
-        before = tool.hand[at]
-        tool.hand[at] = bad
+        before = numbers[at]
+        numbers[at] = bad
         tool.advance()
         assert tool.flags & kernels.IS_HELD
-        assert tool.state[:3].tolist() == [0.0, 0.0, 0.05]
-        tool.hand[at] = before
+        assert tool.state.position.tolist() == [0.0, 0.0, 0.05]
+        numbers[at] = before
 
 
 def test_what_appears_about_the_tool_lets_it_go_on_either_side() -> None:
@@ -372,12 +373,12 @@ def test_what_appears_about_the_tool_lets_it_go_on_either_side() -> None:
     write_voxels(world.environment.store, block((20, 20, MIDDLE), (43, 43, MIDDLE)), "new")
     world.residency.refresh()
     world.load(cells_of(world.grid))
-    tool.hand[2] = 0.05
+    tool.hand.position[2] = 0.05
     tool.settle(0.3)
-    assert tool.state[2] == pytest.approx(0.05, abs=1e-3)
-    tool.hand[2] = -0.05
+    assert tool.state.position[2] == pytest.approx(0.05, abs=1e-3)
+    tool.hand.position[2] = -0.05
     tool.settle(0.3)
-    assert tool.state[2] > 0.01
+    assert tool.state.position[2] > 0.01
 
 
 # --- the body -------------------------------------------------------------------------------------
@@ -417,6 +418,6 @@ def test_a_contact_has_a_stiffness(contact: float) -> None:
 def test_one_signature_does_for_every_period() -> None:
     for voxels in (FLOOR, np.empty((0, 3), dtype=np.int64)):
         tool = Tool(World(voxels), PointShell.sphere(0.012), (0.0, 0.0, 0.02))
-        tool.hand[2] = 0.0
+        tool.hand.position[2] = 0.0
         tool.settle(0.05)
     assert len(kernels.advance.signatures) == 1  # type: ignore[attr-defined]

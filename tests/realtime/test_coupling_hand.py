@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hapticdb import PointShell
 from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.poses import quaternion_of, rotation_of
-from realtime.coupled import SIDE, SIZE, Tool, World, box, punch
+from realtime.coupled import SIDE, SIZE, Tool, World, box, numbers_in, punch
 from realtime.worlds import block
 
 Floats = NDArray[np.float64]
@@ -42,10 +42,10 @@ def turn_vector(matrix: Floats) -> Floats:
 
 def share(tool: Tool) -> float:
     """Of the wrench in full, what the hand gets of it."""
-    full = tool.state[kernels.KEPT : kernels.KEPT + 6]
+    full = tool.state.kept
     assert np.abs(full).max() > 0.0
-    found = float(tool.out[:6] @ full / (full @ full))
-    np.testing.assert_allclose(tool.out[:6], found * full, atol=1e-15)
+    found = float(tool.sent.wrench @ full / (full @ full))
+    np.testing.assert_allclose(tool.sent.wrench, found * full, atol=1e-15)
     return found
 
 
@@ -60,7 +60,7 @@ def shares(tool: Tool, n_frames: int) -> list[float]:
 def pressing(world: World) -> Tool:
     """A box that a hand has pressed on the floor for long."""
     tool = Tool(world, box((0.02, 0.02, 0.02)), (0.0, 0.0, 0.02))
-    tool.hand[2] = 0.005
+    tool.hand.position[2] = 0.005
     tool.settle(0.3)
     assert tool.n_hits > 0
     assert share(tool) == 1.0
@@ -78,14 +78,14 @@ def test_the_wrench_is_the_energys_gradient_at_the_handles_origin(floor: World, 
     center = rng.uniform(-0.05, 0.05, 3)
     shell = PointShell(flat.points, flat.normals, center, is_closed=False)
     tool = Tool(floor, shell, (0.0, 0.0, -0.6 * SIZE))
-    tool.state[kernels.RISEN] = 1.0
-    tool.hand[:3] += rng.uniform(-0.1, 0.1, 3) * SIZE
+    tool.state.risen[()] = 1.0
+    tool.hand.position[:] += rng.uniform(-0.1, 0.1, 3) * SIZE
     first = rotation(rng.uniform(-0.05, 0.05, 3) * SIZE / tool.body.radius)
-    tool.hand[3:7] = quaternion_of(first)[0]
+    tool.hand.quaternion[:] = quaternion_of(first)[0]
 
     def energy(step: Floats) -> float:
         turned = rotation(step[3:]) @ first
-        way = tool.hand[:3] + step[:3] + turned @ center - (tool.state[:3] + center)
+        way = tool.hand.position + step[:3] + turned @ center - (tool.state.position + center)
         turn = turn_vector(turned)
         return float(0.5 * tool.body.spring * way @ way + 0.5 * tool.body.turn_spring * turn @ turn)
 
@@ -93,7 +93,7 @@ def test_the_wrench_is_the_energys_gradient_at_the_handles_origin(floor: World, 
     assert tool.n_hits == len(shell)
     steps = 1e-6 * np.eye(6)
     gradient = np.array([(energy(step) - energy(-step)) / 2e-6 for step in steps])
-    np.testing.assert_allclose(tool.out[:6], -gradient, rtol=1e-5, atol=1e-7)
+    np.testing.assert_allclose(tool.sent.wrench, -gradient, rtol=1e-5, atol=1e-7)
 
 
 # --- how much at most -----------------------------------------------------------------------------
@@ -105,26 +105,26 @@ def test_no_reading_makes_the_force_in_contact_larger_than_spring_and_clamp(
 ) -> None:
     tool = pressing(floor)
     most = tool.body.spring * SIZE
-    tool.hand[7:10] = 0.0, 0.0, -speed
+    tool.hand.velocity[:3] = 0.0, 0.0, -speed
     tool.advance()
     assert tool.n_hits > 0
-    assert np.linalg.norm(tool.out[:3]) == pytest.approx(most, rel=0.1)
-    assert np.linalg.norm(tool.out[:3]) <= most * (1 + 1e-9)
-    tool.hand[7:13] = 0.0, 0.0, 0.0, 0.0, 0.0, 100.0 * speed
+    assert np.linalg.norm(tool.sent.wrench[:3]) == pytest.approx(most, rel=0.1)
+    assert np.linalg.norm(tool.sent.wrench[:3]) <= most * (1 + 1e-9)
+    tool.hand.velocity[:] = 0.0, 0.0, 0.0, 0.0, 0.0, 100.0 * speed
     tool.advance()
     assert tool.n_hits > 0
     most_torque = most * tool.body.radius
-    assert 0.4 * most_torque < np.linalg.norm(tool.out[3:6]) <= most_torque * (1 + 1e-9)
+    assert 0.4 * most_torque < np.linalg.norm(tool.sent.wrench[3:6]) <= most_torque * (1 + 1e-9)
 
 
 def test_a_slow_hand_feels_all_of_the_damper(floor: World) -> None:
     """Below the limit nothing is taken away."""
     tool = pressing(floor)
-    at_rest = tool.out[:3].copy()
-    tool.hand[7] = 0.01
+    at_rest = tool.sent.wrench[:3].copy()
+    tool.hand.velocity[0] = 0.01
     tool.advance(1e-9)
     damped = at_rest[0] - tool.body.damping * 0.01
-    assert tool.out[0] == pytest.approx(damped, abs=1e-4)
+    assert tool.sent.wrench[0] == pytest.approx(damped, abs=1e-4)
 
 
 # --- rising and falling ---------------------------------------------------------------------------
@@ -132,7 +132,7 @@ def test_a_slow_hand_feels_all_of_the_damper(floor: World) -> None:
 
 def test_a_session_that_starts_in_material_begins_softly(floor: World) -> None:
     tool = Tool(floor, box((0.02, 0.02, 0.02)), (0.0, 0.0, 0.0))
-    tool.hand[2] = -0.001
+    tool.hand.position[2] = -0.001
     found = shares(tool, RISE + 10)
     assert found[:RISE] == pytest.approx(np.arange(1, RISE + 1) / RISE)
     assert found[RISE + 1 :] == [1.0] * 9
@@ -141,13 +141,13 @@ def test_a_session_that_starts_in_material_begins_softly(floor: World) -> None:
 def test_a_start_in_free_space_leaves_the_first_contact_as_it_is(floor: World) -> None:
     tool = Tool(floor, box((0.02, 0.02, 0.02)), (0.0, 0.0, 0.02))
     tool.settle(0.03)
-    tool.hand[2] = 0.005
+    tool.hand.position[2] = 0.005
     n_felt = 0
     for _ in range(100):
         tool.advance()
         if tool.n_hits:
-            full = tool.state[kernels.KEPT : kernels.KEPT + 6]
-            assert tool.out[:6].tobytes() == full.tobytes()
+            full = tool.state.kept
+            assert tool.sent.wrench.tobytes() == full.tobytes()
             n_felt += 1
     assert n_felt > 50
 
@@ -157,9 +157,9 @@ def test_after_a_hold_the_wrench_rises_from_where_it_fell_to(
     floor: World, n_held: int, left: float
 ) -> None:
     tool = pressing(floor)
-    tool.hand[kernels.IS_STALE] = 1.0
+    tool.hand.is_stale[()] = 1.0
     assert shares(tool, n_held)[-1] == pytest.approx(left)
-    tool.hand[kernels.IS_STALE] = 0.0
+    tool.hand.is_stale[()] = 0.0
     found = shares(tool, RISE + 10)
     rising = np.minimum(left + np.arange(1, RISE + 11) / RISE, 1.0)
     assert found == pytest.approx(rising)
@@ -168,10 +168,10 @@ def test_after_a_hold_the_wrench_rises_from_where_it_fell_to(
 
 def test_after_a_fall_no_period_however_long_raises_the_wrench_at_once(floor: World) -> None:
     tool = pressing(floor)
-    tool.hand[kernels.IS_STALE] = 1.0
+    tool.hand.is_stale[()] = 1.0
     tool.advance(1.0)
-    assert not tool.out[:6].any()  # falling takes all of the time that passed
-    tool.hand[kernels.IS_STALE] = 0.0
+    assert not tool.sent.wrench.any()  # falling takes all of the time that passed
+    tool.hand.is_stale[()] = 0.0
     found = []
     for _ in range(kernels.RISE_FRAMES + 1):
         tool.advance(1.0)
@@ -185,14 +185,14 @@ def test_an_open_clutch_lets_the_hand_go_and_takes_it_again_softly(
     floor: World, *, is_held: bool
 ) -> None:
     tool = pressing(floor)
-    tool.hand[kernels.IS_OPEN] = 1.0
-    tool.hand[kernels.IS_STALE] = float(is_held)
+    tool.hand.is_open[()] = 1.0
+    tool.hand.is_stale[()] = float(is_held)
     falling = shares(tool, RISE + 10)
     assert falling[: RISE // 2] == pytest.approx(1.0 - np.arange(1, 11) / RISE)
     assert (np.diff(falling[:RISE]) < 0.0).all()
     assert falling[RISE + 1 :] == pytest.approx([0.0] * 9, abs=1e-12)
-    assert not tool.out[:6].any()
-    tool.hand[kernels.IS_OPEN] = tool.hand[kernels.IS_STALE] = 0.0
+    assert not tool.sent.wrench.any()
+    tool.hand.is_open[()] = tool.hand.is_stale[()] = 0.0
     found = shares(tool, RISE + 10)
     assert found[:RISE] == pytest.approx(np.arange(1, RISE + 1) / RISE)
     assert found[-1] == 1.0
@@ -201,30 +201,30 @@ def test_an_open_clutch_lets_the_hand_go_and_takes_it_again_softly(
 # --- what is not a number -------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("at", [0, 4, 8, kernels.KEPT, kernels.HELD_FOR])
-def test_a_state_that_is_not_finite_is_placed_anew(floor: World, at: int) -> None:
+@pytest.mark.parametrize("field", ["position", "quaternion", "velocity", "kept", "held_for"])
+def test_a_state_that_is_not_finite_is_placed_anew(floor: World, field: str) -> None:
     shell = box((0.02, 0.02, 0.02))
     tool = pressing(floor)
-    good = tool.hand.copy()
-    tool.state[at] = math.nan
-    tool.hand[0] = math.nan
+    good = tool.servo["hand"].copy()
+    tool.servo["tool"][field].flat[0] = math.nan
+    tool.hand.position[0] = math.nan
     for _ in range(3):
         tool.advance()
         assert tool.flags & kernels.IS_HELD
-        assert not tool.out[:6].any()
-    tool.hand[:] = good
-    fresh = Tool(floor, shell, good[:3])
+        assert not tool.sent.wrench.any()
+    tool.servo["hand"][()] = good
+    fresh = Tool(floor, shell, good["position"])
     for n in range(50):
         if n == 10:
-            tool.hand[2] = fresh.hand[2] = 0.03
+            tool.hand.position[2] = fresh.hand.position[2] = 0.03
         tool.advance()
         fresh.advance()
-        if at < kernels.VELOCITY:
-            assert tool.state[:20].tobytes() == fresh.state[:20].tobytes()
-            assert tool.out[:6].tobytes() == fresh.out[:6].tobytes()
-        assert np.isfinite(tool.state).all()
-        assert np.isfinite(tool.out).all()
-    assert tool.state[2] > 0.02
+        if field in {"position", "quaternion"}:
+            for same in ("position", "quaternion", "velocity", "kept", "held_for"):
+                assert getattr(tool.state, same).tobytes() == getattr(fresh.state, same).tobytes()
+            assert tool.sent.wrench.tobytes() == fresh.sent.wrench.tobytes()
+        assert np.isfinite(numbers_in(tool.servo)).all()
+    assert tool.state.position[2] > 0.02
 
 
 @pytest.mark.parametrize("far", [-1e3, -1e6, -1e30, -1e38, 1e40, -1e60])
@@ -234,26 +234,26 @@ def test_one_absurd_place_of_the_hand_moves_the_tool_no_farther_than_its_steps(f
     tool.settle(0.02)
     for n_frames in (1, 30):
         for _ in range(n_frames):
-            before = tool.state[:3].copy()
-            tool.hand[2] = far
+            before = tool.state.position.copy()
+            tool.hand.position[2] = far
             tool.advance()
-            moved = float(np.linalg.norm(tool.state[:3] - before))
-            assert moved <= 0.5 * SIZE * tool.out[kernels.SUBSTEPS] * (1 + 1e-9)
-        tool.hand[2] = 0.03
+            moved = float(np.linalg.norm(tool.state.position - before))
+            assert moved <= 0.5 * SIZE * tool.sent.n_steps * (1 + 1e-9)
+        tool.hand.position[2] = 0.03
         tool.settle(1.0)
-        np.testing.assert_allclose(tool.state[:3], (0.0, 0.0, 0.03), atol=1e-6)
+        np.testing.assert_allclose(tool.state.position, (0.0, 0.0, 0.03), atol=1e-6)
 
 
 def test_a_hand_beyond_all_numbers_pushes_nothing(floor: World) -> None:
     """Finite, but its way is not: no wrench of that is sent, and the tool comes back."""
     tool = pressing(floor)
-    good = tool.hand.copy()
-    tool.hand[:3] = 1e308, -1e308, 1e308
-    tool.hand[7:10] = -1e308
+    good = tool.servo["hand"].copy()
+    tool.hand.position[:] = 1e308, -1e308, 1e308
+    tool.hand.velocity[:3] = -1e308
     for _ in range(3):
         tool.advance()
-        assert np.isfinite(tool.out[:6]).all()
-    tool.hand[:] = good
+        assert np.isfinite(tool.sent.wrench).all()
+    tool.servo["hand"][()] = good
     tool.settle(0.3)
-    assert np.isfinite(tool.state).all()
-    np.testing.assert_allclose(tool.state[:2], good[:2], atol=SIZE)
+    assert np.isfinite(numbers_in(tool.servo["tool"])).all()
+    np.testing.assert_allclose(tool.state.position[:2], good["position"][:2], atol=SIZE)

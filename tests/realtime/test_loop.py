@@ -16,8 +16,7 @@ from hapticdb import PointShell
 from hapticdb.devices.scripted import Device
 from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.kernels.hand import servo
-from hapticdb.kernels.hand.coupling import APPLIED, OUT
-from hapticdb.kernels.resident.cells import RESULTS, UNKNOWNS
+from hapticdb.kernels.records import FRAME, SERVO, pose_numbers, views_of
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
@@ -26,8 +25,7 @@ from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of, work
 from hapticdb.realtime.processes import Message, MessageSender
 from hapticdb.realtime.report import LoopAnswer
 from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.realtime.session import frames_of
-from hapticdb.recording.frame import FRAME, State
+from hapticdb.recording.frame import State
 from hapticdb.resident.table import anonymous_memory
 from hapticdb.testing import floor_voxels, write_voxels
 from realtime.hands import Clutched, Lost, Odd, Slow, Talking, Unplugged, still, stroking
@@ -85,7 +83,7 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
             said = list(messages(heard.getvalue()))
             assert [message.word for message in said] == ["running", "done"]
             answer = said[-1].content
-            frames = frames_of(ring_of(memory, N_RING)[: answer.loop.frames])
+            frames = ring_of(memory, N_RING)[: answer.loop.frames].copy()
             return Ran(answer, frames)
 
         yield ran
@@ -258,7 +256,7 @@ def test_a_frame_that_waits_lets_go_and_ends_with_the_session(
         n_steps += 1
         known(loop, dt, is_stale=is_stale)
         if n_steps > 50:  # from now on all is unknown
-            loop.out[UNKNOWNS] = 1.0
+            loop.sent.unknown[()] = 1
 
     monkeypatch.setattr(subject.Loop, "_step", step)
     answer, frames = run(hand, is_waiting=True, seconds=0.5)
@@ -285,25 +283,21 @@ def test_a_loop_of_no_time_has_one_frame(run: Run) -> None:
 
 def test_a_recorded_frame_has_the_unknown_points_of_the_pose_that_was_tried() -> None:
     """The frame that is felt has none by definition."""
-    ring = np.zeros((4, servo.WIDTH))
-    out = np.zeros(OUT)
-    out[APPLIED : APPLIED + 6] = range(1, 7)
-    out[UNKNOWNS] = 5.0
-    servo.note(
-        ring, 6, 1.0, 0.001, 0.0, 0.0, np.arange(14.0), np.arange(64.0), np.zeros(RESULTS), out,
-        7.0, 3, 1,
-    )  # fmt: skip
-    (frame,) = frames_of(ring[[2]])
+    ring = np.zeros(4, FRAME)
+    record = np.zeros((), SERVO)
+    sent, hand = views_of(record["sent"]), views_of(record["hand"])
+    sent.wrench[:] = range(1, 7)
+    sent.unknown[()], sent.revision[()] = 5, 7
+    pose_numbers(record["hand"])[:] = range(7)
+    hand.velocity[:] = range(7, 13)
+    servo.note(ring, 6, 1.0, 0.001, 0.0, 0.0, record, 3, 1)
+    frame = ring[2]
     assert frame["unknown"] == 5
     assert frame["hits"] == 0
     assert frame["applied"].tolist() == [1, 2, 3, 4, 5, 6]
     assert (frame["revision"], frame["buttons"], frame["state"]) == (7, 3, 1)
     assert frame["hand"].tolist() == list(range(7))
     assert frame["hand_velocity"].tolist() == list(range(7, 13))
-
-
-def test_a_row_of_the_ring_is_as_wide_as_a_frame() -> None:
-    assert sum(int(np.prod(FRAME[name].shape)) for name in FRAME.names or ()) == servo.WIDTH
 
 
 def test_a_database_that_is_silent_for_too_long_makes_frames_hold(run: Run) -> None:

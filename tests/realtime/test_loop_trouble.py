@@ -13,14 +13,12 @@ from numpy.typing import NDArray
 from hapticdb.devices.scripted import Reading
 from hapticdb.errors import DeviceError
 from hapticdb.kernels.hand import coupling as kernels
-from hapticdb.kernels.resident.cells import UNKNOWNS
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import WITHDRAWN_NS, Loop, LoopRequest, ring_bytes, work
 from hapticdb.realtime.processes import MessageSender
-from hapticdb.realtime.session import frames_of
 from hapticdb.resident.table import HEARTBEAT, anonymous_memory
 from realtime.coupled import SIDE, World, punch
 from realtime.hands import at
@@ -84,7 +82,7 @@ def frame(loop: Loop, hand: Pressing, dt: float = 1e-3) -> Reading:
     reading = hand.read()
     loop.request.handle.follow(reading, loop.hand)
     used = loop._step_exactly(reading, dt, time.perf_counter_ns() + LATE)
-    hand.apply(loop.out[:6])
+    hand.apply(loop.sent.wrench)
     return used
 
 
@@ -96,7 +94,7 @@ def pressed(world: World, hand: Pressing, **options: object) -> Loop:
     hand.z = -0.01
     for _ in range(300):
         frame(loop, hand)
-    assert loop.out[2] > 1.0
+    assert loop.sent.wrench[2] > 1.0
     return loop
 
 
@@ -131,7 +129,7 @@ def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World) -> 
     """In no frame by more than its share, also in the next, whose period is as long as the wait."""
     hand = Summoning(0.02)
     loop = pressed(world, hand, coupling=Coupling(hold=1e-3))
-    full, n_before = loop.out[2], len(hand.sent)
+    full, n_before = loop.sent.wrench[2], len(hand.sent)
     hand.take(world.table.cells.keys)
     frame(loop, hand)
     for dt in [0.3] + [1e-3] * 20:
@@ -149,9 +147,9 @@ def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(world: Wor
     loop = pressed(world, hand, coupling=Coupling(hold=1e-3))
     hand.take(world.table.cells.keys)
     used = frame(loop, hand)
-    assert not loop.out[UNKNOWNS]
+    assert not loop.sent.unknown
     assert used.buttons == 2
-    assert used.pose[2, 3] == loop.hand[2] == -0.02
+    assert used.pose[2, 3] == loop.hand["position"][2] == -0.02
 
 
 def test_objects_are_no_longer_asked_for_once_the_tool_has_left_and_was_answered(
@@ -199,12 +197,12 @@ def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> 
     hand = Pressing(-0.004)
     loop = Loop(requested(world, hand))
     loop.warm_up()
-    assert loop.frame.any()
+    assert loop.tool["felt"].any()
     hand.z = 0.02
     loop._place()
     loop._step(1e-3, is_stale=True)
     loop._note(0, 0.0, 0.0, 0.0, 0.0, 0, loop._count(is_clutch_open=False, is_stale=True))
-    (noted,) = frames_of(loop.ring[[0]])
+    (noted,) = loop.ring[[0]]
     assert noted["hits"] == loop.counts.hit_frames == 0
     assert not noted["wrench"].any()
 

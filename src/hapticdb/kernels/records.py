@@ -6,13 +6,17 @@ knows, so it costs what a number in a vector costs. One record with many fields 
 kernel in 0.4 us, and every further array costs 0.2 us (a NamedTuple costs that for each array in
 it), so what belongs together is one record.
 
-In Python, ``array["hits"]`` is a view of a field, and ``array[()].hits`` its value. This module
-imports numpy alone, so that whoever needs a layout does not load numba.
+In Python, ``array["hits"]`` is a view of a field; a loop that runs a thousand times a second makes
+its views once, with `views_of`. This module imports numpy alone, so that whoever needs a layout
+does not load numba.
 """
 
+from collections import namedtuple
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 Layout = np.dtype[np.void]
 
@@ -48,6 +52,100 @@ def _record_in_lines(groups: Sequence[Sequence[tuple[object, ...]]], size: int) 
     layout = {"names": names, "formats": formats, "offsets": offsets, "itemsize": size}
     return np.dtype((np.record, np.dtype(layout, align=True)))  # type: ignore[call-overload]
 
+
+def views_of(record: NDArray[np.void]) -> Any:  # noqa: ANN401 - its fields are the layout's
+    """Views of the fields of a record () by their names, those of a record in it likewise.
+
+    A number is a view () of its own: ``views.hits.item()`` reads it, ``views.hits[()] = 1`` writes.
+    """
+    names = record.dtype.names or ()
+    views = [record[name] for name in names]
+    kind = namedtuple("Views", names)  # type: ignore[misc]  # noqa: PYI024 - fields of a layout
+    return kind(*(views_of(view) if view.dtype.names else view for view in views))
+
+
+def pose_numbers(record: NDArray[np.void]) -> NDArray[np.float64]:
+    """Position and unit quaternion of a record () as numbers (7,), the same memory."""
+    fields = record.dtype.fields
+    assert fields is not None  # noqa: S101 - it is a record
+    start = fields["position"][1]
+    assert fields["quaternion"][1] == start + 24  # noqa: S101 - side by side in every layout
+    return np.ndarray((7,), np.float64, record, start)
+
+
+RESULTS = 10
+"""Numbers of a frame's result; `kernels.resident.cells` names them."""
+
+HAND: Layout = _record(
+    [
+        ("position", "<f8", 3),  # m
+        ("quaternion", "<f8", 4),  # unit, scalar first
+        ("velocity", "<f8", 6),  # of the origin, m/s, then rad/s
+        ("is_stale", "?"),  # hold, as if all cells were unknown
+        ("is_open", "?"),  # the clutch
+    ]
+)
+"""The handle, which the tool is pulled to: its frame in the scene. Not a number: it is nowhere."""
+
+OFFSET: Layout = _record([("position", "<f8", 3), ("quaternion", "<f8", 4)])
+"""The handle beyond the hand: what is added to its position, and what its turn follows."""
+
+TOOL: Layout = _record(
+    [
+        ("position", "<f8", 3),  # of the tool's frame, m
+        ("quaternion", "<f8", 4),  # unit, scalar first
+        ("velocity", "<f8", 6),  # of the centre of mass, m/s, then rad/s
+        ("kept", "<f8", 6),  # the wrench that the hand was to feel last, in full: N, N m
+        ("held_for", "<f8"),  # s for which that wrench is kept
+        ("risen", "<f8"),  # share of the wrench that is sent, 0 to 1
+        ("version", "<i8"),  # of the cells that `felt` was felt among, 0 for none
+        ("felt", "<f8", RESULTS),  # frame at this pose, about the centre of mass
+        ("pose", "<f8", (4, 4)),
+        ("tried_felt", "<f8", RESULTS),  # the same at the end of a step that is tried
+        ("tried_pose", "<f8", (4, 4)),
+        ("loose", "<f8", 6),  # box of voxels in which no new hit gets an anchor
+    ]
+)
+"""The tool as a body; zero but for position and quaternion at the start."""
+
+SENT: Layout = _record(
+    [
+        ("wrench", "<f8", 6),  # for the device, about the handle's origin: N, N m
+        ("hits", "<i8"),
+        ("contacts", "<i8"),
+        ("unknown", "<i8"),  # points, at the pose that was tried
+        ("deepest", "<f8"),  # m
+        ("n_steps", "<i8"),  # made
+        ("flags", "<i8"),  # `kernels.hand.coupling` has them
+        ("revision", "<i8"),  # of the database
+    ]
+)
+"""What a period of the loop comes to."""
+
+SERVO: Layout = _record([("tool", TOOL), ("hand", HAND), ("sent", SENT)])
+"""All that a loop keeps from one period to the next."""
+
+FRAME: Layout = np.dtype(
+    [
+        ("time", "<f8"),  # s since the session's start, when the frame began
+        ("dt", "<f8"),  # s since the frame before
+        ("lateness", "<f4"),  # s behind its deadline
+        ("elapsed", "<f4"),  # s that computing took
+        ("hand", "<f8", (7,)),  # the handle: position m, unit quaternion, scalar first
+        ("hand_velocity", "<f8", (6,)),  # m/s, rad/s
+        ("tool", "<f8", (7,)),  # the simulated body, likewise
+        ("wrench", "<f8", (6,)),  # contact wrench at `tool`, about its centre: N, N m
+        ("applied", "<f8", (6,)),  # sent to the device, about the handle's origin: N, N m
+        ("hits", "<i4"),
+        ("contacts", "<i4"),
+        ("unknown", "<i4"),  # points in cells that were not resident
+        ("deepest", "<f4"),  # m
+        ("revision", "<i8"),  # of the database
+        ("buttons", "<i4"),  # bit mask
+        ("state", "<i4"),  # bits of `hapticdb.recording.frame.State`
+    ]
+)
+"""One frame of the loop as it is recorded. The file format is made of it: it never changes."""
 
 TOLD: Layout = _record(
     [

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.hand.coupling import Body
+from hapticdb.kernels.hand.body import Body
 from hapticdb.kernels.resident.cells import Place
 from hapticdb.pointshell.shell import PointShell
 

@@ -7,14 +7,18 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.devices.scripted import Reading, pose_at
 from hapticdb.errors import UsageError
-from hapticdb.kernels.hand.coupling import HAND_VELOCITY, IS_OPEN, IS_STALE
 from hapticdb.kernels.hand.handle import carry, grip, is_somewhere
 from hapticdb.kernels.query.contact import is_rigid
+from hapticdb.kernels.records import OFFSET, pose_numbers
 from hapticdb.poses import quaternion_of
 
 Floats = NDArray[np.float64]
+Hand = NDArray[np.void]
+"""A record () of `kernels.records.HAND`."""
 MOST_SCALE = 1e6
 """More would carry any hand beyond what a reading may be."""
+NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+"""Position and unit quaternion of no move and no turn."""
 
 
 class Handle:
@@ -54,7 +58,7 @@ class Handle:
         if self._start is not None and not is_rigid(self._start):
             raise UsageError("a handle starts at a pose that is a rigid transform")
         self.is_open = False
-        self._offset = np.zeros(7)  # of the handle beyond the hand: position and turn
+        self._offset = np.zeros((), OFFSET)
         self._is_placed = False
         self._x = 0.0  # where the handle was before it was nowhere
 
@@ -63,46 +67,46 @@ class Handle:
         """Whether it starts where it was told to, and not where the hand is."""
         return self._start is not None
 
-    def start(self, reading: Reading, hand: Floats) -> None:
-        """Place the handle for a reading, at rest: into hand (HAND,), its `IS_STALE` left.
+    def start(self, reading: Reading, hand: Hand) -> None:
+        """Place the handle for a reading, at rest: into `hand`, whose `is_stale` stays.
 
         When the reading is nowhere, the next that is somewhere places it, in `follow`.
         """
         self.is_open = False
         self._is_placed = is_somewhere(reading.pose, reading.velocity)
-        hand[:IS_STALE] = 0.0
-        hand[3] = 1.0
-        hand[IS_OPEN] = 0.0
+        pose_numbers(hand)[:] = NO_POSE
+        hand["is_open"] = False
         if self._start is not None:
-            hand[:3] = self._start[:3, 3]
-            hand[3:7] = quaternion_of(self._start[:3, :3])[0]
+            hand["position"] = self._start[:3, 3]
+            hand["quaternion"] = quaternion_of(self._start[:3, :3])[0]
         # also where it is not needed: what is compiled before the loop runs is not compiled in it
         grip(reading.pose, self.scale, self._offset, hand)
         if self._start is None:
-            self._offset[:] = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
+            pose_numbers(self._offset)[:] = NO_POSE
         carry(reading.pose, reading.velocity, self.scale, self._offset, hand)
-        hand[HAND_VELOCITY : HAND_VELOCITY + 6] = 0.0
+        hand["velocity"] = 0.0
         if not self._is_placed:
-            hand[:IS_STALE] = (math.nan, 0.0, 0.0, 1.0, *(0.0,) * 9)
+            pose_numbers(hand)[:] = (math.nan, *NO_POSE[1:])
 
-    def follow(self, reading: Reading, hand: Floats) -> None:
-        """Move the handle on to where a reading carries it: into hand (HAND,)."""
+    def follow(self, reading: Reading, hand: Hand) -> None:
+        """Move the handle on to where a reading carries it: into `hand`."""
+        position = hand["position"]
         if not is_somewhere(reading.pose, reading.velocity):
-            if not math.isnan(hand[0]):
-                self._x = hand[0]
-                hand[0] = math.nan
+            if not math.isnan(position[0]):
+                self._x = position[0]
+                position[0] = math.nan
             return
         if not self._is_placed:
             self.start(reading, hand)
-        elif math.isnan(hand[0]):
-            hand[0] = self._x
+        elif math.isnan(position[0]):
+            position[0] = self._x
         if reading.buttons & self._bit:
             self.is_open = True
-            hand[IS_OPEN] = 1.0
-            hand[HAND_VELOCITY : HAND_VELOCITY + 6] = 0.0
+            hand["is_open"] = True
+            hand["velocity"] = 0.0
             return
         if self.is_open:
             self.is_open = False
-            hand[IS_OPEN] = 0.0
+            hand["is_open"] = False
             grip(reading.pose, self.scale, self._offset, hand)
         carry(reading.pose, reading.velocity, self.scale, self._offset, hand)

@@ -12,7 +12,6 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hapticdb.devices.protocol import (
     Device,
@@ -28,24 +27,18 @@ from hapticdb.grid import Grid
 from hapticdb.kernels._jit import ENTRIES
 from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.hand import servo
+from hapticdb.kernels.hand.anchors import BEFORE, MET_ROWS
 from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.motion import poses_of
-from hapticdb.kernels.records import MOST_MISSED, TOLD
-from hapticdb.kernels.resident.cells import (
-    CONTACTS,
-    DEEPEST,
-    HITS,
-    RESULTS,
-    UNKNOWNS,
-    Place,
-)
+from hapticdb.kernels.records import FRAME, MOST_MISSED, SERVO, TOLD, pose_numbers, views_of
+from hapticdb.kernels.resident.cells import Place
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
-from hapticdb.recording.frame import State
+from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.frames import clusters_of
 from hapticdb.resident.table import HEARTBEAT, STOP, CellTable
 
@@ -104,14 +97,16 @@ class Loop:
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
         self.clusters = clusters_of(request.shell, grid.voxel_size)
         self.body = request.coupling.body(request.shell, self.place, request.stiffness)
-        self.state = np.zeros(kernels.STATE)
-        self.hand = np.zeros(kernels.HAND)
-        self.met = np.empty((kernels.MET_ROWS, len(request.shell)), dtype=np.int64)
+        self.servo = np.zeros((), SERVO)
+        self.tool, self.hand = self.servo["tool"], self.servo["hand"]
+        self.sent = views_of(self.servo["sent"])
+        self._hand_position = self.hand["position"]
+        self._tool_pose = pose_numbers(self.tool)[None]
+        self.met = np.empty((MET_ROWS, len(request.shell)), dtype=np.int64)
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-        self.frame = np.zeros(RESULTS)
-        self.out = np.zeros(kernels.OUT)
         self.told = np.zeros((), TOLD)
         self.pose = np.eye(4)
+        self._pose = self.pose[None]
         self.ring = ring_of(request.ring, request.n_ring)
         self.session = self.table.desk.sessions[request.row, ...]
         self._n_frames, self._is_asked_to_end = (
@@ -150,9 +145,9 @@ class Loop:
         if isinstance(self.device, SupportsRewind):
             self.device.rewind()
         self.request.handle.start(self._read(), self.hand)
-        self.state[:] = 0.0
-        self.state[:7] = self.hand[:7]
-        self.frame[:] = 0.0  # a first frame that is held must not tell of an earlier place's hits
+        # all of it: a first frame that is held must not tell of an earlier place's hits
+        self.tool[()] = np.zeros((), self.tool.dtype)
+        pose_numbers(self.tool)[:] = pose_numbers(self.hand)
 
     def _read(self) -> Reading:
         """Read where the hand is: a device that has just been opened may not know at once."""
@@ -187,11 +182,11 @@ class Loop:
     # -- one frame ---------------------------------------------------------------------------
 
     def _step(self, dt: float, *, is_stale: bool) -> None:
-        """Advance the tool by a period; `out` has what is sent to the device."""
-        self.hand[kernels.IS_STALE] = is_stale
+        """Advance the tool by a period; `sent` has what is sent to the device."""
+        self.hand["is_stale"] = is_stale
         kernels.advance(
-            self.cells, self.request.row, self.clusters, self.place, self.body, self.state,
-            self.hand, dt, self.met, self.missed, self.frame, self.out,
+            self.cells, self.request.row, self.clusters, self.place, self.body, self.servo, dt,
+            self.met, self.missed,
         )  # fmt: skip
 
     def _step_exactly(self, reading: Reading, dt: float, ends: int) -> Reading:
@@ -203,44 +198,43 @@ class Loop:
         clock = time.perf_counter_ns
         holds = clock() + round(min(self.request.coupling.hold, 1e9) * 1e9)
         is_let_go = False
-        before, met, frame = self.state.copy(), self.met.copy(), self.frame.copy()
+        before, met, sent = self.tool.copy(), self.met.copy(), self.sent
         self._step(dt, is_stale=False)
-        while self.out[UNKNOWNS] and clock() < ends and not self._is_left():
+        while sent.unknown and clock() < ends and not self._is_left():
             if not is_let_go and clock() > holds:
                 self.device.apply(np.zeros(6))
                 is_let_go = True
-                before[kernels.RISEN] = 0.0  # from nothing, not back to where it was
-            self.state[:] = before
+                before["risen"] = 0.0  # from nothing, not back to where it was
+            self.tool[()] = before
             self.met[:] = met
-            self.frame[:] = frame
             self._tell()
             time.sleep(2e-4)
             if is_let_go:
                 reading = self.reader.read()
                 self.request.handle.follow(reading, self.hand)
             self._step(dt, is_stale=False)
-        if is_let_go and self.out[UNKNOWNS]:
-            self.out[:6] = 0.0
+        if is_let_go and sent.unknown:
+            sent.wrench[:] = 0.0
         return reading
 
     def _tell(self) -> None:
         """Say where tool and hand are, and which cells the last frame missed."""
         told, center = self.told, self.request.shell.center
-        poses_of(self.state[None, :7], self.pose[None])
+        poses_of(self._tool_pose, self._pose)
         told["is_active"] = True
         told["tool"] = self.pose[:3, :3] @ center + self.pose[:3, 3]
-        told["handle"] = self.hand[:3] + self.pose[:3, :3] @ center
-        told["velocity"] = self.hand[7:10]
+        told["handle"] = self._hand_position + self.pose[:3, :3] @ center
+        told["velocity"] = self.hand["velocity"][:3]
         told["radius"] = self.body.radius
         servo.tell(self.session, told, self.missed)
 
     def _ask(self, n_hits: int) -> None:
         """Have the objects named that the last frame's hits are in."""
         grid = self.request.grid
-        poses_of(self.state[None, :7], self.pose[None])
+        poses_of(self._tool_pose, self._pose)
         servo.name_voxels(
             self.session, self.clusters, self.pose, self.place, grid.bits, grid.curve_code,
-            self.met[0], n_hits,
+            self.met[BEFORE], n_hits,
         )  # fmt: skip
 
     def _ask_or_withdraw(self, now: int) -> None:
@@ -249,8 +243,8 @@ class Loop:
         What stayed would be asked anew at each write, of voxels that are no longer touched; what
         went at once would never be answered where the database is slow.
         """
-        if self.out[HITS]:
-            self._ask(int(self.out[HITS]))
+        if self.sent.hits:
+            self._ask(self.sent.hits.item())
             self._asked_at = now
         elif self._asked_at and self.cells.control[HEARTBEAT] > self._asked_at + WITHDRAWN_NS:
             self._ask(0)
@@ -266,10 +260,7 @@ class Loop:
         buttons: int,
         state: int,
     ) -> None:
-        servo.note(
-            self.ring, at, begun, dt, lateness, elapsed, self.hand, self.state, self.frame,
-            self.out, self.out[kernels.OUT_REVISION], buttons, state,
-        )  # fmt: skip
+        servo.note(self.ring, at, begun, dt, lateness, elapsed, self.servo, buttons, state)
 
     def _is_stopped(self) -> bool:
         return bool(self.cells.control[STOP]) or bool(self._is_asked_to_end)
@@ -291,6 +282,7 @@ class Loop:
         staleness = round(min(request.staleness, 1e9) * 1e9)
         ends = device if isinstance(device, SupportsEnd) else None
         deadlines = Deadlines(round(1e9 / rate), self.lateness, self.elapsed)
+        applied = self.sent.wrench
         over = deadlines.started + round(request.seconds * 1e9)
         while deadlines.passed < n_deadlines:
             at = deadlines.frames
@@ -302,9 +294,9 @@ class Loop:
                 reading = self._step_exactly(reading, deadlines.dt, over)
             else:
                 self._step(deadlines.dt, is_stale=is_stale)
-            device.apply(self.out[:6])
+            device.apply(applied)
             state = self._count(request.handle.is_open, is_stale)
-            if at % tell_every == 0 or self.out[UNKNOWNS]:
+            if at % tell_every == 0 or self.sent.unknown:
                 self._tell()
             if at % ask_every == 0:
                 self._ask_or_withdraw(begun)
@@ -329,20 +321,21 @@ class Loop:
 
     def _count(self, is_clutch_open: bool, is_stale: bool) -> int:  # noqa: FBT001 - of a frame
         """Count a frame in; returns its recorded state."""
-        counts, out = self.counts, self.out.tolist()  # plain floats: a tenth of the time
-        flags = int(out[kernels.FLAGS])
+        counts, sent = self.counts, self.sent
+        flags = sent.flags.item()
         state = State(0)
-        counts.substeps += int(out[kernels.SUBSTEPS])
-        if out[HITS]:
+        counts.substeps += sent.n_steps.item()
+        if sent.hits:
             counts.hit_frames += 1
-            counts.peak_force = max(counts.peak_force, math.hypot(*out[:3]))
-            counts.peak_torque = max(counts.peak_torque, math.hypot(*out[3:6]))
-            if out[CONTACTS]:
+            wrench = sent.wrench.tolist()  # plain floats: a tenth of the time
+            counts.peak_force = max(counts.peak_force, math.hypot(*wrench[:3]))
+            counts.peak_torque = max(counts.peak_torque, math.hypot(*wrench[3:]))
+            if sent.contacts:
                 counts.contact_frames += 1
-                counts.deepest = max(counts.deepest, out[DEEPEST])
-        if out[UNKNOWNS]:
+                counts.deepest = max(counts.deepest, sent.deepest.item())
+        if sent.unknown:
             counts.unknown_frames += 1
-            counts.unknown_points += int(out[UNKNOWNS])
+            counts.unknown_points += sent.unknown.item()
         if flags & (kernels.IS_HELD | kernels.IS_DROPPED):
             if flags & kernels.IS_HELD:
                 counts.held_frames += 1
@@ -355,7 +348,7 @@ class Loop:
             counts.cut_frames += 1
         if is_stale:
             counts.stale_frames += 1
-        if math.isnan(self.hand[0]):
+        if math.isnan(self._hand_position[0]):
             counts.nowhere_frames += 1
             counts.bad_reading = counts.bad_reading or self.reader.complaint() or None
         if is_clutch_open:
@@ -370,15 +363,15 @@ class Loop:
             self.device.close()
 
 
-def ring_of(descriptor: int, n_frames: int) -> NDArray[np.float64]:
-    """Ring (n, WIDTH) of recorded frames in shared memory, a row a frame."""
+def ring_of(descriptor: int, n_frames: int) -> Frames:
+    """Ring (n,) of recorded frames in shared memory."""
     memory = mmap.mmap(descriptor, ring_bytes(n_frames))
-    return np.ndarray((n_frames, servo.WIDTH), np.float64, memory)
+    return np.ndarray((n_frames,), FRAME, memory)
 
 
 def ring_bytes(n_frames: int) -> int:
     """Bytes of a ring of so many frames."""
-    return 8 * servo.WIDTH * n_frames
+    return FRAME.itemsize * n_frames
 
 
 def n_compiled() -> int:

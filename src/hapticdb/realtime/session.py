@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Literal, Self, get_args
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import FileError, HapticDBError, UsageError
@@ -26,7 +25,7 @@ from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report
 from hapticdb.realtime.resident_cells import ResidentCells, start_error
 from hapticdb.recording.file import DEFAULT_LIMIT, Header, Recorder
-from hapticdb.recording.frame import FRAME, Frames
+from hapticdb.recording.frame import Frames
 from hapticdb.resident.table import DEFAULT_BUDGET, anonymous_memory
 
 Policy = Literal["hold", "wait"]
@@ -282,7 +281,7 @@ class Session:
     def last(self) -> Frames | None:
         """Latest frame, (1,) of `FRAME`; None before the first."""
         done = self.n_frames
-        return frames_of(self._ring[[(done - 1) % len(self._ring)]]) if done else None
+        return self._ring[[(done - 1) % len(self._ring)]] if done else None
 
     def wait(self, seconds: float | None = None) -> Report | None:
         """Look after the session until it ends; its report, or None when that time is over.
@@ -333,7 +332,7 @@ class Session:
             self._drained = done - size // 2
         rows = self._ring[np.arange(self._drained, done) % size]
         with self._going_on():
-            self._recorder.append(frames_of(rows))
+            self._recorder.append(rows)
             if time.monotonic() - self._flushed >= FLUSH_EVERY:
                 self._recorder.flush()
                 self._flushed = time.monotonic()
@@ -413,15 +412,3 @@ def _check_times(rate: float, seconds: float | None, staleness: float) -> None:
         raise UsageError(f"{seconds} seconds: give a number above 0, a million at most")
     if not staleness > 0.0:
         raise UsageError(f"a staleness of {staleness} s: give a number above 0, or inf")
-
-
-def frames_of(rows: NDArray[np.float64]) -> Frames:
-    """Frames (n,) of `FRAME` from rows (n, WIDTH) of a ring."""
-    frames = np.empty(len(rows), dtype=FRAME)
-    at = 0
-    for name in FRAME.names or ():
-        shape = FRAME[name].shape
-        width = shape[0] if shape else 1
-        frames[name] = rows[:, at : at + width] if shape else rows[:, at]
-        at += width
-    return frames

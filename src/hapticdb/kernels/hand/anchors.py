@@ -26,6 +26,10 @@ from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.query.contact import turn
 from hapticdb.kernels.resident.cells import UNKNOWN, cell_key, slot_of
 
+BEFORE, AFTER, ANCHOR = 0, 1, 2
+"""Rows of `met` (MET_ROWS, N): indices of the points that hit, of those that hit at the end of a
+step that is tried, and each point's anchor."""
+MET_ROWS = 3
 NO_ANCHOR, LOOSE = -1, -2
 """Instead of an anchor, of points that do not hit, and of those that may leave by any side."""
 CLEARLY = 0.8
@@ -199,38 +203,38 @@ def settle_anchors(
 ):  # fmt: skip
     """Give the hits of a frame at `after` their anchors, given those at `before`, a step away.
 
-    met (3, N): the hits before, the hits after, the anchors. is_new: the cells are of another
+    met (MET_ROWS, N) as above. is_new: the cells are of another
     version, in which what was free may be occupied. box (6,): voxels in which no new hit gets an
     anchor, as near to what the tool was found in as `reach`, voxels; zero while all have one.
     """
     side = np.int64(place.side)
     for m in range(n_before):
-        n = met[0, m]
+        n = met[BEFORE, m]
         i, j, k = voxel_under(points, n, after, place)
         oi, oj, ok = voxel_under(points, n, before, place)
         is_same = i == oi and j == oj and k == ok
         if is_same and not is_new:
             continue
         if state_of(keys, slots, words, which, side, i, j, k) == 0:
-            met[2, n] = NO_ANCHOR
+            met[ANCHOR, n] = NO_ANCHOR
             continue
-        if met[2, n] < 0:
+        if met[ANCHOR, n] < 0:
             if not is_within(box, i, j, k):
                 rx, ry, rz = lever_of(points, n, after, center)
                 code = towards(keys, slots, words, which, side, -rx, -ry, -rz, i, j, k)
-                met[2, n] = LOOSE if code == NO_ANCHOR else code
+                met[ANCHOR, n] = LOOSE if code == NO_ANCHOR else code
             continue
-        ai, aj, ak = anchor_of(met[2, n], oi, oj, ok)
+        ai, aj, ak = anchor_of(met[ANCHOR, n], oi, oj, ok)
         # one whose cell has gone was free, and is still on the side from which the point came
         if is_same and state_of(keys, slots, words, which, side, ai, aj, ak) != 1:
             continue
         code = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
-        met[2, n] = anchor_or_loose(code, box, i, j, k, reach)
+        met[ANCHOR, n] = anchor_or_loose(code, box, i, j, k, reach)
     any_loose = False
     for m in range(n_after):
-        n = met[1, m]
-        met[0, m] = n
-        if met[2, n] == NO_ANCHOR:
+        n = met[AFTER, m]
+        met[BEFORE, m] = n
+        if met[ANCHOR, n] == NO_ANCHOR:
             i, j, k = voxel_under(points, n, after, place)
             ai, aj, ak = voxel_under(points, n, before, place)
             code = np.int64(NO_ANCHOR)
@@ -238,8 +242,8 @@ def settle_anchors(
                 code = np.int64(LOOSE)
             elif are_beside(ai, aj, ak, i, j, k) and not (ai == i and aj == j and ak == k):
                 code = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)
-            met[2, n] = anchor_or_loose(code, box, i, j, k, reach)
-        any_loose = any_loose or met[2, n] == LOOSE
+            met[ANCHOR, n] = anchor_or_loose(code, box, i, j, k, reach)
+        any_loose = any_loose or met[ANCHOR, n] == LOOSE
     if not any_loose:
         for n in range(6):
             box[n] = 0.0

@@ -2,10 +2,10 @@
 
 import numpy as np
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, INTS, entry, record_of
+from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS, entry, record_of
 from hapticdb.kernels.curves import key_of
 from hapticdb.kernels.query.contact import turn
-from hapticdb.kernels.records import MOST_ASKED, SESSION, TOLD
+from hapticdb.kernels.records import FRAME, MOST_ASKED, SERVO, SESSION, TOLD
 from hapticdb.kernels.resident.cells import (
     CLUSTERS,
     CONTACTS,
@@ -13,12 +13,9 @@ from hapticdb.kernels.resident.cells import (
     HITS,
     LISTED,
     PLACE,
-    UNKNOWNS,
+    WRENCH,
 )
 from hapticdb.kernels.resident.fence import fence
-
-WIDTH = 43
-"""Numbers of a recorded frame, in the order of the fields of `realtime.recorded.FRAME`."""
 
 
 @entry(record_of(SESSION), record_of(TOLD), INTS)
@@ -70,27 +67,30 @@ def name_voxels(session_row, shell, pose, place, bits, curve, met, n_hits):
     session.n_asked = count
 
 
-@entry(FLOATS2, INT, FLOAT, FLOAT, FLOAT, FLOAT, FLOATS, FLOATS, FLOATS, FLOATS, FLOAT, INT, INT)
-def note(
-    ring, at, time, dt, lateness, elapsed, hand, tool, frame, applied, revision, buttons, state
-):
-    """Record a frame in row `at` of ring (capacity, WIDTH)."""
-    row = at % ring.shape[0]
-    ring[row, 0] = time
-    ring[row, 1] = dt
-    ring[row, 2] = lateness
-    ring[row, 3] = elapsed
-    for n in range(13):
-        ring[row, 4 + n] = hand[n]
-    for n in range(7):
-        ring[row, 17 + n] = tool[n]
+@entry(record_of(FRAME, 1), INT, FLOAT, FLOAT, FLOAT, FLOAT, record_of(SERVO), INT, INT)
+def note(ring, at, time, dt, lateness, elapsed, servo_record, buttons, state):
+    """Record frame number `at` in its row of ring (capacity,) of FRAME."""
+    servo = servo_record[()]
+    tool, hand, sent = servo.tool, servo.hand, servo.sent
+    row = ring[at % ring.shape[0]]
+    row.time = time
+    row.dt = dt
+    row.lateness = lateness
+    row.elapsed = elapsed
+    for n in range(3):
+        row.hand[n] = hand.position[n]
+        row.tool[n] = tool.position[n]
+    for n in range(4):
+        row.hand[3 + n] = hand.quaternion[n]
+        row.tool[3 + n] = tool.quaternion[n]
     for n in range(6):
-        ring[row, 24 + n] = frame[n]
-        ring[row, 30 + n] = applied[n]
-    ring[row, 36] = frame[HITS]
-    ring[row, 37] = frame[CONTACTS]
-    ring[row, 38] = applied[UNKNOWNS]  # of the pose that was tried; the frame's has none
-    ring[row, 39] = frame[DEEPEST]
-    ring[row, 40] = revision
-    ring[row, 41] = buttons
-    ring[row, 42] = state
+        row.hand_velocity[n] = hand.velocity[n]
+        row.wrench[n] = tool.felt[WRENCH + n]
+        row.applied[n] = sent.wrench[n]
+    row.hits = np.int64(tool.felt[HITS])
+    row.contacts = np.int64(tool.felt[CONTACTS])
+    row.unknown = sent.unknown  # of the pose that was tried; the frame that is felt has none
+    row.deepest = tool.felt[DEEPEST]
+    row.revision = sent.revision
+    row.buttons = buttons
+    row.state = state

@@ -13,8 +13,9 @@ from children import PATIENCE
 from hapticdb import PointShell
 from hapticdb.errors import FileError, UsageError
 from hapticdb.ingest.files import ImportOptions, import_files
-from hapticdb.mesh import accessors, parse_in_process, read_file
-from hapticdb.mesh import threemf as threemf_module
+from hapticdb.mesh import parse_in_process, read_file
+from hapticdb.mesh.formats import accessors
+from hapticdb.mesh.formats import threemf as threemf_module
 from hapticdb.pointshell.shell import FORMAT
 from mesh_files import MESH_3MF, TRIANGLE, cause, glb_of, gltf, text, threemf
 

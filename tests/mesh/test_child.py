@@ -16,7 +16,7 @@ from hapticdb.errors import MissingExtraError
 from hapticdb.mesh import Defects, parse_in_process, read_file
 from hapticdb.mesh import reader as reader_module
 from hapticdb.mesh.child import allowance
-from hapticdb.mesh.gltf import bytes_beside
+from hapticdb.mesh.formats.gltf import bytes_beside
 from hapticdb.resident.table import is_alive
 from mesh_files import cause, gltf, names, text, threemf
 

@@ -108,7 +108,7 @@ def test_all_poses_see_one_revision(
 
 def check_one_revision(env: Environment, other: Environment, shell: PointShell) -> None:
     poses, n_asked = np.tile(np.eye(4), (6, 1, 1)), 0
-    known = HapticQuery._together
+    known = HapticQuery._look_up_together
 
     def removing(query: HapticQuery, *given: Any) -> Any:  # noqa: ANN401 - handed on
         nonlocal n_asked
@@ -119,7 +119,7 @@ def check_one_revision(env: Environment, other: Environment, shell: PointShell) 
         return known(query, *given)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(HapticQuery, "_together", removing)
+        patch.setattr(HapticQuery, "_look_up_together", removing)
         many = env.touch_many(shell, poses)
     assert n_asked == 6
     assert len(set(many.hits.tolist())) == 1

@@ -32,9 +32,9 @@ from hapticdb.store.connect import check_curve, create_store, exists, open_store
 
 
 class ImportProgress(NamedTuple):
-    """How far an import is: sent after each part, and five times a second while one takes long.
+    """How far an import is: sent after each part, and five times a second during a long one.
 
-    share: of the part that is waited for, 0 to 1; 0 after a part.
+    share : of the present part, 0 to 1; 0 after a part.
     """
 
     link: str
@@ -64,9 +64,9 @@ class FileReport:
     restored : int
         Of those written now, parts that had been removed from the environment.
     kept_removed : int
-        Parts that were removed, and stay so: `ImportOptions.keep_removed`.
+        Parts that were removed and were left out: `ImportOptions.keep_removed`.
     replaced, dropped : int
-        Objects that are another now, and that are gone: `ImportOptions.replace`.
+        Objects that were replaced, and that were removed: `ImportOptions.replace`.
     defects : Defects
         What was wrong in the file.
     error : HapticDBError or None

@@ -1,7 +1,7 @@
 """Voxels <-> rows of the index table, in either layout and on any curve.
 
-Bricks in Z-order stand between: what the voxelizer makes, and what two environments of different
-layouts or curves have in common.
+Bricks in Z-order are the form between them: the voxelizer makes them, and rows of any layout and
+curve are converted by way of them.
 """
 
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from hapticdb.kernels.surfaces import voxelize
 from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, Keys, Layout, Rows
 
 BRICKS_AT_ONCE = 1 << 15
-"""Bricks whose voxels are unpacked together: their coordinates take 24 bytes a voxel."""
+"""Bricks whose voxels are unpacked together. A larger value takes more memory: 24 bytes a voxel."""
 
 
 class Bricks(NamedTuple):
@@ -74,7 +74,7 @@ def bricks_of_voxels(ijk: NDArray[np.int64], grid: Grid) -> Bricks:
 
 
 def rows_of_voxels(ijk: NDArray[np.int64], grid: Grid, layout: Layout) -> Rows:
-    """Rows of voxels (n, 3) that were made and not imported: analytic scenes."""
+    """Rows of voxels (n, 3) in any order, such as those of an analytic scene."""
     return rows_of_bricks(bricks_of_voxels(ijk, grid), grid, layout)[0]
 
 
@@ -87,7 +87,7 @@ def voxels_of_rows(rows: Rows, grid: Grid, layout: Layout) -> NDArray[np.int64]:
 
 
 def merged(parts: Sequence[Bricks]) -> Bricks:
-    """Bricks of all parts together, at least one; a brick that several hold has the bits of all."""
+    """Bricks of one or more parts together; a brick of several parts has the bits of all."""
     if len(parts) == 1:
         return parts[0]
     keys = np.concatenate([part.keys for part in parts])
@@ -101,6 +101,6 @@ def merged(parts: Sequence[Bricks]) -> Bricks:
 
 
 def _reordered(keys: Keys, bits: int, curve: int, onto: int) -> Keys:
-    """Brick keys on another curve, in the order in which they came."""
+    """Brick keys converted to another curve, not sorted anew."""
     level = max(bits - BRICK_BITS, 0)
     return curves.encode(curves.decode(keys, level, curve), level, onto)

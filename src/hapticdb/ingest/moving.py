@@ -1,6 +1,7 @@
 """Objects moved: their geometry is read again, voxelized, and exchanged in one transaction."""
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,16 +58,8 @@ def _write_moved(
     """Exchange an object's rows for those of its part at the placement `placed` (4, 4)."""
     bounds = bounds_inside(part, old.link, store.grid, placed)
     rows, n_voxels = rows_of_part(part, store.grid, store.layout, placed)
-    new = Object(
-        id=old.id,
-        name=old.name,
-        link=old.link,
-        digest=old.digest,
-        transform=placed,
-        voxels=n_voxels,
-        bounds=bounds,
-        attributes=old.attributes,
-        revision=revision,
+    new = replace(
+        old, transform=placed, voxels=n_voxels, bounds=bounds, revision=revision, rows_crc=None
     )
     store.replace(new, rows, covering)
 

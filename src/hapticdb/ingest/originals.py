@@ -18,7 +18,7 @@ def parts_of(objects: Sequence[Object], to_be: str, instead: str) -> Iterator[tu
     objects : sequence of Object
         In any order; they come ordered by file.
     to_be, instead : str
-        For messages: what they cannot be (``moved``), and what to do where the file has changed.
+        For messages: what cannot be done with them (``moved``), and what to do instead.
 
     Raises
     ------

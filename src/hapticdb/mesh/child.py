@@ -1,11 +1,11 @@
-"""The process that parses one file, under a limit of memory and time, and hands back arrays.
+"""The process that parses one file, within limits of memory and time, and returns arrays.
 
-Run by path with a request on standard input (see `reader.py`); answers on standard output. A
-parser that eats memory, crashes or hangs takes only this process with it.
+It is run by its path with a request on standard input (see `reader.py`), and answers on standard
+output. A parser that takes too much memory, crashes or hangs ends only this process.
 """
 
-# The package's own __init__ brings in kernels and databases, a second of imports that parsing has
-# no use for. A bare package of the same name and place stands in for it in this process.
+# The package's own __init__ may import modules that parsing does not need. An empty package with
+# the same name and path takes its place in this process.
 import sys
 import types
 from pathlib import Path
@@ -28,7 +28,8 @@ _PR_SET_PDEATHSIG = 1
 BASE_BYTES = 512 << 20
 BYTES_PER_BYTE = 64
 BYTES_PER_PACKED_BYTE = 500
-"""Memory for a file: a base, and so much for each of its bytes, more where these are packed.
+"""Memory limit of a file: a base, plus so much for each of its bytes, more for packed formats.
+Larger values let a damaged file take more memory before it is refused.
 
 Measured at a mesh of 327,680 triangles, bytes of resident memory a byte of the file: OBJ 12,
 OFF 12, PLY 11 (text 15), STL 7 (text 5), GLB 12, 3MF 10, DAE 5; LAZ 21, and 101 where every point
@@ -48,15 +49,15 @@ def main() -> None:
     request = json.loads(sys.stdin.buffer.read())
     _die_with_parent(request["parent"])
     answer = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # libraries print; their words must not mix with the arrays
+    os.dup2(2, 1)  # what libraries print must not mix with the arrays
     sys.path[:] = request["sys_path"]
     _answer(answer, Path(request["path"]), request)
     answer.flush()
-    os._exit(0)  # tearing down a large parser's memory takes longer than leaving it
+    os._exit(0)  # freeing a large parser's memory would take longer
 
 
 def _die_with_parent(parent: int) -> None:
-    """End when the parent does, however it ends (Linux; elsewhere the limit of time ends it)."""
+    """End when the parent ends, however it does (Linux; elsewhere the time limit ends it)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
@@ -72,12 +73,12 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
 
     before = None
     try:
-        reader_of(path)  # its libraries are no part of what the file may use
-        np.linalg.det(np.eye(3))  # OpenBLAS takes its buffers now, and gives up where it cannot
+        reader_of(path)  # before the limit: its libraries do not count as the file's memory
+        np.linalg.det(np.eye(3))  # OpenBLAS allocates its buffers now, before the limit
         before = limit_memory(allowance(path), request["memory_limit"])
         limit_time(request["time_limit"])
         if path.suffix.lower() == ".gltf" and request["memory_limit"] is None:
-            # which files it refers to is asked under the limit of the file alone
+            # The files that it refers to are listed under the limit of this file alone.
             limit_memory(allowance(path, _bytes_beside(path)), None)
         cleaned = parse(path, request["metres"])
     except (UnreadableError, MemoryError, ImportError) as error:
@@ -105,12 +106,12 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
 
 
 def _memory_kind() -> int:
-    """Which limit: on Linux data, which counts no reserved address space, else address space."""
+    """Which limit: of data on Linux, without reserved address space; else of address space."""
     return resource.RLIMIT_DATA if sys.platform == "linux" else resource.RLIMIT_AS
 
 
 def _bytes_now() -> int:
-    """Memory that this process holds by the count that the limit goes by."""
+    """Memory that this process holds, counted as the limit counts it."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmData:"):
@@ -119,7 +120,7 @@ def _bytes_now() -> int:
 
 
 def bytes_available() -> int:
-    """Memory that the machine can give without swapping; unknown is plenty."""
+    """Memory that the machine can give without swapping; where it is not known, 2^62 bytes."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -139,7 +140,7 @@ def allowance(path: Path, n_beside: int = 0) -> int:
 
 def _bytes_beside(path: Path) -> int:
     """Bytes of the files that a glTF file refers to; 0 where parsing will say what is wrong."""
-    from hapticdb.mesh.gltf import bytes_beside  # noqa: PLC0415 - a reader
+    from hapticdb.mesh.formats.gltf import bytes_beside  # noqa: PLC0415 - a reader
     from hapticdb.mesh.raw import UnreadableError  # noqa: PLC0415
 
     try:
@@ -159,9 +160,9 @@ def limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
 
 
 def limit_time(seconds: float) -> None:
-    """Set the limit of processor time: the parent's clock ends a child, unless it is gone."""
+    """Set the limit of processor time, for when the parent is gone and cannot end this process."""
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    # Threads of a parser add up their times.
+    # The times of a parser's threads add up.
     wanted = int(seconds * (os.cpu_count() or 1)) + 10
     resource.setrlimit(resource.RLIMIT_CPU, (wanted if hard < 0 else min(wanted, hard), hard))
 

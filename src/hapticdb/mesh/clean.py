@@ -1,4 +1,4 @@
-"""Checks every number that a reader found, counts what is wrong, and lets only sound parts on."""
+"""Checks every number that a reader found, counts what is wrong, and returns only sound parts."""
 
 import unicodedata
 from dataclasses import dataclass, replace
@@ -13,13 +13,14 @@ from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError
 Scalar = TypeVar("Scalar", bound=np.generic)
 Geometry = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 
-# Twice a triangle's area over its longest edge squared: rounding of float64 edges stays below.
 _FLAT = 1e-12
+"""A triangle is degenerate when twice its area is at most this times its longest edge squared:
+rounding errors of float64 edges are smaller. A larger value counts thin triangles, too."""
 
 
 @dataclass(frozen=True)
 class CleanPart:
-    """A part before it meets its arrays: `geometry` is a number in `Cleaned.geometries`."""
+    """A part without its arrays: `geometry` is an index into `Cleaned.geometries`."""
 
     name: str
     geometry: int
@@ -49,7 +50,7 @@ def clean(parsed: Parsed, metres: float | None) -> Cleaned:
     parsed : Parsed
         Contents of a file.
     metres : float or None
-        Length of the unit of a file that carries none; None where nobody said.
+        Length of the unit of a file that carries none; None where none was given.
     """
     said = (parsed.metres, metres, parsed.likely_metres)
     scale = next((length for length in said if length is not None), 1.0)
@@ -146,7 +147,7 @@ def _count_degenerate(
     positions: NDArray[np.float64], faces: NDArray[np.int64], linear: NDArray[np.float64]
 ) -> int:
     """Triangles without area once `linear` (3, 3) is applied."""
-    # Edges first, then the transform: far from the origin the other way round loses digits.
+    # Edges are taken before the transform, which would lose their digits far from the origin.
     first = positions[faces[:, 0]]
     a = (positions[faces[:, 1]] - first) @ linear.T
     b = (positions[faces[:, 2]] - first) @ linear.T
@@ -174,7 +175,7 @@ def _worlds(
     if len(bent):
         name = _printable(placements[bent[0]].name)
         raise UnreadableError(f"the transform of '{name}' is not affine")
-    # of each geometry once, however many placements share it
+    # Once for each geometry, however many placements share it.
     farthest = np.array([np.abs(v).max(axis=0, initial=0.0) for v, _ in geometries]).reshape(-1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
         worlds[:, :3, 3] *= scale
@@ -194,7 +195,7 @@ def _are_flat(worlds: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 def _printable(name: str) -> str:
-    """Name that any terminal, database and JSON reader takes: no controls, no half characters."""
+    """Name that any terminal, database and JSON reader accepts: no controls, no lone surrogates."""
     if name.isascii() and name.isprintable():
         return name.strip() or "part"
     whole = name.encode("utf-8", "replace").decode("utf-8")

@@ -1,4 +1,4 @@
-"""Picks the reader of a format, and puts any reader's failure into one line of plain words."""
+"""Picks the reader of a format, and turns any reader's failure into one line of plain words."""
 
 import importlib
 import struct
@@ -29,7 +29,7 @@ READERS = {
 
 def reader_of(path: Path) -> Callable[[Path], Parsed]:
     """Reader of a format; importing it brings in its libraries and no others."""
-    module = importlib.import_module(f"hapticdb.mesh.{READERS[path.suffix.lower()]}")
+    module = importlib.import_module(f"hapticdb.mesh.formats.{READERS[path.suffix.lower()]}")
     reader: Callable[[Path], Parsed] = module.read
     return reader
 
@@ -42,7 +42,7 @@ def parse(path: Path, metres: float | None) -> Cleaned:
     path : Path
         A file with one of the suffixes in `READERS`.
     metres : float or None
-        Length of the unit of a file that carries none; None where nobody said.
+        Length of the unit of a file that carries none; None where none was given.
 
     Raises
     ------
@@ -61,7 +61,7 @@ def parse(path: Path, metres: float | None) -> Cleaned:
 
 
 def cause_of(error: BaseException) -> str:
-    """Why a library gave up, in words for whoever has the file and not the library's source."""
+    """Cause of a library's failure, in words that need no knowledge of the library."""
     detail = " ".join(str(error).split())
     if isinstance(error, MemoryError):
         return (

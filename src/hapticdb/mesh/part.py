@@ -1,4 +1,4 @@
-"""What a mesh file holds once read: parts, where they stand, and what was wrong with them."""
+"""What a mesh file holds once read: parts, their placements, and what was wrong with them."""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -66,7 +66,7 @@ _NONE = Defects()
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One instance in a file: a triangle mesh or a point cloud, and where it stands.
+    """One instance in a file: a triangle mesh or a point cloud, and its placement.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ class Part:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the geometry in the part's frame, 64 hex digits; placement is no part."""
+        """SHA-256 of the geometry in the part's frame, 64 hex digits; the placement is left out."""
         if "digest" not in self.shared:
             content = hashlib.sha256()
             content.update(b"cloud" if self.faces is None else b"mesh")

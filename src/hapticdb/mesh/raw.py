@@ -1,4 +1,4 @@
-"""What a format's reader hands on: shapes as the file has them, and where each one stands."""
+"""What a format's reader returns: shapes as the file has them, and their placements."""
 
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -13,9 +13,11 @@ from hapticdb.mesh.part import Defects
 Node = TypeVar("Node", bound=Hashable)
 
 MAX_NODES = 2_000_000
-"""Placements that one file may ask for: assemblies nested in assemblies multiply."""
+"""Most placements in a file: those of assemblies nested in assemblies multiply. A larger value lets
+a small file take more memory and time."""
 MOST_CHARACTERS = 50_000_000
-"""Of the names of all placements: along nodes nested deeply, they grow as the depth squared."""
+"""Most characters in the names of all placements: with nodes nested deeply, names grow as the depth
+squared. A larger value lets a small file take more memory."""
 
 
 class UnreadableError(Exception):
@@ -54,9 +56,9 @@ class Placement:
 class Parsed:
     """A file's contents before any check.
 
-    `metres` is the length of the file's unit, None where the format carries none; `likely_metres`
-    that of one which the file names beside its lengths, and which an option overrides. `up` is the
-    axis that points up, None where nothing says.
+    `metres` is the length of the file's unit, None where the format has none. `likely_metres` is
+    the length of a unit that the file only hints at, such as that of its reference system; an
+    option overrides it. `up` is the axis that points up, None where the file does not say.
     """
 
     shapes: list[Shape]
@@ -68,7 +70,7 @@ class Parsed:
 
 
 class NameBudget:
-    """Joins names of nodes to names of parts, until they are too long together."""
+    """Joins names of nodes to names of parts; refuses when all names together are too long."""
 
     def __init__(self) -> None:
         self._left = MOST_CHARACTERS
@@ -93,7 +95,7 @@ def placed_once(named: Iterable[tuple[str, Shape]], defects: Defects | None = No
 
 
 def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.generic]:
-    """All numbers of a text, separated by white space; anything else is an error."""
+    """Parse all numbers of a text, separated by white space; anything else is an error."""
     if not text or text.isspace():
         return np.empty(0, dtype=dtype)
     with warnings.catch_warnings():
@@ -130,8 +132,8 @@ def walk(
 ) -> Iterator[tuple[list[Node], NDArray[np.float64]]]:
     """Every placement of every node under `roots`: path from the root, and world_from_node.
 
-    Depth first, in the order of the file; a node reached along two paths comes twice. The list is
-    the walk's own and changes after each step. Not recursive: depth costs no stack.
+    Depth first, in the order of the file; a node reached along two paths comes twice. The yielded
+    list is used again: copy what is to be kept. Not recursive, so depth takes no stack.
     """
     path: list[Node] = []
     on_path: set[Node] = set()

@@ -30,14 +30,16 @@ _CHILD = Path(__file__).with_name("child.py")
 _SECONDS = 20.0
 _SECONDS_PER_MIB = 5.0
 _SECONDS_PER_MIB_OF = {"step": 20.0, "threemf": 10.0}
-"""Time for a file: so much, and so much for each MiB of it; ten times what honest files take, and
-more. A STEP file is tessellated, and a 3MF file unpacks to a multiple of its size."""
+"""Time limit of a file: so many seconds, plus so many for each MiB; at least ten times what sound
+files take. STEP files are tessellated, and 3MF files unpack to a multiple of their size. Larger
+values let a damaged file take longer before it is refused."""
 _LIBRARIES = {
     "step": ("OpenCASCADE", "save it anew as STEP AP214 or AP242, or as glTF or STL"),
     "las": ("lazrs, its decompressor,", "unpack it to LAS with another program, or save it anew"),
 }
-"""What may crash, and what helps then."""
+"""Libraries that may crash on a damaged file, by reader, and what helps then."""
 _LONGEST_CAUSE = 300
+"""Characters of a message's cause; longer ones are cut."""
 _MORE_TIME = "if it is sound, give more: import --time-limit, read_file(time_limit=...)"
 
 
@@ -132,7 +134,7 @@ def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | No
 
 
 def _refusal(file: Path) -> str | None:
-    """Why a file need not be given to any parser, None if it may be."""
+    """Why a file is refused before it is parsed; None if it is not."""
     if file.is_dir():
         return "it is a directory; name the files in it"
     if not file.exists():
@@ -206,7 +208,7 @@ def _ask_child(request: dict[str, Any], seconds: float) -> Cleaned:
 
 
 def _end(child: subprocess.Popen[bytes], late: threading.Event) -> None:
-    """End a child that took too long, and leave word of it."""
+    """End a child that took too long, and set `late`."""
     late.set()
     child.kill()
 

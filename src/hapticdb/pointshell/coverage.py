@@ -1,7 +1,7 @@
 """How well points cover the surface that they were spread over, and what lies inside of it.
 
-The covering radius of points on a surface is the least r for which every place of the surface has
-a point within r. It bounds what may pass between the points unseen.
+The covering radius of points on a surface is the least r such that each position on the surface has
+a point within r. It bounds the size of what may pass between the points unseen.
 """
 
 import contextlib
@@ -16,12 +16,15 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
 
 CLOSE = 0.1
-"""A covering radius is at most this share above the least one, and more than this of a spacing."""
+"""How close a computed covering radius is to the least one: at most this share above it, or it
+comes from triangles with sides of at most this share of the points' spacing. A smaller value cuts
+more triangles."""
 COVER_OF_SPACING = 1.45
-"""Covering radii found here, in spacings, of shells made of a mesh: 0.98 at 300 points, 1.37 at
-400,000, on a cube."""
+"""Covering radius to expect of a shell made of a mesh, in spacings of its points. Measured on a
+cube: 0.98 at 300 points, 1.37 at 400,000. A larger value makes a sweep that is not decided ask for
+more points."""
 AT_ONCE = 1 << 16
-"""Triangles that are cut and measured at a time."""
+"""Triangles that are cut and measured at a time. A larger value takes more memory."""
 
 Floats = NDArray[np.float64]
 
@@ -32,17 +35,17 @@ def spacing_of(area: float, n_points: int) -> float:
 
 
 def points_for(area: float, spacing: float) -> int:
-    """How many points such a lattice has on an area, square metres; the reverse of `spacing_of`."""
+    """How many points a hexagonal lattice of that spacing has on an area: undoes `spacing_of`."""
     return int(np.ceil(2.0 * area / (np.sqrt(3.0) * spacing**2)))
 
 
 def covering_radius(triangles: Floats, points: Floats) -> float:
     """Bound the covering radius of points (N, 3) on triangles (F, 3, 3) from above, metres.
 
-    The distance to a point is convex, so that no place of a triangle is farther from a point than
-    the triangle's farthest corner is. Triangles are cut in halves across their longest side until
-    that bound, for the point nearest to their middle, is within `CLOSE` of a distance that was
-    found. Roundings are below a millionth of the bound, which is raised by that.
+    The distance to a point is convex, so no position in a triangle is farther from a point than the
+    triangle's farthest corner. Triangles are cut in halves across their longest side until that
+    bound, for the point nearest to their middle, is within `CLOSE` of a distance that was found.
+    The bound is raised by a millionth, which is more than its rounding errors.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for sweeps alone
 
@@ -85,8 +88,8 @@ class Ball(NamedTuple):
     def covering_radius(self, points: Floats) -> float:
         """Bound the covering radius of points (N, 3) on the sphere from above, metres.
 
-        The farthest places are the middles of the caps that the faces of the points' convex hull
-        cut off. Points without a hull, or on one side, get the sphere's diameter.
+        The farthest positions are the middles of the caps that the faces of the points' convex hull
+        cut off. The bound of points without a hull, or on one side, is the sphere's diameter.
         """
         from scipy.spatial import ConvexHull, QhullError  # noqa: PLC0415 - as above
 
@@ -126,15 +129,15 @@ class Interior:
         """Whether there is any closed body."""
         return self._ball is not None or bool(self._bodies)
 
-    def holds(self, places: Floats) -> NDArray[np.bool_]:
-        """Whether places (Q, 3), metres, the surface's frame, are inside, (Q,).
+    def holds(self, positions: Floats) -> NDArray[np.bool_]:
+        """Whether positions (Q, 3), metres, the surface's frame, are inside, (Q,).
 
-        By the parity of lines through them; on the surface itself either may be said.
+        By the parity of lines through them. On the surface itself the answer may be either.
         """
         if self._ball is not None:
-            return np.asarray(np.linalg.norm(places, axis=1) < self._ball.radius)
-        places = np.ascontiguousarray(places - self._origin)
-        depth = np.zeros(len(places), dtype=np.int64)
+            return np.asarray(np.linalg.norm(positions, axis=1) < self._ball.radius)
+        local = np.ascontiguousarray(positions - self._origin)
+        depth = np.zeros(len(local), dtype=np.int64)
         for body, sign in self._bodies:
-            depth += sign * sides.encloses(self._tree, body, places)
+            depth += sign * sides.encloses(self._tree, body, local)
         return np.asarray(depth > 0)

@@ -1,9 +1,9 @@
-"""Which side of a surface is inside, found from where its triangles lie, not how they are wound.
+"""Which side of a surface is inside, from where its triangles lie, not from their winding.
 
-Files wind faces any way, repeat them and tear their edges. So corners are joined where they
-coincide, faces that hang together by edges form patches of one winding and closed bodies, and lines
-through the patches vote on the side (`kernels.sides`). What is left without a vote is guessed from
-its shape.
+Files wind faces any way, repeat them and tear their edges. So corners that coincide are joined,
+faces that share edges form patches of one winding and closed bodies, and lines through the patches
+vote on the side (`kernels.surfaces.sides`). A patch without votes is guessed from its shape.
+docs/decisions/0015 has the reasons.
 """
 
 from typing import NamedTuple
@@ -15,7 +15,8 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.surfaces import sides as kernels
 
 JOIN = 1e-6
-"""Corners on open edges are joined up to this part of the bounding box's diagonal."""
+"""Distance up to which corners of open edges are joined, as a part of the bounding box's diagonal.
+A larger value closes wider gaps, and joins corners of details that are that small."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -55,10 +56,10 @@ class _Sides(NamedTuple):
 def orient(triangles: Floats) -> Surface:
     """Find for each triangle (F, 3, 3) the side that is inside, whatever its winding.
 
-    Faces that hang together get one winding, and lines through them vote on the side (a line that
-    crosses a body an odd number of times ahead comes from inside it). Each closed body is asked by
-    itself, so that bodies may overlap; one that lies inside another whole is a void in it, one in a
-    void is a body again. All open bodies are asked together; where no line tells, `_guess` does.
+    Faces that share edges get one winding, and lines through them vote on the side: a line that
+    crosses a body an odd number of times ahead comes from inside it. Each closed body votes by
+    itself, so bodies may overlap. A body whole inside another is a void in it, and one inside a
+    void is solid again. All open bodies vote together; `_guess` decides what no line has decided.
     """
     if not np.isfinite(triangles).all():
         n_bad = int((~np.isfinite(triangles)).any(axis=(1, 2)).sum())
@@ -101,10 +102,11 @@ def _edges_of(faces: Ints) -> _Edges:
 
 
 def _join_corners(triangles: Floats) -> Ints:
-    """Corners (F, 3) by number, equal where they coincide: files such as STL do not say.
+    """Number the corners (F, 3) so that corners that coincide have one number.
 
-    Corners that are equal to the bit are one. Where that leaves open edges, their corners are
-    joined within `JOIN`, too: two parts' roundings of one edge.
+    Some formats, such as STL, do not share corners between faces. Corners with equal bits are one.
+    Where that leaves open edges, their corners are also joined within `JOIN`: two faces may hold
+    one edge with different rounding errors.
     """
     corners = triangles.reshape(-1, 3) + 0.0  # -0.0 is 0.0
     order = np.lexsort(corners.T)
@@ -122,18 +124,19 @@ def _join_corners(triangles: Floats) -> Ints:
     loose = np.unique(
         np.concatenate((faces.ravel()[is_open], np.roll(faces, -1, axis=1).ravel()[is_open]))
     )
-    places = corners[order[is_new]]
-    tolerance = JOIN * float(np.linalg.norm(np.ptp(places, axis=0)))
-    pairs = loose[cKDTree(places[loose]).query_pairs(tolerance, output_type="ndarray")]
-    return _components(pairs, len(places))[faces]
+    distinct = corners[order[is_new]]
+    tolerance = JOIN * float(np.linalg.norm(np.ptp(distinct, axis=0)))
+    pairs = loose[cKDTree(distinct[loose]).query_pairs(tolerance, output_type="ndarray")]
+    return _components(pairs, len(distinct))[faces]
 
 
 def _components(pairs: Ints, n: int) -> Ints:
-    """Component (n,) of each node of the graph with those edges (E, 2), in order of first nodes.
+    """Component (n,) of each node of a graph, numbered by lowest node. pairs (E, 2) are its edges.
 
-    Every root with a lower neighbour is hung below the lowest, and all paths are shortened to their
-    roots, until no edge joins two: at most half of the roots of a component stay in each round.
-    scipy's would do, but its import takes a third of a second, which every shell would wait for.
+    In each round every root with a lower neighbour becomes a child of the lowest one, and every
+    node is linked to its root, until each edge has one root at both ends. A round leaves at most
+    half of a component's roots. scipy has this too, but importing it would cost every shell a third
+    of a second.
     """
     root = np.arange(n, dtype=np.int64)
     tail, head = root[pairs[:, 0]], root[pairs[:, 1]]
@@ -146,17 +149,18 @@ def _components(pairs: Ints, n: int) -> Ints:
 
 
 def _neighbours(number: Ints, sides: Ints) -> Ints:
-    """Pairs (P, 2) of the given sides that lie on one edge, each with the next."""
+    """Pairs (P, 2) of given sides that lie on the same edge, each side with the next one."""
     order = sides[np.argsort(number[sides], kind="stable")]
     is_pair = number[order[1:]] == number[order[:-1]]
     return np.stack((order[:-1][is_pair], order[1:][is_pair]), axis=1)
 
 
 def _drop_repeated(faces: Ints) -> Ints:
-    """Faces to keep, by number, ascending: each set of corners once.
+    """Numbers of the faces to keep, ascending: of faces with the same corners, one.
 
-    Bodies glued together may have the wall between them twice. Once would leave them open there, so
-    a patch of repeated faces goes altogether where more of its border would be open than closed.
+    Two bodies that are glued together may have the wall between them twice. Kept once, the wall
+    would leave its border edges with an odd number of faces: open. So a patch of repeated faces is
+    dropped as a whole where more of its border edges would be open than closed.
     """
     is_face = (faces != np.roll(faces, -1, axis=1)).all(axis=1)
     whole = np.flatnonzero(is_face)
@@ -183,10 +187,10 @@ def _drop_repeated(faces: Ints) -> Ints:
 
 
 def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
-    """Patches of faces that hang together by edges of two faces, and a winding that agrees in each.
+    """Form patches of faces that share edges of two faces, with one winding in each patch.
 
-    Returns the patch (F,) of each face and whether the face is to be flipped (F,). A patch that has
-    one side only (Moebius) falls into single faces.
+    Returns the patch (F,) of each face, and whether the face is to be flipped (F,). A patch with
+    one side only (a Moebius strip) is split into single faces.
     """
     n = len(faces)
     pairs = _neighbours(edges.number, np.flatnonzero((edges.uses == 2)[edges.number]))
@@ -208,7 +212,7 @@ def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
 
 
 def _bodies(n_faces: int, edges: _Edges) -> Ints:
-    """Body (F,) of each face: 1, 2, ... what hangs together by edges, 0 whatever is open."""
+    """Body (F,) of each face: 1, 2, ... for closed bodies of faces that share edges, 0 for open."""
     pairs = _neighbours(edges.number, np.arange(3 * n_faces))
     body = _components(pairs // 3, n_faces)
     is_open = np.zeros(n_faces, dtype=bool)
@@ -231,11 +235,11 @@ def _vote(sides: _Sides) -> Floats:
 
 
 def _guess(sides: _Sides, signs: Floats) -> None:
-    """Fill in the signs (F,) that no line could tell: still zero.
+    """Guess the signs (F,) that are still zero because no line has decided them.
 
-    A patch that bulges has its inside where its middle is. Flat ones all face one way: out of the
-    side that the file's winding calls the outer one, or, where the winding contradicts itself,
-    towards the positive end of the axis that they face most.
+    The inside of a patch that bulges is on the side of its middle. Flat patches all face one way:
+    outwards by the file's winding, or, where that contradicts itself, towards the positive end of
+    the axis that they face most.
     """
     silent = np.flatnonzero(signs == 0.0)
     if len(silent) == 0:
@@ -260,13 +264,13 @@ def _guess(sides: _Sides, signs: Floats) -> None:
 
 
 def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
-    """Whether each body (B,) is the wall of a void: whole inside an odd number of closed bodies."""
+    """Tell which bodies (B,) are walls of voids: whole inside an odd number of closed bodies."""
     n_bodies = int(sides.body.max()) + 1
     low = np.full((n_bodies, 3), np.inf)
     high = np.full((n_bodies, 3), -np.inf)
     np.minimum.at(low, sides.body, sides.triangles.min(axis=1))
     np.maximum.at(high, sides.body, sides.triangles.max(axis=1))
-    low[0], high[0] = np.inf, -np.inf  # what is open encloses nothing
+    low[0], high[0] = np.inf, -np.inf  # open bodies enclose nothing
     pairs = [
         (inner, outer)
         for inner in range(1, n_bodies)
@@ -282,7 +286,7 @@ def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
 
 
 def _center(sides: _Sides, inward: Floats) -> tuple[Floats, bool]:
-    """Centre of mass of the solid, and whether there is one: a volume beyond rounding."""
+    """Centre of mass of the solid, and whether its volume is more than rounding errors."""
     a, b, c = sides.triangles[:, 0], sides.triangles[:, 1], sides.triangles[:, 2]
     # A face with its outward normal n spans with the origin the volume (centroid . n) area / 3.
     volumes = -(inward * sides.centroids).sum(axis=1) * sides.areas / 3.0

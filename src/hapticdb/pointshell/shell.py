@@ -1,10 +1,9 @@
 """PointShell: the moving tool as points on its surface, each with a normal into the tool.
 
-A mesh becomes a shell in three steps: each face learns which of its sides is inside
-(`orientation`), points are spread over the faces (`kernels.sampling`), and the points are put in
-order along a Z-order curve. Neighbours in a shell made here are therefore neighbours in space, and
-a frame that takes the points in turn finds the same brick many times in a row, wherever a brick
-holds many points.
+A mesh becomes a shell in three steps: the inner side of each face is found (`orientation`), points
+are spread over the faces (`kernels.surfaces.sampling`), and the points are sorted along a Z-order
+curve. So points that follow one another are close in space, and a frame finds the same brick many
+times in a row wherever a brick holds many points.
 """
 
 import math
@@ -26,22 +25,28 @@ from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.poses import as_floats
 
 MAX_POINTS = 10_000_000
+"""Most points of a shell."""
 DEFAULT_POINTS = 300
+"""Points of a shell unless given. More points feel finer details, and take longer."""
 DENSE_POINTS = 200_000
-"""Of a shell whose spacing is given, at most, unless more are asked for: a few seconds' work."""
+"""Most points of a shell with a given spacing, unless more are asked for: they take a few
+seconds."""
 ORDER_BITS = 10
-"""The curve that orders the points has 2^10 steps along the longest side of their bounding box."""
+"""Bits of the curve that orders the points: 2^10 steps along the longest side of their bounding
+box. A larger value orders points of finer shells too, and changes every shell."""
 
 FORMAT = "hapticdb.pointshell.shell 1"
+"""Names the format in a saved shell."""
 MOST_INFLATION, INFLATED_ANYWAY = 10, 1 << 20
-"""A saved shell may unpack to so many times its size, and so many bytes on top. `save` packs
-nothing; numbers of a surface pack to two thirds."""
+"""A saved shell may unpack to that many times its size, plus that many bytes. `save` does not
+compress; compressed by another program, a surface's numbers take two thirds of their size."""
 
 Floats = NDArray[np.float64]
 
 
 LEAST_COMPONENT = 1e-100
-"""Of a normal: below, it is 0. PostgreSQL takes a product that underflows for an error."""
+"""Components of normals below this are set to 0: PostgreSQL treats a product that underflows as an
+error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +71,12 @@ class PointShell:
     link : str
         The file that it was made from, absolute; empty if from none.
     seed : int
-        The seed of the points' places.
+        The seed that the points were drawn with.
     defects : str
         What was wrong in that file, in words; not saved.
     cover : float, optional
-        Covering radius, metres: no place of the tool's surface is farther from a point. None where
-        it is not known; `with_cover` finds it for shells made of a mesh.
+        Covering radius, metres: no position on the tool's surface is farther from the nearest
+        point. None where it is not known; `with_cover` finds it for shells made of a mesh.
     surface : Surface or Ball, optional
         What the points were spread over; not saved.
 
@@ -98,7 +103,7 @@ class PointShell:
             array = _as_floats(getattr(self, name), name)
             if array.ndim != len(shape) or array.shape[-1] != 3:
                 raise UsageError(f"a shell's {name} have the shape {array.shape}, not {shape}")
-            if name == "normals":  # too small to turn anything, and their products to be numbers
+            if name == "normals":
                 array = np.where(np.abs(array) < LEAST_COMPONENT, 0.0, array)
             array.flags.writeable = False
             object.__setattr__(self, name, array)
@@ -143,7 +148,7 @@ class PointShell:
         unit : str, optional
             Unit of a file that names none; metres otherwise.
         seed : int
-            Seed of the points' places: equal seeds, equal points.
+            Seed of the points: equal seeds, equal points.
 
         Raises
         ------
@@ -239,19 +244,19 @@ class PointShell:
             most = DENSE_POINTS if points is None else points
             wanted = points_for(float(surface.areas.sum()), spacing)
             n_points = min(max(wanted, DEFAULT_POINTS), most)
-        places, face_of = sampling.sample_surface(
+        sampled, face_of = sampling.sample_surface(
             surface.triangles, surface.areas, surface.normals, n_points, np.random.default_rng(seed)
         )
-        order = _curve_order(places)
+        order = _curve_order(sampled)
         normals = surface.normals[face_of[order]]
         return cls(
-            places[order], normals, surface.center, surface.is_closed, link, seed, surface=surface
+            sampled[order], normals, surface.center, surface.is_closed, link, seed, surface=surface
         )
 
     def with_cover(self) -> "PointShell":
-        """Find the covering radius of a shell of a mesh or sphere; others are returned as they are.
+        """Return the shell with its covering radius, if it was made of a mesh or is a sphere.
 
-        It takes about as long as making the shell did.
+        It takes about as long as making the shell. Any other shell is returned as it is.
         """
         if self.cover is not None or self.surface is None:
             return self
@@ -367,7 +372,7 @@ def _check_format(saved: object, path: str | PathLike[str]) -> None:
 
 
 def _saved_cover(saved: "np.lib.npyio.NpzFile") -> float | None:
-    """Covering radius; None where it was not known, or not saved yet by the version that did."""
+    """Covering radius; None where it was not known, or an older version saved the shell."""
     cover = float(saved["cover"]) if "cover" in saved else np.nan
     return None if np.isnan(cover) else cover
 
@@ -383,12 +388,12 @@ def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:
 def _curve_order(points: Floats) -> NDArray[np.intp]:
     """Indices (N,) that put points (N, 3) in order along a Z-order curve over their bounding box.
 
-    Its steps are cubes, as bricks are, whatever the box's proportions.
+    Steps of the curve are cubes, whatever the box's proportions.
     """
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max()) or 1.0
-    # Half a step short of all: a tool's planes lie at its box's ends, middle and quarters, where a
-    # border of steps would leave the order of their points to roundings.
+    # Half a step less than all. Planes of a tool lie at its box's ends, middle and quarters; a
+    # border between steps there would let rounding errors decide on the order of their points.
     steps = ((points - low) * ((2**ORDER_BITS - 0.5) / extent)).astype(np.int64)
     return np.argsort(curves.encode(steps, ORDER_BITS, curves.Z_ORDER), kind="stable")
 

@@ -27,12 +27,12 @@ def grouping_threshold(store: Store) -> int | None:
 def ranges_worth_scanning(
     keys: Keys,
     threshold: int | None,
-    statistics: Callable[[], tuple[QuantileVector, CostModel]],
+    quantiles_and_costs: Callable[[], tuple[QuantileVector, CostModel]],
 ) -> Ranges | None:
     """Decide how `auto` asks for a frame.
 
-    The decision depends on the frame alone, not on frames before it. `statistics` is called only
-    where the frame is grouped: a small frame never waits for a calibration.
+    The decision depends on the frame alone, not on frames before it. `quantiles_and_costs` is
+    called only where the frame is grouped: a small frame never waits for a calibration.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def ranges_worth_scanning(
         Distinct row keys, ascending.
     threshold : int or None
         As `grouping_threshold` gives it.
-    statistics : callable
+    quantiles_and_costs : callable
         Returns the quantile vector and the cost model.
 
     Returns
@@ -50,5 +50,5 @@ def ranges_worth_scanning(
     """
     if threshold is None or len(keys) < threshold:
         return None
-    ranges = cbgroup(keys, *statistics()).ranges
+    ranges = cbgroup(keys, *quantiles_and_costs()).ranges
     return ranges if KEYS_PER_RANGE * len(ranges.lows) <= len(keys) else None

@@ -24,13 +24,18 @@ from hapticdb.store.base import (
 )
 
 CAUTIONS = tuple(2.0**n for n in range(-2, 8))
-"""Tried for `CostModel.caution`."""
+"""Values that are tried for `CostModel.caution`."""
 TOO_MANY_ROWS = 20_000
-"""A range of more is no part of a frame."""
+"""Rows of a statement above which its ranges are not timed: no frame reads so many. A larger value
+makes calibrating slower."""
 
 
 class _Probe(NamedTuple):
-    """A located shell of the calibration: what `kernels.contact.locate` returned."""
+    """A located shell of the calibration.
+
+    frame : as `SupportsStatement` takes it; keys (U,) row keys, ascending; first, last (U,) lowest
+    and highest voxel key asked for under each.
+    """
 
     frame: Frame
     keys: Keys
@@ -54,7 +59,7 @@ def calibrate(
     seed : int
         Of the drawn places.
     repeats : int
-        Timings of each form at each place; their median counts. The first, untimed, warms up.
+        Timings of each form at each place, of which the median is used, after a run untimed.
     budget : float
         Seconds after which no further place is measured (at least 12 are).
     cold : bool
@@ -146,7 +151,7 @@ class _Trials:
         return run
 
     def _time(self, query: Callable[[], object]) -> float:
-        """Median time of a query, microseconds, after one that warms up, or each from the disk."""
+        """Median time of a query, microseconds: after an untimed run, or each with empty caches."""
         if self._before is None:
             query()
         times = []
@@ -159,7 +164,7 @@ class _Trials:
         return statistics.median(times) / 1000
 
     def _groupings(self) -> list[tuple[float, ...]]:
-        """Times of grouping by cost, place after place: no processor foresees a frame's keys."""
+        """Times of grouping by cost. Places take turns: a processor learns keys that it repeats."""
         equal = CostModel.of_equal_parts()
         times = np.empty((self._repeats + 1, len(self._keys)))
         for row in times:
@@ -172,14 +177,14 @@ class _Trials:
 
     def fit(self, rows_per_block: float) -> CostModel:
         """Least squares over all that was measured."""
-        if not self._scans:  # every range held more than a frame could wait for
+        if not self._scans:  # every statement had more than `TOO_MANY_ROWS`
             return CostModel.of_equal_parts()
         (statement, descent, scanned), s_scan = _least_squares(self._scans)
         (_, _, counted), s_count = _least_squares(self._counts)
         counted = min(counted, scanned)
-        # the client's share of a row: what scanning it costs beyond counting it in the engine
+        # What a row costs the client is what scanning costs beyond counting in the engine.
         row = scanned - counted
-        # keys and rows of a lookup go hand in hand: what rows cost is known from the scans
+        # Keys and rows of lookups are correlated, so the cost of a row is that of the scans.
         keyed = [(*n, max(us - row * rows, us / 10)) for *n, rows, us in self._lookups]
         (lookup, probe), s_lookup = _least_squares(keyed)
         (single,), s_single = _least_squares(self._singles)
@@ -226,9 +231,10 @@ def _cautious(
     count: Callable[[Keys, Keys], int],
     under_keys: float,
 ) -> CostModel:
-    """The model with the caution that would have cost least over some frames' keys.
+    """Return the model with the caution that would have cost least for some frames.
 
-    count : how many rows ranges hold; under_keys : rows under the keys of all frames.
+    frames : keys (U,) of each; count : returns how many rows ranges hold; under_keys : rows under
+    the keys of all frames.
     """
     trials = []
     for caution in CAUTIONS:
@@ -240,14 +246,14 @@ def _cautious(
             rows += count(lows, highs)
             expected += in_gaps
         cost = model.descent * ranges + model.row_scanned * rows
-        # of equal costs the one that reads fewer rows
+        # Of equal costs the greater caution, which reads fewer rows.
         trials.append((cost, -caution, rows, expected))
     _, caution, rows, expected = min(trials)
     return replace(model, caution=-caution, crowding=_ratio(rows - under_keys, expected))
 
 
 def _ratio(found: float, expected: float) -> float:
-    """Rows found over rows expected; one where nothing can be said."""
+    """Rows found over rows expected; 1 where none are expected."""
     return max(found, 0.0) / expected if expected > 0 else 1.0
 
 
@@ -256,7 +262,7 @@ def _least_squares(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Fit times (last column) to the columns before it; figures >= 0 and relative errors.
 
-    Rows are weighted by 1 / time: what counts is the relative error of a prediction.
+    Rows are weighted by 1 / time, so that relative errors are minimised.
     """
     from scipy.optimize import nnls  # noqa: PLC0415 - half of the package's import time
 
@@ -288,10 +294,10 @@ def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
         radius = min(grid.voxel_size * (12, 8, 4, 24)[n % 4], grid.edge / 4)
         normals = -fibonacci_sphere(n_points)
         points = -normals * radius
-        # one compiled signature: PointShell, too, hands its arrays out read-only
+        # Read-only, as the arrays of a PointShell: others would compile one more signature.
         points.flags.writeable = normals.flags.writeable = False
         pose = np.eye(4)
-        # a tool lies on a surface or a little in it, seldom half inside: its gaps are emptier
+        # A tool lies on a surface or a little below it: half inside, its gaps would hold more.
         away = rng.normal(size=3)
         pose[:3, 3] = surface + away / np.linalg.norm(away) * radius * rng.uniform(0.5, 1.0)
         placed, asked, keys = contact.locate(

@@ -34,13 +34,15 @@ class CostModel:
     aggregate, point : float
         The statement of Figure 3 with its second one, and each shell point in it.
     crowding, presence : float
-        Rows found in the gaps that grouping closes, and under a frame's keys, over those that the
-        quantile vector expects there: rows crowd where a tool touches, which no histogram knows.
+        Rows found in the gaps that grouping closes, and under a frame's keys, over the rows that
+        the quantile vector expects there. Above 1 where a tool touches: the histogram averages
+        over a whole bucket, surface or not.
     caution : float
-        How many times its expected rows a gap counts when it is decided, so that real frames cost
-        least: the small gaps near a surface are empty or full, and seldom as expected.
+        Factor on the expected rows of a gap when CBGroup decides on it: the one that would have
+        cost least at the places measured. Small gaps near a surface are empty or full, and seldom
+        hold what is expected.
     group, group_key : float
-        Grouping by cost itself: a frame, and each key in it.
+        CBGroup itself: a frame, and each key in it.
     spread : mapping
         Relative standard error of each fitted figure.
     """
@@ -64,12 +66,12 @@ class CostModel:
 
     @cached_property
     def row_scanned(self) -> float:
-        """One row read in a range: its share of a leaf block, and its handling."""
+        """One row read in a range: its share of a leaf block, and what it costs the client."""
         return self.block / self.rows_per_block + self.row
 
     @cached_property
     def row_in_gap(self) -> float:
-        """One row that the quantile vector expects in a gap, as deciding on that gap counts it."""
+        """One row that the quantile vector expects in a gap, weighed by `caution`."""
         return self.row_scanned * self.caution
 
     def of_ranges(self, n_ranges: int, rows: float) -> float:
@@ -93,24 +95,24 @@ class CostModel:
         return self.group + self.group_key * n_keys
 
     def figures(self) -> dict[str, float]:
-        """All figures by name, the spreads as ``name.spread``: what a store keeps."""
+        """All figures by name, the spreads as ``name.spread``, as a store keeps them."""
         plain = asdict(self)
         spread = plain.pop("spread")
         return plain | {f"{name}.spread": value for name, value in spread.items()}
 
     @classmethod
     def of_equal_parts(cls) -> "CostModel":
-        """Figures for an empty environment, where nothing can be measured: all one."""
+        """Return a model whose figures are all 1, for an environment without rows to measure."""
         return cls(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
 
     @classmethod
     def from_figures(cls, figures: Mapping[str, float]) -> "CostModel":
-        """Rebuild from `figures`."""
+        """Rebuild from `figures`; those that an older version did not keep have their defaults."""
         spread = {k.removesuffix(".spread"): v for k, v in figures.items() if k.endswith(".spread")}
         plain = {k: v for k, v in figures.items() if not k.endswith(".spread")}
         return cls(**plain, spread=spread)
 
 
 def machine_name() -> str:
-    """What the kept figures are filed under: they hold for one machine."""
+    """Name of this machine, under which a store keeps the figures measured on it."""
     return f"{platform.node()} {platform.machine()}"

@@ -25,17 +25,18 @@ if TYPE_CHECKING:
 Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 MOST_KEYS = 2048
-"""Row keys of neighbouring poses that one statement asks for: each pose goes over the rows found
-between its first key and its last, so that more would save statements and cost time."""
+"""Row keys of neighbouring poses for which one statement is sent. A larger value sends fewer
+statements, but each pose then has more rows of other poses between its own."""
 MOST_POINTS = 1 << 17
-"""Points of poses that are placed before the database is asked: 12 MB."""
+"""Shell points of all poses for which one statement is sent: 12 MB. A larger value takes more
+memory."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
 
 class Query(NamedTuple):
     """How a frame asked the database.
 
-    strategy : what was used (`auto` names its choice); statements : SQL statements run; ranges :
+    strategy : the strategy used, never `auto`; statements : SQL statements run; ranges :
     index ranges they named, each key of a point query counting as one; rows : rows read, false hits
     included; elapsed_us : the whole frame, microseconds.
     """
@@ -48,7 +49,7 @@ class Query(NamedTuple):
 
 
 class Answer(NamedTuple):
-    """What a frame found, before it is given to a person.
+    """What a frame found; `Touch` shows it to users.
 
     wrench (6,) N and N m; hits (H,) indices, ascending; depths (H,) metres; ids : objects of all
     hits, ascending; pairs : () -> (P, 2) int64, every (hit, object id), computed when asked for.
@@ -63,21 +64,22 @@ class Answer(NamedTuple):
 
 
 class HapticQuery:
-    """Frames against one store. Keeps what does not change between them.
+    """Runs frames against one store.
 
     Parameters
     ----------
     store : Store
         The opened environment.
-    statistics : callable
-        Returns the quantile vector and the cost model; called when a strategy first needs them.
+    quantiles_and_costs : callable
+        Returns the quantile vector and the cost model; called for each frame that is grouped by
+        cost.
     """
 
     def __init__(
-        self, store: Store, statistics: "Callable[[], tuple[QuantileVector, CostModel]]"
+        self, store: Store, quantiles_and_costs: "Callable[[], tuple[QuantileVector, CostModel]]"
     ) -> None:
         self._store = store
-        self._statistics = statistics
+        self._quantiles_and_costs = quantiles_and_costs
         self._grouping_threshold = grouping_threshold(store)
         grid = store.grid
         self._shift = row_shift(store.layout)
@@ -112,7 +114,7 @@ class HapticQuery:
         query: Query,
         started: int,
     ) -> Answer:
-        """What a frame found in rows that were fetched for it, and perhaps for others."""
+        """Answer of a frame from its rows, between which there may be rows of other poses."""
         placed, asked, keys = located
         row_keys, row_ids, occupancy = rows
         wrench, hits, depths, ids = contact.refine(
@@ -159,15 +161,15 @@ class HapticQuery:
                 raise UsageError(f"pose {n}: {error}") from error
             n_keys += len(batch[-1].keys)
             if n_keys >= MOST_KEYS or len(batch) >= most:
-                yield from self._together(batch, exclude, law)
+                yield from self._look_up_together(batch, exclude, law)
                 batch, n_keys = [], 0
         if batch:
-            yield from self._together(batch, exclude, law)
+            yield from self._look_up_together(batch, exclude, law)
 
-    def _together(
+    def _look_up_together(
         self, batch: "list[contact.Located]", exclude: Keys, law: TangentPlane
     ) -> Iterator[Answer]:
-        """Answers of poses whose rows are fetched by one statement."""
+        """Answers of poses, in their order; one statement fetches the rows of all."""
         started = time.perf_counter_ns()
         keys = np.unique(np.concatenate([located.keys for located in batch]))
         row_keys, row_ids, occupancy = self._store.lookup(keys)
@@ -182,7 +184,7 @@ class HapticQuery:
             query, started = Query("array", 0, 0, 0, 0.0), time.perf_counter_ns()
 
     def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> "contact.Located":
-        """Place a shell (N points) at a pose (4, 4), and find the row keys that it asks for."""
+        """Place a shell (N points) at a pose (4, 4), and compute the row keys to ask for."""
         if pose.shape != (4, 4):
             raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
         bits, curve, shift = self._curve
@@ -215,9 +217,11 @@ class HapticQuery:
             first, last = contact.spans_of_keys(asked, keys, *self._curve)
             ranges = maxgap(keys, first, last, gap)
         elif strategy == "cbgroup":
-            ranges = cbgroup(keys, *self._statistics()).ranges
+            ranges = cbgroup(keys, *self._quantiles_and_costs()).ranges
         elif strategy == "auto":
-            ranges = ranges_worth_scanning(keys, self._grouping_threshold, self._statistics)
+            ranges = ranges_worth_scanning(
+                keys, self._grouping_threshold, self._quantiles_and_costs
+            )
             strategy = "array" if ranges is None else "cbgroup"
         if ranges is None:
             rows = self._store.lookup(keys)
@@ -232,7 +236,7 @@ class HapticQuery:
         law: TangentPlane,
         started: int,
     ) -> Answer:
-        """Figure 3, and the second statement for what EXISTS drops, in one snapshot."""
+        """Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
         store = self._store
         if not isinstance(store, SupportsStatement):
             raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
@@ -272,10 +276,10 @@ def as_poses(poses: ArrayLike) -> NDArray[np.float64]:
 
 
 def as_id(object_id: int) -> int:
-    """An object's id as a plain int; refuses what is none."""
+    """An object's id as a plain int; refuses what is not an integer."""
     try:
         if isinstance(object_id, bool):
-            raise TypeError  # noqa: TRY301 - no id, though Python counts it among the integers
+            raise TypeError  # noqa: TRY301 - a bool is an int to Python, but no id
         plain = operator.index(object_id)
     except TypeError as error:
         raise UsageError(

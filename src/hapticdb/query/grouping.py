@@ -15,7 +15,8 @@ from hapticdb.store.base import Keys, Layout, row_shift
 DEFAULT_MAXGAP = 500
 """The paper's choice of MAXGAP, in voxel keys."""
 BOX_CUBES = 16
-"""Cubes along a box's longest edge when it is covered by key ranges."""
+"""Cubes along a box's longest edge when it is covered by key ranges. A larger value gives more
+ranges, which hold fewer keys outside the box."""
 
 
 class Ranges(NamedTuple):
@@ -26,7 +27,10 @@ class Ranges(NamedTuple):
 
 
 class Grouping(NamedTuple):
-    """Ranges of CBGroup and what the quantile vector expects in them."""
+    """Ranges of CBGroup, and the rows that the quantile vector expects.
+
+    rows_asked : under the keys themselves; rows_in_gaps : in the gaps that were closed.
+    """
 
     ranges: Ranges
     rows_asked: float
@@ -47,7 +51,7 @@ def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
     """
     if gap < 0:
         raise UsageError(f"MAXGAP {gap}: give 0 or more")
-    # a key has at most 63 bits, and so has every gap between two
+    # Keys, and so gaps between them, have at most 63 bits.
     return Ranges(*kernels.group_by_gap(keys, first, last, min(int(gap), 2**63 - 1)))
 
 
@@ -83,7 +87,7 @@ def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostM
 
 
 def object_ranges(grid: Grid, layout: Layout, bounds: NDArray[np.float64]) -> Ranges:
-    """Ranges of row keys that hold an object of those bounds (2, 3), a voxel wider on each side."""
+    """Ranges of row keys that cover an object's bounds (2, 3), a voxel wider on each side."""
     low, high = grid.voxels_of(bounds)
     return box_ranges(grid, layout, low - 1, high + 1)
 

@@ -11,6 +11,7 @@ from hapticdb.store.believed import damaged
 DEFAULT_RESOLUTION = 10_000
 """Buckets of the quantile vector: the paper's best."""
 MAX_RESOLUTION = 1_000_000
+"""Most buckets that may be asked for: 8 MB."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class QuantileVector:
         return self.n_rows / self.resolution
 
     def rows_between(self, left: int, right: int) -> float:
-        """Expected rows with a key in [left, right]; of neighbouring ranges they add."""
+        """Expected rows with a key in [left, right]. Those of neighbouring ranges add up."""
         return float(grouping.gap_rows(left, right, self.bounds, self.rows_per_bucket))
 
     @classmethod

@@ -1,6 +1,6 @@
 """3MF: one part a build item and component, named along the objects that hold it.
 
-Read here and not through trimesh, which stops in silence after (edges times nodes) steps, so that
+Not read through trimesh, which stops without an error after (edges times nodes) steps, so that
 nested assemblies lose instances, and keeps one of two build items of the same part number.
 """
 
@@ -25,8 +25,8 @@ _METRES = {
 }
 _PIECE = 1 << 20
 _UNPACKED, _INFLATION = 32 << 20, 40
-"""Bytes that models may unpack to: so many, and so many for each byte of the file. Meshes pack to a
-fifth or an eighth of their text."""
+"""Bytes that models may unpack to: so many, plus so many for each byte of the file. Sound meshes
+unpack to five to eight times their size. Larger values let a damaged file take more memory."""
 Key = tuple[str, str]
 """An object: the model file inside the archive, and its id there."""
 Link = tuple[Key, NDArray[np.float64]]
@@ -129,7 +129,7 @@ def _read_model(
     parser.StartDoctypeDeclHandler = _refuse_doctype
     if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise UnreadableError("its model is packed by another method than deflate: save it anew")
-    # A stream and no tree: memory goes with the geometry, whatever the archive unpacks to.
+    # Parsed as a stream, without a tree, so that memory is in proportion to the geometry.
     with archive.open(name) as stream:
         try:
             while piece := stream.read(_PIECE):
@@ -158,7 +158,7 @@ def _metres(unit: str) -> float:
 
 
 def _index(word: str) -> int:
-    """Read the number of a vertex; what no int64 holds is out of range like any other."""
+    """Parse the number of a vertex; one that int64 cannot hold becomes -1, out of range."""
     value = int(word)
     return value if 0 <= value < 2**62 else -1
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import cascadio
 
-from hapticdb.mesh import gltf
+from hapticdb.mesh.formats import gltf
 from hapticdb.mesh.raw import Parsed, UnreadableError
 
 

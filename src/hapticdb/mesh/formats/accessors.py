@@ -1,7 +1,7 @@
 """Numbers of a glTF file: its buffers, each distinct one read once, and the arrays in them.
 
-Read here and not through trimesh, which reads an external file once for each buffer that names it,
-makes arrays of all accessors whether a mesh uses them or not, and takes half a second to import.
+Not read through trimesh, which reads an external file once for each buffer that names it, makes
+arrays of all accessors even if no mesh uses them, and takes half a second to import.
 """
 
 import base64
@@ -31,7 +31,7 @@ def objects_of(tree: dict[str, Any], key: str) -> list[dict[str, Any]]:
 
 
 def whole(value: object, what: str, least: int = 0) -> int:
-    """Read a whole number, `least` or more; JSON's true and 1.5 are none."""
+    """Check that a value is a whole number, `least` or more; JSON's true and 1.5 are not."""
     if type(value) is not int or not least <= value < 2**53:
         raise UnreadableError(f"it is damaged: {what} is no whole number from {least} on")
     return value
@@ -65,7 +65,7 @@ def external_bytes(tree: dict[str, Any], folder: Path) -> int:
 
 
 def _beside(folder: Path, name: str) -> Path | None:
-    """File that a glTF names, as it stands there or with its %20 and the like resolved."""
+    """File that a glTF names, as written or with percent-encoding such as %20 resolved."""
     for candidate in (name, unquote(name)):
         try:
             if (folder / candidate).is_file():

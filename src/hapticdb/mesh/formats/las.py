@@ -17,21 +17,21 @@ from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once
 _MODEL, _LINEAR_UNIT = 1024, 3076
 _PROJECTED = 1
 _CODES = {9001: 1.0, 9002: 0.3048, 9003: 1200.0 / 3937.0}
-"""Of GeoTIFF keys: a projected system's unit of length, metres."""
+"""Metres of a projected system's unit of length, by its code in a GeoTIFF key."""
 _WKT_UNIT = re.compile(r'(?:LENGTH)?UNIT\["[^"]*",\s*([0-9.eE+-]+)')
 _HEADER = 227
 _HEADER_1_4 = 375
 _RECORD, _LONG_RECORD = 54, 60
 """Bytes of the header of a variable-length record, and of an extended one."""
 _VARIABLE = 0xFFFFFFFF
-"""Stands for chunks of any size."""
+"""Chunk size in a LAZ header that stands for chunks of any size."""
 _LAYERED = 3
 _BYTES = 14
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
-"""Layers of each kind of item of a point; bytes have one each (LASzip's source, laszip.hpp)."""
+"""Layers of each kind of item of a point; extra bytes have one layer each (LASzip, laszip.hpp)."""
 _POINTS_AT_ONCE = 50_000, 1_000_000
-"""At least and at most; between them a point for each byte of the file. laspy takes the memory for
-all before it reads the first."""
+"""Points that are read at a time: one for each byte of the file, but at least and at most these.
+laspy allocates memory for all of them before it reads the first."""
 
 
 def read(path: Path) -> Parsed:
@@ -72,7 +72,7 @@ def _unit_of(records: Iterable[object]) -> float | None:
 
 
 def _unit_of_wkt(text: str) -> float | None:
-    """Metres of a projected system's unit in well-known text: the last one, after its angles."""
+    """Metres of a projected system's unit in well-known text: the last unit, after angles."""
     start = max(text.find("PROJCS["), text.find("PROJCRS["))
     if start < 0:
         return None
@@ -86,7 +86,7 @@ def _unit_of_wkt(text: str) -> float | None:
 
 
 def _check_chunks(header: laspy.LasHeader) -> None:
-    """Refuse chunks far beyond the points of a packed file: lazrs takes memory for whole ones."""
+    """Refuse chunks much larger than the file's points: lazrs allocates whole chunks."""
     for record in header.vlrs.get("LasZipVlr"):
         (n_points,) = struct.unpack_from("<I", record.record_data, 12)
         if n_points != _VARIABLE and n_points > max(_POINTS_AT_ONCE[1], header.point_count):
@@ -97,10 +97,10 @@ def _check_chunks(header: laspy.LasHeader) -> None:
 
 
 def _check_layers(path: Path, header: laspy.LasHeader) -> None:
-    """Refuse layers longer than their chunk: lazrs takes memory for what a chunk promises.
+    """Refuse layers longer than their chunk: lazrs allocates what a chunk promises.
 
-    A chunk in layers begins with a point as it is, the number of its points and the length of each
-    layer (LASzip's compressor 3, for point formats from 6 on).
+    A chunk in layers begins with one point unpacked, the number of its points and the length of
+    each layer (LASzip's compressor 3, for point formats from 6 on).
     """
     for record in header.vlrs.get("LasZipVlr"):
         content = record.record_data
@@ -125,7 +125,7 @@ def _check_layers(path: Path, header: laspy.LasHeader) -> None:
 
 
 def _check_header(path: Path) -> None:
-    """Refuse counts that the file cannot hold: laspy reads record after record behind its end."""
+    """Refuse counts that the file cannot hold: laspy would read records beyond the file's end."""
     n_bytes = path.stat().st_size
     with path.open("rb") as stream:
         header = stream.read(_HEADER_1_4)

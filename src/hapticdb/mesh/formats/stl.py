@@ -1,7 +1,7 @@
 """STL, binary and text. Each solid of a text file is a part of its own.
 
-Read here and not through trimesh, which drops empty solids and a last solid without its end in
-silence, and takes 'solid' inside the name after 'endsolid' for the next one.
+Not read through trimesh, which drops empty solids and an unfinished last solid without an error,
+and takes the word 'solid' in the name behind 'endsolid' for the start of another solid.
 """
 
 import re

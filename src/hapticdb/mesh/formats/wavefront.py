@@ -1,8 +1,8 @@
 """OBJ: each object and group of a Wavefront file a part, named 'object/group'.
 
-Read here and not through trimesh, which joins both names by '_', counts negative indices from the
-end of the file instead of from the line that holds them, takes index 0 for the first vertex, and
-gives up the whole file for one face out of range.
+Not read through trimesh, which joins both names by '_', counts negative indices from the end of the
+file instead of from the line that holds them, takes index 0 for the first vertex, and refuses the
+whole file for one face out of range.
 """
 
 import re
@@ -85,7 +85,7 @@ def _shape(group: _Group, vertices: NDArray[np.float64]) -> Shape:
     corners = _TEXTURE_AND_NORMAL.sub("", text)
     sizes = {len(line.split()) for line in corners.split("\n")} if group.lines else set()
     size = sizes.pop() if len(sizes) == 1 else 0
-    # All polygons of one size and no index counted backwards: one pass through numpy.
+    # The fast path: all polygons have one size and no index is negative.
     if size >= 3 and "-" not in corners:
         polygons = np.asarray(numbers(corners, np.int64), dtype=np.int64).reshape(-1, size) - 1
         faces, incomplete = fan_of_equal(polygons), 0
@@ -107,6 +107,6 @@ def _polygon(line: str, n_before: int) -> list[int]:
             raise UnreadableError("a face holds a word where an index should be") from None
         if index < 0:
             index += n_before + 1
-        # Absolute and relative alike, what is not above 0 now is no vertex.
+        # An index that is still not above 0 is outside, whether it was absolute or relative.
         corners.append(index - 1 if 0 < index < 2**62 else _OUTSIDE)
     return corners

@@ -1,8 +1,8 @@
-"""glTF and GLB: one part a placed mesh, its pieces joined, named along its nodes.
+"""glTF and GLB: one part for each placed mesh, its pieces joined, named along its nodes.
 
-Read here and not through trimesh, whose scene graph names the pieces of one mesh at random, drops
-what hangs under a camera, and keeps one of several placements of a node; `accessors` says why not
-even for the numbers.
+Not read through trimesh, whose scene graph names the pieces of one mesh at random, drops nodes
+below a camera, and keeps one of several placements of a node. `accessors` says why trimesh does not
+read the numbers, either.
 """
 
 import json
@@ -13,7 +13,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.accessors import Accessors, chunks_of, external_bytes, item, objects_of, whole
+from hapticdb.mesh.formats.accessors import (
+    Accessors,
+    chunks_of,
+    external_bytes,
+    item,
+    objects_of,
+    whole,
+)
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableError, walk
 
@@ -90,7 +97,7 @@ def bytes_beside(path: Path) -> int:
 
 
 def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:
-    """Say what would be read wrongly in silence: packed, sparse or scaled positions."""
+    """Refuse what would be read wrongly without an error: packed, sparse or scaled positions."""
     required = tree.get("extensionsRequired", [])
     for extension in required if isinstance(required, list) else [required]:
         if not str(extension).startswith(_HARMLESS):
@@ -150,7 +157,7 @@ def _shape(mesh: dict[str, Any], number: int, accessors: Accessors) -> Shape:
 
 
 def _one(arrays: list[Any]) -> NDArray[Any]:
-    """Arrays as one: without a copy where there is one, which meshes by the thousand may share."""
+    """Join arrays; a single one is not copied, since thousands of meshes may share it."""
     return np.asarray(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
 
 

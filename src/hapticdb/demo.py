@@ -1,7 +1,7 @@
 """The demo: the sample imported in both layouts, touched by every strategy, measured and compared.
 
-What is compared is bit for bit: hits, ids and wrench of every pose, over strategies and layouts.
-What is timed is warm: each strategy has run before, and they take turns at going first.
+Hits, ids and wrench of every pose are compared bit for bit over strategies and layouts. Times are
+warm: each strategy has run before, and the strategies take turns at going first.
 """
 
 import os
@@ -30,18 +30,23 @@ from hapticdb.store.connect import beside, name_of, redact
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"
-"""The paper's point query sequence: what the others are measured by."""
+"""The paper's point query sequence, to which the other strategies are compared."""
 WARM_POSES = 20
+"""Untimed poses of each strategy. More take longer and change little."""
 MAP_CELLS = 4096
-"""Cells an axis of the map of heights that a path over an environment is made from."""
+"""Cells an axis of the map of heights from which a path is made. More follow finer shapes and take
+more memory."""
 SAMPLE_LENGTH = 4.28
-"""Of the sample car, metres."""
+"""Length of the sample car, metres."""
 ALONG_VOXELS = 10_000_000
-"""Voxels that such a path may read at most: a gigabyte."""
+"""Voxels that are read at most to make a path: a gigabyte. The largest objects come first."""
 
 
 class Imported(NamedTuple):
-    """One environment of the demo; how long its import took, nothing if it was there."""
+    """One environment of the demo.
+
+    seconds : the import took; is_new : whether the import added anything.
+    """
 
     layout: Layout
     url: str
@@ -68,7 +73,7 @@ class DemoScene:
 
 @dataclass
 class StrategyFigures:
-    """What one strategy did and took, frame by frame."""
+    """Times and counts of one strategy, frame by frame."""
 
     elapsed_us: list[float] = field(default_factory=list)
     statements: list[int] = field(default_factory=list)
@@ -77,7 +82,7 @@ class StrategyFigures:
     used: Counter[str] = field(default_factory=Counter)
 
     def add(self, touched: Touch) -> None:
-        """Count one frame in."""
+        """Add the figures of one frame."""
         query = touched.query
         self.elapsed_us.append(query.elapsed_us)
         self.statements.append(query.statements)
@@ -106,7 +111,7 @@ class LayoutFigures:
 
 @dataclass
 class Trace:
-    """What the tool felt along the path, whatever the strategy: for the picture.
+    """What the tool felt along the path, for the picture; the same for every strategy.
 
     force (M,) newtons and hits (M,), a number a pose; points (H, 3) metres, world frame, of the
     hits, ids (H,) of the object that each hit (the lowest where several share a voxel), and frames
@@ -140,7 +145,7 @@ class Comparison:
         )
 
     def against_paper(self) -> str:
-        """One line: the default here beside the paper's point queries on its own layout."""
+        """One line: `auto` on bricks beside the paper's point queries on its layout of voxels."""
         felt = {measured.imported.layout: measured.felt for measured in self.layouts}
         ours, theirs = felt["brick"]["auto"].median_us, felt["voxel"][YARDSTICK].median_us
         return (
@@ -165,7 +170,7 @@ def prepare(
     folder : path
         Where everything goes; made when it does not exist.
     url : str or None
-        Where the environments go instead: beside the one that it names, which is left alone.
+        Environment beside which the demo's are made; it is not changed. None: in `folder`.
     bits : int
         Bits an axis of the grid.
     frames : int
@@ -245,13 +250,16 @@ def compare(scene: DemoScene) -> Comparison:
 def _race(
     env: Environment, scene: DemoScene, reference: list[Any], disagreed: list[str]
 ) -> dict[Strategy, StrategyFigures]:
-    """Time of every strategy; what each pose found is held against `reference`, filled first."""
+    """Figures of every strategy. Each pose's answer is compared with `reference`.
+
+    The first layout's first strategy fills `reference`; differences are added to `disagreed`.
+    """
     for strategy in COMPARED:
         for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
             env.touch(scene.shell, pose, strategy)
     felt: dict[Strategy, StrategyFigures] = {strategy: StrategyFigures() for strategy in COMPARED}
     for index, pose in enumerate(scene.poses):
-        # whoever goes first at a pose brings its pages in for the others: they take turns
+        # the first strategy at a pose brings its pages into the cache: they take turns at it
         turn = index % len(COMPARED)
         for strategy in COMPARED[turn:] + COMPARED[:turn]:
             touched = env.touch(scene.shell, pose, strategy)
@@ -275,7 +283,7 @@ def _found(touched: Touch) -> tuple[bytes, bytes, bytes, tuple[int, ...]]:
 
 
 def trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) -> Trace:
-    """Feel a path once, and keep where the hits were."""
+    """Touch along a path once, and keep force, hits and their places."""
     force, hits, points, ids, frames = [], [], [], [], []
     for index, pose in enumerate(poses):
         touched = env.touch(shell, pose)
@@ -305,11 +313,11 @@ def write_along(
             home.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise FileError(f"cannot make the folder {home}: {error.strerror}") from error
-        # as large beside the scene as the wrench is beside the sample car
+        # the same share of the scene's length as of the sample car's
         bounds = np.array([obj.bounds for obj in env.objects()] or [np.zeros((2, 3))])
         longest = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
         wrench = write_wrench(home, longest / SAMPLE_LENGTH or 1.0)
-        # the points that will be looked up: where the mesh alone touches, none of them may
+        # the shell's points, not the mesh: where only the mesh touches, no point would hit
         poses = slide_along(env, PointShell.from_file(wrench).points, frames)
     write_poses(home / "path.csv", poses)
     return wrench, home / "path.csv"
@@ -320,7 +328,7 @@ def slide_along(
 ) -> NDArray[np.float64]:
     """Poses (frames, 4, 4) that slide a tool over the largest objects of an environment.
 
-    Their voxels are thinned to a map that fits in memory, whatever the grid.
+    The path follows a map of the voxels' heights, whose size does not depend on the grid.
     """
     chosen, total = [], 0
     for obj in sorted(env.objects(), key=lambda obj: (-obj.voxels, obj.id)):

@@ -1,4 +1,4 @@
-"""Reading the measured cells of a result: numbers that may be missing, in the house's order."""
+"""Reading measured cells: any number may be missing, and values have one fixed order."""
 
 import math
 import re
@@ -25,7 +25,7 @@ PAPER_POINT: Mapping[str, Any] = {
     "shell": "sphere",
     "points": 300,
 }
-"""What holds where an experiment varies something else: the point that all others stand around."""
+"""Conditions of the paper's experiments. An experiment varies one of them and keeps the others."""
 ORDERS: Mapping[str, Sequence[str]] = {
     "engine": ("SQLite", "PostgreSQL"),
     "layout": ("brick", "voxel"),
@@ -45,7 +45,7 @@ NAMES: Mapping[str, str] = {
     "maxgap": "MaxGap",
     "cbgroup": "CBGroup",
 }
-"""What prose and plots call them; the rest is called what it is."""
+"""Names in text and plots. A value that is not listed is shown as it is."""
 WHERE = (
     "environment",
     "engine",
@@ -58,11 +58,11 @@ WHERE = (
     "points",
     "region",
 )
-"""Within one of these combinations, times stand side by side."""
+"""Conditions of a cell. Times are compared only where all of these are equal."""
 
 
 def cells_of(results: Results, name: str) -> list[Cell]:
-    """Cells of an experiment without what they leave empty; none when it was not run."""
+    """Cells of an experiment, without their empty values; no cells when it was not run."""
     cells = results.get(name, {}).get("cells") or ()
     return [{key: value for key, value in cell.items() if _is_said(value)} for cell in cells]
 
@@ -102,12 +102,12 @@ def word(cell: Cell, key: str) -> str:
 
 
 def form_of(cell: Cell) -> str:
-    """Whether all ranges went in one statement, as they do unless a cell says otherwise."""
+    """How the ranges were sent: in one statement, unless the cell says otherwise."""
     return word(cell, "form") or ONE_STATEMENT
 
 
 def named(value: object) -> str:
-    """What prose calls a layout, curve or strategy."""
+    """Name of a layout, curve or strategy in text and plots."""
     return NAMES.get(str(value), str(value))
 
 
@@ -146,14 +146,14 @@ def _pieces(value: object) -> list[tuple[int, float, str]]:
 
 
 def grouped(cells: Iterable[Cell], keys: Sequence[str]) -> dict[tuple[Any, ...], list[Cell]]:
-    """Cells by the values of some keys, which None stands for where missing; in the house's order.
+    """Cells by the values of some keys, in the order of `distinct`; None is a missing value.
 
     Parameters
     ----------
     cells : iterable of Cell
-        What is sorted.
+        The cells to group.
     keys : sequence of str
-        The first varies slowest.
+        Keys of a group; the first varies slowest.
     """
     every = list(cells)
     orders = [[*distinct(every, key), None] for key in keys]

@@ -25,10 +25,11 @@ more contests as close, and widens the plateaus."""
 
 @dataclass(frozen=True)
 class Contest:
-    """MaxGap and CBGroup side by side in one form, under the same conditions.
+    """MaxGap and CBGroup under the same conditions and in the same form.
 
-    where : conditions by name; form : of both; curve : MaxGap's cells by ascending MAXGAP; best :
-    the fastest of them; cbgroup, array : the cells of these strategies, `array` if any.
+    where : conditions by name; form : one statement, or a loop in the server; curve : MaxGap's
+    cells by ascending MAXGAP; best : the fastest of them; cbgroup, array : cells of these
+    strategies, `array` None where it was not measured.
     """
 
     where: Mapping[str, Any]

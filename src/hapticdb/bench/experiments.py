@@ -17,11 +17,15 @@ from hapticdb.query.quantiles import QuantileVector
 GAPS = (0, 10, 30, 100, 300, 500, 1000, 3000, 10_000, 30_000, 100_000, 1_000_000)
 """MAXGAP of Figure 9, in voxel keys; 500 is the paper's."""
 RESOLUTIONS = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
-"""Of Figure 8; all divide the largest, so that each vector is a part of that one."""
+"""Buckets of the quantile vectors of Figure 8. All divide the largest number, so that each vector's
+bounds are among those of the finest."""
 SHELLS = (300, 1000, 10_000, 100_000)
+"""Points of the shells whose size is varied."""
 MOST_POINTS: dict[Strategy, int] = {"points": 1000, "statement": 10_000}
-"""Larger shells are left out: a frame would take seconds."""
+"""Points of the largest shell that a strategy is measured with; a larger one would take seconds a
+frame. Strategies that are not listed have no limit."""
 PAPERS_GAP = 500
+"""The paper's MAXGAP, voxel keys."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +33,9 @@ class Budget:
     """How much is measured.
 
     cell_s : seconds of frames that one alternative may take; frames : poses of a task; tail :
-    frames from which the slowest are told; cold : frames with empty caches; windows : for regions.
+    frames of the experiment on the slowest frames; cold : frames with empty caches; windows :
+    windows whose density is measured to choose regions; gaps, resolutions, shells : values of the
+    experiments.
     """
 
     cell_s: float = 1.5
@@ -57,7 +63,7 @@ QUICK = Budget(
 def figure_8(subject: Subject, task: Task, finest: QuantileVector, budget: Budget) -> list[Cell]:
     """Query time by CBGroup against the resolution of the quantile vector, grouping apart.
 
-    finest : the vector of the largest resolution, of which all others are parts.
+    finest : the vector of the largest resolution; the bounds of all others are among its bounds.
     """
     alternatives = []
     grouping_us = []
@@ -77,7 +83,7 @@ def figure_8(subject: Subject, task: Task, finest: QuantileVector, budget: Budge
 
 
 def coarsened(finest: QuantileVector, resolution: int) -> QuantileVector:
-    """The vector of a resolution that divides the finest: its bounds are among that one's.
+    """The vector of a coarser resolution, which divides the finest one.
 
     Bound i of R has rank ceil(i N / R), and so has bound i F / R of F.
     """
@@ -113,7 +119,7 @@ def figure_9(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
 def figure_10(
     subject: Subject, shell_task: Task, regions: Sequence[Region], budget: Budget
 ) -> list[Cell]:
-    """The same in regions of low, middle and high density."""
+    """Figure 9's strategies in regions of low, middle and high density."""
     cells = []
     for region in regions:
         task = Task(
@@ -124,7 +130,7 @@ def figure_10(
 
 
 def _maxgap_and_others(subject: Subject, task: Task, budget: Budget) -> list[Alternative]:
-    """MaxGap over MAXGAP, and what it stands beside."""
+    """MaxGap for each MAXGAP, and the strategies that it is compared with."""
     gaps = [subject.alternative(task, "maxgap", gap=gap) for gap in budget.gaps]
     return gaps + [subject.alternative(task, name) for name in ("cbgroup", "array", "auto")]
 
@@ -138,7 +144,7 @@ def strategies(subject: Subject, tasks: Sequence[Task], budget: Budget) -> list[
 
 
 def points(subject: Subject, budget: Budget) -> list[Cell]:
-    """Shells of more points, as dense on a larger sphere: its radius grows with their root."""
+    """Spheres of more points at the same density: the radius grows with their number's root."""
     cells = []
     grid = subject.env.grid
     for n_points in budget.shells:
@@ -160,21 +166,21 @@ def points(subject: Subject, budget: Budget) -> list[Cell]:
 
 
 def tail(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
-    """Enough frames to speak of the slowest in a thousand: the poses over and over."""
+    """Enough frames for the slowest in a thousand: the poses are repeated."""
     times = -(-budget.tail // len(task.poses))
     poses = np.tile(task.poses, (times, 1, 1))[: budget.tail]
     often = Task(task.name, task.tool, task.shell, poses)
     alternatives = [subject.alternative(often, name) for name in ("array", "cbgroup", "auto")]
-    # the cells' limit is for what is slow; here the number of frames is the point
+    # a higher limit: this experiment needs all its frames
     return in_turns(alternatives, poses, limit_s=20 * budget.cell_s)
 
 
 COMPARED: tuple[Strategy, ...] = ("array", "maxgap", "cbgroup", "auto")
-"""Under several conditions."""
+"""Strategies that are compared under several caches, layouts and curves."""
 
 
 def cached(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
-    """A few strategies with the file in the operating system's cache."""
+    """The compared strategies with the file in the operating system's cache."""
     alternatives = _each(subject, task, COMPARED)
     return in_turns(alternatives, task.poses, limit_s=budget.cell_s)
 

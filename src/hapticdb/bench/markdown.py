@@ -13,7 +13,7 @@ NONE = "-"
 
 
 def us_text(value: float | None) -> str:
-    """Microseconds to three digits or so."""
+    """Microseconds to two or three digits."""
     if value is None:
         return NONE
     if value >= 99.5:
@@ -33,14 +33,14 @@ def ratio_text(value: float | None) -> str:
 
 
 def count_text(value: float | None) -> str:
-    """Whole number with its thousands apart; small means keep a place."""
+    """Whole number with commas; a number below 100 that is not whole keeps one decimal."""
     if value is None:
         return NONE
     return f"{value:,.1f}" if value < 100 and value != round(value) else f"{value:,.0f}"
 
 
 def bytes_text(value: float | None) -> str:
-    """Size in the unit that leaves few digits."""
+    """Bytes in the largest unit below it, three digits."""
     if value is None:
         return NONE
     for size, unit in ((1e9, "GB"), (1e6, "MB"), (1e3, "kB")):

@@ -1,4 +1,4 @@
-"""Timing alternatives side by side: in turns, so that a machine's drift falls on all alike."""
+"""Timing alternatives in turns, so that a slow phase of the machine slows all of them alike."""
 
 import time
 from collections import Counter
@@ -12,10 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.query.frame import Query
 
 FRAMES_FOR_P999 = 10_000
-"""Fewer frames say nothing of the slowest in a thousand."""
+"""Frames that a cell needs for its p99.9: then ten frames are slower than that."""
 CHUNK = 20
-"""Poses that an alternative runs before the next one's turn."""
+"""Poses that an alternative runs in one turn. More poses warm the processor's caches better and let
+the machine drift further between turns."""
 WARM_FRAMES = 20
+"""Untimed frames of each alternative before the first turn. More take longer and change little."""
 SEED = 0
 """Of the order in which alternatives take turns."""
 
@@ -28,8 +30,8 @@ Pose = NDArray[np.float64]
 class Alternative:
     """One way to answer a frame, and what its frames took.
 
-    cell : what is known of it beforehand; frame : pose -> Query; before : run, untimed, before each
-    frame, when given.
+    cell : what its cell says before anything is measured; frame : pose -> Query; before : called
+    before each frame and not timed, or None.
     """
 
     cell: Mapping[str, Any]
@@ -43,8 +45,8 @@ class Alternative:
     def run(self, poses: NDArray[np.float64], indices: Sequence[int], limit_s: float) -> None:
         """Measure some poses, until the time is spent.
 
-        The pose before them goes first, untimed: its frame finds the processor's caches full of
-        the others' work.
+        One frame runs first and is not timed, at the pose before them: it finds the processor's
+        caches full of the other alternatives' data.
         """
         if self.before is None and self.spent_s <= limit_s:
             self.frame(poses[indices[0] - 1])
@@ -62,7 +64,10 @@ class Alternative:
             self.spent_s += elapsed_us / 1e6
 
     def record(self, asked_rows: Sequence[int] | None = None) -> Cell:
-        """Everything measured; false rows beside the rows that were asked for, a number a pose."""
+        """The cell with everything measured.
+
+        asked_rows : rows under each pose's own keys; what is read beyond them is a false row.
+        """
         queries = self.queries
         found: Cell = {
             **self.cell,
@@ -96,7 +101,8 @@ def in_turns(
     poses : (M, 4, 4)
         world_from_tool.
     limit_s : float
-        Seconds of frames that each may take; who is stopped by it is marked `cut_short`.
+        Seconds of frames that each may take. An alternative that reaches it stops, and its cell is
+        marked `cut_short`.
     warm : int
         Untimed frames of each before.
     asked_rows : (M,) ints, optional
@@ -104,10 +110,10 @@ def in_turns(
 
     Notes
     -----
-    Poses are cut into chunks, and every alternative runs each chunk once, another one than its
-    neighbours run at that time, in an order drawn anew for each chunk: so a page that one has
-    brought into the cache is not at once used by the next, and what disturbs the machine for a
-    while falls on all alike.
+    The poses are cut into chunks. Every alternative runs each chunk once. In one turn the
+    alternatives run different chunks, in an order drawn anew for each turn. So an alternative does
+    not profit from pages that the one before it has just brought into the cache, and what disturbs
+    the machine for a while disturbs all of them.
     """
     for alternative in alternatives:
         started = time.perf_counter()
@@ -133,9 +139,9 @@ def in_turns(
 def summary(times_us: ArrayLike) -> dict[str, float | None]:
     """Mean, percentiles and worst of frame times (N,), microseconds.
 
-    `typical` is the mean of what lies between the 5th and the 95th percentile: as steady as a
-    median, and, like a mean, it counts every kind of pose by its share. `p99.9` is None below
-    10,000 frames.
+    `typical` is the mean of the times between the 5th and the 95th percentile. It varies as little
+    as a median between runs, and counts every kind of pose by its share, as a mean does.
+    `p99.9` is None below 10,000 frames.
     """
     times = np.sort(np.asarray(times_us, dtype=np.float64))
     if not times.size:

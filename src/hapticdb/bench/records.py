@@ -52,7 +52,7 @@ def result(
 
 
 def make_folder(folder: Path) -> None:
-    """Make a folder for results, and find out before they are measured that it cannot be."""
+    """Make a folder for results before any measurement; FileError when it cannot be written."""
     try:
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ".tried").touch()
@@ -95,7 +95,7 @@ def read(folder: Path) -> dict[str, dict[str, Any]]:
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers depend on; no name of the machine or its owner."""
+    """Processor, memory and system. It names neither the machine nor its owner."""
     return {
         "processor": _processor(),
         "processors": os.cpu_count(),
@@ -133,7 +133,7 @@ def commit(root: Path = ROOT) -> str:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what took part; an extra that is not installed is left out."""
+    """Versions of the packages that take part; those that are not installed are left out."""
     found = {}
     for name in PACKAGES:
         try:

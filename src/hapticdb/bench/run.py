@@ -29,17 +29,17 @@ from hapticdb.store.base import SupportsCaches, SupportsServer
 from hapticdb.warm import warm_up
 
 ALL_BYTES = 2 << 30
-"""A cache that holds every page of most environments; memory is taken as it is filled."""
+"""Bytes of a cache that holds every page of most environments; it takes memory as it is filled."""
 PAGE = "evaluation.md"
 """Name of the page in the folder of results."""
 
 Say = Callable[[str], None]
-"""Told, in a line, what comes next."""
+"""Called with a line that says what is measured next."""
 
 
 @dataclass(frozen=True)
 class Workload:
-    """What is asked of every subject of one environment."""
+    """Tasks and regions of one environment, the same under all conditions."""
 
     slide: Task
     random: Task
@@ -49,7 +49,7 @@ class Workload:
 
     @property
     def tasks(self) -> tuple[Task, ...]:
-        """Those over the whole environment."""
+        """Tasks over the whole environment; without the recorded one where none was given."""
         return tuple(task for task in (self.slide, self.random, self.recorded) if task)
 
 
@@ -79,7 +79,7 @@ def paper_figures(subject: Subject, work: Workload, budget: Budget) -> dict[str,
 def measured(
     subject: Subject, work: Workload, budget: Budget, *, is_paper: bool
 ) -> dict[str, list[Cell]]:
-    """All experiments at the paper's point; with another cache those that it changes."""
+    """All experiments under the paper's cache; under another cache only those that depend on it."""
     cells = (
         paper_figures(subject, work, budget)
         if is_paper
@@ -92,7 +92,7 @@ def measured(
 def under_conditions(
     subject: Subject, work: Workload, budget: Budget, *, is_first: bool
 ) -> list[Cell]:
-    """A few strategies, for the comparison of caches: as they are, and once with all emptied."""
+    """The compared strategies under this cache; with `is_first`, with emptied caches, too."""
     cells = experiments.cached(subject, work.slide, budget)
     return [*cells, *experiments.cold(subject, work.slide, budget)] if is_first else cells
 
@@ -119,7 +119,7 @@ def bench(
     shell, poses : PointShell and (M, 4, 4), optional
         A tool of one's own along a recorded path, measured beside the sphere.
     say : callable, optional
-        Told what comes next.
+        Called with a line that says what is measured next.
 
     Returns
     -------
@@ -152,9 +152,9 @@ def bench(
 
 
 def caches_of(env: Environment) -> Iterator[tuple[str, bool]]:
-    """Give the connection each size of cache in turn: its name, and whether it is the paper's.
+    """Set the cache to each size in turn; give its name, and whether it is the paper's.
 
-    A server has the cache that it has, and a small environment is all cached from the start.
+    A server's cache is not changed. An environment that fits into the paper's cache has one size.
     """
     first = limited(env, PAPER_CACHE)
     yield first, True
@@ -163,7 +163,7 @@ def caches_of(env: Environment) -> Iterator[tuple[str, bool]]:
 
 
 def drop_of(env: Environment) -> Callable[[], None] | None:
-    """What empties all caches of an environment, where this process can."""
+    """Function that empties all caches of an environment; None where this process cannot."""
     return env.store.drop_caches if isinstance(env.store, SupportsCaches) else None
 
 

@@ -1,4 +1,4 @@
-"""What is measured: an opened environment under stated conditions, and ways to ask it a frame."""
+"""An opened environment under stated conditions, and the alternatives that are measured on it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import Store, SupportsCaches, SupportsServer
 
 PAPER_CACHE = 4 << 20
-"""500 blocks of 8 KB."""
+"""Bytes of the paper's database cache: 500 blocks of 8 KB."""
 ALL_CACHED = "all cached"
 CURVES = {"z": "z-order", "hilbert": "hilbert", "lexicographic": "lexicographic"}
 
@@ -27,8 +27,8 @@ CURVES = {"z": "z-order", "hilbert": "hilbert", "lexicographic": "lexicographic"
 class Subject:
     """An opened environment under stated conditions.
 
-    name : of the environment; cache : of the database, as plots say it; drop : empties all caches,
-    where that can be done.
+    name : the environment's; cache : size of the database's cache, as plots show it; drop : empties
+    all caches, or None where this process cannot.
     """
 
     env: Environment
@@ -38,12 +38,12 @@ class Subject:
 
     @cached_property
     def costs(self) -> CostModel:
-        """Fitted under these conditions; not kept, since the conditions are not."""
+        """Cost model fitted under these conditions. It is not stored: they end with the run."""
         return calibrate(self.env.store)
 
     @cached_property
     def quantiles(self) -> QuantileVector:
-        """As `cbgroup` and `auto` use them."""
+        """Quantile vector that `cbgroup` and `auto` use."""
         return self.env.quantiles()
 
     @cached_property
@@ -79,7 +79,7 @@ class Subject:
 
     @cached_property
     def looping_query(self) -> HapticQuery | None:
-        """Frames whose ranges are scanned by a loop inside the server, by costs fitted to that."""
+        """Frames whose ranges a loop inside the server scans, with costs fitted to that loop."""
         if self.looping is None:
             return None
         statistics = (self.quantiles, calibrate(self.looping))
@@ -94,7 +94,7 @@ class Subject:
         query: HapticQuery | None = None,
         **more: Any,  # noqa: ANN401 - what a cell says is JSON's
     ) -> Alternative:
-        """A strategy over a task; `gap` is the strategy maxgap's."""
+        """A strategy over a task. `gap` is MAXGAP, for the strategy maxgap alone."""
         cell = {
             **self.conditions(task),
             "strategy": strategy,
@@ -120,9 +120,9 @@ def asking(
 
 
 def limited(env: Environment, size_bytes: int) -> str:
-    """Leave a connection so much cache, where it has its own; what plots call that.
+    """Limit the connection's cache, and return how plots name its size.
 
-    A server's cache is its own: what it is set to is told.
+    A server has one cache for all connections: it is not changed, and its size is named.
     """
     if isinstance(env.store, SupportsCaches):
         env.store.limit_cache(size_bytes)

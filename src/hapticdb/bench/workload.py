@@ -1,4 +1,4 @@
-"""What the experiments ask: shells, poses and regions, all fixed by a seed.
+"""Shells, poses and regions of the experiments, all fixed by a seed.
 
 Everything is drawn from the environment's own surface, so that the same experiments run on any.
 """
@@ -21,12 +21,17 @@ from hapticdb.store.base import row_shift
 POINTS = 300
 """The paper's PointShell."""
 RADIUS_VOXELS = 12.0
+"""Radius of the sphere with that many points, voxels. A larger one spreads the points farther."""
 POSES = 1000
+"""Poses of a task, unless a budget says otherwise."""
 WINDOW = 64
 """Edge of the windows whose density is measured, voxels."""
 WINDOWS = 400
+"""Windows whose density is measured. More find the percentiles more exactly, and take longer."""
 PERCENTILES = {"low": 10, "middle": 50, "high": 90}
+"""Percentile of the windows' densities that each region stands for."""
 SEED = 20
+"""Of all random poses and windows."""
 
 Poses = NDArray[np.float64]
 
@@ -35,8 +40,8 @@ Poses = NDArray[np.float64]
 class Task:
     """A shell and where it goes.
 
-    name : ``slide``, ``random`` or ``recorded``; tool : ``sphere`` or what the shell was made from;
-    region and density : of the window that the poses stay in, if they do.
+    name : ``slide``, ``random`` or ``recorded``; tool : ``sphere``, or what the shell was made
+    from; region, density : name and density of the window that the poses stay in, if any.
     """
 
     name: str
@@ -58,7 +63,7 @@ class Region(NamedTuple):
 def sphere_shell(
     voxel_size: float, points: int = POINTS, radius_voxels: float = RADIUS_VOXELS
 ) -> PointShell:
-    """Shell of a sphere as large, in voxels, in every environment."""
+    """Shell of a sphere whose size in voxels is the same in every environment."""
     return PointShell.sphere(radius_voxels * voxel_size, points)
 
 

@@ -29,28 +29,30 @@ SIZE = (1600, 1000)
 """Pixels of the picture; the scene fills the upper part."""
 SCENE = (1600, 740)
 WINDOW = ((170, 30), (1480, 712))
-"""Corners of what the parts fill of it."""
+"""Corners of the part of the scene that the objects fill, pixels."""
 SAMPLES = 2
-"""Pixels an axis of the scene for each one shown: edges come out smooth."""
+"""Pixels drawn for each pixel shown, an axis. More make smoother edges and take longer."""
 PAPER = "#0f1419"
 INK = "#d7dde4"
 FAINT = "#7d8896"
 BODY = "#6f7b89"
 REST = "#b9c2cc"
 COLORS = ("#ffb000", "#35c6f4", "#ff5d73", "#7ee081", "#c792ff", "#ff8f4d")
-"""Of the objects touched most, which are told apart by it; the rest is `REST`."""
+"""Of the objects touched most, one each; all others have the colour `REST`."""
 AXES = ("x", "y", "z")
 TOOLS_SHOWN = 9
+"""Poses at which the tool is drawn."""
 HITS_SHOWN = 30_000
+"""Hits drawn at most, evenly along the path."""
 LEGEND = 1480.0
-"""Pixels that the names of objects may take in all, in a line above the force."""
+"""Pixels that all names of objects may take together, in a line above the force."""
 TOWARDS = (0.50, 0.76, 0.44)
-"""From the scene to the eye: ahead, to the left, above."""
+"""Direction from the scene to the eye: ahead, to the left, above."""
 
 
 @dataclass(frozen=True)
 class Palette:
-    """Colours by object id, of those touched most, most first."""
+    """Colours and names by object id, of the objects touched most; the most touched first."""
 
     colors: dict[int, str]
     names: dict[int, str]
@@ -94,7 +96,7 @@ def _palette(env: Environment, trace: "Trace") -> Palette:
 
 
 def up_axis(objects: Iterable[Object]) -> int:
-    """Axis that points up in a scene, 0 to 2, by most voxels; z where files do not say."""
+    """Axis that points up in a scene, 0 to 2: that of most voxels; z for files that name none."""
     votes = np.zeros(3)
     for obj in objects:
         said = obj.attributes.get("up")
@@ -141,7 +143,7 @@ def mixed(one: str, other: str, share: float) -> tuple[float, float, float]:
 def _draw_path(
     axes: Axes, camera: Camera, scene: "DemoScene", trace: "Trace", palette: Palette
 ) -> None:
-    """Hits as points in the colour of their object, the tool at a few poses, and its way."""
+    """Hits as points in the colour of their object, the tool at a few poses, and its path."""
     step = max(1, len(trace.points) // HITS_SHOWN)
     places = camera.project(trace.points[::step])[:, :2] / SAMPLES
     colors = [palette.of(i) for i in trace.ids[::step].tolist()]
@@ -204,7 +206,7 @@ def _draw_words(figure: Figure, scene: "DemoScene", comparison: "Comparison") ->
 
 
 def _draw_force(axes: Axes, trace: "Trace", palette: Palette) -> None:
-    """Force over time at a thousand frames a second, the object hit most as a ribbon below."""
+    """Force over time at 1000 frames a second, filled in the colour of the object hit most."""
     axes.set_facecolor(PAPER)
     time = np.arange(len(trace.force))
     top = max(float(trace.force.max(initial=0.0)), 1e-9)

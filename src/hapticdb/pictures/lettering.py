@@ -1,4 +1,4 @@
-"""Words in pictures: as wide as they are drawn, shortened where they would run over others."""
+"""Words in pictures: measured as they are drawn, and shortened where they are too wide."""
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import FigureBase
@@ -28,10 +28,10 @@ def width_of(figure: FigureBase, words: str, size: float) -> float:
 
 
 def shortened(figure: FigureBase, words: str, size: float, most: float) -> str:
-    """Words in at most so many pixels: what is too long loses its middle."""
+    """Words that take at most `most` pixels; the middle of longer ones is left out."""
     if width_of(figure, words, size) <= most:
         return words
-    low, high = 0, len(words) - 1  # letters that are kept: low fits, or nothing does
+    low, high = 0, len(words) - 1  # letters that are kept; `low` fits, if any number does
     while low < high:
         kept = (low + high + 1) // 2
         if width_of(figure, without_middle(words, kept), size) <= most:
@@ -42,7 +42,7 @@ def shortened(figure: FigureBase, words: str, size: float, most: float) -> str:
 
 
 def without_middle(words: str, kept: int) -> str:
-    """Words with so many of their letters, half from either end, and an ellipsis between."""
+    """Words with `kept` of their letters, half from either end, and an ellipsis between."""
     head = (kept + 1) // 2
     tail = kept - head
     return words[:head].rstrip() + ELLIPSIS + (words[len(words) - tail :].lstrip() if tail else "")

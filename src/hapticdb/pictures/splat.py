@@ -12,12 +12,13 @@ Image = NDArray[np.float32]
 
 FAR = np.iinfo(np.int64).max
 NUMBER_BITS = 20
-"""Bits of a buffer's entry that name the object; the depth is above them."""
+"""Bits of a buffer's entry that hold the object's number; the depth stands above them."""
 DEPTH_STEPS = 1 << 40
+"""Steps between near and far. With the number they fit into an int64."""
 SUN, SIDE = (0.30, 0.45, 0.84), (0.95, 0.1, 0.2)
-"""Where light comes from: ahead, left, up."""
+"""Directions of the two lights: ahead, left, up."""
 CHUNK = 1_000_000
-"""Voxels splatted at a time."""
+"""Voxels drawn at a time. More take more memory."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Depths(NamedTuple):
 
     @classmethod
     def empty(cls, camera: Camera) -> "Depths":
-        """Nothing anywhere."""
+        """Buffer without voxels."""
         return cls(np.full(camera.size[::-1], FAR, dtype=np.int64))
 
 
@@ -130,14 +131,14 @@ def shade(depths: Depths, camera: Camera, tints: Floats, paper: Floats, size: fl
 
     Notes
     -----
-    The staircase of the voxels is smoothed away, but for steps of more than a few voxels: those are
-    edges. What lies behind its surroundings is darkened (unsharp masking of the depths).
+    Steps of a few voxels are smoothed; larger ones are edges and stay. Places behind their
+    surroundings are darkened (unsharp masking of the depths).
     """
     image = _backdrop(camera, paper)
     rows, columns = np.nonzero(depths.nearest != FAR)
     if len(rows) == 0:
         return image
-    # twice the widest blur around what is seen: the rest is backdrop
+    # only the part that holds voxels, and twice the widest blur around it
     seen = tuple(
         slice(max(int(index.min()) - 80, 0), int(index.max()) + 80) for index in (rows, columns)
     )
@@ -171,9 +172,9 @@ def turned(direction: Floats, up: int) -> Floats:
 
 
 def faded(image: Image, camera: Camera, paper: Floats, margin: int) -> Image:
-    """Image (height, width, 3) that goes over into the backdrop within so many pixels of its edges.
+    """Image (height, width, 3) that fades into the backdrop within `margin` pixels of its edges.
 
-    So that a scene that goes on beyond the picture is not cut.
+    A scene that continues beyond the picture is then not cut off.
     """
     height, width = image.shape[:2]
     across = np.minimum(np.arange(width), np.arange(width)[::-1])
@@ -212,9 +213,9 @@ def _smoothed(metres: Image, is_hit: NDArray[np.bool_], reach: int, edge: float)
         total, weight = result.copy(), np.ones_like(result)
         for shift in shifts:
             moved = np.roll(result, shift, axis=axis)
-            # falls off where the depth steps, and along the window
+            # less weight beyond a step in depth, and farther along the window
             step = (moved - result) * np.float32(1 / edge)
-            step *= step  # a power of four by numpy takes longer than all the rest
+            step *= step  # squared twice: numpy's power of four takes longer than all the rest
             near = np.float32(1.0 - 0.7 * (shift / reach) ** 2) / (1 + step * step)
             total += near * moved
             weight += near

@@ -1,4 +1,4 @@
-"""The picture of a sweep: the tool's way through the voxels, its hits, the clearance along it."""
+"""The picture of a sweep: the tool's path through the voxels, its hits, the clearance along it."""
 
 import os
 from collections.abc import Iterable
@@ -36,22 +36,23 @@ from hapticdb.sweeps.result import Moment, Swept
 from hapticdb.units import length_text, readable_unit
 
 WINDOW = ((60, 105), (1540, 690))
-"""Corners of what the path and its surroundings fill of the scene."""
+"""Corners of the part of the scene that the path and its surroundings fill, pixels."""
 CLOSE_UP = 3.0
-"""Lengths of the way up to which all of the scene is shown; of a larger one, the surroundings."""
+"""The whole scene is shown up to so many lengths of the path; of a larger one, the surroundings."""
 FADE = 90
-"""Pixels from the edges within which a scene fades that goes on beyond them."""
+"""Pixels from the edges within which a scene fades that continues beyond them."""
 LEFT, RIGHT, TOP, LINE = 35, 1565, 45, 24
-"""Of the words, pixels from the upper left corner, and from one name to the next."""
+"""Places of the words, pixels from the upper left corner; LINE: from one name to the next."""
 LEGEND = 380
-"""Pixels that the names of objects take at most."""
+"""Pixels that the name of an object takes at most."""
 ROOM = 0.1
-"""Around the tool at each pose, of the whole way's extent."""
+"""Room around the tool at each pose, as a share of the whole path's extent."""
 MOST_VOXELS = 30_000_000
-"""Of the objects drawn, the largest left out first when there are more."""
+"""Voxels drawn at most; the largest objects are left out first."""
 GHOSTS = 7
 """Poses at which the tool is shown."""
 GHOST_POINTS = 1500
+"""Points of the shell drawn at each of these poses, at most about twice as many."""
 MOST_TOUCHED = 300
 """Samples whose hits are shown."""
 LIFTS = (-9.0, 12.0, -26.0, 28.0, -44.0, 46.0)
@@ -59,8 +60,10 @@ BESIDE: list[tuple[float, float, Literal["left", "right"]]] = [
     *((9.0, lift, "left") for lift in LIFTS),
     *((-9.0, lift, "right") for lift in LIFTS),
 ]
-"""Where the words of a mark may stand: points to the right and up, and which end is there."""
+"""Where the words of a mark may stand: typographic points to the right and up, and the end of the
+words that stands there."""
 WAY = 400
+"""Samples of the path that are drawn at most. More follow a curved path better."""
 FREE, CAUGHT = "#ffffff", "#ff5d73"
 
 Floats = NDArray[np.float64]

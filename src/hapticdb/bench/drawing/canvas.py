@@ -1,4 +1,4 @@
-"""The one style of all plots: colours, type, a page with panels, axes of microseconds."""
+"""Style and layout of all plots: colours, type, panels, axes of microseconds."""
 
 import textwrap
 from collections.abc import Sequence
@@ -47,10 +47,11 @@ MARKERS = ("o", "s", "D", "^", "v")
 WIDTH = 9.2
 """Inches; 883 pixels where an SVG is shown at its own size."""
 LINE = 0.175
+"""Inches from one line of text to the next."""
 TEXT = 9.0
 """Points, 12 pixels: nothing is smaller."""
 LETTERS = 132
-"""Of such text in a line."""
+"""Letters of such text that fit in a line."""
 STYLE: dict[Any, Any] = {
     "font.family": ["sans-serif"],
     # an SVG names them all; text is laid out by the first, which is wider than the others
@@ -116,7 +117,7 @@ class Framing:
 
 
 def lay_out(framing: Framing, rows: int = 1, columns: int = 1) -> Canvas:
-    """Make a page with rows x columns empty panels."""
+    """Make a figure with rows x columns empty panels."""
     subtitle = _lines_of(framing.subtitle)
     notes = [line for note in framing.notes for line in textwrap.wrap(note, LETTERS)]
     in_row = _entries_in_a_row(framing.legend)
@@ -158,7 +159,10 @@ def _lines_of(conditions: str) -> list[str]:
 
 
 def _entries_in_a_row(legend: Sequence[Artist]) -> int:
-    """As many as fit; columns are filled from top to bottom, each as wide as its widest."""
+    """Entries of the legend in one row: as many as fit.
+
+    matplotlib fills columns from top to bottom; a column is as wide as its widest entry.
+    """
     widths = [0.078 * len(str(entry.get_label())) + 0.62 for entry in legend]
     for columns in range(len(widths), 1, -1):
         parts = np.array_split(np.array(widths), columns)
@@ -203,7 +207,7 @@ def entry(
 
 
 def head(axes: Axes, left: str, right: str = "") -> None:
-    """What a panel shows; at its right end what follows from it."""
+    """Title of a panel at its left end, and a figure that follows from it at its right end."""
     axes.set_title(left, loc="left", fontsize=TEXT, fontweight="bold", pad=7)
     if right:
         axes.set_title(right, loc="right", fontsize=TEXT, color=FAINT, pad=7)

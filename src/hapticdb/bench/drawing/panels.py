@@ -82,7 +82,7 @@ def by_layout_and_engine(plot: Plot, framing: Framing) -> tuple[Canvas, list[Pan
 def share_times(
     panels: Iterable[Panel], name: Literal["x", "y"], values: Sequence[float], label: str
 ) -> None:
-    """Give all panels the same axis of times, named at the outer ones alone."""
+    """Give all panels the same axis of times, with its name at the outer panels only."""
     for panel in panels:
         log_axis(panel.axes, name, values, unit="us")
         if name == "y":
@@ -163,7 +163,7 @@ def mark_millisecond(axes: Axes, name: Literal["x", "y"]) -> None:
 
 
 def millisecond_entry() -> Artist:
-    """Its sample in the legend."""
+    """Entry of the legend for the line of one millisecond."""
     return entry(MILLISECOND_ENTRY, INK, line=":", width=1.2)
 
 
@@ -173,6 +173,6 @@ def look_of(strategy: str) -> tuple[str, str]:
 
 
 def strategy_entries(strategies: Iterable[str], stroke: Stroke = "none") -> list[Artist]:
-    """A sample for each strategy."""
+    """Entries of the legend for some strategies."""
     looks = [(named(strategy), *look_of(strategy)) for strategy in strategies]
     return [entry(name, color, line=stroke, marker=marker) for name, color, marker in looks]

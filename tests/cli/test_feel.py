@@ -16,8 +16,9 @@ import hapticdb
 from children import PATIENCE, child, until
 from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.cli.values import size_bytes
-from hapticdb.recording.file import Frames, Recording
+from hapticdb.recording.file import Frames, Recorder, Recording
 from hapticdb.resident.table import is_alive
+from recordings import header
 
 ABOVE = "0,0,0.3"
 LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
@@ -231,6 +232,16 @@ def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
     assert scene.exists()
     refused(run("replay", "nowhere.hdbrec"), "no recording at nowhere.hdbrec")
     refused(run("replay", "path.csv"), "path.csv")
+
+
+def test_a_replay_that_compares_no_frame_says_so_and_fails(run: Run, scene: Path) -> None:
+    with hapticdb.open(scene) as env:
+        empty = header(environment=str(scene), grid=env.grid)
+    path = scene.with_name("empty.hdbrec")
+    Recorder(path, empty).close()
+    assert run("replay", path)[:2] == (1, "nothing to compare: 0 skipped (unknown or held)\n")
+    code, out, _ = run("replay", path, "--json")
+    assert (code, json.loads(out)["compared"]) == (1, 0)
 
 
 @pytest.mark.long

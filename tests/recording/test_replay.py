@@ -1,5 +1,6 @@
 """A session replayed is equal bit for bit, or parts at the frame where an edit is first felt."""
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import hapticdb
 from hapticdb import Environment, Grid, GridError, PointShell, TangentPlane
 from hapticdb.kernels.motion import poses_of
 from hapticdb.recording.file import FRAME, Frames, Header, Recorder, Recording, State
-from hapticdb.recording.replay import replay, touching
+from hapticdb.recording.replay import replay, resident, touching
 from hapticdb.testing import blob, floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0.0, 0.0, 0.0), 6)
@@ -73,6 +74,41 @@ def test_the_same_revision_gives_the_same_bits(env: Environment, session: Record
         found.describe() == "equal: 60 frames at the same revision 2, 0 skipped (unknown or held)"
     )
     assert seen == [25, 50, 60]
+
+
+def test_a_replay_asks_for_cells_and_feels_what_a_touch_of_each_frame_does(
+    env: Environment, session: Recording, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    header = session.header
+    asked = replay(session, env, touching(env, header.shell, header.law, header.exclude))
+    monkeypatch.setattr(Environment, "touch", None)
+    assert asdict(replay(session, env)) == asdict(asked)
+    poses = np.tile(np.eye(4), (50, 1, 1))
+    poses[:, :3, 3] = np.random.default_rng(2).uniform(0.05, 0.25, (50, 3))
+    monkeypatch.undo()
+    with resident(env, header.shell, header.law) as feel:
+        for found, wanted in zip(
+            feel(poses), touching(env, header.shell, header.law)(poses), strict=True
+        ):
+            assert found.tobytes() == wanted.tobytes()
+
+
+def test_an_environment_without_cells_is_replayed_by_touches(
+    tmp_path: Path, sphere: PointShell
+) -> None:
+    grid = Grid(0.005, (0.0, 0.0, 0.0), 6, "lexicographic")
+    with hapticdb.create(tmp_path / "lexicographic.db", grid, layout="voxel") as env:
+        write_voxels(env.store, floor_voxels(grid), "floor")
+        assert replay(record(tmp_path / "l.hdbrec", env, sphere, felt(env, sphere)), env).is_equal
+
+
+def test_a_recording_without_frames_is_not_equal(
+    tmp_path: Path, env: Environment, sphere: PointShell
+) -> None:
+    frames = felt(env, sphere)[:0]
+    found = replay(record(tmp_path / "empty.hdbrec", env, sphere, frames), env)
+    assert (found.n_compared, found.n_skipped, found.is_equal) == (0, 0, False)
+    assert found.describe() == "nothing to compare: 0 skipped (unknown or held)"
 
 
 def test_an_edit_elsewhere_is_not_felt(env: Environment, session: Recording) -> None:

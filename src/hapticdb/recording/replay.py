@@ -1,6 +1,7 @@
-"""A recorded session felt again: the same wrenches bit for bit, or the frame at which they part."""
+"""A replay: the wrenches of a recorded session computed again, and compared bit for bit."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -14,6 +15,9 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import TangentPlane
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
+from hapticdb.resident.frames import Frames as ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
 
 Floats = NDArray[np.float64]
 Feel = Callable[[Floats], tuple[Floats, NDArray[np.int64]]]
@@ -96,12 +100,8 @@ class Replayed:
 def touching(
     environment: Environment, shell: PointShell, law: TangentPlane, exclude: Iterable[int] = ()
 ) -> Feel:
-    """Feel by one touch of the database a pose: right, and slow.
-
-    Excluded objects that are gone are left out: nobody feels them.
-    """
-    present = {obj.id for obj in environment.objects()}
-    excluded = [i for i in exclude if i in present]
+    """Feel by one touch of the database a pose: independent of resident cells, and slow."""
+    excluded = _present(environment, exclude)
 
     def feel(poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
         wrenches = np.empty((len(poses), 6))
@@ -116,6 +116,34 @@ def touching(
     return feel
 
 
+@contextmanager
+def resident(
+    environment: Environment, shell: PointShell, law: TangentPlane, exclude: Iterable[int] = ()
+) -> Iterator[Feel]:
+    """Feel among resident cells, each of them fetched before it is needed: as fast as a session.
+
+    The wrenches and hits are those of `touching`, bit for bit. The memory is given back at the end.
+
+    Raises
+    ------
+    UsageError
+        When the environment is in lexicographic order, which has no cells.
+    """
+    with CellTable.create() as table:
+        residency = Residency(environment.store, table, _present(environment, exclude))
+        frames = ResidentFrames(residency, shell, law)
+        try:
+            yield frames.wrenches
+        finally:
+            frames.close()
+
+
+def _present(environment: Environment, ids: Iterable[int]) -> list[int]:
+    """Those of the ids that are objects of the environment: one that has gone is felt by nobody."""
+    present = {obj.id for obj in environment.objects()}
+    return [i for i in ids if i in present]
+
+
 def replay(
     recording: Recording,
     environment: Environment,
@@ -126,6 +154,8 @@ def replay(
 ) -> Replayed:
     """Compute the contact wrench of every recorded frame again, at the recorded pose of the tool.
 
+    Frames that held their wrench, or had points in unknown cells, are not compared.
+
     Parameters
     ----------
     recording : Recording
@@ -133,8 +163,9 @@ def replay(
     environment : Environment
         Where it was recorded, at whatever revision it is now.
     feel : callable or None
-        Computes wrenches and hits; asks the database frame by frame unless given. It stands for
-        the recording's shell, law and excluded objects.
+        Computes wrenches and hits with the recording's shell, law and excluded objects. Unless
+        given, frames are felt among resident cells, in 256 MiB of memory at most; an environment in
+        lexicographic order has no cells, and is asked frame by frame.
     until_damage : bool
         Compare the frames before a damaged chunk, and end there.
     progress : callable or None
@@ -153,13 +184,17 @@ def replay(
             f"{recording.path} was recorded on {header.grid.describe()}, and {environment.url} "
             f"has {environment.grid.describe()}: give the environment of {header.environment}"
         )
-    feel = feel or touching(environment, header.shell, header.law, header.exclude)
-    comparison = _Comparison(environment, feel)
-    for frames in recording.frames(until_damage=until_damage):
-        comparison.add(frames)
-        if progress is not None:
-            progress(comparison.n_done)
-    return comparison.result()
+    with ExitStack() as stack:
+        if feel is None:
+            felt = (environment, header.shell, header.law, header.exclude)
+            is_resident = environment.grid.is_hierarchical
+            feel = stack.enter_context(resident(*felt)) if is_resident else touching(*felt)
+        comparison = _Comparison(environment, feel)
+        for frames in recording.frames(until_damage=until_damage):
+            comparison.add(frames)
+            if progress is not None:
+                progress(comparison.n_done)
+        return comparison.result()
 
 
 class _Comparison:

@@ -77,22 +77,10 @@ def replay(
 def _replayed(session: "Recording", url: str | None, *, until_damage: bool) -> "Replayed":
     """Compute a recording's wrenches again."""
     import hapticdb
-    from hapticdb.recording.replay import replay as compare
-    from hapticdb.resident.frames import Frames
-    from hapticdb.resident.residency import Residency
-    from hapticdb.resident.table import CellTable
 
-    header = session.header
-    with hapticdb.open(url or header.environment, read_only=True) as env:
-        felt = None
+    with hapticdb.open(url or session.header.environment, read_only=True) as env:
         render.compile_kernels("replay")
-        if header.grid == env.grid:
-            present = {obj.id for obj in env.objects()}
-            residency = Residency(
-                env.store, CellTable.create(), [i for i in header.exclude if i in present]
-            )
-            felt = Frames(residency, header.shell, header.law).wrenches
-        return compare(session, env, felt, until_damage=until_damage)
+        return hapticdb.replay(session, env, until_damage=until_damage)
 
 
 def _write_frames(session: "Recording", target: str, *, until_damage: bool) -> None:

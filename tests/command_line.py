@@ -139,7 +139,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def scene(run: Run, made: Path, tmp_path: Path) -> Path:
     """A copy of the environment, tool and path of `made`; the file of boxes stays in its folder."""
-    assert callable(run)  # the environment lies in the folder where the command runs
+    del run  # has changed to the folder in which the environment is to be
     for name in ("scene.db", "tool.stl", "tool.npz", "path.csv"):
         shutil.copy(made / name, tmp_path)
     return tmp_path / "scene.db"

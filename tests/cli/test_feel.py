@@ -43,8 +43,8 @@ def feel(*args: object) -> tuple[object, ...]:
     return ("feel", "scene.db", "--tool", "tool.npz", *args)
 
 
-def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run, scene: Path) -> None:
-    assert scene.exists()
+@pytest.mark.usefixtures("scene")
+def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run) -> None:
     wish = feel("--device", "path.csv", "--seconds", 0.2)
     code, out, err = run(*wish)
     assert (code, err) == (0, "")
@@ -99,8 +99,8 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert (code, json.loads(out)["parts_at"]) == (1, int(parted[1]))
 
 
-def test_without_a_baseline_no_empty_loop_is_run(run: Run, scene: Path) -> None:
-    assert scene.exists()
+@pytest.mark.usefixtures("scene")
+def test_without_a_baseline_no_empty_loop_is_run(run: Run) -> None:
     wish = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.2)
     code, out, err = run(*wish, "--no-baseline")
     assert (code, err) == (0, "")
@@ -110,15 +110,15 @@ def test_without_a_baseline_no_empty_loop_is_run(run: Run, scene: Path) -> None:
     assert json.loads(run(*wish, "--json")[1])["empty"]["frames"] > 0
 
 
-def test_what_is_excluded_is_not_felt(run: Run, scene: Path) -> None:
-    assert scene.exists()
+@pytest.mark.usefixtures("scene")
+def test_what_is_excluded_is_not_felt(run: Run) -> None:
     code, out, _ = run(*feel(*PLAY, "--seconds", 0.3, "--exclude", "1,2", "--exclude", 3, "--json"))
     assert code == 0
     assert json.loads(out)["hit_frames"] == 0
 
 
-def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
-    assert scene.exists()
+@pytest.mark.usefixtures("scene")
+def test_a_simulated_device_is_pushed_back(run: Run) -> None:
     args = ("--device", "random", "--at", "0,0,0.05", "--seconds", 0.5, "--simulate", "--seed", 2)
     code, out, err = run(*feel(*args, "--policy", "wait", "--rate", 200, "--json"))
     assert (code, err) == (0, "")
@@ -126,6 +126,7 @@ def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
     assert report["unknown_frames"] == report["held_frames"] == 0
 
 
+@pytest.mark.usefixtures("scene")
 @pytest.mark.parametrize(
     ("args", "words"),
     [
@@ -174,9 +175,8 @@ def test_a_simulated_device_is_pushed_back(run: Run, scene: Path) -> None:
     ],
 )
 def test_a_mistake_is_one_line_and_leaves_no_process(
-    run: Run, scene: Path, args: list[object], words: list[str]
+    run: Run, args: list[object], words: list[str]
 ) -> None:
-    assert scene.exists()
     before = children()
     refused(run(*feel(*args)), *words)
     assert children() == before
@@ -228,8 +228,8 @@ def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) 
     assert (code, out.startswith("equal: "), err) == (0, True, "")
 
 
-def test_a_replay_of_nothing_is_one_line(run: Run, scene: Path) -> None:
-    assert scene.exists()
+@pytest.mark.usefixtures("scene")
+def test_a_replay_of_nothing_is_one_line(run: Run) -> None:
     refused(run("replay", "nowhere.hdbrec"), "no recording at nowhere.hdbrec")
     refused(run("replay", "path.csv"), "path.csv")
 

@@ -199,9 +199,9 @@ def test_other_grids_are_a_difference(run: Run, scene: Path) -> None:
     refused(run("copy", scene, "b.db"), "another grid")
 
 
+@pytest.mark.usefixtures("scene")
 @pytest.mark.parametrize("args", [["scene.db", "none.db"], ["none.db", "scene.db"]])
-def test_a_diff_with_nothing_is_an_error(run: Run, scene: Path, args: list[str]) -> None:
-    assert scene.exists()
+def test_a_diff_with_nothing_is_an_error(run: Run, args: list[str]) -> None:
     refused(run("diff", *args), "no environment at none.db")
 
 
@@ -229,8 +229,8 @@ def test_a_copy_that_is_interrupted_says_that_it_goes_on(run: Run, tmp_path: Pat
     assert run("diff", source, target)[0] == 0
 
 
-def test_a_terminal_sees_a_bar_with_objects(run: Run, scene: Path) -> None:
-    assert callable(run)
+@pytest.mark.usefixtures("run")
+def test_a_terminal_sees_a_bar_with_objects(scene: Path) -> None:
     ours, theirs = pty.openpty()
     args = command("copy", scene, "b.db")
     with child(args, stderr=theirs) as copying:

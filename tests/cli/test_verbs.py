@@ -87,7 +87,8 @@ def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> N
     assert (code, err) == (0, "")
     found = json.loads(out)
     assert found["kept"] is True
-    assert found["figures"]["descent"] >= 0
+    costs = [found["figures"][name] for name in ("statement", "descent", "block", "row")]
+    assert min(costs) >= 0.0 < sum(costs)
     assert set(found["spread"]) < set(found["figures"])
     assert "±" in run("calibrate", scene)[1]
 

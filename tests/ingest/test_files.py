@@ -63,7 +63,7 @@ def import_one(database: Path, file: Path, options: ImportOptions | None = None)
 
 
 def refusal(report: FileReport, kind: type[hapticdb.HapticDBError]) -> str:
-    """The line that a file was skipped with."""
+    """Message of the error of a file that was skipped."""
     assert report.status == "failed"
     assert not report.added
     assert type(report.error) is kind
@@ -269,7 +269,7 @@ def test_a_surface_on_the_border_of_the_grid_is_inside(tmp_path: Path) -> None:
 
 
 def test_a_point_that_rounding_carries_over_the_border_does_not_vanish(tmp_path: Path) -> None:
-    """It is marked or refused, never dropped in silence."""
+    """It is marked or refused, never dropped without an error."""
     points = np.array([[0.0, 0, 0], [ORIGIN[0] - 1e-7 * SIZE, 0.05, 0.05]])
     cloud = write_ply(tmp_path / "scan.ply", points)
     report = import_one(tmp_path / "e.db", cloud, small_options())
@@ -277,7 +277,7 @@ def test_a_point_that_rounding_carries_over_the_border_does_not_vanish(tmp_path:
 
 
 def test_a_plate_that_rounding_carries_over_the_border_does_not_vanish(tmp_path: Path) -> None:
-    """A file in single precision may be off by so much, 2e-7 of a voxel."""
+    """A file in single precision may be off by 2e-7 of a voxel."""
     corners = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0, 0.1, 0]])
     corners[:, 2] = ORIGIN[2] - 2e-9
     plate = write_obj(tmp_path / "plate.obj", {"plate": (corners, np.array([[0, 1, 2]]))})
@@ -454,7 +454,7 @@ def test_a_name_that_is_no_text_is_refused(
 def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
     tmp_path: Path, file: Path, parts: list[Part], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The engine says that the part is there, and it is gone before the import looks for it."""
+    """Another process removes the part after the engine has refused to add it again."""
     calls: list[str] = []
     add = SQLiteStore.add
 

@@ -35,7 +35,7 @@ from hapticdb.kernels.surfaces.voxelize import brick_voxels, voxelize
 from hapticdb.mesh import MeshFile, Part, parse_in_process, read_file
 from hapticdb.store import base
 from hapticdb.store.base import Layout, Object, present_already
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 from hapticdb.testing import KINDS
 from mesh_files import gltf
 from naive import Voxel, voxels_of_points
@@ -456,15 +456,15 @@ def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
 ) -> None:
     """Another process removes the part after the engine has refused to add it again."""
     calls: list[str] = []
-    add = SQLiteStore.add
+    add = SQLiteWriter.add
 
-    def overtaken(store: SQLiteStore, record: Object, rows: base.Rows) -> int:
+    def overtaken(writer: SQLiteWriter, record: Object, rows: base.Rows) -> int:
         calls.append(record.name)
         if len(calls) == 2:
-            raise present_already(record, store.url)
-        return add(store, record, rows)
+            raise present_already(record, "a.db")
+        return add(writer, record, rows)
 
-    monkeypatch.setattr(SQLiteStore, "add", overtaken)
+    monkeypatch.setattr(SQLiteWriter, "add", overtaken)
     report = import_one(tmp_path / "a.db", file)
     names = [part.name for part in parts]
     assert calls == [names[0], names[1], *names[1:]]
@@ -475,10 +475,10 @@ def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
 def test_a_part_that_stays_in_the_way_is_told(
     tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(store: SQLiteStore, record: Object, rows: base.Rows) -> int:
+    def refused(_: SQLiteWriter, record: Object, rows: base.Rows) -> int:
         assert rows
-        raise present_already(record, store.url)
+        raise present_already(record, "a.db")
 
-    monkeypatch.setattr(SQLiteStore, "add", refused)
+    monkeypatch.setattr(SQLiteWriter, "add", refused)
     with pytest.raises(hapticdb.EnvironmentExistsError, match="remove it first"):
         import_one(tmp_path / "a.db", file)

@@ -21,7 +21,7 @@ from children import PATIENCE, child, until
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.resident.table import is_alive
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.tables.statistics import SQLiteStatistics
 
 N_PARTS = 60
 MOMENTS = np.random.default_rng(20).permutation(np.arange(1, N_PARTS))[:10].tolist()
@@ -226,7 +226,7 @@ def test_statistics_missed_by_an_interruption_are_kept_by_the_next_import(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(SQLiteStore, "analyze", interrupted)
+        patch.setattr(SQLiteStatistics, "analyze", interrupted)
         with pytest.raises(KeyboardInterrupt):
             hapticdb.import_files(tmp_path / "e.db", [file], small_options())
     (report,) = hapticdb.import_files(tmp_path / "e.db", [file], small_options())

@@ -12,7 +12,7 @@ import trimesh
 
 import hapticdb
 from command_line import Run, boxes, made, refused, rows_of, run, scene  # noqa: F401 - fixtures
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 
 
 def names(url: Path) -> list[str]:
@@ -127,18 +127,18 @@ def test_an_interrupted_replacement_goes_on(
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6, extent=3))
     hapticdb.import_files(url, [file], options)
     boxes(file, side=0.12)
-    replace = SQLiteStore.replace
+    replace = SQLiteWriter.replace
     calls: list[int] = []
 
-    def twice(store: SQLiteStore, *words: Any) -> None:  # noqa: ANN401 - handed on
+    def twice(writer: SQLiteWriter, *words: Any) -> None:  # noqa: ANN401 - handed on
         calls.append(1)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        replace(store, *words)
+        replace(writer, *words)
 
     again = hapticdb.ImportOptions(replace=True)
     with monkeypatch.context() as patched:
-        patched.setattr(SQLiteStore, "replace", twice)
+        patched.setattr(SQLiteWriter, "replace", twice)
         with pytest.raises(KeyboardInterrupt):
             hapticdb.import_files(url, [file], again)
     assert names(url) == ["box0", "box1", "box2"]

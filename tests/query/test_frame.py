@@ -70,7 +70,7 @@ def env(
     env = make_scene(with_environment(base_url(request.param), f"scene_{os.getpid()}"), *kind)
     yield env
     assert isinstance(env.store, PostgresStore)
-    drop(env.store.session)
+    drop(env.store.connection)
     env.close()
 
 

@@ -15,9 +15,9 @@ import time
 import psycopg
 
 from hapticdb.errors import ConnectionLostError
-from hapticdb.store.postgres import failures, wire
 from hapticdb.store.postgres.address import LONGEST_NAME
-from hapticdb.store.postgres.session import Session, identifier
+from hapticdb.store.postgres.connecting import failures, wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 
 REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 DIGEST_DIGITS = 32
@@ -39,12 +39,12 @@ def channel_of(environment: str) -> str:
 
 
 class Watch:
-    """What one session has heard of the commits of others."""
+    """What one connection has heard of the commits of others."""
 
-    def __init__(self, session: Session, identity: int) -> None:
-        self._session = session
+    def __init__(self, connection: ServerConnection, identity: int) -> None:
+        self._connection = connection
         self._identity = identity
-        self._connection: psycopg.Connection[tuple[object, ...]] | None = None
+        self._listening_on: psycopg.Connection[tuple[object, ...]] | None = None
         self._revision = -1
         self._is_hinted = False
         self._is_deaf = True
@@ -52,8 +52,8 @@ class Watch:
 
     def begin(self) -> None:
         """Notice commits from now on."""
-        self._session.check_outside()
-        self._session.again(self._listen)
+        self._connection.check_outside()
+        self._connection.again(self._listen)
         self._ask()
 
     def has_changed(self) -> bool:
@@ -63,8 +63,8 @@ class Watch:
         and after a lost connection: then the answer is yes, since what came meanwhile was not
         heard. Raises ConnectionLostError when the environment was made anew.
         """
-        self._session.check_outside()
-        if self._session.again(self._listen):
+        self._connection.check_outside()
+        if self._connection.again(self._listen):
             self._ask()
             return True
         now = time.monotonic()
@@ -73,20 +73,20 @@ class Watch:
 
     def _listen(self) -> bool:
         """Take in what has come; on a connection that does not listen yet, begin, and say so."""
-        connection = self._session.connection
-        if connection is self._connection:
-            self._session.hear()
+        driver = self._connection.driver
+        if driver is self._listening_on:
+            self._connection.hear()
             return False
-        connection.add_notify_handler(self._hear)
-        channel = identifier(channel_of(self._session.address.environment))
+        driver.add_notify_handler(self._hear)
+        channel = identifier(channel_of(self._connection.address.environment))
         try:
-            self._session.command(f"LISTEN {channel.as_string(connection)}")
+            self._connection.command(f"LISTEN {channel.as_string(driver)}")
             self._is_deaf = False
         except psycopg.Error as error:
             if failures.is_lost(error):
                 raise
             self._is_deaf = True
-        self._connection = connection
+        self._listening_on = driver
         self._due = 0.0  # should asking right after this fail, the next call asks
         return True
 
@@ -96,10 +96,10 @@ class Watch:
     def _ask(self) -> bool:
         """Whether the revision is another than the one known."""
         before, self._is_hinted = self._revision, False  # before: what comes meanwhile may be newer
-        found, identity = self._session.fetch(REVISION)
+        found, identity = self._connection.fetch(REVISION)
         if wire.read_int8(identity or b"") != self._identity:
             raise ConnectionLostError(
-                f"{self._session.shown} is another environment than before: open it again"
+                f"{self._connection.shown} is another environment than before: open it again"
             )
         self._revision = wire.read_int8(found or b"")
         self._asked = time.monotonic()

@@ -4,8 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.store.base import LAYOUTS, Keys, Layout
-from hapticdb.store.postgres import wire
-from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres.connecting import wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 SERVER_RESOLUTION = 10_000
 """The largest statistics target, at which both index tables are analysed, and the paper's best."""
@@ -31,11 +31,11 @@ SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
 }
 
 
-def server_histogram(session: Session, layout: Layout) -> tuple[Keys, int] | None:
+def server_histogram(connection: ServerConnection, layout: Layout) -> tuple[Keys, int] | None:
     """Bounds (10,001,) from `pg_stats` and the rows behind them; None before the first ANALYZE."""
-    bounds, common, frequencies, n_rows = session.fetch(
+    bounds, common, frequencies, n_rows = connection.fetch(
         STATISTICS,
-        wire.text(session.address.environment),
+        wire.text(connection.address.environment),
         wire.text(layout),
     )
     rows = wire.read_int8(n_rows) if n_rows is not None else 0
@@ -104,18 +104,20 @@ def with_common_values(
     return np.asarray(np.maximum.accumulate(found))
 
 
-def exact_histogram(session: Session, layout: Layout, resolution: int) -> tuple[Keys, int]:
+def exact_histogram(
+    connection: ServerConnection, layout: Layout, resolution: int
+) -> tuple[Keys, int]:
     """Bounds (R + 1,) by Definition 2 of the paper, over all rows, and their number N.
 
     Bound i is the key of the row of rank ceil(i N / R), bound 0 the lowest key.
     """
-    with session.snapshot(), session.without_limit():
-        counted = session.execute(f"SELECT count(*) FROM {layout}").fetchone()
+    with connection.snapshot(), connection.without_limit():
+        counted = connection.execute(f"SELECT count(*) FROM {layout}").fetchone()
         n_rows = int(counted[0]) if counted else 0
         if n_rows == 0:
             return np.zeros(2, dtype=np.int64), 0
         ranks = -(-np.arange(resolution + 1, dtype=np.int64) * n_rows // resolution)
-        (bounds,) = session.fetch(
+        (bounds,) = connection.fetch(
             EXACT[layout], wire.int8s(np.maximum(ranks, 1)), wire.float8(float(n_rows))
         )
     return wire.read_int8s(bounds), n_rows

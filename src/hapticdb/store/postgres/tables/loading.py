@@ -14,8 +14,9 @@ import psycopg
 
 from hapticdb.errors import ConnectionLostError
 from hapticdb.store.base import LAYOUTS, Layout
-from hapticdb.store.postgres import failures, schema_of
-from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres import schema_of
+from hapticdb.store.postgres.connecting import failures
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 IS_EMPTY = {layout: f"SELECT NOT EXISTS (SELECT 1 FROM {layout})" for layout in LAYOUTS}
 # advisory locks of an environment, by the number of one of its tables: who loads, and who makes the
@@ -25,10 +26,10 @@ KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
 
 class Loading:
-    """The context in which a session loads. May be nested."""
+    """The context in which a connection loads. May be nested."""
 
-    def __init__(self, session: Session, layout: Layout) -> None:
-        self._session = session
+    def __init__(self, connection: ServerConnection, layout: Layout) -> None:
+        self._connection = connection
         self._layout = layout
         self._depth = 0
         self._is_owner = False
@@ -38,17 +39,17 @@ class Loading:
         if not self._depth:
             self._begin()
         self._depth += 1
-        self._session.is_loading = True
+        self._connection.is_loading = True
 
     def _begin(self) -> None:
-        session = self._session
+        connection = self._connection
         self._check_editor()
         self._has_written = False
-        with session.without_limit("statement_timeout", "lock_timeout"):
+        with connection.without_limit("statement_timeout", "lock_timeout"):
             # shared: several loaders at a time
-            session.execute(f"SELECT pg_advisory_lock_shared({KEY})", (LOADERS,))
+            connection.execute(f"SELECT pg_advisory_lock_shared({KEY})", (LOADERS,))
             try:
-                self._is_owner = session.is_owner()
+                self._is_owner = connection.is_owner()
                 if self._is_owner and self._is_empty():
                     self._drop_index()
             except BaseException:
@@ -62,31 +63,31 @@ class Loading:
         trace: TracebackType | None,
     ) -> None:
         self._depth -= 1
-        self._session.is_loading = self._depth > 0
+        self._connection.is_loading = self._depth > 0
         if self._depth or isinstance(error, ConnectionLostError):
             return  # the next one to open it mends it
-        session = self._session
-        if session.connection.closed:  # Ctrl-C in the middle of a statement gave it up
+        connection = self._connection
+        if connection.driver.closed:  # Ctrl-C in the middle of a statement gave it up
             try:
-                session.connect()
+                connection.connect()
             except ConnectionLostError:
                 return
-        with session.without_limit("statement_timeout", "lock_timeout"):
+        with connection.without_limit("statement_timeout", "lock_timeout"):
             try:
                 if self._is_owner:
                     self._make_index()
                     if self._has_written:  # so that frames are read from the index alone
-                        session.command(f"VACUUM {self._layout}")
+                        connection.command(f"VACUUM {self._layout}")
             finally:
                 self._unlock("_shared", LOADERS)
 
     def _check_editor(self) -> None:
         """Tell a toucher at once, and not after a minute's reading."""
-        ((may_edit,),) = self._session.rows(
+        ((may_edit,),) = self._connection.rows(
             "SELECT has_column_privilege('environment', 'revision', 'UPDATE')"
         )
         if not may_edit:
-            raise failures.no_editor(self._session.shown)
+            raise failures.no_editor(self._connection.shown)
 
     def note(self) -> None:
         """Remember that something was written inside."""
@@ -94,11 +95,11 @@ class Loading:
 
     def mend(self) -> None:
         """Make the index that a killed loader has left out, unless one is loading now."""
-        session = self._session
-        if not session.is_owner() or self._has_index():
+        connection = self._connection
+        if not connection.is_owner() or self._has_index():
             return
         with (
-            session.without_limit("statement_timeout", "lock_timeout"),
+            connection.without_limit("statement_timeout", "lock_timeout"),
             self._alone() as is_alone,
         ):
             if is_alone:
@@ -106,15 +107,15 @@ class Loading:
 
     def drop_unused(self) -> None:
         """Delete the environment if nothing was ever written to it and nobody is about to."""
-        session = self._session
+        connection = self._connection
         with self._alone() as is_alone:
-            if is_alone and not session.rows("SELECT 1 FROM environment WHERE revision > 0"):
-                schema_of.drop(session)
+            if is_alone and not connection.rows("SELECT 1 FROM environment WHERE revision > 0"):
+                schema_of.drop(connection)
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[bool]:
         """Whether nobody else loads; none can begin while this lasts."""
-        found = self._session.rows(f"SELECT pg_try_advisory_lock({KEY})", (LOADERS,))
+        found = self._connection.rows(f"SELECT pg_try_advisory_lock({KEY})", (LOADERS,))
         try:
             yield bool(found[0][0])
         finally:
@@ -123,40 +124,42 @@ class Loading:
 
     def _unlock(self, kind: str, lock: int) -> None:
         """Give a lock back, where there is still one to give."""
-        if not self._session.connection.closed:
+        if not self._connection.driver.closed:
             with contextlib.suppress(psycopg.Error):  # the environment itself may be gone
-                self._session.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
+                self._connection.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
 
     def _has_index(self) -> bool:
-        found = self._session.rows("SELECT to_regclass(%s) IS NOT NULL", (f"{self._layout}_key",))
+        found = self._connection.rows(
+            "SELECT to_regclass(%s) IS NOT NULL", (f"{self._layout}_key",)
+        )
         return bool(found[0][0])
 
     def _is_empty(self) -> bool:
-        return bool(self._session.rows(IS_EMPTY[self._layout])[0][0])
+        return bool(self._connection.rows(IS_EMPTY[self._layout])[0][0])
 
     def _drop_index(self) -> None:
         """Leave the index out, if nobody is reading; nobody is made to wait."""
-        session = self._session
+        connection = self._connection
         with contextlib.suppress(psycopg.errors.LockNotAvailable):
-            session.command("BEGIN")
+            connection.command("BEGIN")
             try:
-                session.command("SET LOCAL lock_timeout = '50ms'")
-                session.command(f"DROP INDEX IF EXISTS {self._layout}_key")
-                session.command("COMMIT")
+                connection.command("SET LOCAL lock_timeout = '50ms'")
+                connection.command(f"DROP INDEX IF EXISTS {self._layout}_key")
+                connection.command("COMMIT")
             except BaseException:
-                if not session.connection.closed:
-                    session.command("ROLLBACK")
+                if not connection.driver.closed:
+                    connection.command("ROLLBACK")
                 raise
 
     def _make_index(self) -> None:
         """Readers go on meanwhile; writers wait. One maker at a time: IF NOT EXISTS is no lock."""
-        session, layout = self._session, self._layout
-        session.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
+        connection, layout = self._connection, self._layout
+        connection.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
         try:
-            session.command("SET maintenance_work_mem = '256MB'")
-            session.command(
+            connection.command("SET maintenance_work_mem = '256MB'")
+            connection.command(
                 f"CREATE UNIQUE INDEX IF NOT EXISTS {layout}_key ON {layout} (z_val, id)"
             )
-            session.command("RESET maintenance_work_mem")
+            connection.command("RESET maintenance_work_mem")
         finally:
             self._unlock("", MAKERS)

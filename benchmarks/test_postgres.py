@@ -28,7 +28,7 @@ from awake import awake
 from hapticdb import Environment, Touch
 from hapticdb.kernels.query import contact
 from hapticdb.query.frame import STRATEGIES, Strategy
-from hapticdb.store.base import LAYOUTS, Frame, Layout, row_shift
+from hapticdb.store.base import LAYOUTS, Layout, LocatedShell, row_shift
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
@@ -168,7 +168,7 @@ def wrench_of(touch: Touch) -> NDArray[np.float64]:
     return np.concatenate([touch.force, touch.torque])
 
 
-def frames_of(scene: BenchScene, env: Environment) -> list[Frame]:
+def frames_of(scene: BenchScene, env: Environment) -> list[LocatedShell]:
     """Located shells along the path, as a store gets them."""
     grid = env.grid
     origin = np.array(grid.origin)
@@ -181,7 +181,7 @@ def frames_of(scene: BenchScene, env: Environment) -> list[Frame]:
         placed, asked, _ = contact.locate(
             shell.points, shell.normals, shell.center, pose, origin, grid.voxel_size, *curve
         )
-        found.append(Frame(placed, asked[0], 1000.0, none))
+        found.append(LocatedShell(placed, asked[0], 1000.0, none))
     return found
 
 

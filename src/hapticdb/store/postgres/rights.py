@@ -1,7 +1,7 @@
-"""Who may do what with an environment: rights of roles, kept and enforced by the server itself.
+"""Who may do what with an environment: rights of roles. The server itself enforces them.
 
-A viewer reads and touches; a toucher also keeps fitted cost figures; an editor also adds, moves and
-removes objects. The grid, the tables and the rights are the owner's, who made the environment.
+A viewer reads and touches. A toucher also keeps fitted cost figures. An editor also adds, moves and
+removes objects. Only the owner, who made the environment, may change its tables and grant rights.
 """
 
 from psycopg import sql
@@ -45,7 +45,7 @@ GRANTED: dict[Right, tuple[str, ...]] = {
     "editor": EDITOR,
     "nobody": (),
 }
-# two that change the same rights at once would meet in the server's catalog
+# a lock: two who change the same rights at once would conflict in the server's catalog
 GRANTERS = 0x4841505447524E54
 KNOWN_ROLE = """
 SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')

@@ -32,9 +32,9 @@ _servers: dict[Path, PrivateServer] = {}
 
 
 def connected(url: str, *, read_only: bool = False, making: bool = False) -> ServerConnection:
-    """Connect to an environment's database, whether the environment is there or not.
+    """Connect to an environment's database. The environment itself may be missing.
 
-    `making` one sets up a private server and its database where they are missing.
+    With `making`, a private server and its database are made if they are missing.
     """
     address = parse(url)
     try:
@@ -44,7 +44,7 @@ def connected(url: str, *, read_only: bool = False, making: bool = False) -> Ser
 
 
 def _conninfo(address: Address, *, making: bool) -> str:
-    """Where libpq is to go: with ``data=`` to a private server, started when it does not run."""
+    """What libpq connects to; with ``data=`` a private server, started if it does not run."""
     if address.data is None:
         return address.conninfo
     parts = urlsplit(address.conninfo)
@@ -122,7 +122,7 @@ def check(connection: ServerConnection) -> None:
             f"schema {name!r} at {shown} is no hapticdb environment; name another one with "
             "?environment=NAME"
         )
-    if readable != [(True,)]:  # without the right, the schema is passed over in silence
+    if readable != [(True,)]:  # without the right, the server hides the schema
         raise failures.denied(shown, name)
     found = connection.rows("SELECT format FROM environment")
     version = int(found[0][0]) if found else 0
@@ -144,9 +144,9 @@ def check(connection: ServerConnection) -> None:
 
 
 def _check_writable(connection: ServerConnection) -> None:
-    """Tell at once, and not after a minute's work, that nothing may be written.
+    """Refuse a user who may write nothing, before a minute's work.
 
-    A toucher writes cost figures, no more; `Loading` tells at once that objects are not for it.
+    A toucher may write cost figures; `Loading` refuses it when it begins to write objects.
     """
     ((may_write, is_standby),) = connection.rows(
         "SELECT has_table_privilege('cost', 'INSERT'), pg_is_in_recovery()"
@@ -168,7 +168,7 @@ SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'v' THEN 'view'
 
 
 def read_environment(connection: ServerConnection) -> tuple[Grid, Layout, int]:
-    """Grid and layout of an environment, and what tells it from another in its place."""
+    """Grid and layout of an environment, and the oid that another made in its place has not."""
     rows = connection.rows(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, tableoid::bigint"
         " FROM environment"

@@ -68,7 +68,7 @@ class ServerConnection:
         self._link.close()
 
     def _reconnect(self) -> None:
-        """Connect again, waiting longer each time; raises when the server stays away."""
+        """Connect again and again, for up to `RECONNECT_SECONDS`; then raise the last error."""
         self._link.close()
         deadline = time.monotonic() + RECONNECT_SECONDS
         pause = FIRST_PAUSE_SECONDS
@@ -89,7 +89,7 @@ class ServerConnection:
         return self._is_closed
 
     def give_to(self, thread: int) -> None:
-        """Belong to another thread from now on, or to NOBODY; only while nobody uses it."""
+        """Belong to another thread from now on, or to `NOBODY`. No call may be under way."""
         self._thread = thread
 
     def check_thread(self) -> None:
@@ -103,7 +103,7 @@ class ServerConnection:
     def again(self, read: Callable[[], Result]) -> Result:
         """Run a read; when the connection is lost, connect again and run it once more.
 
-        Inside a snapshot there is no second run: what came before was read from the lost one.
+        Not inside a snapshot: its earlier reads saw the revision of the lost connection.
         """
         self.check_thread()
         if self._is_closed:
@@ -132,7 +132,7 @@ class ServerConnection:
         return self.again(read)
 
     def rows(self, text: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """All rows of a statement, as Python's own values: for what no frame waits on."""
+        """All rows of a statement as Python values: for statements outside frames."""
         return self.again(lambda: self.execute(text, parameters).fetchall())
 
     def execute(
@@ -169,9 +169,9 @@ class ServerConnection:
     ) -> Result:
         """Run `work` in one transaction, without a frame's time limit.
 
-        When the connection is lost before the commit was sent, the whole is done again; when it is
-        lost during the commit, `is_committed` looks, on the new connection, whether it counts.
-        Without `is_committed`, work is what may be done twice.
+        When the connection is lost before the commit was sent, everything is done again. When it is
+        lost during the commit, `is_committed` tells, on the new connection, whether the commit was
+        done. Without `is_committed`, `work` must be harmless when it is done twice.
         """
         self.check_thread()
         for tries_left in reversed(range(WRITE_TRIES)):
@@ -190,13 +190,13 @@ class ServerConnection:
         )
 
     def _finds(self, is_committed: Callable[[], bool]) -> bool:
-        """Whether a write counts whose commit was sent and not answered; never guesses."""
+        """Whether a commit that was sent but not answered was done. Never guesses."""
         try:
             self._reconnect()
             return is_committed()
         except DatabaseError as error:
             raise ConnectionLostError(
-                f"{self.shown}: the server went away during a commit, and whether that counts is "
+                f"{self.shown}: the server went away during a commit, and whether that was done is "
                 f"not known yet: look, then decide ({error})"
             ) from error
 
@@ -228,7 +228,7 @@ class ServerConnection:
         return result, True
 
     def _end_snapshot(self) -> None:
-        """Nothing is left to lose: all was read from one revision, though the server be gone."""
+        """End the transaction. A lost connection is no error: the reads are complete."""
         try:
             with failures.named_errors(self.shown):
                 self.command("COMMIT")
@@ -242,7 +242,7 @@ class ServerConnection:
 
     @contextlib.contextmanager
     def without_limit(self, *limits: str) -> Iterator[None]:
-        """Lift time limits inside, the statement's unless named: for indexes and statistics."""
+        """Lift time limits inside; `statement_timeout` unless others are named."""
         names = limits or ("statement_timeout",)
         with failures.named_errors(self.shown), self._link.unhurried():
             # the connection may have been lost since it was last used
@@ -261,7 +261,7 @@ class ServerConnection:
         return row[0] if row else "0"
 
     def is_owner(self) -> bool:
-        """Whether this user owns the environment's tables: who may make indexes and grant."""
+        """Whether this user owns the environment's tables, and so may make indexes and grant."""
         found = self.rows(
             "SELECT pg_has_role(relowner, 'USAGE') FROM pg_class"
             " WHERE oid = 'environment'::regclass"

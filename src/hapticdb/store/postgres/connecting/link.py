@@ -28,16 +28,16 @@ SETTINGS = {
     "jit": "off",
     # a custom plan reads 10,000 histogram bounds each time: 288 us instead of 84 for one range
     "plan_cache_mode": "force_generic_plan",
-    # a frame reads a few dozen rows: starting a worker takes longer
+    # a frame reads a few dozen rows, which takes less time than starting a worker
     "max_parallel_workers_per_gather": "0",
-    # a bitmap scan reads the heap and forgets the order of the keys; planned for ranges of which
-    # the planner cannot know how short they are
+    # the planner cannot know how short the ranges are and would take a bitmap scan, which reads the
+    # heap and loses the order of the keys
     "enable_bitmapscan": "off",
-    # a plan made while the table was small is kept, and must not be a scan of all of it
+    # a plan that was made while the table was small is kept: it must not scan the whole table
     "enable_seqscan": "off",
-    # readers never wait for locks; a writer that does so is told after this
+    # readers never wait for locks; a writer that waits longer gets an error
     "lock_timeout": "10s",
-    # a frame that takes longer is stuck; writes, indexes and statistics lift it for themselves
+    # a frame that takes longer is stuck; writes, indexes and statistics lift this limit
     "statement_timeout": "10s",
     "client_min_messages": "warning",
 }
@@ -48,12 +48,12 @@ GRACE_MS = 3000
 
 
 class _Connection(psycopg.Connection[tuple[Any, ...]]):
-    """psycopg's connection, which by itself waits for ever, with its link's patience."""
+    """psycopg's connection, which waits only as long as its link does; else it waits for ever."""
 
     link: "Link"
 
     def wait(self, gen: Generator[Any, Any, Result], *args: Any, **options: Any) -> Result:  # noqa: ANN401 - psycopg's own
-        """Let a statement run to its end; the connection is given up when that does not come."""
+        """Let a statement run to its end. Closes the connection when it takes too long."""
         try:
             return super().wait(self.link.until_out_of_patience(gen), *args, **options)
         except StuckError:
@@ -77,7 +77,7 @@ class Link:
     # -- connecting --------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Connect once, with our settings; what the URL's own `options` set stays."""
+        """Connect once, with `SETTINGS`; what the URL's `options` set is left as it is."""
         try:
             made = _Connection.connect(
                 self._conninfo,
@@ -86,7 +86,7 @@ class Link:
                 fallback_application_name="hapticdb",
                 connect_timeout=None if "connect_timeout=" in self._conninfo else CONNECT_SECONDS,
             )
-        # the engine's own words, in a traceback, too, may hold the password: from None
+        # from None: psycopg's message, which a traceback would show, may hold the password
         except psycopg.OperationalError as error:
             raise failures.refused(error, self._address.shown) from None
         except psycopg.Error as error:
@@ -102,7 +102,7 @@ class Link:
         try:
             with failures.named_errors(self._address.shown):
                 self._settle()
-        except BaseException:  # half settled is worse than none
+        except BaseException:  # a connection without its settings must not be used
             self.driver.close()
             raise
 
@@ -168,9 +168,10 @@ class Link:
         return self._result()
 
     def hear(self) -> None:
-        """Hand what has come between statements to the connection's notify handlers; never waits.
+        """Give notifications that have arrived to the notify handlers. Never waits.
 
-        What came during one waits in libpq until then, or went there through psycopg.
+        Those that arrive during a statement stay in libpq until the next call, or psycopg has given
+        them to the handlers already.
         """
         self._pgconn.consume_input()
         while (notify := self._pgconn.notifies()) and self._pgconn.notify_handler:
@@ -180,12 +181,12 @@ class Link:
 
     @property
     def _patience_ms(self) -> int | None:
-        """How long to wait for an answer; None while something is allowed to take its time."""
+        """Milliseconds to wait for an answer; None inside `unhurried`."""
         return None if self._leisure else self._limit_ms
 
     @contextlib.contextmanager
     def unhurried(self) -> Iterator[None]:
-        """Wait without limit inside: for what is allowed to take its time."""
+        """Wait without a limit inside: for statements that may take long."""
         self._leisure += 1
         try:
             yield
@@ -193,14 +194,14 @@ class Link:
             self._leisure -= 1
 
     def _result(self) -> pq.abc.PGresult:
-        """Result of what was sent; the connection is given up when it does not come."""
+        """Result of what was sent. Closes the connection when no result comes."""
         try:
             return self._receive()
         except psycopg.Error as error:
             if failures.is_lost(error):
                 self.driver.close()
             raise
-        except BaseException:  # Ctrl-C, or out of patience: what comes now belongs to nobody
+        except BaseException:  # Ctrl-C or a timeout: a late result would be taken for the next one
             self.driver.close()
             raise
 
@@ -233,7 +234,7 @@ class Link:
     def until_out_of_patience(
         self, waiting: Generator[Any, Any, Result]
     ) -> Generator[Any, Any, Result]:
-        """Pass on what one of psycopg's statements waits for, as long as there is time."""
+        """Run psycopg's own waiting for a statement, but no longer than `_patience_ms`."""
         started = time.monotonic()
         try:
             wanted = next(waiting)

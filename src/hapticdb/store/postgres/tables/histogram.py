@@ -1,4 +1,4 @@
-"""Quantiles of the index: from the server's own statistics, or computed where they do not reach."""
+"""Quantiles of the index: from the server's own statistics, or computed exactly."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from hapticdb.store.postgres.connecting.connection import ServerConnection
 SERVER_RESOLUTION = 10_000
 """The largest statistics target, at which both index tables are analysed, and the paper's best."""
 ENOUGH_ROWS = 10 * SERVER_RESOLUTION
-"""Below, an exact histogram is computed sooner than it takes to think about it."""
+"""Rows from which the server's statistics are used. Below, an exact histogram takes little time."""
 
 # one row, of NULLs before the first ANALYZE
 STATISTICS = """
@@ -20,7 +20,7 @@ SELECT histogram_bounds::text::bigint[], most_common_vals::text::bigint[],
          WHERE oid = to_regclass(quote_ident(schemaname) || '.' || quote_ident(tablename)))
   FROM (SELECT) AS one LEFT JOIN pg_stats
     ON schemaname = $1::text::name AND tablename = $2::text::name AND attname = 'z_val'"""
-# a fraction aims at the middle of its rank: at the rank itself, floating point lands one off
+# the fraction of the middle of each rank: the fraction of the rank itself rounds to its neighbour
 EXACT = {
     layout: f"""
 SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
@@ -79,7 +79,7 @@ def with_common_values(
         return np.zeros(resolution + 1, dtype=np.int64)
     smooth = np.zeros(len(places))
     if len(bounds):
-        # of several equal bounds the last counts: all of their buckets lie at or below that key
+        # of several equal bounds the last is right: all of their buckets lie at or below that key
         last = np.append(bounds[1:] != bounds[:-1], True)
         known = np.flatnonzero(last)
         smooth = rest * np.interp(
@@ -89,7 +89,7 @@ def with_common_values(
     jumps = np.concatenate([[0.0], np.cumsum(shares)])
     below = smooth + jumps[np.searchsorted(common, places, "left")]
     up_to = smooth + jumps[np.searchsorted(common, places, "right")]
-    # two corners a place: where the share stands before its jump, and after
+    # two corners at each place: the share before its jump, and after it
     heights = np.stack([below, up_to], axis=1).reshape(-1)
     corners = np.repeat(places, 2)
     targets = np.arange(resolution + 1) / resolution * heights[-1]
@@ -97,7 +97,7 @@ def with_common_values(
     low, high = heights[at - 1], heights[at]
     part = np.where(high > low, (targets - low) / np.where(high > low, high - low, 1.0), 1.0)
     width = (corners[at] - corners[at - 1]).astype(np.float64)
-    # from the lower corner, in whole keys: a float64 of a key itself would lose its last bits
+    # added to the lower corner in whole keys: a float64 cannot hold the last bits of a key
     found = corners[at - 1] + np.round(np.clip(part, 0.0, 1.0) * width).astype(np.int64)
     found[0] = places[0]
     found[-1] = places[-1]

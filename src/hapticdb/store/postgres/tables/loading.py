@@ -1,8 +1,8 @@
-"""Loading: many objects at once into an empty environment, its index and statistics afterwards.
+"""Loading: many objects at once into an empty environment, whose index is made afterwards.
 
-Measured on 15 million voxel rows: COPY and then the index take 21 s, COPY into the index 57 s, and
-the index is half as large again. A loader that was killed leaves no index; whoever opens the
-environment to write next makes it. Commits wait for the disk all the same, a millisecond each: what
+Measured on 15 million voxel rows: COPY and then the index take 21 s. COPY into an index takes 57 s,
+and that index is half as large again. A loader that was killed leaves no index; the next user who
+opens the environment to write makes it. Every commit waits for the disk, a millisecond each: what
 was reported as written is there after a crash, and an import may go on from it.
 """
 
@@ -19,8 +19,9 @@ from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 IS_EMPTY = {layout: f"SELECT NOT EXISTS (SELECT 1 FROM {layout})" for layout in LAYOUTS}
-# advisory locks of an environment, by the number of one of its tables: who loads, and who makes the
-# index. An oid has 32 bits without a sign, the key of a lock 32 bits with one
+# Advisory locks of an environment: one for those who load, one for the one who makes the index.
+# The key is the oid of a table of the environment. An oid has 32 bits without a sign, a key 32 bits
+# with a sign.
 LOADERS, MAKERS = 0x48415054, 0x48415055
 KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
@@ -65,9 +66,9 @@ class Loading:
         self._depth -= 1
         self._connection.is_loading = self._depth > 0
         if self._depth or isinstance(error, ConnectionLostError):
-            return  # the next one to open it mends it
+            return  # the next one who opens the environment to write makes the index
         connection = self._connection
-        if connection.driver.closed:  # Ctrl-C in the middle of a statement gave it up
+        if connection.driver.closed:  # by Ctrl-C in the middle of a statement
             try:
                 connection.connect()
             except ConnectionLostError:
@@ -82,7 +83,7 @@ class Loading:
                 self._unlock("_shared", LOADERS)
 
     def _check_editor(self) -> None:
-        """Tell a toucher at once, and not after a minute's reading."""
+        """Refuse a user who may not edit objects, before minutes of reading files."""
         ((may_edit,),) = self._connection.rows(
             "SELECT has_column_privilege('environment', 'revision', 'UPDATE')"
         )
@@ -94,7 +95,7 @@ class Loading:
         self._has_written = True
 
     def mend(self) -> None:
-        """Make the index that a killed loader has left out, unless one is loading now."""
+        """Make the index that a killed loader left out, unless somebody is loading now."""
         connection = self._connection
         if not connection.is_owner() or self._has_index():
             return
@@ -106,7 +107,7 @@ class Loading:
                 self._make_index()
 
     def drop_unused(self) -> None:
-        """Delete the environment if nothing was ever written to it and nobody is about to."""
+        """Delete the environment if nothing was ever written to it and nobody is loading."""
         connection = self._connection
         with self._alone() as is_alone:
             if is_alone and not connection.rows("SELECT 1 FROM environment WHERE revision > 0"):
@@ -114,7 +115,7 @@ class Loading:
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[bool]:
-        """Whether nobody else loads; none can begin while this lasts."""
+        """Whether nobody else loads. Nobody can begin to load inside."""
         found = self._connection.rows(f"SELECT pg_try_advisory_lock({KEY})", (LOADERS,))
         try:
             yield bool(found[0][0])
@@ -123,7 +124,7 @@ class Loading:
                 self._unlock("", LOADERS)
 
     def _unlock(self, kind: str, lock: int) -> None:
-        """Give a lock back, where there is still one to give."""
+        """Give a lock back, unless it went with a lost connection."""
         if not self._connection.driver.closed:
             with contextlib.suppress(psycopg.Error):  # the environment itself may be gone
                 self._connection.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
@@ -138,7 +139,7 @@ class Loading:
         return bool(self._connection.rows(IS_EMPTY[self._layout])[0][0])
 
     def _drop_index(self) -> None:
-        """Leave the index out, if nobody is reading; nobody is made to wait."""
+        """Drop the index, unless somebody is reading: then it stays, and nobody waits."""
         connection = self._connection
         with contextlib.suppress(psycopg.errors.LockNotAvailable):
             connection.command("BEGIN")
@@ -152,7 +153,10 @@ class Loading:
                 raise
 
     def _make_index(self) -> None:
-        """Readers go on meanwhile; writers wait. One maker at a time: IF NOT EXISTS is no lock."""
+        """Make the index, while readers go on and writers wait.
+
+        A lock lets one connection at a time do so: IF NOT EXISTS alone would let two begin.
+        """
         connection, layout = self._connection, self._layout
         connection.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
         try:

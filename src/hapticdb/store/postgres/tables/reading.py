@@ -10,9 +10,9 @@ from hapticdb.store.base import (
     NO_OCCUPANCY,
     NO_ROWS,
     Change,
-    Frame,
     Keys,
     Layout,
+    LocatedShell,
     Object,
     Rows,
     no_object,
@@ -46,7 +46,7 @@ class PostgresReader:
     # -- rows -----------------------------------------------------------------------------------
 
     def unpacked(self, found: list[bytes | None]) -> Rows:
-        """Rows of one packed row; its last value is the revision that it has seen."""
+        """Rows from a statement's one packed row; its last value is the revision that was read."""
         seen = found[-1]
         self._seen = wire.read_int8(seen) if seen is not None else -1
         if found[0] is None:
@@ -104,7 +104,7 @@ class PostgresReader:
         (found,) = self._connection.fetch(text, wire.int8s(lows), wire.int8s(highs))
         return wire.read_int8(found or b"")
 
-    def statement(self, frame: Frame) -> NDArray[np.float64]:
+    def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
         text = statements.WRENCH[self._layout]
         parameters = wire.shell(frame)
@@ -114,7 +114,7 @@ class PostgresReader:
         (found,) = self._connection.fetch(text, *parameters)
         return np.zeros(6) if found is None else wire.read_float8s(found)
 
-    def statement_hits(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
         text = statements.HITS[self._layout]
         parameters = [wire.int8s(frame.addresses)]
@@ -129,7 +129,7 @@ class PostgresReader:
 
     def objects(self) -> list[Object]:
         """All objects, ordered by id."""
-        self.revision()  # before: what is written in between is then noticed later, not never
+        self.revision()  # first: a write between the two statements is noticed by the next read
         return [
             believed.object_of(self._url, row)
             for row in self._connection.rows(f"{records.OBJECTS} ORDER BY id")
@@ -145,7 +145,7 @@ class PostgresReader:
     def removed(self, link: str) -> set[str]:
         """Names of a file's parts that were removed and are not there again."""
         if self._connection.rows("SELECT to_regprocedure('removed_parts(text)')") == [(None,)]:
-            return set()  # of format 2 or older, and not ours to bring up to date
+            return set()  # format 2 or older: only its owner can bring it up to date
         return {row[0] for row in self._connection.rows("SELECT removed_parts(%s)", (link,))}
 
     def changes(self, since: int = 0) -> Iterator[Change]:
@@ -165,7 +165,7 @@ def _is_in_order(rows: Rows) -> bool:
 
 
 def _in_order(rows: Rows) -> Rows:
-    """Rows that came without the index, sorted: while a first import has none yet."""
+    """Rows in order of key and id. They come unsorted while a first import has no index yet."""
     order = np.lexsort((rows.ids, rows.keys))
     bits = rows.occupancy
     if bits.size:

@@ -29,7 +29,8 @@ Result = TypeVar("Result")
 
 COPY_CHUNK = 1 << 17
 """Rows that are packed for COPY at a time. More takes more memory and no less time."""
-# no sequence: it would count what was rolled back, and an import run again end with other ids
+# not from a sequence, which also counts rolled-back writes: an import that is run again would end
+# with other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
 # the write lock: revisions follow one another, and no reader waits for it
 NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
@@ -100,7 +101,7 @@ class PostgresWriter:
         return int(self._execute(NEXT_REVISION)[0][0])
 
     def _new_id(self, revision: int) -> int:
-        """One above all that were ever given. The write lock is held: nobody adds meanwhile."""
+        """One above all ids ever given. The write lock is held, so nobody else adds an object."""
         since, highest = self._highest_id
         found = self._execute(HIGHEST_ID, (since,))
         self._highest_id = revision - 1, max(highest, int(found[0][0]))
@@ -140,7 +141,7 @@ class PostgresWriter:
         return wire.read_int8s(found)
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
-        """Record which keys a write touched; who watches is told when it is committed."""
+        """Record which keys a write touched, and notify those who watch when it is committed."""
         ranges = touched_ranges(self._grid, self._layout, row_keys).reshape(-1).tolist()
         ((transaction, _),) = self._execute(
             "INSERT INTO change VALUES (%s, %s, %s, %s)"
@@ -150,8 +151,8 @@ class PostgresWriter:
         self._written = (revision, action, object_id, transaction)
 
     def _is_written(self) -> bool:
-        """Whether the write whose commit was under way when the connection was lost counts."""
-        # the commit may still be under way: wait for its lock, and only then look
+        """Whether the write was committed whose commit was under way when the connection broke."""
+        # the commit may still be under way: wait for its lock before looking
         self._connection.rows("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")
         found = "SELECT 1 FROM change WHERE (revision, action, id, xmin::text) = (%s, %s, %s, %s)"
         return bool(self._connection.rows(found, self._written))

@@ -18,9 +18,9 @@ from hapticdb.store import believed
 from hapticdb.store.base import (
     NO_ROWS,
     Change,
-    Frame,
     Keys,
     Layout,
+    LocatedShell,
     Object,
     Rows,
     no_object,
@@ -106,12 +106,12 @@ class SQLiteReader:
             return 0
         return int(self._connection.fetch(*self._ranges.count(lows, highs))[0][0])
 
-    def statement(self, frame: Frame) -> NDArray[np.float64]:
+    def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
         found = self._connection.fetch(*sqlite_force.wrench_statement(self._layout, frame))
         return np.frombuffer(found[0][0], dtype=np.float64)
 
-    def statement_hits(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
         found = self._connection.fetch(*sqlite_force.hits_statement(self._layout, frame))
         pairs = sqlite_rows.pairs_of(self._connection.url, found)

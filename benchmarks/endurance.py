@@ -36,7 +36,7 @@ from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import State
 from hapticdb.recording.replay import replay
-from hapticdb.resident.frames import Frames as Batch
+from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.sample import write_sample
@@ -184,7 +184,7 @@ def check_exact(path: Path, url: str) -> int:
     """Feel every frame again that was exact, bit for bit; how many that were."""
     recording = Recording(path)
     with hapticdb.open(url, read_only=True) as env:
-        felt = Batch(Residency(env.store, CellTable.create()), recording.header.shell)
+        felt = ResidentFrames(Residency(env.store, CellTable.create()), recording.header.shell)
         replayed = replay(recording, env, felt.wrenches)
     assert replayed.is_equal, replayed.describe()
     return replayed.n_compared

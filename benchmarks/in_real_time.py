@@ -32,7 +32,7 @@ from hapticdb.bench import records
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS, feel_kernel
 from hapticdb.mesh import read_file
 from hapticdb.poses import read_poses, write_poses
-from hapticdb.resident.frames import Frames
+from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.sample import write_sample
@@ -61,7 +61,7 @@ def measure_frames(
     """Medians, in us a frame, of the flat loop, clusters and the dense bitmap, in turns."""
     with hapticdb.open(database, read_only=True) as env, CellTable.create() as table:
         residency = Residency(env.store, table, exclude)
-        frames = {name: Frames(residency, shell, run=run) for name, run in RUNS.items()}
+        frames = {name: ResidentFrames(residency, shell, run=run) for name, run in RUNS.items()}
         frames["flat"].feel(poses)
         bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
         first = frames["flat"]

@@ -26,7 +26,7 @@ import hapticdb
 from hapticdb.devices.scripted import Line
 from hapticdb.kernels import _jit, compiling
 from hapticdb.query.frame import STRATEGIES
-from hapticdb.resident.frames import Frames
+from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.testing import KINDS, floor_voxels, write_voxels
@@ -68,7 +68,7 @@ for n, (layout, curve) in enumerate(KINDS):
             hapticdb.sweep(env, shell, [np.eye(4), np.eye(4)], profile=True)
             hapticdb.sweep(env, shell, [np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4)])
             with CellTable.create(LEAST_BUDGET) as table:
-                frames = Frames(Residency(env.store, table), shell, run=4)
+                frames = ResidentFrames(Residency(env.store, table), shell, run=4)
                 frames.feel(np.eye(4)[None])
                 frames.close()
 hand = Line(np.zeros(3), np.ones(3), 0.1)

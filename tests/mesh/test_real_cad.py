@@ -1,4 +1,4 @@
-"""From a CAD file to a force: on real assemblies, or on the sample where there are none."""
+"""The whole way from a CAD file to a force, on real assemblies, or on the sample without them."""
 
 from collections.abc import Iterator
 from pathlib import Path

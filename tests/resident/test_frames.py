@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from hapticdb import PointShell, UsageError
 from hapticdb.grid import CurveName
-from hapticdb.resident.frames import RUN, Frames
+from hapticdb.resident.frames import RUN, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Layout
@@ -44,7 +44,7 @@ def test_frames_are_the_oracles_bit_for_bit(
     for exclude in ([], [2]):
         for run in (0, 8):
             with CellTable.create(LEAST_BUDGET) as table:
-                frames = Frames(Residency(env.store, table, exclude), shell, run=run)
+                frames = ResidentFrames(Residency(env.store, table, exclude), shell, run=run)
                 felt = frames.feel(poses)
                 frames.close()
             assert felt.hits.any()
@@ -75,9 +75,9 @@ def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed:
     poses = poses_in(env.grid, 12, seed)
     with CellTable.create(LEAST_BUDGET) as table:
         residency = Residency(env.store, table)
-        plain = Frames(residency, shell, run=0).feel(poses)
+        plain = ResidentFrames(residency, shell, run=0).feel(poses)
         for run in (1, int(rng.integers(2, 64)), len(shell)):
-            clustered = Frames(residency, shell, run=run)
+            clustered = ResidentFrames(residency, shell, run=run)
             found = clustered.feel(poses)
             clustered.close()
             for a, b in zip(plain, found, strict=True):
@@ -88,7 +88,7 @@ def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed:
 def test_an_empty_environment_is_felt_as_empty(tmp_path: Path) -> None:
     env = make(tmp_path)
     with CellTable.create(LEAST_BUDGET) as table:
-        felt = Frames(Residency(env.store, table), cloud(50)).feel(poses_in(env.grid, 5))
+        felt = ResidentFrames(Residency(env.store, table), cloud(50)).feel(poses_in(env.grid, 5))
     assert not felt.wrenches.any()
     assert not felt.hits.any()
     assert not felt.unknown.any()
@@ -104,7 +104,7 @@ def test_a_path_longer_than_the_table_is_felt_in_parts(tmp_path: Path) -> None:
     with CellTable.create(LEAST_BUDGET) as table:
         residency = Residency(env.store, table)
         assert table.n_slots < 512
-        felt = Frames(residency, shell).feel(poses)
+        felt = ResidentFrames(residency, shell).feel(poses)
         assert residency.writer.n_evicted > 0
     assert not felt.unknown.any()
     for n in range(0, 200, 7):
@@ -118,7 +118,7 @@ def test_a_tool_larger_than_the_table_is_told_so(tmp_path: Path) -> None:
     write_voxels(env.store, np.unique(rng.integers(0, 256, (60_000, 3)), axis=0))
     shell = cloud(5000, extent=0.1)
     with CellTable.create(LEAST_BUDGET) as table:
-        frames = Frames(Residency(env.store, table), shell)
+        frames = ResidentFrames(Residency(env.store, table), shell)
         with pytest.raises(UsageError, match=r"more than fit into .*give a larger budget"):
             frames.feel(np.eye(4))
 
@@ -134,7 +134,7 @@ def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Pat
     shell = PointShell(points, normals, np.zeros(3))
     write_voxels(env.store, env.grid.voxels_of(middles))
     with CellTable.create(LEAST_BUDGET) as table:
-        frames = Frames(Residency(env.store, table), shell)
+        frames = ResidentFrames(Residency(env.store, table), shell)
         n_cells = len(np.unique(env.grid.voxels_of(points) // 32, axis=0))
         assert n_cells <= (table.n_slots - 1) // 2 < 8 * n_cells
         felt = frames.feel(np.eye(4))
@@ -146,6 +146,6 @@ def test_a_pose_that_is_not_rigid_is_named(tmp_path: Path) -> None:
     poses = np.stack([np.eye(4)] * 3)
     poses[1, 0, 0] = 1.1
     with CellTable.create(LEAST_BUDGET) as table:
-        frames = Frames(Residency(env.store, table), cloud(5))
+        frames = ResidentFrames(Residency(env.store, table), cloud(5))
         with pytest.raises(UsageError, match="pose 1 is no rigid transform"):
             frames.feel(poses)

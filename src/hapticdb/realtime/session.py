@@ -2,16 +2,13 @@
 
 import os
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterable
+from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
-from pathlib import Path
 from typing import Literal, Self, get_args
 
-import numpy as np
-
 from hapticdb.devices.protocol import Device, check_device
-from hapticdb.errors import FileError, HapticDBError, UsageError
+from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
@@ -24,20 +21,27 @@ from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report
 from hapticdb.realtime.resident_cells import ResidentCells, start_error
-from hapticdb.recording.file import DEFAULT_LIMIT, Header, Recorder
+from hapticdb.realtime.session_recording import SessionRecording
+from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames
 from hapticdb.resident.table import DEFAULT_BUDGET, anonymous_memory
 
 Policy = Literal["hold", "wait"]
 RING_SECONDS = 4.0
-"""Seconds of frames that wait in memory for whoever records them."""
+"""Seconds of frames that the ring in shared memory holds until they are recorded. A larger value
+loses no frame over longer pauses of this process, and takes more memory."""
+LEAST_RING = 1024
+"""Frames that the ring holds at least, however low the rate."""
 DRAIN_EVERY = 0.05
-FLUSH_EVERY = 1.0
-"""Seconds of frames that are lost at most when this process is killed."""
+"""Seconds between two looks at the loop in `wait`. A larger value reports its end later."""
 START_PATIENCE = 120.0
+"""Seconds in which the loop's process must be ready. A device may take long to open."""
 END_PATIENCE = 10.0
+"""Seconds in which the loop must end when asked to: it ends after a frame."""
 FOREVER = 1e9
+"""Seconds that stand for no limit: thirty years."""
 DEFAULT_STALENESS = 1.0
+"""Seconds that the database may be silent, unless others are given."""
 
 
 class Session:
@@ -99,7 +103,7 @@ class Session:
     """
 
     _pid = 0
-    """Of the process that began it; in another, forked from it, it is not to be ended."""
+    """Process id of the maker. In a process forked from it, `close` must not end anything."""
 
     def __init__(
         self,
@@ -125,48 +129,35 @@ class Session:
         has_baseline: bool = True,
     ) -> None:
         check_device(device)
-        _check_times(rate, seconds, staleness)
-        if policy not in get_args(Policy):
-            raise UsageError(f"policy {policy!r}: give 'hold' or 'wait'")
+        _check_choices(rate, seconds, staleness, policy)
         self.shell, self.law = shell, law or TangentPlane()
         self.coupling = coupling or Coupling()
         self.handle = handle or Handle()
         self.timing = Timing(rate, is_fifo, processor)
         self.timing.check_granted()
         self._has_baseline = has_baseline
-        self._is_own = isinstance(cells, str)
-        if isinstance(cells, str):
-            budget_bytes = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
-            self.cells = ResidentCells(cells, budget_bytes=budget_bytes, exclude=exclude)
-        elif budget_bytes is not None or tuple(exclude):
-            raise UsageError("these cells have a budget and exclusions already: give a URL instead")
-        elif cells.is_closed:
-            raise UsageError("these cells are closed: make others")
-        else:
-            self.cells = cells
+        self._owns_cells = isinstance(cells, str)
+        self.cells = _cells_of(cells, budget_bytes, exclude)
         self.proportions = self._compared(device)
         self._pid = os.getpid()
         self._row = self._memory = -1
         self._process: Process | None = None
-        self._recorder: Recorder | None = None
-        self._new: Path | None = None
-        self._record_limit = record_limit_bytes
-        self._recording_ended: str | None = None
-        self._is_recording = False
-        self._flushed = 0.0
-        self._drained = self._lost = 0
         self._objects: set[int] = set()
         self._answer: LoopAnswer | None = None
-        how = {"append": append_recording, "replace": replace_recording}
+        self._recording: SessionRecording | None = None
+        if record is not None:
+            self._recording = SessionRecording(
+                record, limit_bytes=record_limit_bytes, append=append_recording,
+                replace=replace_recording,
+            )  # fmt: skip
         try:
-            self._begin(device, policy, staleness, seconds, record, how)
+            self._begin(device, policy, staleness, seconds)
         except BaseException:
             try:
                 self.close()
-            finally:  # also when a second signal cuts that off
-                if self._new is not None:  # nothing was recorded: the name stays free
-                    with suppress(OSError):
-                        self._new.unlink()
+            finally:  # also when a second signal interrupts the closing
+                if self._recording is not None:
+                    self._recording.remove_new_file()
             raise
 
     def _compared(self, device: Device) -> Proportions:
@@ -183,14 +174,12 @@ class Session:
         policy: Policy,
         staleness: float,
         seconds: float | None,
-        record: str | os.PathLike[str] | None,
-        how: dict[str, bool],
     ) -> None:
         compile_missing(entries_for("feel"))  # here: the loop must not wait for it
         table = self.cells.table
-        if record is not None:
-            self._begin_recording(Path(record), how)
-        n_ring = max(int(RING_SECONDS * self.timing.rate), 1024)
+        if self._recording is not None:
+            self._recording.begin(self._header())
+        n_ring = max(int(RING_SECONDS * self.timing.rate), LEAST_RING)
         self._memory = anonymous_memory("hapticdb-frames", ring_bytes(n_ring))
         self._ring = ring_of(self._memory, n_ring)
         self._row = table.join()
@@ -218,17 +207,6 @@ class Session:
         table.desk.pids[self._row] = self._process.pid
         if self._process.receive(START_PATIENCE) is None:
             raise start_error(self._process, "loop's", START_PATIENCE)
-
-    def _begin_recording(self, path: Path, how: dict[str, bool]) -> None:
-        # noted before the file is made: a signal may end the making at any moment
-        self._new = None if os.path.lexists(path) else path
-        try:
-            self._recorder = Recorder(path, self._header(), limit_bytes=self._record_limit, **how)
-        except UsageError:  # another has made it meanwhile
-            self._new = None
-            raise
-        self._is_recording = True
-        self._flushed = time.monotonic()
 
     def _header(self) -> Header:
         return Header(
@@ -276,7 +254,7 @@ class Session:
     @property
     def recording_ended(self) -> str | None:
         """Why the recording has ended before the session, in a line; None while it goes on."""
-        return self._recording_ended
+        return None if self._recording is None else self._recording.ended
 
     def last(self) -> Frames | None:
         """Latest frame, (1,) of `FRAME`; None before the first."""
@@ -286,15 +264,15 @@ class Session:
     def wait(self, seconds: float | None = None) -> Report | None:
         """Look after the session until it ends; its report, or None when that time is over.
 
-        To be called again and again, or without a time: it is here that frames are recorded, and
-        that a fetching process that has died is started again.
+        Call it again and again, or without a time: only while it runs are frames recorded, and is a
+        fetching process that has died started again.
         """
         process = self._process
         if process is None:
             raise UsageError("the session is closed: begin another")
         until = time.monotonic() + (FOREVER if seconds is None else seconds)
         while self._answer is None and time.monotonic() < until:
-            is_alive = process.is_alive  # before: its last words may come with its end
+            is_alive = process.is_alive  # asked first: its last message may come with its end
             message = process.receive(min(DRAIN_EVERY, max(until - time.monotonic(), 0.0)))
             self._drain()
             if message is not None:
@@ -307,7 +285,7 @@ class Session:
         return self._report() if self._answer is not None else None
 
     def ask_to_end(self) -> None:
-        """Have the loop end after its next frame; `wait` then gives the report."""
+        """Make the loop end after its next frame. `wait` then returns the report."""
         self.cells.table.desk.sessions["is_asked_to_end"][self._open_row] = True
 
     def stop(self) -> Report:
@@ -319,46 +297,21 @@ class Session:
         return report
 
     def _drain(self) -> None:
-        """Record the frames that have come, and learn what they touched."""
+        """Note the objects that were touched, and record the frames that have come."""
         sessions, done = self.cells.table.desk.sessions, self.n_frames
         n_objects = int(sessions["n_objects"][self._row])
         self._objects.update(sessions["objects"][self._row, :n_objects].tolist())
-        if self._recorder is None or not self._is_recording:
-            return
-        self._is_recording = False  # unless this goes well: one that failed takes no more
-        size = len(self._ring)
-        if done - self._drained > size - 64:  # the loop may be writing over the oldest by now
-            self._lost += done - self._drained - size // 2
-            self._drained = done - size // 2
-        rows = self._ring[np.arange(self._drained, done) % size]
-        with self._going_on():
-            self._recorder.append(rows)
-            if time.monotonic() - self._flushed >= FLUSH_EVERY:
-                self._recorder.flush()
-                self._flushed = time.monotonic()
-        self._drained = done
-        self._is_recording = self._recording_ended is None
-
-    @contextmanager
-    def _going_on(self) -> Iterator[None]:
-        """Note why the recording has ended, if it has: a full disk does not take the hand away."""
-        assert self._recorder is not None  # noqa: S101 - asked before
-        try:
-            yield
-        except FileError as error:
-            self._recording_ended = str(error)
-        else:
-            self._recording_ended = self._recording_ended or self._recorder.ended
+        if self._recording is not None:
+            self._recording.take(self._ring, done)
 
     def _report(self) -> Report:
         answer = self._answer
         assert answer is not None  # noqa: S101 - asked before
         counts = asdict(answer.counts)
         n_frames, conditions = counts.pop("frames"), counts.pop("conditions")
-        if self._recorder is not None:
-            self._is_recording = False
-            with self._going_on():
-                self._recorder.close()
+        recording = self._recording
+        if recording is not None:
+            recording.finish()
         return Report(
             rate=self.timing.rate,
             loop=answer.loop,
@@ -368,9 +321,9 @@ class Session:
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
             objects=self.objects,
-            recorded_frames=len(self._recorder) if self._recorder is not None else 0,
-            recording_ended=self._recording_ended,
-            lost_records=self._lost,
+            recorded_frames=0 if recording is None else len(recording),
+            recording_ended=self.recording_ended,
+            lost_records=0 if recording is None else recording.n_lost,
             proportions=self.proportions,
             conditions={"points": str(len(self.shell)), **conditions},
             **counts,
@@ -383,11 +336,12 @@ class Session:
         """
         if os.getpid() != self._pid:
             return
-        with ExitStack() as ends:  # each whatever becomes of those below it, which come first
-            if self._is_own:
+        # the last callback runs first, and each one runs even if another raises
+        with ExitStack() as ends:
+            if self._owns_cells:
                 ends.callback(self.cells.close)
-            if self._recorder is not None:
-                ends.callback(self._recorder.close)
+            if self._recording is not None:
+                ends.callback(self._recording.close)
             ends.callback(self._leave)
             if self._row >= 0:
                 ends.callback(self._drain)
@@ -405,10 +359,26 @@ class Session:
             self._memory = -1
 
 
-def _check_times(rate: float, seconds: float | None, staleness: float) -> None:
+def _cells_of(
+    cells: ResidentCells | str, budget_bytes: int | None, exclude: Iterable[int]
+) -> ResidentCells:
+    """Cells that are given, or new ones of the environment that a URL leads to."""
+    if isinstance(cells, str):
+        budget_bytes = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
+        return ResidentCells(cells, budget_bytes=budget_bytes, exclude=exclude)
+    if budget_bytes is not None or tuple(exclude):
+        raise UsageError("these cells have a budget and exclusions already: give a URL instead")
+    if cells.is_closed:
+        raise UsageError("these cells are closed: make others")
+    return cells
+
+
+def _check_choices(rate: float, seconds: float | None, staleness: float, policy: str) -> None:
     if not 10.0 <= rate <= 20_000.0:
         raise UsageError(f"a rate of {rate} Hz: give 10 to 20,000")
     if seconds is not None and not 0.0 < seconds <= 1e6:
         raise UsageError(f"{seconds} seconds: give a number above 0, a million at most")
     if not staleness > 0.0:
         raise UsageError(f"a staleness of {staleness} s: give a number above 0, or inf")
+    if policy not in get_args(Policy):
+        raise UsageError(f"policy {policy!r}: give 'hold' or 'wait'")

@@ -15,7 +15,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import TangentPlane
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.frames import Frames as ResidentFrames
+from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 

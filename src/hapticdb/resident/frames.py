@@ -27,17 +27,20 @@ from hapticdb.query.law import TangentPlane
 from hapticdb.resident.residency import Residency
 
 RUN = 64
-"""Points of a cluster."""
+"""Points of a cluster. A larger value tests fewer spheres and skips fewer points."""
 FLAT_RUN = 512
 """Points that are placed at once without clusters: as many as a processor's first cache holds."""
 LEAST_FOUND = 1 << 16
+"""Entries, at least, of the hash table of cells that poses meet. A larger one has fewer collisions
+and takes longer to clear."""
 SMALL = 16.0
-"""Voxels of a run's radius up to which its surroundings are taken for those of its points."""
+"""Voxels of a run's radius up to which the run's middle stands for its points where cells are
+looked for. A larger value looks up fewer places and fetches more cells that no point meets."""
 
 Floats = NDArray[np.float64]
 
 
-class Felt(NamedTuple):
+class FeltFrames(NamedTuple):
     """What a shell felt at M poses.
 
     wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
@@ -53,15 +56,15 @@ class Felt(NamedTuple):
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
-    """Shell as frames take it: points with normals, and spheres around runs of neighbours.
+    """Lay a shell out for frames: points with normals, and spheres around runs of neighbours.
 
     Parameters
     ----------
     shell : PointShell
-        In any order; clusters skip most where neighbours by index are neighbours in space, as in
-        shells made from files.
+        In any order. Clusters skip most points where neighbours by index are neighbours in space,
+        as in shells made from files.
     voxel_size : float
-        Metres; spheres are a thousandth of it larger, above all rounding.
+        Metres. Spheres are larger by a thousandth of it, which is more than all rounding errors.
     run : int or None
         Points of a cluster, 0 for no clusters; 64 unless given.
     """
@@ -118,8 +121,8 @@ def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
     return Surroundings(places, float(radii[is_small].max()), clusters.run, first)
 
 
-class Frames:
-    """Frames of one shell that wait for their cells: exact, whatever the database takes.
+class ResidentFrames:
+    """Frames of one shell. Each waits until its cells are resident, so that all are exact.
 
     Parameters
     ----------
@@ -151,11 +154,11 @@ class Frames:
         self._row = residency.table.join()
 
     def close(self) -> None:
-        """Be the table's reader no more."""
+        """Give the table's reader row back."""
         self.residency.table.leave(self._row)
 
-    def feel(self, poses: ArrayLike) -> Felt:
-        """Wrenches at poses (M, 4, 4) `world_from_tool`, every cell that they need fetched before.
+    def feel(self, poses: ArrayLike) -> FeltFrames:
+        """Wrenches at poses (M, 4, 4) `world_from_tool`; fetches every cell that they need first.
 
         Raises
         ------
@@ -169,7 +172,7 @@ class Frames:
             n_poses = self._fetch(matrices[done:])
             self._run(matrices, out, done, n_poses)
             done += n_poses
-        return Felt(
+        return FeltFrames(
             out[:, WRENCH : WRENCH + 6],
             out[:, HITS].astype(np.int64),
             out[:, CONTACTS].astype(np.int64),
@@ -187,7 +190,7 @@ class Frames:
         residency = self.residency
         most = (residency.table.n_slots - 1) // 2
         around = self.surroundings
-        # where the surroundings of the first pose do not fit, its points alone may
+        # if the surroundings of the first pose do not fit into the table, its points alone may fit
         for places, reach in ((around.places, around.reach), (self.clusters.points, 0.0)):
             room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
             found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import UsageError
 from hapticdb.kernels.resident import sweep as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
-from hapticdb.resident.frames import Frames
+from hapticdb.resident.frames import ResidentFrames
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -25,7 +25,7 @@ class ClearanceSearch:
 
     Parameters
     ----------
-    frames : Frames
+    frames : ResidentFrames
         Of the shell; their cells are used, and more are fetched around the points.
     limit : float
         Voxels: what is farther is not looked for.
@@ -43,7 +43,7 @@ class ClearanceSearch:
         Voxels, of each window; the limit where nothing is nearer.
     """
 
-    def __init__(self, frames: Frames, limit: float, n_windows: int | None = None) -> None:
+    def __init__(self, frames: ResidentFrames, limit: float, n_windows: int | None = None) -> None:
         self._frames = frames
         self._stride = STRIDE if n_windows is None else 1
         residency = frames.residency

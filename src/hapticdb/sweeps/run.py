@@ -20,7 +20,7 @@ from hapticdb.kernels.resident import sweep as kernels
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.frame import as_ids
-from hapticdb.resident.frames import Felt, Frames
+from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
 from hapticdb.store.base import Keys, Object, unknown_exclusion
@@ -137,7 +137,7 @@ class _Run:
         """Sweep from the start, in one snapshot."""
         with CellTable.create(budget_bytes) as table:
             residency = Residency(self.store, table, exclude)
-            frames = Frames(residency, self.shell)
+            frames = ResidentFrames(residency, self.shell)
             try:
                 with self.store.snapshot():
                     started = time.perf_counter()
@@ -149,7 +149,7 @@ class _Run:
             finally:
                 frames.close()
 
-    def _begin(self, frames: Frames) -> None:
+    def _begin(self, frames: ResidentFrames) -> None:
         residency = frames.residency
         self.known = {obj.id: obj for obj in self.store.objects()}
         for i in residency.exclude.tolist():
@@ -166,7 +166,7 @@ class _Run:
         self.first_contact: Moment | None = None
         self.deepest: Deepest | None = None
 
-    def _sweep(self, frames: Frames) -> None:
+    def _sweep(self, frames: ResidentFrames) -> None:
         total = len(self.path)
         block = max(1, min(BLOCK, BLOCK_POINTS // len(self.shell)))
         for first in range(0, total, block):
@@ -196,7 +196,9 @@ class _Run:
             at, windows = at[~is_hit[at]], windows[~is_hit[at]]
             self.along.look(first, poses[at], travels[at], windows)
 
-    def _note_hits(self, frames: Frames, first: int, poses: Floats, felt: Felt) -> None:
+    def _note_hits(
+        self, frames: ResidentFrames, first: int, poses: Floats, felt: FeltFrames
+    ) -> None:
         """Find the objects of a block's hits, and count them in."""
         self.hit_runs.add(first + np.flatnonzero(felt.hits))
         self.contact_runs.add(first + np.flatnonzero(felt.contacts))
@@ -274,7 +276,7 @@ class _Run:
         is_inside_known = self.enclosed is not None
         return Proof(self.shell.cover, self.path.off, nearest, is_near, is_inside_known)
 
-    def _result(self, frames: Frames, elapsed: float) -> Swept:
+    def _result(self, frames: ResidentFrames, elapsed: float) -> Swept:
         path = self.path
         met = [self._met(self.known[i], one) for i, one in self.met.items()]
         met.sort(key=lambda one: (one.first, one.object.id))
@@ -313,7 +315,7 @@ class _Run:
         )  # fmt: skip
 
 
-def find_hits(frames: Frames, poses: Floats, n_hits: Ints) -> kernels.Found:
+def find_hits(frames: ResidentFrames, poses: Floats, n_hits: Ints) -> kernels.Found:
     """Hits at poses (B, 4, 4), of which there are n_hits (B,), in the order of the poses."""
     samples = np.flatnonzero(n_hits)
     total = int(n_hits.sum())

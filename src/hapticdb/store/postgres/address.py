@@ -73,10 +73,9 @@ def parse(url: str) -> Address:
 
 
 def _split(url: str) -> SplitResult:
-    """Split a URL; refuse one that libpq would misread and then quote in its message.
+    """Split a URL; refuses what libpq would read otherwise than it was meant, and then quote.
 
-    An @ that is not escaped in a password makes a part of the password a host, which libpq's
-    message would show.
+    An @ in a password, not escaped, makes a part of the password a host, and part of its message.
     """
     try:
         parts = urlsplit(url)
@@ -111,7 +110,7 @@ def with_environment(url: str, name: str) -> str:
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse a name that the server refuses, or that it would cut off at 63 bytes.
+    """Refuse what the server would not take as a name, or would cut off and take for another.
 
     Raises
     ------
@@ -134,7 +133,7 @@ def check_name(name: str, what: str) -> None:
 
 
 def _check_login(parts: SplitResult, url: str) -> None:
-    """Refuse names of users and databases that the server would cut off: it would mean another."""
+    """Refuse names of a user or a database that the server would cut off and take for another."""
     pairs = [pair.partition("=") for pair in parts.query.split("&")]
     user = parts.netloc.rpartition("@")[0].partition(":")[0]
     names = [("a user's name", user), ("a database's name", parts.path.removeprefix("/"))]

@@ -1,4 +1,4 @@
-"""Opening and making SQLite files, and SQLite's errors turned into those of `hapticdb.errors`."""
+"""Opening and creating SQLite files: what is told apart, and how an engine's error is named."""
 
 import contextlib
 import glob
@@ -26,10 +26,8 @@ from hapticdb.store.sqlite.migrations import APPLICATION_ID, CHECKED_VERSION, MI
 from hapticdb.store.sqlite.place import OpenedFile
 
 BUSY_TIMEOUT_MS = 10_000
-"""How long a write waits for another process's write before it gives up."""
 CACHE_KIB = 256 * 1024
-"""Page cache of one connection, enough for the bricks of a large car. Memory is taken as pages are
-read. A smaller one reads pages again from the operating system."""
+"""Page cache of one connection: the bricks of a large car; memory is taken as it is filled."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
 
@@ -57,7 +55,7 @@ def named_errors(path: str) -> Iterator[None]:
     except apsw.CantOpenError as error:
         raise DatabaseError(f"{path} cannot be opened: check its folder's rights") from error
     except (apsw.SQLError, apsw.MismatchError, apsw.ConstraintError) as error:
-        # the statements fit the tables of an environment: these are other tables
+        # our statements fit our tables: these are others
         raise damaged(path, str(error)) from error
 
 
@@ -67,10 +65,10 @@ def damaged(path: str, cause: str) -> DamagedError:
 
 
 def check_kind(path: Path) -> None:
-    """Refuse a missing file, a folder, a file of another kind, a file that is cut off.
+    """Tell an environment from a missing file, a folder, a file of another kind, a cut one.
 
-    Reads the file's header of 100 bytes (https://sqlite.org/fileformat2.html, section 1.3) before
-    SQLite opens the file, so that a foreign file is never touched.
+    Looks at the header's first 100 bytes (https://sqlite.org/fileformat2.html, section 1.3):
+    before the engine opens it, so that a foreign file is never touched.
     """
     try:
         is_there = path.exists()
@@ -101,7 +99,7 @@ def check_kind(path: Path) -> None:
     _check_known(path, int.from_bytes(header[60:64], "big"))
     wal = Path(f"{path.resolve()}-wal")
     if wal.exists() and wal.stat().st_size:
-        return  # the size in the header may be older than the log: SQLite decides
+        return  # the size may be older than the log: the engine decides
     page = int.from_bytes(header[16:18], "big")
     expected = int.from_bytes(header[28:32], "big") * (65536 if page == 1 else page)
     if path.stat().st_size < expected:
@@ -134,9 +132,9 @@ def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFi
 
 
 def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
-    """Make an environment of the newest format; `fill` writes its first rows.
+    """Make an environment of the newest format; `fill` writes what belongs into it from the start.
 
-    The file is made under another name beside its path: it appears whole or not at all.
+    The file appears at its path whole or not at all: it is made under another name beside it.
     """
     check_free(path)
     check_folder(path)
@@ -166,7 +164,7 @@ def check_free(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a path whose folder is missing or cannot be written."""
+    """Refuse a path whose folder is missing, or takes no file."""
     if not path.parent.is_dir():
         raise EnvironmentNotFoundError(f"folder {path.parent} does not exist; make it first")
     if not os.access(path.parent, os.W_OK):
@@ -175,7 +173,7 @@ def check_folder(path: Path) -> None:
 
 @contextlib.contextmanager
 def unfinished_beside(path: Path) -> Iterator[Path]:
-    """Name for a file that is moved to `path` when it is complete; removed if it is still there."""
+    """Name for a file that will have that path when it is whole; removed when it has not."""
     _sweep_unfinished(path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
@@ -215,7 +213,7 @@ def migrate(connection: apsw.Connection, version: int) -> None:
         connection.execute("BEGIN IMMEDIATE")
         try:
             marked, done = divmod(_pragma(connection, "user_version"), CHECKED_VERSION)
-            if done < number:  # else another process was faster
+            if done < number:  # another process may have been faster
                 for statement in statements:
                     connection.execute(statement)
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -229,8 +227,8 @@ def migrate(connection: apsw.Connection, version: int) -> None:
 def needs_immutable(path: Path) -> bool:
     """Whether only an immutable opening can read this file: nobody here can write its folder.
 
-    A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, SQLite can still
-    read the file alone, if there is no log whose pages would be missed.
+    A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, and no log is
+    there whose pages would be missed, SQLite can still read the file alone.
     """
     real = path.resolve()
     return not os.access(real.parent, os.W_OK) and not any(

@@ -1,1 +1,0 @@
-"""The tables of an environment on a server: read, written, loaded, their statistics."""

@@ -1,1 +1,0 @@
-"""The tables of an environment in a file: read, written, their statistics."""

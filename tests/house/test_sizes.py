@@ -53,8 +53,6 @@ def test_the_lines_of_a_function_are_counted() -> None:
 
 MOST_FILES = 15
 """Python files in a folder, ``__init__`` aside."""
-CROWDED: dict[str, int] = {"src/hapticdb/store/postgres": 18}
-"""Folders that hold more, and how many."""
 SHARED = 4
 """Files of a folder whose names begin with one word: so many of them are a folder of that name."""
 
@@ -75,8 +73,7 @@ def first_words(names: list[str]) -> Counter[str]:
 
 def test_no_folder_holds_more_than_15_files() -> None:
     counts = {folder: len(names) for folder, names in folders().items()}
-    crowded = {name: n for name, n in counts.items() if n > CROWDED.get(name, MOST_FILES)}
-    assert crowded == {}
+    assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
 
 
 def test_names_that_begin_alike_are_a_folder() -> None:
@@ -97,16 +94,12 @@ def public_classes(source: str) -> list[str]:
     return [name for name in names if not name.startswith("_")]
 
 
-TWINS: set[str] = {"Session"}
-"""Public classes whose names stand in two modules."""
-
-
 def test_a_public_class_name_stands_once() -> None:
     homes: dict[str, list[str]] = {}
     for path in modules():
         for name in public_classes(path.read_text()):
             homes.setdefault(name, []).append(named(path))
-    assert {n: paths for n, paths in homes.items() if len(paths) > 1 and n not in TWINS} == {}
+    assert {n: paths for n, paths in homes.items() if len(paths) > 1} == {}
 
 
 def test_files_are_named_by_the_words_of_the_domain() -> None:

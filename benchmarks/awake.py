@@ -1,4 +1,4 @@
-"""Processors that do not sleep while times count.
+"""Processors that do not sleep while times are measured.
 
 A frame on a server goes to and fro between two processes that each sleep while the other works, and
 a virtual processor that sleeps can take longer to wake than a frame lasts: times double and
@@ -15,7 +15,7 @@ AWAKE = """
 import os, sys
 parent = int(sys.argv[1])
 os.sched_setscheduler(0, os.SCHED_IDLE, os.sched_param(0))
-while os.getppid() == parent:  # not longer than who asked for it, however that ended
+while os.getppid() == parent:  # ends with the process that asked for it
     for _ in range(1_000_000):
         pass
 """
@@ -23,7 +23,7 @@ while os.getppid() == parent:  # not longer than who asked for it, however that 
 
 @contextlib.contextmanager
 def awake() -> Iterator[None]:
-    """Keep each processor of this process awake inside."""
+    """Keep each processor of this process awake while the block runs."""
     started = []
     try:
         for cpu in os.sched_getaffinity(0):

@@ -48,6 +48,7 @@ from report.plots import REPORT_KINDS
 from servers_cold import Cold
 
 EXTENT = 1.6
+"""Edge of the sample's grid, as a multiple of the car's longest side."""
 CAD = (
     ("demo_vintage_car", "*.glb", 1.6),
     ("assembly_vw_t1", "vw_t1.glb", 2.4),
@@ -62,7 +63,7 @@ SETTINGS = {"max_wal_size": "4GB", "fsync": "off"}
 
 @dataclass
 class Evaluation:
-    """What one run of the script knows and has found."""
+    """Inputs of one run of the script, and the cells that it has measured."""
 
     folder: Path
     files: SampleFiles
@@ -76,16 +77,16 @@ class Evaluation:
     work: dict[Layout, Workload] = field(default_factory=dict)
 
     def say(self, line: str) -> None:
-        """Tell what comes next, and how long it has been going on."""
+        """Print what is measured next, and the seconds since the start."""
         print(f"{time.perf_counter() - self.seconds:6.0f} s  {line}", file=sys.stderr, flush=True)
 
     def keep(self, name: str, measured: PeerResults) -> None:
-        """Keep what was measured, and what was not."""
+        """Keep measured cells, and notes on what could not be measured."""
         self.add(name, measured.cells)
         self.notes += measured.notes
 
     def add(self, name: str, cells: list[Cell]) -> None:
-        """Keep what was measured."""
+        """Keep measured cells of one experiment."""
         self.found.setdefault(name, []).extend(cells)
 
     def make(self, url: str, layout: Layout, curve: CurveName = "z") -> str:
@@ -213,7 +214,7 @@ def curves(evaluation: Evaluation) -> None:
 
 
 def peers(evaluation: Evaluation) -> None:
-    """What a user would take instead, on the same poses; and other voxelizers."""
+    """Other systems on the same poses, and other voxelizers."""
     evaluation.say("peers")
     with hapticdb.open(evaluation.folder / "brick.db", read_only=True) as env:
         compare(evaluation, env, None)
@@ -293,7 +294,8 @@ def main(arguments: list[str] | None = None) -> None:
     out = chosen.out or Path("results-quick" if chosen.quick else "results")
     report = chosen.report or (out / run.PAGE if chosen.quick else Path("docs/evaluation.md"))
     data = os.environ.get("HAPTICDB_TEST_DATA")
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that servers and files go, too
+    # an exit instead of an end at once: servers are stopped and files removed
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with awake(), tempfile.TemporaryDirectory(prefix="hapticdb-figures-") as folder:
         found = evaluate(
             Path(folder),

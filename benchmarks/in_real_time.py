@@ -43,13 +43,16 @@ from places import serving
 BITS = 11
 EXTENT = 1.6
 ROUNDS = 15
+"""Timed passes over all poses, of which the median counts."""
 LIFT = 1.0
 """Metres that a part is lifted out of the car."""
 N_LIFTED = 40
 PARTS = ("body/hood", "body/door_front_left", "supply/fuel_tank", "seats/bench_cushion")
 RUNS = {"flat": 0, "clusters": None}
+"""Option `run` of `Frames` for each way that is measured."""
 RATES = (1000, 5000, 10_000)
 LARGE = 100_000
+"""Points of the large shells."""
 PATIENCE = 600.0
 """Seconds after which a command is killed, beyond those that it was asked to last."""
 SETTINGS = {"shared_buffers": "256MB"}

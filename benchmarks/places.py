@@ -1,4 +1,4 @@
-"""Where the environments of all sizes are, on each engine, with 4 MB of page cache."""
+"""Places of the environments of all sizes on each engine, with 4 MB of page cache."""
 
 import contextlib
 from collections.abc import Iterator, Mapping
@@ -26,7 +26,7 @@ class EnginePlace(Protocol):
         """URL of an environment."""
 
     def remove(self, name: str) -> None:
-        """Delete what is there, half built or not."""
+        """Delete an environment, complete or not."""
 
 
 class Files:
@@ -63,7 +63,7 @@ class Server:
 
 @contextlib.contextmanager
 def place_of(engine: str, folder: Path) -> Iterator[EnginePlace]:
-    """Make ready where an engine keeps its environments: ``sqlite``, or a PostgreSQL's major."""
+    """Prepare the place of an engine's environments: ``sqlite``, or a major of PostgreSQL."""
     if engine == "sqlite":
         yield Files(folder)
         return

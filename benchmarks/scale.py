@@ -47,11 +47,11 @@ BITS = 11
 EXTENT = 1.6
 STRATEGIES: tuple[Strategy, ...] = ("array", "cbgroup", "auto")
 BYTES_A_VOXEL = {"sqlite": 1.3, "postgres": 3.0}
-"""More than was ever seen."""
+"""Bytes a voxel that are reserved on the disk, above all that was measured. More refuse sooner."""
 SPARE_BYTES = 3 << 30
-"""For write-ahead logs and the sample."""
+"""Bytes of the disk that are kept free for write-ahead logs and the sample."""
 ROUNDS = 5
-"""Every size has its turn so often: what disturbs the machine for a while falls on all."""
+"""Turns of every size, so that what disturbs the machine for a while disturbs all sizes."""
 LIMIT_S = 60.0
 PROGRESS_S = 5.0
 
@@ -66,7 +66,7 @@ Poses = NDArray[np.float64]
 
 
 def say(line: str) -> None:
-    """Tell whoever waits."""
+    """Print a line on standard error."""
     print(line, file=sys.stderr, flush=True)
 
 
@@ -92,7 +92,7 @@ class ScaleSize:
 
     @property
     def cell(self) -> Cell:
-        """What all cells of this size say."""
+        """Conditions that all cells of this size share."""
         return {
             "environment": "sample",
             "layout": self.plan.source.layout,
@@ -151,7 +151,7 @@ class Built:
         return self.folder / f"{self.engine}_{self.size.name}.json"
 
     def cell(self) -> Cell | None:
-        """What building it has shown; none while it is not built to its end."""
+        """Cell that building it gave; None until it is built completely."""
         if not (self._record.exists() and exists(self.url)):
             return None
         cell: Cell = json.loads(self._record.read_text())
@@ -252,7 +252,7 @@ class Run:
         in_turns(self._alternatives, share, limit_s=self._limit_s)
 
     def cells(self) -> list[Cell]:
-        """What all turns have shown; hits and false rows from one more touch of each pose."""
+        """Cells of all turns; hits and false rows come from one more touch of each pose."""
         touches = [self._env.touch(self._shell, pose, "array") for pose in self._poses]
         asked = float(np.mean([touch.query.rows for touch in touches]))
         hits = float(np.mean([len(touch.hits) for touch in touches]))

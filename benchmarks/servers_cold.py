@@ -6,19 +6,19 @@ from pathlib import Path
 import psycopg
 
 BLOCKS = 2000
-"""Of 8 KB, read to push all others out of a cache of 4 MB."""
+"""Blocks of 8 KB that are read to push all others out of a cache of 4 MB."""
 FILL = f"""
 CREATE TABLE IF NOT EXISTS public.filler (n int PRIMARY KEY, pad text);
 ALTER TABLE public.filler ALTER COLUMN pad SET STORAGE PLAIN;
 INSERT INTO public.filler SELECT n, repeat('x', 7000) FROM generate_series(1, {BLOCKS}) AS s(n)
     ON CONFLICT DO NOTHING;
 CHECKPOINT"""
-# by the index: a scan of the whole table would pass through a small ring of blocks instead
+# by the index: PostgreSQL reads a whole table through a small ring of buffers, and fills no cache
 PUSH_OUT = f"SELECT sum(length(pad)) FROM public.filler WHERE n BETWEEN 1 AND {BLOCKS}"
 
 
 class Cold:
-    """Empties the caches of a server whose folder is ours; its cache must be small."""
+    """Empties the caches of a private server, whose own cache must be small."""
 
     def __init__(self, conninfo: str, data: Path) -> None:
         self._connection = psycopg.connect(conninfo, autocommit=True)

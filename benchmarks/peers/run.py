@@ -13,10 +13,11 @@ from peers import Peer, PeerMissingError, PeerWork, Pose, all_peers
 from peers.own import Own
 
 WARM_FRAMES = 50
+"""Untimed frames of each peer."""
 
 
 class PeerResults(NamedTuple):
-    """A cell for each peer that can be had, and a note for each other."""
+    """A cell for each peer that could be measured, and a note for each of the others."""
 
     cells: list[Cell]
     notes: list[str]
@@ -34,7 +35,7 @@ def measure_peers(
     poses : (M, 4, 4)
         world_from_tool.
     seconds : float
-        Of frames for each peer; who is stopped by it is marked `cut_short`.
+        Of frames for each peer. A peer that reaches it stops, and its cell is marked `cut_short`.
     peers : sequence of Peer, optional
         All of them unless given.
 

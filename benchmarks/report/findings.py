@@ -1,4 +1,4 @@
-"""What cells say of `auto` against the best strategy, of repeated cells, and of peers."""
+"""`auto` against the best strategy, conditions that were measured twice, and peers."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -22,11 +22,11 @@ from hapticdb.bench.cells import (
 )
 
 AUTO_CLOSE = 1.10
-"""`auto` is as good as the best strategy up to this ratio."""
+"""`auto` counts as good as the best strategy up to this ratio of their times."""
 CHOOSABLE = ("array", "cbgroup", "points", "statement")
 """What `auto` chooses among."""
 OURS = "hapticdb"
-"""How the names of its own cells begin among the peers'."""
+"""How the names of hapticdb's own cells begin among the peers'."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class AutoChoice:
 
     @property
     def explained(self) -> float | None:
-        """What its choices alone make of the ratio: the strategies' own times, by their shares."""
+        """Ratio that its choices alone would give: the strategies' own times by their shares."""
         shares = self._shares
         if not shares or not set(shares) <= set(self.own_us):
             return None
@@ -61,14 +61,14 @@ class AutoChoice:
 
     @property
     def choosable_ratio(self) -> float | None:
-        """The same beside the fastest of those that it chooses among."""
+        """Time of `auto` as a multiple of the fastest strategy that it can choose."""
         if self.best_choosable is None:
             return None
         return ratio(frame_us(self.auto), frame_us(self.best_choosable))
 
     @property
     def chosen(self) -> str:
-        """What it chose, in per cent of the frames, most first."""
+        """Strategies that it chose, in per cent of the frames, the most frequent first."""
         most = sorted(self._shares.items(), key=lambda pair: -pair[1])
         return ", ".join(f"{name} {100 * share:.0f} %" for name, share in most)
 
@@ -84,7 +84,7 @@ class AutoChoice:
 def choices(results: Results) -> list[AutoChoice]:
     """Every set of conditions in which `auto` and another strategy have a time.
 
-    Cells that the time limit cut short are left out: they hold other poses than their neighbours.
+    Cells that the time limit cut short are left out: they have fewer poses than the others.
     """
     found = []
     for experiment in results:
@@ -115,7 +115,7 @@ def choices(results: Results) -> list[AutoChoice]:
 
 
 def repeats(results: Results) -> list[float]:
-    """Longest over shortest typical time of what several experiments of the run measured alike."""
+    """Longest over shortest typical time of each cell that several experiments measured."""
     times: dict[tuple[Any, ...], list[float]] = {}
     keys = (*WHERE, "strategy", "form", "maxgap", "resolution")
     for experiment in results:

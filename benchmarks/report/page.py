@@ -39,9 +39,10 @@ LEFT_OUT = "The paper leaves this out."
 
 @dataclass(frozen=True)
 class Chapter:
-    """One experiment: what the paper shows, what is seen here, and why.
+    """One experiment: what the paper shows, what was measured here, and why it differs.
 
-    paper : a paragraph; here : the cells in Markdown; why : reasons that the cells bear out.
+    experiment : its name; paper : what the paper shows, a paragraph; here : the cells as Markdown;
+    why : reasons that the cells themselves show, or None.
     """
 
     experiment: str
@@ -197,7 +198,7 @@ def _how_to_read(results: Results) -> str:
 
 
 def _facts(results: Results, facts_of: Callable[[Result], object]) -> str:
-    """What the experiments say of themselves: once when they all say the same."""
+    """Machine, versions or inputs of the experiments: one table when all are the same."""
     said: dict[str, list[str]] = {}
     for chapter in CHAPTERS:
         found = facts_of(results.get(chapter.experiment, {}))

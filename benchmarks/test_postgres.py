@@ -28,13 +28,14 @@ from awake import awake
 from hapticdb import Environment, Touch
 from hapticdb.kernels.query import contact
 from hapticdb.query.frame import STRATEGIES, Strategy
-from hapticdb.store.base import LAYOUTS, Frame, Layout, row_shift
-from hapticdb.store.postgres import statements, wire
+from hapticdb.store.base import LAYOUTS, Layout, LocatedShell, row_shift
 from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.postgres.connecting import wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.schema_of import drop
-from hapticdb.store.postgres.session import Session
 from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres.tables import statements
 from scene import BenchScene, is_measuring
 from servers import FOUND, named
 
@@ -94,10 +95,10 @@ class Served:
             assert report.status == "imported"
             self.environments[layout] = hapticdb.open(where)
 
-    def session(self, layout: Layout) -> Session:
+    def session(self, layout: Layout) -> ServerConnection:
         store = self.environments[layout].store
         assert isinstance(store, PostgresStore)
-        return store.session
+        return store.connection
 
     def end(self) -> None:
         for layout, env in self.environments.items():
@@ -167,7 +168,7 @@ def wrench_of(touch: Touch) -> NDArray[np.float64]:
     return np.concatenate([touch.force, touch.torque])
 
 
-def frames_of(scene: BenchScene, env: Environment) -> list[Frame]:
+def frames_of(scene: BenchScene, env: Environment) -> list[LocatedShell]:
     """Located shells along the path, as a store gets them."""
     grid = env.grid
     origin = np.array(grid.origin)
@@ -180,7 +181,7 @@ def frames_of(scene: BenchScene, env: Environment) -> list[Frame]:
         placed, asked, _ = contact.locate(
             shell.points, shell.normals, shell.center, pose, origin, grid.voxel_size, *curve
         )
-        found.append(Frame(placed, asked[0], 1000.0, none))
+        found.append(LocatedShell(placed, asked[0], 1000.0, none))
     return found
 
 
@@ -316,7 +317,7 @@ def test_import_beside_sqlite(
             counted, wanted = ({o.name: o.voxels for o in one.objects()} for one in (env, file))
             assert counted == wanted
             assert isinstance(env.store, PostgresStore)
-            drop(env.store.session)
+            drop(env.store.connection)
 
     benchmark.group = f"{layout} import"
     benchmark.pedantic(both, rounds=3, warmup_rounds=1)

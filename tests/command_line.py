@@ -42,21 +42,21 @@ def command(*args: object) -> list[str]:
 HALTING = """
 import sys, time
 from hapticdb.cli import main
-from hapticdb.store.postgres.store import PostgresStore
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.postgres.tables.writing import PostgresWriter
+from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 
 left = int(sys.argv.pop(1))
 
 def halting(add):
-    def until_told(store, record, rows):
+    def until_told(writer, record, rows):
         global left
         if left == 0:
             time.sleep(600)
         left -= 1
-        return add(store, record, rows)
+        return add(writer, record, rows)
     return until_told
 
-for kind in (SQLiteStore, PostgresStore):
+for kind in (SQLiteWriter, PostgresWriter):
     kind.add = halting(kind.add)
 sys.exit(main())
 """

@@ -18,7 +18,7 @@ from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.query.frame import Strategy
 from hapticdb.store.base import Layout
-from hapticdb.store.postgres import session
+from hapticdb.store.postgres.connecting import connection
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
 from validity import Contents, contents, valid_contents
 
@@ -98,7 +98,7 @@ def url(server: PrivateServer) -> str:
 
 @pytest.fixture
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(session, "RECONNECT_SECONDS", SOON_S)
+    monkeypatch.setattr(connection, "RECONNECT_SECONDS", SOON_S)
 
 
 def moments(seed: int) -> list[tuple[int, float]]:

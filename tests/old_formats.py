@@ -13,7 +13,7 @@ def make_old(path: Path) -> None:
     """Turn a file into one of format 1: no marks of commits, no checksums of pages."""
     with closing(SQLiteStore.open(path, read_only=True)) as new:
         tables = {
-            name: new._fetch(f"SELECT * FROM {name}")
+            name: new._connection.fetch(f"SELECT * FROM {name}")
             for name in ("environment", "object", "voxel", "brick", "change")
         }
     path.unlink()

@@ -17,6 +17,7 @@ from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Layout
+from hapticdb.store.sqlite.tables.reading import SQLiteReader
 from hapticdb.testing import KINDS, blob, voxel_object
 
 Kind = tuple[Layout, CurveName]
@@ -87,15 +88,14 @@ def test_a_large_object_is_compared_in_batches(
             write(env, ijk, "sheet")
     monkeypatch.setattr(transfer, "MOST_ROWS", 4000)
     brought: list[int] = []
-    store = type(hapticdb.open(tmp_path / "a.db").store)
-    rows_of_object = store.rows_of
+    rows_of_object = SQLiteReader.rows_of
 
     def counting(*asked: object) -> object:
         rows = rows_of_object(*asked)  # type: ignore[arg-type]
         brought.append(len(rows))
         return rows
 
-    monkeypatch.setattr(store, "rows_of", counting)
+    monkeypatch.setattr(SQLiteReader, "rows_of", counting)
     found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
     assert [(v.only_in_a, v.only_in_b) for v in found.voxels] == [(1, 0)]
     assert max(brought) <= 1.25 * 4000  # what a histogram expects is not what is there

@@ -25,7 +25,8 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite.pages import LAYER
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.tables.reading import SQLiteReader
+from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 from hapticdb.testing import KINDS, blob, voxel_object, write_voxels
 from hapticdb.transfer import CopyProgress, CopyReport
 
@@ -159,14 +160,14 @@ def test_no_statement_brings_more_than_a_batch(
     source = make_blobs(tmp_path / "a.db", kind)
     monkeypatch.setattr(transfer, "MOST_ROWS", 8)
     brought: list[int] = []
-    rows_of_object = SQLiteStore.rows_of
+    rows_of_object = SQLiteReader.rows_of
 
-    def counting(store: SQLiteStore, *asked: Any) -> Any:  # noqa: ANN401
-        rows = rows_of_object(store, *asked)
+    def counting(reader: SQLiteReader, *asked: Any) -> Any:  # noqa: ANN401
+        rows = rows_of_object(reader, *asked)
         brought.append(len(rows))
         return rows
 
-    monkeypatch.setattr(SQLiteStore, "rows_of", counting)
+    monkeypatch.setattr(SQLiteReader, "rows_of", counting)
     copy_environment(source, tmp_path / "b.db")
     assert max(brought) <= 8
     assert len(brought) > 12
@@ -426,7 +427,7 @@ def test_an_error_before_the_first_object_leaves_nothing(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(SQLiteStore, "add", interrupted)
+        patch.setattr(SQLiteWriter, "add", interrupted)
         with pytest.raises(KeyboardInterrupt):
             copy_environment(source, tmp_path / "b.db")
     assert not (tmp_path / "b.db").exists()

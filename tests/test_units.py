@@ -86,7 +86,7 @@ def test_an_empty_scene_has_no_extent(run: Run, tmp_path: Path) -> None:
 def test_an_import_says_when_it_took_metres(run: Run, tmp_path: Path, name: str) -> None:
     made: dict[str, Callable[[Path], Path]] = {"a.las": cloud, "a.stl": stl, "a.glb": boxes}
     file = made[name](tmp_path / name)
-    told = "it names no unit, so its numbers are taken as metres; --unit says another"
+    told = "it names no unit, so its numbers are taken as metres; --unit gives another"
     is_told = name != "a.glb"
     assert (told in run("import", "a.db", file, "--bits", 6)[1]) == is_told
     assert told not in run("import", "b.db", file, "--bits", 6, "--unit", "m")[1]

@@ -219,7 +219,7 @@ def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) 
     code, out, err = run("replay", path)
     assert (code, out.startswith("equal: ")) == (0, True)
     assert re.fullmatch(
-        r"hapticdb: .*felt\.hdbrec: the last [\d,]+ bytes are no whole piece.*\n", err
+        r"hapticdb: .*felt\.hdbrec: the last [\d,]+ bytes are an incomplete chunk.*\n", err
     )
     start = path.stat().st_size - len(whole) + len(whole) // 2
     path.write_bytes(whole[:start] + b"?" * 64 + whole[start + 64 :])

@@ -10,10 +10,11 @@ import pytest
 
 from children import finished
 from hapticdb.cli import app
-from hapticdb.store.postgres import session, statements
+from hapticdb.store.postgres.connecting import link
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer
-from hapticdb.store.sqlite import force as sqlite_force
-from hapticdb.store.sqlite import ranges as sqlite_ranges
+from hapticdb.store.postgres.tables import statements
+from hapticdb.store.sqlite.tables import force as sqlite_force
+from hapticdb.store.sqlite.tables import ranges as sqlite_ranges
 from servers import FOUND, SETTINGS, named
 
 ROOT = Path(__file__).parent.parent.parent
@@ -88,7 +89,7 @@ def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binar
 def test_the_postgresql_page_gives_the_settings_that_are_set() -> None:
     page = (ROOT / "docs" / "postgresql.md").read_text()
     shown = re.findall(r"^\| `(\w+)` \| `(\w+)` \|", page, re.MULTILINE)
-    assert dict(shown) == session.SETTINGS
+    assert dict(shown) == link.SETTINGS
 
 
 def test_every_make_line_of_the_readme_is_run_by_ci() -> None:

@@ -23,7 +23,7 @@ LONG_FUNCTIONS = {
     "src/hapticdb/kernels/resident/cells.py:felt": "one pass over the points",
     "src/hapticdb/kernels/resident/sweep.py:find_clearance": "one pass over the points",
     "src/hapticdb/kernels/resident/sweep.py:find_hits": "one pass over the points",
-    "src/hapticdb/realtime/session.py:__init__": "",
+    "src/hapticdb/realtime/session.py:__init__": "an option a line",
 }
 """Functions that may be longer, and why."""
 

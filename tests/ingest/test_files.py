@@ -35,7 +35,7 @@ from hapticdb.kernels.surfaces.voxelize import brick_voxels, voxelize
 from hapticdb.mesh import MeshFile, Part, parse_in_process, read_file
 from hapticdb.store import base
 from hapticdb.store.base import Layout, Object, present_already
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 from hapticdb.testing import KINDS
 from mesh_files import gltf
 from naive import Voxel, voxels_of_points
@@ -63,7 +63,7 @@ def import_one(database: Path, file: Path, options: ImportOptions | None = None)
 
 
 def refusal(report: FileReport, kind: type[hapticdb.HapticDBError]) -> str:
-    """The line that a file was skipped with."""
+    """Message of the error of a file that was skipped."""
     assert report.status == "failed"
     assert not report.added
     assert type(report.error) is kind
@@ -269,7 +269,7 @@ def test_a_surface_on_the_border_of_the_grid_is_inside(tmp_path: Path) -> None:
 
 
 def test_a_point_that_rounding_carries_over_the_border_does_not_vanish(tmp_path: Path) -> None:
-    """It is marked or refused, never dropped in silence."""
+    """It is marked or refused, never dropped without an error."""
     points = np.array([[0.0, 0, 0], [ORIGIN[0] - 1e-7 * SIZE, 0.05, 0.05]])
     cloud = write_ply(tmp_path / "scan.ply", points)
     report = import_one(tmp_path / "e.db", cloud, small_options())
@@ -277,7 +277,7 @@ def test_a_point_that_rounding_carries_over_the_border_does_not_vanish(tmp_path:
 
 
 def test_a_plate_that_rounding_carries_over_the_border_does_not_vanish(tmp_path: Path) -> None:
-    """A file in single precision may be off by so much, 2e-7 of a voxel."""
+    """A file in single precision may be off by 2e-7 of a voxel."""
     corners = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0, 0.1, 0]])
     corners[:, 2] = ORIGIN[2] - 2e-9
     plate = write_obj(tmp_path / "plate.obj", {"plate": (corners, np.array([[0, 1, 2]]))})
@@ -454,17 +454,17 @@ def test_a_name_that_is_no_text_is_refused(
 def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
     tmp_path: Path, file: Path, parts: list[Part], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The engine says that the part is there, and it is gone before the import looks for it."""
+    """Another process removes the part after the engine has refused to add it again."""
     calls: list[str] = []
-    add = SQLiteStore.add
+    add = SQLiteWriter.add
 
-    def overtaken(store: SQLiteStore, record: Object, rows: base.Rows) -> int:
+    def overtaken(writer: SQLiteWriter, record: Object, rows: base.Rows) -> int:
         calls.append(record.name)
         if len(calls) == 2:
-            raise present_already(record, store.url)
-        return add(store, record, rows)
+            raise present_already(record, "a.db")
+        return add(writer, record, rows)
 
-    monkeypatch.setattr(SQLiteStore, "add", overtaken)
+    monkeypatch.setattr(SQLiteWriter, "add", overtaken)
     report = import_one(tmp_path / "a.db", file)
     names = [part.name for part in parts]
     assert calls == [names[0], names[1], *names[1:]]
@@ -475,10 +475,10 @@ def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
 def test_a_part_that_stays_in_the_way_is_told(
     tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def refused(store: SQLiteStore, record: Object, rows: base.Rows) -> int:
+    def refused(_: SQLiteWriter, record: Object, rows: base.Rows) -> int:
         assert rows
-        raise present_already(record, store.url)
+        raise present_already(record, "a.db")
 
-    monkeypatch.setattr(SQLiteStore, "add", refused)
+    monkeypatch.setattr(SQLiteWriter, "add", refused)
     with pytest.raises(hapticdb.EnvironmentExistsError, match="remove it first"):
         import_one(tmp_path / "a.db", file)

@@ -1,4 +1,4 @@
-"""An import that ends at any moment leaves a valid database, and again it ends as if undisturbed.
+"""An import interrupted at any moment leaves a valid database; run again, it ends as undisturbed.
 
 Each interrupted import is a process of its own that says how many parts it has committed, and
 waits before the last of them, so that no signal comes when it has ended.
@@ -21,7 +21,7 @@ from children import PATIENCE, child, until
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.resident.table import is_alive
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.tables.statistics import SQLiteStatistics
 
 N_PARTS = 60
 MOMENTS = np.random.default_rng(20).permutation(np.arange(1, N_PARTS))[:10].tolist()
@@ -45,7 +45,7 @@ hapticdb.import_files(database, [file], options, say)
 
 
 def big_options(jobs: int) -> ImportOptions:
-    """What the child asks for."""
+    """Options of the child's import."""
     return ImportOptions(grid=GridOptions(bits=8), layout="voxel", jobs=jobs)
 
 
@@ -69,14 +69,14 @@ def undisturbed(folder: Path) -> Rows:
 
 @contextmanager
 def importing(database: Path, file: Path, jobs: int = 2) -> Iterator["Popen[str]"]:
-    """A process that imports, and is gone afterwards."""
+    """A process that imports; it is ended after the test."""
     with child([sys.executable, "-c", IMPORT, str(database), str(file), str(jobs)]) as process:
         yield process
         process.kill()
 
 
 def wait_for(process: "Popen[str]", n_parts: int) -> None:
-    """Until that many parts are committed."""
+    """Wait until that many parts are committed."""
     assert process.stdout is not None
     for line in process.stdout:
         if int(line) >= n_parts:
@@ -97,7 +97,7 @@ def assert_finishes(database: Path, file: Path, undisturbed: Rows, jobs: int = 1
 def test_a_killed_import_run_again_ends_as_an_undisturbed_one(
     folder: Path, undisturbed: Rows, tmp_path: Path, n_parts: int
 ) -> None:
-    """kill -9 at ten moments: so many parts are in, and some way into the next one."""
+    """kill -9 at ten moments: after so many parts, and somewhere in the next one."""
     rng = np.random.default_rng(n_parts)
     database = tmp_path / "e.db"
     with importing(database, folder / "balls.obj", int(rng.integers(1, 4))) as process:
@@ -119,7 +119,7 @@ def test_a_killed_import_run_again_ends_as_an_undisturbed_one(
 
 
 def test_most_moments_fall_into_the_middle() -> None:
-    """Or the test above would show little."""
+    """The test above needs this to prove anything."""
     assert sum(5 < n < N_PARTS - 5 for n in MOMENTS) >= 7
 
 
@@ -159,7 +159,7 @@ def test_an_interrupted_import_run_again_ends_as_an_undisturbed_one(
 
 
 def test_an_import_interrupted_while_it_reads_leaves_nothing(folder: Path, tmp_path: Path) -> None:
-    """Nor does the process that parses outlive the one that is interrupted."""
+    """The process that parses ends with the one that is interrupted."""
     with importing(tmp_path / "e.db", folder / "balls.obj") as process:
         wait_for(process, 0)
         parser = wait_for_parser(process.pid)
@@ -218,7 +218,7 @@ def test_a_later_file_of_an_interrupted_command_goes_in_when_it_is_run_again(
 def test_statistics_missed_by_an_interruption_are_kept_by_the_next_import(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every object is in, the quantile vector is not: the same command again still writes it."""
+    """Interrupted after the last object, before the quantile vector: run again, it writes it."""
     file = write_obj(tmp_path / "ball.obj", {"ball": ball((0, 0, 0), 0.1)})
     hapticdb.import_files(tmp_path / "whole.db", [file], small_options())
 
@@ -226,7 +226,7 @@ def test_statistics_missed_by_an_interruption_are_kept_by_the_next_import(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(SQLiteStore, "analyze", interrupted)
+        patch.setattr(SQLiteStatistics, "analyze", interrupted)
         with pytest.raises(KeyboardInterrupt):
             hapticdb.import_files(tmp_path / "e.db", [file], small_options())
     (report,) = hapticdb.import_files(tmp_path / "e.db", [file], small_options())

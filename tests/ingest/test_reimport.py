@@ -12,7 +12,7 @@ import trimesh
 
 import hapticdb
 from command_line import Run, boxes, made, refused, rows_of, run, scene  # noqa: F401 - fixtures
-from hapticdb.store.sqlite.store import SQLiteStore
+from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 
 
 def names(url: Path) -> list[str]:
@@ -73,7 +73,7 @@ def test_what_was_never_there_is_not_held_for_removed(run: Run, tmp_path: Path) 
 
 
 def changed_file(folder: Path) -> Path:
-    """What was box0 to box2: box0 as it was, box1 larger, box2 gone, and a new box3."""
+    """A changed file: box0 as before, box1 larger, no box2, and a new box3."""
     file = boxes(folder / "boxes.glb", 4)
     scene = trimesh.load_scene(file)
     scene.geometry["box1"].apply_scale(1.3)
@@ -100,7 +100,7 @@ def test_a_changed_file_is_replaced_when_asked(run: Run, tmp_path: Path) -> None
         assert np.allclose(np.ptp(env.object(2).bounds, axis=0), 0.13)
         assert all(len(env.voxels(obj.id)) == obj.voxels for obj in env.objects())
         grid = env.grid
-    # as one that never held anything else
+    # equal to an environment that never held anything else
     options = hapticdb.GridOptions(bits=6, voxel_size=grid.voxel_size, origin=grid.origin)
     hapticdb.import_files("b.db", [file], hapticdb.ImportOptions(grid=options))
     assert run("diff", "a.db", "b.db")[0] == 0
@@ -121,24 +121,24 @@ def test_a_moved_object_goes_back_and_others_stay(run: Run, scene: Path, file: P
 def test_an_interrupted_replacement_goes_on(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each part is the old one or the new one; the same call again ends as an undisturbed one."""
+    """Each part is the old or the new one; the same call again ends like an undisturbed one."""
     file = boxes(tmp_path / "boxes.glb")
     url = tmp_path / "a.db"
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6, extent=3))
     hapticdb.import_files(url, [file], options)
     boxes(file, side=0.12)
-    replace = SQLiteStore.replace
+    replace = SQLiteWriter.replace
     calls: list[int] = []
 
-    def twice(store: SQLiteStore, *words: Any) -> None:  # noqa: ANN401 - handed on
+    def twice(writer: SQLiteWriter, *words: Any) -> None:  # noqa: ANN401 - handed on
         calls.append(1)
         if len(calls) == 2:
             raise KeyboardInterrupt
-        replace(store, *words)
+        replace(writer, *words)
 
     again = hapticdb.ImportOptions(replace=True)
     with monkeypatch.context() as patched:
-        patched.setattr(SQLiteStore, "replace", twice)
+        patched.setattr(SQLiteWriter, "replace", twice)
         with pytest.raises(KeyboardInterrupt):
             hapticdb.import_files(url, [file], again)
     assert names(url) == ["box0", "box1", "box2"]

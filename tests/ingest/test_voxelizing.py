@@ -1,4 +1,4 @@
-"""Huge parts: voxelized in bounded pieces, to the same bits, and their share is told."""
+"""Huge parts are voxelized in bounded pieces, to the same bits, and report their progress."""
 
 import threading
 from pathlib import Path
@@ -19,7 +19,7 @@ HUGE = np.array([[[1.0, 2.0, 3.0], [250.0, 80.3, 41.7], [50.2, 251.0, 199.9]]])
 
 
 def triangles() -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
-    """One across the grid, long thin ones, ones that leave the grid, many small ones."""
+    """Triangles: one across the grid, long thin ones, some that leave the grid, many small."""
     random = np.random.default_rng(5)
     far = random.uniform(-100.0, 400.0, (20, 3, 3))
     small = random.uniform(0.0, 255.0, (300, 1, 3)) + random.uniform(-3.0, 3.0, (300, 3, 3))
@@ -32,7 +32,7 @@ def triangles() -> "np.ndarray[tuple[int, ...], np.dtype[np.float64]]":
 def test_pieces_give_the_bits_of_the_whole(
     given: "np.ndarray[tuple[int, ...], np.dtype[np.float64]]", most: int
 ) -> None:
-    """Each begins and ends within a row of a triangle."""
+    """Each piece begins and ends within a row of a triangle."""
     keys, occupancy = voxelize.voxelize(4 * given, BITS + 2)
     found = bricks_of_triangles(4 * given, BITS + 2, "a part", most=most)
     np.testing.assert_array_equal(found.keys, keys)

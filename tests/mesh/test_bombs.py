@@ -1,4 +1,4 @@
-"""Small files that ask for much: of memory, of time, of points that are not there."""
+"""Small files that ask for much memory or time, or promise points that are not there."""
 
 import json
 import struct
@@ -23,7 +23,7 @@ from mesh_files import MESH_3MF, TRIANGLE, cause, glb_of, gltf, text, threemf
 def test_a_glTF_that_lists_itself_is_read_once(  # noqa: N802
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """9,000 buffers that were the file itself took 5.6 GB."""
+    """Reading 9,000 buffers, each the file itself, once took 5.6 GB."""
     n = 500
     tree = {
         "buffers": [{"byteLength": 100, "uri": "self.gltf"}] * n,
@@ -125,7 +125,7 @@ def _las(tmp_path: Path, **counts: int) -> Path:
 
 
 def test_a_LAS_file_that_promises_more_than_it_holds(tmp_path: Path) -> None:  # noqa: N802
-    """2^31 records took 37 s and all memory that the file was allowed."""
+    """Reading 2^31 records once took 37 s and all memory that the file was allowed."""
     assert len(parse_in_process(_las(tmp_path)).parts[0].vertices) == 3
     assert "2,147,483,648 records" in cause(_las(tmp_path, records=1 << 31))
     assert "extended records" in cause(_las(tmp_path, long_records=1 << 31))
@@ -166,7 +166,7 @@ def _shell(path: Path, **changes: Any) -> Path:  # noqa: ANN401 - arrays
 
 
 def test_a_saved_shell_that_unpacks_to_much_more_is_refused(tmp_path: Path) -> None:
-    """2.3 MB that became 5.9 GB."""
+    """A saved shell of 2.3 MB that once unpacked to 5.9 GB."""
     assert len(PointShell.load(_shell(tmp_path / "a.npz"))) == 8
     with pytest.raises(FileError, match="more than 10 times as many"):
         PointShell.load(_shell(tmp_path / "b.npz", points=np.zeros((200_000, 3))))
@@ -224,7 +224,7 @@ def test_packed_points_of_every_kind_are_read_in_their_chunks(
 
 @pytest.mark.parametrize("layer", [0, 1, 5, 8, 18])
 def test_a_layer_that_is_longer_than_its_chunk_is_refused(tmp_path: Path, layer: int) -> None:
-    """A length of 2^28 in a file of 787 bytes took 244 MiB."""
+    """A length of 2^28 in a file of 787 bytes once took 244 MiB."""
     path = _laz(tmp_path / "a.laz", 6, 40)
     content = bytearray(path.read_bytes())
     (points_at,) = struct.unpack_from("<I", content, 96)

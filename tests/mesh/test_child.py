@@ -60,7 +60,7 @@ def test_files_that_a_glTF_refers_to_count_once(tmp_path: Path) -> None:  # noqa
 
 @pytest.fixture
 def fake_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """A LAS file whose parser does whatever a test wants."""
+    """A LAS file whose parser is replaced by a test's own code."""
 
     def make(body: str) -> Path:
         (tmp_path / "laspy" / "vlrs").mkdir(parents=True)

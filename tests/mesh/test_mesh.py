@@ -1,4 +1,4 @@
-"""Files become parts: names, places, units, and counts of what was wrong."""
+"""Files become parts: names, placements, units, and counts of what was wrong."""
 
 import json
 from pathlib import Path
@@ -14,7 +14,7 @@ from hapticdb.mesh.clean import clean
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, fan
 from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, names, text, threemf
 
-# --- names and places -----------------------------------------------------------------------
+# --- names and placements -------------------------------------------------------------------
 
 
 def test_every_instance_is_a_part_named_by_its_node_path(tmp_path: Path) -> None:

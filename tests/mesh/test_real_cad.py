@@ -1,4 +1,4 @@
-"""The whole way from a CAD file to a force, on real assemblies, or on the sample without them."""
+"""From a CAD file to a force: on real assemblies, or on the sample where there are none."""
 
 from collections.abc import Iterator
 from pathlib import Path

@@ -19,7 +19,7 @@ coordinates = st.tuples(*[st.floats(-1.0, 1.0, width=32)] * 3)
 
 
 def places_on(triangles: Floats, steps: int = 40) -> Floats:
-    """Places all over triangles (F, 3, 3), corners and sides among them."""
+    """Positions all over triangles (F, 3, 3), on their corners and sides, too."""
     u, v = np.meshgrid(*[np.linspace(0.0, 1.0, steps)] * 2)
     u, v = u[u + v <= 1.0 + 1e-12], v[u + v <= 1.0 + 1e-12]
     weights = np.stack([1.0 - u - v, u, v], axis=1)
@@ -27,7 +27,7 @@ def places_on(triangles: Floats, steps: int = 40) -> Floats:
 
 
 def farthest(triangles: Floats, points: Floats) -> float:
-    """Greatest distance from such a place to the nearest of the points: at most the radius."""
+    """Greatest distance from such a position to its nearest point: at most the covering radius."""
     places = places_on(triangles)
     apart = np.linalg.norm(places[:, None] - points[None], axis=2)
     return float(apart.min(axis=1).max())
@@ -44,7 +44,7 @@ def test_a_covering_radius_bounds_the_distance_of_every_place(
     least = farthest(surface, given_points)
     bound = covering_radius(surface, given_points)
     assert bound >= least
-    # 40 steps a side miss the farthest place by a twentieth of a triangle at most
+    # 40 steps a side miss the farthest position by at most a twentieth of a triangle
     assert bound <= 1.11 * (least + 0.1) + 0.1 * np.sqrt(len(triangles) / len(points)) * 2.0
 
 

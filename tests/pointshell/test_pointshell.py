@@ -1,4 +1,4 @@
-"""A tool's mesh, whatever its state, becomes even points with normals into the tool."""
+"""A tool's mesh, however damaged, becomes evenly spread points with normals into the tool."""
 
 import struct
 from itertools import pairwise
@@ -81,7 +81,7 @@ def write_stl(path: Path, mesh: Mesh) -> Path:
 
 
 def spacing(area: float, n: int) -> float:
-    """Neighbours' distance in a hexagonal lattice of n points over that area."""
+    """Distance of neighbours in a hexagonal lattice of n points over that area."""
     return float(np.sqrt(2.0 * area / (np.sqrt(3.0) * n)))
 
 
@@ -149,7 +149,7 @@ def test_every_patch_of_equal_area_gets_its_share() -> None:
     tile = ((axis * 2 + side) * 4 + np.minimum(u * 4, 3).astype(int)) * 4
     counts = np.bincount(tile + np.minimum(v * 4, 3).astype(int), minlength=96)
     expected = n / 96
-    # Independent points would give a chi-square of 95 on average; even ones far less.
+    # Independent points would give a chi-square of 95 on average; evenly spread ones far less.
     assert ((counts - expected) ** 2 / expected).sum() < 48.0
 
 
@@ -169,7 +169,7 @@ def test_a_moved_tool_has_a_moved_shell(seed: int, shift: int) -> None:
     offset = np.array([shift, -2.0 * shift, 0.5])
     here = PointShell.from_mesh(corners, faces, 60, seed=seed)
     there = PointShell.from_mesh(corners @ turn.T + offset, faces, 60, seed=seed)
-    # The curve that orders the points follows the frame's axes: a turned tool has them in another.
+    # The curve that orders the points follows the axes: a turned tool has another order.
     twin = np.asarray(cKDTree(there.points).query(here.points @ turn.T + offset)[1])
     assert len(np.unique(twin)) == 60
     assert np.allclose(there.points[twin], here.points @ turn.T + offset, atol=1e-12)
@@ -210,7 +210,7 @@ def test_a_frame_finds_the_same_brick_many_times_in_a_row() -> None:
 
 
 def test_a_rounding_of_the_frame_leaves_the_order() -> None:
-    # A cube's points lie on the ends of their bounding box: where a step must not end.
+    # A cube's points lie at the ends of their bounding box, where no step of the curve may end.
     here, there = (PointShell.from_mesh(*cube(at=(x, 0.0, 0.0)), 500) for x in (0.0, 0.1))
     assert np.allclose(there.points, here.points + np.array([0.1, 0.0, 0.0]), atol=1e-12)
 

@@ -70,7 +70,7 @@ def env(
     env = make_scene(with_environment(base_url(request.param), f"scene_{os.getpid()}"), *kind)
     yield env
     assert isinstance(env.store, PostgresStore)
-    drop(env.store.session)
+    drop(env.store.connection)
     env.close()
 
 
@@ -160,7 +160,7 @@ def test_every_strategy_finds_what_a_plain_set_finds(
 def test_the_scene_hits_and_misses(
     env: Environment, plain: dict[tuple[int, int, int], set[int]]
 ) -> None:
-    """What the property test draws touches several objects at once, or it would show nothing."""
+    """Frames of the property test touch several objects at once; else it would prove little."""
     found = [expected(plain, random_shell(s, 300), random_pose(s), []) for s in range(20)]
     assert max(len(f.ids) for f in found) >= 3
     assert any(10 <= len(f.hits) < 300 for f in found)

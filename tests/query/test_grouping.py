@@ -60,7 +60,7 @@ def test_neighbours_share_a_range_if_and_only_if_they_are_maxgap_apart(
 @few
 @given(keys=key_lists(st.integers(0, 60), 40))
 def test_maxgap_0_asks_for_each_key_by_itself(keys: list[int]) -> None:
-    """Adjacent keys, too: the point query sequence."""
+    """MAXGAP 0 groups not even adjacent keys: the point query sequence."""
     array = as_keys(keys)
     assert as_pairs(maxgap(array, array, array, 0)) == [(k, k) for k in keys]
 
@@ -68,7 +68,7 @@ def test_maxgap_0_asks_for_each_key_by_itself(keys: list[int]) -> None:
 @few
 @given(voxels=key_lists(st.integers(0, 20 * 512), 60), gap=st.integers(0, 3000))
 def test_gaps_are_voxel_keys_on_bricks(voxels: list[int], gap: int) -> None:
-    """Two bricks share a range where two voxels of theirs do on the voxel layout, and else not."""
+    """Two bricks share a range if and only if voxels of both share one on the voxel layout."""
     under: dict[int, list[int]] = {}
     for voxel in voxels:
         under.setdefault(voxel >> 9, []).append(voxel)
@@ -98,7 +98,7 @@ def test_a_negative_maxgap_is_refused() -> None:
 
 
 def costs_of(descent: float, row: float) -> CostModel:
-    """Figures in which only a descent and a scanned row cost something."""
+    """A model in which only a descent and a scanned row cost anything."""
     return CostModel(
         statement=0.0,
         descent=descent,
@@ -123,7 +123,7 @@ def all_groupings(keys: list[int]) -> Iterator[list[tuple[int, int]]]:
 
 
 def least_cost(keys: list[int], quantiles: QuantileVector, costs: CostModel) -> float:
-    """Cost of the cheapest grouping: each of all, a range by a range."""
+    """Cost of the cheapest of all groupings, summed range by range."""
     known = {
         (low, high): costs.descent + costs.row_scanned * quantiles.rows_between(low, high)
         for low, high in product(keys, keys)
@@ -133,7 +133,7 @@ def least_cost(keys: list[int], quantiles: QuantileVector, costs: CostModel) -> 
 
 
 def vectors(values: st.SearchStrategy[int]) -> st.SearchStrategy[QuantileVector]:
-    """Quantile vectors: from few values, so that many buckets have no width."""
+    """Quantile vectors of few distinct values, so that many buckets have no width."""
     return st.builds(
         lambda bounds, n_rows: QuantileVector(as_keys(sorted(bounds)), n_rows),
         st.lists(values, min_size=2, max_size=30),
@@ -188,7 +188,7 @@ def test_the_expected_rows_are_those_of_the_keys_and_of_the_closed_gaps(
 
 
 def test_a_gap_covers_the_keys_between_and_not_its_ends() -> None:
-    """All rows lie under the keys asked for: the gap is free, and closed at any price."""
+    """All rows lie under the keys asked for: the gap is empty, and closed whatever a row costs."""
     quantiles = QuantileVector(as_keys([4, 4, 4, 5, 9, 9, 9]), 60)
     ranges = cbgroup(as_keys([3, 9]), quantiles, costs_of(1.0, 1.0)).ranges
     assert as_pairs(ranges) == [(3, 3), (9, 9)]
@@ -221,7 +221,7 @@ triples = st.lists(st.integers(-3, 34), min_size=3, max_size=3)
 def test_the_ranges_of_a_box_hold_every_row_of_its_voxels(
     layout: Layout, curve: CurveName, a: list[int], b: list[int]
 ) -> None:
-    """Ascending, disjoint, merged where they touch, and cut to the grid."""
+    """Ranges ascend, are disjoint, merged where they touch, and cut to the grid."""
     grid = Grid(1.0, (0, 0, 0), 5, curve)
     low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
     pairs = as_pairs(box_ranges(grid, layout, low, high))
@@ -245,7 +245,7 @@ def test_the_ranges_of_a_box_hold_every_row_of_its_voxels(
 def test_a_box_of_any_size_has_a_bounded_number_of_ranges(
     curve: CurveName, ends: list[list[int]]
 ) -> None:
-    """17 cubes along the longest edge at most, two layers of which are not merged into larger."""
+    """17 cubes lie along the longest edge at most; the outer two layers are not merged."""
     grid = Grid(1.0, (0, 0, 0), 21, curve)
     low, high = np.min(ends, axis=0), np.max(ends, axis=0)
     ranges = box_ranges(grid, "brick", low, high)

@@ -28,14 +28,14 @@ SIZE = 0.005
 BINARY = 2.0**-8
 MIDDLE = 32
 ROUNDING = 1e-12
-"""Newtons, and newton metres: forces here are some N, sums have some hundred terms."""
+"""Newtons and newton metres. Forces here are some N; sums have some hundred terms."""
 Array = NDArray[np.float64]
 UP = (0.0, 0.0, 1.0)
 few = settings(
     max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 strategies = pytest.mark.parametrize("strategy", STRATEGIES)
-# without figures that would have to be measured first, in each new environment
+# strategies without costs, which would have to be measured in each new environment
 unplanned = pytest.mark.parametrize("strategy", ["statement", "array", "points", "maxgap"])
 
 
@@ -125,7 +125,7 @@ def test_one_point_in_a_solid_floor_feels_a_sawtooth(
 
 
 def test_a_point_on_a_border_belongs_to_the_upper_voxel(binary_floor: Environment) -> None:
-    """At z = 0 it is free; at the floor's underside it still hits; a hair below it does not."""
+    """No hit at z = 0; a hit at the underside of the floor, and none a hair below that."""
     for height, is_hit in ((0.0, False), (-8 * BINARY, True), (-8 * BINARY - 2.0**-20, False)):
         touch = binary_floor.touch(shell_of([0, 0, height]), np.eye(4))
         assert touch.hits.tolist() == ([0] if is_hit else [])
@@ -203,7 +203,7 @@ def test_depths_are_bounded_by_half_a_voxel_along_the_normal(floor: Environment,
 def test_the_force_averaged_over_a_shift_of_one_voxel_is_an_eighth_of_k_s(
     floor: Environment, axis: int, sign: float
 ) -> None:
-    """A hit point, axis normal; nine points, so that the law divides by nothing."""
+    """Nine points with one normal along an axis: the law averages from 10 hits on."""
     rng = np.random.default_rng(axis)
     points = rng.uniform(-3, 3, (9, 3)) * SIZE
     steps = 64
@@ -233,7 +233,7 @@ def mirrored(vectors: Array) -> Array:
 def test_a_peg_centred_in_a_hole_feels_no_lateral_force_and_no_torque(
     tmp_path: Path, strategy: Strategy
 ) -> None:
-    """The peg is wider than the hole by less than half a voxel a side."""
+    """The peg is wider than the hole by less than half a voxel on each side."""
     floor = floor_voxels(grid_of(SIZE))
     is_wall = (np.abs(floor[:, :2] + 0.5 - MIDDLE) > 4).any(axis=1)
     env = scene_of(tmp_path / "e.db", floor[is_wall])
@@ -294,13 +294,13 @@ def quarter_turn(axis: int) -> Array:
 
 
 def off_borders(points: Array) -> bool:
-    """No point so near a voxel's face that rounding could carry it across."""
+    """No point is so near a voxel's face that a rounding error could move it across."""
     scaled = points / SIZE
     return bool((np.abs(scaled - np.round(scaled)) > 1e-9).all())
 
 
 def tilted(seed: int) -> Array:
-    """Rigid pose, turned at random about a place near the world's origin."""
+    """Rigid pose: a random rotation about a position near the world's origin."""
     rng = np.random.default_rng(seed)
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q = q * np.sign(np.diag(r))
@@ -315,7 +315,7 @@ BLOB = blob(3, (30, 34, 31))
 @pytest.mark.parametrize("axis", [0, 1, 2])
 @pytest.mark.parametrize("quarters", [1, 2, 3])
 def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int, quarters: int) -> None:
-    """Tool and environment together, by 90 degrees about a vertex of the grid."""
+    """Tool and environment are turned together, by 90 degrees about a vertex of the grid."""
     turn = np.linalg.matrix_power(quarter_turn(axis), quarters)
     turned = np.round((BLOB + 0.5 - MIDDLE) @ turn.T - 0.5 + MIDDLE).astype(np.int64)
     before = scene_of(tmp_path / "a.db", BLOB)
@@ -387,6 +387,6 @@ def test_half_the_voxel_size_gives_about_four_times_the_surface_voxels() -> None
 
 
 def test_the_wrench_is_never_capped(floor: Environment) -> None:
-    """Caps belong to devices."""
+    """No force is capped here: caps belong to devices."""
     touch = floor.touch(shell_of(punch(4)), at(z=-0.004), law=TangentPlane(stiffness=1e9))
     np.testing.assert_allclose(touch.force, [0, 0, 6e6], rtol=1e-12, atol=1e-6)

@@ -46,7 +46,7 @@ def vector_of(keys: list[int], resolution: int) -> QuantileVector:
 def test_expected_rows_are_off_by_two_buckets_at_most(
     keys: list[int], resolution: int, unit: tuple[float, float]
 ) -> None:
-    """A bucket at each end, however many rows share a key."""
+    """The error is one bucket at each end, however many rows share a key."""
     quantiles = vector_of(keys, resolution)
     left, right = sorted(int(u * (max(keys) + 2)) for u in unit)
     counted = sum(left <= key <= right for key in keys)
@@ -67,7 +67,7 @@ def test_all_rows_lie_between_the_lowest_and_the_highest_key(
 
 @pytest.mark.parametrize("n_rows", [1, 2, 7, 100])
 def test_a_bucket_a_row_counts_neighbouring_keys_exactly(n_rows: int) -> None:
-    """Where every key has a row; the bucket of a row ends at its key."""
+    """Each key has one row, whose bucket ends at the key."""
     quantiles = vector_of(list(range(10, 10 + n_rows)), n_rows)
     assert quantiles.rows_per_bucket == 1.0
     for left in range(11, 10 + n_rows):
@@ -76,7 +76,7 @@ def test_a_bucket_a_row_counts_neighbouring_keys_exactly(n_rows: int) -> None:
 
 
 def test_a_key_of_many_rows_counts_by_its_rows() -> None:
-    """Half of all rows under one key: what a histogram without ties would spread out."""
+    """Half of all rows have one key: a histogram without ties would spread them over a range."""
     quantiles = vector_of([*range(100), *[1000] * 200, *range(2000, 2100)], 100)
     assert quantiles.rows_between(1000, 1000) == pytest.approx(200, abs=8)
     assert quantiles.rows_between(1001, 1999) == pytest.approx(0, abs=8)
@@ -85,7 +85,7 @@ def test_a_key_of_many_rows_counts_by_its_rows() -> None:
 
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
 def test_the_vector_of_an_environment_counts_its_rows(tmp_path: Path, layout: Layout) -> None:
-    """Two objects in the same voxels: every key ties."""
+    """Two objects are in the same voxels, so every key has two rows."""
     env = make_scene(tmp_path / "e.db", layout)
     write_voxels(env.store, floor_voxels(GRID), "again")
     rows = env.store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
@@ -118,7 +118,7 @@ MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0, 7.0, 0.25, 11.0, 13.0, 0.125)
 @few
 @given(values=st.lists(figures, min_size=15, max_size=15), spread=figures)
 def test_a_cost_model_returns_from_its_figures(values: list[float], spread: float) -> None:
-    """Also through text, as a store keeps them."""
+    """Also when they were written as text, as a store keeps them."""
     names = [name for name in vars(MODEL) if name != "spread"]
     model = CostModel.from_figures(dict(zip(names, values, strict=True)))
     model = replace(model, spread={"row": spread, "descent": 0.0})

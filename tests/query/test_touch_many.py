@@ -1,4 +1,4 @@
-"""Many poses in one call: what single touches give, bit for bit, at one revision."""
+"""Many poses in one call: the same as single touches, bit for bit, all at one revision."""
 
 from pathlib import Path
 from typing import Any
@@ -99,7 +99,7 @@ def test_neighbouring_poses_share_statements(tmp_path: Path, sphere: PointShell)
 def test_all_poses_see_one_revision(
     tmp_path: Path, place: Place, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Although another removes the objects while the poses are asked for."""
+    """Another process removes the objects between two statements of the call."""
     monkeypatch.setattr("hapticdb.query.frame.MOST_KEYS", 1)
     for url in (str(tmp_path / "e.db"), place()):
         with filled(url) as env, hapticdb.open(url) as other:

@@ -36,7 +36,7 @@ from hapticdb import Environment, PointShell
 from hapticdb.cli import main
 from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
-from hapticdb.store.postgres import session
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.private_server import PrivateServer
 from servers import Place
 from validity import Contents, assert_valid, contents, valid_contents
@@ -140,16 +140,16 @@ def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
     """Ours is lost in its COMMIT; before we are back, another moves the same object."""
     proxy = Proxy(server, server.folder.parent)
     with small(url, file) as other, hapticdb.open(proxy.url) as env:
-        reconnect = session.Session._reconnect
+        reconnect = ServerConnection._reconnect
 
-        def late(here: session.Session) -> None:
-            if here is env.store.session:  # type: ignore[attr-defined]
+        def late(here: ServerConnection) -> None:
+            if here is env.store.connection:  # type: ignore[attr-defined]
                 other.move(7, PLACE)
             reconnect(here)
 
         proxy.cut = "not forwarded"
         with monkeypatch.context() as patch:
-            patch.setattr(session.Session, "_reconnect", late)
+            patch.setattr(ServerConnection, "_reconnect", late)
             env.move(7, placement(-0.05, 0, 0))
         np.testing.assert_array_equal(env.object(7).transform, placement(-0.05, 0, 0))
         assert_valid(env)
@@ -165,7 +165,7 @@ def cut_off(admin: psycopg.Connection) -> Callable[[Environment], None]:
     """End the process behind an environment's connection, and wait until it is gone."""
 
     def end(env: Environment) -> None:
-        pid = env.store.session.connection.info.backend_pid  # type: ignore[attr-defined]
+        pid = env.store.connection.driver.info.backend_pid  # type: ignore[attr-defined]
         admin.execute("SELECT pg_terminate_backend(%s, 5000)", (pid,))
 
     return end
@@ -205,7 +205,7 @@ def test_a_connection_that_ends_inside_a_frame_costs_nothing_but_time(
         expected = felt(env, sphere, np.eye(4), strategy)
         for n_statements in (1, 2):
             with monkeypatch.context() as patch:
-                After(patch, session.Session, "fetch", lambda: cut_off(env), n_statements)
+                After(patch, ServerConnection, "fetch", lambda: cut_off(env), n_statements)
                 assert felt(env, sphere, np.eye(4), strategy) == expected
 
 

@@ -13,11 +13,11 @@ from children import PATIENCE
 from hapticdb import Grid
 from hapticdb.query.frame import Strategy
 from hapticdb.store.base import Keys, Layout, Store
-from hapticdb.store.postgres import store as store_module
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.histogram import exact_histogram
-from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.postgres.tables import statistics as store_statistics
+from hapticdb.store.postgres.tables.histogram import exact_histogram
 from hapticdb.testing import EngineContract, StoreContract, blob, floor_voxels, write_voxels
 from servers import Place
 
@@ -166,7 +166,7 @@ def test_two_loaders_that_end_together_both_succeed(place: Place) -> None:
     store = PostgresStore.open(where)
     assert len(store.objects()) == 2
     # no loader's lock is left: the next killed one can be mended
-    free = store.session.rows(
+    free = store.connection.rows(
         "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND classid::bigint = %s"
         " AND objid::bigint = ('environment'::regclass::oid::bigint + 2147483648) %% 4294967296",
         (0x48415054,),
@@ -244,12 +244,12 @@ def test_statistics_carry_the_revision_that_they_were_made_at(
 ) -> None:
     store, other = PostgresStore.open(url), PostgresStore.open(url)
 
-    def slow(session: Session, layout: Layout, resolution: int) -> tuple[Keys, int]:
-        found = exact_histogram(session, layout, resolution)
+    def slow(connection: ServerConnection, layout: Layout, resolution: int) -> tuple[Keys, int]:
+        found = exact_histogram(connection, layout, resolution)
         write_voxels(other, blob(1, (30, 30, 30)), "meanwhile")
         return found
 
-    monkeypatch.setattr(store_module, "exact_histogram", slow)
+    monkeypatch.setattr(store_statistics, "exact_histogram", slow)
     store.analyze(10)
     monkeypatch.undo()
     assert store.freshness(10).changes == 1

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Grid
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
-from hapticdb.store.postgres import statements
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.histogram import SERVER_RESOLUTION, with_common_values
+from hapticdb.store.postgres.tables import statements
+from hapticdb.store.postgres.tables.histogram import SERVER_RESOLUTION, with_common_values
 from hapticdb.testing import voxel_object, write_voxels
 from servers import Place
 

@@ -228,7 +228,7 @@ def test_numpy_integers_and_plain_lists_cross_the_binding(path: Path) -> None:
     """The binding's traps: an np.int64 binds as a blob, a bare array to carray as nothing."""
     connection = apsw.Connection(":memory:")
     bound = connection.execute("SELECT typeof(?)", (np.int64(5),)).fetchall()
-    assert bound == [("blob",)], "the trap is gone: simplify store/sqlite.py"
+    assert bound == [("blob",)], "the trap is gone: simplify store/sqlite/tables/reading.py"
     store = SQLiteStore.open(path)
     key = store.scan(np.array([0]), np.array([2**62])).keys[0]
     assert len(store.lookup(np.array([key]))) == 1
@@ -240,7 +240,7 @@ def test_a_database_in_use_is_told_after_a_while(
 ) -> None:
     monkeypatch.setattr("hapticdb.store.sqlite.file.BUSY_TIMEOUT_MS", 50)
     first, second = SQLiteStore.open(path), SQLiteStore.open(path)
-    with first._writing(), pytest.raises(hapticdb.BusyError, match="another process"):
+    with first._connection.writing(), pytest.raises(hapticdb.BusyError, match="another process"):
         write_voxels(second, blob(1, (30, 30, 30)), "blob")
     write_voxels(second, blob(1, (30, 30, 30)), "blob")
     assert len(first.objects()) == 2

@@ -31,8 +31,8 @@ from hapticdb.ingest.originals import parts_of
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.base import Object, Rows
-from hapticdb.store.postgres import session
 from hapticdb.store.postgres.address import parse
+from hapticdb.store.postgres.connecting import link
 from servers import Place
 from validity import assert_valid
 
@@ -336,7 +336,7 @@ def stopped(pid: int) -> Iterator[None]:
 def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(session, "GRACE_MS", 100)
+    monkeypatch.setattr(link, "GRACE_MS", 100)
     shell = two_tools()
     with hapticdb.open(f"{url}&options=-cstatement_timeout%3D200", read_only=True) as env:
         expected = env.touch(shell, np.eye(4)).hits.tolist()
@@ -352,4 +352,4 @@ def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
 
 
 def backend_of(env: Environment) -> int:
-    return int(env.store.session.connection.info.backend_pid)  # type: ignore[attr-defined]
+    return int(env.store.connection.driver.info.backend_pid)  # type: ignore[attr-defined]

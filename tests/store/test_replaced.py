@@ -97,7 +97,7 @@ def test_a_file_that_goes_while_it_is_written_is_not_reported_as_written(
     write(store, 1)
     with (
         pytest.raises(hapticdb.ConnectionLostError, match=r"written last|cannot be reached"),
-        store._writing(),
+        store._connection.writing(),
     ):
         event(path)
     store.close()

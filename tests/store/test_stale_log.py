@@ -188,9 +188,9 @@ def test_a_log_of_format_1_is_applied_to_its_file(path: Path) -> None:
 def test_a_log_with_a_vacuum_in_it_is_applied_to_its_file(path: Path) -> None:
     def work(store: SQLiteStore) -> None:
         write(store, 1)
-        store._connection.execute("VACUUM")
+        store._connection.driver.execute("VACUUM")
         write(store, 2)
-        store._connection.execute("VACUUM")
+        store._connection.driver.execute("VACUUM")
 
     killed(path, work)
     assert names(path, read_only=False) == ["floor", "blob 1", "blob 2"]
@@ -207,7 +207,7 @@ def test_every_commit_draws_a_new_mark(path: Path) -> None:
         ]
         for work in works:
             work()
-            ((lineage,),) = store._fetch("SELECT lineage FROM environment")
+            ((lineage,),) = store._connection.fetch("SELECT lineage FROM environment")
             marks.add(lineage[:16])
             assert lineage[16:] in {*marks, sqlite_log.file_mark(path)}
     assert len(marks) == 4
@@ -270,12 +270,12 @@ def taped(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], T
             if n % 8 == 5:
                 with reader.snapshot():  # which keeps the log from being begun anew
                     reader.objects()
-                    writing._connection.wal_checkpoint()
+                    writing._connection.driver.wal_checkpoint()
                     write(writing, 100 + n)
-                    writing._connection.wal_checkpoint()
+                    writing._connection.driver.wal_checkpoint()
                 write(writing, 200 + n)
             if n % 8 == 7:
-                writing._connection.wal_checkpoint()
+                writing._connection.driver.wal_checkpoint()
         for each in (reader, store, other):
             each.close()
     finally:
@@ -385,7 +385,7 @@ def test_nothing_committed_is_refused_or_lost_by_kills_at_random(path: Path) -> 
         "from hapticdb.store.sqlite.store import SQLiteStore\n"
         "from hapticdb.testing import blob, write_voxels\n"
         "store = SQLiteStore.open(sys.argv[1])\n"
-        "store._connection.wal_autocheckpoint(20)\n"
+        "store._connection.driver.wal_autocheckpoint(20)\n"
         "for n in range(10**6):\n"
         "    write_voxels(store, blob(n, (30, 30, 30)), f'{sys.argv[2]} {n}')\n"
         "    print(n, flush=True)\n"

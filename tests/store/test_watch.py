@@ -25,9 +25,9 @@ from hapticdb.store.base import SupportsWatch
 from hapticdb.store.connect import create_store, grant, open_store
 from hapticdb.store.postgres import watching
 from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.schema_of import drop
-from hapticdb.store.postgres.session import Session
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.watching import channel_of
 from hapticdb.store.sqlite import place as sqlite_place
@@ -152,10 +152,10 @@ def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
 def test_the_changes_since_a_revision_are_found_by_the_primary_key_of_sqlite(file: str) -> None:
     store = SQLiteStore.open(file)
     statements: list[str] = []
-    store._connection.trace_v2(1, lambda event: statements.append(event["sql"]))
+    store._connection.driver.trace_v2(1, lambda event: statements.append(event["sql"]))
     list(store.changes(since=1))
     (text,) = statements
-    plan = store._connection.execute(f"EXPLAIN QUERY PLAN {text}", (1,)).fetchall()
+    plan = store._connection.driver.execute(f"EXPLAIN QUERY PLAN {text}", (1,)).fetchall()
     assert [row[3] for row in plan] == ["SEARCH change USING INTEGER PRIMARY KEY (rowid>?)"]
     store.close()
 
@@ -230,7 +230,7 @@ def test_a_reader_that_lost_its_connection_listens_again(
     monkeypatch.setattr(watching, "HEARING_S", 1e9)
     for is_used_meanwhile in (False, True):
         reader.watch()
-        pid = reader.session.connection.info.backend_pid
+        pid = reader.connection.driver.info.backend_pid
         admin.execute("SELECT pg_terminate_backend(%s, 5000)", (pid,))
         write(url)
         if is_used_meanwhile:
@@ -245,16 +245,16 @@ def test_a_server_that_comes_back_is_found_within_half_a_second(
     reader: PostgresStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pauses: list[float] = []
-    connect = Session.connect
+    connect = ServerConnection.connect
 
-    def refused_at_first(session: Session) -> None:
+    def refused_at_first(connection: ServerConnection) -> None:
         if len(pauses) < 8:
             raise hapticdb.ConnectionLostError("refused")
-        connect(session)
+        connect(connection)
 
-    monkeypatch.setattr(Session, "connect", refused_at_first)
+    monkeypatch.setattr(ServerConnection, "connect", refused_at_first)
     monkeypatch.setattr(time, "sleep", pauses.append)
-    reader.session.connection.close()
+    reader.connection.driver.close()
     assert reader.objects() == []
     assert len(pauses) == 8
     assert max(pauses) <= 0.5
@@ -274,14 +274,14 @@ def test_a_writer_that_does_not_notify_is_noticed_too(
 def test_a_server_that_refuses_to_be_listened_to_is_asked_instead(
     url: str, asked: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    command = Session.command
+    command = ServerConnection.command
 
-    def refuse(session: Session, text: str) -> None:
+    def refuse(connection: ServerConnection, text: str) -> None:
         if text.startswith("LISTEN"):
             raise psycopg.errors.ReadOnlySqlTransaction("cannot execute LISTEN during recovery")
-        command(session, text)
+        command(connection, text)
 
-    monkeypatch.setattr(Session, "command", refuse)
+    monkeypatch.setattr(ServerConnection, "command", refuse)
     monkeypatch.setattr(watching, "HEARING_S", 1e9)
     reader = PostgresStore.open(url, read_only=True)
     reader.watch()
@@ -328,7 +328,7 @@ def test_an_environment_made_anew_is_told_from_the_one_before(
     write(url)
     assert is_noticed(reader)
     with contextlib.closing(PostgresStore.open(url)) as store:
-        drop(store.session)
+        drop(store.connection)
     create_store(url, GRID).close()
     write(url)  # the same revision as before
     for _ in range(2):
@@ -388,7 +388,9 @@ def test_a_viewer_may_watch(url: str, admin: psycopg.Connection) -> None:
     try:
         grant(url, role, "viewer")
         reader = PostgresStore.open(url, read_only=True)
-        reader.session.execute(sql.SQL("SET SESSION AUTHORIZATION {}").format(sql.Identifier(role)))
+        reader.connection.execute(
+            sql.SQL("SET SESSION AUTHORIZATION {}").format(sql.Identifier(role))
+        )
         reader.watch()
         write(url)
         assert is_noticed(reader)
@@ -405,15 +407,17 @@ def test_the_changes_since_a_revision_are_found_by_the_primary_key_of_postgres(
 ) -> None:
     store = PostgresStore.open(url)
     asked: list[str] = []
-    rows = Session.rows
+    rows = ServerConnection.rows
 
-    def noted(session: Session, text: str, parameters: object = ()) -> list[tuple[object, ...]]:
+    def noted(
+        connection: ServerConnection, text: str, parameters: object = ()
+    ) -> list[tuple[object, ...]]:
         asked.append(text)
-        return rows(session, text, parameters)  # type: ignore[arg-type]
+        return rows(connection, text, parameters)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(Session, "rows", noted)
+    monkeypatch.setattr(ServerConnection, "rows", noted)
     list(store.changes(since=1))
     (text,) = asked
-    plan = store.session.execute(f"EXPLAIN {text}", (1,)).fetchall()
+    plan = store.connection.execute(f"EXPLAIN {text}", (1,)).fetchall()
     assert "Index Scan using change_pkey on change" in plan[0][0]
     store.close()

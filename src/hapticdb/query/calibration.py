@@ -15,8 +15,8 @@ from hapticdb.query.cost_model import CostModel
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import (
-    Frame,
     Keys,
+    LocatedShell,
     Store,
     SupportsCaches,
     SupportsStatement,
@@ -37,7 +37,7 @@ class _Probe(NamedTuple):
     and highest voxel key asked for under each.
     """
 
-    frame: Frame
+    frame: LocatedShell
     keys: Keys
     first: Keys
     last: Keys
@@ -306,6 +306,6 @@ def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
         if not len(keys):
             continue
         first, last = contact.spans_of_keys(asked, keys, *grid_codes, shift)
-        frame = Frame(placed, asked[0], 1000.0, np.empty(0, dtype=np.int64))
+        frame = LocatedShell(placed, asked[0], 1000.0, np.empty(0, dtype=np.int64))
         probes.append(_Probe(frame, keys, first, last))
     return probes

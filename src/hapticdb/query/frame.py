@@ -15,7 +15,7 @@ from hapticdb.poses import as_floats
 from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
 from hapticdb.query.law import TangentPlane
-from hapticdb.store.base import Frame, Keys, Rows, Store, SupportsStatement, row_shift
+from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
@@ -241,7 +241,7 @@ class HapticQuery:
         if not isinstance(store, SupportsStatement):
             raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
         placed, (addresses, _), _ = located
-        frame = Frame(placed, addresses, law.stiffness, exclude)
+        frame = LocatedShell(placed, addresses, law.stiffness, exclude)
         with store.snapshot():
             wrench = store.statement(frame)
             ordinals, ids = store.statement_hits(frame)

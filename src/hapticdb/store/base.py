@@ -1,4 +1,4 @@
-"""What an engine does for an environment: the Store protocol and the rows that cross it."""
+"""What an engine does for an opened environment: the protocol `Store`, and what crosses it."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -25,12 +25,13 @@ BRICK_SHIFT = 3 * BRICK_BITS
 CELL_SHIFT = 15
 """Bits of a voxel's key below its cell's."""
 BRICK_BYTES = 64
+"""Bytes of a brick's occupancy: a bit for each of its 512 voxels."""
 
 Keys = NDArray[np.int64]
 
 
 class Rows(NamedTuple):
-    """Rows of the index table, a batch.
+    """A batch of rows of the index table.
 
     keys : (R,) int64, ascending: voxel keys, or brick keys.
     ids : (R,) int64, ids of objects.
@@ -42,12 +43,12 @@ class Rows(NamedTuple):
     occupancy: NDArray[np.uint8]
 
     def __len__(self) -> int:
-        """Count the rows (a tuple of three would say three)."""
+        """Number of rows, not of this tuple's three fields."""
         return len(self.keys)
 
 
 NO_KEYS = np.empty(0, dtype=np.int64)
-# bytes and not an array of numpy's own: kernels see one type, read-only, on every path
+# from bytes, hence read-only: kernels are compiled for the one type that every path gives them
 NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
 NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
 
@@ -58,9 +59,10 @@ def row_shift(layout: Layout) -> int:
 
 
 def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int64]:
-    """Voxel keys (C, 2) that a write of these rows touched, as `Change` holds them.
+    """Ranges of voxel keys (C, 2) that a write of these rows touched, as `Change` holds them.
 
-    Rounded to cells; in lexicographic order, which has none, to slabs of one i.
+    Ranges are rounded outwards to cells. A cell is no range of keys in lexicographic order: there
+    they are rounded to slabs, which are all voxels of one i.
     """
     shift = CELL_SHIFT if grid.is_hierarchical else 2 * grid.bits
     cubes = np.unique(row_keys >> (shift - row_shift(layout)))
@@ -76,13 +78,13 @@ class Object:
     Attributes
     ----------
     id : int
-        Given by the store when written; never used again after a removal. 0 before.
+        The store gives it when the object is written, and never to another object. 0 before.
     name : str
         Path of the part inside its file.
     link : str
         Absolute path of the file that holds its surface.
     digest : str
-        Of its geometry, in its own frame.
+        Digest of its geometry in its own frame.
     transform : (4, 4) float64
         world_from_part, metres.
     voxels : int
@@ -90,12 +92,13 @@ class Object:
     bounds : (2, 3) float64
         Lower and upper corner, metres, world frame.
     attributes : mapping
-        What else is known, as JSON: ``unit`` is the unit its file was read in, ``up`` the
-        axis that the file says points up: ``x``, ``y`` or ``z``.
+        Everything else, as JSON. ``unit`` is the unit that its file was read in. ``up`` is the
+        axis that points up, if the file says so: ``x``, ``y`` or ``z``.
     revision : int
-        Of the environment, when the object was last written.
+        Revision of the environment that last wrote the object.
     rows_crc : int or None
-        Checksum of its rows as they were written; None of objects written before there was one.
+        Checksum of its rows as they were written. None for an object that a version without
+        checksums has written.
     """
 
     name: str
@@ -131,7 +134,7 @@ def unknown_exclusion(object_id: int, url: str) -> ObjectNotFoundError:
 
 
 def present_already(record: Object, url: str) -> EnvironmentExistsError:
-    """Build the error for a part that the environment holds."""
+    """Build the error for a part that the environment holds already."""
     return EnvironmentExistsError(
         f"{record.name} of {record.link} is in {url} already; remove it first"
     )
@@ -140,7 +143,7 @@ def present_already(record: Object, url: str) -> EnvironmentExistsError:
 NOBODY = 0
 """Thread of a store that is lent to nobody: no thread has this number."""
 _forked_as = 0
-"""Process id of a process that was forked since this module was loaded, else 0."""
+"""Process id, in a process that was forked after this module was loaded; 0 in any other."""
 
 
 def _note_fork() -> None:
@@ -152,7 +155,7 @@ os.register_at_fork(after_in_child=_note_fork)
 
 
 def this_thread() -> int:
-    """Number of the calling thread; a forked copy of a thread has another one."""
+    """Number of the calling thread. A thread and its copy in a forked process have two numbers."""
     return get_ident() + _forked_as
 
 
@@ -165,13 +168,13 @@ def check_thread(owner: int, url: str) -> None:
 
 
 def check_outside(depth: int, url: str) -> None:
-    """Refuse to look for the commits of others inside a snapshot, which shows none."""
+    """Refuse to look for the commits of others inside a snapshot, which hides them."""
     if depth:
         raise UsageError(f"{url}: inside a snapshot nothing changes: ask before or after it")
 
 
 def check_unwritten(record: Object, known: Object, url: str) -> None:
-    """Refuse to replace an object that another has written since `record` was derived from it."""
+    """Refuse to replace an object that was written after `record` was derived from it."""
     if record.revision and record.revision != known.revision:
         raise ConflictError(
             f"object {known.id} ({known.name}) of {url} was written by another meanwhile "
@@ -181,9 +184,9 @@ def check_unwritten(record: Object, known: Object, url: str) -> None:
 
 @dataclass(frozen=True)
 class Change:
-    """One committed write: what readers refresh from.
+    """One committed write. A reader learns from it which keys to read again.
 
-    ranges (C, 2) int64: lowest and highest voxel key of each run of keys touched, ascending.
+    ranges (C, 2) int64: lowest and highest voxel key of each range that was touched, ascending.
     """
 
     revision: int
@@ -193,14 +196,14 @@ class Change:
 
 
 Covering = Callable[[Object], Iterable[tuple[int, int]]]
-"""Key ranges, closed, that hold all rows of an object as it stands when a write begins."""
+"""Gives, for an object as it stands when a write begins, closed key ranges that hold its rows."""
 
 
 class Histogram(NamedTuple):
     """Equi-count histogram of all row keys.
 
-    bounds (R + 1,) int64, ascending; n_rows : rows of the index table; source : ``computed`` now,
-    ``kept`` since the last write, or ``server statistics``, the engine's own.
+    bounds (R + 1,) int64, ascending; n_rows : rows of the index table; source : ``computed`` by
+    this call, ``kept`` in the environment since its last write, or ``server statistics``.
     """
 
     bounds: Keys
@@ -209,10 +212,10 @@ class Histogram(NamedTuple):
 
 
 class Freshness(NamedTuple):
-    """How old the statistics are that cost-based grouping stands on.
+    """How old the statistics of the keys are, which the strategy `cbgroup` uses.
 
-    revision : of the environment when they were made, None without any; changes : writes committed
-    since; rows : rows that those wrote, as far as the engine counts them.
+    revision : revision of the environment when they were made, None without any; changes : writes
+    committed since; rows : rows that these wrote, as far as the engine counts them.
     """
 
     revision: int | None
@@ -220,11 +223,116 @@ class Freshness(NamedTuple):
     rows: int
 
 
-class Store(Protocol):
-    """Where an environment lives. Methods take and return whole batches; one call, one round trip.
+class Size(NamedTuple):
+    """How large an index table is; bytes of the whole database, its write-ahead log included."""
+
+    rows: int
+    bytes: int
+    leaf_blocks: int
+
+
+class ReadsRows(Protocol):
+    """Reads rows of the index table, in ascending order of key and id.
+
+    Each call is one statement, but for `lookup_each`. Arrays of keys and of bounds are ascending,
+    distinct and contiguous.
+    """
+
+    def lookup(self, keys: Keys) -> Rows:
+        """Rows of distinct ascending keys (U,), in the form that this engine answers fastest."""
+
+    def lookup_each(self, keys: Keys) -> Rows:
+        """The rows that `lookup` returns, by one statement a key: the paper's point queries."""
+
+    def scan(self, lows: Keys, highs: Keys) -> Rows:
+        """Rows with a key in any closed range, ascending and disjoint, in one statement."""
+
+    def count(self, lows: Keys, highs: Keys) -> int:
+        """Count what `scan` would return, inside the engine."""
+
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
+        """Rows of one object with a key in any closed range, ascending and disjoint."""
+
+
+class ReadsObjects(Protocol):
+    """Reads objects, and what was committed."""
+
+    def revision(self) -> int:
+        """Number of the last committed write; 0 for an empty environment."""
+
+    def version(self) -> int:
+        """Give a number that differs when the last read may have seen another revision."""
+
+    def objects(self) -> list[Object]:
+        """All objects, ordered by id."""
+
+    def object(self, object_id: int) -> Object:
+        """One object; raises ObjectNotFoundError when there is none of that id."""
+
+    def removed(self, link: str) -> set[str]:
+        """Names of a file's parts that were removed and are not there again."""
+
+    def changes(self, since: int = 0) -> Iterator[Change]:
+        """Committed writes after that revision, oldest first."""
+
+
+class WritesObjects(Protocol):
+    """Writes objects, each in one transaction: its rows, its record and its `Change`.
+
+    Raises ReadOnlyError when the store was opened to read, or the user may not write.
+    """
+
+    def loading(self) -> AbstractContextManager[None]:
+        """A context in which many objects are written. May be nested.
+
+        Inside, an engine may postpone what only readers need, such as an index. At its end, an
+        error or not, that is made up for, and what was committed inside is safe.
+        """
+
+    def add(self, record: Object, rows: Rows) -> int:
+        """Write an object and its rows (any ids in them) in one transaction; returns its id.
+
+        The record's own id is kept when it is above 0 and no object has it.
+        """
+
+    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+        """Exchange an object's rows in one transaction; `covering` says where the old ones are.
+
+        A record with a revision above 0 was derived from the object of that revision. Raises
+        ConflictError when the object has been written since.
+        """
+
+    def remove(self, object_id: int, covering: Covering) -> None:
+        """Remove an object and its rows in one transaction; `covering` says where they are."""
+
+
+class KeepsStatistics(Protocol):
+    """Knows how large the environment is and how its keys are distributed; keeps cost figures."""
+
+    def size(self) -> Size:
+        """Rows, bytes and leaf blocks."""
+
+    def quantiles(self, resolution: int) -> Histogram:
+        """Equi-count histogram of all row keys, of R buckets."""
+
+    def freshness(self, resolution: int) -> Freshness:
+        """How old the statistics are that `quantiles` uses at that resolution."""
+
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
+        """Renew the statistics that `quantiles` uses; fresh ones only if `anew`."""
+
+    def costs(self, machine: str) -> Mapping[str, float] | None:
+        """Figures that `save_costs` kept for that machine."""
+
+    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
+        """Keep the fitted cost figures of a machine."""
+
+
+class Store(ReadsRows, ReadsObjects, WritesObjects, KeepsStatistics, Protocol):
+    """An opened environment. Methods take and return whole batches.
 
     A store belongs to the thread that opened it. Reads outside `snapshot` see what is committed
-    when each begins; inside, all see one revision.
+    when each begins. All reads inside see one revision.
     """
 
     @property
@@ -233,7 +341,7 @@ class Store(Protocol):
 
     @property
     def name(self) -> str:
-        """What it is called among others at the same place."""
+        """Its name among the environments of one folder or database."""
 
     @property
     def engine(self) -> str:
@@ -253,121 +361,37 @@ class Store(Protocol):
 
     @property
     def identity(self) -> object:
-        """What tells it from another environment that has taken its place, by comparing."""
+        """A value that another environment, made in its place, does not have."""
 
     @property
     def is_closed(self) -> bool:
         """Whether `close` was called; a lost connection that comes back by itself is not closed."""
 
     def close(self) -> None:
-        """Give back what the connection holds."""
+        """Close the connection."""
 
     def give_to(self, thread: int) -> None:
         """Belong to another thread from now on (`this_thread`), or to `NOBODY`.
 
-        Called by any thread, while no call of another is under way.
+        Any thread may call it, while no other call is under way.
         """
 
     def discard(self) -> None:
-        """Close and delete an environment that nothing went into."""
+        """Close the environment, and delete it if nothing was ever written to it."""
 
     def snapshot(self) -> AbstractContextManager[None]:
         """All reads inside see one committed revision."""
 
-    def version(self) -> int:
-        """A number that has changed when the last read may have seen another revision."""
-
-    def revision(self) -> int:
-        """Number of the last committed write; 0 for an empty environment."""
-
-    # -- the haptic query
-    def lookup(self, keys: Keys) -> Rows:
-        """Rows of distinct ascending keys (U,), in the form that this engine answers fastest."""
-
-    def lookup_each(self, keys: Keys) -> Rows:
-        """The same by one statement a key: the paper's point query sequence."""
-
-    def scan(self, lows: Keys, highs: Keys) -> Rows:
-        """Rows with a key in any closed range, ascending and disjoint, in one statement."""
-
-    def count(self, lows: Keys, highs: Keys) -> int:
-        """Count what `scan` would return, inside the engine."""
-
-    # -- objects
-    def objects(self) -> list[Object]:
-        """All objects, ordered by id."""
-
-    def object(self, object_id: int) -> Object:
-        """One object; raises ObjectNotFoundError when there is none of that id."""
-
-    def removed(self, link: str) -> set[str]:
-        """Names of a file's parts that were removed and are not there again."""
-
-    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
-        """Rows of one object with a key in any closed range, ascending and disjoint."""
-
-    def loading(self) -> AbstractContextManager[None]:
-        """Many objects come: inside, an engine may put off what only readers need. May be nested.
-
-        However it is left, what was committed inside is safe and readers have what they need.
-        """
-
-    def add(self, record: Object, rows: Rows) -> int:
-        """Write an object and its rows (any ids in them) in one transaction; returns its id.
-
-        The record's own id is kept when it is above 0 and no object has it.
-        """
-
-    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
-        """Exchange an object's rows in one transaction; `covering` says where the old ones are.
-
-        A record with a revision above 0 was derived from the object as it stood then: raises
-        ConflictError when another has written it since.
-        """
-
-    def remove(self, object_id: int, covering: Covering) -> None:
-        """Remove an object and its rows in one transaction; `covering` says where they are."""
-
-    def changes(self, since: int = 0) -> Iterator[Change]:
-        """Committed writes after that revision, oldest first."""
-
-    # -- statistics
-    def size(self) -> "Size":
-        """Rows, bytes and leaf blocks."""
-
     def checker(self) -> "Checker":
-        """What `hapticdb check` asks beside the rest."""
-
-    def quantiles(self, resolution: int) -> Histogram:
-        """Equi-count histogram of all row keys, of R buckets."""
-
-    def freshness(self, resolution: int) -> Freshness:
-        """How old the statistics are that `quantiles` answers from at that resolution."""
-
-    def analyze(self, resolution: int, *, anew: bool = False) -> None:
-        """Renew the statistics that `quantiles` answers from; when they are fresh, only if anew."""
-
-    def costs(self, machine: str) -> Mapping[str, float] | None:
-        """Figures that `save_costs` kept for that machine."""
-
-    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
-        """Keep the fitted cost figures of a machine."""
+        """What only `hapticdb check` asks."""
 
 
-class Size(NamedTuple):
-    """How large an index table is; bytes of the whole database, its write-ahead log included."""
+class LocatedShell(NamedTuple):
+    """A shell at its pose, as `SupportsStatement` needs it: arrays in the order of the points.
 
-    rows: int
-    bytes: int
-    leaf_blocks: int
-
-
-class Frame(NamedTuple):
-    """A located shell as `SupportsStatement` binds it: parallel arrays in the order of the points.
-
-    placed (N + 1, 6) float64: points in metres and normals, world frame, last the tool's centre;
-    addresses (N,) int64, -1 outside the grid, both as `kernels.contact.locate` gives them;
-    stiffness N/m; exclude (E,) int64, ids.
+    placed (N + 1, 6) float64: points in metres and normals, world frame; the last row is the tool's
+    centre; addresses (N,) int64, -1 outside the grid; `kernels.query.contact` computes both;
+    stiffness in N/m; exclude (E,) int64: ids of objects that are not felt.
     """
 
     placed: NDArray[np.float64]
@@ -380,22 +404,22 @@ class Frame(NamedTuple):
 class SupportsStatement(Protocol):
     """An engine that computes the wrench inside one statement (the paper's Figure 3)."""
 
-    def statement(self, frame: Frame) -> NDArray[np.float64]:
+    def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame, N and N m about its centre."""
 
-    def statement_hits(self, frame: Frame) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
+    def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Every hit with every object in its voxel: points' ordinals (P,) and object ids (P,)."""
 
 
 @runtime_checkable
 class SupportsCaches(Protocol):
-    """An engine whose caches this process owns: how large, and emptied when asked."""
+    """An engine whose caches belong to this process, which can limit and empty them."""
 
     def limit_cache(self, size_bytes: int) -> None:
-        """Pages that the connection may keep in memory, from now on."""
+        """Keep at most so many bytes of pages in memory, from now on."""
 
     def drop_caches(self) -> None:
-        """Forget all pages: the connection's, and the file's in the operating system's cache."""
+        """Empty the connection's cache, and the operating system's cache of the file."""
 
 
 @runtime_checkable
@@ -409,13 +433,13 @@ class HasGroupingThreshold(Protocol):
 
 @runtime_checkable
 class SupportsServer(Protocol):
-    """An engine whose rows and caches another process holds: what a benchmark asks of it."""
+    """An engine with a server process, which holds the rows and the caches: for benchmarks."""
 
     def looping(self) -> "Store":
         """The same store, but its `scan` loops over the ranges inside the server, one at a time.
 
-        The paper's own form. It needs the right to make a temporary function: raises DatabaseError
-        without it, and when the store was opened to read only.
+        That is the paper's form of a scan. Raises DatabaseError when the user may not make a
+        temporary function, as in a store that was opened to read only.
         """
 
     def server_cache(self) -> int:
@@ -423,7 +447,7 @@ class SupportsServer(Protocol):
 
 
 class Checker(Protocol):
-    """What `hapticdb check` asks an engine: what is wrong below and beside the rows."""
+    """What `hapticdb check` asks an engine: pages, indexes, and all rows in their order."""
 
     def has_page_checksums(self) -> bool:
         """Whether pages carry checksums that are compared when they are read."""
@@ -432,7 +456,7 @@ class Checker(Protocol):
         """What is wrong with pages, indexes and kept statistics, a line each."""
 
     def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
-        """At most that many rows after (key, id), ascending by both; from the start by (-1, 0)."""
+        """At most `limit` rows after (key, id), ascending by both; (-1, 0) starts at the first."""
 
 
 @runtime_checkable
@@ -443,9 +467,9 @@ class SupportsWatch(Protocol):
         """Begin to notice commits from now on; may be called again."""
 
     def has_changed(self) -> bool:
-        """Whether something was committed since `watch` or the last call; never waits for a commit.
+        """Whether something was committed since `watch` or the last call. Never waits.
 
-        Meant to be called hundreds of times a second. May be true without need, as the first time
-        without a `watch`; never false when a commit was made before the call, on a server by as
-        long as its notification takes. Raises UsageError inside a snapshot.
+        Cheap enough for hundreds of calls a second. It may be true without a commit, as at the
+        first call without a `watch`. It is not false when a commit came before the call; on a
+        server the notification of a commit takes a moment. Raises UsageError inside a snapshot.
         """

@@ -1,8 +1,8 @@
-"""The wall between what is stored and what is believed, the same for every engine.
+"""Checks of everything that is read from an environment's tables, the same for every engine.
 
-An environment may have been damaged, or made by somebody who means harm. Whatever is read from its
-tables, but for the rows of the index, passes through here: it comes out as a value of the right
-type within its bounds, or as one DamagedError that names the place.
+An environment may be damaged, or made by somebody who means harm. Every value that is read, apart
+from the rows of the index, passes through here. The result has the right type and lies within its
+bounds; otherwise DamagedError names the place.
 """
 
 import contextlib
@@ -20,10 +20,13 @@ from hapticdb.grid import CurveName, Grid
 from hapticdb.store.base import LAYOUTS, Change, Histogram, Keys, Layout, Object, Rows
 
 KEY_END = 1 << 63
+"""One above the largest count or key that an int64 holds."""
 ROWS_CRC = "rows_crc"
-"""Among an object's attributes as they are stored: the checksum of its rows, not the user's."""
+"""Name under which the checksum of an object's rows is stored among its attributes."""
 ACTIONS = ("add", "move", "remove")
+"""What a change may have done."""
 TABLES = ("brick", "change", "cost", "environment", "object", "quantile", "voxel")
+"""Tables that every environment has, of whatever format."""
 Floats = NDArray[np.float64]
 
 
@@ -41,7 +44,7 @@ class RowsChecksum:
         self._keys = self._bricks = 0
 
     def update(self, keys: Keys, occupancy: NDArray[np.uint8]) -> None:
-        """Go on with more rows."""
+        """Add the next rows."""
         self._keys = zlib.crc32(np.ascontiguousarray(keys, "<i8").data, self._keys)
         if occupancy.size:
             self._bricks = zlib.crc32(np.ascontiguousarray(occupancy).data, self._bricks)
@@ -59,7 +62,7 @@ def rows_crc(rows: Rows) -> int:
 
 
 def attributes_text(record: Object, rows: Rows) -> str:
-    """An object's attributes as they are stored, with the checksum of the rows stored beside."""
+    """An object's attributes as JSON, with the checksum of its rows among them."""
     kept = {**record.attributes, ROWS_CRC: f"{rows_crc(rows):016x}"}
     return json.dumps(kept, sort_keys=True)
 
@@ -82,9 +85,9 @@ def grid_of(url: str, rows: Sequence[Sequence[Any]]) -> tuple[Grid, Layout]:
 
 
 def check_tables(url: str, kinds: Mapping[str, str]) -> None:
-    """Refuse what is no table where one belongs: a view answers what it likes.
+    """Refuse an environment in which a table is missing, or is a view: a view can return anything.
 
-    `kinds` : by name, ``table`` or what it is instead.
+    `kinds` : for each name ``table``, or what it is instead.
     """
     for name in TABLES:
         kind = kinds.get(name)
@@ -97,7 +100,7 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
 def object_of(url: str, row: Sequence[Any]) -> Object:
     """Read an object: id, name, link, digest, transform, voxels, bounds, attributes, revision.
 
-    Doubles come as bytes, little-endian, or as a list.
+    Doubles are bytes, little-endian, or a list.
     """
     object_id, name, link, digest, transform, voxels, bounds, attributes, revision = row
 

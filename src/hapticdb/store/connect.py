@@ -56,7 +56,7 @@ def exists(url: Url) -> bool:
 
 
 def findings_before_opening(url: Url) -> list[str]:
-    """What is wrong with an environment, as far as that shows before it is opened."""
+    """Damage that can be found without opening an environment; a line each."""
     engine = engine_of(url)
     if not isinstance(engine, SupportsFirstFindings):
         return []
@@ -64,7 +64,7 @@ def findings_before_opening(url: Url) -> list[str]:
 
 
 def beside(url: Url, name: str) -> str:
-    """URL of another environment at the same place: in the same folder, or the same database."""
+    """URL of another environment in the same folder or database."""
     return engine_of(url).beside(os.fspath(url), name)
 
 
@@ -76,7 +76,8 @@ def grant(url: Url, role: str, right: Right) -> None:
     AccessError
         When the URL's user does not own the environment.
     UsageError
-        When there is no such role, or none that could be held back; for an engine without roles.
+        When there is no such role, when the role may do everything anyway, or when the engine has
+        no roles.
     """
     engine = engine_of(url)
     if not isinstance(engine, SupportsGrant):
@@ -91,15 +92,14 @@ def backup_environment(
     replace: bool = False,
     progress: BackupCallback | None = None,
 ) -> BackupReport:
-    """Copy an SQLite environment whole, as of one moment, while others go on reading and writing.
+    """Copy a whole SQLite environment as of one moment, while others read and write it.
 
     Parameters
     ----------
     url : str or path
         The environment: a path or ``sqlite:///path``.
     file : path
-        Where the copy goes: an environment of its own, which can be opened. It appears whole, on
-        disk, or not at all.
+        Where the copy goes. The copy is an environment, too. It appears whole or not at all.
     replace : bool
         Replace an environment that is there, unless somebody has it open.
     progress : callable or None
@@ -112,7 +112,7 @@ def backup_environment(
     BusyError
         When the file that is to be replaced is open.
     DamagedError
-        When a page is not what was written: nothing is left then.
+        When the checksum of a page is wrong. No copy is left then.
     UsageError
         When either is on PostgreSQL, or both are one file.
     """
@@ -129,28 +129,28 @@ def restore_environment(
     *,
     progress: BackupCallback | None = None,
 ) -> BackupReport:
-    """Put a copy of an SQLite environment in its place, and remove the log of what was there.
+    """Put a copy of an SQLite environment in its place, and remove the log of the former file.
 
-    The former file stays until the copy is whole beside it. `file` stays as it is.
+    The former file stays until the copy is complete beside it. `file` itself is not changed.
 
     Parameters
     ----------
     file : path
         A copy that `backup_environment` made, or any other environment's file.
     url : str or path
-        Where it goes: a path or ``sqlite:///path``, whether something is there or not.
+        Where it goes: a path or ``sqlite:///path``. An environment may be there already.
     progress : callable or None
         Called after each 4 MiB with `bytes_done` and `bytes_total`.
 
     Raises
     ------
     BusyError
-        When the environment that is to be replaced is open, where that can be known: a reader in a
-        folder that it cannot write leaves no sign.
+        When the environment that is to be replaced is open. A reader that cannot write the folder
+        is not noticed.
     NotAnEnvironmentError
-        When a file of another kind is in the place.
+        When there is a file that is no environment.
     DamagedError
-        When a page of `file` is not what was written: nothing has changed then.
+        When the checksum of a page of `file` is wrong. Nothing has changed then.
     UsageError
         When either is on PostgreSQL, or both are one file.
     """
@@ -179,7 +179,7 @@ def name_of(url: Url) -> str:
 
 
 def check_curve(curve: str, layout: Layout) -> None:
-    """Refuse bricks in an order whose leading bits name no cube."""
+    """Refuse bricks in lexicographic order: leading bits of such a key name no cube."""
     if layout == "brick" and curve == "lexicographic":
         raise UsageError(
             "bricks need a hierarchical curve: choose z or hilbert, or the layout voxel"

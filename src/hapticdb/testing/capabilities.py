@@ -7,8 +7,8 @@ import pytest
 
 from hapticdb.grid import Grid
 from hapticdb.store.base import (
-    Frame,
     HasGroupingThreshold,
+    LocatedShell,
     Store,
     SupportsCaches,
     SupportsServer,
@@ -55,7 +55,7 @@ class CapabilitiesContract(StoreCase):
         placed[:3, :3] = store.grid.centers(both) - np.array([0.0, 0.0, 0.002])
         placed[:3, 5] = 1.0
         none = np.empty(0, dtype=np.int64)
-        frame = Frame(placed, keys, 1000.0, none)
+        frame = LocatedShell(placed, keys, 1000.0, none)
         ordinals, ids = store.statement_hits(frame)
         assert sorted(zip(ordinals.tolist(), ids.tolist(), strict=True)) == [(0, 1), (0, 2), (1, 1)]
         np.testing.assert_allclose(store.statement(frame)[:3], [0, 0, 4.0])

@@ -49,8 +49,8 @@ def replay(
     session = Recording(recording)
     if session.n_torn:
         render.note(
-            f"{recording}: the last {session.n_torn:,} bytes are no whole piece, the recorder was "
-            "cut off; what is before them is whole"
+            f"{recording}: the last {session.n_torn:,} bytes are an incomplete chunk, since the "
+            "recorder was cut off; everything before them is whole"
         )
     if csv is not None:
         _write_frames(session, csv, until_damage=until_damage)

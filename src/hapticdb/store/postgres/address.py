@@ -73,9 +73,10 @@ def parse(url: str) -> Address:
 
 
 def _split(url: str) -> SplitResult:
-    """Split a URL; refuses what libpq would read otherwise than it was meant, and then quote.
+    """Split a URL; refuse one that libpq would misread and then quote in its message.
 
-    An @ in a password, not escaped, makes a part of the password a host, and part of its message.
+    An @ that is not escaped in a password makes a part of the password a host, which libpq's
+    message would show.
     """
     try:
         parts = urlsplit(url)
@@ -110,7 +111,7 @@ def with_environment(url: str, name: str) -> str:
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse what the server would not take as a name, or would cut off and take for another.
+    """Refuse a name that the server refuses, or that it would cut off at 63 bytes.
 
     Raises
     ------
@@ -133,7 +134,7 @@ def check_name(name: str, what: str) -> None:
 
 
 def _check_login(parts: SplitResult, url: str) -> None:
-    """Refuse names of a user or a database that the server would cut off and take for another."""
+    """Refuse names of users and databases that the server would cut off: it would mean another."""
     pairs = [pair.partition("=") for pair in parts.query.split("&")]
     user = parts.netloc.rpartition("@")[0].partition(":")[0]
     names = [("a user's name", user), ("a database's name", parts.path.removeprefix("/"))]

@@ -4,31 +4,35 @@ from collections.abc import Callable, Iterator
 
 from hapticdb.store import believed
 from hapticdb.store.base import Layout, Rows
-from hapticdb.store.postgres import statements, wire
-from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres.connecting import wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.tables import statements
 
 
 class PostgresChecker:
     """Pages are the server's own: it compares their checksums when it reads them, if it has any."""
 
     def __init__(
-        self, session: Session, layout: Layout, rows: Callable[[list[bytes | None]], Rows]
+        self,
+        connection: ServerConnection,
+        layout: Layout,
+        rows: Callable[[list[bytes | None]], Rows],
     ) -> None:
-        self._session = session
+        self._connection = connection
         self._layout = layout
         self._rows = rows
 
     def has_page_checksums(self) -> bool:
         """Whether the server's pages carry checksums."""
-        return self._session.rows("SHOW data_checksums") == [("on",)]
+        return self._connection.rows("SHOW data_checksums") == [("on",)]
 
     def findings(self) -> Iterator[str]:
         """What is wrong with kept statistics, a line each."""
-        kept = self._session.rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")
-        costs = self._session.rows("SELECT figures::text FROM cost")
-        yield from believed.findings_of_kept(self._session.shown, kept, costs)
+        kept = self._connection.rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")
+        costs = self._connection.rows("SELECT figures::text FROM cost")
+        yield from believed.findings_of_kept(self._connection.shown, kept, costs)
 
     def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
         """At most that many rows after (key, id), ascending by both."""
         place = wire.int8(key), wire.int8(object_id), wire.int8(limit)
-        return self._rows(self._session.fetch(statements.AFTER[self._layout], *place))
+        return self._rows(self._connection.fetch(statements.AFTER[self._layout], *place))

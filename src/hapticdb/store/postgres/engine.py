@@ -44,9 +44,9 @@ class PostgresEngine:
 
     def grant(self, url: str, role: str, right: Right) -> None:
         """Give a role of the server one right; see `hapticdb.store.postgres.rights`."""
-        with schema_of.connected(url) as session:
-            schema_of.check(session)
-            rights.grant(session, role, right)
+        with schema_of.connected(url) as connection:
+            schema_of.check(connection)
+            rights.grant(connection, role, right)
 
 
 ENGINE = PostgresEngine()

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from hapticdb.store.base import NO_OCCUPANCY, NO_ROWS, Keys, Layout, Rows, Store
-from hapticdb.store.postgres import failures, wire
-from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres.connecting import failures, wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 NAME = "pg_temp.scan_ranges"
 # a temporary function: the environment itself stays as it is
@@ -54,11 +54,11 @@ END $$""",
 class LoopInServer:
     """A PostgreSQL store whose `scan` loops over its ranges inside the server."""
 
-    def __init__(self, store: Store, session: Session) -> None:
+    def __init__(self, store: Store, connection: ServerConnection) -> None:
         self._store = store
-        self._session = session
-        with failures.named_errors(session.shown):
-            session.command(MAKE[store.layout])
+        self._connection = connection
+        with failures.named_errors(connection.shown):
+            connection.command(MAKE[store.layout])
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - all else is the store's own
         return getattr(self._store, name)
@@ -69,7 +69,7 @@ class LoopInServer:
             return NO_ROWS
         columns = "keys, ids, bits" if self._store.layout == "brick" else "keys, ids"
         text = f"SELECT {columns} FROM {NAME}($1, $2)"
-        found = self._session.fetch(text, wire.int8s(lows), wire.int8s(highs))
+        found = self._connection.fetch(text, wire.int8s(lows), wire.int8s(highs))
         if found[0] is None:
             return NO_ROWS
         occupancy = (

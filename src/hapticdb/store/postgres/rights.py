@@ -1,7 +1,7 @@
-"""Who may do what with an environment: rights of roles, kept and enforced by the server itself.
+"""Who may do what with an environment: rights of roles. The server itself enforces them.
 
-A viewer reads and touches; a toucher also keeps fitted cost figures; an editor also adds, moves and
-removes objects. The grid, the tables and the rights are the owner's, who made the environment.
+A viewer reads and touches. A toucher also keeps fitted cost figures. An editor also adds, moves and
+removes objects. Only the owner, who made the environment, may change its tables and grant rights.
 """
 
 from psycopg import sql
@@ -9,7 +9,7 @@ from psycopg import sql
 from hapticdb.errors import AccessError, UsageError
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import check_name
-from hapticdb.store.postgres.session import Session, identifier
+from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 
 WITHDRAWN = (
     "REVOKE ALL ON SCHEMA {schema} FROM {role}",
@@ -45,7 +45,7 @@ GRANTED: dict[Right, tuple[str, ...]] = {
     "editor": EDITOR,
     "nobody": (),
 }
-# two that change the same rights at once would meet in the server's catalog
+# a lock: two who change the same rights at once would conflict in the server's catalog
 GRANTERS = 0x4841505447524E54
 KNOWN_ROLE = """
 SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')
@@ -53,12 +53,12 @@ SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')
  WHERE role.rolname = %s AND kept.oid = 'environment'::regclass"""
 
 
-def grant(session: Session, role: str, right: Right) -> None:
+def grant(connection: ServerConnection, role: str, right: Right) -> None:
     """Give a role that right on an environment, and no more; one transaction.
 
     Parameters
     ----------
-    session : Session
+    connection : ServerConnection
         Of the environment's owner.
     role : str
         Name of a role of the server, a person's or a group's, written as it is.
@@ -69,7 +69,7 @@ def grant(session: Session, role: str, right: Right) -> None:
     Raises
     ------
     AccessError
-        When the session's user does not own the environment.
+        When the connection's user does not own the environment.
     UsageError
         When there is no such role, none that the server would hold back, or no role can have that
         name: the server would cut it off at 63 bytes, and mean another.
@@ -77,30 +77,31 @@ def grant(session: Session, role: str, right: Right) -> None:
     check_name(role, "a role's name")
     if right not in GRANTED:
         raise UsageError(f"right {right!r}: choose one of {', '.join(GRANTED)}")
-    if not session.is_owner():
+    if not connection.is_owner():
         raise AccessError(
-            f"{session.shown}: only the owner of the environment "
-            f"{session.address.environment!r} may grant rights; connect as the owner"
+            f"{connection.shown}: only the owner of the environment "
+            f"{connection.address.environment!r} may grant rights; connect as the owner"
         )
-    names = {"schema": identifier(session.address.environment), "role": identifier(role)}
+    names = {"schema": identifier(connection.address.environment), "role": identifier(role)}
 
     def work() -> None:
-        session.execute("SELECT pg_advisory_xact_lock(%s)", (GRANTERS,))
-        _check_role(session, role)
+        connection.execute("SELECT pg_advisory_xact_lock(%s)", (GRANTERS,))
+        _check_role(connection, role)
         for statement in (*WITHDRAWN, *GRANTED[right]):
-            session.execute(sql.SQL(statement).format(**names))
+            connection.execute(sql.SQL(statement).format(**names))
 
-    session.write(work)
+    connection.write(work)
 
 
-def _check_role(session: Session, role: str) -> None:
-    found = session.execute(KNOWN_ROLE, (role,)).fetchone()
+def _check_role(connection: ServerConnection, role: str) -> None:
+    found = connection.execute(KNOWN_ROLE, (role,)).fetchone()
     if found is None:
         raise UsageError(
-            f"{session.shown}: no role {role!r} on this server; create it first with 'createuser'"
+            f"{connection.shown}: no role {role!r} on this server; create it first with "
+            "'createuser'"
         )
     if found[0]:
         raise UsageError(
-            f"{session.shown}: {role!r} is the owner, a member of the owner or a superuser, and "
+            f"{connection.shown}: {role!r} is the owner, a member of the owner or a superuser, and "
             "may do everything whatever is granted; give the right to another role"
         )

@@ -1,12 +1,15 @@
-"""How a reader learns that others have committed: LISTEN, and the revision as a net under it.
+"""How a reader learns that others have committed: by LISTEN, and by asking for the revision.
 
-Each write notifies the environment's channel, with its revision as payload, in its transaction
-(PostgreSQL's manual: NOTIFY). The server sends that to whoever listens, once it is committed; to
-look whether it has come costs no round trip. Any role of the database may notify the channel, with
-any payload: a notification is a hint to ask for the revision, which only editors can raise, and
-nothing more; its payload is not read here. A server that refuses LISTEN, as a standby does, and
-writers that do not notify are found out by asking for the revision now and then. So is an
-environment that somebody has dropped and made anew: its table has another oid.
+Each write notifies the environment's channel in its own transaction, with its revision as payload
+(PostgreSQL's manual: NOTIFY). After the commit the server sends the notification to every listener.
+Looking whether one has arrived costs no round trip.
+
+Any role of the database may notify the channel, with any payload. So a notification is only a hint
+to ask for the revision, which only editors can raise; the payload is not read.
+
+The revision is also asked for now and then without a hint. That finds commits where the server
+refuses LISTEN, as a standby does, and commits of writers that do not notify. It also finds that the
+environment was dropped and made anew: the oid of its table is another one.
 """
 
 import hashlib
@@ -15,36 +18,39 @@ import time
 import psycopg
 
 from hapticdb.errors import ConnectionLostError
-from hapticdb.store.postgres import failures, wire
 from hapticdb.store.postgres.address import LONGEST_NAME
-from hapticdb.store.postgres.session import Session, identifier
+from hapticdb.store.postgres.connecting import failures, wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 
 REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 DIGEST_DIGITS = 32
+"""Of the digest in place of a name that is too long for a channel. Fewer risk equal channels."""
 HEARING_S = 1.0
-"""How long a writer that does not notify may go unnoticed where LISTEN works."""
+"""Longest time that a commit without a notification goes unnoticed, where LISTEN works. A smaller
+value costs each watching reader more round trips."""
 DEAF_S = 0.02
-"""How long any writer may, where it does not."""
+"""Longest time that a commit goes unnoticed where LISTEN does not work. Smaller costs the same."""
 HINTED_S = 0.005
-"""Between two round trips that notifications lead to, at least: 200 a second in a flood."""
+"""Shortest time between two round trips because of notifications. It keeps a flood of forged
+notifications at 200 round trips a second."""
 
 
 def channel_of(environment: str) -> str:
-    """Name of an environment's channel, of 63 bytes at most; all share the database's channels."""
+    """Name of an environment's channel, at most 63 bytes. A channel belongs to the database."""
     channel = f"hapticdb_{environment}"
     if len(channel.encode()) <= LONGEST_NAME:
         return channel
-    # a dot, where the others have their underscore: no other environment has the same
+    # a dot instead of the underscore: never equal to the channel of a short name
     return f"hapticdb.{hashlib.sha256(environment.encode()).hexdigest()[:DIGEST_DIGITS]}"
 
 
 class Watch:
-    """What one session has heard of the commits of others."""
+    """What one connection has heard of the commits of others."""
 
-    def __init__(self, session: Session, identity: int) -> None:
-        self._session = session
+    def __init__(self, connection: ServerConnection, identity: int) -> None:
+        self._connection = connection
         self._identity = identity
-        self._connection: psycopg.Connection[tuple[object, ...]] | None = None
+        self._listening_on: psycopg.Connection[tuple[object, ...]] | None = None
         self._revision = -1
         self._is_hinted = False
         self._is_deaf = True
@@ -52,19 +58,19 @@ class Watch:
 
     def begin(self) -> None:
         """Notice commits from now on."""
-        self._session.check_outside()
-        self._session.again(self._listen)
+        self._connection.check_outside()
+        self._connection.again(self._listen)
         self._ask()
 
     def has_changed(self) -> bool:
         """Whether something was committed since `begin` or the last call.
 
-        A round trip only after a notification, when the revision has not been asked for in a while,
-        and after a lost connection: then the answer is yes, since what came meanwhile was not
-        heard. Raises ConnectionLostError when the environment was made anew.
+        It costs a round trip after a notification, after `HEARING_S` or `DEAF_S` without one, and
+        after a lost connection. After a lost connection it is true: notifications may have been
+        missed. Raises ConnectionLostError when the environment was made anew.
         """
-        self._session.check_outside()
-        if self._session.again(self._listen):
+        self._connection.check_outside()
+        if self._connection.again(self._listen):
             self._ask()
             return True
         now = time.monotonic()
@@ -72,34 +78,35 @@ class Watch:
         return (is_hinted or now >= self._due) and self._ask()
 
     def _listen(self) -> bool:
-        """Take in what has come; on a connection that does not listen yet, begin, and say so."""
-        connection = self._session.connection
-        if connection is self._connection:
-            self._session.hear()
+        """Receive notifications, or begin to listen on a new connection; whether it is new."""
+        driver = self._connection.driver
+        if driver is self._listening_on:
+            self._connection.hear()
             return False
-        connection.add_notify_handler(self._hear)
-        channel = identifier(channel_of(self._session.address.environment))
+        driver.add_notify_handler(self._hear)
+        channel = identifier(channel_of(self._connection.address.environment))
         try:
-            self._session.command(f"LISTEN {channel.as_string(connection)}")
+            self._connection.command(f"LISTEN {channel.as_string(driver)}")
             self._is_deaf = False
         except psycopg.Error as error:
             if failures.is_lost(error):
                 raise
             self._is_deaf = True
-        self._connection = connection
-        self._due = 0.0  # should asking right after this fail, the next call asks
+        self._listening_on = driver
+        self._due = 0.0  # if the question that follows fails, the next call asks again
         return True
 
     def _hear(self, _: psycopg.Notify) -> None:
         self._is_hinted = True
 
     def _ask(self) -> bool:
-        """Whether the revision is another than the one known."""
-        before, self._is_hinted = self._revision, False  # before: what comes meanwhile may be newer
-        found, identity = self._session.fetch(REVISION)
+        """Whether the revision has changed since it was last asked for."""
+        # the hint is taken back before asking: a commit after the answer gives a new hint
+        before, self._is_hinted = self._revision, False
+        found, identity = self._connection.fetch(REVISION)
         if wire.read_int8(identity or b"") != self._identity:
             raise ConnectionLostError(
-                f"{self._session.shown} is another environment than before: open it again"
+                f"{self._connection.shown} is another environment than before: open it again"
             )
         self._revision = wire.read_int8(found or b"")
         self._asked = time.monotonic()

@@ -1,9 +1,9 @@
 """Whole copies of SQLite environments, made while others write, and put in place safely.
 
-The backup API copies pages, and begins anew whenever another connection has written between two of
-its steps: for ever, where somebody always writes. Here its source is inside one read transaction
-from the first page to the last, whose pages no writer changes in WAL mode; the log grows meanwhile.
-VACUUM INTO, the other way, orders all rows anew in one statement that tells no progress.
+SQLite's backup API copies pages in steps. It begins again when another connection has written
+between two steps: with a busy writer it never ends. Here one read transaction covers all steps; in
+WAL mode no writer changes the pages that it sees, and the log grows meanwhile. VACUUM INTO would
+also copy, but it sorts all rows again, in one statement that tells no progress.
 """
 
 import contextlib
@@ -32,9 +32,9 @@ from hapticdb.store.sqlite.file import named_errors
 from hapticdb.store.sqlite.migrations import APPLICATION_ID
 
 STEP_PAGES = 512
-"""Copied between two reports of progress: 4 MiB."""
+"""Pages copied between two reports of progress: 4 MiB. More makes the bar jump."""
 SOURCE_CACHE_KIB = 4096
-"""Each page is read once."""
+"""Page cache of the source. A larger one gains nothing: each page is read once."""
 
 
 def back_up(

@@ -1,4 +1,4 @@
-"""What `hapticdb check` looks at below the rows of a SQLite file: pages, log, indexes."""
+"""What `hapticdb check` asks of an SQLite file: pages, log, indexes, statistics."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -27,9 +27,9 @@ from hapticdb.store.sqlite.raw import read_from
 Fetch = Callable[[str, Sequence[Any]], list[Any]]
 PAGES_AT_ONCE = 512
 MOST = 100
-"""Of one kind of finding; a file that is broken throughout is as broken as its first hundred."""
+"""Findings of one kind that are listed. More only makes the report of a ruined file longer."""
 LOOKS = 5
-"""At a page that is not whole: another process may be writing it at this moment."""
+"""Times that a page with a wrong checksum is read again: another process may be writing it."""
 AFTER: dict[Layout, str] = {
     "voxel": """
 SELECT z_val, id FROM voxel
@@ -41,7 +41,7 @@ SELECT z_val, id, occupancy FROM brick
 
 
 class SQLiteChecker:
-    """Pages of the file, the engine's own check, kept statistics; rows in the order of the tree."""
+    """What `hapticdb check` asks a file: SQLite's own check, statistics, rows in their order."""
 
     def __init__(
         self, path: Path, layout: Layout, fetch: Fetch, rows: Callable[[list[Any]], Rows]
@@ -70,7 +70,7 @@ class SQLiteChecker:
 
 
 def page_findings(path: Path) -> Iterator[str]:
-    """Compare every page of a file that carries checksums, those that nothing reads, too."""
+    """Compare the checksum of every page of a file, also of pages that no query reads."""
     with sqlite_bytes.opened_bytes(path) as file:
         first = read_from(file, PAGE_BYTES)
         if not sqlite_pages.is_checked(first):
@@ -101,9 +101,9 @@ def _is_whole_later(file: apsw.VFSFile, number: int, nonce: bytes) -> bool:
 
 
 def log_findings(path: Path) -> Iterator[str]:
-    """Whether commits stand in the log after a frame that is not whole: SQLite leaves them out.
+    """Commits in the log after a broken frame, which SQLite leaves out without a word.
 
-    To be asked before the file is opened, which may do away with the log.
+    Call it before the file is opened: closing the file may remove the log.
     """
     log = Path(f"{path}-wal")
     if not log.exists():
@@ -134,7 +134,7 @@ def log_findings(path: Path) -> Iterator[str]:
 
 
 def first_findings(path: Path) -> list[str]:
-    """What can be said of a file that may not even open."""
+    """Damage that is found without opening the file; a line each."""
     try:
         return [*log_findings(path), *page_findings(path)]
     except OSError:

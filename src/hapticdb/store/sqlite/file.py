@@ -1,4 +1,4 @@
-"""Opening and creating SQLite files: what is told apart, and how an engine's error is named."""
+"""Opening and making SQLite files, and SQLite's errors turned into those of `hapticdb.errors`."""
 
 import contextlib
 import glob
@@ -26,8 +26,10 @@ from hapticdb.store.sqlite.migrations import APPLICATION_ID, CHECKED_VERSION, MI
 from hapticdb.store.sqlite.place import OpenedFile
 
 BUSY_TIMEOUT_MS = 10_000
+"""How long a write waits for another process's write before it gives up."""
 CACHE_KIB = 256 * 1024
-"""Page cache of one connection: the bricks of a large car; memory is taken as it is filled."""
+"""Page cache of one connection, enough for the bricks of a large car. Memory is taken as pages are
+read. A smaller one reads pages again from the operating system."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
 
@@ -55,7 +57,7 @@ def named_errors(path: str) -> Iterator[None]:
     except apsw.CantOpenError as error:
         raise DatabaseError(f"{path} cannot be opened: check its folder's rights") from error
     except (apsw.SQLError, apsw.MismatchError, apsw.ConstraintError) as error:
-        # our statements fit our tables: these are others
+        # the statements fit the tables of an environment: these are other tables
         raise damaged(path, str(error)) from error
 
 
@@ -65,10 +67,10 @@ def damaged(path: str, cause: str) -> DamagedError:
 
 
 def check_kind(path: Path) -> None:
-    """Tell an environment from a missing file, a folder, a file of another kind, a cut one.
+    """Refuse a missing file, a folder, a file of another kind, a file that is cut off.
 
-    Looks at the header's first 100 bytes (https://sqlite.org/fileformat2.html, section 1.3):
-    before the engine opens it, so that a foreign file is never touched.
+    Reads the file's header of 100 bytes (https://sqlite.org/fileformat2.html, section 1.3) before
+    SQLite opens the file, so that a foreign file is never touched.
     """
     try:
         is_there = path.exists()
@@ -99,7 +101,7 @@ def check_kind(path: Path) -> None:
     _check_known(path, int.from_bytes(header[60:64], "big"))
     wal = Path(f"{path.resolve()}-wal")
     if wal.exists() and wal.stat().st_size:
-        return  # the size may be older than the log: the engine decides
+        return  # the size in the header may be older than the log: SQLite decides
     page = int.from_bytes(header[16:18], "big")
     expected = int.from_bytes(header[28:32], "big") * (65536 if page == 1 else page)
     if path.stat().st_size < expected:
@@ -132,9 +134,9 @@ def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFi
 
 
 def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
-    """Make an environment of the newest format; `fill` writes what belongs into it from the start.
+    """Make an environment of the newest format; `fill` writes its first rows.
 
-    The file appears at its path whole or not at all: it is made under another name beside it.
+    The file is made under another name beside its path: it appears whole or not at all.
     """
     check_free(path)
     check_folder(path)
@@ -164,7 +166,7 @@ def check_free(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a path whose folder is missing, or takes no file."""
+    """Refuse a path whose folder is missing or cannot be written."""
     if not path.parent.is_dir():
         raise EnvironmentNotFoundError(f"folder {path.parent} does not exist; make it first")
     if not os.access(path.parent, os.W_OK):
@@ -173,7 +175,7 @@ def check_folder(path: Path) -> None:
 
 @contextlib.contextmanager
 def unfinished_beside(path: Path) -> Iterator[Path]:
-    """Name for a file that will have that path when it is whole; removed when it has not."""
+    """Name for a file that is moved to `path` when it is complete; removed if it is still there."""
     _sweep_unfinished(path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
@@ -213,7 +215,7 @@ def migrate(connection: apsw.Connection, version: int) -> None:
         connection.execute("BEGIN IMMEDIATE")
         try:
             marked, done = divmod(_pragma(connection, "user_version"), CHECKED_VERSION)
-            if done < number:  # another process may have been faster
+            if done < number:  # else another process was faster
                 for statement in statements:
                     connection.execute(statement)
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
@@ -227,8 +229,8 @@ def migrate(connection: apsw.Connection, version: int) -> None:
 def needs_immutable(path: Path) -> bool:
     """Whether only an immutable opening can read this file: nobody here can write its folder.
 
-    A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, and no log is
-    there whose pages would be missed, SQLite can still read the file alone.
+    A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, SQLite can still
+    read the file alone, if there is no log whose pages would be missed.
     """
     real = path.resolve()
     return not os.access(real.parent, os.W_OK) and not any(

@@ -1,13 +1,13 @@
 """Whether a write-ahead log belongs to the file that it lies beside.
 
-Nothing in a log of SQLite's names its file: whatever ``-wal`` lies there is applied, also to an old
-copy that was put in the file's place. So the row of the table `environment` has a lineage: a random
-mark that each commit of ours draws anew, and the mark of the commit before. The row sits on page 2,
-so each commit of ours has that page in its log.
+A log of SQLite does not name its file. SQLite applies whatever ``-wal`` lies beside a file, even to
+an old copy that was put in the file's place. So the row of the table `environment` has a lineage: a
+random mark, new with each commit of hapticdb, and the mark of the commit before. The row is on
+page 2, so each of these commits has page 2 in the log.
 
-A log begins with the file as the last whole checkpoint left it, and a checkpoint copies pages of
-committed frames only. So the mark in the file is the one before the log's first, or one of the
-log's own, at whatever moment a process or the machine died; any other file's mark is neither.
+A log begins where the last complete checkpoint left the file, and a checkpoint copies pages of
+committed frames only. So the mark in the file is the mark before the log's first one, or one of the
+log's marks, whenever a process or the machine died. The mark of any other file is neither.
 
 Layouts: https://sqlite.org/fileformat2.html, sections 1.5, 1.6, 2.1 and 4.
 """
@@ -29,7 +29,7 @@ from hapticdb.store.sqlite.pages import FRAME_BYTES, FRAME_HEADER, LOG_HEADER, P
 
 MARK_BYTES = 16
 NO_MARK = bytes(MARK_BYTES)
-"""Of a file from before format 2, and what the first mark of a file names as the one before."""
+"""Mark of a file from before format 2. The first mark of a file names it as the mark before."""
 LINEAGE_COLUMN = 8
 """Place of `lineage` in the table `environment`."""
 LINEAGE_PAGE = 2
@@ -37,7 +37,7 @@ LINEAGE_PAGE = 2
 LINEAGE_AT = (LINEAGE_PAGE - 1) * PAGE_BYTES
 RENEW_LINEAGE = """
 UPDATE environment SET lineage = CAST(randomblob(16) || substr(lineage, 1, 16) AS BLOB)"""
-"""Belongs into every transaction that writes."""
+"""A statement of every transaction that writes."""
 
 LEAF_OF_TABLE = 13
 BLOB_TYPE = 12
@@ -49,8 +49,9 @@ LOG_MAGIC = 0x377F0682
 """With 1 added where checksums are of big-endian words."""
 SUMS = struct.Struct(">2I")
 ATTEMPTS = 10
+"""Times that file and log are read before the log is refused. More waits longer for a writer."""
 PAUSE_SECONDS = 0.02
-"""Between attempts: a writer may be at work, and file and log are not read at one moment."""
+"""Between attempts. A writer may be at work: file and log cannot be read at one moment."""
 
 
 class Lineage(NamedTuple):

@@ -1,11 +1,11 @@
-"""Checksums of pages: a file system layer below SQLite that believes no page unread.
+"""Checksums of pages: a file system layer below SQLite that checks every page it reads.
 
-Each page of a checked file ends with `TAIL_BYTES` that SQLite leaves alone: a mark, a number drawn
-for the file, and a CRC-32 over the page's number, its content and the other two. They are written
-when a page goes into the file, and compared when one is read from it: a page that was altered,
-zeroed, moved to another place or taken from another file is told, whatever it holds. Pages in the
-write-ahead log are compared with the checksum that SQLite itself keeps of each frame and looks at
-only after a crash. See docs/decisions/0011.
+Each page of a checked file ends with `TAIL_BYTES` that SQLite does not use: a mark, a random number
+of the file (its nonce), and a CRC-32 over the page's number, its content, the mark and the nonce.
+They are written with the page and compared when the page is read. So a page that was altered,
+zeroed, moved to another place or taken from another file is found. For pages in the write-ahead log
+the layer compares SQLite's own checksum of each frame, which SQLite looks at only after a crash.
+See docs/decisions/0011.
 """
 
 import os
@@ -23,12 +23,17 @@ from hapticdb.store.sqlite.migrations import CHECKED_VERSION
 LAYER = "hapticdb"
 """Name under which SQLite knows the layer."""
 PAGE_BYTES = 8192
-"""The paper's block."""
+"""Bytes of a page: the block size of the paper."""
 MARK = b"HapC"
+"""First bytes of the tail of a page that carries a checksum."""
 NONCE_BYTES = 8
+"""Bytes of the random number of a file, after the mark."""
 TAIL_BYTES = 16
+"""Bytes at the end of each page that SQLite leaves to us: mark, nonce, CRC-32."""
 CONTENT_BYTES = PAGE_BYTES - TAIL_BYTES
+"""Bytes of a page that SQLite uses."""
 CRC_AT = PAGE_BYTES - 4
+"""Place of the CRC-32 in a page."""
 PENDING_PAGE = (1 << 30) // PAGE_BYTES + 1
 """SQLite locks bytes of this page and never writes it."""
 # https://sqlite.org/fileformat2.html, section 4: the write-ahead log
@@ -55,14 +60,14 @@ def is_whole(page: bytes, number: int, nonce: bytes) -> bool:
 def is_checked(first: bytes) -> bool:
     """Whether the pages of a file carry checksums, by its first one.
 
-    Three places say so, and each alone is believed: damage to one does not end the checking.
+    Three places tell, and each alone is enough: damage to one place does not switch checking off.
     """
     version = int.from_bytes(first[60:64], "big")
     return is_marked(first) or first[20:21] == bytes([TAIL_BYTES]) or version >= CHECKED_VERSION
 
 
 def is_marked(first: bytes) -> bool:
-    """Whether a page ends as those do that carry a checksum."""
+    """Whether a page has the mark of a page with a checksum."""
     return first[CONTENT_BYTES : CONTENT_BYTES + len(MARK)] == MARK
 
 

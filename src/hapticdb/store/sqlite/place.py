@@ -1,6 +1,6 @@
 """The files that an open database consists of, and whether its path still leads to them.
 
-In WAL mode the engine does not look: it goes on writing into files that were deleted or replaced,
+In WAL mode SQLite does not check that. It goes on writing into files that were deleted or replaced,
 and reports every commit as done.
 """
 
@@ -17,7 +17,8 @@ from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.pages import PAGE_BYTES
 
 LOOK_SECONDS = 0.25
-"""How long it may go unnoticed by a reader that a path leads to another file than before."""
+"""Longest time that a reader does not notice that its path leads to another file. Smaller costs
+more calls of the operating system."""
 
 Identity = tuple[int, int]
 """Device and inode."""
@@ -39,7 +40,7 @@ class OpenedFile:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._real = path.resolve()
-        """Beside which the engine keeps its log, when the path is a link."""
+        """The file itself, if the path is a link. SQLite keeps its log beside it."""
         self._log = f"{self._real}-wal"
         self._due = 0.0
         self._connection: apsw.Connection | None = None
@@ -49,7 +50,7 @@ class OpenedFile:
         self._mark = sqlite_log.check_log(self._real)
 
     def settle(self, connection: apsw.Connection, *, is_immutable: bool) -> None:
-        """Note what the engine keeps beside the file, once it has read from it.
+        """Note the files that SQLite keeps beside the file, after the first read.
 
         Raises
         ------
@@ -67,7 +68,7 @@ class OpenedFile:
         self.look()
 
     def check(self) -> None:
-        """Look now and then: a reader that asks all the time pays for a clock."""
+        """Call `look` if the last one is `LOOK_SECONDS` ago: cheap enough for each read."""
         if time.monotonic() >= self._due:
             self.look()
 
@@ -96,12 +97,14 @@ class OpenedFile:
         self._due = time.monotonic() + LOOK_SECONDS
 
     def check_stamp(self) -> None:
-        """Refuse to answer once somebody else has written: an immutable opening takes no locks.
+        """Refuse to read on after somebody else has written.
+
+        For files that were opened as immutable: SQLite takes no locks on them.
 
         Raises
         ------
         BusyError
-            When that is so.
+            When somebody has written.
         """
         if self.has_new_stamp():
             raise BusyError(f"{self._path} has been written since it was opened: open it again")
@@ -120,7 +123,7 @@ class OpenedFile:
         self._connection = None
 
     def __del__(self) -> None:
-        """Close, too, where nobody has: else the engine would, into whatever file there is."""
+        """Close if nobody has. SQLite would write its log into whatever file is there then."""
         with contextlib.suppress(Exception):
             self.close()
 
@@ -135,7 +138,7 @@ class OpenedFile:
         return True
 
     def _owns_its_log(self) -> bool:
-        """Whether only names beside the file are gone, and the log can still go into it."""
+        """Whether only the names beside the file are gone, so that its log can still go into it."""
         descriptor = sqlite_bytes.descriptor_of(self._beside.get(self._log, (0, 0)))
         if _identity(str(self._path)) != self.identity or descriptor is None:
             return False
@@ -153,7 +156,7 @@ class OpenedFile:
         first, second = (self._connection.read("main", 0, at + n * half, half)[1] for n in (0, 1))
         if (mark := sqlite_log.mark_in(first + second)) != self._mark:
             mark = sqlite_log.check_log(self._real)
-            if mark is None:  # it was there before, and a checkpoint keeps it
+            if mark is None:  # the log had a mark before, and a checkpoint keeps it
                 raise sqlite_log.not_its_log(self._real)
             self._mark = mark
 

@@ -1,8 +1,8 @@
-"""A database file's bytes, reached without the engine's knowledge of them.
+"""The bytes of a database file, read beside SQLite.
 
-Never by `open`: where a process closes any descriptor of a file, it loses all POSIX locks that it
-holds on that file, those of its other connections too (https://sqlite.org/howtocorrupt.html,
-section 2.2). The engine's own file object waits with closing until they have let go.
+Never by `open`: a process that closes any descriptor of a file loses all POSIX locks that it holds
+on that file, also those of its open connections (https://sqlite.org/howtocorrupt.html, section
+2.2). SQLite's own file object, used here, closes its descriptor when these locks are released.
 """
 
 import contextlib
@@ -26,7 +26,7 @@ def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
     OSError
         When the file is not there or may not be read.
     """
-    os.stat(path)  # noqa: PTH116 - for the error's own words: the engine's would not say why
+    os.stat(path)  # noqa: PTH116 - its error says why; SQLite's would not
     if not os.access(path, os.R_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
     try:
@@ -77,7 +77,7 @@ def forget_pages(path: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Have the names in a file's folder on disk: a renaming is safe from then on."""
+    """Write the names in a file's folder to disk: after that, a renaming survives a power cut."""
     descriptor = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)

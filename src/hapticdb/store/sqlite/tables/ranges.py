@@ -1,8 +1,8 @@
-"""How ranges of keys reach SQLite: one prepared statement for any number of them.
+"""How ranges of keys reach SQLite: one prepared statement for any number of ranges.
 
-Both ends cross as one integer where that has room for the lower end and the width, as in every
-frame on a grid of 11 bits; else the lower ends cross, and a function of ours returns the upper ones
-(docs/decisions/0004).
+If one integer has room for the lower end and the width of a range, it carries both. That is so in
+every frame on a grid of 11 bits. Otherwise the lower ends are bound, and the SQL function `nth`
+returns the upper ends (docs/decisions/0004).
 """
 
 from typing import Any, cast
@@ -13,7 +13,7 @@ import numpy as np
 from hapticdb.store.base import Keys, Layout, row_shift
 
 KEY_BITS = 63
-"""Of a signed integer that is not negative."""
+"""Bits of an int64 that is not negative."""
 
 NARROW: dict[Layout, str] = {
     "voxel": """
@@ -41,7 +41,7 @@ class RangeStatements:
     """Statements of ranges on one environment, with what binds to their first three parameters."""
 
     def __init__(self, connection: apsw.Connection, layout: Layout, bits: int) -> None:
-        # a key of that many bits leaves so many for a range's width
+        # the bits that a row key leaves free hold the width of a range
         self._width_bits = KEY_BITS - max(3 * bits - row_shift(layout), 1)
         self._mask = (1 << self._width_bits) - 1
         self._key_end = 1 << (KEY_BITS - self._width_bits)
@@ -60,7 +60,7 @@ class RangeStatements:
         return self._wide, (apsw.carray(np.ascontiguousarray(lows)), _ends(highs), 0)
 
     def count(self, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
-        """How many rows that are."""
+        """Count the rows that `scan` would return."""
         sql, bindings = self.scan(lows, highs)
         return f"SELECT count(*) FROM ({sql})", bindings
 

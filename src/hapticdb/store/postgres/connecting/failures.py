@@ -1,4 +1,4 @@
-"""What psycopg raises, as errors of ours: what, where, what next."""
+"""The errors of psycopg turned into those of `hapticdb.errors`."""
 
 import contextlib
 import re
@@ -32,7 +32,7 @@ def named_errors(shown: str) -> Iterator[None]:
 
 
 def named(error: psycopg.Error, shown: str) -> HapticDBError:
-    """One of our errors for one of the engine's."""
+    """Error of `hapticdb.errors` for an error of psycopg."""
     cause = _line(error)
     if isinstance(error, errors.QueryCanceled):
         return StuckError(
@@ -49,7 +49,7 @@ def named(error: psycopg.Error, shown: str) -> HapticDBError:
             "'hapticdb grant URL ROLE --as editor'"
         )
     if isinstance(error, (errors.UndefinedTable, errors.UndefinedColumn, errors.UndefinedFunction)):
-        return DamagedError(  # what may not be used at all is passed over as if it were not there
+        return DamagedError(  # the server hides a schema without rights as if it did not exist
             f"{shown} is damaged ({cause}), or this user may no longer use it: ask its owner, "
             "restore a copy, or import the files again"
         )
@@ -68,7 +68,7 @@ def named(error: psycopg.Error, shown: str) -> HapticDBError:
 
 
 def is_lost(error: BaseException) -> bool:
-    """Whether the connection, and not the statement, is what failed."""
+    """Whether the connection failed, and not the statement."""
     return isinstance(
         error,
         (
@@ -83,9 +83,9 @@ def is_lost(error: BaseException) -> bool:
 
 
 def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
-    """One of our errors for a connection that never came to be.
+    """Error for a connection that could not be made.
 
-    libpq passes on no code here, only words: the usual ones are told apart, all are shown.
+    libpq gives no code here, only text. The usual causes are told apart by their words.
     """
     cause = _line(error)
     if cause.startswith("connection is bad: invalid"):  # a parameter that libpq does not take
@@ -102,10 +102,10 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
 
 
 def unusable(error: psycopg.Error, shown: str) -> UsageError:
-    """One of our errors for a URL that libpq does not take.
+    """Error for a URL that libpq refuses.
 
-    It quotes what it stumbles over, which may be a piece of a password: shown only where the URL
-    as messages may show it has it, too.
+    libpq quotes what it does not understand, which may be a piece of a password. The quotation is
+    shown only if the redacted URL contains it.
     """
     cause = _line(error).removeprefix("connection is bad: ")
     if any(words not in shown for words in re.findall(r'"([^"]*)"', cause)):
@@ -132,7 +132,7 @@ def no_editor(shown: str) -> ReadOnlyError:
 
 
 def _line(error: psycopg.Error) -> str:
-    """Words of an error on one line, without the server's position marks."""
+    """Text of an error on one line, without the position in the statement."""
     primary = error.diag.message_primary
     text = primary or str(error) or type(error).__name__
     return " ".join(text.split())

@@ -1,4 +1,4 @@
-"""The paper's Figure 3 on SQLite: the frame's wrench by one statement and an aggregate of ours.
+"""The paper's Figure 3 on SQLite: a frame's wrench by one statement and the aggregate `force`.
 
 The PointShell is bound as parallel arrays in the order of its points: ordinal and key through
 ``carray`` (its rowid and its value), point and normal through a pointer that `force` indexes by the
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hapticdb.grid import Grid
 from hapticdb.kernels.query import contact
 from hapticdb.store import believed
-from hapticdb.store.base import BRICK_BYTES, Frame, Layout, row_shift
+from hapticdb.store.base import BRICK_BYTES, Layout, LocatedShell, row_shift
 
 WRENCH = {
     "voxel": """
@@ -43,13 +43,13 @@ SELECT shell.rowid, id
 KEY_TEST = {"voxel": "z_val = shell.value", "brick": "z_val = shell.value >> 9"}
 
 
-def wrench_statement(layout: Layout, frame: Frame) -> tuple[str, tuple[Any, ...]]:
+def wrench_statement(layout: Layout, frame: LocatedShell) -> tuple[str, tuple[Any, ...]]:
     """Text and bindings of the statement that returns the wrench."""
     bindings = (apsw.pyobject(frame), apsw.carray(frame.addresses))
     return _without_excluded(WRENCH[layout], layout, bindings, frame)
 
 
-def hits_statement(layout: Layout, frame: Frame) -> tuple[str, tuple[Any, ...]]:
+def hits_statement(layout: Layout, frame: LocatedShell) -> tuple[str, tuple[Any, ...]]:
     """Text and bindings of the statement that returns ordinal and object id of each hit."""
     return _without_excluded(HITS[layout], layout, (apsw.carray(frame.addresses),), frame)
 
@@ -79,10 +79,10 @@ class _Force:
     def __init__(self, grid: Grid, layout: Layout) -> None:
         self._grid = grid
         self._layout = layout
-        self._frame: Frame | None = None
+        self._frame: LocatedShell | None = None
         self._hits: list[tuple[int, int]] = []
 
-    def step(self, frame: Frame, ordinal: int, address: int) -> None:
+    def step(self, frame: LocatedShell, ordinal: int, address: int) -> None:
         """Collect one hit; ordinals count from 1 here, as rowids do."""
         self._frame = frame
         self._hits.append((ordinal - 1, address))
@@ -107,7 +107,7 @@ class _Force:
 
 
 def _without_excluded(
-    sql: str, layout: Layout, bindings: tuple[Any, ...], frame: Frame
+    sql: str, layout: Layout, bindings: tuple[Any, ...], frame: LocatedShell
 ) -> tuple[str, tuple[Any, ...]]:
     """Leave objects out of a statement: one more condition on the row's id."""
     if not frame.exclude.size:

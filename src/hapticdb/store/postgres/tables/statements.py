@@ -1,7 +1,8 @@
-"""The SQL of the haptic query on PostgreSQL: a frame is one statement and one row of packed arrays.
+"""The SQL of the haptic query on PostgreSQL: one statement, which returns one row of packed arrays.
 
-Every statement also returns the revision that it has seen, so that knowing whether the environment
-has changed costs no round trip. Rows come in the order of the index, which `PostgresStore` checks.
+Every statement also returns the revision that it has seen. So a reader learns without another round
+trip whether the environment has changed. Rows come in the order of the index; `PostgresReader`
+checks that.
 """
 
 from hapticdb.store.base import LAYOUTS, Layout
@@ -12,7 +13,7 @@ PACKED: dict[Layout, str] = {
 }
 SEEN = "(SELECT revision FROM environment WHERE environment.id = 1)"
 
-# 17 and later read each leaf page once for all of the sorted keys on it
+# PostgreSQL 17 and later read each leaf page once for all of the sorted keys on it
 LOOKUP = {
     layout: f"""
 SELECT {PACKED[layout]}, {SEEN}
@@ -42,7 +43,8 @@ SELECT {PACKED[layout]}, {SEEN}
          ORDER BY z_val, id LIMIT $3) AS found"""
     for layout in LAYOUTS
 }
-# the planner takes ranges for wide, and would read the whole index by id: range by range instead
+# LATERAL and OFFSET 0 force a scan of each range: the planner expects wide ranges, and would read
+# the whole index to find the id
 ROWS_OF = {
     layout: f"""
 SELECT {PACKED[layout]}, {SEEN}
@@ -76,8 +78,8 @@ SELECT count(*)
     for layout in LAYOUTS
 }
 
-# The paper's Figure 3. Only hits fetch their point: a shell unnested whole, seven arrays wide,
-# takes half as long again.
+# The paper's Figure 3. Only hits fetch their point, by its ordinal: to unnest all seven arrays of
+# the shell takes half as long again.
 WRENCH: dict[Layout, str] = {
     "voxel": """
 SELECT force(ROW(($2)[n], ($3)[n], ($4)[n], ($5)[n], ($6)[n], ($7)[n],

@@ -1,4 +1,6 @@
-"""Arrays as PostgreSQL's binary format: parameters, results and COPY, by NumPy, without a loop.
+"""Arrays in PostgreSQL's binary format, packed and read by NumPy without a Python loop.
+
+Statements take and return them, and COPY loads them.
 
 An array is a header (dimensions, flags, element type, length, lower bound), then for each element
 its length and its value, all big-endian (PostgreSQL: array_send in arrayfuncs.c;
@@ -11,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.store.base import BRICK_BYTES, Frame, Rows
+from hapticdb.store.base import BRICK_BYTES, LocatedShell, Rows
 
 BYTEA, INT8, INT4, TEXT, FLOAT8 = 17, 20, 23, 25, 701
 INT8_ARRAY, FLOAT8_ARRAY = 1016, 1022
@@ -71,7 +73,7 @@ def float8s(values: NDArray[np.float64]) -> Parameter:
     return Parameter(FLOAT8_ARRAY, _header(FLOAT8, len(values)) + packed.tobytes())
 
 
-def shell(frame: Frame) -> list[Parameter]:
+def shell(frame: LocatedShell) -> list[Parameter]:
     """Pack a located shell: keys, then six arrays of points and normals, centre, stiffness."""
     count = len(frame.addresses)
     return [
@@ -91,7 +93,7 @@ def read_int8(value: bytes) -> int:
 
 
 def read_int8s(value: bytes | None) -> NDArray[np.int64]:
-    """Read a bigint[] without NULLs; none at all is an empty one."""
+    """Read a bigint[] without NULLs; NULL itself gives an empty array."""
     if value is None or len(value) < HEADER_BYTES:
         return np.empty(0, np.int64)
     count = (len(value) - HEADER_BYTES) // _STRIDE

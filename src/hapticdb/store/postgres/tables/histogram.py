@@ -1,16 +1,16 @@
-"""Quantiles of the index: from the server's own statistics, or computed where they do not reach."""
+"""Quantiles of the index: from the server's own statistics, or computed exactly."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.store.base import LAYOUTS, Keys, Layout
-from hapticdb.store.postgres import wire
-from hapticdb.store.postgres.session import Session
+from hapticdb.store.postgres.connecting import wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 SERVER_RESOLUTION = 10_000
 """The largest statistics target, at which both index tables are analysed, and the paper's best."""
 ENOUGH_ROWS = 10 * SERVER_RESOLUTION
-"""Below, an exact histogram is computed sooner than it takes to think about it."""
+"""Rows from which the server's statistics are used. Below, an exact histogram takes little time."""
 
 # one row, of NULLs before the first ANALYZE
 STATISTICS = """
@@ -20,7 +20,7 @@ SELECT histogram_bounds::text::bigint[], most_common_vals::text::bigint[],
          WHERE oid = to_regclass(quote_ident(schemaname) || '.' || quote_ident(tablename)))
   FROM (SELECT) AS one LEFT JOIN pg_stats
     ON schemaname = $1::text::name AND tablename = $2::text::name AND attname = 'z_val'"""
-# a fraction aims at the middle of its rank: at the rank itself, floating point lands one off
+# the fraction of the middle of each rank: the fraction of the rank itself rounds to its neighbour
 EXACT = {
     layout: f"""
 SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
@@ -31,11 +31,11 @@ SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
 }
 
 
-def server_histogram(session: Session, layout: Layout) -> tuple[Keys, int] | None:
+def server_histogram(connection: ServerConnection, layout: Layout) -> tuple[Keys, int] | None:
     """Bounds (10,001,) from `pg_stats` and the rows behind them; None before the first ANALYZE."""
-    bounds, common, frequencies, n_rows = session.fetch(
+    bounds, common, frequencies, n_rows = connection.fetch(
         STATISTICS,
-        wire.text(session.address.environment),
+        wire.text(connection.address.environment),
         wire.text(layout),
     )
     rows = wire.read_int8(n_rows) if n_rows is not None else 0
@@ -79,7 +79,7 @@ def with_common_values(
         return np.zeros(resolution + 1, dtype=np.int64)
     smooth = np.zeros(len(places))
     if len(bounds):
-        # of several equal bounds the last counts: all of their buckets lie at or below that key
+        # of several equal bounds the last is right: all of their buckets lie at or below that key
         last = np.append(bounds[1:] != bounds[:-1], True)
         known = np.flatnonzero(last)
         smooth = rest * np.interp(
@@ -89,7 +89,7 @@ def with_common_values(
     jumps = np.concatenate([[0.0], np.cumsum(shares)])
     below = smooth + jumps[np.searchsorted(common, places, "left")]
     up_to = smooth + jumps[np.searchsorted(common, places, "right")]
-    # two corners a place: where the share stands before its jump, and after
+    # two corners at each place: the share before its jump, and after it
     heights = np.stack([below, up_to], axis=1).reshape(-1)
     corners = np.repeat(places, 2)
     targets = np.arange(resolution + 1) / resolution * heights[-1]
@@ -97,25 +97,27 @@ def with_common_values(
     low, high = heights[at - 1], heights[at]
     part = np.where(high > low, (targets - low) / np.where(high > low, high - low, 1.0), 1.0)
     width = (corners[at] - corners[at - 1]).astype(np.float64)
-    # from the lower corner, in whole keys: a float64 of a key itself would lose its last bits
+    # added to the lower corner in whole keys: a float64 cannot hold the last bits of a key
     found = corners[at - 1] + np.round(np.clip(part, 0.0, 1.0) * width).astype(np.int64)
     found[0] = places[0]
     found[-1] = places[-1]
     return np.asarray(np.maximum.accumulate(found))
 
 
-def exact_histogram(session: Session, layout: Layout, resolution: int) -> tuple[Keys, int]:
+def exact_histogram(
+    connection: ServerConnection, layout: Layout, resolution: int
+) -> tuple[Keys, int]:
     """Bounds (R + 1,) by Definition 2 of the paper, over all rows, and their number N.
 
     Bound i is the key of the row of rank ceil(i N / R), bound 0 the lowest key.
     """
-    with session.snapshot(), session.without_limit():
-        counted = session.execute(f"SELECT count(*) FROM {layout}").fetchone()
+    with connection.snapshot(), connection.without_limit():
+        counted = connection.execute(f"SELECT count(*) FROM {layout}").fetchone()
         n_rows = int(counted[0]) if counted else 0
         if n_rows == 0:
             return np.zeros(2, dtype=np.int64), 0
         ranks = -(-np.arange(resolution + 1, dtype=np.int64) * n_rows // resolution)
-        (bounds,) = session.fetch(
+        (bounds,) = connection.fetch(
             EXACT[layout], wire.int8s(np.maximum(ranks, 1)), wire.float8(float(n_rows))
         )
     return wire.read_int8s(bounds), n_rows

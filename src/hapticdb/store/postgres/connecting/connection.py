@@ -1,0 +1,277 @@
+"""A connection to one environment's schema: statements, transactions, a way back after a loss."""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, Self, TypeVar
+
+import psycopg
+from psycopg import sql
+
+from hapticdb.errors import ConnectionLostError, DatabaseError
+from hapticdb.store.base import check_outside, check_thread, this_thread
+from hapticdb.store.postgres.address import Address
+from hapticdb.store.postgres.connecting import failures
+from hapticdb.store.postgres.connecting.link import Link
+from hapticdb.store.postgres.connecting.wire import Parameter
+
+Result = TypeVar("Result")
+
+RECONNECT_SECONDS = 15.0
+"""How long a lost server is tried again. Longer survives a slower restart; a read waits as long."""
+FIRST_PAUSE_SECONDS = 0.05
+"""Between the first two tries to connect again; each next pause is twice as long."""
+MOST_PAUSE_SECONDS = 0.5
+"""Between two tries at most. Longer asks a struggling server less often."""
+WRITE_TRIES = 3
+"""Times that a write is begun when the server goes away during it."""
+
+
+class ServerConnection:
+    """One connection to one environment's schema; belongs to the thread that opened it."""
+
+    def __init__(self, address: Address, conninfo: str, *, read_only: bool = False) -> None:
+        self.address = address
+        self.shown = address.shown
+        self.is_read_only = read_only
+        self._thread = this_thread()
+        self._depth = 0
+        self.is_loading = False
+        self._is_closed = False
+        self._link = Link(address, conninfo, read_only=read_only)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    # -- the connection ----------------------------------------------------------------------
+
+    @property
+    def driver(self) -> psycopg.Connection[tuple[Any, ...]]:
+        """Psycopg's connection of this moment: another one after a loss."""
+        return self._link.driver
+
+    @property
+    def server_version(self) -> int:
+        """As libpq counts: 150018 is 15.18."""
+        return self._link.server_version
+
+    def connect(self) -> None:
+        """Connect again, once."""
+        self._link.connect()
+
+    def close(self) -> None:
+        """Give the connection back."""
+        self._is_closed = True
+        self._link.close()
+
+    def _reconnect(self) -> None:
+        """Connect again and again, for up to `RECONNECT_SECONDS`; then raise the last error."""
+        self._link.close()
+        deadline = time.monotonic() + RECONNECT_SECONDS
+        pause = FIRST_PAUSE_SECONDS
+        while True:
+            try:
+                self.connect()
+            except ConnectionLostError:
+                if time.monotonic() + pause > deadline:
+                    raise
+                time.sleep(pause)
+                pause = min(2 * pause, MOST_PAUSE_SECONDS)
+            else:
+                return
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called; a lost connection comes back by itself."""
+        return self._is_closed
+
+    def give_to(self, thread: int) -> None:
+        """Belong to another thread from now on, or to `NOBODY`. No call may be under way."""
+        self._thread = thread
+
+    def check_thread(self) -> None:
+        """Refuse a call from another thread than the one that this belongs to."""
+        check_thread(self._thread, self.shown)
+
+    def check_outside(self) -> None:
+        """Refuse to look for the commits of others inside a transaction."""
+        check_outside(self._depth, self.shown)
+
+    def again(self, read: Callable[[], Result]) -> Result:
+        """Run a read; when the connection is lost, connect again and run it once more.
+
+        Not inside a snapshot: its earlier reads saw the revision of the lost connection.
+        """
+        self.check_thread()
+        if self._is_closed:
+            raise DatabaseError(f"{self.shown} has been closed: open it again")
+        try:
+            if self._link.is_lost and not self._depth:
+                self._reconnect()
+            with failures.named_errors(self.shown):
+                return read()
+        except ConnectionLostError:
+            if self._depth:
+                raise
+        self._reconnect()
+        with failures.named_errors(self.shown):
+            return read()
+
+    # -- statements --------------------------------------------------------------------------
+
+    def fetch(self, text: str, *parameters: Parameter) -> list[bytes | None]:
+        """First row of a prepared statement, every value in its binary form."""
+
+        def read() -> list[bytes | None]:
+            result = self._link.run(text, parameters)
+            return [result.get_value(0, column) for column in range(result.nfields)]
+
+        return self.again(read)
+
+    def rows(self, text: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
+        """All rows of a statement as Python values: for statements outside frames."""
+        return self.again(lambda: self.execute(text, parameters).fetchall())
+
+    def execute(
+        self, text: str | sql.Composed, parameters: Sequence[Any] = ()
+    ) -> psycopg.Cursor[tuple[Any, ...]]:
+        """One statement through psycopg, without a second try."""
+        return self.driver.execute(text, parameters or None)
+
+    def command(self, text: str) -> None:
+        """One statement without parameters or rows, through libpq."""
+        self._link.command(text)
+
+    def hear(self) -> None:
+        """Hand what has come between statements to psycopg's notify handlers; never waits."""
+        self._link.hear()
+
+    # -- transactions ------------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All reads inside see one committed revision: REPEATABLE READ. May be nested."""
+        if self._depth == 0:
+            self.again(lambda: self.command(_SNAPSHOT))
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            if self._depth == 0 and not self._link.is_lost:
+                self._end_snapshot()
+
+    def write(
+        self, work: Callable[[], Result], is_committed: Callable[[], bool] | None = None
+    ) -> Result:
+        """Run `work` in one transaction, without a frame's time limit.
+
+        When the connection is lost before the commit was sent, everything is done again. When it is
+        lost during the commit, `is_committed` tells, on the new connection, whether the commit was
+        done. Without `is_committed`, `work` must be harmless when it is done twice.
+        """
+        self.check_thread()
+        for tries_left in reversed(range(WRITE_TRIES)):
+            try:
+                result, is_certain = self._write_once(work)
+            except ConnectionLostError:
+                if not tries_left:
+                    raise
+                self._reconnect()
+            else:
+                if is_certain or (is_committed is not None and self._finds(is_committed)):
+                    return result
+        raise ConnectionLostError(
+            f"{self.shown}: the server went away during each of {WRITE_TRIES} commits; nothing "
+            "was written, so run the same again when it is back"
+        )
+
+    def _finds(self, is_committed: Callable[[], bool]) -> bool:
+        """Whether a commit that was sent but not answered was done. Never guesses."""
+        try:
+            self._reconnect()
+            return is_committed()
+        except DatabaseError as error:
+            raise ConnectionLostError(
+                f"{self.shown}: the server went away during a commit, and whether that was done is "
+                f"not known yet: look, then decide ({error})"
+            ) from error
+
+    def _write_once(self, work: Callable[[], Result]) -> tuple[Result, bool]:
+        """Result of `work`, and whether the commit was answered."""
+        if self._is_closed:
+            raise DatabaseError(f"{self.shown} has been closed: open it again")
+        if self._link.is_lost:
+            self._reconnect()
+        with failures.named_errors(self.shown), self._link.unhurried():
+            self.command("BEGIN ISOLATION LEVEL READ COMMITTED")
+            self._depth += 1
+            try:
+                self.command("SET LOCAL statement_timeout = 0")
+                if self.is_loading:  # another loader may be making its index
+                    self.command("SET LOCAL lock_timeout = 0")
+                result = work()
+            except BaseException:
+                self._roll_back()
+                raise
+            finally:
+                self._depth -= 1
+            try:
+                self.command("COMMIT")
+            except psycopg.Error as error:
+                if not failures.is_lost(error):
+                    raise
+                return result, False
+        return result, True
+
+    def _end_snapshot(self) -> None:
+        """End the transaction. A lost connection is no error: the reads are complete."""
+        try:
+            with failures.named_errors(self.shown):
+                self.command("COMMIT")
+        except ConnectionLostError:
+            self._link.close()
+
+    def _roll_back(self) -> None:
+        with contextlib.suppress(psycopg.Error):
+            if not self._link.is_lost:
+                self.command("ROLLBACK")
+
+    @contextlib.contextmanager
+    def without_limit(self, *limits: str) -> Iterator[None]:
+        """Lift time limits inside; `statement_timeout` unless others are named."""
+        names = limits or ("statement_timeout",)
+        with failures.named_errors(self.shown), self._link.unhurried():
+            # the connection may have been lost since it was last used
+            before = self.again(lambda: [self._shown_setting(name) for name in names])
+            for name in names:
+                self.command(f"SET {name} = 0")
+            try:
+                yield
+            finally:
+                if self._link.is_usable():
+                    for name, value in zip(names, before, strict=True):
+                        self.command(f"SET {name} = '{value}'")
+
+    def _shown_setting(self, name: str) -> str:
+        row = self.driver.execute(f"SHOW {name}").fetchone()
+        return row[0] if row else "0"
+
+    def is_owner(self) -> bool:
+        """Whether this user owns the environment's tables, and so may make indexes and grant."""
+        found = self.rows(
+            "SELECT pg_has_role(relowner, 'USAGE') FROM pg_class"
+            " WHERE oid = 'environment'::regclass"
+        )
+        return bool(found[0][0])
+
+
+_SNAPSHOT = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY"
+
+
+def identifier(name: str) -> sql.Identifier:
+    """Quote a name for a statement's text."""
+    return sql.Identifier(name)

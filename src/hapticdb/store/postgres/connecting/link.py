@@ -1,0 +1,261 @@
+"""The link to a server: psycopg's connection with our settings, waited for with a limit.
+
+The hot path goes to libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
+statement. It waits by polling the socket. So Ctrl-C is heard, and a server that has stopped
+answering ends in an error instead of a hang.
+"""
+
+import contextlib
+import re
+import select
+import time
+from collections.abc import Generator, Iterator, Sequence
+from typing import Any, TypeVar, cast
+
+import psycopg
+from psycopg import pq
+from psycopg.errors import error_from_result
+
+from hapticdb.errors import StuckError
+from hapticdb.store.postgres.address import Address
+from hapticdb.store.postgres.connecting import failures
+from hapticdb.store.postgres.connecting.wire import Parameter
+
+Result = TypeVar("Result")
+
+SETTINGS = {
+    # compiling a frame's plan takes longer than running it: 1.8 ms with, 0.3 without
+    "jit": "off",
+    # a custom plan reads 10,000 histogram bounds each time: 288 us instead of 84 for one range
+    "plan_cache_mode": "force_generic_plan",
+    # a frame reads a few dozen rows, which takes less time than starting a worker
+    "max_parallel_workers_per_gather": "0",
+    # the planner cannot know how short the ranges are and would take a bitmap scan, which reads the
+    # heap and loses the order of the keys
+    "enable_bitmapscan": "off",
+    # a plan that was made while the table was small is kept: it must not scan the whole table
+    "enable_seqscan": "off",
+    # readers never wait for locks; a writer that waits longer gets an error
+    "lock_timeout": "10s",
+    # a frame that takes longer is stuck; writes, indexes and statistics lift this limit
+    "statement_timeout": "10s",
+    "client_min_messages": "warning",
+}
+CONNECT_SECONDS = 10
+"""How long a server may take to accept a connection, unless the URL says otherwise."""
+GRACE_MS = 3000
+"""Milliseconds that the network and a busy server may add to the server's own time limit."""
+
+
+class _Connection(psycopg.Connection[tuple[Any, ...]]):
+    """psycopg's connection, which waits only as long as its link does; else it waits for ever."""
+
+    link: "Link"
+
+    def wait(self, gen: Generator[Any, Any, Result], *args: Any, **options: Any) -> Result:  # noqa: ANN401 - psycopg's own
+        """Let a statement run to its end. Closes the connection when it takes too long."""
+        try:
+            return super().wait(self.link.until_out_of_patience(gen), *args, **options)
+        except StuckError:
+            self.close()
+            raise
+
+
+class Link:
+    """One psycopg connection at a time, made again by `connect`.
+
+    driver : psycopg's connection, autocommit, for statements that no frame waits on.
+    """
+
+    def __init__(self, address: Address, conninfo: str, *, read_only: bool) -> None:
+        self._address = address
+        self._conninfo = conninfo
+        self._is_read_only = read_only
+        self._leisure = 0
+        self.connect()
+
+    # -- connecting --------------------------------------------------------------------------
+
+    def connect(self) -> None:
+        """Connect once, with `SETTINGS`; what the URL's `options` set is left as it is."""
+        try:
+            made = _Connection.connect(
+                self._conninfo,
+                autocommit=True,
+                client_encoding="utf8",
+                fallback_application_name="hapticdb",
+                connect_timeout=None if "connect_timeout=" in self._conninfo else CONNECT_SECONDS,
+            )
+        # from None: psycopg's message, which a traceback would show, may hold the password
+        except psycopg.OperationalError as error:
+            raise failures.refused(error, self._address.shown) from None
+        except psycopg.Error as error:
+            raise failures.unusable(error, self._address.shown) from None
+        made.link = self
+        self.driver: psycopg.Connection[tuple[Any, ...]] = made
+        self.driver.prepare_threshold = None
+        self._prepared: dict[str, bytes] = {}
+        self._pgconn = made.pgconn
+        self._limit_ms: int | None = 1000 * CONNECT_SECONDS
+        self._poller = select.poll()
+        self._poller.register(self._pgconn.socket, select.POLLIN | select.POLLERR | select.POLLHUP)
+        try:
+            with failures.named_errors(self._address.shown):
+                self._settle()
+        except BaseException:  # a connection without its settings must not be used
+            self.driver.close()
+            raise
+
+    def _settle(self) -> None:
+        wanted = {
+            **SETTINGS,
+            "search_path": f"{_quoted(self._address.environment)}, pg_temp",
+            "default_transaction_read_only": "on" if self._is_read_only else "off",
+        }
+        options = self.driver.info.options.lower().replace("-", "_")
+        theirs = re.findall(r"(?:_c\s*|__)(\w+)=", options)
+        ours = {name: value for name, value in wanted.items() if name not in theirs}
+        ours["search_path"] = wanted["search_path"]
+        known = self.driver.execute(
+            "SELECT set_config(s.name, s.value, false)"
+            "  FROM unnest(%s::text[], %s::text[]) AS s(name, value)",
+            (list(ours), list(ours.values())),
+        )
+        known.fetchall()
+        row = self.driver.execute(
+            "SELECT setting::int FROM pg_settings WHERE name = 'statement_timeout'"
+        ).fetchone()
+        assert row is not None  # noqa: S101 - the server has this setting
+        self._limit_ms = row[0] + GRACE_MS if row[0] else None
+
+    @property
+    def server_version(self) -> int:
+        """As libpq counts: 150018 is 15.18."""
+        return self._pgconn.server_version
+
+    def close(self) -> None:
+        """Give the connection back."""
+        self.driver.close()
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether the connection was closed or given up."""
+        return self.driver.closed
+
+    def is_usable(self) -> bool:
+        """Whether a statement can be sent: neither closed nor in a failed transaction."""
+        state = self._pgconn.transaction_status
+        return not self.driver.closed and state != pq.TransactionStatus.INERROR
+
+    # -- statements --------------------------------------------------------------------------
+
+    def command(self, text: str) -> None:
+        """One statement without parameters or rows, through libpq."""
+        self._pgconn.send_query(text.encode())
+        self._result()
+
+    def run(self, text: str, parameters: Sequence[Parameter]) -> pq.abc.PGresult:
+        """Result of a statement, which is prepared when it is first run."""
+        name = self._prepared.get(text)
+        if name is None:
+            name = f"hapticdb_{len(self._prepared)}".encode()
+            oids = [parameter.oid for parameter in parameters]
+            self._pgconn.send_prepare(name, text.encode(), oids)
+            self._result()
+            self._prepared[text] = name
+        values = [parameter.value for parameter in parameters]
+        self._pgconn.send_query_prepared(name, values, [1] * len(values), 1)
+        return self._result()
+
+    def hear(self) -> None:
+        """Give notifications that have arrived to the notify handlers. Never waits.
+
+        Those that arrive during a statement stay in libpq until the next call, or psycopg has given
+        them to the handlers already.
+        """
+        self._pgconn.consume_input()
+        while (notify := self._pgconn.notifies()) and self._pgconn.notify_handler:
+            self._pgconn.notify_handler(notify)
+
+    # -- waiting -----------------------------------------------------------------------------
+
+    @property
+    def _patience_ms(self) -> int | None:
+        """Milliseconds to wait for an answer; None inside `unhurried`."""
+        return None if self._leisure else self._limit_ms
+
+    @contextlib.contextmanager
+    def unhurried(self) -> Iterator[None]:
+        """Wait without a limit inside: for statements that may take long."""
+        self._leisure += 1
+        try:
+            yield
+        finally:
+            self._leisure -= 1
+
+    def _result(self) -> pq.abc.PGresult:
+        """Result of what was sent. Closes the connection when no result comes."""
+        try:
+            return self._receive()
+        except psycopg.Error as error:
+            if failures.is_lost(error):
+                self.driver.close()
+            raise
+        except BaseException:  # Ctrl-C or a timeout: a late result would be taken for the next one
+            self.driver.close()
+            raise
+
+    def _receive(self) -> pq.abc.PGresult:
+        pgconn = self._pgconn
+        while pgconn.flush():  # a shell of many points does not fit into the socket at once
+            self._poller.modify(pgconn.socket, select.POLLIN | select.POLLOUT)
+            self._wait()
+            pgconn.consume_input()
+        self._poller.modify(pgconn.socket, select.POLLIN)
+        found: pq.abc.PGresult | None = None
+        while True:
+            while pgconn.is_busy():
+                self._wait()
+                pgconn.consume_input()
+            result = pgconn.get_result()
+            if result is None:
+                break
+            found = result
+        if found is None:
+            raise psycopg.OperationalError("the server closed the connection")
+        if found.status not in _FINE:
+            raise error_from_result(found, encoding="utf-8")
+        return found
+
+    def _wait(self) -> None:
+        if not self._poller.poll(self._patience_ms):
+            raise self._stuck()
+
+    def until_out_of_patience(
+        self, waiting: Generator[Any, Any, Result]
+    ) -> Generator[Any, Any, Result]:
+        """Run psycopg's own waiting for a statement, but no longer than `_patience_ms`."""
+        started = time.monotonic()
+        try:
+            wanted = next(waiting)
+            while True:
+                ready = yield wanted
+                waited_ms = 1000 * (time.monotonic() - started)
+                if not ready and self._patience_ms is not None and waited_ms > self._patience_ms:
+                    raise self._stuck()
+                wanted = waiting.send(ready)
+        except StopIteration as end:
+            return cast("Result", end.value)
+
+    def _stuck(self) -> StuckError:
+        return StuckError(
+            f"{self._address.shown} did not answer within {self._patience_ms} ms: "
+            "the server, or the way to it, hangs"
+        )
+
+
+_FINE = (pq.ExecStatus.TUPLES_OK, pq.ExecStatus.COMMAND_OK, pq.ExecStatus.EMPTY_QUERY)
+
+
+def _quoted(name: str) -> str:
+    return '"' + name.replace('"', '""') + '"'

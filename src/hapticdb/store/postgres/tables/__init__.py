@@ -1,0 +1,1 @@
+"""The tables of an environment on a server: read, written, loaded, their statistics."""

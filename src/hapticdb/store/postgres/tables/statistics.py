@@ -1,0 +1,129 @@
+"""Statistics on a server: sizes, quantiles of the keys, cost figures."""
+
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from psycopg import sql
+
+from hapticdb.store import believed
+from hapticdb.store.base import Freshness, Histogram, Layout, Size
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.tables.histogram import (
+    ENOUGH_ROWS,
+    SERVER_RESOLUTION,
+    exact_histogram,
+    server_histogram,
+)
+from hapticdb.store.postgres.tables.reading import PostgresReader
+
+
+class PostgresStatistics:
+    """What is known about one environment's tables, and kept beside them."""
+
+    def __init__(
+        self, connection: ServerConnection, layout: Layout, reader: PostgresReader
+    ) -> None:
+        self._connection = connection
+        self._layout = layout
+        self._reader = reader
+
+    def size(self) -> Size:
+        """Rows, bytes of all tables and indexes, leaf blocks of the index."""
+        with self._connection.snapshot(), self._connection.without_limit():
+            self._reader.revision()
+            counted = (
+                "SELECT count(*) FROM brick"
+                if self._layout == "brick"
+                else "SELECT coalesce(sum(voxels), 0) FROM object"  # a row for each voxel
+            )
+            ((rows,),) = self._connection.execute(counted).fetchall()
+            ((total, index),) = self._connection.execute(
+                "SELECT (SELECT sum(pg_total_relation_size(c.oid)) FROM pg_class c"
+                "         WHERE c.relnamespace = to_regnamespace(%s) AND c.relkind = 'r'),"
+                "       coalesce(pg_relation_size(to_regclass(%s)), 0)"
+                "         / current_setting('block_size')::int",
+                (_quoted(self._connection), f"{_quoted(self._connection)}.{self._layout}_key"),
+            ).fetchall()
+        return Size(int(rows), int(total), max(int(index), 1))
+
+    def quantiles(self, resolution: int) -> Histogram:
+        """Equi-count histogram of all row keys, of R buckets.
+
+        At 10,000 from the server's statistics once there are enough rows; else the kept one while
+        no object was written since, else computed exactly.
+        """
+        if resolution == SERVER_RESOLUTION:
+            found = server_histogram(self._connection, self._layout)
+            if found is not None and found[1] >= ENOUGH_ROWS:
+                return Histogram(*found, "server statistics")
+        kept = self._connection.rows(
+            "SELECT bounds, n_rows FROM quantile WHERE resolution = %s AND bounds IS NOT NULL"
+            " AND revision = (SELECT revision FROM environment)",
+            (resolution,),
+        )
+        if kept:
+            return believed.histogram_of(self._connection.shown, *kept[0])
+        return Histogram(*exact_histogram(self._connection, self._layout, resolution), "computed")
+
+    def freshness(self, resolution: int) -> Freshness:
+        """How old the histogram of that resolution is, by its own revision."""
+        ((revision, made, changed, unseen),) = self._connection.rows(
+            "SELECT e.revision, q.revision,"
+            "       (SELECT coalesce(sum(voxels), 0) FROM object WHERE object.revision > "
+            "               coalesce(q.revision, 0)),"
+            "       CASE WHEN q.bounds IS NULL THEN (SELECT n_mod_since_analyze"
+            "         FROM pg_stat_user_tables WHERE schemaname = %s AND relname = %s) END"
+            "  FROM environment e LEFT JOIN quantile q ON q.resolution = %s",
+            (self._connection.address.environment, self._layout, resolution),
+        )
+        since = 0 if made is None else int(made)
+        rows = int(changed if made is None or unseen is None else unseen)
+        changes = int(revision) - since
+        # the server counts a moment late: what it adds after its own ANALYZE was there before
+        return Freshness(None if made is None else since, changes, rows if changes else 0)
+
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
+        """Renew the server's statistics, or compute and keep a histogram, unless it is fresh."""
+        if not anew and self.freshness(resolution)[:2] == (self._reader.revision(), 0):
+            return
+        bounds: list[int] | None = None
+        with self._connection.snapshot():
+            revision = self._reader.revision()
+            n_rows = self.size().rows
+            is_computed = resolution != SERVER_RESOLUTION or n_rows < ENOUGH_ROWS
+            if is_computed:
+                keys, n_rows = exact_histogram(self._connection, self._layout, resolution)
+                bounds = keys.tolist()
+        if not is_computed:
+            with self._connection.without_limit("statement_timeout", "lock_timeout"):
+                self._connection.execute("SELECT refresh_statistics()")
+        self._save(
+            "INSERT INTO quantile VALUES (%s, %s, %s, %s)"
+            " ON CONFLICT (resolution) DO UPDATE SET revision = EXCLUDED.revision,"
+            " n_rows = EXCLUDED.n_rows, bounds = EXCLUDED.bounds"
+            " WHERE quantile.revision <= EXCLUDED.revision",
+            (resolution, revision, n_rows, bounds),
+        )
+
+    def costs(self, machine: str) -> Mapping[str, float] | None:
+        """Figures that `save_costs` kept for that machine."""
+        kept = self._connection.rows(
+            "SELECT figures::text FROM cost WHERE machine = %s", (machine,)
+        )
+        return believed.figures_of(self._connection.shown, kept[0][0]) if kept else None
+
+    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
+        """Keep the fitted cost figures of a machine."""
+        self._save(
+            "INSERT INTO cost VALUES (%s, %s)"
+            " ON CONFLICT (machine) DO UPDATE SET figures = EXCLUDED.figures",
+            (machine, json.dumps(dict(figures))),
+        )
+
+    def _save(self, text: str, parameters: Sequence[Any]) -> None:
+        self._connection.write(lambda: self._connection.execute(text, parameters))
+
+
+def _quoted(connection: ServerConnection) -> str:
+    return sql.Identifier(connection.address.environment).as_string(connection.driver)

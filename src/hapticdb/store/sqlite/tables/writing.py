@@ -1,0 +1,115 @@
+"""Writes into a file: each object in one transaction, with its rows and its change."""
+
+import apsw
+import numpy as np
+
+from hapticdb.grid import Grid
+from hapticdb.store.base import (
+    BRICK_BYTES,
+    Covering,
+    Keys,
+    Layout,
+    Object,
+    Rows,
+    check_unwritten,
+    present_already,
+    touched_ranges,
+)
+from hapticdb.store.sqlite.connection import FileConnection
+from hapticdb.store.sqlite.tables import rows as sqlite_rows
+from hapticdb.store.sqlite.tables.reading import SQLiteReader
+
+# whole arrays cross at once: 8 times faster than executemany, and without the interpreter lock
+INSERT = {
+    "voxel": "INSERT INTO voxel SELECT value, ?2 FROM carray(?1)",
+    "brick": f"""INSERT INTO brick SELECT value, ?2,
+                        substr(?3, {BRICK_BYTES} * rowid - {BRICK_BYTES - 1}, {BRICK_BYTES})
+                   FROM carray(?1)""",
+}
+CHUNK = 1 << 22
+"""Rows that one statement inserts. Each takes up to 80 bytes of memory meanwhile."""
+INSERT_OBJECT = """
+INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
+SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN ?9 END,
+       ?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8"""
+
+
+class SQLiteWriter:
+    """What is written to one environment."""
+
+    def __init__(
+        self, connection: FileConnection, grid: Grid, layout: Layout, reader: SQLiteReader
+    ) -> None:
+        self._connection = connection
+        self._grid = grid
+        self._layout = layout
+        self._reader = reader
+
+    def add(self, record: Object, rows: Rows) -> int:
+        """Write an object and its rows in one transaction; returns its id."""
+        with self._connection.writing():
+            revision = self._reader.revision() + 1
+            try:
+                self._connection.execute(
+                    INSERT_OBJECT,
+                    (
+                        record.name,
+                        record.link,
+                        *sqlite_rows.contents(record, rows),
+                        revision,
+                        record.id,
+                    ),
+                )
+            except apsw.ConstraintError as error:
+                raise present_already(record, self._connection.url) from error
+            object_id = self._connection.driver.last_insert_rowid()
+            self._insert(rows, object_id)
+            self._log(revision, "add", object_id, rows.keys)
+        return object_id
+
+    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+        """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
+        with self._connection.writing():
+            revision = self._reader.revision() + 1
+            check_unwritten(record, self._reader.object(record.id), self._connection.url)
+            gone = self._delete(record.id, covering)
+            self._connection.execute(
+                "UPDATE object SET digest = ?, transform = ?, voxels = ?, bounds = ?,"
+                " attributes = ?, revision = ? WHERE id = ?",
+                (*sqlite_rows.contents(record, rows), revision, record.id),
+            )
+            self._insert(rows, record.id)
+            self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
+
+    def remove(self, object_id: int, covering: Covering) -> None:
+        """Remove an object and its rows in one transaction; `covering` says where they are."""
+        with self._connection.writing():
+            revision = self._reader.revision() + 1
+            gone = self._delete(object_id, covering)
+            self._connection.execute("DELETE FROM object WHERE id = ?", (object_id,))
+            self._log(revision, "remove", object_id, gone)
+
+    def _insert(self, rows: Rows, object_id: int) -> None:
+        """Insert a batch of rows, ascending by key: one statement for up to CHUNK of them."""
+        for at in range(0, len(rows), CHUNK):
+            keys = apsw.carray(rows.keys[at : at + CHUNK])
+            if self._layout == "voxel":
+                self._connection.execute(INSERT["voxel"], (keys, object_id))
+            else:
+                part = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + CHUNK)]
+                self._connection.execute(INSERT["brick"], (keys, object_id, part.tobytes()))
+
+    def _delete(self, object_id: int, covering: Covering) -> Keys:
+        """Delete the rows of an object as it stands now; returns their keys."""
+        known = self._reader.object(object_id)
+        sql = f"DELETE FROM {self._layout} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
+        gone: list[int] = []
+        for low, high in covering(known):
+            gone += [row[0] for row in self._connection.execute(sql, (low, high, object_id))]
+        return np.array(gone, dtype=np.int64)
+
+    def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
+        """Record which keys a write touched."""
+        ranges = touched_ranges(self._grid, self._layout, row_keys)
+        row = (revision, action, object_id, ranges.astype("<i8").tobytes())
+        self._connection.execute("INSERT INTO change VALUES (?, ?, ?, ?)", row)

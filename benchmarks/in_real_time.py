@@ -77,12 +77,18 @@ def measure_frames(
                     started = time.perf_counter()
                     if name == "dense":
                         dense_feel(
-                            bitmap, first.clusters, poses, residency.place, 1000.0, first.met, out
+                            bitmap,
+                            first.clusters,
+                            poses,
+                            residency.place,
+                            first.law,
+                            first.met,
+                            out,
                         )
                     else:
                         one = frames[name]
                         feel_kernel(
-                            table.cells, row, one.clusters, poses, residency.place, 1000.0,
+                            table.cells, row, one.clusters, poses, residency.place, one.law,
                             one.met, one.missed, out,
                         )  # fmt: skip
                     spent.append((time.perf_counter() - started) / len(poses) * 1e6)

@@ -149,5 +149,5 @@ def rows_of(url: Path | str) -> list[tuple[Any, ...]]:
     """Every row of the table of objects and of the index table, in either layout."""
     with hapticdb.open(url, read_only=True) as env:
         found = [(obj.id, obj.name, obj.digest, obj.voxels) for obj in env.objects()]
-        keys, ids, bits = env.store.scan(np.zeros(1, np.int64), np.array([2**62]))
+        keys, ids, bits, _ = env.store.scan(np.zeros(1, np.int64), np.array([2**62]))
     return [*found, *zip(keys.tolist(), ids.tolist(), strict=True), (bits.tobytes(),)]

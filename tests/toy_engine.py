@@ -279,7 +279,7 @@ class MemoryStore:
 
     def size(self) -> Size:
         rows = self._state().rows
-        n_bytes = sum(column.nbytes for column in rows)
+        n_bytes = rows.keys.nbytes + rows.ids.nbytes + rows.occupancy.nbytes
         return Size(len(rows), n_bytes, 1 + n_bytes // 8192)
 
     def quantiles(self, resolution: int) -> Histogram:

@@ -65,9 +65,9 @@ class RowPeer(ABC):
         )
         found, occupancy = self.look_up(keys) if len(keys) else (NO_KEYS, NO_OCCUPANCY)
         ids = self._ids[: len(found)]
-        stiffness = TangentPlane().stiffness
-        wrench, hits, _, _ = contact.refine(
-            placed, asked, keys, found, ids, occupancy, NO_KEYS, self._origin, size, stiffness
+        law = TangentPlane().for_kernels
+        wrench, hits, *_ = contact.refine(
+            placed, asked, keys, found, ids, occupancy, None, NO_KEYS, self._origin, size, law
         )
         return len(hits), wrench
 

@@ -29,7 +29,7 @@ from hapticdb.query.frame import (
 )
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
 from hapticdb.query.known_objects import KnownObjects
-from hapticdb.query.law import TangentPlane
+from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.query.touches import Touch, Touches
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
@@ -267,7 +267,7 @@ class Environment:
         *,
         exclude: Iterable[int] = _NOBODY,
         maxgap: int = DEFAULT_MAXGAP,
-        law: TangentPlane | None = None,
+        law: ForceLaw | None = None,
     ) -> Touch:
         """Force and torque that the environment exerts on the tool at one pose.
 
@@ -317,7 +317,7 @@ class Environment:
         strategy: Strategy,
         maxgap: int,
         ids: Keys,
-        law: TangentPlane,
+        law: ForceLaw,
     ) -> Answer:
         """Answer of a frame; afterwards the objects of the revision that it saw are known."""
         answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
@@ -340,7 +340,7 @@ class Environment:
         *,
         exclude: Iterable[int] = _NOBODY,
         maxgap: int = DEFAULT_MAXGAP,
-        law: TangentPlane | None = None,
+        law: ForceLaw | None = None,
         contacts: bool = False,
     ) -> Touches:
         """Force and torque at many poses, as `touch` gives them one by one, bit for bit.

@@ -19,10 +19,7 @@ LONG_FUNCTIONS = {
     "src/hapticdb/kernels/hand/coupling.py:advance": "one step of the coupling: smooth forces "
     "replace it",
     "src/hapticdb/kernels/hand/coupling.py:cut_back": "likewise",
-    "src/hapticdb/kernels/query/contact.py:locate_kernel": "one pass over the points",
     "src/hapticdb/kernels/resident/cells.py:felt": "one pass over the points",
-    "src/hapticdb/kernels/resident/sweep.py:find_clearance": "one pass over the points",
-    "src/hapticdb/kernels/resident/sweep.py:find_hits": "one pass over the points",
     "src/hapticdb/realtime/session.py:__init__": "an option a line",
 }
 """Functions that may be longer, and why."""

@@ -10,8 +10,8 @@ import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.hand.anchors import MET_ROWS
-from hapticdb.kernels.motion import poses_of
 from hapticdb.kernels.records import MOST_MISSED, SERVO, pose_numbers, views_of
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.resident.frames import clusters_of
 from hapticdb.resident.residency import Residency

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hapticdb import PointShell, UsageError
 from hapticdb.kernels.hand import coupling as kernels
+from hapticdb.kernels.law import TangentPlaneLaw
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
     REVISION,
@@ -270,8 +271,9 @@ def test_the_contact_wrench_is_that_of_the_recorded_pose() -> None:
     for _ in range(100):
         tool.advance()
         feel_kernel(
-            tool.world.table.cells, tool.row, tool.clusters, tool.pose[None], tool.place, 3000.0,
-            np.empty(len(tool.shell), dtype=np.int64), np.zeros(64, dtype=np.int64), again,
+            tool.world.table.cells, tool.row, tool.clusters, tool.pose[None], tool.place,
+            TangentPlaneLaw(3000.0), np.empty(len(tool.shell), dtype=np.int64),
+            np.zeros(64, dtype=np.int64), again,
         )  # fmt: skip
         assert again[0].tobytes() == tool.frame.tobytes()
         n_felt += bool(again[0, WRENCH : WRENCH + 6].any())

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from hapticdb.devices.scripted import Reading
 from hapticdb.errors import UsageError
-from hapticdb.kernels.motion import poses_of
 from hapticdb.kernels.records import HAND, pose_numbers
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.realtime.handle import Hand, Handle
 from realtime.worlds import turned
 

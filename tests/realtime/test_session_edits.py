@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.kernels.motion import poses_of
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.query.law import TangentPlane
 from hapticdb.realtime.session import Session
 from hapticdb.recording.frame import State

@@ -12,6 +12,7 @@ import naive_frame
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.kernels.law import TangentPlaneLaw
 from hapticdb.kernels.resident.cells import (
     HITS,
     RESULTS,
@@ -145,8 +146,8 @@ class Reader:
     def feel(self, pose: NDArray[np.float64]) -> tuple[list[int], bytes, int]:
         """Hits, wrench and number of unknown points."""
         feel_kernel(
-            self.cells, self.row, self.clusters, pose[None], self.place, 1000.0, self.met,
-            self.missed, self.out,
+            self.cells, self.row, self.clusters, pose[None], self.place,
+            TangentPlaneLaw(1000.0), self.met, self.missed, self.out,
         )  # fmt: skip
         row = self.out[0]
         wrench = row[WRENCH : WRENCH + 6] + 0.0  # no zero is negative

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hapticdb import FileError, PointShell, UsageError
-from hapticdb.kernels.motion import poses_of
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.poses import rotation_of
 from hapticdb.recording.file import CHUNK, FRAME, Frames, Recorder, Recording, State
 from recordings import HEADER, header, motion, read, write

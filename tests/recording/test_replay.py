@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, GridError, PointShell, TangentPlane
-from hapticdb.kernels.motion import poses_of
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.recording.file import FRAME, Frames, Header, Recorder, Recording, State
 from hapticdb.recording.replay import replay, resident, touching
 from hapticdb.testing import blob, floor_voxels, write_voxels

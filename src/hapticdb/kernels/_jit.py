@@ -13,11 +13,14 @@ from typing import Any
 
 import numba
 from numba import config, types
+from numba.core.caching import FunctionCache
+from numba.core.sigutils import normalize_signature
+from numba.extending import overload
 from numba.np.numpy_support import from_dtype
 
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
-INT, FLOAT = types.int64, types.float64
+INT, FLOAT, NONE = types.int64, types.float64, types.none
 INTS, INTS2 = INT[::1], INT[:, ::1]
 INTS32, INTS32_2, INTS32_3 = types.int32[::1], types.int32[:, ::1], types.int32[:, :, ::1]
 BYTES, WORDS32_2, WORDS = types.uint8[::1], types.uint32[:, ::1], types.uint64[::1]
@@ -46,6 +49,22 @@ def record_of(layout: Any, axes: int = 0) -> Any:  # noqa: ANN401 - likewise
     return types.Array(from_dtype(layout), axes, "C")
 
 
+class _Cache(FunctionCache):  # type: ignore[misc]
+    """Machine code on disk of one entry.
+
+    What was compiled for a NamedTuple from outside this package stays in memory. The file that
+    lists an entry's machine code names such types by their module, and a process that cannot
+    import one of them could read nothing of that file.
+    """
+
+    def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401 - numba's types
+        """Keep what was compiled, unless it is for types of others."""
+        given, _ = normalize_signature(sig)
+        classes = [getattr(kind, "instance_class", None) for kind in given]
+        if all(c is None or c.__module__.startswith("hapticdb.") for c in classes):
+            super().save_overload(sig, data)
+
+
 def entry(*signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:  # noqa: ANN401
     """Compile a kernel that Python calls with arguments of those types, when it is first called.
 
@@ -57,9 +76,9 @@ def entry(*signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
         before = config.CACHE_DIR
         config.CACHE_DIR = CACHE_FOLDER
         try:
-            compiled = numba.njit(
-                cache=True, nogil=True, error_model="numpy", no_cfunc_wrapper=True
-            )(function)
+            compiled = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+            if not config.DISABLE_JIT:
+                compiled._cache = _Cache(function)  # noqa: SLF001 - as cache=True sets numba's own
         finally:
             config.CACHE_DIR = before
         ENTRIES.append(compiled)
@@ -89,3 +108,20 @@ def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a leaf that takes arrays: put into its caller by numba, with no counted reference."""
     decorate = numba.njit(nogil=True, error_model="numpy", inline="always")
     return decorate(function)  # type: ignore[no-any-return]
+
+
+def chosen_by_type(choose: Callable[[type], Callable[..., Any]]) -> Callable[..., Any]:
+    """Make a leaf whose body is chosen by the type of its first argument, a NamedTuple.
+
+    `choose` gives the body, a plain function of the same arguments. numba compiles it into each
+    kernel for the type that the kernel is compiled for, so that the choice costs no time.
+    """
+
+    def call(first: Any, *others: Any) -> Any:  # noqa: ANN401
+        return choose(type(first))(first, *others)
+
+    @overload(call, strict=False, jit_options={"nogil": True, "error_model": "numpy"})
+    def body(first: Any, *others: Any) -> Any:  # noqa: ANN401, ARG001
+        return choose(first.instance_class)
+
+    return call

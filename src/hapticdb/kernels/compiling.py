@@ -29,7 +29,7 @@ from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 ENTRIES = {
     "hand.coupling": "advance",
     "surfaces.voxelize": "voxelize_kernel",
-    "resident.sweep": "poses_between unpack find_hits find_clearance cells_near",
+    "resident.clearance": "find_clearance cells_near",
     "resident.cells": "feel_kernel bounding_spheres",
     "query.contact": (
         "locate_kernel spans_of_keys refine_kernel pairs_of_hits wrench_of_addresses depths_of_hits"
@@ -40,11 +40,13 @@ ENTRIES = {
         "cells_met"
     ),
     "surfaces.sides": "side_votes_kernel nesting_kernel",
-    "motion": "poses_of play sway survey pull",
+    "motion": "play sway survey pull",
     "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
+    "resident.sweep": "poses_between unpack find_hits",
     "surfaces.sampling": "eliminate_kernel",
     "hand.servo": "tell name_voxels note",
     "curves": "encode_kernel decode_kernel",
+    "rigid": "poses_of",
     "surfaces.bricks": "z_keys_kernel mark_points_kernel count_kernel brick_voxels_kernel",
     "hand.handle": "is_somewhere grip carry",
 }
@@ -90,9 +92,24 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "calibrate": _COST,
     "touch": (*_SHELL, *_COST, "query.contact.*"),
     "resident": _RESIDENT,
-    "feel": (*_SHELL, *_RESIDENT, "hand.coupling.*", "hand.servo.*", "hand.handle.*", "motion.*"),
-    "replay": (*_RESIDENT, "resident.cells.*", "motion.poses_of"),
-    "sweep": (*_SHELL, *_RESIDENT, "resident.cells.*", "resident.sweep.*", *_RANGES),
+    "feel": (
+        *_SHELL,
+        *_RESIDENT,
+        "hand.coupling.*",
+        "hand.servo.*",
+        "hand.handle.*",
+        "motion.*",
+        "rigid.*",
+    ),
+    "replay": (*_RESIDENT, "resident.cells.*", "rigid.poses_of"),
+    "sweep": (
+        *_SHELL,
+        *_RESIDENT,
+        "resident.cells.*",
+        "resident.sweep.*",
+        "resident.clearance.*",
+        *_RANGES,
+    ),
     "everything": ("*",),
 }
 """Entries that a purpose calls, with ``*`` for any name (`tests/house/test_warm.py` checks it)."""

@@ -1,7 +1,6 @@
 """How hands move: timed poses, smooth random motion, and a mass that a hand pulls along.
 
-Quaternions have the scalar first. A turn is a rotation vector: its axis times its angle. Velocities
-(6,) are m/s of the origin, then rad/s, both in the frame that the poses are given in.
+Velocities (6,) are m/s of the origin, then rad/s, both in the frame that the poses are given in.
 """
 
 import math
@@ -10,102 +9,9 @@ import numpy as np
 from numba import types
 
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INT, entry, leaf
+from hapticdb.kernels.rigid import product, quaternion_by, quaternion_in, turn_of, write_pose
 
 PAIR = types.UniTuple(FLOAT, 2)
-
-
-@leaf
-def product(aw, ax, ay, az, bw, bx, by, bz):
-    """Quaternion of turning by b, then by a."""
-    return (
-        aw * bw - ax * bx - ay * by - az * bz,
-        aw * bx + ax * bw + ay * bz - az * by,
-        aw * by - ax * bz + ay * bw + az * bx,
-        aw * bz + ax * by - ay * bx + az * bw,
-    )
-
-
-@leaf
-def turn_of(w, x, y, z):
-    """Shortest turn that a unit quaternion stands for."""
-    sine = math.sqrt(x * x + y * y + z * z)
-    if w < 0.0:
-        w, x, y, z = -w, -x, -y, -z
-    # the quotient's limit: w is 1 there
-    scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
-    return scale * x, scale * y, scale * z
-
-
-@leaf
-def quaternion_by(x, y, z):
-    """Unit quaternion of a turn."""
-    angle = math.sqrt(x * x + y * y + z * z)
-    scale = 0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle
-    return math.cos(0.5 * angle), scale * x, scale * y, scale * z
-
-
-@leaf
-def quaternion_in(pose):
-    """Unit quaternion of a pose's rotation, from its longest component (Shepperd 1978)."""
-    xx, yy, zz = pose[0, 0], pose[1, 1], pose[2, 2]
-    w, x, y, z = 1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz
-    longest = max(w, x, y, z)
-    if longest == w:
-        x, y, z = pose[2, 1] - pose[1, 2], pose[0, 2] - pose[2, 0], pose[1, 0] - pose[0, 1]
-    elif longest == x:
-        w, y, z = pose[2, 1] - pose[1, 2], pose[0, 1] + pose[1, 0], pose[0, 2] + pose[2, 0]
-    elif longest == y:
-        w, x, z = pose[0, 2] - pose[2, 0], pose[0, 1] + pose[1, 0], pose[1, 2] + pose[2, 1]
-    else:
-        w, x, y = pose[1, 0] - pose[0, 1], pose[0, 2] + pose[2, 0], pose[1, 2] + pose[2, 1]
-    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-    return w * scale, x * scale, y * scale, z * scale
-
-
-@leaf
-def place(px, py, pz, w, x, y, z, pose):
-    """Write position and unit quaternion into pose (4, 4), whose last row stays."""
-    pose[0, 0] = 1.0 - 2.0 * (y * y + z * z)
-    pose[0, 1] = 2.0 * (x * y - w * z)
-    pose[0, 2] = 2.0 * (x * z + w * y)
-    pose[0, 3] = px
-    pose[1, 0] = 2.0 * (x * y + w * z)
-    pose[1, 1] = 1.0 - 2.0 * (x * x + z * z)
-    pose[1, 2] = 2.0 * (y * z - w * x)
-    pose[1, 3] = py
-    pose[2, 0] = 2.0 * (x * z - w * y)
-    pose[2, 1] = 2.0 * (y * z + w * x)
-    pose[2, 2] = 1.0 - 2.0 * (x * x + y * y)
-    pose[2, 3] = pz
-
-
-@leaf
-def pose_of_quaternion(px, py, pz, w, x, y, z, out):
-    """Write the whole matrix, out (4, 4), of a position and a unit quaternion, not normalised here.
-
-    A session and its replay both come this way, so that the bits are the same.
-    """
-    place(px, py, pz, w, x, y, z, out)
-    out[3, 0] = 0.0
-    out[3, 1] = 0.0
-    out[3, 2] = 0.0
-    out[3, 3] = 1.0
-
-
-@entry(FLOATS2, FLOATS3)
-def poses_of(states, out):
-    """Matrices, out (M, 4, 4), of states (M, 7): m, unit quaternion."""
-    for m in range(states.shape[0]):
-        pose_of_quaternion(
-            states[m, 0],
-            states[m, 1],
-            states[m, 2],
-            states[m, 3],
-            states[m, 4],
-            states[m, 5],
-            states[m, 6],
-            out[m],
-        )
 
 
 @entry(FLOAT, FLOATS2, FLOATS2, FLOATS)
@@ -134,7 +40,7 @@ def play(time, knots, pose, velocity):
     px = knots[left, 1] + share * (knots[right, 1] - knots[left, 1])
     py = knots[left, 2] + share * (knots[right, 2] - knots[left, 2])
     pz = knots[left, 3] + share * (knots[right, 3] - knots[left, 3])
-    place(px, py, pz, w, x, y, z, pose)
+    write_pose(px, py, pz, w, x, y, z, pose)
     rate = 0.0 if rests else 1.0 / span
     for axis in range(3):
         velocity[axis] = rate * (knots[right, 1 + axis] - knots[left, 1 + axis])
@@ -194,7 +100,7 @@ def sway(time, waves, center, pose, velocity):
     z, dz = wave(time, waves, np.int64(5))
     velocity[3], velocity[4], velocity[5] = angular_velocity(x, y, z, dx, dy, dz)
     w, x, y, z = product(*quaternion_by(x, y, z), *quaternion_in(center))
-    place(px + center[0, 3], py + center[1, 3], pz + center[2, 3], w, x, y, z, pose)
+    write_pose(px + center[0, 3], py + center[1, 3], pz + center[2, 3], w, x, y, z, pose)
 
 
 @entry(FLOATS3, FLOAT, INT)
@@ -264,7 +170,7 @@ def pull(
     w, x, y, z = product(
         *quaternion_by(rest * body[10], rest * body[11], rest * body[12]), w, x, y, z
     )
-    place(
+    write_pose(
         body[0] + rest * body[7],
         body[1] + rest * body[8],
         body[2] + rest * body[9],

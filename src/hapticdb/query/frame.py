@@ -14,7 +14,7 @@ from hapticdb.kernels.query import contact
 from hapticdb.poses import as_floats
 from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
-from hapticdb.query.law import TangentPlane
+from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
 
 if TYPE_CHECKING:
@@ -31,6 +31,8 @@ MOST_POINTS = 1 << 17
 """Shell points of all poses for which one statement is sent: 12 MB. A larger value takes more
 memory."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
+NO_POINTS = np.empty(0, dtype=np.int64)
+NO_DEPTHS = np.empty(0)
 
 
 class Query(NamedTuple):
@@ -52,7 +54,8 @@ class Answer(NamedTuple):
     """What a frame found; `Touch` shows it to users.
 
     wrench (6,) N and N m; hits (H,) indices, ascending; depths (H,) metres; ids : objects of all
-    hits, ascending; pairs : () -> (P, 2) int64, every (hit, object id), computed when asked for.
+    hits, ascending; pairs : () -> (P, 2) int64, every (hit, object id), computed when asked for;
+    apart (A,) : indices of points that are felt without being hits, ascending, and apart_depths.
     """
 
     wrench: NDArray[np.float64]
@@ -61,6 +64,18 @@ class Answer(NamedTuple):
     ids: list[int]
     pairs: Callable[[], NDArray[np.int64]]
     query: Query
+    apart: NDArray[np.int64] = NO_POINTS
+    apart_depths: NDArray[np.float64] = NO_DEPTHS
+
+    def contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Indices (C,) of the points that are felt, ascending, and their depths (C,), above 0."""
+        is_felt = self.depths > 0
+        points, depths = self.hits[is_felt], self.depths[is_felt]
+        if self.apart.size:
+            points = np.concatenate([points, self.apart])
+            order = np.argsort(points)
+            points, depths = points[order], np.concatenate([depths, self.apart_depths])[order]
+        return points, depths
 
 
 class HapticQuery:
@@ -94,7 +109,7 @@ class HapticQuery:
         strategy: Strategy = "auto",
         gap: int = DEFAULT_MAXGAP,
         exclude: Keys = NOTHING_EXCLUDED,
-        law: TangentPlane = TangentPlane(),  # noqa: B008 - frozen, and a frame counts microseconds
+        law: ForceLaw = TangentPlane(),  # noqa: B008 - frozen, and a frame counts microseconds
     ) -> Answer:
         """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
         started = time.perf_counter_ns()
@@ -110,30 +125,32 @@ class HapticQuery:
         located: "contact.Located",
         rows: Rows,
         exclude: Keys,
-        law: TangentPlane,
+        law: ForceLaw,
         query: Query,
         started: int,
     ) -> Answer:
         """Answer of a frame from its rows, between which there may be rows of other poses."""
         placed, asked, keys = located
-        row_keys, row_ids, occupancy = rows
-        wrench, hits, depths, ids = contact.refine(
+        row_keys, row_ids, occupancy, payload = rows
+        wrench, hits, depths, ids, apart, apart_depths = contact.refine(
             placed,
             asked,
             keys,
             row_keys,
             row_ids,
             occupancy,
+            payload,
             exclude,
             self._origin,
             self._size,
-            law.stiffness,
+            law.for_kernels,
         )
         pairs = partial(
             contact.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
         )
-        query = query._replace(elapsed_us=(time.perf_counter_ns() - started) / 1000)
-        return Answer(wrench, hits, depths, ids.tolist(), pairs, query)
+        # a new tuple: `_replace` takes three times as long
+        query = Query(*query[:4], (time.perf_counter_ns() - started) / 1000)
+        return Answer(wrench, hits, depths, ids.tolist(), pairs, query, apart, apart_depths)
 
     def run_many(
         self,
@@ -142,7 +159,7 @@ class HapticQuery:
         strategy: Strategy,
         gap: int,
         exclude: Keys,
-        law: TangentPlane,
+        law: ForceLaw,
     ) -> Iterator[Answer]:
         """Answers at poses (n, 4, 4), in their order; see `Environment.touch_many`.
 
@@ -167,19 +184,19 @@ class HapticQuery:
             yield from self._look_up_together(batch, exclude, law)
 
     def _look_up_together(
-        self, batch: "list[contact.Located]", exclude: Keys, law: TangentPlane
+        self, batch: "list[contact.Located]", exclude: Keys, law: ForceLaw
     ) -> Iterator[Answer]:
         """Answers of poses, in their order; one statement fetches the rows of all."""
         started = time.perf_counter_ns()
         keys = np.unique(np.concatenate([located.keys for located in batch]))
-        row_keys, row_ids, occupancy = self._store.lookup(keys)
-        query = Query("array", 1, len(keys), len(row_keys), 0.0)
+        fetched = self._store.lookup(keys)
+        query = Query("array", 1, len(keys), len(fetched), 0.0)
         for located in batch:
             low = high = 0
             if located.keys.size:
-                low = int(np.searchsorted(row_keys, located.keys[0], "left"))
-                high = int(np.searchsorted(row_keys, located.keys[-1], "right"))
-            rows = Rows(row_keys[low:high], row_ids[low:high], occupancy[64 * low : 64 * high])
+                low = int(np.searchsorted(fetched.keys, located.keys[0], "left"))
+                high = int(np.searchsorted(fetched.keys, located.keys[-1], "right"))
+            rows = fetched.part(low, high)
             yield self._refined(located, rows, exclude, law, query, started)
             query, started = Query("array", 0, 0, 0, 0.0), time.perf_counter_ns()
 
@@ -233,11 +250,15 @@ class HapticQuery:
         self,
         located: "contact.Located",
         exclude: Keys,
-        law: TangentPlane,
+        law: ForceLaw,
         started: int,
     ) -> Answer:
         """Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
         store = self._store
+        if not isinstance(law, TangentPlane):
+            raise UsageError(
+                "the strategy 'statement' computes the tangent-plane law alone: choose another one"
+            )
         if not isinstance(store, SupportsStatement):
             raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
         placed, (addresses, _), _ = located

@@ -1,15 +1,29 @@
-"""Hits -> wrench: the force law (the paper, section 3).
+"""The force law as users name it (the paper, section 3); its arithmetic is `hapticdb.kernels.law`.
 
-The arithmetic runs in `hapticdb.kernels.query.contact`, fused with the refinement of a frame's
-rows, and once more inside the engine for the strategy `statement`; both share the same leaves.
+A law of this module is checked and immutable, and gives kernels the NamedTuple that they take.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Protocol
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels import law as kernels
 
 MOST_STIFFNESS = 1e9
 """N/m: stiffer than any hand, device or part."""
+
+
+class ForceLaw(Protocol):
+    """A force law: how stiff it is, and what kernels take of it."""
+
+    @property
+    def stiffness(self) -> float:
+        """K, N/m."""
+
+    @property
+    def for_kernels(self) -> Any:  # noqa: ANN401 - a NamedTuple of a type of its own
+        """NamedTuple that `hapticdb.kernels.law` has functions for; made once, a frame reads it."""
 
 
 @dataclass(frozen=True)
@@ -35,3 +49,8 @@ class TangentPlane:
                 f"stiffness {self.stiffness} N/m: give a number from 0 to {MOST_STIFFNESS:g}"
             )
         object.__setattr__(self, "stiffness", float(self.stiffness))
+
+    @cached_property
+    def for_kernels(self) -> Any:  # noqa: ANN401 - kernels are loaded when they are first used
+        """Law as kernels take it."""
+        return kernels.TangentPlaneLaw(self.stiffness)

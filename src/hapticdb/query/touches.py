@@ -43,8 +43,8 @@ class Touch:
 
     @property
     def contacts(self) -> NDArray[np.int64]:
-        """Indices (C,) of the shell's points whose depth is above 0, ascending."""
-        return self.hits[self.depths > 0]
+        """Indices (C,) of the shell's points that the law feels, ascending."""
+        return self._answer.contacts()[0]
 
     @property
     def objects(self) -> list[Object]:
@@ -117,9 +117,9 @@ class Touches:
         total = self.query
         for n, answer in enumerate(answers):
             self.forces[n], self.torques[n] = answer.wrench[:3], answer.wrench[3:]
-            is_contact = answer.depths > 0
-            self.hits[n], self.n_contacts[n] = len(answer.hits), np.count_nonzero(is_contact)
-            self.deepest[n] = answer.depths.max(initial=0.0)
+            points, depths = answer.contacts()
+            self.hits[n], self.n_contacts[n] = len(answer.hits), len(points)
+            self.deepest[n] = depths.max(initial=0.0)
             self.ids.append(answer.ids)
             asked = answer.query
             total = Query(
@@ -131,8 +131,7 @@ class Touches:
             )
             if self.contacts is not None:
                 piece = np.empty(self.n_contacts[n], CONTACT)
-                piece["pose"], piece["point"] = n, answer.hits[is_contact]
-                piece["depth"] = answer.depths[is_contact]
+                piece["pose"], piece["point"], piece["depth"] = n, points, depths
                 pieces.append(piece)
         if self.contacts is not None:
             self.contacts = np.concatenate(pieces)

@@ -8,8 +8,8 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.devices.scripted import Reading, pose_at
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import carry, grip, is_somewhere
-from hapticdb.kernels.query.contact import is_rigid
 from hapticdb.kernels.records import OFFSET, pose_numbers
+from hapticdb.kernels.rigid import is_rigid
 from hapticdb.poses import quaternion_of
 
 Floats = NDArray[np.float64]

@@ -29,9 +29,9 @@ from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.hand import servo
 from hapticdb.kernels.hand.anchors import BEFORE, MET_ROWS
 from hapticdb.kernels.hand.handle import is_somewhere
-from hapticdb.kernels.motion import poses_of
 from hapticdb.kernels.records import FRAME, MOST_MISSED, SERVO, TOLD, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import Place
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed

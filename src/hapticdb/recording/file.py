@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, UsageError
-from hapticdb.kernels.motion import poses_of
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.recording.chunks import HEAD, MOST_FRAMES, Chunk, Scan, read_bytes, scan
 from hapticdb.recording.frame import FRAME, Frames, State
 from hapticdb.recording.header import MAGIC, Header

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import GridError
-from hapticdb.kernels.motion import poses_of
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import TangentPlane
 from hapticdb.recording.file import Recording

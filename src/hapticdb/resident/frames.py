@@ -23,7 +23,7 @@ from hapticdb.kernels.resident.cells import (
 )
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
-from hapticdb.query.law import TangentPlane
+from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.resident.residency import Residency
 
 RUN = 64
@@ -130,7 +130,7 @@ class ResidentFrames:
         Of the environment; this is its table's only reader or one of several.
     shell : PointShell
         The tool.
-    law : TangentPlane or None
+    law : ForceLaw or None
         1000 N/m unless given.
     run : int or None
         As `clusters_of` takes it.
@@ -140,13 +140,13 @@ class ResidentFrames:
         self,
         residency: Residency,
         shell: PointShell,
-        law: TangentPlane | None = None,
+        law: ForceLaw | None = None,
         *,
         run: int | None = None,
     ) -> None:
         self.residency = residency
         self.shell = shell
-        self.stiffness = (law or TangentPlane()).stiffness
+        self.law = (law or TangentPlane()).for_kernels
         self.clusters = clusters_of(shell, residency.grid.voxel_size, run)
         self.met = np.empty(len(shell), dtype=np.int64)
         self.surroundings = surroundings_of(self.clusters, residency.grid.voxel_size)
@@ -206,7 +206,7 @@ class ResidentFrames:
         part = slice(start, start + n_poses)
         done = feel_kernel(
             self.residency.table.cells, self._row, self.clusters, poses[part],
-            self.residency.place, self.stiffness, self.met, self.missed, out[part],
+            self.residency.place, self.law, self.met, self.missed, out[part],
         )  # fmt: skip
         if done < n_poses:
             raise UsageError(f"pose {start + done} is no rigid transform: give a rotation")

@@ -127,7 +127,7 @@ class CellTable:
         for name, dtype, shape in _fields(n_slots, _capacity(n_slots)):
             views[name] = np.ndarray(shape, dtype, self._memory, at)
             at += -(-views[name].nbytes // _PAGE) * _PAGE
-        self.cells = kernels.Cells(**{n: views[n] for n in kernels.Cells._fields})  # type: ignore[arg-type]
+        self.cells = kernels.Cells(**{n: views[n] for n in kernels.Cells._fields if n in views})  # type: ignore[arg-type]
         self.desk = Desk(**{n: views[n] for n in Desk._fields})  # type: ignore[arg-type]
 
     @classmethod

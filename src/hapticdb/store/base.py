@@ -36,15 +36,23 @@ class Rows(NamedTuple):
     keys : (R,) int64, ascending: voxel keys, or brick keys.
     ids : (R,) int64, ids of objects.
     occupancy : (64 R,) uint8, row after row; empty on the voxel layout.
+    payload : what force laws read beside the occupancy, an array whose first axis is (R,), or None.
     """
 
     keys: Keys
     ids: NDArray[np.int64]
     occupancy: NDArray[np.uint8]
+    payload: NDArray[np.uint8] | None = None
 
     def __len__(self) -> int:
-        """Number of rows, not of this tuple's three fields."""
+        """Number of rows, not of this tuple's four fields."""
         return len(self.keys)
+
+    def part(self, low: int, high: int) -> "Rows":
+        """Rows low .. high, as views."""
+        payload = None if self.payload is None else self.payload[low:high]
+        bits = self.occupancy[BRICK_BYTES * low : BRICK_BYTES * high]
+        return Rows(self.keys[low:high], self.ids[low:high], bits, payload)
 
 
 NO_KEYS = np.empty(0, dtype=np.int64)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.resident import sweep as kernels
+from hapticdb.kernels.resident import clearance as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
 from hapticdb.resident.frames import ResidentFrames
 

@@ -23,8 +23,8 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import leaf
-from hapticdb.kernels.query.contact import turn
 from hapticdb.kernels.resident.cells import UNKNOWN, cell_key, slot_of
+from hapticdb.kernels.rigid import turn
 
 BEFORE, AFTER, ANCHOR = 0, 1, 2
 """Rows of `met` (MET_ROWS, N): indices of the points that hit, of those that hit at the end of a

@@ -35,8 +35,7 @@ from hapticdb.kernels.hand.anchors import (
     voxel_under,
 )
 from hapticdb.kernels.hand.body import BODY, begin_anew, is_finite, is_somewhere
-from hapticdb.kernels.motion import pose_of_quaternion, product, quaternion_by, turn_of
-from hapticdb.kernels.query.contact import turn
+from hapticdb.kernels.law import TangentPlaneLaw
 from hapticdb.kernels.records import RESULTS, SERVO
 from hapticdb.kernels.resident.cells import (
     CELLS,
@@ -53,6 +52,7 @@ from hapticdb.kernels.resident.cells import (
     end_frame,
     felt,
 )
+from hapticdb.kernels.rigid import pose_of_quaternion, product, quaternion_by, turn, turn_of
 
 IS_HELD, IS_FADING, IS_DROPPED, IS_CUT, IS_STOPPED = 1, 2, 8, 16, 32
 """Flags: the wrench was kept; it is falling or gone; time was left over; a step was cut back; a
@@ -290,6 +290,7 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
     version = cells.readers[reader * READER_STRIDE]
     points, center = shell.points, shell.center
     keys, slots, words = cells.keys, cells.slots, cells.words
+    law = TangentPlaneLaw(body.stiffness)
     servo = servo_record[()]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
     position, turned, velocity, kept = tool.position, tool.quaternion, tool.velocity, tool.kept
@@ -315,7 +316,7 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
         pose_of_quaternion(
             position[0], position[1], position[2], turned[0], turned[1], turned[2], turned[3], pose
         )
-        felt(cells, which, shell, pose, place, body.stiffness, next_met, missed, next_frame)
+        felt(cells, which, shell, pose, place, law, next_met, missed, next_frame)
         n_unknown = np.int64(next_frame[UNKNOWNS])
         if n_unknown == 0:
             if is_first:
@@ -411,7 +412,7 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
             for n in range(6):
                 velocity[n] = 0.0
             continue
-        felt(cells, which, shell, next_pose, place, body.stiffness, next_met, missed, next_frame)
+        felt(cells, which, shell, next_pose, place, law, next_met, missed, next_frame)
         n_unknown = np.int64(next_frame[UNKNOWNS])
         if n_unknown > 0:
             break

@@ -1,8 +1,8 @@
 """How a hand carries the handle: scale, and the offset that a clutch leaves between them."""
 
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, entry, record_of
-from hapticdb.kernels.motion import product, quaternion_in
 from hapticdb.kernels.records import HAND, OFFSET
+from hapticdb.kernels.rigid import product, quaternion_in
 
 FARTHEST = 1e6
 """Metres, m/s or rad/s: no hand is farther or faster, it is its device's numbers that are wrong."""

@@ -4,7 +4,6 @@ import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS, entry, record_of
 from hapticdb.kernels.curves import key_of
-from hapticdb.kernels.query.contact import turn
 from hapticdb.kernels.records import FRAME, MOST_ASKED, SERVO, SESSION, TOLD
 from hapticdb.kernels.resident.cells import (
     CLUSTERS,
@@ -16,6 +15,7 @@ from hapticdb.kernels.resident.cells import (
     WRENCH,
 )
 from hapticdb.kernels.resident.fence import fence
+from hapticdb.kernels.rigid import turn
 
 
 @entry(record_of(SESSION), record_of(TOLD), INTS)

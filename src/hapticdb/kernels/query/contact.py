@@ -5,7 +5,7 @@ strategy, layout, curve and engine gives the same wrench bit for bit (numba cont
 multiplication and addition without fastmath, which this package never sets).
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,17 +17,42 @@ from hapticdb.kernels._jit import (
     INT,
     INTS,
     INTS2,
+    NONE,
     READ_BYTES,
     READ_FLOATS,
     READ_FLOATS2,
     entry,
+    inlined,
     leaf,
 )
 from hapticdb.kernels.curves import Z_ORDER, compact, key_of, voxel_of, z_encode
+from hapticdb.kernels.law import (
+    NOTHING_NEAR,
+    TANGENT_PLANE,
+    accumulate,
+    average_into,
+    depth_below_plane,
+    reach,
+    respond,
+    sample_row,
+)
 from hapticdb.kernels.query.sorting import insert_distinct, sorting_order
+from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+
+
+Refined = tuple[Floats, Ints, Floats, Ints, Ints, Floats]
+"""What `refine` returns.
+
+wrench (6,): N and N m about the centre, world frame; hits (H,): indices of the shell's points
+inside a voxel, ascending; depths (H,): metres at which each hit is felt, 0 where it is not;
+ids (I,): objects that the hits are in, ascending; apart (A,) and apart_depths (A,): points that are
+felt though they are no hits, ascending, and their depths, above 0.
+"""
+NO_POINTS = np.empty(0, dtype=np.int64)
+NO_DEPTHS = np.empty(0)
 
 
 class Located(NamedTuple):
@@ -40,14 +65,6 @@ class Located(NamedTuple):
 
 LARGEST = 0x7FFFFFFFFFFFFFFF
 """Of an int64."""
-AVERAGE_FROM = 10
-"""Hits from which force and torque are averaged (McNeely et al. 1999, section 4.3)."""
-
-
-@leaf
-def contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz):
-    """Depth of a hit below its tangent plane, metres: (c - p) . n, not yet cut off at 0."""
-    return (cx - px) * nx + (cy - py) * ny + (cz - pz) * nz
 
 
 @leaf
@@ -56,62 +73,54 @@ def center_of(x, origin, size):
     return origin + size * (np.floor((x - origin) / size) + 0.5)
 
 
-@leaf
-def contact_force(nx, ny, nz, depth, stiffness):
-    """Force of a contact (McNeely et al. 1999): F = K d n."""
-    return stiffness * depth * nx, stiffness * depth * ny, stiffness * depth * nz
+@inlined
+def place_shell(points, normals, center, transform, placed):
+    """Points, normals and last the centre of a shell into placed (N + 1, 6), world frame."""
+    total = points.shape[0]
+    for n in range(total):
+        x, y, z = moved(transform, points[n, 0], points[n, 1], points[n, 2])
+        placed[n, 0] = x
+        placed[n, 1] = y
+        placed[n, 2] = z
+        x, y, z = turned(transform, normals[n, 0], normals[n, 1], normals[n, 2])
+        placed[n, 3] = x
+        placed[n, 4] = y
+        placed[n, 5] = z
+    x, y, z = moved(transform, center[0], center[1], center[2])
+    placed[total, 0] = x
+    placed[total, 1] = y
+    placed[total, 2] = z
+    placed[total, 3] = placed[total, 4] = placed[total, 5] = 0.0
 
 
-@leaf
-def moment(rx, ry, rz, fx, fy, fz):
-    """Torque of a force at a lever: r x F."""
-    return ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx
+@inlined
+def number_of_key(table, found, count, key):
+    """Number that a row key has in found (N,), entered as number `count` when it is new.
+
+    table (capacity,) int32: an open-addressing set of those numbers, -1 where free.
+    """
+    # Fibonacci hashing (Knuth, volume 3, section 6.4) into a table at most half full
+    at = ((key * 0x9E3779B97F4A7C1) >> 20) & (table.shape[0] - 1)
+    while table[at] >= 0 and found[table[at]] != key:
+        at = (at + 1) & (table.shape[0] - 1)
+    if table[at] < 0:
+        table[at] = count
+        found[count] = key
+    return table[at]
 
 
-@leaf
-def average_into(out, n_hits, fx, fy, fz, tx, ty, tz):
-    """Wrench into out (6+,): divided by a tenth of the hits when there are ten or more."""
-    out[0] = fx
-    out[1] = fy
-    out[2] = fz
-    out[3] = tx
-    out[4] = ty
-    out[5] = tz
-    if n_hits >= AVERAGE_FROM:
-        tenth = n_hits / 10.0
-        for axis in range(6):
-            out[axis] /= tenth
-
-
-@leaf
-def is_rigid(pose):
-    """Whether a (4, 4) matrix is finite, a rotation to 1e-6, and has the last row 0 0 0 1."""
-    for a in range(4):
-        for b in range(4):
-            if not np.isfinite(pose[a, b]):
-                return False
-    for b in range(3):
-        if pose[3, b] != 0.0:
-            return False
-    if pose[3, 3] != 1.0:
-        return False
-    for a in range(3):
-        for b in range(a, 3):
-            dot = pose[0, a] * pose[0, b] + pose[1, a] * pose[1, b] + pose[2, a] * pose[2, b]
-            if abs(dot - (1.0 if a == b else 0.0)) > 1e-6:
-                return False
-    det = (
-        pose[0, 0] * (pose[1, 1] * pose[2, 2] - pose[1, 2] * pose[2, 1])
-        - pose[0, 1] * (pose[1, 0] * pose[2, 2] - pose[1, 2] * pose[2, 0])
-        + pose[0, 2] * (pose[1, 0] * pose[2, 1] - pose[1, 1] * pose[2, 0])
-    )
-    return det > 0.0
-
-
-@leaf
-def turn(a, b, c, x, y, z):
-    """One coordinate of a turned vector: a row (a, b, c) of the rotation times (x, y, z)."""
-    return a * x + b * y + c * z
+@inlined
+def sort_keys(found, count, asked, keys):
+    """Write the first `count` of the keys found, ascending, and renumber the points' slots."""
+    order = sorting_order(found[:count])
+    rank = np.empty(count, dtype=np.int32)
+    for n in range(count):
+        at = order[n]
+        keys[n] = found[at]
+        rank[at] = n
+    for n in range(asked.shape[1]):
+        if asked[1, n] >= 0:
+            asked[1, n] = rank[asked[1, n]]
 
 
 @entry(
@@ -132,17 +141,10 @@ def locate_kernel(
     points, normals, center, pose, origin, size, bits, curve, shift, placed, asked, keys
 ):
     """`locate` into placed, asked and keys (N,); returns U, or -1 when the pose is not rigid."""
-    total = points.shape[0]
     if not is_rigid(pose):
         return -1
-    # scalars: an array handed to a leaf, or a row of one, costs a counted reference each time
-    a, b, c, u = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
-    d, e, f, v = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
-    g, h, m, w = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
-    placed[total, 0] = turn(a, b, c, center[0], center[1], center[2]) + u
-    placed[total, 1] = turn(d, e, f, center[0], center[1], center[2]) + v
-    placed[total, 2] = turn(g, h, m, center[0], center[1], center[2]) + w
-    placed[total, 3] = placed[total, 4] = placed[total, 5] = 0.0
+    place_shell(points, normals, center, transform_of(pose), placed)
+    total = points.shape[0]
     ox, oy, oz = origin[0], origin[1], origin[2]
     side = float(1 << bits)
     capacity = 16
@@ -151,57 +153,28 @@ def locate_kernel(
     table = np.full(capacity, -1, dtype=np.int32)
     found = np.empty(total, dtype=np.int64)
     count = 0
-    memo_key = -1
-    memo_slot = -1
+    last_key, last_number = -1, -1  # neighbours by index often share a row
     for n in range(total):
-        px, py, pz = points[n, 0], points[n, 1], points[n, 2]
-        nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
-        wx = turn(a, b, c, px, py, pz) + u
-        wy = turn(d, e, f, px, py, pz) + v
-        wz = turn(g, h, m, px, py, pz) + w
-        placed[n, 0] = wx
-        placed[n, 1] = wy
-        placed[n, 2] = wz
-        placed[n, 3] = turn(a, b, c, nx, ny, nz)
-        placed[n, 4] = turn(d, e, f, nx, ny, nz)
-        placed[n, 5] = turn(g, h, m, nx, ny, nz)
-        x = np.floor((wx - ox) / size)
-        y = np.floor((wy - oy) / size)
-        z = np.floor((wz - oz) / size)
+        x = np.floor((placed[n, 0] - ox) / size)
+        y = np.floor((placed[n, 1] - oy) / size)
+        z = np.floor((placed[n, 2] - oz) / size)
         if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
             asked[0, n] = -1
             asked[1, n] = -1
             continue
-        i = np.int64(x)
-        j = np.int64(y)
-        k = np.int64(z)
+        i, j, k = np.int64(x), np.int64(y), np.int64(z)
         key = key_of(i, j, k, bits, curve)
         row_key = key >> shift
         if shift == 0 or curve == Z_ORDER:
             asked[0, n] = key  # a Z-order key ends in the bit number
         else:
             asked[0, n] = (row_key << 9) | z_encode(i & 7, j & 7, k & 7)
-        if row_key != memo_key:
-            # Fibonacci hashing (Knuth, volume 3, section 6.4) into a table at most half full
-            at = ((row_key * 0x9E3779B97F4A7C1) >> 20) & (capacity - 1)
-            while table[at] >= 0 and found[table[at]] != row_key:
-                at = (at + 1) & (capacity - 1)
-            if table[at] < 0:
-                table[at] = count
-                found[count] = row_key
-                count += 1
-            memo_key = row_key
-            memo_slot = table[at]
-        asked[1, n] = memo_slot
-    order = sorting_order(found[:count])
-    rank = np.empty(count, dtype=np.int32)
-    for n in range(count):
-        at = order[n]
-        keys[n] = found[at]
-        rank[at] = n
-    for n in range(total):
-        if asked[1, n] >= 0:
-            asked[1, n] = rank[asked[1, n]]
+        if row_key != last_key:
+            last_key = row_key
+            last_number = number_of_key(table, found, count, row_key)
+            count = max(count, last_number + 1)
+        asked[1, n] = last_number
+    sort_keys(found, count, asked, keys)
     return count
 
 
@@ -325,61 +298,99 @@ def counting_rows(row_ids, exclude):
     return counts
 
 
-@entry(FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, INTS, FLOATS, FLOAT, FLOAT, FLOATS, INTS)
-def refine_kernel(
-    placed, asked, keys, row_keys, row_ids, occupancy, exclude, origin, size, stiffness, felt, met
-):
-    """`refine` into felt (6 + N,) and met (N + R,); returns H and I."""
-    total = asked.shape[1]
-    touched = np.empty(row_ids.shape[0], dtype=np.bool_)
+@inlined
+def has_voxel(occupancy, row, address):
+    """Whether a row has the voxel of an address; a voxel row, without occupancy, always has."""
+    if occupancy.shape[0] == 0:
+        return True
+    return (occupancy[64 * row + ((address & 511) >> 3)] >> (address & 7)) & 1 != 0
+
+
+@inlined
+def distinct_ids(touched, row_ids, met, start):
+    """Write the ids of touched rows into met[start:], ascending, each once -> how many."""
+    count = np.int64(0)
     for row in range(row_ids.shape[0]):
-        touched[row] = False
+        if touched[row]:
+            count = insert_distinct(met, start, count, row_ids[row])
+    return count
+
+
+@entry(
+    FLOATS2,
+    INTS2,
+    INTS,
+    INTS,
+    INTS,
+    READ_BYTES,
+    NONE,
+    INTS,
+    FLOATS,
+    FLOAT,
+    TANGENT_PLANE,
+    FLOATS,
+    INTS,
+)
+def refine_kernel(
+    placed,
+    asked,
+    keys,
+    row_keys,
+    row_ids,
+    occupancy,
+    payload,
+    exclude,
+    origin,
+    size,
+    law,
+    felt,
+    met,
+):
+    """`refine` into felt (6 + N,) and met (N + R,) -> P, A and I.
+
+    P points are hits or felt or both, A of them felt only. felt has the wrench and their depths;
+    met has their indices, ~n for a point n that is no hit, and then the I ids.
+    """
+    total = asked.shape[1]
+    touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
     starts, ends = rows_of_keys(keys, row_keys)
     counts = counting_rows(row_ids, exclude)
-    has_bits = occupancy.shape[0] > 0
     ox, oy, oz = origin[0], origin[1], origin[2]
     mx, my, mz = placed[total, 0], placed[total, 1], placed[total, 2]
-    fx = fy = fz = tx = ty = tz = 0.0
-    count = np.int64(0)
+    fx = fy = fz = tx = ty = tz = weight = 0.0
+    count = n_apart = np.int64(0)
     for n in range(total):
         at = asked[1, n]
         if at < 0:
             continue
-        byte = (asked[0, n] & 511) >> 3
-        bit = asked[0, n] & 7
+        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
         is_hit = False
+        sample = NOTHING_NEAR
         for row in range(starts[at], ends[at]):
-            if has_bits and not (occupancy[64 * row + byte] >> bit) & 1:
+            if not counts[row]:
                 continue
-            if counts[row]:
+            x, y, z = (px - ox) / size, (py - oy) / size, (pz - oz) / size
+            sample = min(sample, sample_row(law, payload, row, x, y, z))
+            if has_voxel(occupancy, row, asked[0, n]):
                 is_hit = True
                 touched[row] = True
-        if not is_hit:
+        if not is_hit and not sample <= reach(law):
             continue
-        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
         nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
-        cx = center_of(px, ox, size)
-        cy = center_of(py, oy, size)
-        cz = center_of(pz, oz, size)
-        depth = contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz)
-        met[count] = n
-        felt[6 + count] = max(depth, 0.0)
-        count += 1
+        cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
+        depth, share = respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+        weight += share
+        if is_hit or depth > 0.0:
+            met[count] = n if is_hit else ~n
+            felt[6 + count] = max(depth, 0.0)
+            count += 1
+            n_apart += not is_hit
         if depth > 0.0:
-            x, y, z = contact_force(nx, ny, nz, depth, stiffness)
-            fx += x
-            fy += y
-            fz += z
-            x, y, z = moment(px - mx, py - my, pz - mz, x, y, z)
-            tx += x
-            ty += y
-            tz += z
-    average_into(felt, count, fx, fy, fz, tx, ty, tz)
-    n_ids = np.int64(0)
-    for row in range(row_ids.shape[0]):
-        if touched[row]:
-            n_ids = insert_distinct(met, count, n_ids, row_ids[row])
-    return count, n_ids
+            fx, fy, fz, tx, ty, tz = accumulate(
+                fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
+            )
+    average_into(felt, weight, fx, fy, fz, tx, ty, tz)
+    return count, n_apart, distinct_ids(touched, row_ids, met, count)
 
 
 def refine(
@@ -389,35 +400,31 @@ def refine(
     row_keys: Ints,
     row_ids: Ints,
     occupancy: NDArray[np.uint8],
+    payload: NDArray[np.uint8] | None,
     exclude: Ints,
     origin: Floats,
     size: float,
-    stiffness: float,
-) -> tuple[Floats, Ints, Floats, Ints]:
-    """Drop the false hits of a frame's rows and sum the wrench of the rest.
+    law: Any,  # noqa: ANN401 - a NamedTuple that `kernels.law` knows
+) -> Refined:
+    """Drop the false hits of a frame's rows and sum the wrench of what is felt.
 
     placed, asked, keys as `locate` returns them; row_keys (R,) int64 ascending, row_ids (R,) int64,
-    occupancy (64 R,) uint8 or empty for voxel rows; exclude (E,) int64; stiffness in N/m.
-
-    Returns
-    -------
-    wrench : (6,) float64
-        Force in N and torque in N m about the centre, world frame.
-    hits : (H,) int64
-        Indices of the shell's points inside a voxel, ascending.
-    depths : (H,) float64
-        Metres below each hit's tangent plane, 0 above it.
-    ids : (I,) int64
-        Objects that the hits are in, ascending.
+    occupancy (64 R,) uint8 or empty for voxel rows, payload as the law reads it, or None;
+    exclude (E,) int64; origin (3,) and size of a voxel, metres.
     """
     total = asked.shape[1]
     felt = np.empty(6 + total)
     met = np.empty(total + row_ids.shape[0], dtype=np.int64)
-    n_hits, n_ids = refine_kernel(
-        placed, asked, keys, row_keys, row_ids, occupancy, exclude, origin, size, stiffness,
+    n_points, n_apart, n_ids = refine_kernel(
+        placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law,
         felt, met,
     )  # fmt: skip
-    return felt[:6], met[:n_hits], felt[6 : 6 + n_hits], met[n_hits : n_hits + n_ids]
+    ids = met[n_points : n_points + n_ids]
+    if n_apart == 0:
+        return felt[:6], met[:n_points], felt[6 : 6 + n_points], ids, NO_POINTS, NO_DEPTHS
+    points, depths = met[:n_points], felt[6 : 6 + n_points]
+    is_hit = points >= 0
+    return felt[:6], points[is_hit], depths[is_hit], ids, ~points[~is_hit], depths[~is_hit]
 
 
 @entry(INTS2, INTS, INTS, INTS, READ_BYTES, INTS, INTS)
@@ -425,7 +432,6 @@ def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
     """Every (shell point, object) pair of a frame's hits, (P, 2) int64, ordered by both."""
     starts, ends = rows_of_keys(keys, row_keys)
     counts = counting_rows(row_ids, exclude)
-    has_bits = occupancy.shape[0] > 0
     most = 0
     for h in range(hits.shape[0]):
         at = asked[1, hits[h]]
@@ -435,26 +441,25 @@ def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
     for h in range(hits.shape[0]):
         n = hits[h]
         at = asked[1, n]
-        byte = (asked[0, n] & 511) >> 3
-        bit = asked[0, n] & 7
         for row in range(starts[at], ends[at]):
-            if counts[row] and not (has_bits and not (occupancy[64 * row + byte] >> bit) & 1):
+            if counts[row] and has_voxel(occupancy, row, asked[0, n]):
                 pairs[count, 0] = n
                 pairs[count, 1] = row_ids[row]
                 count += 1
     return pairs[:count]
 
 
-@entry(FLOATS2, INTS, INTS, FLOATS, FLOAT, INT, INT, INT, FLOAT)
-def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, shift, stiffness):
+@entry(FLOATS2, INTS, INTS, FLOATS, FLOAT, INT, INT, INT, TANGENT_PLANE)
+def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, shift, law):
     """Wrench (6,) of hits given as ordinals (H,), ascending, and addresses (H,) int64.
 
-    The paper's ``force(point, z_val)``: the voxel's centre comes from the address alone.
+    The paper's ``force(point, z_val)``: the voxel's centre comes from the address alone. For laws
+    that read no payload.
     """
     ox, oy, oz = origin[0], origin[1], origin[2]
     last = placed.shape[0] - 1
     mx, my, mz = placed[last, 0], placed[last, 1], placed[last, 2]
-    fx = fy = fz = tx = ty = tz = 0.0
+    fx = fy = fz = tx = ty = tz = weight = 0.0
     for h in range(ordinals.shape[0]):
         i, j, k = voxel_at(addresses[h], bits, curve, shift)
         n = ordinals[h]
@@ -463,18 +468,14 @@ def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, 
         cx = ox + size * (i + 0.5)
         cy = oy + size * (j + 0.5)
         cz = oz + size * (k + 0.5)
-        depth = contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz)
+        depth, share = respond(law, True, NOTHING_NEAR, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+        weight += share
         if depth > 0.0:
-            x, y, z = contact_force(nx, ny, nz, depth, stiffness)
-            fx += x
-            fy += y
-            fz += z
-            x, y, z = moment(px - mx, py - my, pz - mz, x, y, z)
-            tx += x
-            ty += y
-            tz += z
+            fx, fy, fz, tx, ty, tz = accumulate(
+                fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
+            )
     wrench = np.empty(6)
-    average_into(wrench, ordinals.shape[0], fx, fy, fz, tx, ty, tz)
+    average_into(wrench, weight, fx, fy, fz, tx, ty, tz)
     return wrench
 
 
@@ -490,5 +491,5 @@ def depths_of_hits(placed, hits, origin, size):
         cx = center_of(px, ox, size)
         cy = center_of(py, oy, size)
         cz = center_of(pz, oz, size)
-        depths[h] = max(contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz), 0.0)
+        depths[h] = max(depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz), 0.0)
     return depths

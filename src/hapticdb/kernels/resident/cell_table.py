@@ -19,7 +19,6 @@ from hapticdb.kernels._jit import (
     leaf,
 )
 from hapticdb.kernels.curves import compact, key_of, voxel_of
-from hapticdb.kernels.query.contact import turn
 from hapticdb.kernels.query.grouping import first_bound
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
@@ -29,10 +28,14 @@ from hapticdb.kernels.resident.cells import (
     VERSION,
     brick_bit,
     cell_key,
+    cell_of_key,
+    column_of,
+    key_of_cell,
     slot_of,
     spread_key,
 )
 from hapticdb.kernels.resident.fence import fence
+from hapticdb.kernels.rigid import moved, transform_of
 
 NEVER_AGAIN = 0x7FFFFFFFFFFFFFFF
 
@@ -141,7 +144,7 @@ def fill_cells(
                 mark_brick(masks, slot, i, j, k)
         else:
             i, j, k = voxel_of(row_key, bits, curve)
-            words[slot, ((i & 31) << 5) | (j & 31)] |= np.uint32(1) << np.uint32(k & 31)
+            words[slot, column_of(i, j)] |= np.uint32(1) << np.uint32(k & 31)
             mark_brick(masks, slot, i, j, k)
 
 
@@ -150,8 +153,8 @@ def curve_keys_of_cells(cells, bits, curve, out):
     """Cells (n,), as directories name them, on the curve: their voxels' keys >> 15."""
     level = max(bits - 5, 0)
     for n in range(cells.shape[0]):
-        key = cells[n]
-        out[n] = key_of(key >> 32, (key >> 16) & 0xFFFF, key & 0xFFFF, level, curve)
+        ci, cj, ck = cell_of_key(cells[n])
+        out[n] = key_of(ci, cj, ck, level, curve)
 
 
 @entry(INTS, INT, INT, INTS)
@@ -159,8 +162,8 @@ def cells_of_curve_keys(curve_keys, bits, curve, out):
     """Undo `curve_keys_of_cells`."""
     level = max(bits - 5, 0)
     for n in range(curve_keys.shape[0]):
-        i, j, k = voxel_of(curve_keys[n], level, curve)
-        out[n] = (i << 32) | (j << 16) | k
+        ci, cj, ck = voxel_of(curve_keys[n], level, curve)
+        out[n] = key_of_cell(ci, cj, ck)
 
 
 @entry(INTS, INTS, BYTES, INT, INT, INT, INTS)
@@ -244,7 +247,7 @@ def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
                     dx = max(abs(start[0] - x) - 16.0, 0.0)
                     dy = max(abs(start[1] - y) - 16.0, 0.0)
                     dz = max(abs(start[2] - z) - 16.0, 0.0)
-                    keys[count] = (i << 32) | (j << 16) | k
+                    keys[count] = key_of_cell(i, j, k)
                     urgency[count] = 0.0
                     if dx * dx + dy * dy + dz * dz > radius * radius:
                         urgency[count] = max(gap, 0.0) + along * way
@@ -268,15 +271,11 @@ def cells_met(points, reach, poses, place, found, most):
     low_memo = high_memo = np.int64(-1)
     before = np.empty((8 if r > 0.0 else 1) * points.shape[0], dtype=np.int64)
     for n in range(poses.shape[0]):
-        a, b, c, u = poses[n, 0, 0], poses[n, 0, 1], poses[n, 0, 2], poses[n, 0, 3]
-        d, e, f, v = poses[n, 1, 0], poses[n, 1, 1], poses[n, 1, 2], poses[n, 1, 3]
-        g, h, m, w = poses[n, 2, 0], poses[n, 2, 1], poses[n, 2, 2], poses[n, 2, 3]
+        transform = transform_of(poses[n])
         added = 0
         for p in range(points.shape[0]):
-            px, py, pz = points[p, 0], points[p, 1], points[p, 2]
-            x = (turn(a, b, c, px, py, pz) + u - ox) / size
-            y = (turn(d, e, f, px, py, pz) + v - oy) / size
-            z = (turn(g, h, m, px, py, pz) + w - oz) / size
+            x, y, z = moved(transform, points[p, 0], points[p, 1], points[p, 2])
+            x, y, z = (x - ox) / size, (y - oy) / size, (z - oz) / size
             if not (-r <= x < side + r and -r <= y < side + r and -r <= z < side + r):
                 continue
             low = cell_key(
@@ -288,10 +287,12 @@ def cells_met(points, reach, poses, place, found, most):
             if low == low_memo and high == high_memo:
                 continue
             low_memo, high_memo = low, high
-            for ci in range(low >> 32, (high >> 32) + 1):
-                for cj in range((low >> 16) & 0xFFFF, ((high >> 16) & 0xFFFF) + 1):
-                    for ck in range(low & 0xFFFF, (high & 0xFFFF) + 1):
-                        key = (ci << 32) | (cj << 16) | ck
+            low_i, low_j, low_k = cell_of_key(low)
+            high_i, high_j, high_k = cell_of_key(high)
+            for ci in range(low_i, high_i + 1):
+                for cj in range(low_j, high_j + 1):
+                    for ck in range(low_k, high_k + 1):
+                        key = key_of_cell(ci, cj, ck)
                         at = spread_key(key, capacity)
                         while found[at] >= 0 and found[at] != key:
                             at = (at + 1) & (capacity - 1)

@@ -25,6 +25,7 @@ from hapticdb.kernels._jit import (
     INTS,
     INTS2,
     INTS32_2,
+    NONE,
     WORDS,
     WORDS32_2,
     entry,
@@ -32,17 +33,18 @@ from hapticdb.kernels._jit import (
     inlined,
     leaf,
 )
-from hapticdb.kernels.query.contact import (
+from hapticdb.kernels.law import (
+    TANGENT_PLANE,
+    accumulate,
     average_into,
-    center_of,
-    contact_depth,
-    contact_force,
-    is_rigid,
-    moment,
-    turn,
+    reach,
+    respond,
+    sample_slot,
 )
+from hapticdb.kernels.query.contact import center_of
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident.fence import fence
+from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -74,7 +76,9 @@ class Cells(NamedTuple):
 
     control (16,) int64; readers (16 x 8,) int64, the version that each reader sees, 0 for none;
     keys (3, capacity) int64 and slots (3, capacity) int32, the directories; words (slots, 1024)
-    uint32; masks (slots,) uint64; used (slots,) uint8, set where a frame has looked.
+    uint32; masks (slots,) uint64; used (slots,) uint8, set where a frame has looked; payload: what
+    laws read beside the occupancy, an array (slots, ...), or None. A slot's mask has the bricks
+    that hold a voxel, or a payload that is not empty.
     """
 
     control: Ints
@@ -84,9 +88,10 @@ class Cells(NamedTuple):
     words: NDArray[np.uint32]
     masks: NDArray[np.uint64]
     used: NDArray[np.uint8]
+    payload: NDArray[np.uint8] | None = None
 
 
-CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES)
+CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, NONE)
 
 
 class Place(NamedTuple):
@@ -142,9 +147,33 @@ _COLUMNS = np.array(
 
 
 @leaf
+def key_of_cell(ci, cj, ck):
+    """Key of cell (ci, cj, ck): its coordinates side by side."""
+    return (ci << 32) | (cj << 16) | ck
+
+
+@leaf
+def cell_of_key(key):
+    """Cell (ci, cj, ck) of a key; undoes `key_of_cell`."""
+    return key >> 32, (key >> 16) & 0xFFFF, key & 0xFFFF
+
+
+@leaf
 def cell_key(i, j, k):
-    """Key of the cell that holds voxel (i, j, k): its coordinates side by side."""
-    return ((i >> 5) << 32) | ((j >> 5) << 16) | (k >> 5)
+    """Key of the cell that holds voxel (i, j, k)."""
+    return key_of_cell(i >> 5, j >> 5, k >> 5)
+
+
+@leaf
+def column_of(i, j):
+    """Which word of its cell holds voxel (i, j, k), whatever its k."""
+    return ((i & 31) << 5) | (j & 31)
+
+
+@leaf
+def bit_in(word, k):
+    """Bit of voxel (i, j, k) in its word: 1 where the voxel is occupied."""
+    return (word >> np.uint32(k & 31)) & 1
 
 
 @leaf
@@ -197,7 +226,7 @@ def voxel_state(cells, which, i, j, k):
     slot = slot_of(cells.keys, cells.slots, which, cell_key(i, j, k))
     if slot < 0:
         return np.int64(UNKNOWN)
-    return np.int64((cells.words[slot, ((i & 31) << 5) | (j & 31)] >> np.uint32(k & 31)) & 1)
+    return np.int64(bit_in(cells.words[slot, column_of(i, j)], k))
 
 
 @inlined
@@ -221,7 +250,7 @@ def is_something_near(
         for cj in range(first_j, last_j + 1):
             j0, j1 = max(low_j, cj << 5) & 31, min(high_j, (cj << 5) | 31) & 31
             for ck in range(first_k, last_k + 1):
-                slot = slot_of(keys, slots, which, (ci << 32) | (cj << 16) | ck)
+                slot = slot_of(keys, slots, which, key_of_cell(ci, cj, ck))
                 if slot < 0:
                     return True
                 if slot == EMPTY_SLOT:
@@ -243,31 +272,29 @@ def is_something_near(
 
 
 @inlined
-def is_sphere_free(
-    keys, slots, words, masks, used, which, spheres, n, side, size, ox, oy, oz,
-    a, b, c, u, d, e, f, v, g, h, m, w,
-):  # fmt: skip
-    """Whether no voxel is in the box around sphere n, placed by rotation a .. m and shift u, v, w.
+def is_sphere_free(keys, slots, words, masks, used, which, spheres, n, transform, place, reached):
+    """Whether no voxel is in the box around sphere n of a placed shell, wider by `reached` voxels.
 
     Unknown cells count as voxels; what is outside the grid is free.
     """
-    x, y, z = spheres[n, 0], spheres[n, 1], spheres[n, 2]
-    radius = spheres[n, 3] / size
-    sx = (turn(a, b, c, x, y, z) + u - ox) / size
-    sy = (turn(d, e, f, x, y, z) + v - oy) / size
-    sz = (turn(g, h, m, x, y, z) + w - oz) / size
-    if sx + radius < 0.0 or sy + radius < 0.0 or sz + radius < 0.0:
+    side = place.side
+    x, y, z = moved(transform, spheres[n, 0], spheres[n, 1], spheres[n, 2])
+    radius = spheres[n, 3] / place.size + reached
+    x = (x - place.x) / place.size
+    y = (y - place.y) / place.size
+    z = (z - place.z) / place.size
+    if x + radius < 0.0 or y + radius < 0.0 or z + radius < 0.0:
         return True
-    if sx - radius >= side or sy - radius >= side or sz - radius >= side:
+    if x - radius >= side or y - radius >= side or z - radius >= side:
         return True
     return not is_something_near(
         keys, slots, words, masks, used, which,
-        np.int64(max(sx - radius, 0.0)),
-        np.int64(max(sy - radius, 0.0)),
-        np.int64(max(sz - radius, 0.0)),
-        np.int64(min(sx + radius, side - 1.0)),
-        np.int64(min(sy + radius, side - 1.0)),
-        np.int64(min(sz + radius, side - 1.0)),
+        np.int64(max(x - radius, 0.0)),
+        np.int64(max(y - radius, 0.0)),
+        np.int64(max(z - radius, 0.0)),
+        np.int64(min(x + radius, side - 1.0)),
+        np.int64(min(y + radius, side - 1.0)),
+        np.int64(min(z + radius, side - 1.0)),
     )  # fmt: skip
 
 
@@ -283,124 +310,148 @@ def with_missed(missed, count, key):
     return count
 
 
+@inlined
+def free_runs(
+    keys, slots, words, masks, used, which, spheres, groups, cluster, transform, place, reached
+):
+    """How many runs from number `cluster` on are far from everything: a group, one, or none.
+
+    None of a shell without spheres. What is farther away than `reached` voxels counts as far.
+    """
+    if spheres.shape[0] == 0:
+        return 0
+    if cluster % GROUP == 0 and is_sphere_free(
+        keys, slots, words, masks, used, which, groups, cluster // GROUP, transform, place, reached
+    ):
+        return GROUP
+    if is_sphere_free(
+        keys, slots, words, masks, used, which, spheres, cluster, transform, place, reached
+    ):
+        return 1
+    return 0
+
+
+@inlined
+def place_run(columns, start, count, transform, place, scratch):
+    """Points start .. start + count into scratch: metres in rows 0 to 2, voxels in rows 3 to 5.
+
+    One loop an axis, which the compiler makes vectors of: that halves the time of a flat frame of
+    100,000 points.
+    """
+    ox, oy, oz, size = place.x, place.y, place.z, place.size
+    for at in range(count):
+        x, y, z = columns[0, start + at], columns[1, start + at], columns[2, start + at]
+        x, y, z = moved(transform, x, y, z)
+        scratch[0, at] = x
+        scratch[1, at] = y
+        scratch[2, at] = z
+    for at in range(count):
+        scratch[3, at] = (scratch[0, at] - ox) / size
+    for at in range(count):
+        scratch[4, at] = (scratch[1, at] - oy) / size
+    for at in range(count):
+        scratch[5, at] = (scratch[2, at] - oz) / size
+
+
+@inlined
+def enter_cell(keys, slots, masks, used, which, key, missed, n_missed):
+    """Look a cell up -> its slot, its mask, and how many unknown cells are on the list `missed`.
+
+    The mask of a cell that is empty or unknown is zero.
+    """
+    slot = slot_of(keys, slots, which, key)
+    mask = np.uint64(0)
+    if slot > EMPTY_SLOT:
+        used[slot] = 1
+        mask = masks[slot]
+    elif slot < 0:
+        n_missed = with_missed(missed, n_missed, key)
+    return slot, mask, n_missed
+
+
 @leaf
-def felt(cells, which, shell, pose, place, stiffness, met, missed, out):
-    """One frame: hits of a placed shell and their wrench into out (RESULTS,).
+def respond_at(law, is_hit, sample, transform, px, py, pz, nx, ny, nz, ox, oy, oz, size):
+    """Depth, weight and turned normal of a placed point p; n is its normal in the tool's frame."""
+    nx, ny, nz = turned(transform, nx, ny, nz)
+    cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
+    depth, weight = respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+    return depth, weight, nx, ny, nz
+
+
+@leaf
+def felt(cells, which, shell, pose, place, law, met, missed, out):
+    """One frame: hits of a placed shell, and the wrench of what is felt, into out (RESULTS,).
 
     met (N,) takes the indices of the hits, missed (1 + MOST_MISSED,) the number of unknown cells
     that points are in and their keys; unknown points neither hit nor miss. The arithmetic, and the
     order of the sums, are those of `contact.locate` and `contact.refine`.
     """
-    points, words, masks, used = shell.points, cells.words, cells.masks, cells.used
-    keys, slots = cells.keys, cells.slots
-    total = points.shape[0]
-    a, b, c, u = pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3]
-    d, e, f, v = pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3]
-    g, h, m, w = pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3]
+    # arrays by names of their own: a field that is read in a loop costs a counted reference
+    _, _, keys, slots, words, masks, used, payload = cells
+    points, _, spheres, groups, run, columns, scratch = shell
+    transform = transform_of(pose)
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
-    x, y, z = shell.center[0], shell.center[1], shell.center[2]
-    mx = turn(a, b, c, x, y, z) + u
-    my = turn(d, e, f, x, y, z) + v
-    mz = turn(g, h, m, x, y, z) + w
-    fx = fy = fz = tx = ty = tz = deepest = 0.0
-    count = n_contacts = n_unknown = n_missed = 0
-    memo = np.int64(-1)
-    slot = np.int64(UNKNOWN)
-    n_clusters = shell.spheres.shape[0]
-    run = shell.run
-    columns, scratch = shell.columns, shell.scratch
-    mask = np.uint64(0)
-    start = 0
-    cluster = 0
-    while start < total:
-        end = min(start + run, total)
-        if n_clusters > 0:
-            if cluster % GROUP == 0 and is_sphere_free(
-                keys, slots, words, masks, used, which, shell.groups, cluster // GROUP, side,
-                size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
-            ):  # fmt: skip
-                start += GROUP * run
-                cluster += GROUP
-                continue
-            is_free = is_sphere_free(
-                keys, slots, words, masks, used, which, shell.spheres, cluster, side,
-                size, ox, oy, oz, a, b, c, u, d, e, f, v, g, h, m, w,
-            )  # fmt: skip
-            cluster += 1
-            if is_free:
-                start = end
-                continue
-        # a run at a time, an axis after another: these loops the compiler makes vectors of, which
-        # halves the time of a flat frame of 100,000 points
-        for at in range(end - start):
-            x, y, z = columns[0, start + at], columns[1, start + at], columns[2, start + at]
-            scratch[0, at] = turn(a, b, c, x, y, z) + u
-            scratch[1, at] = turn(d, e, f, x, y, z) + v
-            scratch[2, at] = turn(g, h, m, x, y, z) + w
-        for at in range(end - start):
-            scratch[3, at] = (scratch[0, at] - ox) / size
-        for at in range(end - start):
-            scratch[4, at] = (scratch[1, at] - oy) / size
-        for at in range(end - start):
-            scratch[5, at] = (scratch[2, at] - oz) / size
-        for at in range(end - start):
+    mx, my, mz = moved(transform, shell.center[0], shell.center[1], shell.center[2])
+    fx = fy = fz = tx = ty = tz = weight = deepest = 0.0
+    n_hits = n_contacts = n_unknown = n_missed = cluster = start = 0
+    last_key, slot, mask = np.int64(-1), np.int64(UNKNOWN), np.uint64(0)
+    while start < points.shape[0]:
+        n_free = free_runs(
+            keys, slots, words, masks, used, which, spheres, groups, cluster, transform, place,
+            reach(law),
+        )  # fmt: skip
+        if n_free > 0:
+            cluster += n_free
+            start += n_free * run
+            continue
+        n_run = min(run, points.shape[0] - start)
+        place_run(columns, start, n_run, transform, place, scratch)
+        for at in range(n_run):
             x, y, z = scratch[3, at], scratch[4, at], scratch[5, at]
             if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
                 continue
             i, j, k = np.int64(x), np.int64(y), np.int64(z)
             key = cell_key(i, j, k)
-            if key != memo:
-                memo = key
-                slot = slot_of(keys, slots, which, key)
-                mask = np.uint64(0)
-                if slot > EMPTY_SLOT:
-                    used[slot] = 1
-                    mask = masks[slot]
-                elif slot < 0:
-                    n_missed = with_missed(missed, n_missed, key)
+            if key != last_key:
+                last_key = key
+                slot, mask, n_missed = enter_cell(
+                    keys, slots, masks, used, which, key, missed, n_missed
+                )
             # by the bricks first: most of space is free, and the mask is in a register
             if not (mask >> brick_bit(i, j, k)) & np.uint64(1):
                 if slot < 0:
                     n_unknown += 1
                 continue
-            if not (words[slot, ((i & 31) << 5) | (j & 31)] >> np.uint32(k & 31)) & 1:
+            is_hit = bit_in(words[slot, column_of(i, j)], k) != 0
+            sample = sample_slot(law, payload, slot, x, y, z)
+            if not (is_hit or sample <= reach(law)):
                 continue
             n = start + at
             px, py, pz = scratch[0, at], scratch[1, at], scratch[2, at]
-            nx, ny, nz = points[n, 3], points[n, 4], points[n, 5]
-            nx, ny, nz = (
-                turn(a, b, c, nx, ny, nz),
-                turn(d, e, f, nx, ny, nz),
-                turn(g, h, m, nx, ny, nz),
-            )
-            cx = center_of(px, ox, size)
-            cy = center_of(py, oy, size)
-            cz = center_of(pz, oz, size)
-            depth = contact_depth(px, py, pz, nx, ny, nz, cx, cy, cz)
-            met[count] = n
-            count += 1
+            depth, share, nx, ny, nz = respond_at(
+                law, is_hit, sample, transform, px, py, pz, points[n, 3], points[n, 4],
+                points[n, 5], ox, oy, oz, size,
+            )  # fmt: skip
+            weight += share
+            if is_hit:
+                met[n_hits] = n
+                n_hits += 1
             if depth > 0.0:
                 n_contacts += 1
                 deepest = max(deepest, depth)
-                x, y, z = contact_force(nx, ny, nz, depth, stiffness)
-                fx += x
-                fy += y
-                fz += z
-                x, y, z = moment(px - mx, py - my, pz - mz, x, y, z)
-                tx += x
-                ty += y
-                tz += z
-        start = end
-    average_into(out, count, fx, fy, fz, tx, ty, tz)
-    out[HITS] = count
-    out[CONTACTS] = n_contacts
-    out[UNKNOWNS] = n_unknown
-    out[DEEPEST] = deepest
+                fx, fy, fz, tx, ty, tz = accumulate(
+                    fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
+                )
+        cluster += 1
+        start += n_run
+    average_into(out, weight, fx, fy, fz, tx, ty, tz)
+    out[HITS], out[CONTACTS] = n_hits, n_contacts
+    out[UNKNOWNS], out[DEEPEST] = n_unknown, deepest
     missed[LISTED] = n_missed
 
 
-@entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, FLOAT, INTS, INTS, FLOATS2)
-def feel_kernel(cells, reader, shell, poses, place, stiffness, met, missed, out):
+@entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, INTS, FLOATS2)
+def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out):
     """`felt` at poses (M, 4, 4) into out (M, RESULTS); met and missed keep the last frame's.
 
     Returns the number of poses done: fewer than M when one is not rigid.
@@ -409,7 +460,7 @@ def feel_kernel(cells, reader, shell, poses, place, stiffness, met, missed, out)
         if not is_rigid(poses[n]):
             return n
         which = begin_frame(cells, reader)
-        felt(cells, which, shell, poses[n], place, stiffness, met, missed, out[n])
+        felt(cells, which, shell, poses[n], place, law, met, missed, out[n])
         end_frame(cells, reader)
     return poses.shape[0]
 

@@ -1,0 +1,129 @@
+"""The force law: what a point of the shell feels, and how a frame adds it up. It stands only here.
+
+A *hit* is a point inside an occupied voxel. Hits come from the occupancy alone and are the same
+under every law. What a point *feels* is the law's answer: a depth, and a weight in the frame's
+average. A law may feel a point that is no hit (a distance field does, before the surface), and it
+need not feel every hit (the tangent plane does not, above the plane).
+
+A law is a NamedTuple of its numbers, with the field `stiffness` among them, and the functions in
+`Leaves` that `define` enters for its type. Kernels are compiled once for each type of law. The
+other way, one compiled kernel and a branch on a number in the law, was not taken: every frame would
+pass the payload of every law, at 0.3 us an array, and a law could not be added from outside.
+
+A *payload* is what a law reads beside the occupancy: an array next to the rows of a frame, or next
+to the cells in memory. None stands for no payload and costs a frame nothing.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+from hapticdb.kernels._jit import FLOAT, chosen_by_type, fields_of, leaf
+from hapticdb.kernels.rigid import moment
+
+AVERAGE_FROM = 10.0
+"""Sum of weights from which force and torque are averaged (McNeely et al. 1999, section 4.3).
+
+A larger number lets a frame of many contacts push harder.
+"""
+NOTHING_NEAR = math.inf
+"""Sample of a point near which a law's payload has nothing."""
+
+
+def no_sample(law, payload, at, x, y, z):  # noqa: ARG001 - the arguments of every such leaf
+    """Sample of a law that reads no payload."""
+    return NOTHING_NEAR
+
+
+def no_reach(law):  # noqa: ARG001 - the arguments of every such leaf
+    """Reach of a law that feels only hits."""
+    return 0.0
+
+
+class Leaves(NamedTuple):
+    """Functions of one type of law: plain Python that numba compiles into the kernels.
+
+    respond : (law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size) -> depth, weight. Of
+        the point p with the inward normal n in the voxel of centre c, world frame, metres; `size`
+        is the voxel's. Depth in metres, felt where above 0. The weight is 1 for a point that counts
+        fully in the average, 0 for one that does not.
+    reach : (law) -> voxels within which a point is felt that is no hit. A point that is no hit is
+        left out when its sample is above the reach.
+    sample_row, sample_slot : (law, payload, at, x, y, z) -> sample. What the payload says about the
+        point (x, y, z), in voxels from the grid's origin, in a row of the index table or in a
+        slot of the resident cells. Of several rows the least sample counts.
+    """
+
+    respond: Callable[..., Any]
+    reach: Callable[..., Any] = no_reach
+    sample_row: Callable[..., Any] = no_sample
+    sample_slot: Callable[..., Any] = no_sample
+
+
+LEAVES: dict[type, Leaves] = {}
+"""Functions by the type of the law."""
+
+
+def define(law_type: type, leaves: Leaves) -> None:
+    """Enter the functions of a type of law, before a kernel is called with one."""
+    LEAVES[law_type] = leaves
+
+
+respond = chosen_by_type(lambda law_type: LEAVES[law_type].respond)
+reach = chosen_by_type(lambda law_type: LEAVES[law_type].reach)
+sample_row = chosen_by_type(lambda law_type: LEAVES[law_type].sample_row)
+sample_slot = chosen_by_type(lambda law_type: LEAVES[law_type].sample_slot)
+
+
+@leaf
+def accumulate(
+    fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, stiffness
+):  # fmt: skip
+    """Add one felt point to a frame's force and torque: F = K d n, T = (p - m) x F.
+
+    m is the tool's centre. Sums run in the order of the shell's points.
+    """
+    x, y, z = stiffness * depth * nx, stiffness * depth * ny, stiffness * depth * nz
+    rx, ry, rz = moment(px - mx, py - my, pz - mz, x, y, z)
+    return fx + x, fy + y, fz + z, tx + rx, ty + ry, tz + rz
+
+
+@leaf
+def average_into(out, weight, fx, fy, fz, tx, ty, tz):
+    """Wrench into out (6+,), divided by a tenth of the weight from `AVERAGE_FROM` on."""
+    out[0] = fx
+    out[1] = fy
+    out[2] = fz
+    out[3] = tx
+    out[4] = ty
+    out[5] = tz
+    if weight >= AVERAGE_FROM:
+        tenth = weight / 10.0
+        for axis in range(6):
+            out[axis] /= tenth
+
+
+# --- the tangent plane ---------------------------------------------------------------------------
+
+
+class TangentPlaneLaw(NamedTuple):
+    """Tangent-plane law (McNeely, Puterbaugh and Troy 1999). stiffness: K, N/m."""
+
+    stiffness: float
+
+
+TANGENT_PLANE = fields_of(TangentPlaneLaw, FLOAT)
+
+
+@leaf
+def depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz):
+    """Depth below the plane through the voxel's centre c, metres: (c - p) . n, negative above."""
+    return (cx - px) * nx + (cy - py) * ny + (cz - pz) * nz
+
+
+def tangent_plane(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # noqa: ARG001
+    """Depth below the tangent plane; every hit counts in the average, above the plane, too."""
+    return depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz), 1.0
+
+
+define(TangentPlaneLaw, Leaves(respond=tangent_plane))

@@ -1,0 +1,339 @@
+"""How near a swept shell comes to occupied voxels, by bounds that are kept from pose to pose.
+
+The search stops at the first cell that is not resident and says where, so that whoever fetches
+cells can bring it in and go on; nothing is guessed.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import (
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    entry,
+    fields_of,
+    inlined,
+    leaf,
+)
+from hapticdb.kernels.resident.cells import (
+    CELLS,
+    CLUSTERS,
+    EMPTY_SLOT,
+    PLACE,
+    begin_frame,
+    end_frame,
+    key_of_cell,
+    slot_of,
+    spread_key,
+)
+from hapticdb.kernels.resident.sweep import CAUTION, packed, unpacked
+from hapticdb.kernels.rigid import moved, transform_of
+
+MARGIN = 4.0
+"""Voxels beyond what matters now that a search looks, so that it need not be repeated soon."""
+
+
+class Bounds(NamedTuple):
+    """What is known about clearance, in voxels, kept from sample to sample.
+
+    expiry (N,): for each point, a travel at which it may have come to an occupied voxel at the
+    earliest, if it went straight there: its distance now is at least expiry - travel; of_runs (C,):
+    the same for all points of each run of a cluster; nearest (N,)
+    int64: the voxel, packed, that it was nearest to when last looked at, or -1; least (W,): of each
+    window of the path so far; state (2,): the least expiry, the least distance of all; where (5,)
+    int64: sample, point and voxel of that, the point that was nearest last, and where it stopped.
+    """
+
+    expiry: NDArray[np.float64]
+    of_runs: NDArray[np.float64]
+    nearest: NDArray[np.int64]
+    least: NDArray[np.float64]
+    state: NDArray[np.float64]
+    where: NDArray[np.int64]
+
+
+BOUNDS = fields_of(Bounds, FLOATS, FLOATS, INTS, FLOATS, FLOATS, INTS)
+
+
+SOONEST, LEAST = 0, 1
+"""Indices into `Bounds.state`: the least expiry of all points, and the least distance, voxels."""
+SAMPLE, POINT, VOXEL, NEAREST, STOPPED = 0, 1, 2, 3, 4
+"""Indices into `Bounds.where`: sample, point and voxel of the least distance; the point that was
+nearest last; the point, or the first of a run, at which the search stopped."""
+
+
+@leaf
+def gap(x, low, high):
+    """How far x lies outside the interval low .. high."""
+    return max(low - x, x - high, 0.0)
+
+
+@inlined
+def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
+    """Least squared distance to a voxel of one cell, and that voxel, packed; those given if nearer.
+
+    All in voxels.
+    """
+    radius = math.sqrt(square)
+    for bi in range(4):
+        if not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
+            continue
+        i0 = (ci << 5) + (bi << 3)
+        di = gap(x, i0, i0 + 8.0)
+        if di >= radius:
+            continue
+        for bj in range(4):
+            if not (mask >> np.uint64((bi << 4) | (bj << 2))) & np.uint64(0xF):
+                continue
+            j0 = (cj << 5) + (bj << 3)
+            dj = gap(y, j0, j0 + 8.0)
+            if di * di + dj * dj >= square:
+                continue
+            for bk in range(4):
+                if not (mask >> np.uint64((bi << 4) | (bj << 2) | bk)) & np.uint64(1):
+                    continue
+                k0 = (ck << 5) + (bk << 3)
+                dk = gap(z, k0, k0 + 8.0)
+                if di * di + dj * dj + dk * dk >= square:
+                    continue
+                for i in range(i0, i0 + 8):
+                    dx = gap(x, i, i + 1.0)
+                    if dx * dx >= square:
+                        continue
+                    for j in range(j0, j0 + 8):
+                        dy = gap(y, j, j + 1.0)
+                        column = dx * dx + dy * dy
+                        if column >= square:
+                            continue
+                        word = words[slot, ((i & 31) << 5) | (j & 31)]
+                        byte = (np.int64(word) >> (k0 & 31)) & 255
+                        k = k0
+                        while byte:
+                            if byte & 1:
+                                dz = gap(z, k, k + 1.0)
+                                if column + dz * dz < square:
+                                    square = column + dz * dz
+                                    voxel = packed(i, j, k)
+                            byte >>= 1
+                            k += 1
+    return square, voxel
+
+
+@leaf
+def square_to(x, y, z, voxel):
+    """Squared distance to the box of a packed voxel, all in voxels."""
+    i, j, k = unpacked(voxel)
+    dx, dy, dz = gap(x, i, i + 1.0), gap(y, j, j + 1.0), gap(z, k, k + 1.0)
+    return dx * dx + dy * dy + dz * dz
+
+
+@inlined
+def nearest_voxel(keys, slots, words, masks, used, which, x, y, z, square, voxel, side):
+    """Occupied voxel nearest to (x, y, z), all in voxels, if nearer than the root of `square`.
+
+    Returns its box's squared distance and the voxel, packed, or both as given; voxel -2 when a cell
+    in reach is not resident.
+    """
+    radius = math.sqrt(square)
+    top = np.int64(side) - 1
+    first_i = np.int64(max(math.floor(x - radius), 0)) >> 5
+    first_j = np.int64(max(math.floor(y - radius), 0)) >> 5
+    first_k = np.int64(max(math.floor(z - radius), 0)) >> 5
+    last_i = np.int64(min(math.floor(x + radius), top)) >> 5
+    last_j = np.int64(min(math.floor(y + radius), top)) >> 5
+    last_k = np.int64(min(math.floor(z + radius), top)) >> 5
+    for ci in range(first_i, last_i + 1):
+        di = gap(x, 32.0 * ci, 32.0 * ci + 32.0)
+        for cj in range(first_j, last_j + 1):
+            dj = gap(y, 32.0 * cj, 32.0 * cj + 32.0)
+            for ck in range(first_k, last_k + 1):
+                dk = gap(z, 32.0 * ck, 32.0 * ck + 32.0)
+                if di * di + dj * dj + dk * dk >= square:
+                    continue
+                slot = slot_of(keys, slots, which, key_of_cell(ci, cj, ck))
+                if slot < 0:
+                    return square, np.int64(-2)
+                if slot == EMPTY_SLOT:
+                    continue
+                used[slot] = 1
+                square, voxel = nearest_in_cell(
+                    words, slot, masks[slot], ci, cj, ck, x, y, z, square, voxel
+                )
+    return square, voxel
+
+
+@inlined
+def nearest_to(keys, slots, words, masks, used, which, x, y, z, cap, near, side):
+    """Squared distance from (x, y, z) to the nearest occupied voxel, and that voxel; all in voxels.
+
+    Looked for within `cap` and `MARGIN`, and no farther than the voxel `near`, packed, or -1.
+    The voxel is -1 when there is none and -2 when a cell in reach is not resident.
+    """
+    square, voxel = (cap + MARGIN) ** 2, np.int64(-1)
+    if near >= 0 and square_to(x, y, z, near) < square:
+        square, voxel = square_to(x, y, z, near), near
+    return nearest_voxel(
+        keys, slots, words, masks, used, which, x, y, z, square, voxel, side
+    )  # fmt: skip
+
+
+@inlined
+def far_run(
+    keys, slots, words, masks, used, which, spheres, at, near, cap, transform, place
+):  # fmt: skip
+    """Bound, voxels, from a placed run's sphere to what is nearest, as far as `cap`; -1 if unknown.
+
+    near: a voxel, packed, to begin with, or -1. A point of the run is no nearer than the bound.
+    """
+    size = place.size
+    x, y, z = moved(transform, spheres[at, 0], spheres[at, 1], spheres[at, 2])
+    radius = spheres[at, 3] / size
+    square, voxel = nearest_to(
+        keys, slots, words, masks, used, which, (x - place.x) / size, (y - place.y) / size,
+        (z - place.z) / size, cap + radius, near, place.side,
+    )  # fmt: skip
+    return -1.0 if voxel == -2 else max(math.sqrt(square) - radius, 0.0)
+
+
+@inlined
+def near_points(
+    keys, slots, words, masks, used, which, points, run, at, transform, place, travel, cap, sample,
+    expiry, nearest, state, where,
+):  # fmt: skip
+    """Distances of those points of run `at` that may be nearer than `cap`, into arrays of `Bounds`.
+
+    -> the least of them and `cap`, and the run's earliest expiry, all in voxels; -1 and 0 when a
+    cell is unknown. sample: number of the pose on the path.
+    """
+    ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
+    soonest = np.inf
+    start = at * run
+    for p in range(start, min(start + run, points.shape[0])):
+        if expiry[p] - travel < cap:
+            x, y, z = moved(transform, points[p, 0], points[p, 1], points[p, 2])
+            square, voxel = nearest_to(
+                keys, slots, words, masks, used, which,
+                (x - ox) / size, (y - oy) / size, (z - oz) / size, cap, nearest[p], side,
+            )  # fmt: skip
+            if voxel == -2:
+                where[STOPPED] = p
+                return -1.0, 0.0
+            distance = math.sqrt(square)
+            nearest[p] = voxel
+            expiry[p] = travel + distance - CAUTION
+            if voxel >= 0 and distance < cap:
+                cap = distance
+                where[NEAREST] = p
+                if distance < state[LEAST]:
+                    state[LEAST] = distance
+                    where[SAMPLE] = sample
+                    where[POINT] = p
+                    where[VOXEL] = voxel
+        soonest = min(soonest, expiry[p])
+    return cap, soonest
+
+
+@entry(CELLS, INT, CLUSTERS, FLOATS3, INT, INT, FLOATS, INTS, PLACE, FLOAT, BOUNDS)
+def find_clearance(
+    cells, reader, shell, poses, first, base, travels, windows, place, small, bounds
+):  # fmt: skip
+    """Least distance from the points to an occupied voxel's box at poses[first:], in `bounds`.
+
+    travels (B,): how far any point can have come at each pose since the path's start, voxels;
+    windows (B,) int64: which of `bounds.least` each pose counts for; base: number of poses[0] as a
+    sample of the path; small: voxels, runs of no greater radius are looked at as one, before their
+    points. Returns how many poses are done: fewer than B when a cell was not resident,
+    and `bounds.where` has the point, or the first of the run.
+    """
+    _, _, keys, slots, words, masks, used, _ = cells
+    points, _, spheres, _, run, _, _ = shell
+    expiry, of_runs, nearest, least, state, where = bounds
+    which = begin_frame(cells, reader)
+    for n in range(first, poses.shape[0]):
+        travel, window = travels[n], windows[n]
+        cap = least[window]
+        if state[SOONEST] - travel >= cap:
+            continue
+        transform = transform_of(poses[n])
+        soonest = np.inf
+        # the run of what was nearest last comes first: it bounds the search for all others
+        for turn_of in range(-1, of_runs.shape[0]):
+            at = where[NEAREST] // run if turn_of < 0 else turn_of
+            is_expired = of_runs[at] - travel < cap and turn_of >= 0
+            if is_expired and spheres.shape[0] > 0 and spheres[at, 3] <= small * place.size:
+                bound = far_run(
+                    keys, slots, words, masks, used, which, spheres, at, nearest[at * run], cap,
+                    transform, place,
+                )  # fmt: skip
+                if bound < 0.0:
+                    where[STOPPED] = at * run
+                    end_frame(cells, reader)
+                    return n
+                of_runs[at] = max(of_runs[at], travel + bound - CAUTION)
+            if of_runs[at] - travel < cap:
+                cap, soonest_of_run = near_points(
+                    keys, slots, words, masks, used, which, points, run, at, transform, place,
+                    travel, cap, base + n, expiry, nearest, state, where,
+                )  # fmt: skip
+                if cap < 0.0:
+                    end_frame(cells, reader)
+                    return n
+                of_runs[at] = soonest_of_run
+            if turn_of >= 0:
+                soonest = min(soonest, of_runs[at])
+        least[window] = cap
+        state[SOONEST] = soonest
+    end_frame(cells, reader)
+    return poses.shape[0]
+
+
+@entry(FLOATS2, FLOATS3, PLACE, INT, INT, FLOAT, INTS, INT)
+def cells_near(points, poses, place, first, stride, reach, found, most):
+    """Distinct cells within reach, metres, of points (N, 3+): at poses[0] from point `first` on.
+
+    Then at every stride-th pose, all points. They go into found (capacity,) int64, -1 all over
+    before, an open-addressing set whose capacity is a power of two, above 2 most; it ends before
+    they are more than `most`. Returns how many they are.
+    """
+    capacity = found.shape[0]
+    ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
+    top = side - 1.0
+    r = reach / size
+    count = 0
+    for n in range(0, poses.shape[0], stride):
+        transform = transform_of(poses[n])
+        low_memo = high_memo = np.int64(-1)
+        for p in range(first if n == 0 else 0, points.shape[0]):
+            x, y, z = moved(transform, points[p, 0], points[p, 1], points[p, 2])
+            x, y, z = (x - ox) / size, (y - oy) / size, (z - oz) / size
+            if not (-r <= x <= side + r and -r <= y <= side + r and -r <= z <= side + r):
+                continue
+            first_i, last_i = np.int64(max(x - r, 0.0)) >> 5, np.int64(min(x + r, top)) >> 5
+            first_j, last_j = np.int64(max(y - r, 0.0)) >> 5, np.int64(min(y + r, top)) >> 5
+            first_k, last_k = np.int64(max(z - r, 0.0)) >> 5, np.int64(min(z + r, top)) >> 5
+            low = key_of_cell(first_i, first_j, first_k)
+            high = key_of_cell(last_i, last_j, last_k)
+            if low == low_memo and high == high_memo:
+                continue
+            low_memo, high_memo = low, high
+            n_cells = (last_i - first_i + 1) * (last_j - first_j + 1) * (last_k - first_k + 1)
+            if count + n_cells > most and count > 0:
+                return count
+            for ci in range(first_i, last_i + 1):
+                for cj in range(first_j, last_j + 1):
+                    for ck in range(first_k, last_k + 1):
+                        key = key_of_cell(ci, cj, ck)
+                        at = spread_key(key, capacity)
+                        while found[at] >= 0 and found[at] != key:
+                            at = (at + 1) & (capacity - 1)
+                        if found[at] < 0:
+                            found[at] = key
+                            count += 1
+    return count

@@ -1,0 +1,169 @@
+"""Rigid motion: rotations, poses and quaternions as kernels use them.
+
+A pose is a (4, 4) matrix. A quaternion has the scalar first and unit length. A turn is a rotation
+vector: its axis times its angle in radians.
+"""
+
+import math
+
+import numpy as np
+
+from hapticdb.kernels._jit import FLOATS2, FLOATS3, entry, inlined, leaf
+
+
+@leaf
+def is_rigid(pose):
+    """Whether a (4, 4) matrix is finite, a rotation to 1e-6, and has the last row 0 0 0 1."""
+    for a in range(4):
+        for b in range(4):
+            if not np.isfinite(pose[a, b]):
+                return False
+    for b in range(3):
+        if pose[3, b] != 0.0:
+            return False
+    if pose[3, 3] != 1.0:
+        return False
+    for a in range(3):
+        for b in range(a, 3):
+            dot = pose[0, a] * pose[0, b] + pose[1, a] * pose[1, b] + pose[2, a] * pose[2, b]
+            if abs(dot - (1.0 if a == b else 0.0)) > 1e-6:
+                return False
+    det = (
+        pose[0, 0] * (pose[1, 1] * pose[2, 2] - pose[1, 2] * pose[2, 1])
+        - pose[0, 1] * (pose[1, 0] * pose[2, 2] - pose[1, 2] * pose[2, 0])
+        + pose[0, 2] * (pose[1, 0] * pose[2, 1] - pose[1, 1] * pose[2, 0])
+    )
+    return det > 0.0
+
+
+@inlined
+def transform_of(pose):
+    """Upper three rows of a pose as twelve numbers, row by row.
+
+    Loops over points take these: an array handed to a leaf costs a counted reference each time.
+    """
+    return (
+        pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3],
+        pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3],
+        pose[2, 0], pose[2, 1], pose[2, 2], pose[2, 3],
+    )  # fmt: skip
+
+
+@leaf
+def turn(a, b, c, x, y, z):
+    """One coordinate of a turned vector: a row (a, b, c) of the rotation times (x, y, z)."""
+    return a * x + b * y + c * z
+
+
+@leaf
+def turned(transform, x, y, z):
+    """Vector (x, y, z) turned by a pose's rotation; see `transform_of`."""
+    a, b, c, _, d, e, f, _, g, h, m, _ = transform
+    return turn(a, b, c, x, y, z), turn(d, e, f, x, y, z), turn(g, h, m, x, y, z)
+
+
+@leaf
+def moved(transform, x, y, z):
+    """Point (x, y, z) placed by a pose; see `transform_of`."""
+    a, b, c, u, d, e, f, v, g, h, m, w = transform
+    return turn(a, b, c, x, y, z) + u, turn(d, e, f, x, y, z) + v, turn(g, h, m, x, y, z) + w
+
+
+@leaf
+def moment(rx, ry, rz, fx, fy, fz):
+    """Torque of a force at a lever: r x F."""
+    return ry * fz - rz * fy, rz * fx - rx * fz, rx * fy - ry * fx
+
+
+@leaf
+def product(aw, ax, ay, az, bw, bx, by, bz):
+    """Quaternion of turning by b, then by a."""
+    return (
+        aw * bw - ax * bx - ay * by - az * bz,
+        aw * bx + ax * bw + ay * bz - az * by,
+        aw * by - ax * bz + ay * bw + az * bx,
+        aw * bz + ax * by - ay * bx + az * bw,
+    )
+
+
+@leaf
+def turn_of(w, x, y, z):
+    """Shortest turn that a unit quaternion stands for."""
+    sine = math.sqrt(x * x + y * y + z * z)
+    if w < 0.0:
+        w, x, y, z = -w, -x, -y, -z
+    # the quotient's limit: w is 1 there
+    scale = 2.0 if sine < 1e-12 else 2.0 * math.atan2(sine, w) / sine
+    return scale * x, scale * y, scale * z
+
+
+@leaf
+def quaternion_by(x, y, z):
+    """Unit quaternion of a turn."""
+    angle = math.sqrt(x * x + y * y + z * z)
+    scale = 0.5 if angle < 1e-12 else math.sin(0.5 * angle) / angle
+    return math.cos(0.5 * angle), scale * x, scale * y, scale * z
+
+
+@leaf
+def quaternion_in(pose):
+    """Unit quaternion of a pose's rotation, from its longest component (Shepperd 1978)."""
+    xx, yy, zz = pose[0, 0], pose[1, 1], pose[2, 2]
+    w, x, y, z = 1.0 + xx + yy + zz, 1.0 + xx - yy - zz, 1.0 - xx + yy - zz, 1.0 - xx - yy + zz
+    longest = max(w, x, y, z)
+    if longest == w:
+        x, y, z = pose[2, 1] - pose[1, 2], pose[0, 2] - pose[2, 0], pose[1, 0] - pose[0, 1]
+    elif longest == x:
+        w, y, z = pose[2, 1] - pose[1, 2], pose[0, 1] + pose[1, 0], pose[0, 2] + pose[2, 0]
+    elif longest == y:
+        w, x, z = pose[0, 2] - pose[2, 0], pose[0, 1] + pose[1, 0], pose[1, 2] + pose[2, 1]
+    else:
+        w, x, y = pose[1, 0] - pose[0, 1], pose[0, 2] + pose[2, 0], pose[1, 2] + pose[2, 1]
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return w * scale, x * scale, y * scale, z * scale
+
+
+@leaf
+def write_pose(px, py, pz, w, x, y, z, pose):
+    """Write position and unit quaternion into pose (4, 4), whose last row stays."""
+    pose[0, 0] = 1.0 - 2.0 * (y * y + z * z)
+    pose[0, 1] = 2.0 * (x * y - w * z)
+    pose[0, 2] = 2.0 * (x * z + w * y)
+    pose[0, 3] = px
+    pose[1, 0] = 2.0 * (x * y + w * z)
+    pose[1, 1] = 1.0 - 2.0 * (x * x + z * z)
+    pose[1, 2] = 2.0 * (y * z - w * x)
+    pose[1, 3] = py
+    pose[2, 0] = 2.0 * (x * z - w * y)
+    pose[2, 1] = 2.0 * (y * z + w * x)
+    pose[2, 2] = 1.0 - 2.0 * (x * x + y * y)
+    pose[2, 3] = pz
+
+
+@leaf
+def pose_of_quaternion(px, py, pz, w, x, y, z, out):
+    """Write the whole matrix, out (4, 4), of a position and a unit quaternion, not normalised here.
+
+    A session and its replay both come this way, so that the bits are the same.
+    """
+    write_pose(px, py, pz, w, x, y, z, out)
+    out[3, 0] = 0.0
+    out[3, 1] = 0.0
+    out[3, 2] = 0.0
+    out[3, 3] = 1.0
+
+
+@entry(FLOATS2, FLOATS3)
+def poses_of(states, out):
+    """Matrices, out (M, 4, 4), of states (M, 7): m, unit quaternion."""
+    for m in range(states.shape[0]):
+        pose_of_quaternion(
+            states[m, 0],
+            states[m, 1],
+            states[m, 2],
+            states[m, 3],
+            states[m, 4],
+            states[m, 5],
+            states[m, 6],
+            out[m],
+        )

@@ -20,7 +20,6 @@ LONG_FUNCTIONS = {
     "replace it",
     "src/hapticdb/kernels/hand/coupling.py:cut_back": "likewise",
     "src/hapticdb/kernels/resident/cells.py:felt": "one pass over the points",
-    "src/hapticdb/realtime/session.py:__init__": "an option a line",
 }
 """Functions that may be longer, and why."""
 

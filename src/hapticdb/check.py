@@ -25,9 +25,11 @@ from hapticdb.store.believed import RowsChecksum
 from hapticdb.store.connect import findings_before_opening, open_store
 
 ROWS_AT_ONCE = 1 << 17
+"""Rows that are read at a time. More takes more memory and hardly less time."""
 MOST_FINDINGS = 1000
-"""Kept in a report; all are counted."""
+"""Findings that a report keeps; it counts all of them."""
 BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
+"""Number of set bits of each byte."""
 
 
 class CheckProgress(NamedTuple):
@@ -75,7 +77,7 @@ class CheckReport:
         return self.n_findings == 0
 
     def add(self, finding: str) -> None:
-        """Keep one more, once."""
+        """Add a finding, unless it is there already."""
         if finding in self.findings:
             return
         self.n_findings += 1
@@ -141,7 +143,7 @@ def _check(store: Store, report: CheckReport, progress: CheckCallback | None) ->
 
 
 def _log_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
-    """Gaps in the log, and objects that it tells otherwise."""
+    """Gaps in the log of changes, and objects that do not agree with it."""
     last: dict[int, Change] = {}
     expected = 1
     key_end = 1 << 3 * store.grid.bits
@@ -173,14 +175,14 @@ def _log_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
 
 
 class _Sums:
-    """What was read of each object so far."""
+    """Voxels and checksum of each object, from the rows read so far."""
 
     def __init__(self) -> None:
         self.voxels: dict[int, int] = {}
         self.checksums: dict[int, RowsChecksum] = {}
 
     def add(self, rows: Rows) -> None:
-        """Count a batch, and go on with its objects' checksums."""
+        """Add a batch to the counts and the checksums of its objects."""
         if rows.occupancy.size:
             counts = BITS[rows.occupancy].reshape(-1, BRICK_BYTES).sum(axis=1, dtype=np.int64)
         else:
@@ -252,7 +254,7 @@ class _Places:
         self._boxes = np.array(boxes, dtype=np.int64).reshape(-1, 2, 3)
 
     def findings(self, rows: Rows) -> Iterator[str]:
-        """What is wrong with the places of a batch, the first row of each kind."""
+        """What is wrong with the places of a batch: the first row of each kind of fault."""
         outside = (rows.keys < 0) | (rows.keys >= self._key_end)
         if outside.any():
             yield f"key {int(rows.keys[outside][0])} lies outside the grid"

@@ -71,7 +71,7 @@ def farthest_corner(a: Object, b: Object) -> float:
 
 @dataclass(frozen=True)
 class Difference:
-    """How two environments differ. The same part is what has the same link and name.
+    """How two environments differ. Objects with the same link and name are the same part.
 
     Attributes
     ----------
@@ -80,18 +80,18 @@ class Difference:
     grids : tuple of two Grid
         Theirs; voxels are compared only where `is_same_grid`.
     only_in_a, only_in_b : tuple of Object
-        Parts that the other has not.
+        Parts that the other environment lacks.
     changed : tuple of pairs of Object
         The same part with another geometry (`digest`).
     moved : tuple of pairs of Object
         The same geometry in another place (`transform`).
     voxels : tuple of VoxelDifference
-        The same geometry at the same place, of other voxels.
+        The same geometry in the same place, but with other voxels.
     elsewhere : tuple of VoxelDifference
         The voxels of those that are changed or moved; empty where the grids are not the same.
     renumbered, described : tuple of pairs of Object
-        The same part with another id, or with other attributes or another bounding box:
-        differences that nobody feels.
+        The same part with another id, or with other attributes or another bounding box. These
+        differences change no wrench.
     compared, n_voxels : int
         Objects of the same geometry at the same place, whose voxels were compared, and those
         voxels.
@@ -255,7 +255,7 @@ def _boxes(
     ):
         yield low, high
         return
-    # in lexicographic order only a slab of one i or more is a range with little else in it
+    # in lexicographic order only slabs of i are ranges that hold few rows of other places
     is_sliced = edges[0] > BRICK_EDGE and not all(store.grid.is_hierarchical for store in stores)
     axis = 0 if is_sliced else int(edges.argmax())
     middle = low[axis] + (edges[axis] // 2 & -BRICK_EDGE)
@@ -266,7 +266,7 @@ def _boxes(
 
 
 def _inside(bricks: Bricks, grid: Grid, low: Corner, high: Corner) -> Bricks:
-    """Those of the bricks that lie in the box: ranges of keys may cover more."""
+    """Bricks that lie in the box: the ranges of keys that cover it also hold others."""
     corners = (
         curves.decode(bricks.keys, max(grid.bits - BRICK_BITS, 0), curves.Z_ORDER) << BRICK_BITS
     )

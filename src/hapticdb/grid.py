@@ -14,12 +14,16 @@ from hapticdb.kernels import curves
 CurveName = Literal["z", "hilbert", "lexicographic"]
 CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
 CURVE_CODES = {"lexicographic": 0, "z": 1, "hilbert": 2}
-"""Numbers of the curves, as `kernels.curves` has them; written here, so that it loads later."""
+"""Numbers of the curves. `kernels.curves` has the same; this copy spares its import."""
 MAX_BITS = 21
+"""Most bits an axis: three axes fit into the 63 bits of a key."""
 BRICK_BITS = 3
+"""Bits an axis of a voxel's place in its brick."""
 CELL_BITS = 5
+"""Bits an axis of a voxel's place in its cell."""
 ROOM = 1.6
-"""Edge of a fitted grid in longest sides of the bounding box: the room around the first file."""
+"""Edge of a fitted grid, in longest sides of the first file's bounding box. A larger value leaves
+more room around the file, and makes voxels larger."""
 
 
 @dataclass(frozen=True)
@@ -39,8 +43,8 @@ class Grid:
 
     Notes
     -----
-    Voxel (i, j, k) covers ``[i s, (i + 1) s)`` on each axis from the origin: half-open for points,
-    so that each has one voxel. Surfaces are voxelized with closed boxes.
+    Voxel (i, j, k) covers ``[i s, (i + 1) s)`` on each axis from the origin. The interval is
+    half-open, so that each point has one voxel. Surfaces are voxelized with closed boxes.
     """
 
     voxel_size: float
@@ -156,7 +160,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridOptions:
-    """What a user says about a grid; what is left out is fitted to the first file.
+    """A user's wishes for a grid. Everything that is left out is fitted to the first file.
 
     Attributes
     ----------
@@ -183,7 +187,7 @@ class GridOptions:
             raise GridError("bits, voxel size and extent contradict one another: give two of them")
         if self.extent is not None and not (math.isfinite(self.extent) and self.extent > 0):
             raise GridError(f"extent {self.extent}: give a positive number of longest sides")
-        # what can be checked before a file is read is checked before a file is read
+        # refuse bad values now, before a file is read
         Grid(
             self.voxel_size if self.voxel_size is not None else 1.0,
             _triple(self.origin) if self.origin is not None else (0.0, 0.0, 0.0),

@@ -17,15 +17,15 @@ from hapticdb.store.base import NOBODY, this_thread
 class Pool:
     """At most so many opened environments of one database, lent to threads one at a time.
 
-    Opening costs a connection, the statistics and the cost model: here they are paid once a member.
-    Who borrows gets the one that was given back last, with the warmest caches.
+    Opening costs a connection, the statistics and the cost model. In a pool each member pays them
+    once. A borrower gets the member that was given back last: its caches are the warmest.
 
     Parameters
     ----------
     url : str or path
         As for `hapticdb.open`.
     size : int
-        Members at most; opened when first needed, the first at once.
+        Members at most. The first is opened at once, the others when they are needed.
     read_only : bool
         Refuse every write.
     timeout : float
@@ -85,7 +85,7 @@ class Pool:
         self.close()
 
     def close(self) -> None:
-        """Close all members: those that are out as soon as they are given back."""
+        """Close all members; those that are lent, when they are given back."""
         with self._changed:
             self._is_closed = True
             left, self._free = self._free, []
@@ -96,7 +96,7 @@ class Pool:
 
     @contextlib.contextmanager
     def environment(self, timeout: float | None = None) -> Iterator[Environment]:
-        """Lend an environment to this thread, inside a ``with``; not to be used after it.
+        """Lend an environment to this thread inside a ``with``. Do not use it afterwards.
 
         Parameters
         ----------
@@ -115,7 +115,7 @@ class Pool:
         try:
             yield env
         except ConnectionLostError:
-            raise  # it connects anew by itself, and keeps its statistics
+            raise  # the member stays: it connects again by itself, and keeps its statistics
         except DatabaseError:
             is_sound = False
             raise
@@ -148,10 +148,10 @@ class Pool:
             raise
 
     def _take_back(self, env: Environment, *, is_sound: bool) -> None:
-        """Make a member free again; one that is broken or closed is replaced when needed."""
+        """Make a member free again. A broken or closed one is dropped: a new one may replace it."""
         with self._changed:
             if is_sound and not env.store.is_closed and not self._is_closed:
-                env.store.give_to(NOBODY)  # whoever still holds it is refused
+                env.store.give_to(NOBODY)  # a borrower that still uses it gets an error
                 self._free.append(env)
                 self._changed.notify()
                 return

@@ -1,4 +1,4 @@
-"""Moving house: environments copied between engines, layouts and curves."""
+"""Environments copied between engines, layouts and curves."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -25,7 +25,8 @@ from hapticdb.store.base import Layout, Object, Rows, Store
 from hapticdb.store.connect import create_store, exists, open_store
 
 MOST_ROWS = 1 << 19
-"""Rows, of whatever object, that one statement is expected to pass over: far below a second."""
+"""Rows of the index that one statement may read, whatever objects they belong to. It takes far less
+than a second. A larger value needs fewer statements and more memory."""
 
 Url = str | os.PathLike[str]
 
@@ -78,10 +79,10 @@ def copy_environment(
 ) -> CopyReport:
     """Copy an environment's objects into another, which is made when it does not exist.
 
-    Each object goes over whole, in one transaction, with its id where that is free. What is there
-    already is left alone, so that an interrupted copy goes on when it is started again. Everything
-    is read at one revision of the source: edits made meanwhile are not copied. Memory is in
-    proportion to the largest object.
+    Each object is copied in one transaction, with its id if that is free. Objects that are in the
+    target already are left alone: an interrupted copy goes on when it is started again. Everything
+    is read at one revision of the source, so that later edits are not copied. The memory needed is
+    in proportion to the largest object.
 
     Parameters
     ----------
@@ -169,7 +170,7 @@ def is_same_kind(a: Store, b: Store) -> bool:
 
 def _copy_objects(source: Store, target: Store, progress: CopyCallback | None) -> CopyReport:
     copied = voxels = renumbered = 0
-    # left after the source's snapshot: an engine cannot tidy up behind the back of a reader
+    # loading ends after the source's snapshot: an engine cannot vacuum tables that are being read
     with ExitStack() as loading, source.snapshot():
         objects = source.objects()
         missing = _missing(objects, source, target)
@@ -193,7 +194,7 @@ def _copy_objects(source: Store, target: Store, progress: CopyCallback | None) -
 
 
 def _missing(objects: Iterable[Object], source: Store, target: Store) -> list[Object]:
-    """Objects that the target has not; refuses those that it has otherwise."""
+    """Objects that the target lacks. Refuses objects that differ from those of the target."""
     known = {part_of(obj): obj for obj in target.objects()}
     taken = {obj.id for obj in known.values()}
     missing = []
@@ -214,7 +215,7 @@ def _missing(objects: Iterable[Object], source: Store, target: Store) -> list[Ob
             f"object {obj.id} ({obj.name}) of {source.url} is in {target.url} {word}: remove "
             f"object {there.id} there, or copy into a new environment"
         )
-    # those that will get another id come last, or they would get one that is still to come
+    # objects that need a new id come last: a new id must not be one that a later object brings
     return sorted(missing, key=lambda obj: (obj.id in taken, obj.id))
 
 
@@ -243,7 +244,7 @@ def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVect
 
 
 def are_few_rows(ranges: Ranges, quantiles: QuantileVector) -> bool:
-    """Whether one statement may pass over these ranges."""
+    """Whether one statement may read these ranges: they hold at most `MOST_ROWS` rows."""
     pairs = zip(*(bounds.tolist() for bounds in ranges), strict=True)
     return sum(quantiles.rows_between(low, high) for low, high in pairs) <= MOST_ROWS
 

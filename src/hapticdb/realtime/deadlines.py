@@ -14,12 +14,17 @@ from hapticdb.errors import UsageError
 from hapticdb.realtime.report import LoopFigures, Times
 
 SPIN = 60e-6
-"""Seconds before a deadline at which the loop stops sleeping."""
+"""Seconds before a deadline at which the loop stops sleeping and watches the clock. A larger value
+hides a later wake-up by the system, and takes more of the processor."""
 SWITCH_INTERVAL = 1e-4
+"""Seconds after which another thread of this process may run, while the loop runs. Python's own
+value is 5e-3, five periods at 1 kHz; a smaller one costs more switches."""
 _PR_SET_TIMERSLACK = 29
 _PR_GET_TIMERSLACK = 30
+"""Numbers of two operations of Linux's prctl."""
 DEFAULT_SLACK_NS = 50_000
 MOST_PROCESSORS = 4096
+"""Processors are numbered below this; a machine with more has the others unused."""
 
 
 @dataclass(frozen=True)
@@ -66,18 +71,18 @@ class Timing:
 class Deadlines:
     """A fixed grid of deadlines, and how well they are kept.
 
-    `wait` sleeps until shortly before the next one, spins until it, and returns when the frame
-    begins, ns; a frame that took too long misses the deadlines that it ran over, and the loop goes
-    on with the next one on the grid.
+    `wait` sleeps until shortly before the next deadline, then watches the clock until the deadline,
+    and returns the time at which the frame begins, ns. A frame that takes longer than its period
+    misses the deadlines within its time; the loop goes on with the next deadline of the grid.
 
     Parameters
     ----------
     period_ns : int
         Between two deadlines.
     lateness, elapsed : Times
-        Are given every frame's.
+        Collect every frame's lateness and computing time, s.
     clock, sleep : callable
-        Nanoseconds that never go back, and what lets seconds pass.
+        Returns nanoseconds that never go back; waits for a number of seconds.
     """
 
     def __init__(
@@ -100,11 +105,11 @@ class Deadlines:
 
     @property
     def passed(self) -> int:
-        """Deadlines that are over: kept, or missed."""
+        """Number of deadlines that are over: those kept and those missed."""
         return self.frames + self.missed
 
     def wait(self) -> int:
-        """Wait for the deadline; returns now, ns of `time.perf_counter_ns`."""
+        """Wait for the deadline; returns the time after it, ns of `time.perf_counter_ns`."""
         clock = self._clock
         left = self.due - clock() - self._spin
         if left > 0:
@@ -142,7 +147,7 @@ class Deadlines:
 
 
 def empty_loop(timing: Timing, seconds: float) -> LoopFigures:
-    """A loop of that rate that does nothing: how late this machine is by itself."""
+    """Run a loop of that rate that does nothing; its figures are this machine's own lateness."""
     deadlines = Deadlines(round(1e9 / timing.rate), Times(), Times())
     while deadlines.passed < seconds * timing.rate:
         deadlines.wait()
@@ -154,8 +159,8 @@ def empty_loop(timing: Timing, seconds: float) -> LoopFigures:
 def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
     """No garbage collection, quick thread switches, exact sleeps, and what `timing` asks for.
 
-    Yields what was granted, in words. All is as before afterwards. A processor that is not granted
-    is a UsageError; SCHED_FIFO is asked for, and what is yielded says whether it was granted.
+    Yields in words what the system granted; at the end all is as before. A processor that is not
+    granted is a UsageError. SCHED_FIFO is asked for, and the words say whether it was granted.
     """
     granted: dict[str, str] = {}
     switch, was_enabled = sys.getswitchinterval(), gc.isenabled()
@@ -243,7 +248,7 @@ def _ask_for_fifo(granted: dict[str, str]) -> tuple[int, os.sched_param] | None:
 
 
 def _set_slack(nanoseconds: int) -> int | None:
-    """Set how late the system may wake this thread; returns what it was, None off Linux."""
+    """Set how late the system may wake this thread; returns the value before, None off Linux."""
     if sys.platform != "linux":
         return None
     libc = ctypes.CDLL(None, use_errno=True)

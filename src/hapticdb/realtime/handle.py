@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 Hand = NDArray[np.void]
 """A record () of `kernels.records.HAND`."""
 MOST_SCALE = 1e6
-"""More would carry any hand beyond what a reading may be."""
+"""Greatest scale. A larger one would move any hand beyond the 1e6 m that a reading may have."""
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """Position and unit quaternion of no move and no turn."""
 
@@ -24,10 +24,10 @@ NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 class Handle:
     """Where the hand is in the scene: the handle, which the tool is pulled to.
 
-    While the clutch is open the hand moves and the handle stays; when it closes the handle goes on
-    from there. A reading that is not finite, or beyond 1e6 m, m/s or rad/s, leaves the handle
-    nowhere, its x not a number, until the next that is somewhere. A handle holds the state of one
-    session.
+    While the clutch is open the hand moves and the handle stays; when the clutch closes the handle
+    goes on from its place. After a reading that is not finite, or beyond 1e6 m, m/s or rad/s, the
+    handle has no place (its x is not a number) until the next valid reading. A handle holds the
+    state of one session.
 
     Parameters
     ----------

@@ -43,15 +43,18 @@ from hapticdb.resident.frames import clusters_of
 from hapticdb.resident.table import HEARTBEAT, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
-"""Length of the empty loop, at most: shorter sessions have shorter ones."""
+"""Seconds that the empty loop lasts at most; in a shorter session it lasts as long as the session.
+A longer one knows the machine's own lateness better, and delays the first frame."""
 TELL_EVERY = 1e-3
+"""Seconds between two reports of the tool's place to the fetching process. With a larger value
+cells are asked for later; with a smaller one the loop computes more."""
 ASK_EVERY = 1e-2
+"""Seconds between two questions for the names of the objects that the tool touches."""
 LOOK_EVERY = 0.25
-"""Seconds between what the fetching process is told, between names asked for, and between looks
-whether the process that started the loop is still there."""
+"""Seconds between two looks whether the process that started the loop is still there."""
 WITHDRAWN_NS = 250_000_000
-"""What was asked is withdrawn when the database has answered that much later: by then objects have
-been named for it, and whoever started the session has read them."""
+"""Nanoseconds. The loop withdraws its question for names once the database has answered this much
+later: by then the objects are named, and the process that began the session has read them."""
 WARM_PATIENCE = 30.0
 """Seconds that the loop waits for its first cells, and for a device to say where it is."""
 
@@ -79,7 +82,7 @@ class LoopRequest:
 
 
 class Loop:
-    """A session's loop in this process: made, warmed up, run once.
+    """A session's loop in this process. It is made, warmed up, and run once.
 
     Parameters
     ----------
@@ -121,7 +124,7 @@ class Loop:
     # -- before the first frame --------------------------------------------------------------
 
     def prepare(self) -> float:
-        """Place the tool at the hand, wait for its cells; returns the seconds that took."""
+        """Place the tool at the hand and wait for its cells; returns the seconds of that."""
         started = time.monotonic()
         session, asked = self.session, 0
         self._place()
@@ -164,7 +167,7 @@ class Loop:
         return reading
 
     def warm_up(self) -> None:
-        """Run every kernel of a frame, on the spot, until no more of them is compiled."""
+        """Run every kernel of a frame, so that none is compiled later; the tool stays in place."""
         if isinstance(self.device, SupportsOpen):
             self.device.open()
         self._place()
@@ -190,10 +193,11 @@ class Loop:
         )  # fmt: skip
 
     def _step_exactly(self, reading: Reading, dt: float, ends: int) -> Reading:
-        """Advance once all cells that it needs are there; until then there is no force for long.
+        """Advance by a period once all cells that it needs are there.
 
-        The session's end, ns, is not waited beyond. Returns the reading that was followed: where a
-        hand is that was let go counts by then.
+        After the coupling's `hold` seconds of waiting no force is sent. The wait ends at `ends`,
+        ns, when the session ends. Returns the reading that was followed: a hand that was let go
+        has moved meanwhile, and its latest reading counts.
         """
         clock = time.perf_counter_ns
         holds = clock() + round(min(self.request.coupling.hold, 1e9) * 1e9)
@@ -238,10 +242,10 @@ class Loop:
         )  # fmt: skip
 
     def _ask_or_withdraw(self, now: int) -> None:
-        """Ask about the last frame's hits; without any, take back what was asked and answered.
+        """Ask for the objects at the last frame's hits; without hits, withdraw the last question.
 
-        What stayed would be asked anew at each write, of voxels that are no longer touched; what
-        went at once would never be answered where the database is slow.
+        A question that stayed would be asked again at each write, of voxels that are no longer
+        touched. A question withdrawn at once would never be answered by a slow database.
         """
         if self.sent.hits:
             self._ask(self.sent.hits.item())

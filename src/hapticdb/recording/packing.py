@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 LEVEL = 1
+"""zlib's level: a higher one makes files smaller and packing slower."""
 
 
 def pack(rows: NDArray[np.void]) -> bytes:

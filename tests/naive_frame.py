@@ -5,7 +5,7 @@ for bit; the hits come from a plain set.
 """
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 Triple = tuple[float, float, float]
@@ -45,6 +45,14 @@ def voxel_of(p: Triple, origin: Triple, size: float) -> Voxel:
     return i, j, k
 
 
+def below_plane(p: Sequence[float], n: Sequence[float], c: Sequence[float], _: float) -> float:
+    """Depth of point p with inward normal n below the plane through the voxel's centre c."""
+    return (c[0] - p[0]) * n[0] + (c[1] - p[1]) * n[1] + (c[2] - p[2]) * n[2]
+
+
+Depth = Callable[[Sequence[float], Sequence[float], Sequence[float], float], float]
+
+
 def touch(
     ids_in: Mapping[Voxel, Collection[int]],
     points: list[Triple],
@@ -56,8 +64,9 @@ def touch(
     side: int,
     stiffness: float = 1000.0,
     exclude: Collection[int] = (),
+    depth_of: Depth = below_plane,
 ) -> NaiveTouch:
-    """Look every point up in a dictionary of voxels and sum the tangent-plane law."""
+    """Look every point up in a dictionary of voxels and sum a law, the tangent plane by default."""
     found = NaiveTouch((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), [], [], [])
     total = [0.0] * 6
     cm = transform(pose, center, shift=True)
@@ -71,7 +80,7 @@ def touch(
         if not ids:
             continue
         c = [o + size * (v + 0.5) for o, v in zip(origin, voxel, strict=True)]
-        depth = (c[0] - p[0]) * nrm[0] + (c[1] - p[1]) * nrm[1] + (c[2] - p[2]) * nrm[2]
+        depth = depth_of(p, nrm, c, size)
         found.hits.append(n)
         found.depths.append(max(depth, 0.0))
         found.pairs += [(n, i) for i in ids]

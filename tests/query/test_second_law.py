@@ -1,0 +1,115 @@
+"""A law from outside the package: a plain penalty on occupancy, through frames of both kinds.
+
+No kernel knows it. `hapticdb.kernels.law.define` enters its functions, and the kernels are compiled
+once more for its type.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, Grid, PointShell, UsageError
+from hapticdb.kernels import law as kernels
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.testing import blob, write_voxels
+from naive_frame import NaiveTouch
+from naive_frame import touch as naive_touch
+
+ORIGIN = (-0.31, 0.17, -0.05)
+SIZE = 0.013
+BITS = 6
+STIFFNESS = 750.0
+Array = NDArray[np.float64]
+
+
+class PenaltyNumbers(NamedTuple):
+    """A plain penalty as kernels take it."""
+
+    stiffness: float
+
+
+def penalty(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
+    """Every hit is felt half a voxel deep."""
+    return 0.5 * size, 1.0
+
+
+kernels.define(PenaltyNumbers, kernels.Leaves(respond=penalty))
+
+
+class Penalty:
+    """A plain penalty on occupancy, as `Environment.touch` takes a law."""
+
+    stiffness = STIFFNESS
+    for_kernels = PenaltyNumbers(STIFFNESS)
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> Environment:
+    env = hapticdb.create(tmp_path / "e.db", Grid(SIZE, ORIGIN, BITS))
+    for seed, center in ((1, (20, 20, 20)), (2, (26, 22, 20))):
+        write_voxels(env.store, blob(seed, center), f"blob {seed}")
+    return env
+
+
+def shell_of(n_points: int) -> PointShell:
+    rng = np.random.default_rng(n_points)
+    normals = rng.normal(size=(n_points, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = rng.uniform(-8, 8, (n_points, 3)) * SIZE
+    return PointShell(points=points, normals=normals, center=rng.normal(size=3) * SIZE)
+
+
+def poses() -> Array:
+    found = np.tile(np.eye(4), (4, 1, 1))
+    found[:, :3, 3] = np.array(ORIGIN) + SIZE * (np.array([22.0, 21.0, 20.0]))
+    found[1:, :3, 3] += np.random.default_rng(1).normal(size=(3, 3)) * 4 * SIZE
+    return found
+
+
+def expected(shell: PointShell, pose: Array) -> NaiveTouch:
+    plain: dict[tuple[int, int, int], set[int]] = {}
+    for seed, center in ((1, (20, 20, 20)), (2, (26, 22, 20))):
+        for i, j, k in blob(seed, center).tolist():
+            plain.setdefault((i, j, k), set()).add(seed)
+    x, y, z = shell.center.tolist()
+    points = [(a, b, c) for a, b, c in shell.points.tolist()]
+    normals = [(a, b, c) for a, b, c in shell.normals.tolist()]
+    return naive_touch(
+        plain, points, normals, (x, y, z), pose.tolist(), ORIGIN, SIZE, 1 << BITS, STIFFNESS,
+        depth_of=lambda _p, _n, _c, size: 0.5 * size,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("n_points", [7, 300])
+def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(
+    env: Environment, n_points: int
+) -> None:
+    shell = shell_of(n_points)
+    n_felt = 0
+    with CellTable.create(LEAST_BUDGET) as table:
+        frames = ResidentFrames(Residency(env.store, table), shell, Penalty())
+        felt = frames.feel(poses())
+        frames.close()
+    for n, pose in enumerate(poses()):
+        wanted = expected(shell, pose)
+        wrench = np.array([*wanted.force, *wanted.torque])
+        for strategy in ("auto", "array", "points", "maxgap"):
+            touch = env.touch(shell, pose, strategy, law=Penalty())
+            assert touch.hits.tolist() == touch.contacts.tolist() == wanted.hits
+            assert touch.depths.tolist() == wanted.depths
+            assert np.array_equal([*touch.force, *touch.torque], wrench)
+        assert np.array_equal(felt.wrenches[n], wrench)
+        assert felt.hits[n] == felt.contacts[n] == len(wanted.hits)
+        n_felt += len(wanted.hits)
+    assert n_felt > 0
+
+
+def test_the_statement_computes_the_tangent_plane_alone(env: Environment) -> None:
+    with pytest.raises(UsageError, match="tangent-plane law alone"):
+        env.touch(shell_of(7), np.eye(4), "statement", law=Penalty())

@@ -14,6 +14,9 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell, UsageError
 from hapticdb.kernels import law as kernels
+from hapticdb.kernels.query import contact
+from hapticdb.kernels.records import RESULTS
+from hapticdb.kernels.resident.cells import CONTACTS, HITS, feel_kernel
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
@@ -40,6 +43,27 @@ def penalty(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # t
 
 
 kernels.define(PenaltyNumbers, kernels.Leaves(respond=penalty))
+
+
+class NearNumbers(NamedTuple):
+    """A law that feels what its payload says, hit or not."""
+
+    stiffness: float
+
+
+def sample(law, payload, at, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
+    """Distance that the payload has for a whole row or slot, voxels."""
+    return float(payload[at])
+
+
+def reach(law):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
+    """One voxel."""
+    return 1.0
+
+
+kernels.define(
+    NearNumbers, kernels.Leaves(penalty, reach=reach, sample_row=sample, sample_slot=sample)
+)
 
 
 class Penalty:
@@ -113,3 +137,45 @@ def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(
 def test_the_statement_computes_the_tangent_plane_alone(env: Environment) -> None:
     with pytest.raises(UsageError, match="tangent-plane law alone"):
         env.touch(shell_of(7), np.eye(4), "statement", law=Penalty())
+
+
+def test_a_payload_lets_a_law_feel_points_that_are_no_hits(env: Environment) -> None:
+    """A payload of zeros: everything in a brick that holds a voxel is felt, and hits stay hits."""
+    shell, pose, law = shell_of(300), poses()[0], NearNumbers(STIFFNESS)
+    grid = env.grid
+    located = contact.locate(
+        shell.points, shell.normals, shell.center, pose, np.array(grid.origin), SIZE, BITS,
+        grid.curve_code, 9,
+    )  # fmt: skip
+    rows = env.store.lookup(located.keys)
+    nothing = np.empty(0, dtype=np.int64)
+    origin = np.array(grid.origin)
+
+    def refined(payload: NDArray[np.uint8]) -> contact.Refined:
+        return contact.refine(*located, *rows[:3], payload, nothing, origin, SIZE, law)
+
+    wrench, hits, _, _, apart, depths = refined(np.zeros(len(rows), dtype=np.uint8))
+    wanted = expected(shell, pose)
+    is_near = np.isin(located.keys[located.asked[1]], rows.keys) & (located.asked[1] >= 0)
+    assert hits.tolist() == wanted.hits
+    assert sorted([*hits.tolist(), *apart.tolist()]) == np.flatnonzero(is_near).tolist()
+    assert len(apart) > 0
+    assert (depths == 0.5 * SIZE).all()
+    with CellTable.create(LEAST_BUDGET) as table:
+        frames = ResidentFrames(Residency(env.store, table), shell, Penalty())
+        frames.feel(pose[None])
+        cells = table.cells._replace(payload=np.zeros(table.n_slots, dtype=np.uint8))
+        out = np.zeros((1, RESULTS))
+        place, met = frames.residency.place, np.empty(300, dtype=np.int64)
+        with table.reading() as reader:
+            feel_kernel(
+                cells, reader, frames.clusters, pose[None], place, law, met, frames.missed, out
+            )
+        frames.close()
+    assert out[0, :6].tolist() == wrench.tolist()
+    assert met[: int(out[0, HITS])].tolist() == wanted.hits
+    assert out[0, CONTACTS] == is_near.sum()
+    far = refined(np.full(len(rows), 2, dtype=np.uint8))
+    assert far[1].tolist() == wanted.hits
+    assert far[4].size == 0
+    assert far[0].tolist() == [*wanted.force, *wanted.torque]

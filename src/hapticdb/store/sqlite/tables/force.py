@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
-from hapticdb.kernels.law import TangentPlaneLaw
+from hapticdb.kernels import law as laws
 from hapticdb.kernels.query import contact
 from hapticdb.store import believed
 from hapticdb.store.base import BRICK_BYTES, Layout, LocatedShell, row_shift
@@ -102,7 +102,7 @@ class _Force:
             self._grid.bits,
             self._grid.curve_code,
             row_shift(self._layout),
-            TangentPlaneLaw(self._frame.stiffness),
+            laws.TangentPlaneLaw(self._frame.stiffness),
         )
         return wrench.tobytes()
 

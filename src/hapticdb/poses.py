@@ -35,7 +35,7 @@ def as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
         lists of unequal lengths.
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
-        return np.ascontiguousarray(values)
+        return values if values.flags.c_contiguous else np.ascontiguousarray(values)
     if isinstance(values, np.ma.MaskedArray):
         raise UsageError(f"{name} that is a masked array: give numbers, or fill it first")
     try:

@@ -113,6 +113,7 @@ def test_the_docs_show_the_sql_that_runs() -> None:
     [
         "README.md",
         "ARCHITECTURE.md",
+        "CONTRIBUTING.md",
         *(f"docs/{path.name}" for path in sorted((ROOT / "docs").glob("*.md"))),
     ],
 )

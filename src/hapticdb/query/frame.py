@@ -50,6 +50,10 @@ class Query(NamedTuple):
     elapsed_us: float
 
 
+_Asked = tuple[Strategy, int, int, int]
+"""Fields of `Query` but the last, which is known at a frame's end."""
+
+
 class Answer(NamedTuple):
     """What a frame found; `Touch` shows it to users.
 
@@ -66,6 +70,17 @@ class Answer(NamedTuple):
     query: Query
     apart: NDArray[np.int64] = NO_POINTS
     apart_depths: NDArray[np.float64] = NO_DEPTHS
+
+    @property
+    def n_contacts(self) -> int:
+        """Number of points that are felt."""
+        return int(np.count_nonzero(self.depths)) + self.apart.size
+
+    @property
+    def deepest(self) -> float:
+        """Greatest depth of a felt point, metres; 0 where nothing is felt."""
+        deepest = float(self.depths.max(initial=0.0))
+        return max(deepest, float(self.apart_depths.max())) if self.apart.size else deepest
 
     def contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Indices (C,) of the points that are felt, ascending, and their depths (C,), above 0."""
@@ -117,8 +132,8 @@ class HapticQuery:
         located = self.locate(shell, as_floats(world_from_tool, "a pose"))
         if strategy == "statement":
             return self._by_statement(located, exclude, law, started)
-        query, rows = self._fetch(strategy, located, gap)
-        return self._refined(located, rows, exclude, law, query, started)
+        asked, rows = self._fetch(strategy, located, gap)
+        return self._refined(located, rows, exclude, law, asked, started)
 
     def _refined(
         self,
@@ -126,7 +141,7 @@ class HapticQuery:
         rows: Rows,
         exclude: Keys,
         law: ForceLaw,
-        query: Query,
+        query: _Asked,
         started: int,
     ) -> Answer:
         """Answer of a frame from its rows, between which there may be rows of other poses."""
@@ -148,9 +163,17 @@ class HapticQuery:
         pairs = partial(
             contact.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
         )
-        # a new tuple: `_replace` takes three times as long
-        query = Query(*query[:4], (time.perf_counter_ns() - started) / 1000)
-        return Answer(wrench, hits, depths, ids.tolist(), pairs, query, apart, apart_depths)
+        elapsed_us = (time.perf_counter_ns() - started) / 1000
+        return Answer(
+            wrench,
+            hits,
+            depths,
+            ids.tolist(),
+            pairs,
+            Query(*query, elapsed_us),
+            apart,
+            apart_depths,
+        )
 
     def run_many(
         self,
@@ -190,15 +213,17 @@ class HapticQuery:
         started = time.perf_counter_ns()
         keys = np.unique(np.concatenate([located.keys for located in batch]))
         fetched = self._store.lookup(keys)
-        query = Query("array", 1, len(keys), len(fetched), 0.0)
+        query: _Asked = ("array", 1, len(keys), len(fetched))
+        row_keys = fetched.keys
         for located in batch:
             low = high = 0
             if located.keys.size:
-                low = int(np.searchsorted(fetched.keys, located.keys[0], "left"))
-                high = int(np.searchsorted(fetched.keys, located.keys[-1], "right"))
+                # methods: the functions of the same name take twice as long, 1 us each
+                low = int(row_keys.searchsorted(located.keys[0], "left"))
+                high = int(row_keys.searchsorted(located.keys[-1], "right"))
             rows = fetched.part(low, high)
             yield self._refined(located, rows, exclude, law, query, started)
-            query, started = Query("array", 0, 0, 0, 0.0), time.perf_counter_ns()
+            query, started = ("array", 0, 0, 0), time.perf_counter_ns()
 
     def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> "contact.Located":
         """Place a shell (N points) at a pose (4, 4), and compute the row keys to ask for."""
@@ -222,13 +247,13 @@ class HapticQuery:
 
     def _fetch(
         self, strategy: Strategy, located: "contact.Located", gap: int
-    ) -> tuple[Query, Rows]:
-        """Rows of a frame, and how they were asked for; the frame's time is not known yet."""
+    ) -> tuple[_Asked, Rows]:
+        """Rows of a frame, and how they were asked for."""
         _, asked, keys = located
         if strategy == "points":
             with self._store.snapshot():
                 rows = self._store.lookup_each(keys)
-            return Query("points", len(keys), len(keys), len(rows), 0.0), rows
+            return ("points", len(keys), len(keys), len(rows)), rows
         ranges: Ranges | None = None
         if strategy == "maxgap":
             first, last = contact.spans_of_keys(asked, keys, *self._curve)
@@ -242,9 +267,9 @@ class HapticQuery:
             strategy = "array" if ranges is None else "cbgroup"
         if ranges is None:
             rows = self._store.lookup(keys)
-            return Query("array", 1, len(keys), len(rows), 0.0), rows
+            return ("array", 1, len(keys), len(rows)), rows
         rows = self._store.scan(*ranges)
-        return Query(strategy, 1, len(ranges.lows), len(rows), 0.0), rows
+        return (strategy, 1, len(ranges.lows), len(rows)), rows
 
     def _by_statement(
         self,

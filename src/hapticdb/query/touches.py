@@ -117,9 +117,8 @@ class Touches:
         total = self.query
         for n, answer in enumerate(answers):
             self.forces[n], self.torques[n] = answer.wrench[:3], answer.wrench[3:]
-            points, depths = answer.contacts()
-            self.hits[n], self.n_contacts[n] = len(answer.hits), len(points)
-            self.deepest[n] = depths.max(initial=0.0)
+            self.hits[n], self.n_contacts[n] = len(answer.hits), answer.n_contacts
+            self.deepest[n] = answer.deepest
             self.ids.append(answer.ids)
             asked = answer.query
             total = Query(
@@ -130,7 +129,8 @@ class Touches:
                 0.0,
             )
             if self.contacts is not None:
-                piece = np.empty(self.n_contacts[n], CONTACT)
+                points, depths = answer.contacts()
+                piece = np.empty(len(points), CONTACT)
                 piece["pose"], piece["point"], piece["depth"] = n, points, depths
                 pieces.append(piece)
         if self.contacts is not None:

@@ -27,7 +27,7 @@ from sources import PACKAGE, ROOT, modules, named, python_files
 # from the top; a module imports its own floor and those below it
 FLOORS: list[set[str]] = [
     {"__main__"},
-    {"cli", "server"},
+    {"cli"},
     {"bench", "demo", "pictures"},
     {"pool", "warm"},
     {"realtime", "sweeps"},

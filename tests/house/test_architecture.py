@@ -7,7 +7,7 @@ from house.test_house import FLOORS, LEVELS, PACKAGE, ROOT, modules
 
 PAGE = (ROOT / "ARCHITECTURE.md").read_text()
 BY_ITS_FILES = {"sample", "mesh/formats", "devices/vendors", "cli/verbs"}
-"""Rooms whose modules are not listed: each is named after the part, format, device or verb in it."""
+"""Rooms whose modules are not listed: each is named after its part, format, device or verb."""
 
 
 def drawn_floors() -> list[set[str]]:

@@ -3,7 +3,8 @@
 import re
 from pathlib import PurePosixPath
 
-from house.test_house import FLOORS, LEVELS, PACKAGE, ROOT, modules
+from house.test_house import FLOORS, LEVELS
+from sources import PACKAGE, ROOT, modules
 
 PAGE = (ROOT / "ARCHITECTURE.md").read_text()
 BY_ITS_FILES = {"sample", "mesh/formats", "devices/vendors", "cli/verbs"}

@@ -1,4 +1,4 @@
-"""What differs between two environments is told, and nothing else."""
+"""`diff_environments` reports every difference between two environments, and nothing else."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -41,7 +41,7 @@ def write(env: Environment, ijk: NDArray[np.int64], name: str, **fields: object)
 def test_every_voxel_that_differs_is_counted(
     monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, most_rows: int
 ) -> None:
-    """Against plain sets; in one batch and in many, beside an object that shares voxels."""
+    """Counts equal those of Python sets, in one batch and in many; another object shares voxels."""
     monkeypatch.setattr(transfer, "MOST_ROWS", most_rows)
 
     @settings(max_examples=3, deadline=None)
@@ -80,7 +80,7 @@ def test_every_voxel_that_differs_is_counted(
 def test_a_large_object_is_compared_in_batches(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Kind
 ) -> None:
-    """One voxel of 70,000 differs, and no statement brings many of them."""
+    """One voxel of 80,000 differs, and no statement returns many of them."""
     span = np.arange(20, 220)
     sheet = np.stack(np.meshgrid(span, span, [99, 100], indexing="ij"), axis=-1).reshape(-1, 3)
     for name, ijk in (("a", sheet), ("b", np.delete(sheet, 33_333, axis=0))):
@@ -98,7 +98,7 @@ def test_a_large_object_is_compared_in_batches(
     monkeypatch.setattr(SQLiteReader, "rows_of", counting)
     found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
     assert [(v.only_in_a, v.only_in_b) for v in found.voxels] == [(1, 0)]
-    assert max(brought) <= 1.25 * 4000  # what a histogram expects is not what is there
+    assert max(brought) <= 1.25 * 4000  # batches are cut by a histogram, which is only an estimate
     assert kind[0] == "brick" or len(brought) >= 2 * len(sheet) // 4000
 
 
@@ -131,7 +131,7 @@ def test_parts_are_told_apart_by_what_differs(tmp_path: Path) -> None:
 
 
 def test_ids_and_attributes_are_felt_by_nobody(tmp_path: Path) -> None:
-    """They are told, and the environments are equal."""
+    """The difference is reported, and the environments still count as equal."""
     ijk = blob(1, PLACE)
     for n, name in enumerate(("a", "b"), start=1):
         with make(tmp_path / f"{name}.db") as env:
@@ -148,7 +148,7 @@ def test_an_environment_equals_itself(tmp_path: Path) -> None:
 
 
 def test_how_far_a_part_has_moved_is_told(tmp_path: Path) -> None:
-    """In metres, by its bounding box, and by the voxels that it left and took."""
+    """The way of its bounding box in metres, and the voxels that only one environment has."""
     ijk = blob(1, PLACE)
     shift = np.array([3, 0, -2])
     for name, voxels, transform in (

@@ -44,7 +44,7 @@ def file(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def env(tmp_path: Path, file: Path) -> Environment:
-    """Four objects in a grid of 32^3."""
+    """An environment of four objects in a grid of 32^3 voxels."""
     hapticdb.import_files(tmp_path / "e.db", [file], small_options())
     return hapticdb.open(tmp_path / "e.db")
 
@@ -62,7 +62,7 @@ def write_balls(path: Path, *placed: NDArray[np.float64]) -> Path:
 
 @pytest.fixture
 def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Files are parsed in this process: the tests' own are sound, and a child takes longer."""
+    """Parse files in this process: the tests' own files are sound, and a child takes longer."""
     for module in (environment, files):
         monkeypatch.setattr(module, "read_file", parse_in_process)
 
@@ -107,7 +107,7 @@ def test_what_is_not_there_is_told(env: Environment, missing: int) -> None:
 
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 def test_voxels_return_as_written(tmp_path: Path, layout: Layout, curve: CurveName) -> None:
-    """Also those at the grid's border."""
+    """Voxels at the grid's border are included."""
     env = hapticdb.create(tmp_path / "e.db", small_grid(curve), layout=layout)
     for n, center in enumerate([(16, 16, 16), (1, 2, 30), (31, 16, 16)]):
         ijk = blob(n, center)
@@ -188,7 +188,7 @@ def test_a_moved_object_is_as_if_imported_there(
 
 @pytest.mark.usefixtures("without_child")
 def test_any_series_of_moves_ends_as_a_fresh_import(tmp_path: Path) -> None:
-    """Nothing of a place on the way stays, the border included."""
+    """No row of an earlier place remains, even when that place was at the grid's border."""
     rng = np.random.default_rng(11)
     n_balls = 3
     file = write_balls(tmp_path / "balls.gltf", *[placement(0, 0, 0)] * n_balls)
@@ -274,7 +274,7 @@ def test_what_is_no_placement_is_refused(env: Environment, transform: NDArray[np
 def test_a_move_by_another_while_the_file_is_read_leaves_no_stray_rows(
     tmp_path: Path, layout: Layout, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two editors move one object at once: it ends at one place, the last writer's."""
+    """Two editors move one object at once: it ends at the place of the last writer only."""
     file = write_balls(tmp_path / "balls.gltf", placement(-0.1, 0, 0))
     hapticdb.import_files(tmp_path / "e.db", [file], small_options("z", layout))
     env, other = hapticdb.open(tmp_path / "e.db"), hapticdb.open(tmp_path / "e.db")
@@ -315,7 +315,7 @@ def test_leaving_its_context_closes_an_environment(tmp_path: Path) -> None:
     with hapticdb.create(tmp_path / "e.db", small_grid()) as env:
         assert env.objects() == []
     assert left_behind(tmp_path) == ["e.db"]
-    env.close()  # once more is harmless
+    env.close()  # closing twice is harmless
     with pytest.raises(ZeroDivisionError), hapticdb.open(tmp_path / "e.db") as again:
         raise ZeroDivisionError
     again.close()
@@ -358,7 +358,7 @@ def test_edits_of_another_process_are_felt_by_the_next_touch(
         assert editor.stdout.readline() == "done\n"
 
     def felt() -> list[tuple[int, float]]:
-        """Ids, and where the objects that are felt stand, by every strategy."""
+        """Ids and x positions (metres) of the objects that are hit; all strategies must agree."""
         found = [env.touch(sphere, pose, s).objects for s in ("auto", "statement", "cbgroup")]
         places = [[(o.id, float(o.transform[0, 3])) for o in objects] for objects in found]
         assert places[0] == places[1] == places[2]
@@ -417,7 +417,7 @@ def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointS
     with hapticdb.open(env.url, read_only=True) as reader:
         assert reader.touch(sphere, placement(0, 0, 0), "cbgroup").query.strategy == "cbgroup"
         assert reader._figures.both()[1] == costs
-        reader.calibrate()  # measured, and not kept
+        reader.calibrate()  # a reader measures, and stores nothing
     assert env.store.costs(machine_name()) == costs.figures()
     env.calibrate(seed=1, keep=False)
     assert env.store.costs(machine_name()) == costs.figures()

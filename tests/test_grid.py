@@ -1,4 +1,4 @@
-"""Grids: metres <-> voxels <-> keys, what options make of a file's bounds, and what is refused."""
+"""Grids: metres <-> voxels <-> keys, grids made from options and bounds, refused values."""
 
 import itertools
 import math
@@ -267,7 +267,7 @@ KNOWN = Grid(0.01, (-1.0, 0.0, 2.0), 9, "hilbert")
         {},
         {"bits": 9},
         {"voxel_size": 0.01},
-        {"voxel_size": 0.1 * 0.1},  # another rounding of the same length
+        {"voxel_size": 0.1 * 0.1},  # the same length, rounded differently
         {"origin": (-1.0, 0.0, 2.0)},
         {"origin": [-1.0 - 1e-15, 1e-15, 2.0]},
         {"curve": "hilbert"},
@@ -298,12 +298,12 @@ def test_an_extent_is_compared_by_the_edge_that_it_gives() -> None:
     GridOptions(bits=11, extent=1.6).check_matches(grid, BOUNDS)
     with pytest.raises(GridError, match=r"extent 1\.7 .an edge of 6\.8 m. instead .* 6\.4 m"):
         GridOptions(bits=11, extent=1.7).check_matches(grid, BOUNDS)
-    GridOptions(extent=1.7).check_matches(grid)  # nothing to measure it by
+    GridOptions(extent=1.7).check_matches(grid)  # no bounds: not comparable
 
 
 @pytest.mark.parametrize("extent", [1.6, 3.0])
 def test_the_options_of_a_grid_match_it_again(extent: float) -> None:
-    """The same command run again finishes an import: extent and voxel size together, too."""
+    """An import can be finished by the same command, also with both extent and voxel size."""
     options = GridOptions(voxel_size=0.01, extent=extent)
     options.check_matches(options.fit(BOUNDS), BOUNDS)
 

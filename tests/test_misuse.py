@@ -108,7 +108,7 @@ BOXES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n" + "".join(
 
 
 def test_two_imports_of_one_file_at_once_end_as_one(tmp_path: Path) -> None:
-    """Neither says that the other was wrong; together they leave every part once."""
+    """Neither import fails because of the other, and each part is in the environment once."""
     (tmp_path / "parts.obj").write_text(BOXES)
     command = [sys.executable, "-m", "hapticdb", "import", "e.db", "parts.obj", "--bits", "7"]
     with child(command, cwd=tmp_path) as one, child(command, cwd=tmp_path) as other:
@@ -190,7 +190,7 @@ def test_points_and_seeds_are_whole_numbers(wrong: Any) -> None:  # noqa: ANN401
 
 
 def test_a_forked_process_is_told_to_open_its_own(env: Environment, sphere: PointShell) -> None:
-    """Two processes on one SQLite connection would damage the file."""
+    """Two processes that share one SQLite connection would damage the file."""
     answer, question = os.pipe()
     pid = os.fork()
     if not pid:

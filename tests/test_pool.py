@@ -35,7 +35,7 @@ def pool(url: str) -> Iterator[Pool]:
 
 
 def test_many_threads_share_few_environments(pool: Pool, sphere: PointShell) -> None:
-    """Each frame of each thread is the right one, and no more than `size` are ever out."""
+    """Every frame of every thread is right, and at most `size` environments are lent at once."""
     with pool.environment() as env:
         expected = env.touch(sphere, np.eye(4)).force.tobytes()
     out: set[int] = set()
@@ -58,7 +58,7 @@ def test_many_threads_share_few_environments(pool: Pool, sphere: PointShell) -> 
 
 
 def test_the_one_given_back_last_is_lent_first(pool: Pool) -> None:
-    """So a single borrower opens one, and finds its statistics again."""
+    """A single borrower thus opens one environment only, and its statistics stay loaded."""
     with pool.environment() as first:
         pass
     for _ in range(3):
@@ -145,7 +145,7 @@ def test_members_read_unless_asked_to_write(url: str, pool: Pool) -> None:
 def test_a_closed_pool_lends_nothing_and_leaves_nothing_open(pool: Pool) -> None:
     with pool.environment() as env:
         pool.close()
-        assert len(env.objects()) == 1  # what is out may be used to its end
+        assert len(env.objects()) == 1  # a lent environment stays usable until returned
     with pytest.raises(hapticdb.DatabaseError, match="has been closed"):
         env.objects()
     with pytest.raises(hapticdb.DatabaseError, match="make a new one"), pool.environment():

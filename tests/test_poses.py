@@ -1,4 +1,4 @@
-"""Files of poses: what is written comes back, and what cannot be read is told in one line."""
+"""Files of poses: written poses are read back, and an unreadable file is a one-line error."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Tool, path and scene that do not fit are told with the factor; honest ones never are."""
+"""A tool, path or scene of the wrong unit is reported with its factor; right ones never are."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -60,7 +60,7 @@ def found(
     return compare_proportions(scene, VOXEL * largest, shell, path, **given)  # type: ignore[arg-type]
 
 
-# -- what is off, and by which factor --------------------------------------------------------------
+# -- wrong sizes, and by which factor --------------------------------------------------------------
 
 
 def test_what_fits_is_not_told() -> None:
@@ -135,7 +135,7 @@ def test_nothing_to_hit_is_told() -> None:
     assert (fit.scene, fit.gap) == (None, None)
 
 
-# -- what is honest is not told --------------------------------------------------------------------
+# -- right sizes are not reported ------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -159,7 +159,7 @@ def test_honest_work_raises_no_alarm(
 
 
 def test_a_part_larger_than_what_is_left_is_no_misfit() -> None:
-    """A hull that is lifted off what stands in it has the scene's own unit."""
+    """A hull that is lifted off its contents came from the scene, so its unit is the scene's."""
     hull, path = wrench(20.0), along((0, 0, 0), (0, 0, 2))
     assert [misfit.what for misfit in found(car(), hull, path).misfits] == ["tool"]
     assert found(car(), hull, path, tool_unit=None).misfits == ()

@@ -39,7 +39,7 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> SampleFiles:
 
 
 def assert_closed_and_outward(mesh: s.Mesh) -> None:
-    """Each edge is used once in each direction, no vertex is idle, no face is degenerate."""
+    """Each edge is used once in each direction, every vertex is used, no face is degenerate."""
     n = len(mesh.vertices)
     assert np.isfinite(mesh.vertices).all()
     assert np.array_equal(np.unique(mesh.faces), np.arange(n))
@@ -132,8 +132,8 @@ def test_the_car_is_as_large_as_a_car(car: list[SamplePart]) -> None:
 
 
 def test_the_car_has_surface_for_about_fourteen_million_voxels(car: list[SamplePart]) -> None:
-    # at 11 bits over 1.6 times its length; a plane of area A meets between A / s^2 and
-    # sqrt(3) A / s^2 voxels, sides of a sheet thinner than a voxel share theirs
+    # 11 bits, extent 1.6 times the car's length. A plane of area A meets A / s^2 to sqrt(3) A / s^2
+    # voxels of size s. The two sides of a sheet thinner than a voxel share their voxels.
     size = 1.6 * 4.28 / 2**11
     corners = np.concatenate([part.triangles() for part in car])
     sides = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -146,7 +146,7 @@ def test_the_wrench_is_one_closed_piece_of_a_quarter_metre() -> None:
     assert_closed_and_outward(wrench)
     mesh = trimesh.Trimesh(*wrench, process=False)
     assert mesh.body_count == 1
-    # a hole through the ring, and none through the open end
+    # genus 1: the ring end has a hole, the open end has none
     assert mesh.euler_number == 0
     assert mesh.extents == pytest.approx([0.25, 0.054, 0.010], abs=0.003)
 
@@ -215,7 +215,7 @@ def test_the_path_touches_the_car_nearly_everywhere(
     map_ = heights_of_triangles(np.concatenate(outside), 0.005)
     points = moved_points(build_wrench().vertices, read_poses(files.path)[::10])
     above = (points[..., 2] - map_.at(points[..., 0], points[..., 1])).min(axis=1)
-    # a map of 5 mm columns is up to 4 mm off where the surface is steepest
+    # the map's columns of 5 mm are wrong by up to 4 mm where the surface is steepest
     assert (np.abs(above) < 0.006).mean() > 0.9
     assert above.min() > -0.012
 

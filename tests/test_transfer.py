@@ -1,4 +1,4 @@
-"""Moving house: a copy holds the same whatever its layout and curve, and goes on when cut off."""
+"""Copies of environments: equal content in any layout and curve; a cut-off copy can go on."""
 
 import signal
 import subprocess
@@ -54,7 +54,7 @@ def add(env: Environment, ijk: NDArray[np.int64], name: str, **fields: Any) -> i
 
 
 def change(path: Path, *statements: str) -> None:
-    """Write past the library."""
+    """Change the database with plain SQL, without the library."""
     with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
         for sql in statements:
             connection.execute(sql)
@@ -62,7 +62,7 @@ def change(path: Path, *statements: str) -> None:
 
 @st.composite
 def scattered(draw: st.DrawFn, bits: int) -> NDArray[np.int64]:
-    """Distinct voxels, at least one."""
+    """Distinct random voxels, at least one."""
     coordinate = st.integers(0, 2**bits - 1)
     found = draw(st.sets(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=60))
     return np.array(sorted(found), dtype=np.int64)
@@ -76,7 +76,7 @@ def scattered(draw: st.DrawFn, bits: int) -> NDArray[np.int64]:
 def test_voxels_come_back_from_every_layout_and_curve(
     monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, most_rows: int
 ) -> None:
-    """There and back again, in one batch and in many, down to grids smaller than a brick."""
+    """A copy and a copy back, in one batch and in many, also on grids smaller than a brick."""
     monkeypatch.setattr(transfer, "MOST_ROWS", most_rows)
 
     @settings(max_examples=3, deadline=None)
@@ -121,7 +121,7 @@ def test_an_object_keeps_everything_but_its_revision(tmp_path: Path) -> None:
     with hapticdb.open(source) as a, hapticdb.open(tmp_path / "b.db") as b:
         (left,), (right,) = a.objects(), b.objects()
     for name, value in vars(left).items():
-        if name != "rows_crc":  # of rows in another layout
+        if name != "rows_crc":  # a checksum of rows, which differ between layouts
             np.testing.assert_array_equal(getattr(right, name), value)
     assert right.id == 7
 
@@ -156,7 +156,7 @@ def test_a_copy_of_an_empty_environment_is_one(tmp_path: Path) -> None:
 def test_no_statement_brings_more_than_a_batch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Kind
 ) -> None:
-    """However large an object is."""
+    """No statement returns more rows than a batch, however large an object is."""
     source = make_blobs(tmp_path / "a.db", kind)
     monkeypatch.setattr(transfer, "MOST_ROWS", 8)
     brought: list[int] = []
@@ -174,7 +174,7 @@ def test_no_statement_brings_more_than_a_batch(
     assert diff_environments(source, tmp_path / "b.db").is_equal
 
 
-# --- what is there already ----------------------------------------------------------------------
+# --- a target that is not empty -----------------------------------------------------------------
 
 
 def test_a_second_copy_writes_nothing(tmp_path: Path) -> None:
@@ -225,7 +225,7 @@ def test_the_same_part_otherwise_is_a_conflict_before_anything_is_written(
     assert rows_of(tmp_path / "b.db") == before
 
 
-# --- what cannot be -----------------------------------------------------------------------------
+# --- copies that are refused --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("spelling", ["{0}", "sqlite:///{0}", "{1}/x/../a.db", "{1}/link.db"])
@@ -311,7 +311,7 @@ def test_a_source_that_is_not_there_makes_no_target(tmp_path: Path) -> None:
 
 
 def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
-    """The copy is of the revision at which it began; started again, it tells of the conflict."""
+    """A copy has the revision at which it began; started again, it reports the conflict."""
     source = make_blobs(tmp_path / "a.db")
     copy_environment(source, tmp_path / "before.db")
 
@@ -337,7 +337,7 @@ def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
 
 
 def test_two_copies_at_once_make_one(tmp_path: Path) -> None:
-    """The slower one finds what the faster one has written."""
+    """The slower copy finds and accepts the objects that the faster one has written."""
     source = make_blobs(tmp_path / "a.db")
 
     def overtake(progress: CopyProgress) -> None:

@@ -1,4 +1,4 @@
-"""Lengths are in the unit that is said, and a user sees which one and how large the scene is."""
+"""Lengths are read in the given unit, and a user sees that unit and the scene's size."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -34,7 +34,7 @@ COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" versi
 
 
 def cloud(path: Path, wkt: str = "") -> Path:
-    """Points of a LAS file, 100 apart at most."""
+    """A LAS file of points that lie at most 100 units apart."""
     las = laspy.create(point_format=6, file_version="1.4")
     las.header.scales, las.header.offsets = np.full(3, 0.001), np.zeros(3)
     las.x, las.y, las.z = np.random.default_rng(1).uniform(0, 100, (3, 500))

@@ -1,4 +1,4 @@
-"""A tool on its coupling among resident cells, for tests that move its handle by hand."""
+"""A tool, its coupling and resident cells, for tests that set the handle's pose themselves."""
 
 import tempfile
 from pathlib import Path
@@ -27,7 +27,7 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 class World:
-    """Voxels of 5 mm about the world's origin, all cells resident unless told otherwise."""
+    """Voxels of 5 mm about the world's origin; no cell is resident if `is_known` is false."""
 
     def __init__(self, ijk: ArrayLike = (), *, is_known: bool = True) -> None:
         self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
@@ -55,7 +55,7 @@ class World:
 
 
 class Tool:
-    """A shell on its coupling, its handle where the test puts it."""
+    """A shell with its coupling; the test sets the handle's pose."""
 
     def __init__(
         self,
@@ -100,7 +100,7 @@ class Tool:
 
     @property
     def voxels(self) -> NDArray[np.int64]:
-        """Voxel of each point (N, 3), outside the grid, too."""
+        """Voxel of each point (N, 3), also outside the grid."""
         placed = self.shell.points @ self.pose[:3, :3].T + self.pose[:3, 3]
         voxels: NDArray[np.int64] = np.floor(placed / SIZE + SIDE / 2).astype(np.int64)
         return voxels
@@ -126,7 +126,7 @@ class Tool:
 
 
 def numbers_in(record: NDArray[np.void]) -> Floats:
-    """All numbers of a record (), those of the records in it, too."""
+    """All numbers of a record (), including those of nested records."""
     fields = [record[name] for name in record.dtype.names or ()]
     return np.concatenate(
         [numbers_in(field) if field.dtype.names else field.ravel() for field in fields]

@@ -1,4 +1,4 @@
-"""Hands that misbehave, for the loop's process to import, and those of the tests of sessions."""
+"""Hands for the tests of sessions, some of them faulty; the loop's process imports them."""
 
 import time
 from collections.abc import Callable
@@ -22,19 +22,19 @@ def at(x: float, y: float, z: float) -> Floats:
 
 
 def still(z: float) -> Player:
-    """A hand that rests there for ever."""
+    """A hand that rests at a pose for ever."""
     return Player([0.0, 3600.0], [at(0.0, 0.0, z)] * 2)
 
 
 def stroking(low: float, seconds: float = 1.0, loops: bool = False) -> Player:
-    """A hand that comes down from 20 mm, strokes along x, and leaves."""
+    """A hand that comes down from a height of 20 mm, moves along x, and leaves."""
     places = [(0.0, 0.02), (0.0, low), (0.02, low), (-0.02, low), (-0.02, 0.02), (0.0, 0.02)]
     times = np.linspace(0.0, seconds, len(places))
     return Player(times, [at(x, 0.0, z) for x, z in places], loops=loops)
 
 
 class Slow:
-    """A hand whose read takes long, now and then."""
+    """A hand whose every n-th read takes so many seconds."""
 
     def __init__(self, hand: Player, every: int, seconds: float) -> None:
         self.hand, self.every, self.seconds = hand, every, seconds
@@ -47,11 +47,11 @@ class Slow:
         return self.hand.read()
 
     def apply(self, wrench: Floats) -> None:
-        """Feel nothing."""
+        """Ignore the wrench."""
 
 
 class Clutched(Slow):
-    """A hand that moves to and fro, its first button down every other 100 reads."""
+    """A hand whose first button changes between down and up every 100 reads."""
 
     def read(self) -> Reading:
         reading = super().read()
@@ -59,7 +59,7 @@ class Clutched(Slow):
 
 
 class Lost(Slow):
-    """A hand whose first reads, so many, are no place."""
+    """A hand whose first `every` readings are NaN."""
 
     def read(self) -> Reading:
         reading = super().read()
@@ -69,7 +69,7 @@ class Lost(Slow):
 
 
 class Unplugged(Slow):
-    """A hand whose cable is pulled at its n-th read, with an error of some kind."""
+    """A hand that raises an error at its n-th read, as when its cable is pulled."""
 
     def __init__(self, hand: Player, every: int, kind: type[Exception] = DeviceError) -> None:
         super().__init__(hand, 1 << 30, 0.0)
@@ -83,7 +83,7 @@ class Unplugged(Slow):
 
 
 class Noted(Slow):
-    """A hand whose driver keeps the latest wrench in a file."""
+    """A hand whose driver writes the latest wrench into a file."""
 
     def __init__(self, hand: Player, path: Path) -> None:
         super().__init__(hand, 1 << 30, 0.0)
@@ -102,7 +102,7 @@ class Talking(Slow):
 
 
 class Beckoned(Slow):
-    """A hand that rests where its path begins until there is such a file."""
+    """A hand that rests at the start of its path until a file exists."""
 
     def __init__(self, hand: Player, path: Path) -> None:
         super().__init__(hand, 1 << 30, 0.0)
@@ -122,7 +122,7 @@ class Beckoned(Slow):
 
 
 class Odd(Slow):
-    """A hand whose reads from the n-th on, so many, are changed."""
+    """A hand whose readings `first` to `first + n_reads - 1` are changed by a function."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""What the tests of sessions share: a floor, patience, and frames read back."""
+"""Shared by the tests of sessions: a floor, waiting, and reading recorded frames."""
 
 import time
 from collections.abc import Callable
@@ -20,7 +20,7 @@ Recorded = NDArray[np.void]
 
 
 def until(claim: Callable[[], object], session: Session | None = None) -> None:
-    """Wait until that is so, looking after a session meanwhile."""
+    """Wait until a claim is true, and run a session's `wait` meanwhile."""
     if session is None:
         children.until(claim)
         return

@@ -1,4 +1,4 @@
-"""The virtual coupling against closed forms, and what a hand must feel and not feel."""
+"""The virtual coupling against closed forms, and which forces a hand must feel or not feel."""
 
 import math
 
@@ -39,7 +39,7 @@ CORNER = np.unique(
     axis=0,
 )
 HOLE = 4
-"""Voxels across a hole, which is about the z axis."""
+"""Width in voxels of a square hole along the z axis; the peg is made to fit the hole."""
 
 
 def plate_with_hole() -> NDArray[np.int64]:
@@ -53,7 +53,7 @@ PEG = box((HOLE * SIZE + 0.6 * SIZE, HOLE * SIZE + 0.6 * SIZE, 0.03), points=600
 
 
 def critically_damped(time: float, step: float) -> float:
-    """Way after a handle step: m x'' = k (d0 - x) - b x', b = 2 sqrt(k m)."""
+    """Tool's way after the handle jumps by d0: m x'' = k (d0 - x) - b x', b = 2 sqrt(k m)."""
     rate = math.sqrt(Coupling().stiffness / Coupling().mass)
     return step * (1.0 - (1.0 + rate * time) * math.exp(-rate * time))
 
@@ -77,7 +77,7 @@ def test_nothing_is_felt_while_every_point_is_free() -> None:
 
 @pytest.mark.parametrize("step", [0.4 * SIZE, 0.05])
 def test_free_motion_follows_the_damped_oscillator(step: float) -> None:
-    """Its error halves with the period: integration of the first order, clamped by nothing."""
+    """The error halves with the period: the integration is of first order, no clamp acts."""
     world = World()
     worst = []
     for dt in (1e-4, 5e-5):
@@ -111,7 +111,7 @@ def test_the_tool_turns_about_its_centre() -> None:
     tool = Tool(World(), shifted, (0.0, 0.0, 0.0))
     half = math.sqrt(0.5)
     tool.hand.position[:] = 0.1, -0.1, 0.0
-    tool.hand.quaternion[:] = half, 0.0, 0.0, half  # about the centre by a quarter
+    tool.hand.quaternion[:] = half, 0.0, 0.0, half  # a quarter turn about the centre
     for _ in range(50):
         tool.advance()
         assert np.allclose(tool.pose[:3, :3] @ shifted.center + tool.pose[:3, 3], (0.1, 0, 0))
@@ -182,7 +182,7 @@ def test_a_hand_at_rest_brings_the_tool_to_rest(
 @pytest.mark.parametrize("n_across", [2, 3, 6])
 @pytest.mark.parametrize("dt", [1e-3, 1e-4])
 def test_energy_at_rest_never_grows(n_across: int, dt: float) -> None:
-    """Its maximum over successive windows, while all points stay in one layer of voxels."""
+    """The energy's maximum per time window does not rise while all points stay in one layer."""
     shell = punch(n_across)
     tool = Tool(World(FLOOR), shell, (0.0, 0.0, -0.6 * SIZE))
     tool.hand.position[:] = 0.0003, 0.0, -0.95 * SIZE
@@ -210,7 +210,7 @@ def test_energy_at_rest_never_grows(n_across: int, dt: float) -> None:
 
 @pytest.mark.parametrize("voxels", [plate_with_hole()], ids=["hole"])
 def test_a_centred_peg_is_pushed_neither_aside_nor_round(voxels: NDArray[np.int64]) -> None:
-    """All four sides a little inside the wall: the sums cancel to rounding."""
+    """All four sides reach a little into the wall; the forces cancel up to rounding."""
     half = (HOLE / 2 + 0.7) * SIZE
     across = np.array([-0.6, -0.2, 0.2, 0.6]) * SIZE * HOLE / 2
     points, normals = [], []
@@ -231,7 +231,7 @@ def test_a_centred_peg_is_pushed_neither_aside_nor_round(voxels: NDArray[np.int6
 
 
 def test_a_wedge_on_its_axis_is_only_lifted() -> None:
-    """Two faces at 45 degrees in a groove that is as wide on either side."""
+    """Two faces at 45 degrees in a symmetric groove give no sideways force."""
     groove = FLOOR[(FLOOR[:, 0] < MIDDLE - 1) | (FLOOR[:, 0] > MIDDLE)]
     slope = math.sqrt(0.5)
     points, normals = [], []
@@ -280,11 +280,11 @@ def test_the_contact_wrench_is_that_of_the_recorded_pose() -> None:
     assert n_felt > 30
 
 
-# --- what is not known ----------------------------------------------------------------------------
+# --- unknown cells --------------------------------------------------------------------------------
 
 
 def half_known() -> World:
-    """A wall along a border of cells, what is beyond it not loaded: k >= 32."""
+    """A wall along a border of cells; the cells beyond the border, k >= 32, are not loaded."""
     world = World(block((20, 20, 30), (43, 43, 30)), is_known=False)
     cells = cells_of(world.grid)
     world.load(cells[(cells & 0xFFFF) == 0])
@@ -339,7 +339,7 @@ def test_the_tool_waits_at_unknown_cells_and_goes_on_when_they_come() -> None:
 def test_a_frame_has_the_revision_of_the_version_that_it_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Not of one that takes its buffer as soon as the frame has let go of it."""
+    """Not the revision of a later version that reuses the buffer right after the frame."""
     tool = Tool(World(FLOOR), PointShell.sphere(0.012), (0.0, 0.0, 0.05))
     control = tool.world.table.cells.control
     read = float(control[REVISION + control[VERSION] % BUFFERS])
@@ -350,7 +350,7 @@ def test_a_frame_has_the_revision_of_the_version_that_it_read(
 
     monkeypatch.setattr(kernels, "end_frame", end_frame_and_lose_it)
     monkeypatch.setattr(kernels, "advance", getattr(kernels.advance, "py_func", kernels.advance))
-    tool.hand.is_stale[()] = 1.0  # most of a frame is left out
+    tool.hand.is_stale[()] = 1.0  # a stale frame skips most of its work
     tool.advance()
     assert tool.sent.revision == read
 

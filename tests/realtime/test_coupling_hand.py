@@ -1,4 +1,4 @@
-"""What the hand gets of the coupling: about which point, how much at most, how it rises, falls."""
+"""The wrench that the hand gets from the coupling: its point, limit, rise and fall."""
 
 import math
 
@@ -16,7 +16,7 @@ Floats = NDArray[np.float64]
 MIDDLE = SIDE // 2
 FLOOR = block((MIDDLE - 12, MIDDLE - 12, MIDDLE - 4), (MIDDLE + 11, MIDDLE + 11, MIDDLE - 1))
 RISE = 20
-"""Frames of 1 ms in which a wrench rises or falls."""
+"""Number of frames of 1 ms in which a wrench rises from zero or falls to zero."""
 
 
 @pytest.fixture
@@ -41,7 +41,7 @@ def turn_vector(matrix: Floats) -> Floats:
 
 
 def share(tool: Tool) -> float:
-    """Of the wrench in full, what the hand gets of it."""
+    """Share of the full wrench that is sent to the hand."""
     full = tool.state.kept
     assert np.abs(full).max() > 0.0
     found = float(tool.sent.wrench @ full / (full @ full))
@@ -58,7 +58,7 @@ def shares(tool: Tool, n_frames: int) -> list[float]:
 
 
 def pressing(world: World) -> Tool:
-    """A box that a hand has pressed on the floor for long."""
+    """A box that a hand presses on the floor; the wrench has fully risen."""
     tool = Tool(world, box((0.02, 0.02, 0.02)), (0.0, 0.0, 0.02))
     tool.hand.position[2] = 0.005
     tool.settle(0.3)
@@ -72,7 +72,7 @@ def pressing(world: World) -> Tool:
 
 @pytest.mark.parametrize("seed", range(8))
 def test_the_wrench_is_the_energys_gradient_at_the_handles_origin(floor: World, seed: int) -> None:
-    """So the coupling gives to a hand what it takes from the springs, wherever the centre is."""
+    """Work on the hand therefore equals the springs' loss of energy, for any centre of mass."""
     rng = np.random.default_rng(seed)
     flat = punch(3)
     center = rng.uniform(-0.05, 0.05, 3)
@@ -118,7 +118,7 @@ def test_no_reading_makes_the_force_in_contact_larger_than_spring_and_clamp(
 
 
 def test_a_slow_hand_feels_all_of_the_damper(floor: World) -> None:
-    """Below the limit nothing is taken away."""
+    """Below the limit the damper's force is sent unchanged."""
     tool = pressing(floor)
     at_rest = tool.sent.wrench[:3].copy()
     tool.hand.velocity[0] = 0.01
@@ -170,7 +170,7 @@ def test_after_a_fall_no_period_however_long_raises_the_wrench_at_once(floor: Wo
     tool = pressing(floor)
     tool.hand.is_stale[()] = 1.0
     tool.advance(1.0)
-    assert not tool.sent.wrench.any()  # falling takes all of the time that passed
+    assert not tool.sent.wrench.any()  # a fall counts the whole period
     tool.hand.is_stale[()] = 0.0
     found = []
     for _ in range(kernels.RISE_FRAMES + 1):
@@ -229,7 +229,7 @@ def test_a_state_that_is_not_finite_is_placed_anew(floor: World, field: str) -> 
 
 @pytest.mark.parametrize("far", [-1e3, -1e6, -1e30, -1e38, 1e40, -1e60])
 def test_one_absurd_place_of_the_hand_moves_the_tool_no_farther_than_its_steps(far: float) -> None:
-    """And once the hand is back, so is the tool, soon."""
+    """Once the hand is back, the tool soon follows."""
     tool = Tool(World(), box((0.02, 0.02, 0.02)), (0.0, 0.0, 0.03))
     tool.settle(0.02)
     for n_frames in (1, 30):
@@ -245,7 +245,7 @@ def test_one_absurd_place_of_the_hand_moves_the_tool_no_farther_than_its_steps(f
 
 
 def test_a_hand_beyond_all_numbers_pushes_nothing(floor: World) -> None:
-    """Finite, but its way is not: no wrench of that is sent, and the tool comes back."""
+    """The pose is finite, but the way overflows: the wrench stays finite, the tool recovers."""
     tool = pressing(floor)
     good = tool.servo["hand"].copy()
     tool.hand.position[:] = 1e308, -1e308, 1e308

@@ -1,4 +1,4 @@
-"""A sheet of one voxel is never passed, whatever the hand does and whatever the tool is."""
+"""No tool passes through a sheet of one voxel's thickness, whatever the hand does."""
 
 import math
 
@@ -18,7 +18,7 @@ from realtime.worlds import block
 
 Floats = NDArray[np.float64]
 REACH = 0.05
-"""Metres that hands go aside, and no higher than twice that: the sheet ends where the grid does."""
+"""Metres that hands go sideways at most; upwards twice that. Sheets end at the grid's border."""
 TOOLS = {
     "ball": PointShell.sphere(0.012, 100),
     "marble": PointShell.sphere(0.002, 30),
@@ -29,7 +29,7 @@ TOOLS = {
 
 
 def sheet(normal: Floats, distance: float) -> NDArray[np.int64]:
-    """Voxels (n, 3) that a plane meets, its distance from the grid's middle in voxels."""
+    """Voxels (n, 3) that a plane meets; `distance` from the grid's middle is in voxels."""
     aside = np.cross(normal, np.eye(3)[int(np.argmin(np.abs(normal)))])
     aside /= np.linalg.norm(aside)
     up = np.cross(normal, aside)
@@ -53,7 +53,7 @@ def is_on_the_entry_side(tool: Tool, normal: Floats, distance: float) -> bool:
 
 
 def directions() -> st.SearchStrategy[Floats]:
-    """Axes, and any other direction."""
+    """Unit vectors: the axes, and any other direction."""
     axes = st.sampled_from([s * a for a in np.eye(3) for s in (-1.0, 1.0)])
     angles = st.tuples(st.floats(-1.0, 1.0), st.floats(0.0, 2.0 * math.pi))
     return axes | angles.map(
@@ -79,7 +79,7 @@ def directions() -> st.SearchStrategy[Floats]:
 def test_no_hand_brings_a_tool_through_a_sheet(
     normal: Floats, distance: float, name: str, contact: float, seed: int
 ) -> None:
-    """At up to 5 m/s and 20 rad/s, periods of 0.1 to 4 ms, jumps among them, at last 1 m deep."""
+    """Hands at up to 5 m/s and 20 rad/s, periods of 0.1 to 4 ms, turns and jumps up to 1 m deep."""
     rng = np.random.default_rng(seed)
     shell = TOOLS[name]
     quaternion = rng.normal(size=4)
@@ -93,7 +93,7 @@ def test_no_hand_brings_a_tool_through_a_sheet(
         velocity = rng.normal(size=3)
         velocity -= normal * 2.0 * max(float(velocity @ normal), 0.0)
         velocity *= rng.uniform(0.1, 5.0) / np.linalg.norm(velocity)
-        if part == 4:  # back out, and in again
+        if part == 4:  # straight out, away from the sheet
             velocity = 5.0 * normal
         turning = rng.normal(size=3) * rng.uniform(0.0, 20.0)
         dt = 10.0 ** rng.uniform(-4.0, -2.4)
@@ -114,7 +114,7 @@ def test_no_hand_brings_a_tool_through_a_sheet(
             tool.advance(dt)
             n_hit += tool.n_hits > 0
             if not ((tool.voxels > 0) & (tool.voxels < SIDE - 1)).all():
-                return  # flung to the grid's border by a jump: there it may go round the sheet
+                return  # a jump took the tool to the grid's border, where the sheet ends
             assert is_on_the_entry_side(tool, normal, distance)
             assert np.isfinite(tool.state).all()
             assert (tool.met[2] != LOOSE).all()
@@ -143,7 +143,7 @@ def test_a_hand_through_a_sheet_at_2_metres_a_second_leaves_the_tool_behind(
 def test_a_tool_that_starts_in_something_is_held_by_what_is_farther_away(
     name: str, rate: float
 ) -> None:
-    """It slides over a floor, from within its first layer, against a sheet upright on it."""
+    """The tool starts in a floor's first layer and slides over it against an upright sheet."""
     middle, last = SIDE // 2, SIDE - 1
     at = middle + 20
     shell = TOOLS[name]
@@ -188,7 +188,7 @@ def test_a_tool_that_starts_across_a_sheet_may_leave_by_either_side(name: str, w
 
 
 def test_a_blocked_ball_slides_along_the_sheet() -> None:
-    """Without any contact force: only steps that are cut back hold it."""
+    """There is no contact force: only shortened steps keep the ball on its side."""
     normal = np.array([0.3, 0.1, 0.9]) / np.linalg.norm([0.3, 0.1, 0.9])
     along = np.cross(normal, [0.0, 1.0, 0.0])
     along /= np.linalg.norm(along)
@@ -219,9 +219,9 @@ def test_a_sheet_holds_when_the_cell_of_the_anchors_goes_and_comes_back() -> Non
     known = keys.copy()
     for is_above_known in (False, True, True):
         keys[:] = known
-        if not is_above_known:  # entries of cells that are nowhere, so that others are still found
+        if not is_above_known:  # keys of no cell: lookups of others still work
             keys[(known >= 0) & (known & 0xFFFF == 1)] |= 0xFFFE
-        tool.state.version[()] = -1  # as of another version
+        tool.state.version[()] = -1  # makes the next frame see another version
         tool.settle(0.2)
         assert tool.n_hits == len(tool.shell)
         assert not tool.sent.unknown

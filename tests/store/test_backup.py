@@ -1,4 +1,4 @@
-"""Whole copies of SQLite environments: made while others write, put in place, never half."""
+"""Backups of SQLite environments: made while others write, restored, never incomplete."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -48,7 +48,7 @@ def make(path: Path, *numbers: int) -> Path:
 
 
 def files(folder: Path) -> dict[str, bytes]:
-    """Contents of a folder, but for the empty log and its index that a reader leaves."""
+    """Contents of a folder, without the empty log and the log's index that a reader leaves."""
     found = {path.name: path.read_bytes() for path in folder.iterdir() if path.is_file()}
     return {
         name: content
@@ -64,7 +64,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def copy(path: Path, tmp_path: Path) -> Path:
-    """A copy of it, made before it was written again."""
+    """A backup of `path`; after the backup another object is written to `path`."""
     backup_environment(path, tmp_path / "copy.db")
     with closing(SQLiteStore.open(path)) as store:
         write(store, 2)
@@ -73,7 +73,7 @@ def copy(path: Path, tmp_path: Path) -> Path:
 
 def test_a_copy_has_what_was_committed_and_nothing_beside_it(path: Path, tmp_path: Path) -> None:
     with closing(SQLiteStore.open(path)) as store:
-        write(store, 2)  # into the log
+        write(store, 2)  # goes into the log
         report = backup_environment(path, tmp_path / "copy.db")
         assert (report.revision, report.objects) == (3, 3)
         assert report.bytes == (tmp_path / "copy.db").stat().st_size
@@ -182,7 +182,7 @@ def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
 def test_a_copy_under_the_log_of_what_it_was_copied_from_is_refused(
     path: Path, tmp_path: Path
 ) -> None:
-    """Even when not a commit lies between: its pages could be others."""
+    """Refused even without a commit before the copy: its pages may differ from the original's."""
     store = SQLiteStore.open(path)
     backup_environment(path, tmp_path / "copy.db")
     write(store, 2)
@@ -192,15 +192,15 @@ def test_a_copy_under_the_log_of_what_it_was_copied_from_is_refused(
     store.close()
 
 
-# --- putting it in place --------------------------------------------------------------------------
+# --- restoring ------------------------------------------------------------------------------------
 
 
 def killed(path: Path, *numbers: int) -> None:
-    """Write in a process that dies of it and leaves its log."""
+    """Write in a process that is killed right after, so that its log remains."""
     pid = os.fork()
-    if pid == 0:  # everything is imported, and nothing is started: safe here, as a test
+    if pid == 0:  # fork is safe: all modules are imported, and no thread runs
         try:
-            store = SQLiteStore.open(path)  # held until the end: whoever lets go of it closes it
+            store = SQLiteStore.open(path)  # kept in a variable: a dropped store closes itself
             write(store, *numbers)
         finally:
             os.kill(os.getpid(), signal.SIGKILL)

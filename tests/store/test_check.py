@@ -1,4 +1,4 @@
-"""What is stored is believed only as far as it can be; `hapticdb check` finds the rest."""
+"""Damage in stored data raises an error where it is read; `hapticdb check` finds the rest."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -32,7 +32,7 @@ CASES = [(layout, name) for layout in LAYOUTS for name in CRAFTED] + [
 
 
 def told(ask: Callable[[], object]) -> str:
-    """What an error of ours says; nothing where there is none. Others pass."""
+    """Text of the hapticdb error that a call raises, or "". Other errors are not caught."""
     try:
         ask()
     except hapticdb.HapticDBError as error:
@@ -41,7 +41,7 @@ def told(ask: Callable[[], object]) -> str:
 
 
 def used(path: Path, sphere: PointShell) -> None:
-    """Everything that a user asks of an environment, each by itself; errors of ours may come."""
+    """Run each of a user's calls by itself; a hapticdb error is allowed, another is not."""
     pose = np.eye(4)
     pose[:3, 3] = 0.06, 0.06, 0.21
     with hapticdb.open(path) as env:
@@ -99,7 +99,7 @@ def test_a_sound_environment_stays_sound_through_edits(
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_every_damaged_page_is_found(tmp_path: Path, layout: Layout) -> None:
-    """Those that nothing reads, too."""
+    """Damage is found also in pages that no other command reads."""
     path = made(tmp_path / "e.db", layout)
     whole = path.read_bytes()
     for number in range(1, len(whole) // PAGE_BYTES + 1):
@@ -119,7 +119,7 @@ def everything(path: Path) -> list[object]:
 
 
 def test_an_earlier_state_of_a_page_is_found(tmp_path: Path) -> None:
-    """Its checksum fits, since it was written there; what it holds does not fit the rest."""
+    """Its checksum is right, as it was once written there; its content contradicts other pages."""
     path = made(tmp_path / "e.db", "voxel")
     before = path.read_bytes()
     with hapticdb.open(path) as env:
@@ -134,14 +134,14 @@ def test_an_earlier_state_of_a_page_is_found(tmp_path: Path) -> None:
             path.write_bytes(after[:start] + before[start:stop] + after[stop:])
             n_stale += 1
             if hapticdb.check_environment(path).is_sound:
-                assert everything(path) == truth  # it is a free page, or one of statistics
+                assert everything(path) == truth  # the page is free, or holds statistics
             else:
                 n_found += 1
     assert n_found > n_stale / 2 > 5
 
 
 def test_commits_behind_a_broken_frame_of_the_log_are_found(tmp_path: Path) -> None:
-    """After a crash SQLite leaves them out in silence."""
+    """After a crash SQLite drops such commits without an error."""
     path = tmp_path / "e.db"
     with hapticdb.create(path, GRID) as env:
         for name in "abc":

@@ -1,4 +1,4 @@
-"""The wall and `hapticdb check` on PostgreSQL: what its types let through."""
+"""Checks on reading, and `hapticdb check`, on PostgreSQL: wrong values that its types allow."""
 
 import numpy as np
 import psycopg

@@ -1,4 +1,4 @@
-"""A connection that ends, at any moment, costs no frame and no write, and none counts twice."""
+"""A connection that is lost at any moment loses no frame and no write, and repeats no write."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -43,10 +43,10 @@ from validity import Contents, assert_valid, contents, valid_contents
 
 
 class Proxy:
-    """A socket between client and server that cuts the line when a COMMIT comes by.
+    """A socket between client and server that cuts the connection at a COMMIT.
 
-    forwarded : the server gets that COMMIT, and its answer is lost; not forwarded : it gets none;
-    late : it gets the COMMIT when the client has long been cut off.
+    forwarded : the server gets the COMMIT, its answer is lost; not forwarded : the server gets no
+    COMMIT; late : the server gets the COMMIT long after the client was cut off.
     """
 
     def __init__(self, server: PrivateServer, folder: Path) -> None:
@@ -61,7 +61,7 @@ class Proxy:
         self._accepting.start()
 
     def close(self) -> None:
-        self._listener.shutdown(socket.SHUT_RDWR)  # a close alone would not wake the other thread
+        self._listener.shutdown(socket.SHUT_RDWR)  # `close` alone would not wake `_accept`
         joined(self._accepting)
         self._listener.close()
 
@@ -125,7 +125,7 @@ def test_a_write_whose_commit_is_not_answered_counts_once(
         env.remove(3)
         proxy.cut = how
         assert env.store.add(obj, rows) == 3
-        # derived from a revision: done twice, the second would be a conflict
+        # conditional on a revision: a repeated move would raise a conflict
         proxy.cut = how
         env.move(3, placement(0.01, 0, 0), revision=env.object(3).revision)
         assert_valid(env)
@@ -137,7 +137,7 @@ def test_a_write_whose_commit_is_not_answered_counts_once(
 def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
     server: PrivateServer, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Ours is lost in its COMMIT; before we are back, another moves the same object."""
+    """Our write is lost at its COMMIT; before we reconnect, another writer moves the object."""
     proxy = Proxy(server, server.folder.parent)
     with small(url, file) as other, hapticdb.open(proxy.url) as env:
         reconnect = ServerConnection._reconnect
@@ -162,7 +162,7 @@ def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
 
 @pytest.fixture
 def cut_off(admin: psycopg.Connection) -> Callable[[Environment], None]:
-    """End the process behind an environment's connection, and wait until it is gone."""
+    """End the server process of an environment's connection, and wait until it is gone."""
 
     def end(env: Environment) -> None:
         pid = env.store.connection.driver.info.backend_pid  # type: ignore[attr-defined]
@@ -212,7 +212,7 @@ def test_a_connection_that_ends_inside_a_frame_costs_nothing_but_time(
 def test_a_snapshot_does_not_go_on_over_another_connection(
     place: Place, file: Path, cut_off: CutOff
 ) -> None:
-    """What came before was read from the lost one, perhaps of another revision."""
+    """Reads before the loss were on the lost connection, perhaps at another revision."""
     with small(place(), file) as env:
         with env.store.snapshot():
             env.objects()
@@ -221,7 +221,7 @@ def test_a_snapshot_does_not_go_on_over_another_connection(
                 with pytest.raises(hapticdb.ConnectionLostError, match="run the same again"):
                     env.objects()
         assert len(env.objects()) == N_PARTS
-        with env.store.snapshot():  # all was read: nothing is lost with the line
+        with env.store.snapshot():  # everything was read before the connection was lost
             found = env.objects()
             cut_off(env)
         assert len(found) == len(env.objects()) == N_PARTS

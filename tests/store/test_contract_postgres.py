@@ -1,4 +1,4 @@
-"""PostgreSQL passes the contract, and what is only PostgreSQL's."""
+"""PostgreSQL passes the contract suite; tests of what only PostgreSQL does."""
 
 import threading
 from concurrent.futures import ThreadPoolExecutor
@@ -53,7 +53,7 @@ class TestPostgresEngine(EngineContract):
 
 @pytest.fixture
 def url(place: Place) -> str:
-    """A small environment, closed."""
+    """URL of a small environment that no store has open."""
     where = place()
     store = PostgresStore.create(where, GRID)
     write_voxels(store, floor_voxels(GRID))
@@ -165,7 +165,7 @@ def test_two_loaders_that_end_together_both_succeed(place: Place) -> None:
         list(pool.map(load, range(2), timeout=PATIENCE))
     store = PostgresStore.open(where)
     assert len(store.objects()) == 2
-    # no loader's lock is left: the next killed one can be mended
+    # no advisory lock of a loader remains, so that the next killed import can be repaired
     free = store.connection.rows(
         "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND classid::bigint = %s"
         " AND objid::bigint = ('environment'::regclass::oid::bigint + 2147483648) %% 4294967296",
@@ -201,7 +201,7 @@ def test_what_cannot_be_a_name_is_refused(database: str, name: str) -> None:
 
 
 def test_an_object_that_another_has_added_can_be_left_out(url: str) -> None:
-    """Also by a frame outside the grid, which asks the database nothing."""
+    """Also in a frame outside the grid, which sends no query to the database."""
     env = hapticdb.open(url, read_only=True)
     shell = hapticdb.PointShell(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros(3))
     far = np.eye(4)
@@ -214,7 +214,7 @@ def test_an_object_that_another_has_added_can_be_left_out(url: str) -> None:
 
 
 def test_tiny_components_of_normals_end_as_in_the_kernels(url: str) -> None:
-    """PostgreSQL raises where a product underflows."""
+    """Products that underflow must not fail, though PostgreSQL raises an error for them."""
     env = hapticdb.open(url, read_only=True)
     center = GRID.centers(np.array([[32, 32, 31]]))[0]
     shell = hapticdb.PointShell(

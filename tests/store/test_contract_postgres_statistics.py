@@ -47,11 +47,11 @@ def as_the_server_would(
 def test_common_values_go_back_to_their_rank(
     draws: list[tuple[int, int]], n_common: int, n_buckets: int, resolution: int
 ) -> None:
-    """Every bound lies where its share of all rows lies, to a bucket of the server's histogram."""
+    """Every bound's rank is right to within two buckets of the server's histogram."""
     keys = np.sort(np.repeat([k for k, _ in draws], [c for _, c in draws]).astype(np.int64))
     bounds, common, shares = as_the_server_would(keys, n_common, n_buckets)
     if not len(bounds) and not len(common):
-        return  # nothing that the server would keep
+        return  # the server would store no statistics
     found = with_common_values(bounds, common, shares, resolution)
     assert len(found) == resolution + 1
     assert (np.diff(found) >= 0).all()
@@ -59,7 +59,7 @@ def test_common_values_go_back_to_their_rank(
     largest = max((np.unique(rest, return_counts=True)[1] / len(keys)), default=0.0)
     bucket = len(rest) / len(keys) / max(len(bounds) - 1, 1) + largest + 1 / len(keys)
     if not len(bounds):
-        bucket += len(rest) / len(keys)  # one value, too few for a histogram
+        bucket += len(rest) / len(keys)  # one value is too few for a histogram
     for i, bound in enumerate(found):
         share = i / resolution
         assert np.mean(keys <= bound) >= share - 2 * bucket - 1e-9
@@ -70,13 +70,13 @@ def test_without_common_values_the_histogram_stays_as_it_is() -> None:
     bounds = np.sort(np.random.default_rng(0).integers(0, 2**60, SERVER_RESOLUTION + 1))
     none = np.empty(0, dtype=np.int64)
     found = with_common_values(bounds, none, np.empty(0), SERVER_RESOLUTION)
-    # to the rounding of a share of keys that float64 cannot count one by one
+    # equal up to rounding: float64 cannot hold every key of this size
     assert np.abs(found - bounds).max() <= np.diff(bounds).max() * 1e-6
 
 
 @pytest.fixture
 def large(place: Place) -> hapticdb.Environment:
-    """Two objects of 130,000 voxels in all, some of them shared, on the voxel layout."""
+    """Two objects of together 130,000 voxels, some of them shared, in the voxel layout."""
     env = hapticdb.create(place(), GRID, layout="voxel")
     rng = np.random.default_rng(5)
     with env.store.loading():
@@ -94,7 +94,7 @@ def test_the_default_resolution_comes_from_the_server(large: hapticdb.Environmen
     assert served.resolution == DEFAULT_RESOLUTION == SERVER_RESOLUTION
     keys = np.sort(large.store.scan(*(np.array([b]) for b in (0, 2**62))).keys)
     assert served.n_rows == pytest.approx(len(keys), rel=0.01)
-    # a bucket holds 13 rows; bounds lie within two buckets of their rank
+    # a bucket holds 13 rows; each bound is within three buckets of its rank
     ranks = np.searchsorted(keys, served.bounds) / len(keys)
     error = np.abs(ranks - np.arange(SERVER_RESOLUTION + 1) / SERVER_RESOLUTION)
     assert error.max() <= 3 / SERVER_RESOLUTION

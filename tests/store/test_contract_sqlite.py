@@ -1,4 +1,4 @@
-"""SQLite passes the contract, and what is only SQLite's."""
+"""SQLite passes the contract suite; tests of what only SQLite does."""
 
 import itertools
 import os
@@ -53,7 +53,7 @@ class TestSQLiteEngine(EngineContract):
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A small environment, closed."""
+    """Path of a small environment that no store has open."""
     store = SQLiteStore.create(tmp_path / "e.db", GRID)
     write_voxels(store, floor_voxels(GRID))
     store.close()
@@ -183,7 +183,7 @@ def test_a_read_only_environment_refuses_to_be_written(path: Path) -> None:
 
 
 def test_an_unprivileged_reader_opens_a_read_only_folder(path: Path, tmp_path: Path) -> None:
-    """A WAL database needs its -shm beside it, which nobody but root can make there."""
+    """A WAL database needs its -shm file, which only root could create in this folder."""
     for folder in (tmp_path, *tmp_path.parents):
         if not os.access(folder, os.X_OK) or folder == Path(tmp_path.anchor):
             break
@@ -193,7 +193,7 @@ def test_an_unprivileged_reader_opens_a_read_only_folder(path: Path, tmp_path: P
     failures: list[str] = []
     read_end, write_end = os.pipe()
     pid = os.fork()
-    if pid == 0:  # everything is imported, and nothing is started: safe here, as a test
+    if pid == 0:  # fork is safe: all modules are imported, and no thread runs
         try:
             if os.getuid() == 0:
                 os.setgid(65534)
@@ -225,7 +225,7 @@ def test_an_immutable_reader_notices_a_writer(path: Path, monkeypatch: pytest.Mo
 
 
 def test_numpy_integers_and_plain_lists_cross_the_binding(path: Path) -> None:
-    """The binding's traps: an np.int64 binds as a blob, a bare array to carray as nothing."""
+    """Traps of the binding: np.int64 binds as a blob, a bare array to carray(?) as nothing."""
     connection = apsw.Connection(":memory:")
     bound = connection.execute("SELECT typeof(?)", (np.int64(5),)).fetchall()
     assert bound == [("blob",)], "the trap is gone: simplify store/sqlite/tables/reading.py"
@@ -247,7 +247,7 @@ def test_a_database_in_use_is_told_after_a_while(
 
 
 def test_an_unfinished_creation_is_swept_away(tmp_path: Path) -> None:
-    """A process that dies while creating leaves a file under another name."""
+    """A process that dies while it creates an environment leaves a file of a temporary name."""
     with child([sys.executable, "-c", ""]) as dead:
         pass
     lefts = [tmp_path / f".e.db.{dead.pid}.new{suffix}" for suffix in ("", "-wal", "-shm")]

@@ -1,4 +1,4 @@
-"""A short run of `damaging`: no damaged environment answers wrongly, and `check` finds each."""
+"""A short run of `damaging`: no damaged environment answers wrongly; `check` finds each one."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""A URL leads to its engine: those of this package, and those that others install."""
+"""A URL's scheme picks the engine: one of this package, or one that another package adds."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -48,7 +48,7 @@ def test_a_scheme_that_no_engine_has_is_told() -> None:
 
 
 def test_a_file_is_opened_without_any_server_driver(tmp_path: Path) -> None:
-    """Nor is the kernels' compiler loaded to ask whether one is there."""
+    """The question whether an environment exists does not load numba either."""
     script = (
         "import sys; from hapticdb.store import connect;"
         f"assert not connect.exists({str(tmp_path / 'no.db')!r});"
@@ -72,7 +72,7 @@ def test_an_engine_whose_driver_is_missing_says_what_brings_it(
 
 @pytest.mark.usefixtures("toy_is_installed")
 def test_an_installed_engine_is_used_from_the_command_line(run: Run, tmp_path: Path) -> None:
-    """Imported into, listed, touched and checked, by its URL."""
+    """The verbs import, objects, touch and check accept its URL."""
     boxes(tmp_path / "bracket.glb")
     trimesh.creation.icosphere(radius=0.02).export(tmp_path / "probe.stl")
     url = f"memory://{tmp_path.name}-line"
@@ -104,7 +104,7 @@ def test_the_page_shows_the_contract_that_the_toy_passes() -> None:
 
 
 def test_what_the_page_says_runs(tmp_path: Path) -> None:
-    """The entry point in a fresh process, and the page's last block."""
+    """A fresh process finds the engine's entry point and runs the page's last block."""
     install_toy(tmp_path)
     boxes(tmp_path / "bracket.glb", count=1)
     trimesh.creation.icosphere(radius=0.06).export(tmp_path / "probe.stl")

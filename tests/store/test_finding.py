@@ -1,4 +1,4 @@
-"""Objects are chosen by ids, names and patterns; a shell is made of all that were chosen."""
+"""Objects are chosen by ids, names and patterns; a shell covers all chosen objects."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -51,7 +51,7 @@ def car(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
         ([np.int64(2), " 2 , 1"], [1, 2]),
         (["3,4", 3, "5"], [3, 4, 5]),
         ([], []),
-        # an element of the path, whichever; below a sub-assembly everything
+        # any element of the path; a sub-assembly chooses all objects below it
         (["tyre"], [1, 3]),
         (["wheel*"], [1, 2, 3, 4]),
         (["*bolt*"], [2, 4]),
@@ -63,7 +63,7 @@ def car(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
         (["wheels/*/tyre"], [1, 3]),
         (["Body/door"], [6, 7]),
         (["Body/h*"], [5, 8, 9]),
-        # a name as it stands is no pattern, and may hold a comma
+        # an exact name goes before a pattern, and may contain a comma
         (["handle[1]"], [8]),
         (["handle[12]"], [9]),
         (["left,right"], [10]),
@@ -109,7 +109,7 @@ def test_what_is_no_word_is_refused(car: Environment, word: object) -> None:
 
 def test_a_shell_of_several_objects_lies_on_all_of_them_where_they_sit(car: Environment) -> None:
     shell = car.shell("wheels/rear", 5, points=600, seed=3)
-    cubes = np.array([0.4, 0.6, 0.8])  # their centres on x
+    cubes = np.array([0.4, 0.6, 0.8])  # x of the cubes' centres
     nearest = np.abs(shell.points[:, 0, None] - cubes).argmin(axis=1)
     assert np.allclose(np.bincount(nearest), 200, atol=30)
     off = shell.points - np.stack([cubes[nearest], *np.zeros((2, len(shell)))], axis=1)
@@ -138,7 +138,7 @@ def test_a_shift_moves_all_of_them_or_none(car: Environment) -> None:
     ids = [obj.id for obj in car.find("wheels")]
     before = [obj.transform for obj in car.find("wheels")]
     with pytest.raises(hapticdb.OutsideGridError):
-        car.shift([*ids, 11], (2.0, 0, 0))  # the first ones would stay inside
+        car.shift([*ids, 11], (2.0, 0, 0))  # only object 11 would leave the grid
     assert all(
         np.array_equal(a.transform, b) for a, b in zip(car.find("wheels"), before, strict=True)
     )

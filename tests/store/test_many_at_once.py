@@ -1,7 +1,7 @@
-"""Many at once on PostgreSQL: frames of one revision, nobody blocks, nothing is lost.
+"""Many clients on PostgreSQL: each frame is of one revision, none blocks, no write is lost.
 
-Readers and writers are processes of their own. What blocks is shown by outcome: a reader ends while
-a writer still holds its lock, a writer while a reader still holds its snapshot.
+Readers and writers are separate processes. That none blocks is shown by the outcome: a reader ends
+while a writer still holds its lock, a writer ends while a reader still holds its snapshot.
 """
 
 import contextlib
@@ -40,12 +40,12 @@ N_READERS = 8
 ENOUGH_FRAMES = 10
 N_IMPORTS = 2
 LEFT, RIGHT = (-0.09, 0.0, 0.0), (0.09, 0.0, 0.0)
-"""Where the shuttle goes back and forth; a tool stands at both."""
+"""The shuttle's two places (metres); half of the shell's points are at each."""
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A shuttle that stands left; eight balls to be added and removed, in pairs."""
+    """Files: a shuttle at its left place, and eight balls that are added and removed in pairs."""
     made = tmp_path_factory.mktemp("scene")
     write_obj(made / "shuttle.obj", {"shuttle": box((-0.12, -0.03, -0.03), (-0.06, 0.03, 0.03))})
     balls = {f"ball {n}": ball((0.02 * n - 0.07, 0.1, 0.0), 0.03) for n in range(8)}
@@ -61,7 +61,7 @@ def url(place: Place, folder: Path) -> str:
 
 
 def two_tools() -> PointShell:
-    """A shell in two halves of 200 points: one inside the shuttle's place left, one right."""
+    """A shell of 400 points: 200 inside the shuttle's left place, 200 inside its right place."""
     rng = np.random.default_rng(1)
     half = rng.uniform(-0.035, 0.035, (200, 3))
     points = np.concatenate([half + LEFT, half + RIGHT])
@@ -71,7 +71,7 @@ def two_tools() -> PointShell:
 
 
 def read(url: str, number: int, said: Connection) -> None:
-    """Touch until told to stop: a reader's life. Says when it has felt both sides often enough."""
+    """Touch until a message says stop. Send "seen" after enough frames with hits on both sides."""
     shell = two_tools()
     strategy = STRATEGIES[number % len(STRATEGIES)]
     sides: set[bool] = set()
@@ -88,7 +88,7 @@ def read(url: str, number: int, said: Connection) -> None:
             n_right = len(touch.hits) - n_left
             assert min(n_left, n_right) == 0 < max(n_left, n_right), strategy
             (shuttle,) = touch.objects
-            # the object as the frame gives it stands where the frame has felt it
+            # the object that the frame returns is at the place that the frame has hit
             assert (shuttle.bounds[0, 0] > 0) == (n_left == 0), strategy
             sides.add(n_left == 0)
             with env.store.snapshot():
@@ -105,8 +105,8 @@ def read(url: str, number: int, said: Connection) -> None:
 def processes(
     target: Callable[..., object], *arguments: tuple[Any, ...]
 ) -> Iterator[list[Process]]:
-    """Processes of their own, one a tuple of arguments, gone afterwards."""
-    # forked, since every other way costs seconds of importing
+    """One process for each tuple of arguments; all are ended on exit."""
+    # forked: a spawned process would import for seconds
     made = [multiprocessing.get_context("fork").Process(target=target, args=a) for a in arguments]
     for process in made:
         process.start()
@@ -121,7 +121,7 @@ def processes(
 
 
 def places_of(env: Environment) -> list[tuple[Object, Rows]]:
-    """The shuttle as it stands left and as it stands right, and its rows there."""
+    """The shuttle's record and rows at its left place, then at its right place."""
     ((_, part),) = parts_of([env.object(1)], "moved", "")
     found: list[tuple[Object, Rows]] = []
     for x in (0.0, 0.18):
@@ -138,7 +138,7 @@ def places_of(env: Environment) -> list[tuple[Object, Rows]]:
 
 @pytest.mark.long
 def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder: Path) -> None:
-    """One moves the shuttle back and forth, one imports and removes: no frame sees a mixture."""
+    """One writer moves the shuttle, one imports and removes balls: no frame mixes revisions."""
     assert len(STRATEGIES) <= N_READERS
     pipes = [multiprocessing.Pipe() for _ in range(N_READERS)]
     failed: list[Exception] = []
@@ -206,7 +206,7 @@ def test_a_snapshot_held_open_stops_no_writer(url: str, folder: Path) -> None:
 
 @contextlib.contextmanager
 def unfinished_move(url: str) -> Iterator[psycopg.Connection]:
-    """A writer in the middle of a transaction: it has the write lock and has deleted rows."""
+    """A writer in the middle of a transaction: it has the write lock, and its rows are deleted."""
     address = parse(url)
     with psycopg.connect(address.conninfo) as writer:
         writer.execute(f"SET search_path = {address.environment}")
@@ -240,7 +240,7 @@ def test_a_lock_held_too_long_is_told(url: str) -> None:
 
 
 def test_of_two_writers_of_one_object_one_waits(url: str) -> None:
-    """Neither is lost: the second begins where the first has ended."""
+    """Neither write is lost: the second begins where the first has ended."""
     with unfinished_move(url) as first:
         second = threading.Thread(target=move_once, daemon=True, args=(url, placement(0.18, 0, 0)))
         second.start()
@@ -259,7 +259,7 @@ def move_once(url: str, transform: np.ndarray[Any, Any]) -> None:
 
 
 def test_translations_of_two_writers_both_count(url: str) -> None:
-    """Each reads, shifts and writes; one that was overtaken reads again."""
+    """Each writer reads, shifts and writes; a writer that was overtaken reads again."""
     n_each, step = 3, "0.001,0,0"
     with processes(shift, *((url, step, n_each) for _ in range(2))) as writers:
         for writer in writers:
@@ -304,7 +304,7 @@ def import_once(url: str, file: Path) -> None:
     hapticdb.import_files(url, [file])
 
 
-# --- what is stuck ------------------------------------------------------------------------------
+# --- clients and servers that hang ----------------------------------------------------------------
 
 
 def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) -> None:
@@ -323,7 +323,7 @@ def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) 
 
 @contextlib.contextmanager
 def stopped(pid: int) -> Iterator[None]:
-    """A server's process that answers no more, and does again afterwards."""
+    """Stop a process of the server, and let it continue on exit."""
     os.kill(pid, signal.SIGSTOP)
     try:
         yield

@@ -1,4 +1,4 @@
-"""The objects in voxels are those that were written there."""
+"""`objects_at` returns the objects that were written into a voxel."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from realtime.worlds import HIERARCHICAL, ids_by_voxel, make, scatter
 def test_ids_are_those_of_the_voxels(
     tmp_path: Path, layout: Layout, curve: CurveName, bits: int
 ) -> None:
-    """Of several objects in one voxel, of free voxels, and with some left out."""
+    """For voxels of several objects, for free voxels, and with some objects left out."""
     env = make(tmp_path, bits, layout, curve)
     scatter(env, n_objects=4, n_voxels=4000)
     ids = ids_by_voxel(env)

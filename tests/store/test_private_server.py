@@ -1,4 +1,4 @@
-"""A private PostgreSQL server: what becomes of it when others start, stop and kill it, too."""
+"""A private PostgreSQL server, and what happens when others start, stop or kill it."""
 
 import contextlib
 import os
@@ -23,7 +23,7 @@ from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find
 FOUND = find_binaries()
 assert FOUND, "no PostgreSQL found: install the extra postgres"
 UNSAFE = {"fsync": "off"}
-"""Fast; what a process writes outlives it all the same."""
+"""Settings for speed: commits survive the end of a process, but not a loss of power."""
 START = """
 import sys
 from hapticdb.store.postgres.private_server import PrivateServer
@@ -60,7 +60,7 @@ def place() -> Iterator[Path]:
 
 @pytest.fixture
 def server(template: Path, place: Path) -> PrivateServer:
-    """Set up and not started."""
+    """A private server that is set up and not started."""
     return copy_of(template, place / "server")
 
 
@@ -257,7 +257,7 @@ def test_a_start_waits_for_the_children_of_a_killed_server(server: PrivateServer
     server.start()
     write(server)
     busy = psycopg.connect(server.conninfo())
-    # too busy to notice that its parent is gone
+    # this backend is too busy to notice that its parent has ended
     loop = b"DO 'DECLARE t timestamptz := clock_timestamp(); BEGIN WHILE clock_timestamp() < t +"
     loop += b" interval ''1 s'' LOOP NULL; END LOOP; END'"
     busy.pgconn.send_query(loop)
@@ -316,7 +316,7 @@ def test_the_log_does_not_grow_without_end(
 
 @pytest.mark.long
 def test_a_server_outlives_the_process_that_started_it(server: PrivateServer) -> None:
-    """Its pipes close as it ends, and an interrupt of its group stays there."""
+    """The process's pipes close as it ends, and Ctrl-C in its group does not reach the server."""
     sleeping = script(START + "import time; time.sleep(600)", server.folder)
     with child(sleeping, stderr=STDOUT) as process:
         assert process.stdout is not None
@@ -324,11 +324,11 @@ def test_a_server_outlives_the_process_that_started_it(server: PrivateServer) ->
         assert pid == pid_of(server)
         assert os.getsid(pid) != os.getsid(process.pid)
         os.killpg(process.pid, signal.SIGINT)
-        process.communicate(timeout=PATIENCE)  # ends with the pipe
+        process.communicate(timeout=PATIENCE)  # returns when the pipe closes
     assert ask(server, "SELECT 1") == 1
 
 
-# --- where it is --------------------------------------------------------------------------------
+# --- the server's folder ------------------------------------------------------------------------
 
 
 @pytest.mark.long
@@ -387,7 +387,7 @@ def test_a_socket_folder_that_others_may_enter_is_refused(server: PrivateServer)
         PrivateServer.at(server.folder)
 
 
-# --- its users ----------------------------------------------------------------------------------
+# --- the server's users -------------------------------------------------------------------------
 
 
 def test_a_release_stops_a_server_that_nobody_uses(server: PrivateServer) -> None:

@@ -1,6 +1,6 @@
-"""A server that dies at any moment leaves a valid environment, and the same command finishes.
+"""A server that dies at any moment leaves a valid environment; the same command then finishes.
 
-Each test has a server of its own, with all of its durability, and ends it as a crash does.
+Each test has a server of its own, with full durability, and ends that server as a crash does.
 """
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
@@ -66,7 +66,7 @@ def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
         assert "\n" not in str(told.value)
         server.start()
         objects, _, _ = valid_contents(url)
-        # what was reported is there: a commit waits for the disk
+        # all reported parts are stored: a commit waits for the disk
         assert n_parts <= len(objects) < N_PARTS
         assert objects == undisturbed[layout][0][: len(objects)]
     (report,) = hapticdb.import_files(url, [file], options(layout))

@@ -1,4 +1,4 @@
-"""A database that is deleted, moved or replaced while it is open: nobody is told what is not so."""
+"""A database is deleted, moved or replaced while it is open: nobody gets a wrong answer."""
 
 import shutil
 import subprocess
@@ -31,7 +31,7 @@ def names(path: Path) -> list[str]:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A small environment, closed, and a copy of it."""
+    """Path of a small environment that no store has open; a copy of it is beside it."""
     store = SQLiteStore.create(tmp_path / "q.db", GRID)
     write_voxels(store, floor_voxels(GRID), "floor")
     store.close()
@@ -81,7 +81,7 @@ def test_a_write_into_a_file_that_is_gone_is_refused(
     store = SQLiteStore.open(path)
     write(store, 1)
     event(path)
-    for _ in range(2):  # and again
+    for _ in range(2):  # also on the second try
         with pytest.raises(hapticdb.ConnectionLostError) as told:
             change(store)
         assert "\n" not in str(told.value)
@@ -119,7 +119,7 @@ def test_a_write_through_a_link_is_refused_too(
 
 
 def test_a_replaced_file_keeps_what_is_its_own(path: Path) -> None:
-    """Neither a write nor the end of who had the former file open changes it."""
+    """A store on the former file changes the new file neither by a write nor by `close`."""
     store = SQLiteStore.open(path)
     write(store, 1)
     replaced(path)
@@ -179,7 +179,7 @@ def test_nobody_opens_a_file_whose_log_was_taken_from_who_has_it_open(
 def test_a_copy_put_in_place_by_hand_is_not_written_into_by_the_log_that_was_removed(
     path: Path, tmp_path: Path, is_dropped: bool
 ) -> None:
-    """An old copy into the same inode, log removed as one is told: its own holder ends later."""
+    """An old copy overwrites the file (same inode), the log is deleted; the old store ends last."""
     with closing(SQLiteStore.open(path)) as store:
         write(store, 1)
     store = SQLiteStore.open(path)
@@ -210,7 +210,7 @@ def test_a_reader_of_a_replaced_file_is_told(
 def test_a_reader_never_feels_commits_into_another_file(
     path: Path, sphere: hapticdb.PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whoever opens the file in its place shares the log with the reader: it is told at once."""
+    """A store that opens the new file shares the log with the reader, which fails at once."""
     monkeypatch.setattr("hapticdb.store.sqlite.place.LOOK_SECONDS", 1e6)
     with hapticdb.open(path, read_only=True) as env:
         env.touch(sphere, np.eye(4))
@@ -231,7 +231,7 @@ def test_an_empty_environment_that_another_has_replaced_is_not_discarded(path: P
 
 
 def test_opening_again_takes_no_locks_from_who_has_it_open(path: Path) -> None:
-    """A process that closes any descriptor of a file of its own loses its locks on that file."""
+    """POSIX: a process that closes any descriptor of a file loses all its locks on that file."""
     script = (
         "import sys, apsw\n"
         "plain = apsw.Connection(sys.argv[1])\n"

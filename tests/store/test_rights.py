@@ -1,4 +1,4 @@
-"""Roles: what each may do is tried over plain connections, then through hapticdb; passwords."""
+"""Roles: their rights over plain connections and through hapticdb; passwords stay hidden."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -48,7 +48,7 @@ NAMES: dict[Right, str] = {
 
 @pytest.fixture
 def roles(admin: psycopg.Connection) -> Iterator[dict[Right, str]]:
-    """A role of its own for each right, named to be quoted; dropped after the test."""
+    """One role for each right, with a name that needs quotes; dropped after the test."""
     names = {right: f"{os.getpid()} {name}" for right, name in NAMES.items()}
     for role in map(sql.Identifier, names.values()):
         admin.execute(sql.SQL("CREATE ROLE {} LOGIN PASSWORD {}").format(role, PASSWORD))
@@ -60,7 +60,7 @@ def roles(admin: psycopg.Connection) -> Iterator[dict[Right, str]]:
 
 @pytest.fixture
 def url(place: Place) -> str:
-    """A small environment of the owner's."""
+    """URL of a small environment that the owner has made."""
     where = place()
     store = PostgresStore.create(where, GRID)
     write_voxels(store, floor_voxels(GRID), "floor")
@@ -71,14 +71,14 @@ def url(place: Place) -> str:
 
 @pytest.fixture
 def granted(url: str, roles: dict[Right, str]) -> dict[Right, str]:
-    """The environment's URLs by right, as the roles that were given it."""
+    """Right -> URL of the environment with the role that was granted this right."""
     for right, role in roles.items():
         grant(url, role, right)
     return {right: url_as(url, role) for right, role in roles.items()}
 
 
 def url_as(url: str, role: str) -> str:
-    """The same environment as another user."""
+    """URL of the same environment for another user."""
     address = parse(url)
     known = conninfo.conninfo_to_dict(address.conninfo)
     wanted = {**known, "user": role, "password": PASSWORD, "environment": address.environment}
@@ -97,7 +97,7 @@ A_COLUMN = {
     "cost": "machine",
 }
 GRID_COLUMNS = ("id", "format", "voxel_size", "origin_x", "bits", "curve", "layout")
-# no row is meant: a right is looked at before the rows are
+# no row is affected: the server checks rights before it reads rows
 SELECT = {table: f"SELECT * FROM @{table}" for table in A_COLUMN}
 INSERT = {table: f"INSERT INTO @{table} SELECT * FROM @{table} WHERE false" for table in A_COLUMN}
 UPDATE = {t: f"UPDATE @{t} SET {column} = {column} WHERE false" for t, column in A_COLUMN.items()}
@@ -140,7 +140,7 @@ EVERYTHING = {*INSERT.values(), *UPDATE.values(), *DELETE.values(), *OWNING, *AL
 
 
 def allowed(url: str) -> set[str]:
-    """Statements that the server lets the URL's user run, each undone; the others it forbids."""
+    """Statements that the URL's user may run; each is rolled back. The server forbids the rest."""
     address = parse(url)
     found = set()
     with psycopg.connect(address.conninfo) as connection:
@@ -178,7 +178,7 @@ def test_an_editor_cannot_pass_its_right_on(url: str, roles: dict[Right, str]) -
     role, schema = sql.Identifier(roles["nobody"]), sql.Identifier(parse(url).environment)
     theirs = parse(url_as(url, roles["editor"])).conninfo
     with psycopg.connect(theirs, autocommit=True) as connection:
-        # the server warns, and grants nothing
+        # the server only warns, and grants nothing
         connection.execute(sql.SQL("GRANT USAGE ON SCHEMA {} TO {}").format(schema, role))
         connection.execute(sql.SQL("GRANT SELECT ON {}.brick TO {}").format(schema, role))
         connection.execute(sql.SQL("GRANT SELECT ON {}.brick TO PUBLIC").format(schema))
@@ -250,7 +250,7 @@ def test_a_toucher_keeps_costs_and_changes_no_object(granted: dict[Right, str], 
             lambda: env.remove(1),
             lambda: write_voxels(env.store, floor_voxels(GRID), "another"),
             lambda: env.store.analyze(quantiles.DEFAULT_RESOLUTION, anew=True),
-            lambda: env.store.loading().__enter__(),  # before anything is read or voxelized
+            lambda: env.store.loading().__enter__(),  # refused before a file is read or voxelized
         ):
             with pytest.raises(ReadOnlyError, match="hapticdb grant URL ROLE --as editor"):
                 refused()
@@ -296,7 +296,7 @@ def test_an_editor_fills_an_empty_environment_and_renews_the_servers_statistics(
     assert copy_environment(source, theirs).copied == 1
     with hapticdb.open(theirs) as env:
         assert env.quantiles().source == "server statistics"
-        # an id that was brought along is never given again
+        # the id of a copied object is never given to another
         env.remove(2)
         assert write_voxels(env.store, floor_voxels(GRID), "new") == 3
 
@@ -336,7 +336,7 @@ def test_grant_speaks_one_line(run: Run, url: str, roles: dict[Right, str]) -> N
 # -- passwords are never shown -------------------------------------------------------------------
 
 MARK = "Zq7"
-# nobody listens on port 1
+# no server listens on port 1
 UNREACHABLE = "127.0.0.1:1"
 SECRET_KEYS = ("password", "p%61ssword", "sslpassword", "oauth_client_secret", "scram_client_key")
 passwords = st.builds(
@@ -346,7 +346,7 @@ passwords = st.builds(
 
 
 def urls_with(password: str) -> Iterator[str]:
-    """URLs that hold the password in each place that libpq takes one from, escaped or as it is."""
+    """URLs with the password in each place where libpq reads one, escaped and plain."""
     escaped = quote(password, safe="")
     for text in (escaped, password):
         yield f"postgresql://anna:{text}@{UNREACHABLE}/plant"
@@ -382,7 +382,7 @@ def test_what_is_no_secret_stays_readable(password: str) -> None:
 
 
 def lines(url: str) -> dict[str, list[str]]:
-    """A command line of each verb that takes a URL, in an order in which all go well."""
+    """Arguments for each verb that takes a URL, in an order in which all succeed."""
     by = ("--tool", "tool.stl")
     return {"import": [url, "boxes.glb", "--bits", "6"]} | {
         **{verb: [url] for verb in ("info", "objects", "check", "calibrate", "analyze")},
@@ -417,9 +417,9 @@ def test_every_verb_that_takes_a_url_is_tried() -> None:
 def test_no_verb_prints_a_password_when_all_goes_well(run: Run, place: Place) -> None:
     url = f"{place()}&password={MARK}&sslpassword={MARK}"
     for verb, args in lines(url).items():
-        if verb != "demo":  # takes long
+        if verb != "demo":  # the demo takes long
             code, out, err = run("--debug", verb, *args)
-            is_well = code == 0 or (verb, code) == ("sweep", 1)  # the path is not free
+            is_well = code == 0 or (verb, code) == ("sweep", 1)  # code 1: the path hits something
             assert (is_well, MARK in out + err) == (True, False), (verb, out, err)
     for verb in ("info", "touch", "remove", "copy", "grant"):
         code, out, err = run("--debug", verb, *lines(f"{url}&environment=missing")[verb])
@@ -482,7 +482,7 @@ def test_a_server_without_tls_is_refused_where_tls_is_required(mode: str) -> Non
         def decline() -> None:
             with listener.accept()[0] as client:
                 client.recv(8)
-                client.sendall(b"N")  # as a server without TLS does
+                client.sendall(b"N")  # the answer of a server without TLS
 
         threading.Thread(target=decline, daemon=True).start()
         where = f"127.0.0.1:{listener.getsockname()[1]}/plant"

@@ -1,4 +1,4 @@
-"""Names of roles, users, databases and environments that the server would take for others."""
+"""Names of roles, users, databases and environments that the server would read as others."""
 
 import os
 import sys
@@ -20,13 +20,13 @@ LONG = "r" * 64
 
 
 def of_bytes(start: str, letter: str) -> str:
-    """A name of as many bytes as a name may have, or one less."""
+    """A name of at most LONGEST_NAME bytes, as long as whole letters allow."""
     return start + letter * ((LONGEST_NAME - len(start.encode())) // len(letter.encode()))
 
 
 @pytest.fixture(params=["r", "é", "語"])
 def role(request: pytest.FixtureRequest, admin: psycopg.Connection) -> Iterator[str]:
-    """A role whose name is as long as one may be."""
+    """A role with a name of the greatest length."""
     name = of_bytes(f"{os.getpid()}", request.param)
     quoted = sql.Identifier(name)
     admin.execute(sql.SQL("CREATE ROLE {}").format(quoted))

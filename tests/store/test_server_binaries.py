@@ -1,4 +1,4 @@
-"""Which PostgreSQL a private server runs, and as whom where root asks for it."""
+"""Which PostgreSQL a private server runs, and under which account when root starts it."""
 
 import importlib.util
 import os
@@ -20,7 +20,7 @@ UNSAFE = {"fsync": "off"}
 
 
 def bindir(folder: Path, version: str) -> Path:
-    """Programs that know their version and no more."""
+    """A folder of fake programs that only print a version."""
     folder.mkdir(parents=True)
     for name in ("initdb", "postgres"):
         (folder / name).write_text(f"#!/bin/sh\necho 'postgres (PostgreSQL) {version}'\n")
@@ -77,7 +77,7 @@ root_only = pytest.mark.skipif(os.geteuid() != 0, reason="changing the account i
 
 @pytest.fixture
 def place() -> Iterator[Path]:
-    """A folder that everybody may enter; servers below it end with the test."""
+    """A folder that every account may enter; servers below the folder end with the test."""
     folder = Path(tempfile.mkdtemp(prefix="place-")).resolve()
     folder.chmod(0o755)
     yield folder
@@ -90,7 +90,7 @@ def place() -> Iterator[Path]:
 
 @pytest.fixture(params=FOUND, ids=lambda binaries: f"postgres{binaries.major}")
 def binaries(request: pytest.FixtureRequest) -> Binaries:
-    """One that every account may run, wherever the environment of the tests is."""
+    """Programs that every account may run; others are skipped."""
     assert isinstance(request.param, Binaries)
     account = server_binaries.Account(uid=65534, gid=65534)
     try:
@@ -101,7 +101,7 @@ def binaries(request: pytest.FixtureRequest) -> Binaries:
 
 
 def owner_of(server: PrivateServer) -> int:
-    """Who runs the server, as the system sees it."""
+    """User id of the server's process, from /proc."""
     return Path(f"/proc/{server._postmaster()}").stat().st_uid
 
 
@@ -127,7 +127,7 @@ def test_root_keeps_the_folder_where_unshare_is_allowed(place: Path, binaries: B
 def test_where_unshare_is_not_allowed_an_account_gets_the_folder(
     place: Path, binaries: Binaries, monkeypatch: pytest.MonkeyPatch, unshare: str
 ) -> None:
-    """One that was set up with it; its new owner then runs the server for good."""
+    """A folder made with unshare goes to an account, which then runs the server for good."""
     folder = place / "server"
     PrivateServer.at(folder, binaries, UNSAFE)
     monkeypatch.setattr(server_binaries, "UNSHARE", (unshare,))

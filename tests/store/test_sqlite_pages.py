@@ -1,4 +1,4 @@
-"""Pages of a file that are not as they were written are told, whatever they hold."""
+"""A page of a file that differs from what was written is an error, whatever it holds."""
 
 import shutil
 import sqlite3
@@ -24,7 +24,7 @@ GRID = Grid(0.005, (0, 0, 0), 7)
 
 
 def made(path: Path, layout: Layout = "brick") -> Path:
-    """An environment of a few dozen pages, closed."""
+    """An environment of a few dozen pages that no store has open."""
     with closing(SQLiteStore.create(path, GRID, layout)) as store:
         for name in ("a", "b", "c"):
             width = 96 if layout == "brick" else 24
@@ -42,7 +42,7 @@ def page(number: int) -> slice:
 
 
 def read_all(path: Path) -> None:
-    """Read every row, as a touch, a list and a look at the statistics do."""
+    """Read every row, as frames, listings and statistics do."""
     with hapticdb.open(path, read_only=True) as env:
         env.objects()
         env.store.scan(np.zeros(1, np.int64), np.full(1, 1 << 62))
@@ -69,7 +69,7 @@ def duplicate(content: bytearray, number: int) -> None:
 
 @pytest.mark.parametrize("damage", [flip_a_bit, zero, swap, duplicate])
 def test_damage_to_any_page_is_told(path: Path, damage: Callable[[bytearray, int], None]) -> None:
-    """But to a page that nothing reads."""
+    """Damage is found on every page that is read."""
     whole = path.read_bytes()
     n_pages = len(whole) // PAGE_BYTES
     told = 0
@@ -81,12 +81,12 @@ def test_damage_to_any_page_is_told(path: Path, damage: Callable[[bytearray, int
             read_all(path)
         except hapticdb.DamagedError as error:
             told += "is not what was written" in str(error)
-    # seven tables and indexes are not asked for rows, nor is the first page damaged here
+    # not found: pages of seven tables and indexes that are not read; page 1 stays whole here
     assert told >= n_pages - 8
 
 
 def test_a_page_of_another_environment_is_told(path: Path, tmp_path: Path) -> None:
-    """Though it has the same number and holds the same rows."""
+    """A page of another file is an error, even with the same number and the same rows."""
     with closing(SQLiteStore.open(path)) as store:
         layout = store.layout
     other = made(tmp_path / "other.db", layout).read_bytes()
@@ -101,7 +101,7 @@ def test_a_page_of_another_environment_is_told(path: Path, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("at", [20, 60, 28, 100, PAGE_BYTES - 16, PAGE_BYTES - 3])
 def test_damage_to_the_header_does_not_end_the_checking(path: Path, at: int) -> None:
-    """The size of the tail, the version, the number of pages, the mark, the checksum itself."""
+    """Damaged: size of the tail, version, number of pages, application mark, or checksum."""
     content = bytearray(path.read_bytes())
     content[at : at + 4] = bytes(4)
     path.write_bytes(content)
@@ -110,7 +110,7 @@ def test_damage_to_the_header_does_not_end_the_checking(path: Path, at: int) -> 
 
 
 def test_damage_to_the_log_is_told(path: Path) -> None:
-    """While others hold it open, when SQLite itself looks at no checksum."""
+    """Found also while others have the log open, when SQLite itself checks no checksum."""
     env = hapticdb.open(path)
     write_voxels(env.store, floor_voxels(GRID), "later")
     log = Path(f"{path}-wal")
@@ -121,11 +121,11 @@ def test_damage_to_the_log_is_told(path: Path) -> None:
     with pytest.raises(hapticdb.DamagedError, match="-wal is not as written"):
         read_all(path)
     with pytest.raises(hapticdb.DamagedError, match="-wal is not as written"):
-        env.close()  # the last one folds the log into the file, and never a page that is damaged
+        env.close()  # the last close copies the log into the file, but no damaged page
 
 
 def test_a_transaction_larger_than_the_cache_reads_what_it_wrote(tmp_path: Path) -> None:
-    """Its frames are written twice, and have their checksums at the commit."""
+    """Its frames are written twice, and their checksums are right at the commit."""
     file = made(tmp_path / "e.db")
     rng = np.random.default_rng(0)
     with hapticdb.open(file) as env:
@@ -161,7 +161,7 @@ def test_a_file_edited_by_another_program_is_told(path: Path) -> None:
 
 
 def without_checksums(path: Path) -> Path:
-    """The same environment as it was before there were any."""
+    """The same environment in the older format, which had no checksums."""
     old = path.with_name("old.db")
     with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
         script = [
@@ -212,7 +212,7 @@ def test_a_link_leads_to_the_file_and_its_log(path: Path, tmp_path: Path) -> Non
 
 
 def test_closing_a_reader_is_quiet(path: Path, tmp_path: Path) -> None:
-    """As the last one, also when the file is gone."""
+    """The last reader closes without an error, also when the file is gone."""
     env = hapticdb.open(path, read_only=True)
     env.objects()
     shutil.rmtree(tmp_path)

@@ -1,4 +1,4 @@
-"""A log belongs to one file: no other is opened with it, and that one always is."""
+"""A log belongs to one file: with another file it is refused, with its own it is accepted."""
 
 import os
 import shutil
@@ -33,11 +33,11 @@ def write(store: SQLiteStore, *numbers: int) -> None:
 
 
 def killed(path: Path, work: Callable[[SQLiteStore], None]) -> None:
-    """Do something to a database in a process that dies of it."""
+    """Change a database in a process that is killed right after."""
     pid = os.fork()
-    if pid == 0:  # everything is imported, and nothing is started: safe here, as a test
+    if pid == 0:  # fork is safe: all modules are imported, and no thread runs
         try:
-            store = SQLiteStore.open(path)  # held until the end: whoever lets go of it closes it
+            store = SQLiteStore.open(path)  # kept in a variable: a dropped store closes itself
             work(store)
         finally:
             os.kill(os.getpid(), signal.SIGKILL)
@@ -55,7 +55,7 @@ def folder_bytes(folder: Path) -> dict[str, bytes]:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """A small environment, closed."""
+    """Path of a small environment that no store has open."""
     store = SQLiteStore.create(tmp_path / "q.db", GRID)
     write_voxels(store, floor_voxels(GRID), "floor")
     store.close()
@@ -64,7 +64,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def stale(path: Path, tmp_path: Path) -> Path:
-    """An old copy of an environment in its place, under the log of a writer that was killed."""
+    """An environment replaced by an old copy, beside the log of a writer that was killed."""
     shutil.copy(path, tmp_path / "backup")
     with closing(SQLiteStore.open(path)) as store:
         write(store, 1, 2)
@@ -143,7 +143,7 @@ def test_a_file_copied_over_one_that_is_being_written_is_noticed_by_the_next_wri
         write(store, 1)
     store = SQLiteStore.open(path)
     write(store, 2)
-    shutil.copy(tmp_path / "backup", path)  # into the same inode
+    shutil.copy(tmp_path / "backup", path)  # overwrites the file in the same inode
     with pytest.raises(hapticdb.DamagedError, match="-wal"):
         write(store, 3)
     store.close()
@@ -217,7 +217,7 @@ def test_every_commit_draws_a_new_mark(path: Path) -> None:
 
 
 class Tape(apsw.VFS):
-    """The operating system's files, with all writes to them in the order in which they came."""
+    """A VFS on the system's files that records all writes to them, in order."""
 
     def __init__(self) -> None:
         self.steps: list[tuple[str, int, bytes | None]] = []
@@ -228,7 +228,7 @@ class Tape(apsw.VFS):
 
 
 class TapedFile(apsw.VFSFile):
-    """One file; a write of None is a sync, at -1 a truncation."""
+    """One file. A recorded content of None is a sync, an offset of -1 a truncation."""
 
     def __init__(self, tape: Tape, name: Any, flags: Any) -> None:  # noqa: ANN401 - apsw's
         super().__init__("unix", name, flags)
@@ -249,9 +249,9 @@ class TapedFile(apsw.VFSFile):
 
 @pytest.fixture(scope="module")
 def taped(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], Tape]:
-    """A database before some writing, and all writes to it and its log.
+    """A database before some changes, and all writes to the database and its log.
 
-    Several connections, several generations of the log, checkpoints in the midst of one.
+    The changes use several connections, several generations of the log, and checkpoints within one.
     """
     path = tmp_path_factory.mktemp("taped") / "q.db"
     store = SQLiteStore.create(path, GRID)
@@ -268,7 +268,7 @@ def taped(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], T
             if n % 4 == 3:
                 writing.remove(writing.objects()[1].id, lambda _: [(0, 2**62)])
             if n % 8 == 5:
-                with reader.snapshot():  # which keeps the log from being begun anew
+                with reader.snapshot():  # a snapshot keeps the log from starting again
                     reader.objects()
                     writing._connection.driver.wal_checkpoint()
                     write(writing, 100 + n)
@@ -324,7 +324,7 @@ def test_a_log_is_never_refused_after_a_kill_between_any_two_writes(
 def test_a_log_is_never_refused_after_a_loss_of_power(
     taped: tuple[dict[str, bytes], Tape], tmp_path: Path
 ) -> None:
-    """Of what was written to a file since it was synced, any sectors of 512 bytes are there."""
+    """After a loss of power any subset of the 512-byte sectors since the last sync is on disk."""
     start, tape = taped
     rng = np.random.default_rng(0)
     files = {name: bytearray(content) for name, content in start.items()}
@@ -353,7 +353,7 @@ def test_a_log_is_never_refused_after_a_loss_of_power(
 
 
 def test_every_older_copy_is_refused(taped: tuple[dict[str, bytes], Tape], tmp_path: Path) -> None:
-    """Under the last log, any file but the one that it was begun on."""
+    """With the last log, every file state before the log's own is refused."""
     start, tape = taped
     files = {name: bytearray(content) for name, content in start.items()}
     last = max(

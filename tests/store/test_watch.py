@@ -1,4 +1,4 @@
-"""A reader learns that others have written: what the contract leaves to each engine."""
+"""How a reader learns of others' writes, as far as the contract leaves it to each engine."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -49,7 +49,7 @@ write_voxels(open_store(sys.argv[1]), np.array([[4, 5, 6]]), "of another process
 
 @pytest.fixture
 def url(place: Place) -> str:
-    """An empty environment on a server."""
+    """URL of an empty environment on a server."""
     where = place()
     create_store(where, GRID).close()
     return where
@@ -57,7 +57,7 @@ def url(place: Place) -> str:
 
 @pytest.fixture
 def file(tmp_path: Path) -> str:
-    """An empty environment in a file."""
+    """Path of an empty environment in a file."""
     create_store(tmp_path / "e.db", GRID).close()
     return str(tmp_path / "e.db")
 
@@ -117,7 +117,7 @@ def test_an_immutable_reader_is_told_by_the_files_stamp(
     reader.watch()
     assert not reader.has_changed()
     change(file)
-    for _ in range(2):  # it cannot be read any more: for good
+    for _ in range(2):  # the reader stays unusable
         assert reader.has_changed()
         with pytest.raises(hapticdb.BusyError, match="open it again"):
             reader.objects()
@@ -174,7 +174,7 @@ def reader(url: str) -> Iterator[PostgresStore]:
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Grows by one for each round trip that asks for the revision."""
+    """A list that gets one entry for each round trip that asks for the revision."""
     found: list[int] = []
     ask = watching.Watch._ask
 

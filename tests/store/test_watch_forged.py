@@ -1,4 +1,4 @@
-"""Notifications of roles that have no right on an environment: they neither hide nor cost."""
+"""Notifications from roles without rights hide no edit and cause few extra questions."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -48,7 +48,7 @@ def test_words_of_strangers_on_the_channel_hide_no_edit(
     stranger: psycopg.Connection,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Each edit is seen by its notification alone, as it is where nobody forges one."""
+    """Each edit is noticed by its own notification, as without forged ones."""
     monkeypatch.setattr(watching, "HEARING_S", 1e9)
     channel = channel_of(parse(url).environment)
     with pytest.raises(psycopg.errors.InsufficientPrivilege):
@@ -89,12 +89,12 @@ def test_a_flood_of_notifications_leads_to_few_round_trips(
     reader.watch()
     asked.clear()
     channel = channel_of(parse(url).environment)
-    for n in range(100):  # as a fetching process looks: each millisecond
+    for n in range(100):  # the fetching process looks each millisecond
         clock.now += 1e-3
         stranger.execute(
             "SELECT pg_notify(%s, %s::text || n) FROM generate_series(1, 20) n", (channel, n)
         )
-        reader.objects()  # which also takes in what has come
+        reader.objects()  # a read also receives waiting notifications
         assert not reader.has_changed()
     assert 1 <= len(asked) <= 0.1 / watching.HINTED_S
     write(url)

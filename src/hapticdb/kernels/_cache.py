@@ -1,4 +1,4 @@
-"""Where machine code is kept between processes; known without numba.
+"""The folder in which machine code is kept between processes; found without loading numba.
 
 numba's on-disk cache watches only the file of the entry itself, by time stamp and size. A leaf
 edited in another file, or a wheel whose files all carry one fixed time stamp, would leave stale
@@ -11,7 +11,7 @@ import tempfile
 from pathlib import Path
 
 IN_WORKER = "HAPTICDB_COMPILING"
-"""Set in the environment of a process that only compiles."""
+"""Environment variable that is set in a process that only compiles."""
 
 
 def sources_digest(folder: Path) -> str:
@@ -41,4 +41,4 @@ def cache_folder() -> str:
 
 
 CACHE_FOLDER = cache_folder()
-"""Where this process keeps and finds machine code."""
+"""Folder in which this process keeps and finds machine code."""

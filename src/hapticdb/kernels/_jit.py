@@ -1,7 +1,7 @@
 """How kernels are compiled: the numba options of this package, here and nowhere else.
 
-An entry, which Python calls, names the types that it is called with: `compiling` can so compile it
-before its first call, in another process. A leaf is called by kernels only.
+An entry is called from Python and declares the types of its arguments, so that `compiling` can
+compile it before its first call, in another process. A leaf is called by kernels only.
 
 Machine code goes into a folder of its own (`_cache`); users' own kernels keep the folder that they
 configured.
@@ -28,9 +28,9 @@ FLOATS, FLOATS2, FLOATS3 = FLOAT[::1], FLOAT[:, ::1], FLOAT[:, :, ::1]
 READ_BYTES = types.Array(types.uint8, 1, "C", readonly=True)
 READ_FLOATS = types.Array(FLOAT, 1, "C", readonly=True)
 READ_FLOATS2 = types.Array(FLOAT, 2, "C", readonly=True)
-"""Types of arguments: arrays are C-contiguous, the digit is the number of their axes if above 1.
+"""Types of arguments. Arrays are C-contiguous; a last digit is the number of axes, if above 1.
 
-An array that cannot be written is of another type than one that can.
+A read-only array has another type than a writable one.
 """
 
 ENTRIES: list[Any] = []
@@ -52,13 +52,13 @@ def record_of(layout: Any, axes: int = 0) -> Any:  # noqa: ANN401 - likewise
 class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk of one entry.
 
-    What was compiled for a NamedTuple from outside this package stays in memory. The file that
+    Machine code for a NamedTuple from outside this package stays in memory. The file that
     lists an entry's machine code names such types by their module, and a process that cannot
     import one of them could read nothing of that file.
     """
 
     def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401 - numba's types
-        """Keep what was compiled, unless it is for types of others."""
+        """Store the machine code, unless it is for types from outside this package."""
         given, _ = normalize_signature(sig)
         classes = [getattr(kind, "instance_class", None) for kind in given]
         if all(c is None or c.__module__.startswith("hapticdb.") for c in classes):
@@ -68,8 +68,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 def entry(*signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:  # noqa: ANN401
     """Compile a kernel that Python calls with arguments of those types, when it is first called.
 
-    It is cached on disk, and runs without the interpreter lock. Called with other types it is
-    compiled for those, too: correct, and slow the first time.
+    The kernel is cached on disk and runs without the interpreter lock. A call with other types is
+    correct, but slow the first time, because the kernel is compiled for them then.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -92,8 +92,8 @@ def entry(*signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
 def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
     """Compile a scalar function that only kernels call; LLVM inlines it.
 
-    Tests call leaves from Python, so they have wrappers for it; in a process that only compiles
-    nobody does, and a sixth of the time is saved without.
+    Tests call leaves from Python, so leaves have wrappers for such calls. A process that only
+    compiles leaves the wrappers out, which saves a sixth of its time.
     """
     decorate = numba.njit(
         nogil=True,
@@ -105,7 +105,7 @@ def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a leaf that takes arrays: put into its caller by numba, with no counted reference."""
+    """Compile a leaf that takes arrays: numba inlines it, so arrays cost no counted reference."""
     decorate = numba.njit(nogil=True, error_model="numpy", inline="always")
     return decorate(function)  # type: ignore[no-any-return]
 

@@ -1,10 +1,10 @@
-"""Entries compiled before their first call, side by side in processes of their own.
+"""Compile entries before their first call, side by side in several processes.
 
-numba compiles one function at a time in a process, whatever the threads. So each process owns
-whole modules of entries: two processes that wrote the index of one entry
-would lose each other's work. What is compiled goes into the cache on disk, from which the process
-that asked, and every later one, loads it. A mark beside it tells that an entry is there, without
-numba having to look.
+numba compiles one function at a time in a process, with any number of threads. Each process
+compiles whole modules of entries, because two processes that wrote the index of one entry would
+lose each other's work. The machine code goes into the cache on disk; the process that asked, and
+every later process, loads it from there. A mark file beside the code says that an entry is
+compiled, so that numba need not be loaded to find out.
 """
 
 import contextlib
@@ -50,16 +50,16 @@ ENTRIES = {
     "surfaces.bricks": "z_keys_kernel mark_points_kernel count_kernel brick_voxels_kernel",
     "hand.handle": "is_somewhere grip carry",
 }
-"""Entries by module, those that take longest to compile first. They are named here so that nobody
-loads numba to see that they are compiled."""
+"""Entries of each module; modules that take longest to compile come first. The names are listed
+here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {"resident.cells": "hand.coupling"}
-"""Modules that are compiled after another in one process, since they share its leaves."""
+"""Modules that are compiled after another module in the same process: they share its leaves."""
 LONGEST_S = 600.0
 """Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
 where it is first called."""
 SERVE = "from hapticdb.kernels.compiling import serve; serve()"
-"""What a process that compiles runs."""
+"""Python code that a compiling process runs."""
 
 _SHELL = ("surfaces.sampling.*", "surfaces.sides.*", "curves.encode_kernel")
 _VOXELIZE = (
@@ -112,11 +112,11 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     ),
     "everything": ("*",),
 }
-"""Entries that a purpose calls, with ``*`` for any name (`tests/house/test_warm.py` checks it)."""
+"""Entries that each purpose calls; ``*`` is any name (checked by `tests/house/test_warm.py`)."""
 
 
 class Compiled(NamedTuple):
-    """How far it is: entries that are compiled, and how many are to be."""
+    """Progress: number of entries that are compiled, and of all entries to compile."""
 
     done: int
     total: int
@@ -176,13 +176,13 @@ def compile_missing(
 
 
 def load(names: Collection[str]) -> None:
-    """Load those entries from the cache, or compile them here: no first call waits any more."""
+    """Load those entries from the cache, or compile them here, so that no first call waits."""
     for name in names:
         _compile_here(name)
 
 
 def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
-    """Names by job: entries of one module, and of one that goes with it, share their leaves."""
+    """Names by job: a module's entries and those of its partner in `TOGETHER` are one job."""
     jobs: dict[str, list[str]] = {}
     for name in sorted(names, key=NAMES.index):
         module = name.rpartition(".")[0]
@@ -191,7 +191,7 @@ def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
 
 
 class _Workers:
-    """Processes that compile, started as threads ask for them; all are ended at the end."""
+    """Compiling processes. They are started when threads ask for them and all ended at exit."""
 
     def __init__(self) -> None:
         self._idle: list[subprocess.Popen[str]] = []
@@ -203,11 +203,11 @@ class _Workers:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """End them, when no thread speaks with one any more."""
+        """End the processes when no thread uses one any more."""
         self.end()
         for worker in self._all:
             for pipe in (worker.stdin, worker.stdout):
-                with contextlib.suppress(OSError):  # what was to be sent to one that is gone
+                with contextlib.suppress(OSError):  # data for a process that has ended
                     if pipe is not None:
                         pipe.close()
 
@@ -233,7 +233,7 @@ class _Workers:
         return len(job)
 
     def end(self) -> None:
-        """End every process, compiling or not: nothing half-written stays (numba renames)."""
+        """End every process, even a compiling one: no half-written file stays (numba renames)."""
         with self._lock:
             self._has_ended = True
             self._idle.clear()
@@ -242,7 +242,7 @@ class _Workers:
                 worker.wait()
 
     def _started(self) -> "subprocess.Popen[str] | None":
-        # the package is found where this process has found it, whatever the folder
+        # the package is found in the same place as here, in any working folder
         path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
         try:
             worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
@@ -252,7 +252,7 @@ class _Workers:
                 stderr=subprocess.DEVNULL,
                 env=os.environ | {IN_WORKER: "1", "PYTHONPATH": path},
                 text=True,
-                start_new_session=True,  # Ctrl-C is the parent's, which ends this one
+                start_new_session=True,  # the parent handles Ctrl-C and ends this process
             )
         except OSError:
             return None
@@ -261,8 +261,8 @@ class _Workers:
 
 
 def serve() -> None:
-    """Be a process that compiles: a line of names in, the same line out when they are compiled."""
-    gc.set_threshold(100_000, 50, 100)  # compiling makes few cycles, and many objects
+    """Run a compiling process: read a line of names, write it back when they are compiled."""
+    gc.set_threshold(100_000, 50, 100)  # compiling makes many objects and few cycles
     for line in sys.stdin:
         for name in line.split():
             _compile_here(name)
@@ -289,7 +289,7 @@ def _compile_here(name: str) -> None:
 
 @functools.cache
 def _target() -> str:
-    """Digest of what numba's cached code depends on beside our sources: version and processor."""
+    """Digest of numba's version and the processor: cached code depends on them, too."""
     from llvmlite import binding  # noqa: PLC0415 - where it is not needed, nobody waits for it
 
     features = binding.get_host_cpu_features().flatten()

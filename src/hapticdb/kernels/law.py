@@ -1,14 +1,14 @@
-"""The force law: what a point of the shell feels, and how a frame adds it up. It stands only here.
+"""The force law: what a point of the shell feels, and how a frame adds it up. It is only here.
 
 A *hit* is a point inside an occupied voxel. Hits come from the occupancy alone and are the same
 under every law. What a point *feels* is the law's answer: a depth, and a weight in the frame's
 average. A law may feel a point that is no hit (a distance field does, before the surface), and it
 need not feel every hit (the tangent plane does not, above the plane).
 
-A law is a NamedTuple of its numbers, with the field `stiffness` among them, and the functions in
-`Leaves` that `define` enters for its type. Kernels are compiled once for each type of law. The
-other way, one compiled kernel and a branch on a number in the law, was not taken: every frame would
-pass the payload of every law, at 0.3 us an array, and a law could not be added from outside.
+A law consists of a NamedTuple of its numbers, one of them the field `stiffness`, and of the
+functions in `Leaves` that `define` enters for its type. Kernels are compiled once for each type of
+law. One compiled kernel with a branch on a number in the law would be worse: every frame would pass
+the payload of every law, at 0.3 us an array, and a law could not be added from outside.
 
 A *payload* is what a law reads beside the occupancy: an array next to the rows of a frame, or next
 to the cells in memory. None stands for no payload and costs a frame nothing.
@@ -27,7 +27,7 @@ AVERAGE_FROM = 10.0
 A larger number lets a frame of many contacts push harder.
 """
 NOTHING_NEAR = math.inf
-"""Sample of a point near which a law's payload has nothing."""
+"""Sample of a point when the payload holds nothing near the point."""
 
 
 def no_sample(law, payload, at, x, y, z):  # noqa: ARG001 - the arguments of every such leaf
@@ -43,15 +43,15 @@ def no_reach(law):  # noqa: ARG001 - the arguments of every such leaf
 class Leaves(NamedTuple):
     """Functions of one type of law: plain Python that numba compiles into the kernels.
 
-    respond : (law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size) -> depth, weight. Of
-        the point p with the inward normal n in the voxel of centre c, world frame, metres; `size`
-        is the voxel's. Depth in metres, felt where above 0. The weight is 1 for a point that counts
-        fully in the average, 0 for one that does not.
-    reach : (law) -> voxels within which a point is felt that is no hit. A point that is no hit is
-        left out when its sample is above the reach.
-    sample_row, sample_slot : (law, payload, at, x, y, z) -> sample. What the payload says about the
-        point (x, y, z), in voxels from the grid's origin, in a row of the index table or in a
-        slot of the resident cells. Of several rows the least sample counts.
+    respond : (law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size) -> depth, weight. The
+        point is p, its inward normal n, the centre of its voxel c, world frame, metres; `size` is
+        the voxel size. Depth in metres; the point is felt if it is above 0. The weight is 1 for a
+        point that counts fully in the average, and 0 for a point that does not count.
+    reach : (law) -> largest sample, in voxels, at which a point that is no hit may be felt. A point
+        that is no hit is left out when its sample is above the reach.
+    sample_row, sample_slot : (law, payload, at, x, y, z) -> sample. The payload's value at the
+        point (x, y, z), in voxels from the grid's origin, in row `at` of the index table or in
+        slot `at` of the resident cells. Of several rows the least sample counts.
     """
 
     respond: Callable[..., Any]
@@ -61,11 +61,11 @@ class Leaves(NamedTuple):
 
 
 LEAVES: dict[type, Leaves] = {}
-"""Functions by the type of the law."""
+"""The functions of each type of law."""
 
 
 def define(law_type: type, leaves: Leaves) -> None:
-    """Enter the functions of a type of law, before a kernel is called with one."""
+    """Enter the functions of a type of law; call it before any kernel gets a law of that type."""
     LEAVES[law_type] = leaves
 
 
@@ -122,7 +122,7 @@ def depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz):
 
 
 def tangent_plane(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # noqa: ARG001
-    """Depth below the tangent plane; every hit counts in the average, above the plane, too."""
+    """Depth below the tangent plane. Every hit counts in the average, even above the plane."""
     return depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz), 1.0
 
 

@@ -18,8 +18,8 @@ PAIR = types.UniTuple(FLOAT, 2)
 def play(time, knots, pose, velocity):
     """Pose and velocity at a time: linear between knots, turning about one axis (slerp).
 
-    knots (M, 8) in order of time, M > 1: s, m, unit quaternion. Before the first and from the last
-    on the hand rests. Writes pose (4, 4) and velocity (6,).
+    knots (M, 8) in order of time, M > 1: s, m, unit quaternion. The hand rests before the first
+    knot and from the last knot on. Writes pose (4, 4) and velocity (6,).
     """
     left, right = 0, len(knots) - 1
     rests = time < knots[0, 0] or time >= knots[right, 0]
@@ -70,7 +70,7 @@ def angular_velocity(x, y, z, dx, dy, dz):
     a = (1 - cos r) / r^2, b = (r - sin r) / r^3, r the turn's angle.
     """
     square = x * x + y * y + z * z
-    if square < 1e-6:  # where the differences lose their digits; the next terms are below 1e-14
+    if square < 1e-6:  # differences lose digits here: series, whose next terms are below 1e-14
         a = 0.5 - square / 24.0
         b = 1.0 / 6.0 - square / 120.0
     else:
@@ -90,7 +90,7 @@ def sway(time, waves, center, pose, velocity):
     """Pose and velocity at a time of a hand that sways about a pose by sums of sines.
 
     waves (6, K, 4): amplitude (m; rad for the last three axes, which are a turn), rad/s, phase, the
-    phase's sine. center (4, 4). Writes pose (4, 4) and velocity (6,), exact derivatives.
+    phase's sine. center (4, 4): the pose. Writes pose (4, 4) and velocity (6,), exact derivatives.
     """
     px, velocity[0] = wave(time, waves, np.int64(0))
     py, velocity[1] = wave(time, waves, np.int64(1))
@@ -107,7 +107,7 @@ def sway(time, waves, center, pose, velocity):
 def survey(waves, cycle, n_samples):
     """Farthest distance, fastest speed and fastest turning over a cycle -> m, m/s, rad/s.
 
-    waves as in `sway`; cycle in seconds, looked at n_samples times.
+    waves as in `sway`; cycle in seconds, sampled at n_samples times.
     """
     reach = 0.0
     speed = 0.0
@@ -133,10 +133,10 @@ def pull(
 ):
     """Let a hand pull a body along by a critically damped spring, against a wrench.
 
-    n_steps of step seconds, semi-implicit. ahead: seconds from the first step's start to the
-    instant of hand (4, 4) and hand_velocity (6,); before it the hand moved at that velocity.
+    n_steps semi-implicit steps of step seconds. ahead: seconds from the first step's start to the
+    time of hand (4, 4) and hand_velocity (6,); before that the hand moved at that velocity.
     inertias (kg, kg m^2) and grips (N/m, N m/rad) are pairs. body (13,): position, unit quaternion,
-    velocity; moved on. Writes pose (4, 4) and velocity (6,) as they are rest seconds later.
+    velocity; changed in place. Writes pose (4, 4) and velocity (6,) for `rest` seconds later.
     """
     mass, inertia = inertias
     grip, turn_grip = grips

@@ -1,10 +1,10 @@
 """Records: the named state that crosses between Python, kernels and processes.
 
-Each layout is a structured NumPy dtype. A kernel takes an array of it without axes, or one axis of
-them, and reads ``record = array[()]`` once; from there a field is an offset that the compiler
-knows, so it costs what a number in a vector costs. One record with many fields crosses into a
-kernel in 0.4 us, and every further array costs 0.2 us (a NamedTuple costs that for each array in
-it), so what belongs together is one record.
+Each layout is a structured NumPy dtype. A kernel takes an array of records, without axes or with
+one axis, and reads ``record = array[()]`` once. After that a field is an offset that the compiler
+knows, so reading a field costs the same as reading a number of a vector. Passing one record with
+many fields to a kernel costs 0.4 us, and every further array costs 0.2 us (a NamedTuple costs that
+for each array in it), so numbers that belong together form one record.
 
 In Python, ``array["hits"]`` is a view of a field; a loop that runs a thousand times a second makes
 its views once, with `views_of`. This module imports numpy alone, so that whoever needs a layout
@@ -21,19 +21,20 @@ from numpy.typing import NDArray
 Layout = np.dtype[np.void]
 
 MOST_MISSED = 63
-"""Unknown cells that a frame names for the fetching process. More are fetched in fewer rounds when
-a tool has come far into unknown cells; each costs a comparison for each unknown cell of a frame."""
+"""Most unknown cells that a frame lists for the fetching process. Larger: fewer rounds of fetching
+when the tool is far in unknown cells, and more comparisons for each unknown cell of a frame."""
 MOST_ASKED = 64
-"""Voxels that a session has objects named for at a time, and objects that are named for them. More
-name small objects sooner, and make the statement longer."""
+"""Most voxels that a session asks the objects of at a time, and most objects in the answer. Larger:
+small objects are named sooner, and the statement is longer."""
 LINE = 64
 """Bytes of a processor's cache line: processes that write to one line slow one another down."""
 SESSION_BYTES = 2560
-"""Of a session's row on the desk: whole cache lines, and the table's arrays keep their pages."""
+"""Size of a session's row on the desk: whole cache lines, such that the table's arrays keep their
+pages."""
 
 
 def _record(fields: Sequence[tuple[object, ...]]) -> Layout:
-    """Layout of those fields, aligned; in plain Python, too, a record has them as attributes."""
+    """Aligned layout of those fields; a record has them as attributes, in plain Python, too."""
     return np.dtype((np.record, np.dtype(list(fields), align=True)))
 
 
@@ -54,7 +55,7 @@ def _record_in_lines(groups: Sequence[Sequence[tuple[object, ...]]], size: int) 
 
 
 def views_of(record: NDArray[np.void]) -> Any:  # noqa: ANN401 - its fields are the layout's
-    """Views of the fields of a record () by their names, those of a record in it likewise.
+    """Views of the fields of a record () by their names; a nested record gives nested views.
 
     A number is a view () of its own: ``views.hits.item()`` reads it, ``views.hits[()] = 1`` writes.
     """
@@ -85,20 +86,20 @@ HAND: Layout = _record(
         ("is_open", "?"),  # the clutch
     ]
 )
-"""The handle, which the tool is pulled to: its frame in the scene. Not a number: it is nowhere."""
+"""The handle to which the tool is pulled: its frame in the scene. NaN: there is no handle yet."""
 
 OFFSET: Layout = _record([("position", "<f8", 3), ("quaternion", "<f8", 4)])
-"""The handle beyond the hand: what is added to its position, and what its turn follows."""
+"""Offset from hand to handle: added to the hand's position, applied before the hand's turn."""
 
 TOOL: Layout = _record(
     [
         ("position", "<f8", 3),  # of the tool's frame, m
         ("quaternion", "<f8", 4),  # unit, scalar first
         ("velocity", "<f8", 6),  # of the centre of mass, m/s, then rad/s
-        ("kept", "<f8", 6),  # the wrench that the hand was to feel last, in full: N, N m
+        ("kept", "<f8", 6),  # the last unfaded wrench for the hand: N, N m
         ("held_for", "<f8"),  # s for which that wrench is kept
         ("risen", "<f8"),  # share of the wrench that is sent, 0 to 1
-        ("version", "<i8"),  # of the cells that `felt` was felt among, 0 for none
+        ("version", "<i8"),  # of the cells that `felt` was computed from, 0 for none
         ("felt", "<f8", RESULTS),  # frame at this pose, about the centre of mass
         ("pose", "<f8", (4, 4)),
         ("tried_felt", "<f8", RESULTS),  # the same at the end of a step that is tried
@@ -106,7 +107,7 @@ TOOL: Layout = _record(
         ("loose", "<f8", 6),  # box of voxels in which no new hit gets an anchor
     ]
 )
-"""The tool as a body; zero but for position and quaternion at the start."""
+"""The tool as a body; at the start all fields but position and quaternion are zero."""
 
 SENT: Layout = _record(
     [
@@ -116,11 +117,11 @@ SENT: Layout = _record(
         ("unknown", "<i8"),  # points, at the pose that was tried
         ("deepest", "<f8"),  # m
         ("n_steps", "<i8"),  # made
-        ("flags", "<i8"),  # `kernels.hand.coupling` has them
+        ("flags", "<i8"),  # named in `kernels.hand.coupling`
         ("revision", "<i8"),  # of the database
     ]
 )
-"""What a period of the loop comes to."""
+"""The result of a period of the loop."""
 
 SERVO: Layout = _record([("tool", TOOL), ("hand", HAND), ("sent", SENT)])
 """All that a loop keeps from one period to the next."""
@@ -130,7 +131,7 @@ FRAME: Layout = np.dtype(
         ("time", "<f8"),  # s since the session's start, when the frame began
         ("dt", "<f8"),  # s since the frame before
         ("lateness", "<f4"),  # s behind its deadline
-        ("elapsed", "<f4"),  # s that computing took
+        ("elapsed", "<f4"),  # s of computing
         ("hand", "<f8", (7,)),  # the handle: position m, unit quaternion, scalar first
         ("hand_velocity", "<f8", (6,)),  # m/s, rad/s
         ("tool", "<f8", (7,)),  # the simulated body, likewise
@@ -145,7 +146,7 @@ FRAME: Layout = np.dtype(
         ("state", "<i4"),  # bits of `hapticdb.recording.frame.State`
     ]
 )
-"""One frame of the loop as it is recorded. The file format is made of it: it never changes."""
+"""One recorded frame of the loop. It is part of the file format and never changes."""
 
 TOLD: Layout = _record(
     [
@@ -197,8 +198,8 @@ FIGURES: Layout = _record(
         ("resident", "<i8"),  # cells in memory now
         ("empty", "<i8"),  # cells known to be empty now
         ("wanted", "<i8"),  # cells wanted, summed over all looks
-        ("granted", "<i8"),  # cells of those that were there
+        ("granted", "<i8"),  # wanted cells that were in memory
         ("losses", "<i8"),  # how often the database was lost
     ]
 )
-"""What the fetching process counts."""
+"""Counts and latencies of the fetching process."""

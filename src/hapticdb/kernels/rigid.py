@@ -40,7 +40,7 @@ def is_rigid(pose):
 def transform_of(pose):
     """Upper three rows of a pose as twelve numbers, row by row.
 
-    Loops over points take these: an array handed to a leaf costs a counted reference each time.
+    Loops over points use these numbers: an array passed to a leaf costs a counted reference.
     """
     return (
         pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3],
@@ -88,7 +88,7 @@ def product(aw, ax, ay, az, bw, bx, by, bz):
 
 @leaf
 def turn_of(w, x, y, z):
-    """Shortest turn that a unit quaternion stands for."""
+    """Turn of a unit quaternion, by at most half a revolution."""
     sine = math.sqrt(x * x + y * y + z * z)
     if w < 0.0:
         w, x, y, z = -w, -x, -y, -z
@@ -142,9 +142,9 @@ def write_pose(px, py, pz, w, x, y, z, pose):
 
 @leaf
 def pose_of_quaternion(px, py, pz, w, x, y, z, out):
-    """Write the whole matrix, out (4, 4), of a position and a unit quaternion, not normalised here.
+    """Write the matrix, out (4, 4), of a position and a unit quaternion, which is not normalised.
 
-    A session and its replay both come this way, so that the bits are the same.
+    A session and its replay both use this function, so that they get the same bits.
     """
     write_pose(px, py, pz, w, x, y, z, out)
     out[3, 0] = 0.0

@@ -1,4 +1,4 @@
-"""Kernels of the hand: coupling, clutch, and what the loop tells other processes."""
+"""Kernels of the hand: coupling, clutch, and the report of the servo loop to other processes."""
 
 from hapticdb.kernels._later import later_modules
 

@@ -1,21 +1,23 @@
-"""Anchors: what a point that hits may do, so that no surface is ever passed.
+"""Anchors: they decide where a hit may move, so that no point passes through a surface.
 
-Every point that hits has an *anchor*: a free voxel beside its own. When it comes to hit, the anchor
-is the voxel from which it came, or a nearer one beside both; as it goes on, the anchor follows, by
-one step at most and through free voxels only. A point may leave its voxel only for one beside which
-its anchor can follow, or for a free one beside the anchor.
+Every hit has an *anchor*: a free voxel beside the point's own voxel. When a point becomes a hit,
+its anchor is the voxel that the point came from, or a nearer free voxel beside both. While the
+point moves on, its anchor follows, by at most one voxel on each axis and through free voxels only.
+A hit may leave its voxel for an occupied voxel only if the anchor can follow to a free voxel beside
+it, and for a free voxel only if that voxel is beside the anchor.
 
-Two free voxels that touch, if only by a corner, are together one closed body that meets no surface,
-for a voxel is occupied when a surface so much as touches it. So a walk through free voxels never
-changes sides, and a point stays beside its anchor's walk. Neither normals nor forces take part in
-this: it holds for the points of a needle as for those of a ball. The surface need not be closed;
-where it has a hole of a voxel or more a point goes through, as it should.
+Two free voxels that touch, even only at a corner, form one closed body that meets no surface,
+because a voxel is occupied as soon as a surface touches it. So a walk through free voxels never
+changes to the other side of a surface, and each hit stays beside the walk of its anchor. The rule
+uses neither normals nor forces: it holds for the points of a needle as well as for those of a ball.
+The surface need not be closed: a point passes through a hole of one voxel or more, as it should.
 
-Where something is put upon the tool, or the tool is first placed in something, points on either
-side of it would hold the tool for ever. So such points have no anchor, nor has any that comes to
-hit as near to where they were as the tool reaches: it may leave by any side. When the last of them
-is free, all hits have anchors again. One that goes on hitting till it is farther away gets one on
-the side of the tool's centre, if that is clear, and what is met there holds the tool as ever.
+If an object is placed on the tool, or the tool is first placed inside an object, points on both
+sides of the object would hold the tool for ever. So these hits are *loose*: they have no anchor and
+may leave by any side. A point that becomes a hit within the tool's radius of such a place is loose,
+too. When no hit is loose any more, all new hits get anchors again. A loose hit that is still a hit
+farther away gets an anchor on the side of the tool's centre, if that side is clear. The surfaces
+that the tool meets there hold it as usual.
 """
 
 import math
@@ -27,13 +29,14 @@ from hapticdb.kernels.resident.cells import UNKNOWN, cell_key, slot_of
 from hapticdb.kernels.rigid import turn
 
 BEFORE, AFTER, ANCHOR = 0, 1, 2
-"""Rows of `met` (MET_ROWS, N): indices of the points that hit, of those that hit at the end of a
-step that is tried, and each point's anchor."""
+"""Rows of `met` (MET_ROWS, N): indices of the hits, indices of the hits at the end of the step that
+is tried, and the code of each point's anchor."""
 MET_ROWS = 3
 NO_ANCHOR, LOOSE = -1, -2
-"""Instead of an anchor, of points that do not hit, and of those that may leave by any side."""
+"""Codes in place of an anchor: the point is no hit; the point is a loose hit."""
 CLEARLY = 0.8
-"""Of the cosine to the best of two sides: below it lies the other."""
+"""Part of the best cosine. A free voxel on another side with a cosine of at least this part of the
+best makes the side unclear. Larger: fewer sides are unclear."""
 
 
 @leaf
@@ -49,7 +52,7 @@ def state_of(keys, slots, words, which, side, i, j, k):
 
 @leaf
 def voxel_under(points, n, pose, place):
-    """Voxel of point n under a pose, as `felt` finds it; outside the grid, too."""
+    """Voxel that holds point n at a pose, as `felt` computes it; it may lie outside the grid."""
     x, y, z = points[n, 0], points[n, 1], points[n, 2]
     px = turn(pose[0, 0], pose[0, 1], pose[0, 2], x, y, z) + pose[0, 3]
     py = turn(pose[1, 0], pose[1, 1], pose[1, 2], x, y, z) + pose[1, 3]
@@ -63,7 +66,7 @@ def voxel_under(points, n, pose, place):
 
 @leaf
 def lever_of(points, n, pose, center):
-    """Lever of point n about the centre, world frame."""
+    """Lever from the centre to point n, metres, world frame."""
     x, y, z = points[n, 0] - center[0], points[n, 1] - center[1], points[n, 2] - center[2]
     return (
         turn(pose[0, 0], pose[0, 1], pose[0, 2], x, y, z),
@@ -80,19 +83,19 @@ def are_beside(ai, aj, ak, i, j, k):
 
 @leaf
 def anchor_code(di, dj, dk):
-    """An anchor as it is kept: where it is, seen from its point's voxel."""
+    """Code of an anchor: its offset (di, dj, dk) from its point's voxel, each -1, 0 or 1."""
     return (di + 1) * 9 + (dj + 1) * 3 + (dk + 1)
 
 
 @leaf
 def anchor_of(code, i, j, k):
-    """Undo `anchor_code` for a point in voxel (i, j, k)."""
+    """Anchor's voxel for a code and a point in voxel (i, j, k); undoes `anchor_code`."""
     return i + code // 9 - 1, j + (code // 3) % 3 - 1, k + code % 3 - 1
 
 
 @leaf
 def follow(keys, slots, words, which, side, ai, aj, ak, i, j, k):
-    """Code of the free voxel nearest to (i, j, k), beside it and an anchor, or NO_ANCHOR."""
+    """Code of the free voxel nearest to (i, j, k) beside both it and the anchor, or NO_ANCHOR."""
     best = np.int64(NO_ANCHOR)
     least = 4
     for di in range(max(-1, ai - 1 - i), min(1, ai + 1 - i) + 1):
@@ -110,7 +113,7 @@ def follow(keys, slots, words, which, side, ai, aj, ak, i, j, k):
 
 @leaf
 def may_enter(keys, slots, words, which, side, ai, aj, ak, i, j, k):
-    """Whether a point with that anchor may go to the next voxel (i, j, k): 1, 0 or UNKNOWN."""
+    """Whether a point with anchor (ai, aj, ak) may enter voxel (i, j, k): 1, 0 or UNKNOWN."""
     state = state_of(keys, slots, words, which, side, i, j, k)
     if state == UNKNOWN:
         return np.int64(UNKNOWN)
@@ -121,7 +124,7 @@ def may_enter(keys, slots, words, which, side, ai, aj, ak, i, j, k):
 
 @leaf
 def outward(keys, slots, words, which, side, ai, aj, ak, i, j, k):
-    """Unit direction out of voxel (i, j, k): the mean to free voxels beside it and its anchor."""
+    """Unit direction out of voxel (i, j, k): mean way to free voxels beside it and its anchor."""
     x = y = z = 0.0
     for di in range(max(-1, ai - 1 - i), min(1, ai + 1 - i) + 1):
         for dj in range(max(-1, aj - 1 - j), min(1, aj + 1 - j) + 1):
@@ -139,7 +142,7 @@ def outward(keys, slots, words, which, side, ai, aj, ak, i, j, k):
 
 @leaf
 def cosine_to(code, x, y, z):
-    """Cosine, times the length of (x, y, z), between it and the way to that anchor; 0 for none."""
+    """Length of (x, y, z) along the way from a voxel to the anchor of that code; 0 for no way."""
     di, dj, dk = anchor_of(code, 0, 0, 0)
     return (di * x + dj * y + dk * z) / math.sqrt(max(di * di + dj * dj + dk * dk, 1))
 
@@ -148,8 +151,8 @@ def cosine_to(code, x, y, z):
 def towards(keys, slots, words, which, side, x, y, z, i, j, k):
     """Code of the free voxel beside (i, j, k) that lies nearest to direction (x, y, z).
 
-    NO_ANCHOR when none does, or when one that it does not touch lies almost as near: then it is
-    not clear which side of a surface is meant.
+    NO_ANCHOR when no free voxel lies on that side. NO_ANCHOR, too, when another free voxel lies
+    almost as near and does not touch the first: then the side of the surface is not clear.
     """
     best = np.int64(NO_ANCHOR)
     most = 0.0
@@ -173,13 +176,13 @@ def towards(keys, slots, words, which, side, x, y, z, i, j, k):
 
 @leaf
 def is_within(box, i, j, k):
-    """Whether voxel (i, j, k) is in a half-open box (6,), lower corner first."""
+    """Whether voxel (i, j, k) is in a half-open box (6,): lower corner, then upper corner."""
     return box[0] <= i < box[3] and box[1] <= j < box[4] and box[2] <= k < box[5]
 
 
 @leaf
 def extend(box, i, j, k, reach):
-    """Take all voxels that are no farther than `reach` on any axis into a box, empty if zero."""
+    """Enlarge a box (6,), empty if zero, by all voxels within `reach` of (i, j, k) on each axis."""
     is_empty = not box[0] < box[3]
     for axis in range(3):
         at = i if axis == 0 else (j if axis == 1 else k)
@@ -189,7 +192,7 @@ def extend(box, i, j, k, reach):
 
 @leaf
 def anchor_or_loose(code, box, i, j, k, reach):
-    """That code, or, where it is no anchor, LOOSE, and the box extended around the voxel."""
+    """Return the code if it is an anchor; else extend the box around the voxel, return LOOSE."""
     if code != NO_ANCHOR:
         return np.int64(code)
     extend(box, i, j, k, reach)
@@ -201,11 +204,11 @@ def settle_anchors(
     keys, slots, words, which, points, center, place, met, n_before, n_after, before, after, is_new,
     box, reach,
 ):  # fmt: skip
-    """Give the hits of a frame at `after` their anchors, given those at `before`, a step away.
+    """Update the anchors from the hits at pose `before` to the hits at pose `after`, a step later.
 
-    met (MET_ROWS, N) as above. is_new: the cells are of another
-    version, in which what was free may be occupied. box (6,): voxels in which no new hit gets an
-    anchor, as near to what the tool was found in as `reach`, voxels; zero while all have one.
+    met (MET_ROWS, N) as above. is_new: the cells are of another version, so a voxel that was free
+    may be occupied now. box (6,): voxels in which a new hit is loose; they lie within `reach`
+    voxels of a hit that found no anchor. The box is zero while every hit has an anchor.
     """
     side = np.int64(place.side)
     for m in range(n_before):
@@ -225,7 +228,7 @@ def settle_anchors(
                 met[ANCHOR, n] = LOOSE if code == NO_ANCHOR else code
             continue
         ai, aj, ak = anchor_of(met[ANCHOR, n], oi, oj, ok)
-        # one whose cell has gone was free, and is still on the side from which the point came
+        # an anchor in a cell that is unknown now was free: it is still on the side of arrival
         if is_same and state_of(keys, slots, words, which, side, ai, aj, ak) != 1:
             continue
         code = follow(keys, slots, words, which, side, ai, aj, ak, i, j, k)

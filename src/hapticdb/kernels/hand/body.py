@@ -11,8 +11,9 @@ class Body(NamedTuple):
     """The tool as a body, and its coupling.
 
     mass in kg, inertia in kg m^2; spring and turn_spring in N/m and N m/rad, damping and
-    turn_damping in N s/m and N m s/rad; radius, of the point farthest from the centre, m;
-    stiffness of a contact, N/m; hold and fade in s; most_substeps of a period.
+    turn_damping in N s/m and N m s/rad; radius, m: distance of the farthest point from the centre;
+    stiffness of a contact, N/m; hold and fade, s: how long the wrench is kept when cells are
+    unknown, and how long it then falls to zero; most_substeps: largest number of steps in a period.
     """
 
     mass: float
@@ -33,7 +34,7 @@ BODY = fields_of(Body, *(FLOAT,) * 10, INT)
 
 @inlined
 def is_finite(numbers):
-    """Whether all of numbers (n,) are."""
+    """Whether all numbers (n,) are finite."""
     count = 0
     for n in range(numbers.shape[0]):
         count += math.isfinite(numbers[n])
@@ -48,7 +49,7 @@ def is_somewhere(frame):
 
 @leaf
 def begin_anew(tool):
-    """Make all of a tool's state zero but where it is."""
+    """Set a tool's state to zero, except its position and quaternion."""
     for n in range(6):
         tool.velocity[n] = tool.kept[n] = tool.loose[n] = 0.0
     for n in range(RESULTS):

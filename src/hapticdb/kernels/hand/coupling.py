@@ -1,12 +1,12 @@
 """Virtual coupling: a rigid body between the hand and the shell, one period of the loop at a time.
 
-The tool is a body of some mass and one moment of inertia. A spring and a damper pull it to the
-handle, the contact wrench pushes it, and it moves by semi-implicit steps, the damper implicit. No
-point moves more than half a voxel in a step.
+The tool is a body with a mass and one moment of inertia. A spring and a damper pull it to the
+handle, and the contact wrench pushes it. The body moves by semi-implicit steps, with the damper
+implicit. No point moves more than half a voxel in a step.
 
-That alone lets a fast tool through a thin sheet, so a step that a hit may not make (see `anchors`)
-is cut back: what carries the point against the outward direction is taken away by an impulse; then
-what carries it through a face; then all turning; then all of the motion.
+These forces alone let a fast tool pass through a thin sheet. So a step that a hit may not make (see
+`anchors`) is cut back: impulses first remove the point's speed against the outward direction, then
+its speed through a voxel's face; then all turning is removed, and last the whole motion.
 """
 
 import math
@@ -55,23 +55,28 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.rigid import pose_of_quaternion, product, quaternion_by, turn, turn_of
 
 IS_HELD, IS_FADING, IS_DROPPED, IS_CUT, IS_STOPPED = 1, 2, 8, 16, 32
-"""Flags: the wrench was kept; it is falling or gone; time was left over; a step was cut back; a
-step was not made."""
+"""Flags of a period: the last wrench was kept; the kept wrench falls or is zero; part of the period
+was not simulated; a step was cut back; a step was not made."""
 
 ATTEMPTS = 8
-"""To cut a step back: the first two along outward directions, the last three without turning."""
+"""Times that a step is cut back before the tool stops: two along outward directions, three without
+turning at the end. Larger: fewer steps are given up, and the worst frame takes longer."""
 TURNING_ATTEMPTS = 5
+"""Attempts in which the tool may still turn."""
 FREE_STEP = 0.5
-"""Longest step of free motion, times the spring's frequency: for precision, not for stability."""
+"""Longest step without hits, times the spring's angular frequency. Larger: fewer steps, less
+precision; the motion stays stable."""
 CONTACT_STIFFNESS = 10.0
-"""Contacts of a frame, averaged, are never stiffer than so many."""
+"""Largest stiffness of all contacts of a frame, in stiffnesses of one contact: forces are averaged.
+Larger: shorter steps while a point is a hit."""
 RISE_FRAMES = 4
-"""Frames, at least, in which a wrench rises: after a period that lasted long it must not jump."""
+"""Fewest frames in which a wrench rises to its full size, so that it does not jump after a long
+period. Larger: a slower rise."""
 
 
 @leaf
 def clamped(x, y, z, longest):
-    """Vector, no longer than that."""
+    """Vector (x, y, z), shortened to the length `longest` where it is longer."""
     length = math.sqrt(x * x + y * y + z * z)
     scale = longest / length if length > longest else 1.0
     return scale * x, scale * y, scale * z
@@ -79,11 +84,11 @@ def clamped(x, y, z, longest):
 
 @leaf
 def pull_of(body, tool, hand, pose, center, size, hits):
-    """Spring and damper between tool and hand -> displacement, turn, relative velocities, lever.
+    """Stretch and speed of the coupling -> displacement, turn, relative velocities, lever.
 
-    Three numbers each: m, rad, m/s, rad/s; the lever, m, is that of the handle's centre about the
-    handle's origin. While a point hits, displacement and turn are clamped, and the velocities so
-    that the damper pulls no harder than the spring can.
+    Three numbers each, from tool to hand: m, rad, m/s, rad/s. The lever, m, goes from the handle's
+    origin to its centre. While a point is a hit, displacement and turn are clamped, and the
+    velocities are clamped until the damper pulls no harder than the spring can.
     """
     x, y, z = center[0], center[1], center[2]
     at, aim, moves, leads = hand.position, hand.quaternion, tool.velocity, hand.velocity
@@ -114,7 +119,7 @@ def pull_of(body, tool, hand, pose, center, size, hits):
 
 @leaf
 def push_hand(body, tool, hand, pose, center, size, wrench):
-    """What the coupling does to the hand about the handle's origin, in full, into wrench (6,)."""
+    """Unfaded wrench of the coupling on the hand, about the handle's origin, into wrench (6,)."""
     dx, dy, dz, tx, ty, tz, ux, uy, uz, wx, wy, wz, rx, ry, rz = pull_of(
         body, tool, hand, pose, center, size, 1.0
     )
@@ -122,7 +127,7 @@ def push_hand(body, tool, hand, pose, center, size, wrench):
     fy = -(body.spring * dy + body.damping * uy)
     fz = -(body.spring * dz + body.damping * uz)
     wrench[0], wrench[1], wrench[2] = fx, fy, fz
-    # the hand is pushed at its origin, the spring pulls at the centre
+    # the wrench acts at the handle's origin, the spring pulls at its centre
     wrench[3] = ry * fz - rz * fy - (body.turn_spring * tx + body.turn_damping * wx)
     wrench[4] = rz * fx - rx * fz - (body.turn_spring * ty + body.turn_damping * wy)
     wrench[5] = rx * fy - ry * fx - (body.turn_spring * tz + body.turn_damping * wz)
@@ -130,15 +135,15 @@ def push_hand(body, tool, hand, pose, center, size, wrench):
 
 @leaf
 def faded_of(body, seconds):
-    """Share of the wrench that is gone when it was held for so long."""
+    """Share, 0 to 1, by which a wrench has faded that was kept for so many seconds."""
     return min(max((seconds - body.hold) / body.fade, 0.0), 1.0)
 
 
 @leaf
 def place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
-    """Move the frame, of unit quaternion turned (4,), for a step -> position, quaternion.
+    """Pose after a step at constant velocities, into next_pose (4, 4) -> position, quaternion.
 
-    And into next_pose (4, 4).
+    turned (4,): unit quaternion of pose (4, 4); step in s, velocities of the centre, m/s and rad/s.
     """
     w, x, y, z = product(
         *quaternion_by(step * wx, step * wy, step * wz), turned[0], turned[1], turned[2], turned[3]
@@ -147,7 +152,7 @@ def place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
     w, x, y, z = scale * w, scale * x, scale * y, scale * z
     pose_of_quaternion(0.0, 0.0, 0.0, w, x, y, z, next_pose)
     cx, cy, cz = center[0], center[1], center[2]
-    # the centre's old place and way, less its new place in a frame at the origin
+    # position: the moved centre, minus the centre's lever in the turned frame
     px = turn(pose[0, 0], pose[0, 1], pose[0, 2], cx, cy, cz) + pose[0, 3] + step * vx
     py = turn(pose[1, 0], pose[1, 1], pose[1, 2], cx, cy, cz) + pose[1, 3] + step * vy
     pz = turn(pose[2, 0], pose[2, 1], pose[2, 2], cx, cy, cz) + pose[2, 3] + step * vz
@@ -160,10 +165,10 @@ def place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
 
 @leaf
 def stopped_along(gx, gy, gz, floor, rx, ry, rz, vx, vy, vz, wx, wy, wz, lightness, slimness):
-    """Velocities after an impulse along a unit g that makes a point's speed there `floor`.
+    """Velocities after an impulse at a point that raises its speed along unit vector g to `floor`.
 
-    The point is at lever r; lightness 1/m, slimness 1/I, 0 for a body that does not turn. Nothing
-    happens to a point that is as fast already.
+    r: the point's lever; lightness: 1/m; slimness: 1/I, or 0 for a body that does not turn. A
+    point that already has that speed gets no impulse.
     """
     ux, uy, uz = vx + wy * rz - wz * ry, vy + wz * rx - wx * rz, vz + wx * ry - wy * rx
     lacking = floor - (ux * gx + uy * gy + uz * gz)
@@ -182,9 +187,9 @@ def stopped_along(gx, gy, gz, floor, rx, ry, rz, vx, vy, vz, wx, wy, wz, lightne
 def cut_back(
     keys, slots, words, which, points, center, place, body, met, n_hits, pose, next_pose, attempt, v
 ):
-    """Take from velocities v (6,) what carries hits where they may not go; returns how many are.
+    """Remove from velocities v (6,) the motion of hits into forbidden voxels -> number of these.
 
-    v is changed in place, point after point, each seeing what is left by those before it.
+    v is changed in place, point after point: each point starts from the v that the last one left.
     """
     side = np.int64(place.side)
     lightness = 1.0 / body.mass
@@ -200,7 +205,7 @@ def cut_back(
             continue
         ai, aj, ak = anchor_of(met[ANCHOR, n], oi, oj, ok)
         if may_enter(keys, slots, words, which, side, ai, aj, ak, i, j, k) != 0:
-            continue  # what is unknown ends the step anyway
+            continue  # the point may enter, or the voxel is unknown, which ends the step anyway
         count += 1
         rx, ry, rz = lever_of(points, n, pose, center)
         if attempt == TURNING_ATTEMPTS:
@@ -233,7 +238,7 @@ def cut_back(
                 -float(di), -float(dj), -float(dk), 0.0, rx, ry, rz,
                 v[0], v[1], v[2], v[3], v[4], v[5], lightness, slimness,
             )  # fmt: skip
-        if n_shut == 0:  # only the way across an edge or a corner is shut: not into it, then
+        if n_shut == 0:  # only the way across an edge or a corner is shut: stop along that way
             di, dj, dk = float(oi - i), float(oj - j), float(ok - k)
             length = math.sqrt(di * di + dj * dj + dk * dk)
             v[0], v[1], v[2], v[3], v[4], v[5] = stopped_along(
@@ -245,7 +250,7 @@ def cut_back(
 
 @leaf
 def longest_step(speed, acceleration, way):
-    """Seconds in which a point of that speed, accelerated for as long, goes no farther than way."""
+    """Seconds in which a point of that speed and acceleration goes at most `way` metres."""
     return 2.0 * way / (speed + math.sqrt(speed * speed + 4.0 * acceleration * way) + 1e-300)
 
 
@@ -257,7 +262,7 @@ def length_of(x, y, z):
 
 @leaf
 def slow_down(velocity, radius, fastest):
-    """Take from a velocity (6,) what would make a point at that radius faster than that, m/s."""
+    """Scale a velocity (6,) down until no point at that radius is faster than `fastest`, m/s."""
     speed = length_of(velocity[0], velocity[1], velocity[2])
     speed += radius * length_of(velocity[3], velocity[4], velocity[5])
     if speed > fastest:
@@ -269,23 +274,24 @@ def slow_down(velocity, radius, fastest):
 def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
     """Move the tool for one period of dt seconds.
 
-    servo_record () of SERVO: `tool` is moved, `hand` is read, `sent` is written. met (MET_ROWS, N)
-    int64, rows as in `anchors`, and missed as `felt` fills it are kept from period to period.
-    `tool.felt` is what `felt` says at exactly the tool's position and quaternion, among the cells
-    of one published version, its wrench about the tool's centre of mass. `sent.wrench` is what the
-    coupling does to the hand, about the handle's origin, exactly zero while no point hits. Its
-    force is k s at most, s the voxels' size: half from the spring, half from the damper; so is its
-    torque about the centre, k r s of the radius r.
+    servo_record () of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
+    met (MET_ROWS, N) int64, rows as in `anchors`, and missed, as `felt` fills it, between periods.
+    `tool.felt` is the result of `felt` at exactly the tool's position and quaternion, in the cells
+    of one published version; its wrench is about the tool's centre of mass. `sent.wrench` is the
+    wrench of the coupling on the hand, about the handle's origin; it is exactly zero while no point
+    is a hit. Its force is at most k s, with the voxel size s: half from the spring, half from the
+    damper. Likewise its torque about the centre is at most k r s, with the radius r.
 
-    Where the tool would meet unknown cells it stays, still, and the wrench is kept for `hold`
-    seconds, then falls to zero within `fade`; `sent` and missed then tell of the pose that was
-    tried. After that, and from the first frame on, the wrench rises to its full size within `fade`,
-    and in RISE_FRAMES frames at least; while the clutch is open it falls, and the tool goes on.
+    If a step would take points into unknown cells, the tool stays at rest before it. The wrench is
+    kept for `hold` seconds, then falls to zero within `fade` seconds; `sent.unknown` and missed
+    then belong to the pose that was tried. After that, and after the first frame, the wrench rises
+    to its full size within `fade` seconds and at least RISE_FRAMES frames. While the clutch is open
+    the wrench falls to zero, and the tool still follows the handle.
 
-    With a hand that is not finite all is held; a tool that is not is placed anew, at rest, at the
-    first hand that is finite.
+    While the hand is not finite, the tool and the wrench are held. A tool that is not finite is
+    placed at the first finite hand, at rest.
     """
-    # loops, not slices: a slice that is assigned costs a second of compile time
+    # loops instead of slices: one assignment to a slice costs a second of compile time
     which = begin_frame(cells, reader)
     version = cells.readers[reader * READER_STRIDE]
     points, center = shell.points, shell.center
@@ -297,7 +303,7 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
     pose, next_pose = tool.pose, tool.tried_pose
     frame, next_frame, box = tool.felt, tool.tried_felt, tool.loose
     reach = body.radius / place.size
-    v = sent.wrench  # of the step that is tried, until the wrench is known
+    v = sent.wrench  # velocities of the step that is tried; the wrench comes last
     next_met = met[AFTER]
     flags = 0
     n_steps = 0
@@ -340,7 +346,7 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
     while left > 0.0:
         if n_steps >= body.most_substeps:
             flags |= IS_DROPPED
-            # else one absurd hand would leave a speed whose steps are too short to brake it
+            # else one absurd hand pose leaves a speed that needs too short steps to brake
             slow_down(velocity, body.radius, body.most_substeps * way / dt)
             break
         hits = frame[HITS]
@@ -358,10 +364,10 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
         speed += body.radius * length_of(velocity[3], velocity[4], velocity[5])
         gain = length_of(ax, ay, az) + body.radius * length_of(bx, by, bz)
         step = min(longest_step(speed, gain, way), contact_step if hits > 0.0 else free_step)
-        # numpy's, a float: more steps than an integer holds are none of a negative length
+        # np.ceil stays a float: a count above the largest int64 must not become negative
         step = left / np.ceil(left / step) if step < left else left
         n_steps += 1
-        # the damper implicit: no step is too long for it
+        # the damper is implicit: it is stable for every length of step
         share = step / (1.0 + step * body.damping / body.mass)
         turn_share = step / (1.0 + step * body.turn_damping / body.inertia)
         v[0] = velocity[0] + share * ax
@@ -430,7 +436,7 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
                 pose[row, column] = next_pose[row, column]
         for n in range(RESULTS):
             frame[n] = next_frame[n]
-    revision = cells.control[REVISION + which]  # of what was read: later the buffer is another's
+    revision = cells.control[REVISION + which]  # before end_frame: then the buffer may be reused
     end_frame(cells, reader)
     is_held = is_held or n_unknown > 0
     passed = max(dt, 0.0) / body.fade
@@ -450,7 +456,7 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
             kept[n] = 0.0
         if frame[HITS] > 0.0:
             push_hand(body, tool, hand, pose, center, place.size, kept)
-            if not is_finite(kept):  # the next frame heals the tool
+            if not is_finite(kept):  # the next frame places the tool anew
                 for n in range(6):
                     kept[n] = 0.0
     if hand.is_open:

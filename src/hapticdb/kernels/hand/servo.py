@@ -1,4 +1,4 @@
-"""One period of the servo loop around the coupling: what is told, and what is recorded."""
+"""One period of the servo loop around the coupling: its report to other processes, its record."""
 
 import numpy as np
 
@@ -20,9 +20,10 @@ from hapticdb.kernels.rigid import turn
 
 @entry(record_of(SESSION), record_of(TOLD), INTS)
 def tell(session_row, told_row, missed):
-    """Write what a loop tells, and the unknown cells of its last frame, into its row of the desk.
+    """Write a loop's report and the unknown cells of its last frame into its row of the desk.
 
-    missed (1 + MOST_MISSED,) int64, as `felt` fills it. The row's sequence number is odd meanwhile.
+    missed (1 + MOST_MISSED,) int64, as `felt` fills it. The row's sequence number is odd while the
+    row is written.
     """
     session, told = session_row[()], told_row[()]
     session.sequence += 1
@@ -42,10 +43,10 @@ def tell(session_row, told_row, missed):
 
 @entry(record_of(SESSION), CLUSTERS, FLOATS2, PLACE, INT, INT, INTS, INT)
 def name_voxels(session_row, shell, pose, place, bits, curve, met, n_hits):
-    """Ask for the objects in voxels that a placed shell hits: write the voxels' keys.
+    """Ask for the objects in the voxels that a placed shell hits: write these voxels' keys.
 
-    met (n_hits,): indices of the points that hit. Of more than MOST_ASKED hits, evenly spread ones
-    are taken.
+    met (n_hits,): indices of the hits. If there are more than MOST_ASKED, every second, third, ...
+    hit is taken.
     """
     session = session_row[()]
     step = max((n_hits + MOST_ASKED - 1) // MOST_ASKED, 1)
@@ -69,7 +70,7 @@ def name_voxels(session_row, shell, pose, place, bits, curve, met, n_hits):
 
 @entry(record_of(FRAME, 1), INT, FLOAT, FLOAT, FLOAT, FLOAT, record_of(SERVO), INT, INT)
 def note(ring, at, time, dt, lateness, elapsed, servo_record, buttons, state):
-    """Record frame number `at` in its row of ring (capacity,) of FRAME."""
+    """Record frame number `at` in its row of the ring buffer (capacity,) of FRAME."""
     servo = servo_record[()]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
     row = ring[at % ring.shape[0]]
@@ -89,7 +90,7 @@ def note(ring, at, time, dt, lateness, elapsed, servo_record, buttons, state):
         row.applied[n] = sent.wrench[n]
     row.hits = np.int64(tool.felt[HITS])
     row.contacts = np.int64(tool.felt[CONTACTS])
-    row.unknown = sent.unknown  # of the pose that was tried; the frame that is felt has none
+    row.unknown = sent.unknown  # at the pose that was tried; the frame at `tool` has none
     row.deepest = tool.felt[DEEPEST]
     row.revision = sent.revision
     row.buttons = buttons

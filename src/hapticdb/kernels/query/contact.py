@@ -1,4 +1,4 @@
-"""One frame in arrays: the shell's points located in the grid, rows refined to hits, the wrench.
+"""One frame in arrays: locate the shell's points in the grid, refine rows to hits, sum the wrench.
 
 Every sum runs in the order of the shell's points and every product is written out, so that each
 strategy, layout, curve and engine gives the same wrench bit for bit (numba contracts no
@@ -47,9 +47,9 @@ Refined = tuple[Floats, Ints, Floats, Ints, Ints, Floats]
 """What `refine` returns.
 
 wrench (6,): N and N m about the centre, world frame; hits (H,): indices of the shell's points
-inside a voxel, ascending; depths (H,): metres at which each hit is felt, 0 where it is not;
-ids (I,): objects that the hits are in, ascending; apart (A,) and apart_depths (A,): points that are
-felt though they are no hits, ascending, and their depths, above 0.
+inside a voxel, ascending; depths (H,): depth of each hit in metres, 0 where the law feels nothing;
+ids (I,): objects that the hits are in, ascending; apart (A,): points that the law feels although
+they are no hits, ascending; apart_depths (A,): their depths in metres, above 0.
 """
 NO_POINTS = np.empty(0, dtype=np.int64)
 NO_DEPTHS = np.empty(0)
@@ -64,7 +64,7 @@ class Located(NamedTuple):
 
 
 LARGEST = 0x7FFFFFFFFFFFFFFF
-"""Of an int64."""
+"""Largest int64."""
 
 
 @leaf
@@ -75,7 +75,7 @@ def center_of(x, origin, size):
 
 @inlined
 def place_shell(points, normals, center, transform, placed):
-    """Points, normals and last the centre of a shell into placed (N + 1, 6), world frame."""
+    """Write points and normals of a placed shell, last its centre, to placed (N + 1, 6), world."""
     total = points.shape[0]
     for n in range(total):
         x, y, z = moved(transform, points[n, 0], points[n, 1], points[n, 2])
@@ -95,7 +95,7 @@ def place_shell(points, normals, center, transform, placed):
 
 @inlined
 def number_of_key(table, found, count, key):
-    """Number that a row key has in found (N,), entered as number `count` when it is new.
+    """Number of a row key: its place in found (N,). A new key is entered there as number `count`.
 
     table (capacity,) int32: an open-addressing set of those numbers, -1 where free.
     """
@@ -111,7 +111,7 @@ def number_of_key(table, found, count, key):
 
 @inlined
 def sort_keys(found, count, asked, keys):
-    """Write the first `count` of the keys found, ascending, and renumber the points' slots."""
+    """Write the first `count` of the keys found in ascending order; renumber the points' slots."""
     order = sorting_order(found[:count])
     rank = np.empty(count, dtype=np.int32)
     for n in range(count):
@@ -153,7 +153,7 @@ def locate_kernel(
     table = np.full(capacity, -1, dtype=np.int32)
     found = np.empty(total, dtype=np.int64)
     count = 0
-    last_key, last_number = -1, -1  # neighbours by index often share a row
+    last_key, last_number = -1, -1  # points next to each other in the shell often share a row
     for n in range(total):
         x = np.floor((placed[n, 0] - ox) / size)
         y = np.floor((placed[n, 1] - oy) / size)
@@ -211,8 +211,8 @@ def locate(
 
     Notes
     -----
-    Few arrays cross, and results into arrays made here: one that a kernel returns costs twice the
-    time (0.6 us) of one that it is given.
+    Few arrays cross into the kernel, and it writes into arrays made here: an array that a kernel
+    returns costs 0.6 us, twice as much as an array that it is given.
     """
     total = points.shape[0]
     placed = np.empty((total + 1, 6))
@@ -266,7 +266,7 @@ def spans_of_keys(asked, keys, bits, curve, shift):
 def rows_of_keys(keys, row_keys):
     """Where the rows of each asked key begin and end, (U,) int64 each.
 
-    One merge of two ascending lists; rows of keys that nobody asked for are the false hits.
+    One merge of two ascending lists; rows of keys that were not asked for are the false hits.
     """
     total = keys.shape[0]
     starts = np.empty(total, dtype=np.int64)
@@ -286,7 +286,7 @@ def rows_of_keys(keys, row_keys):
 
 @leaf
 def counting_rows(row_ids, exclude):
-    """Which rows count, (R,) bool: those of objects that are not excluded."""
+    """Mask (R,) bool of the rows whose objects are not excluded."""
     counts = np.empty(row_ids.shape[0], dtype=np.bool_)
     for row in range(row_ids.shape[0]):
         counts[row] = True
@@ -300,7 +300,7 @@ def counting_rows(row_ids, exclude):
 
 @inlined
 def has_voxel(occupancy, row, address):
-    """Whether a row has the voxel of an address; a voxel row, without occupancy, always has."""
+    """Whether a row has the voxel of an address; always true for a voxel row (no occupancy)."""
     if occupancy.shape[0] == 0:
         return True
     return (occupancy[64 * row + ((address & 511) >> 3)] >> (address & 7)) & 1 != 0
@@ -308,7 +308,7 @@ def has_voxel(occupancy, row, address):
 
 @inlined
 def distinct_ids(touched, row_ids, met, start):
-    """Write the ids of touched rows into met[start:], ascending, each once -> how many."""
+    """Write the distinct ids of touched rows into met[start:], ascending -> number of ids."""
     count = np.int64(0)
     for row in range(row_ids.shape[0]):
         if touched[row]:
@@ -348,8 +348,8 @@ def refine_kernel(
 ):
     """`refine` into felt (6 + N,) and met (N + R,) -> P, A and I.
 
-    P points are hits or felt or both, A of them felt only. felt has the wrench and their depths;
-    met has their indices, ~n for a point n that is no hit, and then the I ids.
+    P points are hits, or felt, or both; A of them are felt only. felt takes the wrench and the P
+    depths; met takes the P indices (~n for a point n that is no hit), then the I ids.
     """
     total = asked.shape[1]
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
@@ -406,10 +406,10 @@ def refine(
     size: float,
     law: Any,  # noqa: ANN401 - a NamedTuple that `kernels.law` knows
 ) -> Refined:
-    """Drop the false hits of a frame's rows and sum the wrench of what is felt.
+    """Drop the false hits of a frame's rows and sum the wrench of the points that are felt.
 
     placed, asked, keys as `locate` returns them; row_keys (R,) int64 ascending, row_ids (R,) int64,
-    occupancy (64 R,) uint8 or empty for voxel rows, payload as the law reads it, or None;
+    occupancy (64 R,) uint8, or empty for voxel rows; payload as the law reads it, or None;
     exclude (E,) int64; origin (3,) and size of a voxel, metres.
     """
     total = asked.shape[1]

@@ -10,8 +10,8 @@ from hapticdb.kernels.curves import LEXICOGRAPHIC, key_of
 def first_bound(x, bounds, start):
     """Index of the first bound >= x, at `start` or above it; R + 1 when there is none.
 
-    Steps that double, then halves: keys of a frame lie close together, so that the next bound is
-    mostly the last one again.
+    The search doubles its steps, then halves the interval: a frame's keys lie close together, so
+    the next bound is mostly the same as the last one.
     """
     total = bounds.shape[0]
     step = 1
@@ -35,8 +35,8 @@ def first_bound(x, bounds, start):
 def rows_below_bound(x, low, bounds, rows_per_bucket):
     """Expected rows with a key < x, given the first bound >= x.
 
-    A bucket [b[i-1], b[i]) counts in proportion to what lies below x; one of zero width counts
-    whole as soon as its value does.
+    A bucket [b[i-1], b[i]) counts in proportion to its part below x. A bucket of zero width counts
+    fully if its value is below x.
     """
     if low == 0:
         return 0.0
@@ -48,7 +48,7 @@ def rows_below_bound(x, low, bounds, rows_per_bucket):
 
 @leaf
 def bound_after(x, bounds, start):
-    """Index of the first bound > x, at `start` or above it: x may be the last int64."""
+    """Index of the first bound > x, at `start` or above it. x may be the largest int64."""
     if x >= bounds[bounds.shape[0] - 1]:
         return bounds.shape[0]
     return first_bound(x + 1, bounds, start)
@@ -76,7 +76,7 @@ def gap_rows(left, right, bounds, rows_per_bucket):
 
 @entry(INTS, INTS, INTS, INT)
 def group_by_gap(keys, first, last, maxgap):
-    """MaxGap: neighbours p < q share a range if and only if q - p <= maxgap.
+    """MaxGap: neighbouring keys p < q share a range if and only if q - p <= maxgap.
 
     keys (U,) row keys, ascending; first, last (U,) the lowest and highest voxel key asked for under
     each. Returns the ranges' lowest and highest row keys.
@@ -99,15 +99,15 @@ def group_by_gap(keys, first, last, maxgap):
 def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, highs):
     """CBGroup: a gap is closed if and only if scanning it costs no more than another descent.
 
-    keys (U,) row keys, ascending; bounds (R + 1,) int64, the quantile vector; costs in one unit.
-    The ranges' lowest and highest row keys go into lows and highs, (U,) int64.
+    keys (U,) row keys, ascending; bounds (R + 1,) int64, the quantile vector; both costs in the
+    same unit. The ranges' lowest and highest row keys go into lows and highs, (U,) int64.
 
     Returns
     -------
     count : int
-        G, how many ranges there are.
+        Number G of ranges.
     asked, scanned : float
-        Expected rows under the keys themselves, and in the gaps that were closed.
+        Expected rows under the keys themselves, and expected rows in the gaps that were closed.
     """
     total = keys.shape[0]
     count = 0
@@ -134,9 +134,9 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, h
 
 @entry(INTS, INTS, INTS, FLOAT, FLOAT, FLOAT)
 def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
-    """CBGroup over closed spans (U,) of row keys, ascending and disjoint: merged in place.
+    """CBGroup over closed spans (U,) of row keys, ascending and disjoint; merges them in place.
 
-    Returns how many ranges there are.
+    Returns the number of ranges.
     """
     count = 0
     for n in range(lows.shape[0]):
@@ -160,7 +160,7 @@ def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_
 
 @leaf
 def add_range(ranges, count, low, high):
-    """Append a closed range, growing the array; returns both."""
+    """Append a closed range; returns the array, larger when it was full, and the new count."""
     if count == ranges.shape[0]:
         larger = np.empty((2 * count, 2), dtype=np.int64)
         for n in range(count):
@@ -174,11 +174,11 @@ def add_range(ranges, count, low, high):
 
 @entry(INTS, INTS, INT, INT, INT)
 def ranges_of_box(low, high, bits, curve, finest):
-    """Closed ranges of voxel keys (G, 2) that cover the voxels low .. high (3,), both inside.
+    """Closed ranges of voxel keys (G, 2) that cover the voxels low .. high (3,), both included.
 
-    On a hierarchical curve the box's cubes, split no finer than 2^finest voxels an edge, so that
-    their number stays in proportion to the box's surface in such cubes; in lexicographic order one
-    range for each of at most 1024 runs of slabs. Not yet sorted or merged.
+    On a hierarchical curve each range is a cube. Cubes with an edge of 2^finest voxels are not
+    split, so the number of ranges is in proportion to the box's surface, measured in such cubes.
+    In lexicographic order each range is a run of slabs, at most 1024. Neither sorted nor merged.
     """
     ranges = np.empty((64, 2), dtype=np.int64)
     count = np.int64(0)

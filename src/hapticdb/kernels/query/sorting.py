@@ -8,7 +8,7 @@ import numpy as np
 from hapticdb.kernels._jit import leaf
 
 SORTED_RUN = np.int64(64)
-"""Keys that are sorted by insertion: longer runs take longer, shorter ones need more merging."""
+"""Keys in a run that is sorted by insertion. Larger: slower runs. Smaller: more merging."""
 
 
 @leaf

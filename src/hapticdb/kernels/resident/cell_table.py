@@ -1,4 +1,4 @@
-"""A table of cells from its writer's side: directories, rows into cells, which slots are free."""
+"""The writer's side of a cell table: edit directories, fill cells from rows, free slots."""
 
 import numpy as np
 
@@ -38,11 +38,12 @@ from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import moved, transform_of
 
 NEVER_AGAIN = 0x7FFFFFFFFFFFFFFF
+"""`wanted_at` of a slot that is already chosen for freeing: later than every `since`."""
 
 
 @entry(INTS2, INTS32_2, INT, INTS, INTS)
 def insert_cells(keys, slots, which, new_keys, new_slots):
-    """Enter cells (n,) that directory `which` lacks, or give those that it has other slots."""
+    """Enter cells (n,) in directory `which`; cells that are there already get the new slots."""
     capacity = keys.shape[1]
     for n in range(new_keys.shape[0]):
         at = spread_key(new_keys[n], capacity)
@@ -54,7 +55,7 @@ def insert_cells(keys, slots, which, new_keys, new_slots):
 
 @entry(INTS2, INTS32_2, INT, INTS)
 def remove_cells(keys, slots, which, old_keys):
-    """Take cells (n,) out of directory `which`; what followed them in their run moves up."""
+    """Remove cells (n,) from directory `which`; later entries of the same run move up."""
     capacity = keys.shape[1]
     for n in range(old_keys.shape[0]):
         at = spread_key(old_keys[n], capacity)
@@ -68,7 +69,7 @@ def remove_cells(keys, slots, which, old_keys):
             if keys[which, at] < 0:
                 break
             home = spread_key(keys[which, at], capacity)
-            # an entry whose home lies behind the hole, going round, is still found from there
+            # move an entry only if its search, from its home, passes the hole (going round)
             if ((at - home) & (capacity - 1)) >= ((at - hole) & (capacity - 1)):
                 keys[which, hole] = keys[which, at]
                 slots[which, hole] = slots[which, at]
@@ -78,7 +79,7 @@ def remove_cells(keys, slots, which, old_keys):
 
 @entry(INTS2, INTS32_2, INT, INTS, INTS)
 def slots_of_cells(keys, slots, which, asked, out):
-    """Slots (n,) of cells (n,) in directory `which`, UNKNOWN where it has none."""
+    """Write slots (n,) of cells (n,) in directory `which`, UNKNOWN for a cell without an entry."""
     for n in range(asked.shape[0]):
         out[n] = slot_of(keys, slots, which, asked[n])
 
@@ -91,7 +92,7 @@ def mark_brick(masks, slot, i, j, k):
 
 @leaf
 def fill_brick(words, slot, i, j, k, occupancy, start):
-    """Set the voxels of a brick of origin (i, j, k), its bits at `start`; whether it has any."""
+    """Set the voxels of the brick at (i, j, k), bytes from `start` -> whether it has a voxel."""
     has_any = False
     for byte in range(64):
         value = occupancy[start + byte]
@@ -101,7 +102,7 @@ def fill_brick(words, slot, i, j, k, occupancy, start):
         x = (i & 31) | (compact(byte >> 2) << 1)
         y = (j & 31) | (compact(byte >> 1) << 1)
         z = (k & 31) | (compact(byte) << 1)
-        for column in range(4):  # bits of a byte: i, j, k of one each, k the lowest
+        for column in range(4):  # a byte is 2 x 2 x 2 voxels, k the lowest bit
             two = np.uint32((value >> (2 * column)) & 3)
             word = ((x | (column >> 1)) << 5) | y | (column & 1)
             words[slot, word] |= two << np.uint32(z)
@@ -112,12 +113,12 @@ def fill_brick(words, slot, i, j, k, occupancy, start):
 def fill_cells(
     row_keys, row_ids, occupancy, exclude, cell_keys, places, bits, curve, shift, words, masks
 ):
-    """Rows of the index table into cells that were empty.
+    """Fill empty cells from rows of the index table.
 
     row_keys (R,) ascending, row_ids (R,), occupancy (64 R,) or empty for voxel rows; exclude (E,)
-    ids, ascending, that are left out; cell_keys (n,) ascending, on the curve (voxel keys >> 15),
-    and the slots places (n,) of words (S, 1024) uint32 and masks (S,) uint64 that they go into.
-    Rows of other cells are passed over.
+    ids to leave out, ascending; cell_keys (n,) of the cells on the curve (voxel keys >> 15),
+    ascending; places (n,) their slots in words (S, 1024) uint32 and masks (S,) uint64. Rows of
+    other cells are skipped.
     """
     n_cells = cell_keys.shape[0]
     n_excluded = exclude.shape[0]
@@ -150,7 +151,7 @@ def fill_cells(
 
 @entry(INTS, INT, INT, INTS)
 def curve_keys_of_cells(cells, bits, curve, out):
-    """Cells (n,), as directories name them, on the curve: their voxels' keys >> 15."""
+    """Write keys on the curve (voxel keys >> 15) of cells (n,), given by directory keys."""
     level = max(bits - 5, 0)
     for n in range(cells.shape[0]):
         ci, cj, ck = cell_of_key(cells[n])
@@ -159,7 +160,7 @@ def curve_keys_of_cells(cells, bits, curve, out):
 
 @entry(INTS, INT, INT, INTS)
 def cells_of_curve_keys(curve_keys, bits, curve, out):
-    """Undo `curve_keys_of_cells`."""
+    """Write directory keys of cells (n,) on the curve; undoes `curve_keys_of_cells`."""
     level = max(bits - 5, 0)
     for n in range(curve_keys.shape[0]):
         ci, cj, ck = voxel_of(curve_keys[n], level, curve)
@@ -168,11 +169,11 @@ def cells_of_curve_keys(curve_keys, bits, curve, out):
 
 @entry(INTS, INTS, BYTES, INT, INT, INT, INTS)
 def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
-    """Clock eviction: slots of cells that no frame has used since the hand last passed.
+    """Clock eviction: choose slots of cells that no frame has used since the hand last passed.
 
     cell_of_slot (S,) int64, -1 where free; wanted_at (S,) int64: slots wanted at `since` or later
-    stay; used (S,) uint8 is cleared as the hand passes. Up to `wanted` slots go into out. Returns
-    how many, and where the hand stands.
+    stay; used (S,) uint8 is cleared as the hand passes. hand is the slot at which the clock's hand
+    is. Up to `wanted` slots go into out. Returns their number and the new hand.
     """
     total = cell_of_slot.shape[0]
     count = 0
@@ -195,7 +196,7 @@ def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
 
 @entry(INTS, INT, INT)
 def publish(control, version, revision):
-    """Make a directory, complete in its buffer, the one that frames read from now on."""
+    """Publish a directory that is complete in its buffer: new frames read it from now on."""
     control[REVISION + version % BUFFERS] = revision
     fence()
     control[VERSION] = version
@@ -204,7 +205,7 @@ def publish(control, version, revision):
 
 @entry(INTS)
 def oldest_version_read(readers):
-    """Lowest version that a frame is reading; the largest number when there is none."""
+    """Lowest version that a frame is reading; the largest int64 when no frame is reading."""
     fence()
     oldest = np.int64(0x7FFFFFFFFFFFFFFF)
     for n in range(0, readers.shape[0], READER_STRIDE):
@@ -215,12 +216,12 @@ def oldest_version_read(readers):
 
 @entry(INTS, INTS, FLOATS, FLOATS, FLOAT, FLOAT, INTS, FLOATS)
 def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
-    """Cells of a box that a sphere comes near on a straight way, and how urgent each is.
+    """Cells of a box that a sphere comes near on a straight way, and the urgency of each.
 
-    first, last (3,) int64: the box, in cells; start, move (3,), radius, margin: the sphere's way,
-    and how far beside it counts as near, in voxels. keys (n,) and urgency (n,) take what is found:
-    voxels from the sphere at its nearest, and that it has to go until there, 0 where it is already.
-    Returns how many.
+    first, last (3,) int64: the box, in cells, both included; start, move (3,), radius: the sphere's
+    way; margin: the largest distance that counts as near; all in voxels. keys (n,) and urgency (n,)
+    take the cells. The urgency is the way to the sphere's nearest position plus the distance there,
+    in voxels, 0 for a cell that the sphere meets already. Returns the number of cells.
     """
     length = move[0] * move[0] + move[1] * move[1] + move[2] * move[2]
     way = np.sqrt(length)
@@ -257,12 +258,12 @@ def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
 
 @entry(FLOATS2, FLOAT, FLOATS3, PLACE, INTS, INT)
 def cells_met(points, reach, poses, place, found, most):
-    """Distinct cells within reach, voxels, at most 16, of points (N, 3+) at the first of the poses.
+    """Distinct cells within `reach` of points (N, 3+) at the first of the poses.
 
-    poses (M, 4, 4). The cells go into found (capacity,) int64, -1 all over before, an
-    open-addressing set whose capacity is a power of two and 2 (most + 8 N) at least, 2 (most + N)
-    without reach. Returns how many poses that are: the first at least, then while the cells are no
-    more than `most`; and how many cells.
+    reach in voxels, at most 16; poses (M, 4, 4). The cells go into found (capacity,) int64, an
+    open-addressing set, all -1 before. Its capacity is a power of two, at least 2 (most + 8 N), or
+    2 (most + N) if reach is 0. Returns the number of poses taken and the number of cells: at least
+    one pose is taken, and more as long as there are at most `most` cells.
     """
     capacity = found.shape[0]
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
@@ -301,7 +302,7 @@ def cells_met(points, reach, poses, place, found, most):
                             before[added] = at
                             added += 1
         if n > 0 and count + added > most:
-            for p in range(added):  # in the opposite order, so that no run of entries is torn
+            for p in range(added):  # newest first: no run of entries gets a hole
                 found[before[added - 1 - p]] = -1
             return n, count
         count += added

@@ -1,13 +1,14 @@
-"""Resident cells: a frame against voxels in memory, none of it waiting for a database.
+"""Resident cells: a frame reads voxels in memory and never waits for a database.
 
 A cell is 32^3 voxels, held as 1024 words: word ``(i & 31) << 5 | (j & 31)``, bit ``k & 31``. A
-directory, an open-addressing table, says in which slot a cell is; slot 0 is empty for ever and
-stands for every cell known to be empty, and a cell without an entry is *unknown*. Beside its words
-each slot has a mask of 64 bits, one for each of its 4^3 bricks that holds a voxel.
+directory, an open-addressing table, maps a cell to its slot. Slot 0 is always empty and is the slot
+of every cell that is known to be empty; a cell without an entry is *unknown*. Besides its words
+each slot has a mask of 64 bits, one for each of its 4^3 bricks; a bit is set if the brick holds a
+voxel.
 
 Directories are published in versions, three buffers in turn. A frame announces which version it
-reads and keeps to it, so it never sees one half changed; the process that writes uses a buffer or a
-slot again only when no frame can still see it (`hapticdb.resident.table`).
+reads and uses only that one, so it never reads a half-changed directory. The writing process reuses
+a buffer or a slot only when no frame can still read it (`hapticdb.resident.table`).
 """
 
 from typing import NamedTuple
@@ -54,31 +55,31 @@ BUFFERS = 3
 UNKNOWN = -1
 EMPTY_SLOT = 0
 VERSION = 0
-"""Where `Cells.control` has the number of the published version."""
+"""Index into `Cells.control`: the number of the published version."""
 REVISION = 1
-"""And, from there on, the database's revision of each buffer."""
+"""First index into `Cells.control` of the database's revisions, one for each buffer."""
 READER_STRIDE = 8
-"""Readers stand a cache line apart."""
+"""Numbers from one reader to the next: a cache line, so readers do not slow one another down."""
 LISTED = 0
-"""Where a frame's list of unknown cells has their number; their keys follow."""
+"""Index into a frame's list of unknown cells: their number. Their keys follow."""
 GROUP = 4
-"""Runs of a group, which are skipped together."""
+"""Runs in a group. A group far from every voxel is skipped at once; a larger one is seldom far."""
 MOST_COLUMNS = 64
-"""Of a cluster's box, looked at one by one: more, and an occupied brick counts as near."""
+"""Most columns (i, j) of a box that are read. In a larger box an occupied brick counts as near."""
 MOST_CELLS = 8
-"""Of a cluster's box: more, and its points are looked up one by one."""
+"""Most cells of a box that are read. A larger box counts as near, and its points are looked up."""
 WRENCH, HITS, CONTACTS, UNKNOWNS, DEEPEST, RESULTS = 0, 6, 7, 8, 9, 10
-"""Where a frame's result has what: (10,) float64."""
+"""Indices into a frame's result (RESULTS,) float64."""
 
 
 class Cells(NamedTuple):
     """A table of cells, as `hapticdb.resident.table.CellTable` lays it out in shared memory.
 
-    control (16,) int64; readers (16 x 8,) int64, the version that each reader sees, 0 for none;
+    control (16,) int64; readers (16 x 8,) int64, the version that each reader reads, 0 for none;
     keys (3, capacity) int64 and slots (3, capacity) int32, the directories; words (slots, 1024)
-    uint32; masks (slots,) uint64; used (slots,) uint8, set where a frame has looked; payload: what
-    laws read beside the occupancy, an array (slots, ...), or None. A slot's mask has the bricks
-    that hold a voxel, or a payload that is not empty.
+    uint32; masks (slots,) uint64; used (slots,) uint8, set by a frame that reads the slot; payload:
+    what laws read beside the occupancy, an array (slots, ...), or None. A slot's mask has the
+    bricks that hold a voxel, or a payload that is not empty.
     """
 
     control: Ints
@@ -95,7 +96,7 @@ CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, N
 
 
 class Place(NamedTuple):
-    """A grid as kernels take it: origin and voxel size in metres, voxels an axis."""
+    """A grid for kernels: origin x, y, z and voxel size in metres, voxels on each axis (side)."""
 
     x: float
     y: float
@@ -108,13 +109,13 @@ PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
 
 
 class Clusters(NamedTuple):
-    """A shell as frames take it.
+    """A shell in the form that frames read.
 
     points (N, 6): metres and inward normals, tool frame, in the order of the shell; center (3,);
     spheres (C, 4): centre and radius, metres, of each run of `run` points, or (0, 4) for none;
-    groups (G, 4): likewise of each `GROUP` of them;
-    columns (3, N): the points again, an axis a row; scratch (6, run): where a run is placed. A
-    thread of its own needs a scratch of its own.
+    groups (G, 4): the same of each group of `GROUP` runs; columns (3, N): the points again, one
+    row for each axis; scratch (6, run): memory for one placed run. Each thread needs its own
+    scratch.
     """
 
     points: Floats
@@ -130,7 +131,7 @@ CLUSTERS = fields_of(Clusters, FLOATS2, FLOATS, FLOATS2, FLOATS2, INT, FLOATS2, 
 
 
 def _masks_of_runs(stride: int) -> NDArray[np.uint64]:
-    """Mask (4, 4) of the bricks from one step to another on the axis of that stride."""
+    """Masks (4, 4): entry [low, high] has the bricks low .. high on the axis of that stride."""
     masks = np.zeros((4, 4), dtype=np.uint64)
     for low in range(4):
         for high in range(low, 4):
@@ -143,12 +144,12 @@ _MASKS_I, _MASKS_J, _MASKS_K = _masks_of_runs(16), _masks_of_runs(4), _masks_of_
 _COLUMNS = np.array(
     [[((2 << high) - 1) & ~((1 << low) - 1) for high in range(32)] for low in range(32)]
 ).astype(np.uint32)
-"""Bits of a word from one k to another, (32, 32)."""
+"""Masks (32, 32) for a word: entry [low, high] has the bits k = low .. high."""
 
 
 @leaf
 def key_of_cell(ci, cj, ck):
-    """Key of cell (ci, cj, ck): its coordinates side by side."""
+    """Directory key of cell (ci, cj, ck): 16 bits each for cj and ck, the upper bits for ci."""
     return (ci << 32) | (cj << 16) | ck
 
 
@@ -166,7 +167,7 @@ def cell_key(i, j, k):
 
 @leaf
 def column_of(i, j):
-    """Which word of its cell holds voxel (i, j, k), whatever its k."""
+    """Index of the word that holds voxel (i, j, k) in its cell, for any k."""
     return ((i & 31) << 5) | (j & 31)
 
 
@@ -184,8 +185,8 @@ def brick_bit(i, j, k):
 
 @leaf
 def spread_key(key, capacity):
-    """Where a directory of that capacity, a power of two, looks for a key first."""
-    # Fibonacci hashing (Knuth, volume 3, section 6.4); the fold brings the upper axis into reach
+    """Place at which the search for a key begins in a table of that capacity, a power of two."""
+    # Fibonacci hashing (Knuth, volume 3, section 6.4); the fold mixes the upper axis in
     return (((key ^ (key >> 29)) * 0x9E3779B97F4A7C1) >> 20) & (capacity - 1)
 
 
@@ -203,7 +204,7 @@ def slot_of(keys, slots, which, key):
 
 @leaf
 def begin_frame(cells, reader):
-    """Announce a frame of that reader; returns the directory that it reads to its end."""
+    """Announce a frame of a reader; returns the directory that the frame reads to its end."""
     control, readers = cells.control, cells.readers
     while True:
         version = control[VERSION]
@@ -215,7 +216,7 @@ def begin_frame(cells, reader):
 
 @leaf
 def end_frame(cells, reader):
-    """Let go of what `begin_frame` announced."""
+    """End the frame that `begin_frame` announced; its directory may be reused."""
     fence()
     cells.readers[reader * READER_STRIDE] = 0
 
@@ -233,10 +234,10 @@ def voxel_state(cells, which, i, j, k):
 def is_something_near(
     keys, slots, words, masks, used, which, low_i, low_j, low_k, high_i, high_j, high_k
 ):
-    """Whether a closed box of voxels, inside the grid, holds one, or may: unknown counts, too.
+    """Whether a closed box in the grid holds an occupied voxel, or may: unknown cells count, too.
 
-    First by the masks of its cells' bricks, then, where the box is small, voxel by voxel: without
-    an early end, since a branch that is guessed wrong costs more than ten words.
+    The masks of bricks are read first, then, in a small box, the words. The loop over words has no
+    early end, since a mispredicted branch costs more than ten words.
     """
     is_near = False
     first_i, first_j, first_k = low_i >> 5, low_j >> 5, low_k >> 5
@@ -275,7 +276,7 @@ def is_something_near(
 def is_sphere_free(keys, slots, words, masks, used, which, spheres, n, transform, place, reached):
     """Whether no voxel is in the box around sphere n of a placed shell, wider by `reached` voxels.
 
-    Unknown cells count as voxels; what is outside the grid is free.
+    Unknown cells count as occupied; space outside the grid is free.
     """
     side = place.side
     x, y, z = moved(transform, spheres[n, 0], spheres[n, 1], spheres[n, 2])
@@ -300,7 +301,7 @@ def is_sphere_free(keys, slots, words, masks, used, which, spheres, n, transform
 
 @inlined
 def with_missed(missed, count, key):
-    """Put an unknown cell on the list, once; returns how many are on it."""
+    """Add an unknown cell to the list, if absent and there is room -> cells on the list."""
     for n in range(1, count + 1):
         if missed[n] == key:
             return count
@@ -314,9 +315,9 @@ def with_missed(missed, count, key):
 def free_runs(
     keys, slots, words, masks, used, which, spheres, groups, cluster, transform, place, reached
 ):
-    """How many runs from number `cluster` on are far from everything: a group, one, or none.
+    """Number of runs, from run `cluster` on, that are far from all voxels: GROUP, 1 or 0.
 
-    None of a shell without spheres. What is farther away than `reached` voxels counts as far.
+    Far means farther away than `reached` voxels. It is 0 for a shell without spheres.
     """
     if spheres.shape[0] == 0:
         return 0
@@ -333,9 +334,9 @@ def free_runs(
 
 @inlined
 def place_run(columns, start, count, transform, place, scratch):
-    """Points start .. start + count into scratch: metres in rows 0 to 2, voxels in rows 3 to 5.
+    """Place points start .. start + count: scratch takes metres (rows 0-2), voxels (rows 3-5).
 
-    One loop an axis, which the compiler makes vectors of: that halves the time of a flat frame of
+    One loop for each axis, which the compiler vectorizes: this halves the time of a flat frame of
     100,000 points.
     """
     ox, oy, oz, size = place.x, place.y, place.z, place.size
@@ -355,7 +356,7 @@ def place_run(columns, start, count, transform, place, scratch):
 
 @inlined
 def enter_cell(keys, slots, masks, used, which, key, missed, n_missed):
-    """Look a cell up -> its slot, its mask, and how many unknown cells are on the list `missed`.
+    """Look a cell up -> its slot, its mask, and the number of unknown cells on the list `missed`.
 
     The mask of a cell that is empty or unknown is zero.
     """
@@ -380,13 +381,13 @@ def respond_at(law, is_hit, sample, transform, px, py, pz, nx, ny, nz, ox, oy, o
 
 @leaf
 def felt(cells, which, shell, pose, place, law, met, missed, out):
-    """One frame: hits of a placed shell, and the wrench of what is felt, into out (RESULTS,).
+    """One frame: hits of a placed shell and the wrench of the points felt, into out (RESULTS,).
 
-    met (N,) takes the indices of the hits, missed (1 + MOST_MISSED,) the number of unknown cells
-    that points are in and their keys; unknown points neither hit nor miss. The arithmetic, and the
-    order of the sums, are those of `contact.locate` and `contact.refine`.
+    met (N,) takes the indices of the hits; missed (1 + MOST_MISSED,) takes the number and the keys
+    of the unknown cells that hold points. A point in an unknown cell is neither a hit nor a miss.
+    Arithmetic and order of the sums are those of `contact.locate` and `contact.refine`.
     """
-    # arrays by names of their own: a field that is read in a loop costs a counted reference
+    # arrays get local names: a field that is read in a loop costs a counted reference
     _, _, keys, slots, words, masks, used, payload = cells
     points, _, spheres, groups, run, columns, scratch = shell
     transform = transform_of(pose)
@@ -417,7 +418,7 @@ def felt(cells, which, shell, pose, place, law, met, missed, out):
                 slot, mask, n_missed = enter_cell(
                     keys, slots, masks, used, which, key, missed, n_missed
                 )
-            # by the bricks first: most of space is free, and the mask is in a register
+            # bricks first: most of space is free, and the mask is in a register
             if not (mask >> brick_bit(i, j, k)) & np.uint64(1):
                 if slot < 0:
                     n_unknown += 1
@@ -452,7 +453,7 @@ def felt(cells, which, shell, pose, place, law, met, missed, out):
 
 @entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, INTS, FLOATS2)
 def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out):
-    """`felt` at poses (M, 4, 4) into out (M, RESULTS); met and missed keep the last frame's.
+    """`felt` at poses (M, 4, 4) into out (M, RESULTS); met and missed are those of the last frame.
 
     Returns the number of poses done: fewer than M when one is not rigid.
     """
@@ -467,9 +468,9 @@ def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out):
 
 @entry(FLOATS2, INT, FLOAT, FLOATS2)
 def bounding_spheres(points, run, slack, out):
-    """Sphere (C, 4) around the box of each run of points (N, 6), its radius larger by `slack`.
+    """Sphere (C, 4) at the centre of the box of each run of points (N, 6), radius plus `slack`.
 
-    Larger, too, by what a pose that `is_rigid` lets pass may stretch.
+    The radius also has room for the stretch of a pose that `is_rigid` just accepts.
     """
     total = points.shape[0]
     for cluster in range(out.shape[0]):

@@ -1,7 +1,7 @@
-"""How near a swept shell comes to occupied voxels, by bounds that are kept from pose to pose.
+"""Clearance of a swept shell from occupied voxels, by bounds that are kept from pose to pose.
 
-The search stops at the first cell that is not resident and says where, so that whoever fetches
-cells can bring it in and go on; nothing is guessed.
+The search stops at the first cell that is not resident and returns where it stopped. The caller
+fetches that cell and continues the search; no distance is guessed.
 """
 
 import math
@@ -37,18 +37,18 @@ from hapticdb.kernels.resident.sweep import CAUTION, packed, unpacked
 from hapticdb.kernels.rigid import moved, transform_of
 
 MARGIN = 4.0
-"""Voxels beyond what matters now that a search looks, so that it need not be repeated soon."""
+"""Voxels that a search reaches beyond the distance that matters now. Larger: longer searches, fewer
+repeated ones."""
 
 
 class Bounds(NamedTuple):
-    """What is known about clearance, in voxels, kept from sample to sample.
+    """Bounds on the clearance, in voxels, kept from sample to sample.
 
-    expiry (N,): for each point, a travel at which it may have come to an occupied voxel at the
-    earliest, if it went straight there: its distance now is at least expiry - travel; of_runs (C,):
-    the same for all points of each run of a cluster; nearest (N,)
-    int64: the voxel, packed, that it was nearest to when last looked at, or -1; least (W,): of each
-    window of the path so far; state (2,): the least expiry, the least distance of all; where (5,)
-    int64: sample, point and voxel of that, the point that was nearest last, and where it stopped.
+    expiry (N,): for each point, the earliest travel at which it can reach an occupied voxel, if it
+    went straight there: its distance now is at least expiry - travel; of_runs (C,): the earliest
+    expiry of the points of each run; nearest (N,) int64: the voxel, packed, that was nearest to
+    each point in its last search, or -1; least (W,): least distance so far in each window of the
+    path; state (2,): indices `SOONEST`, `LEAST`; where (5,) int64: indices `SAMPLE` to `STOPPED`.
     """
 
     expiry: NDArray[np.float64]
@@ -66,20 +66,20 @@ SOONEST, LEAST = 0, 1
 """Indices into `Bounds.state`: the least expiry of all points, and the least distance, voxels."""
 SAMPLE, POINT, VOXEL, NEAREST, STOPPED = 0, 1, 2, 3, 4
 """Indices into `Bounds.where`: sample, point and voxel of the least distance; the point that was
-nearest last; the point, or the first of a run, at which the search stopped."""
+nearest last; the point, or first point of a run, at which the search stopped."""
 
 
 @leaf
 def gap(x, low, high):
-    """How far x lies outside the interval low .. high."""
+    """Distance of x from the interval low .. high, 0 inside."""
     return max(low - x, x - high, 0.0)
 
 
 @inlined
 def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
-    """Least squared distance to a voxel of one cell, and that voxel, packed; those given if nearer.
+    """Least squared distance from (x, y, z) to a voxel of one cell, and that voxel, packed.
 
-    All in voxels.
+    Returns `square` and `voxel` as given if no voxel is nearer. All lengths in voxels.
     """
     radius = math.sqrt(square)
     for bi in range(4):
@@ -173,8 +173,8 @@ def nearest_voxel(keys, slots, words, masks, used, which, x, y, z, square, voxel
 def nearest_to(keys, slots, words, masks, used, which, x, y, z, cap, near, side):
     """Squared distance from (x, y, z) to the nearest occupied voxel, and that voxel; all in voxels.
 
-    Looked for within `cap` and `MARGIN`, and no farther than the voxel `near`, packed, or -1.
-    The voxel is -1 when there is none and -2 when a cell in reach is not resident.
+    The search reaches as far as `cap` + `MARGIN`, or as the voxel `near` (packed, or -1 for none)
+    if that is nearer. The voxel is -1 when there is none, and -2 when a cell in reach is unknown.
     """
     square, voxel = (cap + MARGIN) ** 2, np.int64(-1)
     if near >= 0 and square_to(x, y, z, near) < square:
@@ -188,9 +188,10 @@ def nearest_to(keys, slots, words, masks, used, which, x, y, z, cap, near, side)
 def far_run(
     keys, slots, words, masks, used, which, spheres, at, near, cap, transform, place
 ):  # fmt: skip
-    """Bound, voxels, from a placed run's sphere to what is nearest, as far as `cap`; -1 if unknown.
+    """Lower bound, voxels, of the distance from a placed run's points to any occupied voxel.
 
-    near: a voxel, packed, to begin with, or -1. A point of the run is no nearer than the bound.
+    It comes from the run's sphere, looked for as far as `cap`; -1 when a cell in reach is unknown.
+    near: a voxel, packed, with which the search begins, or -1.
     """
     size = place.size
     x, y, z = moved(transform, spheres[at, 0], spheres[at, 1], spheres[at, 2])
@@ -207,10 +208,10 @@ def near_points(
     keys, slots, words, masks, used, which, points, run, at, transform, place, travel, cap, sample,
     expiry, nearest, state, where,
 ):  # fmt: skip
-    """Distances of those points of run `at` that may be nearer than `cap`, into arrays of `Bounds`.
+    """Distances of the points of run `at` that may be nearer than `cap`, into arrays of `Bounds`.
 
-    -> the least of them and `cap`, and the run's earliest expiry, all in voxels; -1 and 0 when a
-    cell is unknown. sample: number of the pose on the path.
+    Returns the least of `cap` and these distances, and the run's earliest expiry, all in voxels; -1
+    and 0 when a cell is unknown. sample: number of the pose on the path.
     """
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
     soonest = np.inf
@@ -246,11 +247,11 @@ def find_clearance(
 ):  # fmt: skip
     """Least distance from the points to an occupied voxel's box at poses[first:], in `bounds`.
 
-    travels (B,): how far any point can have come at each pose since the path's start, voxels;
-    windows (B,) int64: which of `bounds.least` each pose counts for; base: number of poses[0] as a
-    sample of the path; small: voxels, runs of no greater radius are looked at as one, before their
-    points. Returns how many poses are done: fewer than B when a cell was not resident,
-    and `bounds.where` has the point, or the first of the run.
+    travels (B,): largest way of any point from the path's start to each pose, voxels; windows (B,)
+    int64: the entry of `bounds.least` that each pose counts for; base: number of poses[0] as a
+    sample of the path; small: runs with a radius of at most so many voxels are searched as a whole
+    before their points. Returns the number of poses done. It is less than B when a cell was not
+    resident; then `bounds.where[STOPPED]` has the point, or the first point of the run.
     """
     _, _, keys, slots, words, masks, used, _ = cells
     points, _, spheres, _, run, _, _ = shell
@@ -263,7 +264,7 @@ def find_clearance(
             continue
         transform = transform_of(poses[n])
         soonest = np.inf
-        # the run of what was nearest last comes first: it bounds the search for all others
+        # first the run of the point that was nearest last: it bounds the search for all others
         for turn_of in range(-1, of_runs.shape[0]):
             at = where[NEAREST] // run if turn_of < 0 else turn_of
             is_expired = of_runs[at] - travel < cap and turn_of >= 0
@@ -296,11 +297,11 @@ def find_clearance(
 
 @entry(FLOATS2, FLOATS3, PLACE, INT, INT, FLOAT, INTS, INT)
 def cells_near(points, poses, place, first, stride, reach, found, most):
-    """Distinct cells within reach, metres, of points (N, 3+): at poses[0] from point `first` on.
+    """Distinct cells within `reach` metres of points (N, 3+) at every stride-th of the poses.
 
-    Then at every stride-th pose, all points. They go into found (capacity,) int64, -1 all over
-    before, an open-addressing set whose capacity is a power of two, above 2 most; it ends before
-    they are more than `most`. Returns how many they are.
+    At poses[0] only points from `first` on count. The cells go into found (capacity,) int64, an
+    open-addressing set, all -1 before; its capacity is a power of two, above 2 most. The search
+    ends before there are more than `most` cells. Returns the number of cells.
     """
     capacity = found.shape[0]
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side

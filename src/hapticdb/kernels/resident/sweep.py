@@ -1,7 +1,7 @@
-"""A path swept through resident cells: poses between poses, and hits with their voxels.
+"""A path swept through resident cells: poses between the given poses, and hits with their voxels.
 
-Hits stop at the first cell that is not resident and say where, so that whoever fetches cells can
-bring it in and go on; nothing is guessed.
+The search for hits stops at the first cell that is not resident and returns where it stopped. The
+caller fetches that cell and continues the search; no hit is guessed.
 """
 
 from typing import NamedTuple
@@ -47,18 +47,19 @@ from hapticdb.kernels.rigid import (
 )
 
 AXIS_BITS = 21
-"""Of each coordinate of a packed voxel, i uppermost."""
+"""Bits of each coordinate of a packed voxel, i uppermost. Three coordinates must fit an int64."""
 AXIS_MASK = (1 << AXIS_BITS) - 1
 CAUTION = 1e-6
-"""Voxels that a bound is kept on the safe side of roundings."""
+"""Voxels by which a bound is lowered, so that rounding errors cannot make it wrong."""
 
 
 class Found(NamedTuple):
-    """Hits as `find_hits` writes them, H of them.
+    """H hits as `find_hits` writes them.
 
-    samples (H,) int64: indices into the poses; points (H,) int64: of the shell; places (H,) int64:
-    where `voxels` has the voxel; depths (H,): metres, not below 0; voxels (capacity,) int64: an
-    open-addressing set of packed voxels, -1 where free, its capacity a power of two.
+    samples (H,) int64: indices into the poses; points (H,) int64: indices of the shell's points;
+    places (H,) int64: index of the hit's voxel in `voxels`; depths (H,): metres, not below 0;
+    voxels (capacity,) int64: an open-addressing set of packed voxels, -1 where free; its capacity
+    is a power of two.
     """
 
     samples: NDArray[np.int64]
@@ -73,11 +74,12 @@ FOUND = fields_of(Found, INTS, INTS, INTS, FLOATS, INTS)
 
 @entry(FLOATS3, FLOATS2, FLOATS2, FLOATS2, INTS, FLOATS, INT, FLOATS3)
 def poses_between(poses, centers, quaternions, turns, starts, center, first, out):
-    """Samples first .. first + B of a path, out (B, 4, 4): its centre on lines, turning by slerp.
+    """Write samples first .. first + B - 1 of a path to out (B, 4, 4).
 
-    poses (M, 4, 4): as given, which samples at them are; centers (M, 3): where the point `center`
-    (3,) of the tool is at each, metres; quaternions (M, 4); turns (M - 1, 3): from each to the
-    next, rotation vectors, world frame; starts (M,) int64: which sample each pose is.
+    Between two poses the tool's centre moves on a line and the tool turns by slerp. A sample at a
+    given pose is exactly that pose. poses (M, 4, 4) as given; centers (M, 3): position of the
+    tool's point `center` (3,) at each pose, metres; quaternions (M, 4); turns (M - 1, 3): rotation
+    vectors from each pose to the next, world frame; starts (M,) int64: the sample at each pose.
     """
     at = first_bound(first + 1, starts, np.int64(0)) - 1
     x, y, z = center[0], center[1], center[2]
@@ -132,7 +134,7 @@ def unpack(voxels, out):
 
 @inlined
 def entered(voxels, voxel):
-    """Where the set `voxels` has a packed voxel, entered when it was not there."""
+    """Index of a packed voxel in the set `voxels`; enters the voxel if it is not there."""
     capacity = voxels.shape[0]
     at = spread_key(voxel, capacity)
     while voxels[at] >= 0 and voxels[at] != voxel:
@@ -143,9 +145,9 @@ def entered(voxels, voxel):
 
 @inlined
 def hits_of_pose(cells, which, shell, transform, place, sample, count, found):
-    """Append hits of one placed shell to `found` -> how many it has now, -1 if a cell is unknown.
+    """Append hits of one placed shell to `found` -> its number of hits, -1 if a cell is unknown.
 
-    sample: number that the hits are given.
+    sample: index of the pose, written with each hit.
     """
     _, _, keys, slots, words, masks, used, _ = cells
     points, _, spheres, groups, run, _, _ = shell
@@ -186,9 +188,9 @@ def hits_of_pose(cells, which, shell, transform, place, sample, count, found):
 def find_hits(cells, reader, shell, poses, samples, place, first, count, found):
     """Hits at poses[samples[first:]], appended to `found` from its entry `count` on.
 
-    Runs of points whose sphere is free are passed over. Returns how many of the samples (S,) are
-    done and how many hits there are now: fewer samples than S when a cell was not resident, and the
-    rest of the last one's hits are not counted. Depths are those of `cells.felt` under the
+    Runs of points whose sphere is free are skipped. Returns the number of samples (S,) done and the
+    number of hits now. There are fewer samples than S when a cell was not resident; hits of the
+    sample that was not finished are not counted. Depths equal those of `cells.felt` under the
     tangent-plane law, bit for bit.
     """
     which = begin_frame(cells, reader)

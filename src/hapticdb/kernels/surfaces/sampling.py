@@ -1,8 +1,9 @@
 """Points spread evenly over a surface.
 
 Weighted sample elimination (Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets",
-Computer Graphics Forum 34(2), 2015): of several times as many candidates as wanted, the most
-crowded one goes, again and again. All lengths are in metres, in one frame of the caller's choice.
+Computer Graphics Forum 34(2), 2015): several times as many candidates as wanted are drawn, and
+the most crowded one is dropped, again and again. All lengths are in metres, in one frame of the
+caller's choice.
 """
 
 from typing import NamedTuple
@@ -18,16 +19,17 @@ CHUNK = 1 << 18
 """Candidates that are drawn at a time. Another value draws the random numbers in another order, so
 that every shell changes; a larger one takes more memory."""
 CROWD = 500
-"""Candidates that one is compared with, on average; above it the reach is shortened. Several sheets
-at one place have half as many. A larger value makes folded surfaces slower to sample."""
+"""Candidates that a candidate may be compared with, on average; above it the reach is shortened.
+Several sheets at one place have half as many. A larger value makes folded surfaces slower to
+sample."""
 
 
 @leaf
 def pair_weight(points, face_of, normals, a, b, reach, nearest, opposite):
     """Weigh a and b on each other: (1 - d / reach)^8, d the distance, at least `nearest`.
 
-    Yuksel 2015, equations 2 and 5. Points on opposite sides of a sheet see each other only within
-    `opposite` times the reach: else thin walls would get fewer points an area than thick ones.
+    Yuksel 2015, equations 2 and 5. Points on opposite sides of a sheet have a weight only
+    within `opposite` times the reach: otherwise thin walls would get fewer points an area.
     """
     x = points[a, 0] - points[b, 0]
     y = points[a, 1] - points[b, 1]
@@ -156,7 +158,7 @@ def spread_points(
     spacing: float,
     opposite: float = 0.35,
 ) -> NDArray[np.intp]:
-    """Choose `n_keep` of M candidates, as far from one another as they come.
+    """Choose `n_keep` of M candidates, as far from one another as elimination makes them.
 
     Parameters
     ----------
@@ -198,10 +200,10 @@ def sample_surface(
     n_points: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """Choose points (N, 3) spread evenly over triangles, and tell the face (N,) of each.
+    """Choose points (N, 3) spread evenly over triangles -> points, and the face (N,) of each.
 
-    triangles (F, 3, 3); areas (F,), all positive; normals (F, 3). Of several times as many
-    candidates, drawn in strata of equal area, those stay that are farthest apart. Measured on a
+    triangles (F, 3, 3); areas (F,), all positive; normals (F, 3). Several times as many candidates
+    are drawn in strata of equal area, and the most crowded are dropped. Measured on a
     sphere, the nearest neighbours are 0.74 of the hexagonal lattice's spacing apart with 10
     candidates a point, 0.69 with 5, 0.66 with 4.
     """

@@ -1,11 +1,11 @@
 """Which side of a surface is inside, and which body encloses which: by votes of lines.
 
 A ray that begins inside a closed surface crosses it an odd number of times, one that begins outside
-an even number (Jordan's theorem). So a line through a face tells which side of the face is inside,
-by the parity of its crossings ahead of the face and behind it, whatever the winding of the
-triangles. A line may meet an edge, a hole or a rounding error, so several lines vote. A tree of
-boxes spares a line from testing every triangle. Lengths are in metres, in one frame of the caller's
-choice. docs/decisions/0015 says why it is done like this.
+an even number (Jordan's theorem). So a line through a face shows which side of the face is inside,
+by the parity of its crossings ahead of the face and behind it, for any winding of the triangles. A
+line may meet an edge, a hole or a rounding error, so several lines vote. A tree of boxes spares a
+line from testing every triangle. Lengths are in metres, in one frame of the caller's choice.
+docs/decisions/0015 gives the reasons.
 """
 
 from typing import NamedTuple
@@ -34,7 +34,7 @@ LEAF_SIZE = 4
 STACK = 64
 """Nodes that wait to be visited: more than the height of a tree over 2^31 leaves."""
 TOUCH = 2
-"""Told of a crossing at the line's own start: such a line has no vote."""
+"""Code of a crossing at the line's own start: such a line has no vote."""
 PATIENCE = 32
 """Most lines that vote on one patch or body. A larger value decides more doubtful ones, slower."""
 ENOUGH = 5
@@ -57,7 +57,7 @@ class TriangleTree(NamedTuple):
     bodies: Ints  # (T,) body of each sorted triangle, ascending
     boxes: Floats  # (nodes, 2, 3) lower and upper corner
     spans: Ints  # (nodes, 2) least and greatest body below
-    slack: float  # what counts as no distance, metres
+    slack: float  # largest distance that counts as zero, metres
 
 
 TREE = fields_of(TriangleTree, FLOATS3, INTS, INTS, FLOATS3, INTS2, FLOAT)
@@ -190,7 +190,7 @@ def crossings(origin, direction, body, skip, tree, stack):
 
 @entry(TREE, INTS2, FLOATS2, FLOATS2, FLOATS2, INTS, INTS)
 def side_votes_kernel(tree, picks, directions, centroids, normals, body_of, out):
-    """For each patch, the votes that its normals point inside less the votes that they do not.
+    """For each patch, votes that its normals point inside, minus votes that they do not.
 
     picks (P, L) int64 faces, -1 for none; directions (L, 3); centroids, normals (F, 3); body_of
     (F,) int64; out (P,) int64. A line that starts on a closed surface crosses the rest of it an odd
@@ -301,7 +301,7 @@ def side_votes(
 ) -> Ints:
     """Let lines vote on each patch: positive (P,) where its normals point inside.
 
-    patch, body, areas (F,); centroids, normals (F, 3), the normals alike in each patch.
+    patch, body, areas (F,); centroids, normals (F, 3). In a patch all normals are on one side.
     """
     picks = _pick_faces(patch, areas, int(patch.max()) + 1)
     votes = np.zeros(len(picks), dtype=np.int64)
@@ -316,7 +316,7 @@ def enclosures(
     areas: Floats,
     centroids: Floats,
 ) -> NDArray[np.bool_]:
-    """Tell for each pair (inner, outer) of bodies whether the outer one encloses the inner one."""
+    """For each pair (inner, outer) of bodies, whether the outer body encloses the inner body."""
     picks = _pick_faces(body, areas, int(body.max()) + 1)
     out = np.zeros(len(pairs), dtype=np.uint8)
     nesting_kernel(tree, pairs, picks, _directions(PATIENCE), centroids, out)
@@ -324,7 +324,7 @@ def enclosures(
 
 
 def encloses(tree: TriangleTree, body: int, positions: Floats) -> NDArray[np.bool_]:
-    """Tell whether a closed body of the tree encloses positions (Q, 3), (Q,)."""
+    """Whether a closed body of the tree encloses each of the positions (Q, 3): (Q,)."""
     numbers = np.arange(len(positions))
     pairs = np.stack([numbers, np.full(len(positions), body)], axis=1)
     picks = np.repeat(numbers[:, None], PATIENCE, axis=1)

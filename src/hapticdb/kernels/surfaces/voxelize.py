@@ -63,9 +63,9 @@ move the result by 1e-11 voxel. A larger value is faster and less exact."""
 FAR = 2.0**60
 """Coordinates beyond it, in voxels, are set to it, so that no product of three overflows."""
 AXIS_X, AXIS_Y, AXIS_Z = np.int64(0), np.int64(1), np.int64(2)
-"""Axes as leaves take them: a bare 0 would be a type of its own to numba."""
+"""Numbers of the axes as int64: numba would give a bare 0 a type of its own."""
 OUTSIDE, CUT, WHOLE = 0, 1, 2
-"""How much of a triangle's bounding box lies in the grid: nothing, a part, all."""
+"""Part of a triangle's bounding box that lies in the grid: nothing, a part, all."""
 AT_TRIANGLE, AT_ROW, AT_COLUMN, ROWS_DONE = 0, 1, 2, 3
 """Fields of `resume`, where voxelizing goes on: the triangle; the row and the column in it, the row
 -1 where the triangle is new; thousandths of its rows that are done."""
@@ -103,7 +103,7 @@ def exact_product(a, b):
 
 @leaf
 def exact_minor(corners, p, q):
-    """Return (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p, right to the last bits."""
+    """Return (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p, exact to the last bits."""
     a, a_low = exact_difference(corners[1, p], corners[0, p])
     b, b_low = exact_difference(corners[2, q], corners[0, q])
     c, c_low = exact_difference(corners[1, q], corners[0, q])
@@ -337,7 +337,7 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
         first_u, first_v = box[0, u], box[0, v]
         move_u, move_v, move_w = box[2, u], box[2, v], box[2, w]
         if placed == WHOLE and first_u == box[1, u] and first_v == box[1, v]:
-            # a triangle that lies in one column meets every voxel of it that its bounding box does
+            # a triangle in one column meets every voxel of it that its bounding box meets
             start = (first_u + move_u, first_v + move_v, box[0, w] + move_w)
             write_run(runs, n_runs, uvw, start, box[1, w] + move_w)
             n_runs += 1
@@ -379,7 +379,7 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
 def voxelize_kernel(triangles, bits, resume, most):
     """Bricks of the voxels that triangles (T, 3, 3) meet: packed keys, words (C, 8), count.
 
-    Stops after `most` bricks or so, or many times as many runs of voxels. resume (4,) int64 is
+    Stops after about `most` bricks, or many times as many runs of voxels. resume (4,) int64 is
     where it begins and then where it has stopped: `AT_TRIANGLE`, `AT_ROW`, `AT_COLUMN` and
     `ROWS_DONE`. All is done when the triangle is T.
     """
@@ -461,7 +461,7 @@ def voxelize(
     Notes
     -----
     Boxes are closed: a triangle in the plane between two layers of voxels marks both. The result
-    is the union over the triangles, whatever their order. Holds no interpreter lock and no state
+    is the union over the triangles, in any order. Holds no interpreter lock and no state
     of its own, so that threads may voxelize different parts at once.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)

@@ -1,7 +1,7 @@
 """The smallest engine: environments in this process's memory, opened by ``memory://name``.
 
-docs/engines.md leads here. Every commit makes a new, immutable `State`, so that a snapshot is a
-reference to one. It has what each engine must have, and none of the capabilities that only some
+docs/engines.md refers to this file. Every commit makes a new, immutable `State`; a snapshot is a
+reference to one. The engine has what each engine must have, and no capability that only some
 engines have.
 """
 
@@ -49,7 +49,7 @@ from hapticdb.store.engines import Capability
 
 
 class State:
-    """What an environment holds at one revision; never changed."""
+    """Content of an environment at one revision; immutable."""
 
     def __init__(
         self,
@@ -79,7 +79,7 @@ class State:
 
 
 def picked(rows: Rows, which: Keys) -> Rows:
-    """Rows by their places in a batch."""
+    """The rows at the given places of a batch."""
     if not len(which):
         return NO_ROWS
     bits = NO_OCCUPANCY
@@ -89,7 +89,7 @@ def picked(rows: Rows, which: Keys) -> Rows:
 
 
 class Contents:
-    """One environment: its grid, its newest state, and what is kept about it."""
+    """One environment: its grid, its newest state, its histograms and costs."""
 
     def __init__(self, name: str, grid: Grid, layout: Layout) -> None:
         self.name = name
@@ -145,7 +145,7 @@ class MemoryStore:
                 self._snapshot = None
 
     def _state(self) -> State:
-        """What a read sees: the newest state, or the snapshot's."""
+        """The state that a read uses: the snapshot's, or else the newest."""
         self._check()
         state = self._snapshot or self._contents.state
         self._seen = state.revision
@@ -236,7 +236,7 @@ class MemoryStore:
             self._commit("remove", object_id, old.keys, None, NO_ROWS)
 
     def _newest(self) -> State:
-        """What a write begins from."""
+        """The state that a write starts from."""
         self._check_writable()
         return self._contents.state
 
@@ -259,7 +259,7 @@ class MemoryStore:
         record: Object | None,
         rows: Rows,
     ) -> None:
-        """Put the next state in place of the newest. The write lock is held."""
+        """Replace the newest state by the next one. The caller holds the write lock."""
         state = self._contents.state
         revision = state.revision + 1
         objects, removed = dict(state.objects), set(state.removed)
@@ -329,7 +329,7 @@ ENVIRONMENTS: dict[str, Contents] = {}
 
 
 class MemoryEngine:
-    """What the scheme ``memory`` means."""
+    """The engine of the scheme ``memory``."""
 
     title = "memory"
     lacks: Mapping[Capability, str] = MappingProxyType(

@@ -1,4 +1,4 @@
-"""What a valid environment is, and all that one holds: for tests that cut writers off."""
+"""Checks and contents of a valid environment, for tests that interrupt writers."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ Contents = tuple[list[tuple[Any, ...]], list[tuple[Any, ...]], set[tuple[int, in
 
 
 def assert_valid(env: Environment) -> None:
-    """Every object has the rows that its record says, no row is without one, the log is whole."""
+    """Assert that objects have their recorded rows, rows have an object, the log is complete."""
     with env.store.snapshot():
         objects = env.objects()
         rows = env.store.scan(np.array([0]), np.array([2**62]))
@@ -36,7 +36,7 @@ def assert_valid(env: Environment) -> None:
 
 
 def contents(env: Environment) -> Contents:
-    """Objects, log and index rows: equal where two environments came to be in the same way."""
+    """Objects, log and index rows; equal for two environments with the same history."""
     objects = [
         (obj.id, obj.name, obj.digest, obj.transform.tolist(), obj.voxels, obj.revision)
         for obj in env.objects()
@@ -46,7 +46,7 @@ def contents(env: Environment) -> Contents:
 
 
 def valid_contents(url: str) -> Contents:
-    """Contents of an environment, found valid by one who opens it to write."""
+    """Open an environment for writing, check it, and return its contents."""
     with hapticdb.open(url) as env:
         assert_valid(env)
         return contents(env)

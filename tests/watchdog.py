@@ -1,10 +1,10 @@
-"""Ends what a run of the tests has left, however the run ended: its processes, servers and files.
+"""Removes the processes, servers and files that a test run has left, however the run ended.
 
-`children.begin_run` starts this script beside pytest, in a session of its own. It waits for the end
-of its input, which also comes when pytest is killed and can tidy up nothing itself. It needs Linux.
+`children.begin_run` starts this script beside pytest, in a session of its own. The script waits for
+the end of its input, which also comes when pytest is killed and cannot clean up. It needs Linux.
 
-Each line of its input is a word and a value: ``folder PATH``, below which servers are ended;
-``process PID``, one that was forked. All others are known by the variable HAPTICDB_TEST_RUN.
+Each line of its input is a word and a value: ``folder PATH``, a folder below which servers are
+ended; ``process PID``, a forked process. Other processes have the variable HAPTICDB_TEST_RUN.
 """
 
 import contextlib
@@ -18,13 +18,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 TICK_S = 0.5
-"""Between looks whether pytest is there: a process that it has forked may hold the line open."""
+"""Seconds between checks that pytest lives; a process forked from it may hold the pipe open."""
 PATIENCE_S = 20.0
-"""For a server to shut down; after that it is killed."""
+"""Seconds for a server to shut down; after that it is killed."""
 
 
 def identity_of(pid: int) -> tuple[int, str] | None:
-    """Number and start time of a living process: the same number may be another's later."""
+    """Number and start time of a living process; the number alone may be reused later."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text(errors="replace").rpartition(")")[2].split()
     except OSError:
@@ -33,7 +33,7 @@ def identity_of(pid: int) -> tuple[int, str] | None:
 
 
 def processes() -> Iterator[tuple[int, list[str], list[str]]]:
-    """Id, command line and first environment of each living process but this one."""
+    """Id, command line and initial environment of each living process except this one."""
     for path in Path("/proc").glob("[0-9]*"):
         pid = int(path.name)
         if pid == os.getpid() or identity_of(pid) is None:
@@ -44,12 +44,12 @@ def processes() -> Iterator[tuple[int, list[str], list[str]]]:
 
 
 class Leftovers:
-    """What a run may have left.
+    """Processes, servers and files that a run may have left.
 
     Parameters
     ----------
     run : Path
-        The run's folder, which is removed; named by HAPTICDB_TEST_RUN in all that the run starts.
+        The run's folder, which is removed; the run's processes have it in HAPTICDB_TEST_RUN.
     """
 
     def __init__(self, run: Path) -> None:
@@ -58,7 +58,7 @@ class Leftovers:
         self._forked: set[tuple[int, str]] = set()
 
     def note(self, line: bytes) -> None:
-        """Take a line of the input in."""
+        """Store the folder or process that a line of the input names."""
         word, _, value = os.fsdecode(line).partition(" ")
         if word == "folder":
             self._folders.append(Path(value))
@@ -66,11 +66,11 @@ class Leftovers:
             self._forked.add(found)
 
     def end(self) -> None:
-        """End all of it, servers last: none is there then to start another."""
+        """End all processes and remove all folders, until no process is found twice in a row."""
         deadline = time.monotonic() + PATIENCE_S
         mark = f"HAPTICDB_TEST_RUN={self._run}"
         n_quiet, asked, folders = 0, set[int](), set[Path]()
-        while n_quiet < 2:  # between two processes, one may start the other
+        while n_quiet < 2:  # a process may have started another between two looks
             is_late = time.monotonic() > deadline
             found = list(processes())
             servers = {pid: data for pid, words, _ in found if (data := self._data_of(words))}
@@ -84,13 +84,13 @@ class Leftovers:
             folders.update(servers.values())
             n_quiet = 0 if servers or others else n_quiet + 1
             if is_late and time.monotonic() > deadline + PATIENCE_S:
-                break  # not to be killed: stuck in the system
+                break  # cannot be killed: stuck in the kernel
             time.sleep(0.05)
         for folder in (*folders, self._run):
             shutil.rmtree(folder, ignore_errors=True)
 
     def _data_of(self, words: list[str]) -> Path | None:
-        """Data folder of a PostgreSQL that runs, or is being set up, below our folders."""
+        """Data folder of a PostgreSQL that runs or is set up below the run's folders, else None."""
         if "-D" not in words[:-1]:
             return None
         data = Path(words[words.index("-D") + 1])
@@ -103,10 +103,10 @@ def _send(pid: int, number: signal.Signals) -> None:
 
 
 def watch(parent: int, leftovers: Leftovers) -> None:
-    """Read the input until it ends, or the parent does."""
+    """Read the input until it ends or the parent has ended."""
     rest = b""
     while True:
-        is_orphan = os.getppid() != parent  # asked before: what it said is in the pipe by now
+        is_orphan = os.getppid() != parent  # before the read: an ended parent's lines are in the pipe
         ready, _, _ = select.select([0], [], [], 0 if is_orphan else TICK_S)
         if ready:
             read = os.read(0, 1 << 16)

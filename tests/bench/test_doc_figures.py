@@ -1,4 +1,4 @@
-"""Every measured figure of the pages is one of results/, or says that its results were not kept."""
+"""Every measured figure on a page is in results/, or is marked with the commit that observed it."""
 
 import json
 import re
@@ -19,7 +19,7 @@ from report.realtime_page import edit_table, frame_table, model_words, session_t
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
 FILES = sorted(RESULTS.glob("*.json"))
-# docs/evaluation.md is written from results; docs/format.md has a file's layout and no measurement
+# left out: docs/evaluation.md is computed from results/, docs/format.md has no measurement
 PAGES = [
     ROOT / "README.md",
     *(p for p in sorted((ROOT / "docs").glob("*.md")) if p.stem not in {"evaluation", "format"}),
@@ -34,9 +34,9 @@ MARKER = re.compile(
 
 
 def blocks(text: str) -> Iterator[str]:
-    """Paragraphs, items of lists and tables of a page, fenced code left out."""
+    """Paragraphs, list items and tables of a page, without fenced code."""
     prose = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
-    prose = re.sub(r" -->\n\n(?=    )", " -->\n", prose)  # a marker of indented code
+    prose = re.sub(r" -->\n\n(?=    )", " -->\n", prose)  # keeps a marker with its indented code
     yield from (block for block in re.split(r"\n\s*\n|\n(?=- |\d+\. )", prose) if block.strip())
 
 
@@ -55,7 +55,7 @@ def loaded(name: str) -> dict[str, Any]:
 
 
 def test_the_evaluation_is_what_the_results_say(tmp_path: Path) -> None:
-    """Byte for byte: every figure in its tables and sentences is computed from results/."""
+    """The page equals its recomputation byte for byte: all figures come from results/."""
     page = tmp_path / "evaluation.md"
     write_report(records.read(RESULTS), page, "../results")
     assert page.read_text() == (ROOT / "docs" / "evaluation.md").read_text()
@@ -100,7 +100,7 @@ def test_a_result_written_in_a_clone_names_its_commit(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_a_measured_figure_says_where_it_comes_from(page: Path) -> None:
-    """By a comment before it: of which file of results/, or which commit brought it."""
+    """A comment before a figure names its file in results/ or the commit that brought it."""
     bare = [b for b in blocks(page.read_text()) if is_claim(b) and not MARKER.match(b)]
     assert bare == []
 
@@ -112,7 +112,7 @@ def test_every_figure_that_is_said_to_be_measured_is_in_its_file() -> None:
         "results/edits.json": [edit_table(edits)],
     }
     for one in (*realtime["sessions"], *edits["edits"]):
-        assert one["unknown_frames"] == 0  # as the page says
+        assert one["unknown_frames"] == 0  # the pages claim it
     shown: list[str] = []
     for page in PAGES:
         for block in blocks(page.read_text()):

@@ -1,4 +1,4 @@
-"""Every experiment on small environments: which cells come, and that what they count is right."""
+"""Every experiment on small environments: the cells it returns, and that their counts are right."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -169,7 +169,7 @@ def test_a_cache_is_named_by_what_it_holds(env: Environment) -> None:
 
 @pytest.mark.long
 def test_a_loop_in_the_server_finds_the_same(place: Place, car: Path) -> None:
-    """On every server and both layouts; its ranges are scanned one at a time."""
+    """The loop scans one range at a time; tested on every server and both layouts."""
     for layout in LAYOUTS:
         url = place()
         hapticdb.import_files(url, [car], options(layout))

@@ -1,4 +1,4 @@
-"""Timing in turns: every pose once for each, side by side, and the summary of the times."""
+"""Timing in turns: each alternative runs every pose once, interleaved; summary of the times."""
 
 import itertools
 import math
@@ -18,7 +18,7 @@ POSES[:, 0, 3] = np.arange(len(POSES))
 
 
 def counting(log: list[tuple[str, int]], name: str) -> Callable[[Pose], Query]:
-    """A frame that only notes which pose it was asked for."""
+    """A frame that only logs the pose it gets."""
 
     def frame(pose: Pose) -> Query:
         log.append((name, int(pose[0, 3])))
@@ -40,7 +40,7 @@ def test_every_alternative_measures_every_pose_once(count: int) -> None:
 
 
 def test_no_alternative_follows_another_over_the_same_poses() -> None:
-    """Or the second would find in the cache what the first has brought."""
+    """Otherwise the second would find in the cache the pages that the first has read."""
     log: list[tuple[str, int]] = []
     alternatives = [Alternative({}, counting(log, name)) for name in "abc"]
     in_turns(alternatives, POSES, limit_s=60.0, warm=0)
@@ -60,7 +60,7 @@ def test_the_frame_before_a_turn_is_not_timed() -> None:
 
 
 class Clock:
-    """Time that passes only when it is told to."""
+    """A clock that only a test moves."""
 
     def __init__(self) -> None:
         self.now_ns = 0
@@ -90,7 +90,7 @@ def test_a_slow_alternative_is_stopped_and_says_so(clock: Clock) -> None:
     quick = counting([], "quick")
     cells = in_turns([Alternative({}, slow), Alternative({}, quick)], POSES, limit_s=0.02, warm=0)
     assert cells[0]["cut_short"]
-    assert cells[0]["frames"] == 5  # the fifth is over the limit
+    assert cells[0]["frames"] == 5  # the fifth frame is over the limit
     assert not cells[1]["cut_short"]
 
 

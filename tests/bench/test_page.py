@@ -1,4 +1,4 @@
-"""The page of `hapticdb bench`: its own plots and tables, and nothing of the evaluation's."""
+"""The page of `hapticdb bench` has its own plots and tables, and none of the evaluation's."""
 
 import re
 from pathlib import Path
@@ -20,7 +20,7 @@ def written(results: dict[str, Any], folder: Path) -> str:
 
 
 def own_results() -> dict[str, Any]:
-    """What `hapticdb bench` measures of one environment, out of the made-up evaluation."""
+    """The part of the made-up evaluation that `hapticdb bench` measures of one environment."""
     found = {name: one for name, one in everything().items() if name in {"table1", *OURS}}
     cell = {
         "environment": "car",

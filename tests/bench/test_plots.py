@@ -1,4 +1,4 @@
-"""Plots of made-up results: every picture is drawn, says its conditions, and is the same twice."""
+"""Plots of made-up results: each is drawn, names its conditions, and is reproducible."""
 
 import math
 import re
@@ -198,7 +198,7 @@ def test_a_file_that_cannot_be_written_is_said_in_one_line(tmp_path: Path) -> No
         draw({"figure8": everything()["figure8"]}, tmp_path / "file")
 
 
-# --- whatever a cell lacks ----------------------------------------------------------------------
+# --- cells that lack fields ---------------------------------------------------------------------
 
 LACKS = st.sampled_from(
     ["us", "engine", "layout", "cache", "poses", "points", "maxgap", "rows", "false_rows", "ranges",

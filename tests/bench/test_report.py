@@ -1,4 +1,4 @@
-"""The written evaluation says what the cells say, recomputed here from made-up ones."""
+"""The written evaluation states the cells' figures, recomputed here from made-up cells."""
 
 import math
 import re
@@ -228,7 +228,7 @@ def test_one_maxgap_for_all_regions_is_held_against_cbgroup() -> None:
 def test_auto_is_held_against_the_fastest_beside_it(us: dict[str, float], auto: float) -> None:
     base: Cell = {"engine": SQLITE, "layout": "brick"}
     cells = [cell(value, strategy=name, **base) for name, value in {**us, "auto": auto}.items()]
-    # another group, which must not be held against it
+    # another group, with which `auto` must not be compared
     cells.append(cell(0.1, strategy="array", **{**base, "layout": "voxel"}))
     (found,) = choices({"strategies": {"cells": cells}})
     assert found.ratio == pytest.approx(auto / min(us.values()))

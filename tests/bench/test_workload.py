@@ -1,4 +1,4 @@
-"""Shells, poses and regions: fixed by a seed, near surfaces, of the density they claim."""
+"""Shells, poses and regions: fixed by a seed, near surfaces, of the stated density."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +18,7 @@ GRID = Grid(0.002, (0.1, -0.2, 0.3), 8)
 
 @pytest.fixture(params=LAYOUTS)
 def env(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Environment]:
-    """Solid balls of several sizes, some of them in one another's windows."""
+    """An environment of solid balls of several sizes; some share a window."""
     layout: Layout = request.param
     made = hapticdb.create(tmp_path / "e.db", GRID, layout=layout)
     for n, (place, radius) in enumerate(

@@ -1,4 +1,4 @@
-"""The verb bench, used rightly and wrongly."""
+"""The verb bench, with right and wrong arguments."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -82,7 +82,7 @@ def test_bench_takes_a_tool_along_its_path(run: Run, scene: Path, tmp_path: Path
 
 
 def path_over(folder: Path) -> Path:
-    """Poses at the places of the scene's boxes."""
+    """A file of poses at the positions of the scene's boxes."""
     lines = ["x,y,z,qw,qx,qy,qz", *(f"{x},{y},{z},1,0,0,0" for x, y, z in PLACES)]
     path = folder / "over.csv"
     path.write_text("\n".join(lines) + "\n")

@@ -1,4 +1,4 @@
-"""Every option that takes objects takes several, by id, name and pattern."""
+"""Every option that names objects accepts several, by id, name and pattern."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -38,7 +38,7 @@ def test_feel_excludes_by_name(run: Run, scene: Path) -> None:
     "parts", [("1", "--part", "3"), ("1,3",), ("box[02]",), ("box0", "--part", "box2")]
 )
 def test_several_parts_are_one_tool(run: Run, scene: Path, parts: tuple[str, ...]) -> None:
-    """Boxes 0 and 2, left and right of box 1, which is in the way of one of them."""
+    """Boxes 0 and 2 are one tool; box 1, between them, is in the way of box 0."""
     up = poses(scene.parent / "up.csv", (0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
     aside = poses(scene.parent / "aside.csv", (0.0, 0.0, 0.0), (0.15, 0.0, 0.0))
     code, out, err = run("sweep", scene, "--part", *parts, "--path", up, "--json")
@@ -47,7 +47,7 @@ def test_several_parts_are_one_tool(run: Run, scene: Path, parts: tuple[str, ...
     assert (found["tool"]["parts"], found["tool"]["excluded"]) == ([1, 3], [1, 3])
     code, out, _ = run("sweep", scene, "--part", *parts, "--path", aside, "--json")
     assert (code, [one["id"] for one in json.loads(out)["objects"]]) == (1, [2])
-    # each alone: the last one, which nothing is in the way of, does not stand for all
+    # box 2 alone has a free path, so the result above does not come from it alone
     assert run("sweep", scene, "--part", "3", "--path", aside)[0] == 0
 
 

@@ -1,4 +1,4 @@
-"""The command line as a user meets it: what is offered, import, and the process around it."""
+"""The command line for a user: help and verbs, import, and its process."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -51,7 +51,7 @@ VERBS = (
 )
 
 
-# -- what is offered ------------------------------------------------------------------------------
+# -- help and verbs -------------------------------------------------------------------------------
 
 
 def test_alone_it_shows_the_verbs(run: Run) -> None:
@@ -118,7 +118,7 @@ def test_an_unforeseen_error_is_one_line_too(
 
 
 def modules_after(program: str, *names: str) -> list[str]:
-    """Which of those modules a program has loaded at its end."""
+    """Which of the named modules a program has loaded when it ends."""
     code = f"{program}\nimport sys\nprint(*sorted(sys.modules))"
     done = finished([sys.executable, "-c", code], check=True)
     return sorted({*names} & {*done.stdout.splitlines()[-1].split()})

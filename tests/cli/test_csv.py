@@ -1,4 +1,4 @@
-"""Results as CSV: every digit, stable headers, whole files or none, no other word on stdout."""
+"""Results as CSV: all digits, stable headers, no partial files, nothing else on stdout."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -113,7 +113,7 @@ def frames_of(n: int) -> np.ndarray[tuple[int], np.dtype[np.void]]:
     for name in FRAME.names or ():
         values = random.normal(size=frames[name].shape) * 10.0 ** random.integers(-9, 9)
         frames[name] = values.astype(frames.dtype[name].base)
-    frames["hand"][3, 0] = np.nan  # as where a hand is nowhere
+    frames["hand"][3, 0] = np.nan  # as when the hand has no valid pose
     return frames
 
 
@@ -125,7 +125,7 @@ def recording(scene: Path) -> Path:
         header = Header(env.url, env.grid, 1, shell, 1000.0, hapticdb.TangentPlane(), (), {})
     with Recorder(path, header) as recorder:
         recorder.append(frames_of(5000))
-    scene.unlink()  # an export needs none
+    scene.unlink()  # an export needs no environment
     return path
 
 

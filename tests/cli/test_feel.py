@@ -1,4 +1,4 @@
-"""The verbs feel and replay, as a newcomer uses them: with mistakes, and with Ctrl-C."""
+"""The verbs feel and replay as a newcomer uses them, with mistakes and Ctrl-C."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -27,7 +27,7 @@ LIMITED = (*PLAY, "--record", "felt.hdbrec", "--record-limit")
 
 
 def children() -> set[int]:
-    """Ids of the processes that this one has started and that run."""
+    """Ids of the running child processes of this process."""
     me, found = str(os.getpid()), set()
     for path in Path("/proc").glob("[0-9]*/stat"):
         try:
@@ -54,7 +54,7 @@ def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run) -> None:
 
 
 def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) -> None:
-    """And told to differ once an object has moved."""
+    """A replay reports a difference once an object has moved."""
     before = children()
     code, out, err = run(*feel(*PLAY, "--speed", 0.5, "--record", "felt.hdbrec"))
     assert (code, err) == (0, "")
@@ -301,7 +301,7 @@ def recorded(path: Path) -> Frames:
 
 
 def frames_in(path: Path) -> bool:
-    """Whether a session has begun to record."""
+    """Whether a recording has at least one frame."""
     try:
         return sum(map(len, Recording(path).frames(until_damage=True))) > 0
     except hapticdb.HapticDBError:
@@ -320,11 +320,11 @@ def descendants(pid: int) -> list[int]:
 def test_a_signal_ends_a_session_with_its_report(
     scene: Path, number: signal.Signals, code: int, words: str
 ) -> None:
-    """And with a recording that has every frame."""
+    """Its recording then has every frame."""
     args = feel("--device", "random", "--at", ABOVE, "--rate", 5000, "--record", "cut.hdbrec")
     with child(command(*args, "--json"), cwd=scene.parent) as process:
 
-        def is_recording() -> bool:  # the first chunk is full
+        def is_recording() -> bool:  # true once the first chunk is full
             assert process.poll() is None
             return frames_in(scene.with_name("cut.hdbrec"))
 

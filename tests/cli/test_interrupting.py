@@ -37,14 +37,14 @@ else:
     from hapticdb.__main__ import main
     sys.exit(main())
 """
-"""A command line that is interrupted within its n-th import after the command line's own."""
+"""A program: the command line, interrupted in the n-th import after its own module's."""
 
 
 @pytest.mark.parametrize("at", [1, 2, 5, 12, 40, 90, 150, 220, 300, 380, 450, 520])
 def test_ctrl_c_within_any_import_is_one_line(scene: Path, at: int) -> None:
     how = "module" if at % 2 else "script"
     done = finished([sys.executable, "-c", AT_IMPORT, str(at), how, "objects", str(scene)])
-    if done.returncode == 0:  # so many imports there are not
+    if done.returncode == 0:  # there are fewer imports than `at`
         assert at > 150
         assert done.stderr == ""
     else:
@@ -63,7 +63,7 @@ def test_ctrl_c_within_an_import_of_a_touch_is_one_line(scene: Path, at: int) ->
 
 @pytest.mark.long
 def test_ctrl_c_after_any_delay_leaves_no_traceback_of_ours(scene: Path) -> None:
-    """Before our first line Python itself answers; that traceback names no file of ours."""
+    """Before hapticdb's first line Python prints a traceback, which names no file of hapticdb."""
     codes = set()
     for n in range(30):
         with child(command("info", scene)) as process:

@@ -1,4 +1,4 @@
-"""Every verb has --json: JSON alone on standard output, whatever goes on beside it."""
+"""Every verb has --json: standard output is JSON alone, whatever goes to standard error."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 

@@ -1,4 +1,4 @@
-"""The verbs copy and diff, used rightly and wrongly."""
+"""The verbs copy and diff, with right and wrong arguments."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -244,7 +244,7 @@ def test_a_terminal_sees_a_bar_with_objects(scene: Path) -> None:
 
 
 def read_terminal(ours: int) -> bytes:
-    """What was drawn; nothing once the other side is closed."""
+    """Bytes written to the terminal; empty once the other side is closed."""
     try:
         return os.read(ours, 4096)
     except OSError:

@@ -1,4 +1,4 @@
-"""The listing of objects: chosen, sorted, a page at a time, as wide as where it is shown."""
+"""The listing of objects: filtered, sorted, in pages, as wide as the terminal."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -24,7 +24,7 @@ N_BOLTS = 60
 
 @pytest.fixture(scope="module")
 def bolts(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Sixty bolts in a row along x, 0.1 m apart and ever smaller, bolt 7 longest; and a plate."""
+    """60 bolts along x, 0.1 m apart, each shorter than the last, bolt 7 longest; and a plate."""
     folder = tmp_path_factory.mktemp("bolts")
     lines: list[str] = []
     sizes = [0.05 - 0.0005 * n for n in range(N_BOLTS)]
@@ -69,7 +69,7 @@ def test_a_box_chooses_by_bounds(run: Run, bolts: Path) -> None:
 
 def test_objects_are_sorted_as_asked(run: Run, bolts: Path) -> None:
     by_name = [*(f"frame/bolt_{n}" for n in range(N_BOLTS)), "plate"]
-    assert listed(run, bolts, "--sort", "name") == by_name  # 10 after 9
+    assert listed(run, bolts, "--sort", "name") == by_name  # 10 sorts after 9
     assert listed(run, bolts, "--sort", "name", "--reverse") == by_name[::-1]
     assert listed(run, bolts, "--sort", "id", "--reverse", "--limit", 1) == ["plate"]
     by_size = listed(run, bolts, "--sort", "size")

@@ -1,4 +1,4 @@
-"""matplotlib is loaded by the verbs that draw, and by no other."""
+"""matplotlib is loaded by the verbs that draw a picture, and by no other verb."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -17,7 +17,7 @@ import os
 open(os.environ["LOADED"], "w").close()
 raise ImportError("nothing is to be drawn")
 """
-"""A package of matplotlib's name that leaves a mark in whichever process imports it."""
+"""Source of a stand-in for matplotlib: a process that imports it creates a file."""
 
 TOOL = "--tool tool.npz"
 LINES = {
@@ -41,9 +41,9 @@ LINES = {
     "sample": "made --frames 2",
     "warm": "",
 }
-"""What each verb without a picture is asked to do."""
+"""Arguments of each verb, without a picture."""
 REFUSED = {"grant": 2}
-"""Exit codes that are not 0: an SQLite file knows no roles."""
+"""Verbs with an exit code other than 0: an SQLite file has no roles."""
 DRAWING = {"demo", "bench"}
 """Verbs that always draw."""
 LONG = {"feel", "replay", "sweep", "calibrate", "sample", "warm"}
@@ -52,7 +52,7 @@ TRIANGLE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n"
 
 @pytest.fixture
 def variables(tmp_path: Path) -> dict[str, str]:
-    """Environment of a process in which matplotlib is the stand-in."""
+    """Environment variables of a process in which matplotlib is the stand-in."""
     package = tmp_path / "shadow" / "matplotlib"
     package.mkdir(parents=True)
     (package / "__init__.py").write_text(STAND_IN)
@@ -71,7 +71,7 @@ def test_every_verb_is_tried() -> None:
 def test_a_verb_without_a_picture_loads_no_matplotlib(
     variables: dict[str, str], scene: Path, tmp_path: Path, verb: str
 ) -> None:
-    """Nor does a process that it starts."""
+    """The processes that the verb starts load none either."""
     (tmp_path / "file.obj").write_text(TRIANGLE)
     if verb == "replay":
         recorded = command("feel", *LINES["feel"].split())
@@ -94,7 +94,7 @@ def test_importing_the_package_loads_no_matplotlib(
 def test_a_verb_with_a_picture_loads_it(
     variables: dict[str, str], scene: Path, tmp_path: Path
 ) -> None:
-    """So that the mark is known to be left."""
+    """This shows that the stand-in does create its file."""
     line = f"{LINES['sweep']} --picture sweep.png"
     done = finished(command("sweep", *line.split()), cwd=scene.parent, env=variables)
     assert "nothing is to be drawn" in done.stderr

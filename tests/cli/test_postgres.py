@@ -1,4 +1,4 @@
-"""The command line on PostgreSQL: what it does on a file, and what only a server can do wrong."""
+"""The command line on PostgreSQL: the same as on a file, and a server's own failures."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -50,7 +50,7 @@ ESCAPED = "h%40nter%3A2%2F%23%3F%26%25"
 def scene(run: Run, made: Path, tmp_path: Path, place: Place) -> str:
     """The environment of three boxes on a server, with tool and path in the folder.
 
-    Copied, since an import starts a process to read the file.
+    The environment is copied, since an import would start a process to read the file.
     """
     for name in ("tool.stl", "tool.npz", "path.csv"):
         shutil.copy(made / name, tmp_path)
@@ -113,7 +113,7 @@ def test_info_names_the_environment_and_the_server(
     assert found["engine"] == f"PostgreSQL {version[0].split()[0]}"
 
 
-# -- what no one may read over a shoulder ---------------------------------------------------------
+# -- passwords are not shown ----------------------------------------------------------------------
 
 LINES: tuple[tuple[str, ...], ...] = (
     ("info",),
@@ -150,7 +150,7 @@ def test_a_password_that_should_have_been_escaped_is_refused_unseen(run: Run, se
     assert "nter" not in run("--debug", "info", url)[2]
 
 
-# -- what only a server can do wrong --------------------------------------------------------------
+# -- failures that only a server has --------------------------------------------------------------
 
 
 def test_no_server_is_one_line(run: Run, tmp_path: Path) -> None:
@@ -171,7 +171,7 @@ def test_psycopg_missing_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.fixture(params=[found for found in FOUND if not isinstance(found, str)], ids=named)
 def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[PrivateServer]:
-    """A server of this test's own."""
+    """A server for one test."""
     started = PrivateServer.at(tmp_path / "plant", request.param, SETTINGS)
     started.start()
     yield started
@@ -226,13 +226,13 @@ def test_a_standby_is_read_and_refuses_to_be_written(
         replica.stop()
 
 
-# -- a first try ----------------------------------------------------------------------------------
+# -- a private server -----------------------------------------------------------------------------
 
 PRIVATE = "postgresql:///local?data=server"
 
 
 def started(tmp_path: Path, *args: object) -> AbstractContextManager["Popen[str]"]:
-    """The command line in a process of its own: a private server is released at its end."""
+    """The command line in its own process, which releases a private server when it ends."""
     return child(command(*args), cwd=tmp_path)
 
 

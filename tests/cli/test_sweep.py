@@ -1,4 +1,4 @@
-"""The verb sweep, used rightly and wrongly."""
+"""The verb sweep, with right and wrong arguments."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -38,7 +38,7 @@ def test_what_comes_out_is_said_with_its_clearance(run: Run, scene: Path) -> Non
     assert (code, err) == (0, "")
     lines = out.splitlines()
     assert lines[0].startswith("comes out: no hit in ")
-    # voxels of 12.5 mm: those of a box end at 62.5, the tool begins at 90
+    # voxels of 12.5 mm: a box's voxels end at 62.5 mm, the tool begins at 90 mm
     assert lines[0].endswith(", least clearance 27.5 mm from box0")
     assert any(line.startswith("clearance") and "the surfaces are" in line for line in lines)
     assert any(
@@ -81,7 +81,7 @@ def test_what_is_left_at_once_is_told_apart_from_what_is_in_the_way(run: Run, sc
 
 
 def test_what_is_not_decided_has_a_code_of_its_own(run: Run, scene: Path) -> None:
-    """The tool ends 5 mm above the voxels of a box; its 40 points lie farther apart than that."""
+    """The tool ends 5 mm above a box's voxels, and its 40 points are more than 5 mm apart."""
     poses(scene.parent / "near.csv", (0.0, 0.0, 0.0775), (0.005, 0.0, 0.0775))
     few = ("--points", 40)
     code, out, err = run("sweep", scene, *TOOL, "--path", "near.csv", *few)

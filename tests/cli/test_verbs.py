@@ -1,4 +1,4 @@
-"""The verbs on a small environment, used rightly and wrongly: info to touch."""
+"""The verbs info to touch on a small environment, with right and wrong arguments."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -16,7 +16,7 @@ from command_line import PLACES, Run, boxes, made, poses, refused, rows_of, run,
 from hapticdb.query.frame import STRATEGIES
 
 Scene = Path | str
-"""A file here; the same tests run on servers in cli/test_postgres.py."""
+"""A path or a URL: a file in this module; cli/test_postgres.py runs the same tests on servers."""
 
 # -- info, objects, calibrate, analyze -----------------------------------------------------------
 
@@ -284,7 +284,7 @@ def test_a_few_poses_are_touched_without_measuring_costs_first(run: Run, scene: 
     assert used <= set(STRATEGIES)
 
 
-# -- names from elsewhere --------------------------------------------------------------------------
+# -- names with control characters -----------------------------------------------------------------
 
 UNWANTED = re.compile("[\x00-\x09\x0b-\x1f\x7f-\x9f\u2028-\u202e\u2066-\u2069]")
 SPITEFUL = ("bell\x07\x1b[2J\x1b]0;owned", "gnp.\u202eexe", "\x9b31mred", "isolated\u2066\u2069")
@@ -293,7 +293,7 @@ SPITEFUL = ("bell\x07\x1b[2J\x1b]0;owned", "gnp.\u202eexe", "\x9b31mred", "isola
 def test_no_name_from_elsewhere_moves_the_cursor_or_turns_the_writing(
     run: Run, tmp_path: Path
 ) -> None:
-    """Of parts in a file and in a database, of the file itself, in results and in errors."""
+    """Names of parts in files and databases, and of files, in results and in errors."""
     lines = []
     for n, name in enumerate(SPITEFUL):
         corners = [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1)]

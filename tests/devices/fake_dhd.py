@@ -11,7 +11,7 @@ SAID = {0: "no error", NO_DEVICE_FOUND: "no device found", COM: "communication e
 
 
 class FakeDhd(ModuleType):
-    """One device, at a place, that writes down what it is told."""
+    """One device at a set position; it records the calls it gets."""
 
     def __init__(self) -> None:
         super().__init__("forcedimension_core.dhd")

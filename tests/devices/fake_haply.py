@@ -18,7 +18,7 @@ def vector(x: float, y: float, z: float) -> dict[str, float]:
 
 
 class FakeHaply:
-    """Sends all devices on connection, then one state for each message; keeps what it was told."""
+    """Sends all devices on connection, then one state for each message; records the messages."""
 
     def __init__(self) -> None:
         self.devices = ["049D"]
@@ -54,7 +54,7 @@ class FakeHaply:
 
     @property
     def forces(self) -> list[dict[str, float]]:
-        """Every force that it was told."""
+        """Every force that was sent to the device."""
         return [
             message["inverse3"][0]["commands"]["set_cursor_force"]["vector"]
             for message in self.told

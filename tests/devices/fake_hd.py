@@ -16,7 +16,7 @@ Matrix = (ctypes.c_double * 4) * 4
 
 
 class FakeHd(ModuleType):
-    """One device at a place; state and force only between `begin_frame` and `end_frame`."""
+    """One device; its state and force are usable only between `begin_frame` and `end_frame`."""
 
     def __init__(self) -> None:
         super().__init__("pyOpenHaptics.hd")
@@ -79,7 +79,7 @@ class FakeHd(ModuleType):
         self.forces.append([x, y, z])
 
     def schedule(self, callback: Callable[[], None]) -> None:
-        """Call back a thousand times a second in a thread, as OpenHaptics does."""
+        """Call a function a thousand times a second in a thread, as OpenHaptics does."""
         self.callback = callback
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()

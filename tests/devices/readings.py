@@ -1,4 +1,4 @@
-"""Readings as faulty and odd devices give them."""
+"""Readings as faulty and unusual devices return them."""
 
 from collections.abc import Callable
 from typing import Any
@@ -9,7 +9,7 @@ from hapticdb.devices.scripted import Reading
 
 Change = Callable[[Any], object]
 
-# what they return, and how that is told
+# changes of a reading, and the error text for each
 FAULTS: list[tuple[Change, str]] = [
     (lambda r: r._replace(pose=np.eye(3)), r"a pose that is an array \(3, 3\) of float64"),
     (lambda r: r._replace(pose=np.eye(4)[None]), r"a pose that is an array \(1, 4, 4\) of float64"),
@@ -36,14 +36,14 @@ FAULTS: list[tuple[Change, str]] = [
 
 
 def placed(reading: Reading, row: int, column: int, value: float) -> Reading:
-    """With another number in the pose."""
+    """The reading with one number of its pose replaced."""
     pose = reading.pose.copy()
     pose[row, column] = value
     return reading._replace(pose=pose)
 
 
 def turned(reading: Reading, factor: float) -> Reading:
-    """With a rotation times a factor."""
+    """The reading with its rotation multiplied by a factor."""
     pose = reading.pose.copy()
     pose[:3, :3] *= factor
     return reading._replace(pose=pose)
@@ -64,7 +64,7 @@ MOMENTS: list[tuple[Change, str]] = [
 
 
 def unwritable(reading: Reading) -> Reading:
-    """With arrays that nobody may write."""
+    """The reading with read-only arrays."""
     pose, velocity = reading.pose.copy(), reading.velocity.copy()
     pose.flags.writeable = velocity.flags.writeable = False
     return reading._replace(pose=pose, velocity=velocity)

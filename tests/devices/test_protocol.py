@@ -1,4 +1,4 @@
-"""What may stand for a device, and what a simulated one makes of a hand that is nowhere."""
+"""Which objects count as a device, and a simulated device on a hand without a valid pose."""
 
 from pathlib import Path
 from typing import Any
@@ -15,14 +15,14 @@ from realtime.hands import Odd, still
 
 
 class Mute:
-    """It can be read, and that is all."""
+    """No device: it has `read`, but no `apply`."""
 
     def read(self) -> Reading:
         return Reading(np.eye(4), np.zeros(6), 0)
 
 
 class Rows:
-    """What has poses, as a recording."""
+    """Has `poses`, as a recording has."""
 
     def poses(self) -> None: ...
 

@@ -1,4 +1,4 @@
-"""Scripted devices: where they say that they are, how fast, and when they are over."""
+"""Scripted devices: their poses, velocities and ends."""
 
 import math
 import pickle
@@ -32,7 +32,7 @@ from hapticdb.poses import quaternion_of, rotation_of
 
 
 class Hands:
-    """A clock whose hands are set by hand."""
+    """A clock that a test sets, in seconds."""
 
     def __init__(self) -> None:
         self.now = 100.0
@@ -42,7 +42,7 @@ class Hands:
 
 
 def quarter(axis: int) -> NDArray[np.float64]:
-    """A quarter turn about an axis of the world, at the origin."""
+    """A pose at the origin, turned by 90 degrees about an axis of the world."""
     q = np.zeros(4)
     q[[0, axis + 1]] = math.sqrt(0.5)
     pose = np.eye(4)
@@ -63,7 +63,7 @@ MAKERS: dict[str, Callable[[Hands], Device]] = {
 
 
 def kept(reading: Reading) -> Reading:
-    """The reading as it was, whatever is read next."""
+    """A copy of a reading, which the next read does not change."""
     return Reading(reading.pose.copy(), reading.velocity.copy(), reading.buttons)
 
 
@@ -77,7 +77,7 @@ def difference(before: Reading, after: Reading, seconds: float) -> NDArray[np.fl
 
 
 def read_at(device: Device, clock: Hands, seconds: float) -> Reading:
-    """What the device says some seconds after its start at 100 s."""
+    """The reading so many seconds after the device's start at 100 s."""
     clock.now = 100.0 + seconds
     return kept(device.read())
 
@@ -92,7 +92,7 @@ def test_velocities_are_what_the_poses_change_by(name: str, instant: float) -> N
     h = 1e-5
     before, at, after = (read_at(device, clock, instant + d) for d in (-h, 0.0, h))
     if not np.allclose(before.velocity, after.velocity, atol=0.05):
-        return  # a knot of the path lies between
+        return  # a corner of the path lies between the readings
     assert np.allclose(difference(before, after, 2 * h), at.velocity, atol=2e-5)
 
 
@@ -270,7 +270,7 @@ def test_a_file_without_times_runs_at_a_speed(tmp_path: FilePath) -> None:
     poses[1:, 0, 3] = 0.1, 0.1, 0.3
     write_poses(tmp_path / "p.csv", poses)
     path = Path(tmp_path / "p.csv", clock=clock)
-    assert path.duration == pytest.approx(3.0)  # 0.3 m at 0.1 m/s; the pause is no way
+    assert path.duration == pytest.approx(3.0)  # 0.3 m at 0.1 m/s; two equal poses add no time
     path.read()
     assert read_at(path, clock, 1.7).velocity[0] == pytest.approx(0.1)
     assert Path(tmp_path / "p.csv", speed=0.6).duration == pytest.approx(0.5)

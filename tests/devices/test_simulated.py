@@ -1,4 +1,4 @@
-"""The simulated device: how it follows the hand, when a wrench arrives, and how much of it."""
+"""The simulated device: how it follows the hand, and when and how strongly a wrench acts."""
 
 import pickle
 from typing import Any
@@ -16,7 +16,7 @@ from hapticdb.poses import quaternion_of, rotation_of
 
 
 class SetClock:
-    """A clock that only moves when told."""
+    """A clock that only a test moves."""
 
     def __init__(self) -> None:
         self.now = 0.0
@@ -26,7 +26,7 @@ class SetClock:
 
 
 class Still:
-    """A hand that is where it is put."""
+    """A hand at the pose that the test sets."""
 
     def __init__(self) -> None:
         self.pose, self.velocity, self.buttons = np.eye(4), np.zeros(6), 0
@@ -39,7 +39,7 @@ class Still:
 
 
 def run(device: SimulatedDevice, clock: SetClock, seconds: float, rate: float = 1000.0) -> Reading:
-    """Read at a rate for a while; the last reading."""
+    """Read at a rate in hertz for some seconds; return the last reading."""
     start = clock.now
     for n in range(1, round(seconds * rate) + 1):
         clock.now = start + n / rate
@@ -52,7 +52,7 @@ def angle_between(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
 
 
 def energy(reading: Reading, hand: Still) -> float:
-    """Of the default device and its spring: J."""
+    """Kinetic energy of the default device and energy of its spring, in joules."""
     x = reading.pose[:3, 3] - hand.pose[:3, 3]
     v, w = reading.velocity[:3], reading.velocity[3:]
     angle = angle_between(reading.pose[:3, :3], hand.pose[:3, :3])
@@ -105,7 +105,7 @@ def test_a_wrench_pushes_after_the_latency_and_not_before() -> None:
     device.apply(np.array([1.0, 0, 0, 0, 0, 0.01]))
     assert run(device, clock, 0.0049, 10_000).velocity.tolist() == [0.0] * 6
     moved = run(device, clock, 0.0006, 10_000)
-    # half a millisecond of 1 N on 0.1 kg
+    # 1 N acts on 0.1 kg for half a millisecond
     assert moved.velocity[0] == pytest.approx(0.005, rel=0.05)
     assert moved.velocity[5] == pytest.approx(0.05, rel=0.05)
 
@@ -117,7 +117,7 @@ def test_wrenches_push_in_turn() -> None:
     for force in (1.0, -1.0, 0.0):
         device.apply(np.array([force, 0, 0, 0, 0, 0]))
         clock.now += 0.001
-    # one read sees them all: a millisecond forth, a millisecond back
+    # one read applies all three: 1 ms forwards, 1 ms backwards, then no force
     clock.now = 0.010
     reading = device.read()
     assert reading.velocity[0] == pytest.approx(0.0, abs=1e-12)
@@ -179,7 +179,7 @@ def test_a_long_pause_is_skipped_but_for_its_end() -> None:
     device.read()
     device.apply(np.array([1.0, 0, 0, 0, 0, 0]))
     clock.now = 100.0
-    # 50 ms at 10 m/s^2
+    # one read counts at most 50 ms, at 10 m/s^2
     assert device.read().velocity[0] == pytest.approx(0.5, rel=1e-3)
 
 

@@ -1,4 +1,4 @@
-"""Bought devices, each against a fake of what its maker documents."""
+"""Vendors' devices, each against a fake of the interface that its vendor documents."""
 
 import math
 import pickle
@@ -75,7 +75,7 @@ def test_a_package_that_is_not_there_is_named_with_its_extra(
 
 
 class Without:
-    """An installation without one package."""
+    """An import finder that makes one package look missing."""
 
     def __init__(self, package: str) -> None:
         self.package = package
@@ -123,7 +123,7 @@ def test_velocity_is_the_difference_over_the_window() -> None:
         pose[1, 3] = 0.3 * n * 0.001
         velocity = window.measure(5.0 + n * 0.001, pose.copy())
         assert np.allclose(velocity, [0, 0.3, 0, 0, 0, 2.0], atol=1e-6)
-    for n in range(60, 90):  # the hand stops, and 20 ms later nothing is left of its speed
+    for n in range(60, 90):  # the hand stops; 20 ms later its velocity is zero
         velocity = window.measure(5.0 + n * 0.001, pose.copy())
     assert velocity.tolist() == [0.0] * 6
 
@@ -218,7 +218,7 @@ def test_openhaptics_turns_millimetres_and_columns_into_a_pose(
     device.open()
     reading = device.read()
     assert np.allclose(reading.pose[:3, 3], [0.01, 0.02, 0.03])
-    assert reading.pose[:3, 1].tolist() == [0.0, 0.0, 1.0]  # its second column
+    assert reading.pose[:3, 1].tolist() == [0.0, 0.0, 1.0]  # the second column
     assert reading.pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
     assert reading.buttons == 2
     assert hd.calls[:3] == [("init_device", "Left"), "enable_force", "start_scheduler"]
@@ -261,7 +261,7 @@ def test_openhaptics_measures_velocity(hd: FakeHd) -> None:
 
     def is_moving() -> bool:
         now[0] += 0.001
-        # the hand is where it was when the callback asked for the time: 0.1 m/s along y
+        # position in mm at the time that the callback last read: 0.1 m/s along y
         hd.columns[3][1] = 100.0 * seen_at[0]
         return bool(abs(device.read().velocity[1] - 0.1) < 0.02)
 
@@ -281,7 +281,7 @@ def test_openhaptics_that_is_not_there_is_told(hd: FakeHd, handle: int | None) -
 
 @pytest.mark.parametrize("code", [0x0103, 0x0302])
 def test_openhaptics_that_fails_to_start_is_let_go(hd: FakeHd, code: int) -> None:
-    hd.error = code  # one that the package knows by name, one that it does not
+    hd.error = code  # one code has a name in the package, the other has none
     with pytest.raises(DeviceError, match="failed to start"):
         OpenHapticsDevice().open()
     assert hd.calls[-2:] == ["stop_scheduler", ("close_device", 7)]
@@ -340,7 +340,7 @@ def test_haply_reads_the_newest_state_whatever_was_asked_before(haply: FakeHaply
     for n in range(5):
         device.apply(PUSH)
         haply.position = vector(0.01 * n, 0.0, 0.0)
-    device.read()  # the answers so far
+    device.read()  # reads all answers so far
     haply.position = vector(0.5, 0.0, 0.0)
     assert device.read().pose[0, 3] == 0.5
     assert haply.forces[-1] == haply.forces[-2] != vector(0, 0, 0)
@@ -366,7 +366,7 @@ def test_haply_takes_turns_and_buttons_from_the_grip(
     assert np.allclose(reading.pose[:3, 0], [0.0, 1.0, 0.0])
     assert reading.buttons == buttons
     haply.grips[kind][0]["state"]["orientation"] = dict.fromkeys(IDENTITY, 0.0)
-    assert np.allclose(device.read().pose[:3, 0], [0.0, 1.0, 0.0])  # zeros are no turn
+    assert np.allclose(device.read().pose[:3, 0], [0.0, 1.0, 0.0])  # zeros are no rotation
     device.close()
 
 

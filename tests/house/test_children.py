@@ -1,4 +1,4 @@
-"""A run of the tests hears Ctrl-C however it was started, and leaves nothing however it ends."""
+"""A test run reacts to Ctrl-C however it was started, and leaves nothing however it ends."""
 
 import os
 import signal
@@ -65,7 +65,7 @@ def test_a_child_is_killed_with_its_group_when_its_time_is_over() -> None:
     def listen() -> None:
         with child(["sh", "-c", "sleep 600 & echo $!; wait"], patience=0.5) as process:
             assert process.stdout is not None
-            pids.extend(map(int, process.stdout))  # until the pipe closes
+            pids.extend(map(int, process.stdout))  # reads until the pipe closes
 
     with pytest.raises(pytest.fail.Exception, match=r"killed, since it did not end within 0\.5 s"):
         listen()
@@ -80,7 +80,7 @@ def test_a_test_that_fails_does_not_wait_for_its_child() -> None:
 
 
 def test_temporary_files_are_in_the_folder_of_the_run(tmp_path: Path) -> None:
-    """But those that a person may want to see after it."""
+    """pytest's `tmp_path`, which a person may want to see after the run, is elsewhere."""
     done = finished([sys.executable, "-c", "import tempfile; print(tempfile.gettempdir())"])
     assert done.stdout.strip() == os.environ[RUN]
     assert not tmp_path.is_relative_to(os.environ[RUN])

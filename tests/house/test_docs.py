@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent.parent
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 SHOWN = re.compile(r"<!-- sql: (\w+)\.(\w+)\[\"(\w+)\"\] -->\n```sql\n(.*?)```", re.DOTALL)
 LONG = 600.0
-"""Seconds for all that a page does in one block."""
+"""Longest time in seconds for one block of a page."""
 CODE = {"sqlite_ranges": sqlite_ranges, "sqlite_force": sqlite_force, "statements": statements}
 
 
@@ -31,7 +31,7 @@ def blocks(kind: str, page: str = "README.md") -> list[str]:
 
 @pytest.mark.long
 def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
-    """Shell first, since Python needs the sample; then all Python in one session."""
+    """Shell blocks run first, since Python needs the sample; then all Python in one session."""
     tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     for block in blocks("sh"):
         bash = ["bash", "-euo", "pipefail", "-c", block]
@@ -46,14 +46,14 @@ def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_every_block_of_the_realtime_page_runs(tmp_path: Path) -> None:
-    """As one reads it: what the shell has made, Python goes on with."""
+    """Shell blocks run first; the Python blocks use the files that the shell has made."""
     page = "docs/realtime.md"
     tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
     for block in blocks("sh", page):
         for line in block.splitlines():
             bash = ["bash", "-euo", "pipefail", "-c", line]
             done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
-            # a sweep says by 1 that the part is caught
+            # exit code 1 of a sweep: the part hits something
             assert done.returncode == (1 if " sweep " in line else 0), done.stderr
     session = "\n".join(blocks("python", page))
     done = finished([sys.executable, "-c", session], cwd=tmp_path, patience=LONG)
@@ -64,7 +64,7 @@ def test_every_block_of_the_realtime_page_runs(tmp_path: Path) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("binaries", [b for b in FOUND if not isinstance(b, str)], ids=named)
 def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
-    """On a private server that libpq's environment variables lead to, by its own pg_dump."""
+    """The blocks use a private server, named by libpq's environment variables, and its pg_dump."""
     server = PrivateServer.at(tmp_path / "plant", binaries, SETTINGS)
     server.start()
     server.create_database("plant")

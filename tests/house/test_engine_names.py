@@ -1,4 +1,4 @@
-"""No module outside store/ knows which engine it speaks to: it asks for a protocol."""
+"""No module outside store/ depends on a particular engine; it checks for a protocol."""
 
 import ast
 import re
@@ -13,7 +13,7 @@ ASKS_OF_TEXT = {"startswith", "endswith", "partition", "removeprefix", "match", 
 
 
 def test_only_the_stores_know_their_engine() -> None:
-    """Neither its driver, nor its modules, nor a branch on its name: others ask for protocols."""
+    """No other module imports an engine's driver or modules, or branches on an engine's name."""
     folders = {f"hapticdb.store.{path.parent.name}" for path in PACKAGE.glob("store/*/store.py")}
     assert len(folders) == 2
     for path in sorted(PACKAGE.rglob("*.py")):
@@ -26,7 +26,7 @@ def test_only_the_stores_know_their_engine() -> None:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Dotted names of what a source imports, at its top or inside a function."""
+    """Dotted names that a source imports, at its top or inside a function."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -35,7 +35,7 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def branches_on_engines(source: str) -> Iterator[str]:
-    """Comparisons with a text that names an engine, and questions whether a text begins so."""
+    """Comparisons with an engine's name, and calls of `startswith` with one."""
     engine = re.compile("sqlite|postgres", re.IGNORECASE)
     for node in ast.walk(ast.parse(source)):
         asked: list[ast.expr] = []

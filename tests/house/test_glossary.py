@@ -1,4 +1,4 @@
-"""The glossary names things that are in the code, and each word once."""
+"""The glossary names things that exist in the code, and defines each word once."""
 
 import dataclasses
 import importlib
@@ -15,7 +15,7 @@ PAGE = (Path(__file__).parent.parent.parent / "docs" / "glossary.md").read_text(
 
 
 def rows() -> Iterator[tuple[str, str]]:
-    """Word and place in the code of each row of the page's tables."""
+    """Word and code column of each row of the page's tables."""
     for line in PAGE.splitlines():
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) == 3 and cells[0] not in {"word", "---"}:

@@ -1,6 +1,6 @@
-"""Rules of the house, read off the sources: which way imports point, texts, waits, what is public.
+"""Rules of the project, checked on the sources: direction of imports, texts, waits, public names.
 
-ARCHITECTURE.md draws the floors; this file keeps them.
+ARCHITECTURE.md draws the floors; this file tests them.
 """
 
 import ast
@@ -24,7 +24,7 @@ from hapticdb import errors
 from hapticdb.kernels._cache import cache_folder, sources_digest
 from sources import PACKAGE, ROOT, modules, named, python_files
 
-# from the top; a module imports its own floor and those below it
+# from the top down; a module may import from its own floor and the floors below it
 FLOORS: list[set[str]] = [
     {"__main__"},
     {"cli"},
@@ -43,7 +43,7 @@ FLOORS: list[set[str]] = [
     {"errors", "interrupting"},
 ]
 LEVELS = {name: level for level, floor in enumerate(FLOORS) for name in floor}
-# what may import less than its floor allows
+# domains that may import less than their floor allows -> what they may import
 NARROW: dict[str, set[str]] = {
     "kernels": set(),
     "errors": set(),
@@ -119,7 +119,7 @@ PUBLIC = [
 
 
 def domain(path: Path) -> str:
-    """Module or folder directly below the package that a source belongs to."""
+    """Domain of a source: the module or folder directly below the package."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
@@ -138,7 +138,7 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def own(path: Path) -> set[str]:
-    """Domains of the package that a source imports, its own left out."""
+    """Domains of the package that a source imports, without its own domain."""
     found = {name.split(".")[1] for name in imported(path) if name.startswith("hapticdb.")}
     return found - {domain(path)}
 
@@ -154,7 +154,7 @@ def test_imports_point_one_way() -> None:
     for path in modules():
         if domain(path) == "__init__":
             continue
-        # those on top may use the public names as a user does
+        # domains above `environment` may use the public names as a user does
         public = {*PUBLIC, "__version__"} if LEVELS[domain(path)] < LEVELS["environment"] else set()
         above = {n for n in own(path) - public if LEVELS.get(n, -1) < LEVELS[domain(path)]}
         assert above == set(), f"{named(path)} imports from above"
@@ -167,7 +167,7 @@ def test_modules_import_no_more_than_they_need() -> None:
 
 
 def test_no_two_domains_import_each_other() -> None:
-    """Within a floor, too; for the type checker as well."""
+    """Also within one floor, and also in imports for the type checker only."""
     below: dict[str, set[str]] = {}
     for path in modules():
         below.setdefault(domain(path), set()).update(own(path) & set(LEVELS))
@@ -210,7 +210,7 @@ def test_the_package_imports_no_benchmark() -> None:
 
 
 def test_importing_the_package_stays_light() -> None:
-    """What only some commands need waits until one does."""
+    """Packages that only some commands need are not loaded with hapticdb."""
     script = "import sys, hapticdb; print(*sys.modules)"
     loaded = run_python(script).split()
     heavy = {"trimesh", "matplotlib", "rich", "typer", "laspy", "cascadio", "collada", "pytest"}
@@ -234,7 +234,7 @@ def test_nothing_is_left_to_do_in_the_sources() -> None:
 
 
 def committed_texts() -> Iterator[tuple[str, str]]:
-    """Name and text of each text file that is or would be committed."""
+    """Name and text of each text file that git has or would add."""
     paths: list[Path] = []
     if shutil.which("git") and (ROOT / ".git").exists():
         listing = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
@@ -253,7 +253,7 @@ def committed_texts() -> Iterator[tuple[str, str]]:
 
 def test_no_text_names_this_machine_or_a_package_index() -> None:
     place = re.compile(r"(?<![\w.~$}/])/(?:work|root|home|Users)/")
-    # written so that this file does not hold what it looks for
+    # written so that the pattern does not match this file
     index = re.compile(r"pypi\.(org|python)|files\.pythonhosted|-index-ur[l]|-find-link[s]")
     found = [
         f"{name}: {match.group()}"
@@ -264,18 +264,18 @@ def test_no_text_names_this_machine_or_a_package_index() -> None:
     assert found == []
 
 
-# --- what tests wait for -------------------------------------------------------------------------
+# --- waits in tests ------------------------------------------------------------------------------
 
-# called without any argument, they may wait for ever; deadlines and tables have such words, too
+# methods that may wait for ever without arguments; deadlines and tables have the same names
 WAITS = {"acquire", "communicate", "get", "join", "recv", "result", "wait"}
 WAITS_OF_OTHERS = {("table", "join"), ("deadlines", "wait")}
 RUNS = {"run", "call", "check_call", "check_output"}
 
 
 def endless_waits(source: str, *, is_test: bool) -> Iterator[tuple[int, str]]:
-    """Line and text of each call and loop of a source that may wait for ever.
+    """Line number and text of each call and loop of a source that may wait for ever.
 
-    Tests start processes by the module `children` alone; benchmarks give a timeout each time.
+    Tests start processes only through the module `children`; benchmarks always give a timeout.
     """
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.While) and _sleeps(node) and not _looks_at_clock(node):
@@ -303,9 +303,9 @@ def _looks_at_clock(loop: ast.While) -> bool:
 
 
 def test_nothing_is_waited_for_without_an_end() -> None:
-    """Or a test that fails hangs the run."""
-    # the latter three wait in what is ended by others: a process of a session, a thread of a
-    # fake, a process that is given damaged files
+    """A wait without an end would let a failing test hang the run."""
+    # the last three wait in something that another part ends: a session's process, a fake's
+    # thread, a process that reads damaged files
     allowed = [
         "tests/children.py",
         "tests/realtime/workers.py",
@@ -340,7 +340,7 @@ def test_a_wait_without_an_end_is_seen(line: str, is_refused: bool) -> None:
     assert bool(list(endless_waits(line, is_test=False))) == is_refused
 
 
-# --- what is public -----------------------------------------------------------------------------
+# --- public names -------------------------------------------------------------------------------
 
 
 def test_public_names() -> None:
@@ -367,7 +367,7 @@ def test_every_error_is_public() -> None:
 
 
 def test_the_drawn_error_tree_is_the_real_one() -> None:
-    """Parents by indentation, builtin bases in parentheses."""
+    """Indentation shows the parent of an error, parentheses show its builtin base."""
     drawn: dict[str, tuple[str, str | None]] = {}
     above: list[str] = []
     for line in (errors.__doc__ or "").splitlines():
@@ -391,7 +391,7 @@ def test_the_drawn_error_tree_is_the_real_one() -> None:
 
 
 def test_any_edit_of_a_kernel_moves_the_cache(tmp_path: Path) -> None:
-    """A leaf edited in another file than its entry's, though size and time stamp stay."""
+    """Also an edit of a leaf in another file than its entry's, with equal size and time stamp."""
     folder = tmp_path / "kernels"
     shutil.copytree(PACKAGE / "kernels", folder, ignore=shutil.ignore_patterns("__pycache__"))
     first = sources_digest(folder)

@@ -1,4 +1,4 @@
-"""Rules of the house, read off the sources: sizes of files, functions and folders, and names."""
+"""Rules of the project, checked on the sources: sizes of files, functions, folders; names."""
 
 import ast
 import re
@@ -14,14 +14,14 @@ def test_no_file_is_longer_than_500_lines() -> None:
 
 
 MOST_LINES = 60
-"""Of a function, its signature and docstring counted."""
+"""Longest function in lines, with signature and docstring."""
 LONG_FUNCTIONS = {
     "src/hapticdb/kernels/hand/coupling.py:advance": "one step of the coupling: smooth forces "
     "replace it",
     "src/hapticdb/kernels/hand/coupling.py:cut_back": "likewise",
     "src/hapticdb/kernels/resident/cells.py:felt": "one pass over the points",
 }
-"""Functions that may be longer, and why."""
+"""Functions that may be longer than `MOST_LINES`, each with the reason."""
 
 
 def lengths(source: str) -> Iterator[tuple[str, int]]:
@@ -48,9 +48,9 @@ def test_the_lines_of_a_function_are_counted() -> None:
 
 
 MOST_FILES = 15
-"""Python files in a folder, ``__init__`` aside."""
+"""Most Python files in a folder, without ``__init__``."""
 SHARED = 4
-"""Files of a folder whose names begin with one word: so many of them are a folder of that name."""
+"""So many files of one folder whose names begin with one word belong in a folder of their own."""
 
 
 def folders() -> dict[str, list[str]]:
@@ -63,7 +63,7 @@ def folders() -> dict[str, list[str]]:
 
 
 def first_words(names: list[str]) -> Counter[str]:
-    """How many names begin with each word; an underscore ends a word."""
+    """Number of names that begin with each word; an underscore ends a word."""
     return Counter(name.partition("_")[0] for name in names if not name.startswith("_"))
 
 

@@ -1,4 +1,4 @@
-"""State has names: no number says where in an array a position, a wrench or a count stands."""
+"""State has named fields: no number is used as the index of a position, wrench or count."""
 
 import ast
 from collections.abc import Iterator
@@ -20,7 +20,7 @@ STATE = {
     "body", "control", "desk", "felt", "figures", "frame", "hand", "missed", "next_frame", "offset",
     "servo", "session", "sessions", "signal", "state", "told", "tool",
 }  # fmt: skip
-"""What arrays of state are called; fields of theirs, like ``hand.position``, may be numbered."""
+"""Names of arrays of state. Their fields, like ``hand.position``, may be indexed by numbers."""
 
 
 def sources() -> list[Path]:
@@ -33,7 +33,7 @@ def name_of(node: ast.expr) -> str:
 
 
 def literals_in(index: ast.expr) -> Iterator[int]:
-    """Numbers that stand alone in an index, not beside a name as in ``WRENCH + 1``."""
+    """Plain numbers in an index; in ``WRENCH + 1`` the 1 does not count."""
     if isinstance(index, ast.Constant):
         if isinstance(index.value, int):
             yield index.value
@@ -49,7 +49,7 @@ def literals_in(index: ast.expr) -> Iterator[int]:
 
 
 def numbered(source: str) -> list[int]:
-    """Lines of a source in which a number indexes state."""
+    """Line numbers of a source at which a number indexes state."""
     return [
         node.lineno
         for node in ast.walk(ast.parse(source))
@@ -75,7 +75,7 @@ def test_a_name_that_indexes_state_is_no_number(line: str) -> None:
 
 
 def test_no_number_indexes_state() -> None:
-    """`kernels.records` lays state out; elsewhere a field is named."""
+    """`kernels.records` defines the fields of state; other modules use the fields' names."""
     assert len(sources()) > 30
     found = {path.relative_to(PACKAGE).as_posix(): numbered(path.read_text()) for path in sources()}
     assert {name: lines for name, lines in found.items() if lines} == {}

@@ -1,4 +1,4 @@
-"""After `warm_up` nothing is compiled any more, and each verb compiles its own kernels only."""
+"""After `warm_up` nothing is compiled, and each verb compiles only the kernels that it uses."""
 
 import fnmatch
 import json
@@ -88,10 +88,10 @@ NEEDS_JIT = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="without J
 
 @NEEDS_JIT
 def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
-    """Every entry has the one signature that it names, whatever is done after.
+    """Every entry has only its declared signature, whatever is called after `warm_up`.
 
-    A session's loop is a process of its own, which ends in an error when a kernel is compiled while
-    it runs (`realtime.loop.work`).
+    A session's loop runs in its own process and raises an error if a kernel is compiled while it
+    runs (`realtime.loop.work`).
     """
     done = finished([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True)
     found = json.loads(done.stdout)
@@ -124,17 +124,17 @@ VERBS: tuple[tuple[str, str], ...] = (
 @NEEDS_JIT
 @pytest.mark.long
 def test_a_verb_compiles_its_own_kernels_once_and_says_so(tmp_path: Path) -> None:
-    """From an empty cache; what numba has stored is what the purposes of the verbs name."""
+    """From an empty cache, numba stores exactly the kernels that the verbs' purposes name."""
     env = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     so_far: set[str] = set()
     for purpose, words in VERBS:
         done = finished(command(*words.split()), cwd=tmp_path, env=env)
-        assert done.returncode in {0, 1}, done.stderr  # 1: a sweep that hits
+        assert done.returncode in {0, 1}, done.stderr  # 1: the sweep hits something
         wanted = so_far | set(entries_for(purpose) if purpose else ())
         n_new = len(wanted - so_far)
         assert done.stderr.count("compiling, once") == (n_new > 0), words
         found = {path.name.partition("-")[0] for path in (tmp_path / "cache").rglob("*.nbi")}
-        # numba leaves the packages out of a file's name
+        # numba's file names lack the package names
         assert found == {".".join(entry.split(".")[-2:]) for entry in wanted}, words
         so_far = wanted
     done = finished(command("warm"), env=env)

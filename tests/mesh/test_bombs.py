@@ -1,4 +1,4 @@
-"""Small files that ask for much memory or time, or promise points that are not there."""
+"""Small files that would take much memory or time, or declare points that are missing."""
 
 import json
 import struct
@@ -111,7 +111,7 @@ def test_names_along_deep_nodes_have_an_end(
 
 
 def _las(tmp_path: Path, **counts: int) -> Path:
-    """LAS 1.4 file of three points in format 0, with other counts in its header."""
+    """A LAS 1.4 file of three points in format 0, with the given counts in its header."""
     header = bytearray(375)
     header[:4], header[24], header[25], header[105] = b"LASF", 1, 4, 20
     given = {"size": 375, "points_at": 375, "records": 0} | counts
@@ -201,7 +201,7 @@ def test_limits_are_options_of_an_import(tmp_path: Path) -> None:
 
 
 def _laz(path: Path, point_format: int, n_points: int) -> Path:
-    """Packed points of a format, with extra bytes."""
+    """A LAZ file with points of the given format and extra bytes."""
     laspy = pytest.importorskip("laspy", reason="the extra 'pointcloud' is not installed")
     header = laspy.LasHeader(point_format=point_format, version="1.4")
     header.add_extra_dims([laspy.ExtraBytesParams("a", "f8"), laspy.ExtraBytesParams("b", "u2")])
@@ -217,7 +217,7 @@ def _laz(path: Path, point_format: int, n_points: int) -> Path:
 def test_packed_points_of_every_kind_are_read_in_their_chunks(
     tmp_path: Path, point_format: int
 ) -> None:
-    n_points = 110_000  # chunks have 50,000
+    n_points = 110_000  # chunks have 50,000 points
     file = parse_in_process(_laz(tmp_path / "a.laz", point_format, n_points))
     assert len(file.parts[0].vertices) == n_points
 
@@ -228,7 +228,7 @@ def test_a_layer_that_is_longer_than_its_chunk_is_refused(tmp_path: Path, layer:
     path = _laz(tmp_path / "a.laz", 6, 40)
     content = bytearray(path.read_bytes())
     (points_at,) = struct.unpack_from("<I", content, 96)
-    at = points_at + 8 + 30 + 10 + 4 + 4 * layer  # the table's place, a point, their number
+    at = points_at + 8 + 30 + 10 + 4 + 4 * layer  # skips table position, first point, count
     (length,) = struct.unpack_from("<I", content, at)
     struct.pack_into("<I", content, at, length + (1 << 28))
     path.write_bytes(content)

@@ -1,4 +1,4 @@
-"""The child process that parses: same result, bounded damage, no orphan."""
+"""The child process that parses files: same result, limited harm, no orphan process."""
 
 import os
 import signal
@@ -60,7 +60,7 @@ def test_files_that_a_glTF_refers_to_count_once(tmp_path: Path) -> None:  # noqa
 
 @pytest.fixture
 def fake_laspy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """A LAS file whose parser is replaced by a test's own code."""
+    """A function that makes a LAS file and replaces laspy by a test's code."""
 
     def make(body: str) -> Path:
         (tmp_path / "laspy" / "vlrs").mkdir(parents=True)
@@ -125,13 +125,13 @@ def test_no_child_outlives_a_killed_parent(
     note = "def _note():\n    f = os.open('note', os.O_WRONLY | os.O_CREAT)\n"
     note += "    os.write(f, str(os.getpid()).encode()); os.close(f); return 'note'\n"
     module.write_text(module.read_text() + note)
-    # No guard for the main module: a child by spawn would run this script again.
+    # No guard for the main module: a spawned child would run this script again.
     script = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom hapticdb.mesh import read_file\nread_file({str(path)!r})\n"  # noqa: E501
-    scratch = os.environ | {"TMPDIR": str(tmp_path)}  # a killed parent leaves its own behind
+    scratch = os.environ | {"TMPDIR": str(tmp_path)}  # a killed parent leaves its files behind
     with child([sys.executable, "-c", script], cwd=tmp_path, env=scratch) as parent:
         until(pid_file.exists)
         parser = int(pid_file.read_text())
-        parent.kill()  # it alone, not its group
+        parent.kill()  # the parent alone, not its group
         until(lambda: not is_alive(parser))
 
 

@@ -18,7 +18,7 @@ CLEAN = Defects()
 
 
 class Reads(NamedTuple):
-    """What a file gives: parts, triangles (or points), extents in metres, and defects."""
+    """Expected content of a file: parts, triangles or points, extents in metres, and defects."""
 
     n_parts: int
     n_pieces: int
@@ -41,7 +41,7 @@ EXPECTED: dict[str, Reads | str] = {
     "assimp_empty.obj": "it is empty",
     "assimp_invalid.off": "fewer corners than its first word says",
     "assimp_issue623.ply": Reads(1, 24, (3.7537, 3.7537, 3.7537), is_cloud=True),
-    # f 4 12 2 1 loses one of its two triangles, f 0 7 8 5 both; f 5 8 8 1 has one without area.
+    # f 4 12 2 1 loses one of its two triangles, f 0 7 8 5 loses both; one of f 5 8 8 1 has no area.
     "assimp_malformed.obj": Reads(1, 9, (1, 1, 1), Defects(degenerate=1, out_of_range=3)),
     "assimp_malformed2.obj": Reads(1, 10, (1, 1, 1), Defects(incomplete=1)),
     "assimp_malformed_property_index_oob.3mf": Reads(1, 1, (0.01, 0.02, 0)),
@@ -60,7 +60,7 @@ EXPECTED: dict[str, Reads | str] = {
     "derived_outlier_vertex.ply": Reads(1, 4800, (72.1844, 9.5109, 50.005)),
     "derived_random_winding.stl": Reads(1, 4800, (0.021, 0.021, 0.01)),
     "derived_truncated.glb": "cut short: 619,032 bytes where its header promises 928,548",
-    # float32 goes in steps of 0.5 at five million, which folds small triangles.
+    # float32 has steps of 0.5 at five million, so that small triangles lose their area.
     "derived_utm_offset_mm.ply": Reads(1, 4800, (21, 21, 10), Defects(degenerate=416)),
     "trimesh_1002_tray_bottom.STL": Reads(1, 4520, (355.6, 3.175, 355.6)),
     "trimesh_busted.STL": Reads(1, 3878, (10.6755, 11.3847, 9.5724)),

@@ -1,4 +1,4 @@
-"""From a CAD file to a force: on real assemblies, or on the sample where there are none."""
+"""From a CAD file to a force: on real assemblies, or on the sample without them."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -29,7 +29,7 @@ def assembly(
     test_data: Path | None,
     tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Path, int]:
-    """A file and how many parts it has."""
+    """A file and its number of parts."""
     name = str(request.param)
     if test_data is not None:
         return test_data / name, ASSEMBLIES[name]
@@ -127,7 +127,7 @@ def test_strategies_layouts_and_the_plain_set_agree_along_a_path(
 def test_half_the_voxel_size_gives_about_four_times_the_voxels(
     assembly: tuple[Path, int], environments: dict[Layout, Environment], tmp_path: Path
 ) -> None:
-    """Case 12, once parts are larger than a voxel: here between 9 and 10 bits."""
+    """Case 12. It holds where parts are larger than a voxel: here between 9 and 10 bits."""
     counted = []
     for bits in (9, 10):
         options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=bits, extent=1.6))

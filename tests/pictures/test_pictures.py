@@ -1,4 +1,4 @@
-"""Pictures: scenes stand upright and are not cut, words run over nothing, lengths are readable."""
+"""Pictures: scenes are upright and not cut, text covers nothing, lengths are readable."""
 
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -26,7 +26,7 @@ def test_the_axis_that_points_up_does_so_in_the_picture(up: int) -> None:
     camera = Camera.looking_at(box, np.array(TOWARDS), (200, 150), window, up)
     foot = np.array([1.0, 1.0, 1.0])
     (x0, y0, _), (x1, y1, _) = camera.project(np.stack([foot, foot + np.eye(3)[up]]))
-    assert y1 < y0  # rows are counted downwards
+    assert y1 < y0  # pixel rows count downwards
     assert abs(x1 - x0) < 0.25 * (y0 - y1)
     assert np.linalg.det(np.stack([turned(row, up) for row in np.eye(3)])) == pytest.approx(1.0)
 
@@ -102,7 +102,7 @@ def test_lengths_are_in_the_unit_that_reads_best(length: float, text: str) -> No
 
 
 def swept_figure(folder: Path, scale: float, names: list[str], reach: float = 1.0) -> Figure:
-    """A sweep over plates with such names, some of which it hits."""
+    """Figure of a sweep over plates with the given names; the tool hits some of the plates."""
     assembly = trimesh.Scene()
     for n, name in enumerate(names):
         box = trimesh.creation.box((scale, scale, 0.05 * scale))
@@ -140,7 +140,7 @@ def test_no_words_run_over_others_or_the_edge(tmp_path: Path, scale: float) -> N
 
 @pytest.mark.parametrize("reach", [0.15, 1.0])
 def test_no_scene_is_cut_at_the_edges_of_its_picture(tmp_path: Path, reach: float) -> None:
-    """All of it is in view, or it fades: rows and columns at the edges are backdrop."""
+    """The scene is in view or fades out: the rows and columns at the edges are background."""
     figure = swept_figure(tmp_path, 0.5, ["plate"], reach)
     (image,) = figure.axes[0].images
     pixels = np.asarray(image.get_array())

@@ -1,4 +1,4 @@
-"""Deadlines on a clock that only moves when told, and what `undisturbed` restores."""
+"""Deadlines on a clock that the test moves, and the settings that `undisturbed` restores."""
 
 import ctypes
 import gc
@@ -25,7 +25,7 @@ GET_TIMERSLACK = 30
 
 
 class Clock:
-    """Nanoseconds; every look takes 50, and who sleeps may wake late."""
+    """A clock in nanoseconds: reading it takes 50 ns, a sleep ends `late` ns too late."""
 
     def __init__(self, start: int = 12_345) -> None:
         self.now = start
@@ -86,7 +86,7 @@ def test_a_late_wake_up_is_lateness_and_no_drift() -> None:
     clock.late = 300_000
     for _ in range(100):
         begun = deadlines.wait()
-        assert (begun - deadlines.due) == pytest.approx(240_000, abs=200)  # 60 us were for spinning
+        assert (begun - deadlines.due) == pytest.approx(240_000, abs=200)  # 60 us were to spin
         deadlines.done()
     assert deadlines.missed == 0
     assert deadlines.due - deadlines.started == 101 * PERIOD
@@ -116,7 +116,7 @@ def test_percentiles_are_of_all_that_was_counted() -> None:
     assert times.spread() == (0.0, 0.0, 0.0, 0.0)
     for n in range(1, 1001):
         times.add(n * 1e-6)
-    times.add(1.0)  # beyond the bins
+    times.add(1.0)  # beyond the histogram's last bin
     spread = times.spread()
     assert spread.p50 == pytest.approx(501e-6, abs=1e-6)
     assert spread.p99 == pytest.approx(991e-6, abs=1e-6)
@@ -129,7 +129,7 @@ def test_an_empty_loop_lasts_as_many_deadlines_as_asked() -> None:
     assert all(map(math.isfinite, (*figures.lateness, *figures.elapsed)))
 
 
-# -- what a loop changes in its process ----------------------------------------------------------
+# -- settings that a loop changes in its process ------------------------------------------------
 
 
 def slack() -> int:
@@ -154,7 +154,7 @@ def test_all_is_as_before_afterwards(kind: type[BaseException] | None) -> None:
             assert sys.getswitchinterval() == pytest.approx(SWITCH_INTERVAL)
             if sys.platform == "linux":
                 assert os.sched_getaffinity(0) == {processor}
-                assert slack() <= 1  # 0 for who is scheduled first in, first out
+                assert slack() <= 1  # SCHED_FIFO has a timer slack of 0
                 assert granted["processor"] == f"bound to processor {processor}"
             assert granted["scheduling"].startswith("SCHED_FIFO")
             if kind:
@@ -195,7 +195,7 @@ def test_a_processor_that_is_not_there_is_refused_and_nothing_breaks() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Linux binds processes to processors")
 def test_the_processors_that_are_granted_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of a cpuset, which need not follow one another."""
+    """The processors of a cpuset need not have consecutive numbers."""
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: {2, 3, 4, 7})
     with pytest.raises(UsageError, match=r"^processor 5 is not .* may run on 2 to 4, 7$"):
         Timing(processor=5).check_granted()

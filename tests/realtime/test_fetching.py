@@ -1,4 +1,4 @@
-"""Cells come before the hand does, from a database that is slow, errs, changes or goes away."""
+"""Cells are fetched before the hand arrives, though the database is slow, fails or changes."""
 
 import functools
 import os
@@ -38,7 +38,7 @@ Pose = NDArray[np.float64]
 
 
 def until(claim: Callable[[], bool], do: Callable[[], object] = lambda: None) -> bool:
-    """Whether a claim comes true while something is done again and again."""
+    """Whether a claim comes true in time while an action is repeated."""
     deadline = time.monotonic() + PATIENCE
     while not claim():
         if time.monotonic() > deadline:
@@ -49,7 +49,7 @@ def until(claim: Callable[[], bool], do: Callable[[], object] = lambda: None) ->
 
 
 class Side:
-    """A session's side of the desk: tells where it is, and runs its frames."""
+    """A session as the fetching process meets it: it writes its state, and runs frames."""
 
     def __init__(self, table: CellTable, grid: Grid, shell: PointShell) -> None:
         self.reader = Reader(table, grid, shell)
@@ -62,7 +62,7 @@ class Side:
     def be_at(
         self, pose: Pose, velocity: NDArray[np.float64] | None = None
     ) -> tuple[list[int], bytes, int]:
-        """Run a frame and tell; returns what the frame found."""
+        """Run a frame, write the state; return the frame's hits, wrench and unknown points."""
         found = self.reader.feel(pose)
         self.told["is_active"] = True
         self.told["tool"] = self.told["handle"] = pose[:3, 3]
@@ -89,9 +89,9 @@ class Side:
 
 
 class LockStep:
-    """A hand, its frames and the fetching process on one clock, which only waiting moves.
+    """A hand, its frames and the fetching process on one clock, which only `wait` moves.
 
-    While the database takes its time, the hand moves on and its frames run.
+    During a slow round trip to the database the hand moves on and its frames run.
     """
 
     def __init__(
@@ -116,7 +116,7 @@ class LockStep:
         )
 
     def wait(self, seconds: float) -> None:
-        """Let time pass, a frame each millisecond."""
+        """Let so many seconds pass, with a frame each millisecond."""
         end = self.now + seconds
         while self.now < end:
             self.now = min(self.now + 1e-3, end)
@@ -137,7 +137,7 @@ class LockStep:
 
     def round(self) -> None:
         self.fetcher.round()
-        self.is_served = self.side.is_served  # the next frame tells anew
+        self.is_served = self.side.is_served  # read before the next frame writes its state
         self.wait(1e-3)
 
     def warm_start(self) -> None:
@@ -156,7 +156,7 @@ class LockStep:
 
 @pytest.fixture
 def world(tmp_path: Path) -> Environment:
-    """A metre of 2 mm voxels, things everywhere, and a board below the middle."""
+    """An environment of 1 m with 2 mm voxels, scattered objects, and a board below the middle."""
     env = make(tmp_path, bits=9)
     scatter(env, n_objects=8, n_voxels=8000)
     write_voxels(env.store, block((180, 180, 246), (330, 330, 248)), "board")
@@ -169,7 +169,7 @@ def world(tmp_path: Path) -> Environment:
 @given(st.integers(0, 10_000))
 @settings(deadline=None, max_examples=60)
 def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> None:
-    """Wherever the hand goes within its reach, at the border of the grid, too."""
+    """All cells within the hand's reach are wanted, also at the border of the grid."""
     grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
     rng = np.random.default_rng(seed)
     tool = rng.uniform(-0.02, grid.edge + 0.02, 3)
@@ -185,7 +185,7 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
     assert (np.diff(urgency) >= 0).all()
     for _ in range(200):
         t = rng.uniform()
-        reach = radius + 1.5 * lookahead * rng.uniform()  # at the speed that it has shown, and half
+        reach = radius + 1.5 * lookahead * rng.uniform()  # up to 1.5 times the lookahead, in metres
         off = rng.normal(size=3)
         point = (
             tool + t * (handle + velocity * lookahead - tool) + reach * off / np.linalg.norm(off)
@@ -272,7 +272,7 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
 def test_the_heartbeat_waits_for_an_answer(
     world: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """To hear of no commit is none; a question for the revision is, a while after the last."""
+    """Silence about commits does not move the heartbeat; the answer to a revision query does."""
     step = LockStep(world, sphere)
     step.warm_start()
     step.run(0.2)
@@ -361,7 +361,7 @@ def test_sessions_share_a_table(world: Environment, sphere: PointShell) -> None:
 def test_a_tool_too_large_for_the_budget_is_fetched_for_as_far_as_it_goes(
     tmp_path: Path, sphere: PointShell
 ) -> None:
-    """And no longer than it helps: nothing is asked again and again."""
+    """Fetching stops when the table is full: no cell is requested again and again."""
     env = make(tmp_path, bits=9)
     n = env.grid.side >> 5
     write_voxels(env.store, 32 * block((0, 0, 0), (n - 1, n - 1, n - 1)) + 7)
@@ -382,7 +382,7 @@ def test_a_tool_too_large_for_the_budget_is_fetched_for_as_far_as_it_goes(
 
 @pytest.fixture
 def away(tmp_path: Path) -> Path:
-    """A file: while it is there, the database does not answer."""
+    """Path of a file; the database does not answer while the file exists."""
     return tmp_path / "away"
 
 
@@ -439,7 +439,7 @@ def test_a_database_that_goes_away_silences_the_heartbeat_until_it_is_back(
 def test_a_process_killed_at_any_moment_is_replaced_and_frames_are_right_again(
     world: Environment, resident: ResidentCells, away: Path, sphere: PointShell
 ) -> None:
-    """Also when the database is away just then."""
+    """Also when the database does not answer at that moment."""
     side = Side(resident.table, world.grid, sphere)
     rng = np.random.default_rng(5)
     ids = ids_by_voxel(world)

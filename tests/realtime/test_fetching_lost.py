@@ -1,4 +1,4 @@
-"""The fetching process and what becomes of its file: gone, put back, another, of another grid."""
+"""The fetching process when its file is deleted, restored or replaced, also by another grid."""
 
 import contextlib
 import os
@@ -44,7 +44,7 @@ def cells(env: Environment) -> Iterator[ResidentCells]:
 
 
 def replace(env: Environment, folder: Path, bits: int = 7) -> Environment:
-    """Put another environment, with another object, in the place of one; returns it, moved."""
+    """Replace an environment's file by another environment, with another object; return it open."""
     folder.mkdir()
     other = make(folder, bits=bits)
     middle = other.grid.side // 2
@@ -58,7 +58,7 @@ def replace(env: Environment, folder: Path, bits: int = 7) -> Environment:
 
 
 def served(cells: ResidentCells, shell: PointShell, pose: NDArray[np.float64]) -> Side:
-    """A session whose tool is at a pose, all cells there resident."""
+    """A session whose tool is at a pose, with all cells there resident."""
     side = Side(cells.table, cells.grid, shell)
     side.be_at(pose)
     assert until(lambda: side.is_served)
@@ -94,7 +94,7 @@ def test_another_file_of_the_same_grid_is_felt_instead(
 def test_another_file_is_felt_instead_that_came_while_nobody_fetched(
     env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
-    """Also when the system gives it the number of the old: no revision tells them apart."""
+    """Also when the new file gets the old inode number: both have the same revision."""
     pose = np.eye(4)
     side = served(cells, sphere, pose)
     before, revision = side.reader.feel(pose)[0], env.store.revision()
@@ -122,7 +122,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         remove_file(Path(env.url))
         with pytest.raises(hapticdb.EnvironmentNotFoundError):
             fetching.reopen()
-        assert fetching.store.revision() == 1  # SQLite reads the deleted file on
+        assert fetching.store.revision() == 1  # SQLite still reads the deleted file
         other = make(tmp_path)
         write_voxels(other.store, block((62, 56, 56), (68, 72, 72)))
         naive = expected(ids_by_voxel(other), grid, sphere, pose)
@@ -148,7 +148,7 @@ def test_an_environment_of_a_server_made_anew_is_felt_instead(
         before = side.reader.feel(pose)[0]
         with contextlib.closing(PostgresStore.open(url)) as store:
             drop(store.connection)
-        with hapticdb.create(url, grid) as env:  # of the same revision
+        with hapticdb.create(url, grid) as env:  # has the same revision
             write_voxels(env.store, block((62, 56, 56), (68, 72, 72)))
             naive = expected(ids_by_voxel(env), grid, sphere, pose)
         assert naive.hits != before
@@ -168,14 +168,14 @@ def test_another_grid_ends_the_fetching_and_is_told(
         except GridError as error:
             told.append(str(error))
 
-    assert until(lambda: len(told) == 2, supervise)  # and whenever one asks
+    assert until(lambda: len(told) == 2, supervise)  # each call of `supervise` raises it again
     assert all("another environment than before: start the session again" in t for t in told)
     assert "\n" not in told[0]
     assert (cells.pid, cells.restarts) == (pid, 0)
 
 
 class Listener:
-    """Stands in for a `MessageSender`: notes what is sent, and ends the fetching after it."""
+    """Stands in for a `MessageSender`: records the words sent, then stops the fetching."""
 
     def __init__(self, table: CellTable) -> None:
         self.table = table

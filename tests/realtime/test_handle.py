@@ -1,4 +1,4 @@
-"""The handle: scale, clutch, and where the hand is in the scene."""
+"""The handle: scale, clutch, and the map from the hand's pose to the scene."""
 
 import math
 
@@ -63,11 +63,11 @@ def test_positions_and_speeds_are_scaled_and_turns_are_not(seed: int, scale: flo
 @few
 @given(SEEDS, SCALES)
 def test_nothing_jumps_when_the_clutch_opens_and_closes(seed: int, scale: float) -> None:
-    """However far the hand went and turned meanwhile."""
+    """Nothing jumps, however far the hand moved and turned while the clutch was open."""
     rng = np.random.default_rng(seed)
     handle, hand = Handle(scale=scale, clutch=1), np.zeros((), HAND)
     handle.start(reading(rng), hand)
-    for _ in range(20):  # errors do not add up
+    for _ in range(20):  # over many changes of the clutch errors must not add up
         handle.follow(reading(rng), hand)
         before = hand.copy()
         for _ in range(3):
@@ -86,7 +86,7 @@ def test_nothing_jumps_when_the_clutch_opens_and_closes(seed: int, scale: float)
 @few
 @given(SEEDS, SCALES)
 def test_after_the_clutch_the_handle_moves_as_the_hand_does(seed: int, scale: float) -> None:
-    """By the same way, scaled, and the same turn, about the world's axes."""
+    """The handle moves by the scaled way and the same turn, in the world's axes."""
     rng = np.random.default_rng(seed)
     handle, hand = Handle(scale=scale, clutch=0), np.zeros((), HAND)
     handle.start(reading(rng), hand)
@@ -110,7 +110,7 @@ def test_a_handle_starts_where_it_is_told_to(seed: int, scale: float) -> None:
     start = turned(rng, rng.uniform(-1, 1, 3))
     handle, hand = Handle(scale=scale, start=start), np.zeros((), HAND)
     first = reading(rng)
-    for _ in range(2):  # a second start begins anew
+    for _ in range(2):  # a second start discards the first
         handle.start(first, hand)
         np.testing.assert_allclose(pose(hand), start, atol=1e-12 * max(scale, 1.0))
         assert not hand["velocity"].any()
@@ -118,7 +118,7 @@ def test_a_handle_starts_where_it_is_told_to(seed: int, scale: float) -> None:
 
 
 def lost(rng: np.random.Generator, bad: float, at: int, buttons: int = 0) -> Reading:
-    """A reading of which one number is not finite."""
+    """A reading in which one number is not finite."""
     found = reading(rng, buttons)
     if at < 12:
         found.pose.ravel()[at] = bad
@@ -132,7 +132,7 @@ def lost(rng: np.random.Generator, bad: float, at: int, buttons: int = 0) -> Rea
 def test_after_readings_that_are_not_finite_all_is_as_if_they_had_not_been(
     seed: int, scale: float, bad: float, at: int
 ) -> None:
-    """Also while the clutch is open, and when it closes."""
+    """Such readings have no effect, also while the clutch is open and when it closes."""
     rng = np.random.default_rng(seed)
     handles = [Handle(scale=scale, clutch=0) for _ in range(2)]
     hands = [np.zeros((), HAND) for _ in range(2)]

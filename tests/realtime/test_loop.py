@@ -1,4 +1,4 @@
-"""The loop in this process, on the cells of a fetching process: what it counts and refuses."""
+"""The loop, run in this process on a fetching process's cells: its counts and refusals."""
 
 import dataclasses
 import io
@@ -53,8 +53,8 @@ def cells(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ResidentCells]:
 
 @pytest.fixture
 def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
-    """Runs the loop's work in this process, and returns its answer and its frames."""
-    monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # a test's input may be closed
+    """A function that runs the loop's work in this process and returns its answer and frames."""
+    monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
     memory = anonymous_memory("frames", ring_bytes(N_RING))
     with cells.table.reading() as row:
 
@@ -233,7 +233,7 @@ def test_a_hand_that_is_never_a_rotation_does_not_begin(
 
 @pytest.mark.parametrize("change", FORMS)
 def test_a_reading_of_another_form_is_felt_as_it_is(run: Run, change: Change) -> None:
-    answer, frames = run(Odd(still(0.015625), change))  # a number that single precision has, too
+    answer, frames = run(Odd(still(0.015625), change))  # exact in single precision, too
     assert answer.counts.nowhere_frames == 0
     assert (frames["hand"] == (0.0, 0.0, 0.015625, 1.0, 0.0, 0.0, 0.0)).all()
 
@@ -255,7 +255,7 @@ def test_a_frame_that_waits_lets_go_and_ends_with_the_session(
         nonlocal n_steps
         n_steps += 1
         known(loop, dt, is_stale=is_stale)
-        if n_steps > 50:  # from now on all is unknown
+        if n_steps > 50:  # from now on all cells count as unknown
             loop.sent.unknown[()] = 1
 
     monkeypatch.setattr(subject.Loop, "_step", step)
@@ -263,7 +263,7 @@ def test_a_frame_that_waits_lets_go_and_ends_with_the_session(
     assert answer.counts.unknown_frames == 1
     assert answer.loop.seconds == pytest.approx(0.5, abs=0.2)
     assert applied[-5].any()
-    assert not np.any(applied[-4:])  # while it waited, of that frame, and twice at the end
+    assert not np.any(applied[-4:])  # one during the wait, one of that frame, two at the end
     assert not frames["applied"][-1].any()
 
 
@@ -282,7 +282,7 @@ def test_a_loop_of_no_time_has_one_frame(run: Run) -> None:
 
 
 def test_a_recorded_frame_has_the_unknown_points_of_the_pose_that_was_tried() -> None:
-    """The frame that is felt has none by definition."""
+    """`unknown` comes from the tried pose: a pose that is accepted has no unknown points."""
     ring = np.zeros(4, FRAME)
     record = np.zeros((), SERVO)
     sent, hand = views_of(record["sent"]), views_of(record["hand"])

@@ -1,4 +1,4 @@
-"""The loop when cells go, the hand leaves, or its process is told to end: frame by frame."""
+"""The loop, frame by frame, when cells are lost, the hand leaves, or its process must end."""
 
 import io
 import os
@@ -29,11 +29,11 @@ N_RING = 64
 MIDDLE = SIDE // 2
 FLOOR = block((MIDDLE - 12, MIDDLE - 12, MIDDLE - 4), (MIDDLE + 11, MIDDLE + 11, MIDDLE - 1))
 LATE = 10 * 10**9
-"""ns that a frame may wait in a test, which is never the end of it."""
+"""Longest wait of a frame in ns: so long that no test reaches it."""
 
 
 class Pressing:
-    """A hand at some height whose tests see what it is sent."""
+    """A hand at height z (metres) that records the wrenches it is sent."""
 
     def __init__(self, z: float) -> None:
         self.z = z
@@ -49,8 +49,8 @@ class Pressing:
 
 @pytest.fixture
 def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
-    monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # a test's input may be closed
-    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # for a fetching process, which is not there
+    monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
+    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no fetching process exists
     before = signal.getsignal(signal.SIGTERM)
     made = World(FLOOR)
     yield made
@@ -78,7 +78,7 @@ def requested(world: World, hand: Pressing, **options: object) -> LoopRequest:
 
 
 def frame(loop: Loop, hand: Pressing, dt: float = 1e-3) -> Reading:
-    """One frame that waits for its cells."""
+    """Run one frame that waits for its cells."""
     reading = hand.read()
     loop.request.handle.follow(reading, loop.hand)
     used = loop._step_exactly(reading, dt, time.perf_counter_ns() + LATE)
@@ -87,7 +87,7 @@ def frame(loop: Loop, hand: Pressing, dt: float = 1e-3) -> Reading:
 
 
 def pressed(world: World, hand: Pressing, **options: object) -> Loop:
-    """A loop whose tool was placed in the air, and rests on the floor."""
+    """A loop whose tool was placed in the air and then pressed on the floor."""
     loop = Loop(requested(world, hand, **options))
     loop.warm_up()
     loop._place()
@@ -99,7 +99,7 @@ def pressed(world: World, hand: Pressing, **options: object) -> Loop:
 
 
 class Summoning(Pressing):
-    """A hand that, while it is let go, moves, and after some reads has the cells come back."""
+    """A hand without cells: 3 reads after its force is zero it moves, and the cells return."""
 
     def __init__(self, z: float) -> None:
         super().__init__(z)
@@ -108,7 +108,7 @@ class Summoning(Pressing):
         self.reads_left = 1 << 30
 
     def take(self, keys: NDArray[np.int64]) -> None:
-        """Take all cells away."""
+        """Make all cells unknown."""
         self.keys, self.known = keys, keys.copy()
         keys[:] = -1
 
@@ -126,7 +126,7 @@ class Summoning(Pressing):
 
 
 def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World) -> None:
-    """In no frame by more than its share, also in the next, whose period is as long as the wait."""
+    """No frame raises the force by more than one share, even a frame as long as the wait."""
     hand = Summoning(0.02)
     loop = pressed(world, hand, coupling=Coupling(hold=1e-3))
     full, n_before = loop.sent.wrench[2], len(hand.sent)
@@ -142,7 +142,7 @@ def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World) -> 
 
 
 def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(world: World) -> None:
-    """The frame says which reading that is, so that it is the one that is recorded."""
+    """The frame returns the reading it used, and that reading is the one that is recorded."""
     hand = Summoning(0.02)
     loop = pressed(world, hand, coupling=Coupling(hold=1e-3))
     hand.take(world.table.cells.keys)
@@ -163,7 +163,7 @@ def test_objects_are_no_longer_asked_for_once_the_tool_has_left_and_was_answered
     hand.z = 0.02
     for _ in range(100):
         frame(loop, hand)
-    control[HEARTBEAT] = 1000 + WITHDRAWN_NS  # the database may still be naming them
+    control[HEARTBEAT] = 1000 + WITHDRAWN_NS  # the database may still be looking up the names
     loop._ask_or_withdraw(2000)
     assert asked > 0
     control[HEARTBEAT] += 1
@@ -172,7 +172,7 @@ def test_objects_are_no_longer_asked_for_once_the_tool_has_left_and_was_answered
 
 
 def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
-    """A whole run: a hand on the floor that leaves it, the database answering all the time."""
+    """A whole run: a hand leaves the floor while the database keeps answering."""
 
     class Leaving(Pressing):
         def apply(self, wrench: Floats) -> None:

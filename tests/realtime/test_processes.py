@@ -1,4 +1,4 @@
-"""A session's process says what happened, and ends when its session does."""
+"""A session's process reports what happened, and ends when its session ends."""
 
 import gc
 import os
@@ -123,7 +123,7 @@ time.sleep(1000)
 
 @pytest.mark.parametrize("forks", [False, True])
 def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
-    """Though a process that was forked from it holds the line to it open."""
+    """Also when a process forked from the session holds the pipe open."""
     args = [sys.executable, "-c", SCRIPT.format(forks=forks)]
     with child(args, stderr=None) as session:
         assert session.stdout is not None

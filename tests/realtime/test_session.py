@@ -1,4 +1,4 @@
-"""Sessions: whole, cut short, and with any of their processes killed; each a few seconds."""
+"""Sessions: complete, cut short, or with one of their processes killed; each a few seconds."""
 
 import json
 import math
@@ -35,7 +35,7 @@ from recordings import motion, write
 
 @pytest.fixture(scope="module")
 def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    """A floor, its top at z = 0, on SQLite."""
+    """An environment on SQLite: a floor with its top at z = 0."""
     with floored(make(tmp_path_factory.mktemp("session"), bits=6)) as made:
         yield made
 
@@ -47,7 +47,7 @@ def cells(env: Environment) -> Iterator[ResidentCells]:
 
 
 class Played(NamedTuple):
-    """A session that came to its end by itself."""
+    """Results of a session that ended with its device."""
 
     report: Report
     frames: Recorded
@@ -59,7 +59,7 @@ class Played(NamedTuple):
 def played(
     cells: ResidentCells, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
 ) -> Played:
-    """Strokes over the floor, to the device's end, 2 mm deep."""
+    """A session that moves 2 mm deep over the floor until the device's end."""
     path = tmp_path_factory.mktemp("played") / "session.hdbrec"
     with Session(
         cells, sphere, stroking(0.010), rate=RATE, record=path, staleness=NEVER_STALE
@@ -71,7 +71,7 @@ def played(
     return Played(report, np.concatenate(list(recording.frames())), recording, pid)
 
 
-# -- one that is left alone --------------------------------------------------------------------
+# -- sessions without disturbance --------------------------------------------------------------
 
 
 def test_a_session_ends_with_its_device(played: Played) -> None:
@@ -142,7 +142,7 @@ def test_nothing_is_sent_while_nothing_is_touched(played: Played) -> None:
     assert not played.frames["applied"][is_free].any()
 
 
-# -- one that is not ---------------------------------------------------------------------------
+# -- sessions with disturbances ----------------------------------------------------------------
 
 
 def test_a_session_is_waited_for_in_steps_and_stopped(
@@ -156,7 +156,7 @@ def test_a_session_is_waited_for_in_steps_and_stopped(
         until(lambda: session.objects == (1,), session)
         report = session.stop()
         assert report.loop.frames >= 100
-        assert session.wait(PATIENCE) == session.stop()  # said again
+        assert session.wait(PATIENCE) == session.stop()  # the same report again
     for closed in (session.stop, session.wait, session.last):
         with pytest.raises(UsageError, match="the session is closed"):
             closed()
@@ -165,7 +165,7 @@ def test_a_session_is_waited_for_in_steps_and_stopped(
 def test_a_session_lasts_its_seconds_however_slow_it_is(
     cells: ResidentCells, sphere: PointShell
 ) -> None:
-    """20,000 Hz are more than a machine that does much else can do."""
+    """A busy machine cannot keep a rate of 20,000 Hz; frames are then missed."""
     with Session(cells, sphere, still(0.03), rate=20_000.0, seconds=0.5) as session:
         report = session.wait(PATIENCE)
     assert report is not None
@@ -188,7 +188,7 @@ def test_a_loop_that_is_killed_is_one_clear_error(
     n_frames = sum(map(len, Recording(path).frames()))
     assert n_frames > 50
     with Session(cells, sphere, still(0.010), rate=RATE, seconds=0.1) as session:
-        report = session.wait(PATIENCE)  # the cells are none the worse for it
+        report = session.wait(PATIENCE)  # the cells are still usable
     assert report is not None
     assert report.hit_frames == report.loop.frames
 
@@ -371,7 +371,7 @@ def test_a_device_of_the_script_itself_is_refused_with_the_way_out(
 
 
 def held_for(frames: Recorded) -> NDArray[np.float64]:
-    """Seconds for which each frame's wrench had been kept, by what the coupling goes by."""
+    """Seconds for which each frame's wrench had been held, by the coupling's own periods."""
     out, kept = np.zeros(len(frames)), 0.0
     for n, frame in enumerate(frames):
         kept = kept + max(float(frame["dt"]), 0.0) if frame["state"] & State.HELD else 0.0
@@ -380,7 +380,7 @@ def held_for(frames: Recorded) -> NDArray[np.float64]:
 
 
 def check_falling(frames: Recorded) -> None:
-    """Kept for 20 ms bit for bit, zero from 40 ms on, never growing between."""
+    """Check held wrenches: unchanged for 20 ms, zero from 40 ms on, never growing in between."""
     seconds = held_for(frames)
     sizes = np.linalg.norm(frames["applied"], axis=1)
     kept = np.zeros(6)
@@ -432,7 +432,7 @@ def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
 def test_unknown_cells_hold_and_fade_for_one_session_and_are_waited_for_by_another(
     sphere: PointShell, tmp_path: Path
 ) -> None:
-    """Both on the same cells; the fetching process stands still while the hand goes far."""
+    """Both sessions share cells; the fetching process is stopped while the hand moves far."""
     path = Player([0.0, 0.4, 1.5], [at(x, 0.0, 0.010) for x in (-0.45, 0.45, 0.45)])
     hand = Beckoned(path, tmp_path / "come")
     with make(tmp_path, bits=9) as env:
@@ -467,7 +467,7 @@ def test_unknown_cells_hold_and_fade_for_one_session_and_are_waited_for_by_anoth
     exact = recorded(tmp_path / "b")
     assert not exact["unknown"].any()
     assert not (exact["state"] & State.HELD).any()
-    assert exact["tool"][-1, 0] > exact["tool"][0, 0] + 0.1  # it drags along the floor, and lags
+    assert exact["tool"][-1, 0] > exact["tool"][0, 0] + 0.1  # the tool lags behind the hand
 
 
 def held_now(session: Session) -> bool:

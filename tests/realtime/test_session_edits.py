@@ -1,4 +1,4 @@
-"""Edits that a running session feels, on both engines."""
+"""A running session feels edits of the environment, on both engines."""
 
 import time
 from collections.abc import Callable
@@ -31,7 +31,7 @@ def felt_at(env: Environment, shell: PointShell, frames: Recorded) -> NDArray[np
 def test_edits_are_felt_and_no_frame_mixes_two_revisions(
     sphere: PointShell, tmp_path: Path, record_property: Callable[..., None]
 ) -> None:
-    """The floor gives way by 6 mm under a hand that presses 2 mm into it, and comes back."""
+    """The floor moves 6 mm down under a hand that presses 2 mm into it, and returns."""
     with floored(make(tmp_path, bits=6)) as env:
         check_edits(env, sphere, tmp_path, record_property)
 

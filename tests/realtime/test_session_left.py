@@ -1,4 +1,4 @@
-"""Sessions that nobody closes, that are forked, or whose end fails: nothing of them stays."""
+"""Sessions that are not closed, are forked, or fail to end leave nothing behind."""
 
 import contextlib
 import gc
@@ -23,12 +23,12 @@ from realtime.sessions import RATE, floored, until
 from realtime.worlds import make
 
 DEEP = 0.0085
-"""Height of a hand whose tool reaches into the floor."""
+"""Height in metres of a hand whose tool reaches into the floor; deeper if smaller."""
 
 
 @pytest.fixture(scope="module")
 def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    """A floor, its top at z = 0, on SQLite."""
+    """An environment on SQLite: a floor with its top at z = 0."""
     with floored(make(tmp_path_factory.mktemp("left"), bits=6)) as made:
         yield made
 
@@ -48,7 +48,7 @@ def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
     pids = sessions[0].pid, sessions[0].cells.pid
     until(lambda: sessions[0].n_frames > 100 and force_in(path) > 0, sessions[0])
     n_frames = sessions[0].n_frames
-    assert n_memories() == n_before + 2 * len(("cells", "frames"))  # each mapping keeps one, too
+    assert n_memories() == n_before + 2 * len(("cells", "frames"))  # a mapping has one, too
     sessions.clear()
     gc.collect()
     assert path.read_bytes() == bytes(48)
@@ -58,11 +58,11 @@ def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
 
 
 def n_memories() -> int:
-    """Shared memories that are open here: by number, and as mappings."""
+    """Number of this process's file descriptors of shared memories; a mapping has its own."""
     gc.collect()
     found = []
     for link in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(OSError):  # the one by which the folder is read
+        with contextlib.suppress(OSError):  # the descriptor of this folder itself
             found.append(link.readlink())
     return sum("hapticdb-" in name.name for name in found)
 
@@ -86,7 +86,7 @@ def test_cells_that_are_dropped_are_given_back(env: Environment) -> None:
 
 
 def in_a_fork(work: Callable[[], object]) -> int:
-    """Exit status of a copy of this process that does that."""
+    """Exit status of a forked process that runs `work`."""
     pid = os.fork()
     if pid == 0:
         status = 1
@@ -143,7 +143,7 @@ def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
 def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
     env: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The first ends the start, the second what the first has begun."""
+    """The first signal interrupts the start, the second the cleaning up after the first."""
 
     close = Session.close
     signals = iter([KeyboardInterrupt()])
@@ -154,7 +154,7 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
     def cut_off(session: Session) -> None:
         for signal in signals:
             raise signal
-        close(session)  # by then it is dropped
+        close(session)  # later calls, when the session is dropped
 
     path = tmp_path / "never.hdbrec"
     monkeypatch.setattr(module, "Process", interrupted)
@@ -165,7 +165,7 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
         assert not path.exists()
 
 
-# -- what is misread -----------------------------------------------------------------------------
+# -- wrong arguments -----------------------------------------------------------------------------
 
 
 def test_a_budget_of_nothing_is_refused(env: Environment, sphere: PointShell) -> None:

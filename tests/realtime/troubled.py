@@ -1,4 +1,4 @@
-"""A store that is slow, errs and goes away, as a real one may: the same for a seed."""
+"""A store that is slow, fails and disconnects, as a real one may; repeatable by its seed."""
 
 import contextlib
 import functools
@@ -20,22 +20,22 @@ _openings = itertools.count()
 
 
 class Troubled:
-    """A store in front of another.
+    """Passes calls to another store, with delays and errors.
 
     Parameters
     ----------
     store : Store
-        What answers in the end.
+        The store that answers.
     latency, jitter : float
-        Seconds that are added to each round trip, the jitter up to so much.
+        Seconds that are added to each round trip: `latency`, and a random part of `jitter`.
     errors : float
         Probability that a round trip fails.
     away : path or None
-        While such a file exists, nothing answers.
+        While this file exists, every round trip fails.
     seed : int
-        Of jitter and errors; each opening in a process goes on with another number.
+        Seed of jitter and errors; each store opened in a process gets other random numbers.
     wait : callable
-        Lets so many seconds pass.
+        Called with seconds to let pass.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Troubled:
         self.check()
 
     def check(self) -> None:
-        """Fail while away."""
+        """Raise `ConnectionLostError` while the file `away` exists."""
         if self._away and self._away.exists():
             raise ConnectionLostError(f"{self._store.url} is away: wait")
 
@@ -93,17 +93,17 @@ class Troubled:
 
 
 def troubled(store: Store, **trouble: Any) -> Store:  # noqa: ANN401 - see `Troubled`
-    """Put trouble in front of a store; `functools.partial` of it crosses to another process."""
+    """Wrap a store; `functools.partial` of this function can be sent to another process."""
     return cast("Store", Troubled(store, **trouble))
 
 
 def refuse(store: Store) -> Store:
-    """Fail as a database does."""
+    """Fail with an error that a database raises."""
     store.close()
     raise DatabaseError(f"{store.url} is not for us: ask another")
 
 
 def refuse_strangely(store: Store) -> Store:
-    """Fail as nobody expects."""
+    """Fail with an error that no caller expects."""
     store.close()
     raise ZeroDivisionError(store.url)

@@ -1,4 +1,4 @@
-"""Processes for the tests: what they do is the first word of their request."""
+"""Work of processes in the tests; the first word of the request says what they do."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""Environments for the tests of resident cells, and what a frame in them must find."""
+"""Environments for the tests of resident cells, and the frames that the oracle expects."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -41,14 +41,14 @@ SIZE = 0.002
 def make(
     folder: Path, bits: int = 7, layout: Layout = "brick", curve: CurveName = "z"
 ) -> Environment:
-    """An empty environment of 2 mm voxels about the world's origin."""
+    """An empty environment with 2 mm voxels; the world's origin is the grid's middle."""
     half = SIZE * (1 << bits) / 2
     grid = Grid(SIZE, (-half, -half, -half), bits, curve)
     return hapticdb.create(folder / f"{layout}-{curve}-{bits}.db", grid, layout=layout)
 
 
 def scatter(env: Environment, n_objects: int = 3, n_voxels: int = 4000, seed: int = 0) -> None:
-    """Objects of random voxels, in clumps; some voxels belong to several."""
+    """Write objects of random voxels, in clumps; some voxels belong to several objects."""
     rng = np.random.default_rng(seed)
     side = env.grid.side
     for n in range(n_objects):
@@ -59,7 +59,7 @@ def scatter(env: Environment, n_objects: int = 3, n_voxels: int = 4000, seed: in
 
 
 def ids_by_voxel(env: Environment) -> dict[Voxel, list[int]]:
-    """Every voxel with the objects in it."""
+    """Voxel -> ids of the objects in the voxel."""
     found: dict[Voxel, list[int]] = {}
     for obj in env.objects():
         for i, j, k in env.voxels(obj.id).tolist():
@@ -68,7 +68,7 @@ def ids_by_voxel(env: Environment) -> dict[Voxel, list[int]]:
 
 
 def move(store: Store, object_id: int, ijk: Voxels) -> None:
-    """Put an object's voxels elsewhere, in one transaction."""
+    """Replace an object's voxels by `ijk`, in one transaction."""
     before = store.object(object_id)
     after = voxel_object(store.grid, ijk, before.name)
     record = dataclasses.replace(
@@ -78,20 +78,20 @@ def move(store: Store, object_id: int, ijk: Voxels) -> None:
 
 
 def block(low: Iterable[int], high: Iterable[int]) -> Voxels:
-    """Voxels (n, 3) from one corner to another, both within."""
+    """Voxels (n, 3) from one corner to the other, both included."""
     axes = [np.arange(a, b + 1) for a, b in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def cells_of(grid: Grid) -> Voxels:
-    """Keys of all cells of a grid, as directories name them."""
+    """Keys of all cells of a grid, in the form that cell directories use."""
     n = max(grid.side >> 5, 1)
     ijk = block((0, 0, 0), (n - 1, n - 1, n - 1))
     return (ijk[:, 0] << 32) | (ijk[:, 1] << 16) | ijk[:, 2]
 
 
 def turned(rng: np.random.Generator, place: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A pose (4, 4) at a place (3,), turned at random."""
+    """A pose (4, 4) at a place (3,), with a random rotation."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))
     q *= np.sign(np.diag(r))
     if np.linalg.det(q) < 0:
@@ -102,7 +102,7 @@ def turned(rng: np.random.Generator, place: NDArray[np.float64]) -> NDArray[np.f
 
 
 def poses_in(grid: Grid, count: int, seed: int = 0, beyond: float = 0.1) -> NDArray[np.float64]:
-    """Poses (count, 4, 4) in a grid and, by that share of its edge, beside it."""
+    """Poses (count, 4, 4) in a grid and up to `beyond` times its edge outside the grid."""
     rng = np.random.default_rng(seed)
     low, high = grid.bounds
     spare = beyond * grid.edge
@@ -116,7 +116,7 @@ def expected(
     pose: NDArray[np.float64],
     exclude: Iterable[int] = (),
 ) -> naive_frame.NaiveTouch:
-    """What the oracle finds."""
+    """The frame as the oracle computes it."""
     return naive_frame.touch(
         ids,
         [(x, y, z) for x, y, z in shell.points.tolist()],
@@ -131,7 +131,7 @@ def expected(
 
 
 class Reader:
-    """One reader's frames over a table, whoever fills it; unknown cells stay unknown."""
+    """Frames of one reader of a cell table; the reader fetches nothing."""
 
     def __init__(self, table: CellTable, grid: Grid, shell: PointShell) -> None:
         self.table = table
@@ -150,5 +150,5 @@ class Reader:
             TangentPlaneLaw(1000.0), self.met, self.missed, self.out,
         )  # fmt: skip
         row = self.out[0]
-        wrench = row[WRENCH : WRENCH + 6] + 0.0  # no zero is negative
+        wrench = row[WRENCH : WRENCH + 6] + 0.0  # turns -0.0 into 0.0
         return self.met[: int(row[HITS])].tolist(), wrench.tobytes(), int(row[UNKNOWNS])

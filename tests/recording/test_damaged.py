@@ -1,4 +1,4 @@
-"""Recordings that were cut off or damaged: what is whole is read, the rest told in one line."""
+"""Recordings that were cut off or damaged: whole chunks are read, the rest is one error line."""
 
 import json
 import os
@@ -53,7 +53,7 @@ def test_a_file_cut_anywhere_is_whole_up_to_its_last_chunk_and_goes_on(
 
 
 def test_a_killed_recorder_leaves_whole_chunks(tmp_path: Path) -> None:
-    """Killed at random moments; the next one goes on."""
+    """Recorders are killed at random moments; the next one continues the file."""
     rng = np.random.default_rng(5)
     path = tmp_path / "s.hdbrec"
     Recorder(path, HEADER).close()
@@ -82,7 +82,7 @@ def test_a_killed_recorder_leaves_whole_chunks(tmp_path: Path) -> None:
 def test_a_full_disk_leaves_whole_chunks(tmp_path: Path) -> None:
     path = tmp_path / "s.hdbrec"
     child = os.fork()
-    if child == 0:  # the limit is this process's own
+    if child == 0:  # the file size limit holds for the child process only
         code = 1
         try:
             resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
@@ -146,7 +146,7 @@ def test_the_last_chunk_is_torn_unless_the_recorder_was_closed(tmp_path: Path) -
 
 
 def readable(path: Path) -> bytes:
-    """Frames that can be read; what cannot is told in one line."""
+    """Frames that can be read; the error at the first damaged one must be one line."""
     found = b""
     try:
         found = read(path, until_damage=True)
@@ -191,7 +191,7 @@ def test_whatever_happens_to_a_file_no_frame_is_wrong(
     ],
 )
 def test_a_chunk_that_asks_for_absurd_sizes_is_none(tmp_path: Path, head: Chunk) -> None:
-    """Its checksum is right."""
+    """A chunk with absurd sizes counts as no chunk, even with a right checksum."""
     path = tmp_path / "s.hdbrec"
     path.write_bytes(HEADER.packed() + head.packed() + bytes(400))
     assert len(Recording(path)) == 0
@@ -199,7 +199,7 @@ def test_a_chunk_that_asks_for_absurd_sizes_is_none(tmp_path: Path, head: Chunk)
 
 
 def test_a_column_that_unpacks_to_more_than_its_frames_is_damage(tmp_path: Path) -> None:
-    """It is not unpacked further."""
+    """Unpacking stops at the size that the frames need."""
     bomb = zlib.compress(bytes(10_000_000))
     payload = np.array([len(bomb)] * 16, "<u4").tobytes() + bomb * 16
     path = tmp_path / "s.hdbrec"
@@ -219,7 +219,7 @@ def test_a_payload_of_anything_is_damage(tmp_path: Path, payload: bytes, n_frame
 
 
 def sealed(text: bytes, n_points: int = 1, n_text: int | None = None, number: int = 1) -> bytes:
-    """A header with the right checksum over whatever it says."""
+    """A header with any content and the right checksum."""
     counts = PREAMBLE.pack(MAGIC, number, len(text) if n_text is None else n_text, n_points, 0)[:-4]
     body = text + HEADER.packed()[-72:]
     return counts + struct.pack("<I", zlib.crc32(body, zlib.crc32(counts))) + body

@@ -1,4 +1,4 @@
-"""A recording ends whole at its limit and before its disk is full; its session goes on."""
+"""A recording ends with a whole chunk at its limit or before the disk is full."""
 
 import io
 import math
@@ -22,7 +22,7 @@ LIMIT = 1_000_000
 
 
 def noise(n: int) -> Frames:
-    """Frames that packing makes no shorter."""
+    """Random frames, which compression makes no shorter."""
     return np.frombuffer(np.random.default_rng(n).bytes(FRAME.itemsize * n), dtype=FRAME)
 
 
@@ -38,7 +38,7 @@ def test_a_recording_ends_whole_at_its_limit(
         assert recorder.ended == (
             f"{path}: the recording ends after {len(recorder):,} frames, at its limit of 0.9537 MiB"
         )
-        recorder.append(frames)  # left out
+        recorder.append(frames)  # these frames are dropped
         recorder.flush()
     assert 0.5 * LIMIT < path.stat().st_size <= LIMIT
     found = Recording(path)

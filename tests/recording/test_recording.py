@@ -1,4 +1,4 @@
-"""Recordings: what was written is read, bit for bit."""
+"""Recordings: frames are read as they were written, bit for bit."""
 
 import json
 import struct
@@ -27,7 +27,7 @@ repeatedly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture
 @repeatedly
 @given(frames=arrays(FRAME, st.integers(1, 6)), n=st.integers(1, 6))
 def test_frames_return_bit_for_bit(tmp_path: Path, frames: Frames, n: int) -> None:
-    """Also infinities, signed zeros and what is no number."""
+    """Also infinities, signed zeros and NaN."""
     path = tmp_path / "s.hdbrec"
     with Recorder(path, header(), replace=True) as recorder:
         recorder.append(frames[:n])
@@ -101,7 +101,7 @@ def test_poses_of_states_are_the_formula_bit_for_bit(states: np.ndarray[Any, Any
 
 
 def test_a_smooth_motion_takes_little_more_than_half(tmp_path: Path) -> None:
-    """60 s at 1 kHz."""
+    """60 s at 1 kHz take less than 0.6 of the frames' plain size."""
     path = tmp_path / "s.hdbrec"
     with Recorder(path, header()) as recorder:
         recorder.append(motion(60_000))
@@ -109,7 +109,7 @@ def test_a_smooth_motion_takes_little_more_than_half(tmp_path: Path) -> None:
 
 
 def test_the_file_is_as_the_format_says(tmp_path: Path) -> None:
-    """Read by what docs/format.md tells, with NumPy alone."""
+    """The file is read as docs/format.md describes, with NumPy alone."""
     frames = motion(9)
     content = write(tmp_path / "s.hdbrec", frames[:5], frames[5:]).read_bytes()
     magic, number, n_text, n_points, crc = struct.unpack_from("<8sIIII", content)
@@ -146,7 +146,7 @@ def test_the_file_is_as_the_format_says(tmp_path: Path) -> None:
     assert [len(rows) for rows in found] == [5, 4, 0]
 
 
-# --- files that are there -----------------------------------------------------------------------
+# --- files that exist ---------------------------------------------------------------------------
 
 
 def test_a_file_is_not_replaced_unasked(tmp_path: Path) -> None:
@@ -173,7 +173,7 @@ def test_a_recording_is_replaced_by_the_first_frames_of_another(tmp_path: Path) 
     path = tmp_path / "s.hdbrec"
     write(path, motion(10))
     before = path.read_bytes()
-    Recorder(path, header(), replace=True).close()  # nothing came
+    Recorder(path, header(), replace=True).close()  # no frame was recorded
     assert path.read_bytes() == before
     with Recorder(path, header(), replace=True) as recorder:
         recorder.append(motion(4))

@@ -1,4 +1,4 @@
-"""A session replayed is equal bit for bit, or parts at the frame where an edit is first felt."""
+"""A replay equals its session bit for bit, or differs from the first frame that feels an edit."""
 
 from dataclasses import asdict
 from pathlib import Path
@@ -21,7 +21,7 @@ N = 60
 
 @pytest.fixture
 def env(tmp_path: Path) -> Environment:
-    """A floor, and a block where the tool never comes."""
+    """An environment: a floor, and a block that the tool never reaches."""
     env = hapticdb.create(tmp_path / "e.db", GRID)
     write_voxels(env.store, floor_voxels(GRID), "floor")
     write_voxels(env.store, blob(1, (60, 60, 60), 2), "aside")
@@ -29,7 +29,7 @@ def env(tmp_path: Path) -> Environment:
 
 
 def felt(env: Environment, shell: PointShell, exclude: tuple[int, ...] = ()) -> Frames:
-    """A tool that sinks into the floor, turning on its way, and slides along."""
+    """Frames of a tool that sinks into the floor, turns, and slides along."""
     s = np.linspace(0.0, 1.0, N)
     frames = np.zeros(N, dtype=FRAME)
     frames["time"] = s
@@ -48,7 +48,7 @@ def felt(env: Environment, shell: PointShell, exclude: tuple[int, ...] = ()) -> 
 def record(
     path: Path, env: Environment, shell: PointShell, frames: Frames, exclude: tuple[int, ...] = ()
 ) -> Recording:
-    """In chunks of 25 frames."""
+    """Record frames in chunks of 25."""
     header = Header(
         env.url, env.grid, env.store.revision(), shell, 1000.0, law=LAW, exclude=exclude
     )
@@ -121,7 +121,7 @@ def test_an_edit_elsewhere_is_not_felt(env: Environment, session: Recording) -> 
 def test_frames_part_where_an_edit_is_first_felt(
     env: Environment, sphere: PointShell, session: Recording
 ) -> None:
-    """Of a wall that the tool reaches on its way, and of the floor taken away."""
+    """Edits: a new wall that the tool reaches on its way, and the removal of the floor."""
     before = np.concatenate([frames["hits"] for frames in session.frames()])
     i, j, k = np.meshgrid(np.arange(38, 42), np.arange(64), np.arange(64), indexing="ij")
     wall = write_voxels(env.store, np.stack([i, j, k], axis=-1).reshape(-1, 3), "wall")
@@ -182,7 +182,7 @@ def test_the_last_bit_counts(
 def test_what_was_not_felt_is_not_felt_again(
     tmp_path: Path, env: Environment, sphere: PointShell
 ) -> None:
-    """Nor missed when it is gone by then."""
+    """An object that the session left out stays left out, also when it has been removed."""
     through = write_voxels(env.store, floor_voxels(GRID, depth=3), "through")
     session = record(tmp_path / "s.hdbrec", env, sphere, felt(env, sphere, (through,)), (through,))
     assert replay(session, env).is_equal

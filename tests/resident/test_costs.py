@@ -1,4 +1,4 @@
-"""What statements cost is learned in no time: kept, measured nearby, or taken to be all equal."""
+"""Statement costs at a start: stored, measured on a near database, or all taken as equal."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -20,7 +20,7 @@ EQUAL = CostModel.of_equal_parts()
 
 
 class Line:
-    """A line to the database and the clock that only its round trips move."""
+    """A connection with a latency in seconds, and a clock that only its round trips move."""
 
     def __init__(self, latency: float) -> None:
         self.latency = latency
@@ -43,7 +43,7 @@ def env(tmp_path: Path) -> Iterator[Environment]:
 
 @pytest.fixture
 def measured(monkeypatch: pytest.MonkeyPatch) -> list[Store]:
-    """Stores that were calibrated."""
+    """The stores that were calibrated during a test."""
     seen: list[Store] = []
 
     def calibrate(store: Store) -> CostModel:
@@ -84,7 +84,7 @@ def test_who_has_no_time_measures_nothing(env: Environment, measured: list[Store
 
 
 def test_a_start_over_a_slow_line_takes_a_few_round_trips(env: Environment) -> None:
-    """However slow: on 150 ms each, a calibration's hundreds took minutes."""
+    """At 150 ms a round trip, the hundreds of round trips of a calibration took minutes."""
     line = Line(0.15)
     with CellTable.create(LEAST_BUDGET) as table:
         Residency(line.to(env), table, clock=lambda: line.now)

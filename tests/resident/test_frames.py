@@ -1,4 +1,4 @@
-"""A frame against resident cells is the frame against the database, bit for bit."""
+"""A frame against resident cells equals the frame against the database, bit for bit."""
 
 from pathlib import Path
 
@@ -18,7 +18,7 @@ from realtime.worlds import HIERARCHICAL, expected, ids_by_voxel, make, poses_in
 
 
 def cloud(n_points: int, seed: int = 0, extent: float = 0.02) -> PointShell:
-    """Points about the tool's origin, in no order, with normals of all directions."""
+    """A shell of random points about the tool's origin, with random normals."""
     rng = np.random.default_rng(seed)
     normals = rng.normal(size=(n_points, 3))
     normals /= np.linalg.norm(normals, axis=1)[:, None]
@@ -35,7 +35,7 @@ def cloud(n_points: int, seed: int = 0, extent: float = 0.02) -> PointShell:
 def test_frames_are_the_oracles_bit_for_bit(
     tmp_path: Path, layout: Layout, curve: CurveName, bits: int
 ) -> None:
-    """In every kind of environment, inside and beside it, with an object left out, clustered."""
+    """In each layout and curve, inside and outside the grid, with an object left out, clustered."""
     env = make(tmp_path, bits, layout, curve)
     scatter(env, n_voxels=min(8**bits // 4, 4000))
     ids = ids_by_voxel(env)
@@ -65,7 +65,7 @@ def test_frames_are_the_oracles_bit_for_bit(
 @given(st.integers(0, 10_000))
 @settings(deadline=None, max_examples=8)
 def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
-    """However many points are in one, and in whatever order the points are."""
+    """For clusters of any size, and points in any order."""
     env = make(tmp_path_factory.mktemp("clusters"))
     scatter(env, n_objects=2, n_voxels=600, seed=seed)
     rng = np.random.default_rng(seed)
@@ -95,7 +95,7 @@ def test_an_empty_environment_is_felt_as_empty(tmp_path: Path) -> None:
 
 
 def test_a_path_longer_than_the_table_is_felt_in_parts(tmp_path: Path) -> None:
-    """512 cells, nearly all with voxels, through a table of fewer."""
+    """512 cells, nearly all with voxels, in a table with fewer slots."""
     env = make(tmp_path, bits=8)
     rng = np.random.default_rng(0)
     ijk = np.unique(rng.integers(0, 256, (60_000, 3)), axis=0)
@@ -124,7 +124,7 @@ def test_a_tool_larger_than_the_table_is_told_so(tmp_path: Path) -> None:
 
 
 def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Path) -> None:
-    """Small runs of points, far apart: around each are up to eight cells, and its own is one."""
+    """Small clusters far apart: each lies in one cell, and with a margin touches up to eight."""
     env = make(tmp_path, bits=9)
     size = env.grid.voxel_size
     rng = np.random.default_rng(1)

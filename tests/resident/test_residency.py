@@ -1,4 +1,4 @@
-"""What is resident is what the database holds, whatever was loaded, evicted and written before."""
+"""Resident cells equal the database after any loads, evictions and writes."""
 
 import itertools
 import threading
@@ -45,7 +45,7 @@ def voxels_by_cell(env: Environment, exclude: tuple[int, ...] = ()) -> dict[int,
 
 
 def check(residency: Residency, wanted: dict[int, set[Voxel]]) -> int:
-    """Every published cell holds its voxels and nothing else; returns how many are published."""
+    """Assert that every published cell holds exactly its voxels; return how many are published."""
     table = residency.table
     which = table.version % BUFFERS
     entries = np.flatnonzero(table.cells.keys[which] >= 0)
@@ -89,7 +89,7 @@ STEPS = st.lists(
 def test_what_is_resident_is_what_the_database_holds(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
 ) -> None:
-    """After loads and evictions in any order, writes of others, and writers that ended."""
+    """After loads and evictions in any order, writes of others, and new writers."""
     env = make(tmp_path_factory.mktemp("steps"), bits=8)
     scatter(env, n_voxels=800)
     store = open_store(env.url, read_only=True)
@@ -152,7 +152,7 @@ def test_what_is_wanted_stays_and_the_rest_makes_way(tmp_path: Path, table: Cell
 
 
 def test_nothing_is_thrown_out_that_is_wanted_just_now(tmp_path: Path, table: CellTable) -> None:
-    """A tool too large for the table keeps what it has."""
+    """A tool too large for the table keeps the cells that it has."""
     env = full_of_voxels(tmp_path)
     residency = Residency(env.store, table)
     cells = cells_of(env.grid)
@@ -171,7 +171,7 @@ def test_nothing_is_thrown_out_that_is_wanted_just_now(tmp_path: Path, table: Ce
 def test_empty_cells_beyond_number_do_not_push_out_those_at_the_tool(
     tmp_path: Path, table: CellTable
 ) -> None:
-    env = make(tmp_path, bits=9)  # 4096 cells without a voxel
+    env = make(tmp_path, bits=9)  # 4096 cells, all without voxels
     residency = Residency(env.store, table)
     cells = cells_of(env.grid)
     near = cells[:50]
@@ -185,7 +185,7 @@ def test_empty_cells_beyond_number_do_not_push_out_those_at_the_tool(
 
 
 def test_a_write_during_a_load_is_caught_up_with(tmp_path: Path, table: CellTable) -> None:
-    """Both in one version: the new cells, and the known ones anew."""
+    """One version has both: the new cells, and the known cells read again."""
     env = make(tmp_path)
     scatter(env)
     residency = Residency(open_store(env.url, read_only=True), table)
@@ -217,7 +217,7 @@ def test_only_the_most_urgent_cells_are_read_again_and_the_others_forgotten(
 def test_writes_elsewhere_leave_cells_as_they_are(
     tmp_path: Path, table: CellTable, few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However the cells of a write are found."""
+    """For both ways in which the cells of a write are found."""
     monkeypatch.setattr(changes, "FEW_CELLS", few)
     env = full_of_voxels(tmp_path, bits=7)
     second = write_voxels(env.store, block((1, 1, 1), (3, 3, 3)), "second")
@@ -296,7 +296,7 @@ def two_of_one_grid(tmp_path: Path) -> list[Environment]:
 
 
 def test_another_file_of_the_same_grid_makes_all_unknown(tmp_path: Path, table: CellTable) -> None:
-    """Though its writes be of the same numbers."""
+    """Also when both files have the same revisions."""
     env, other = two_of_one_grid(tmp_path)
     write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
     write_voxels(other.store, block((60, 60, 60), (70, 70, 70)))
@@ -311,9 +311,9 @@ def test_another_file_of_the_same_grid_makes_all_unknown(tmp_path: Path, table: 
 def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
     tmp_path: Path, table: CellTable
 ) -> None:
-    """Its environment may have been replaced by one with as many writes, by nobody knows whom.
+    """The environment may since have been replaced by another with as many writes.
 
-    What is urgent is known before and after, and in no version between.
+    Urgent cells are read again within one version, so no version lacks them.
     """
     env, other = two_of_one_grid(tmp_path)
     write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
@@ -376,7 +376,7 @@ def test_a_reader_that_died_in_a_frame_holds_the_writer_up_for_a_moment_only(
 
 
 def shell_of(places: NDArray[np.int64], env: Environment) -> PointShell:
-    """A shell with a point in the middle of each of the voxels, when it is not moved."""
+    """A shell that has, at the identity pose, a point at the centre of each voxel."""
     points = env.grid.centers(places)
     return PointShell(
         points, np.tile([0.0, 0.0, 1.0], (len(points), 1)), np.zeros(3), is_closed=True
@@ -384,10 +384,10 @@ def shell_of(places: NDArray[np.int64], env: Environment) -> PointShell:
 
 
 def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) -> None:
-    """Frames in a thread, while the object moves and the writer loads, evicts and refreshes.
+    """Frames run in a thread while the object moves and the writer loads, evicts and refreshes.
 
-    It has a voxel in each of several cells; all cells have some voxels in common, which must all be
-    there or the cell be unknown.
+    The object has a voxel in each of several cells. Every cell has the same pattern of voxels, of
+    which a frame must hit all or none.
     """
     env = make(tmp_path, bits=8)
     pattern = np.array([[5, 5, 5], [6, 6, 6], [20, 9, 31], [31, 31, 0]])

@@ -1,4 +1,4 @@
-"""Slots and empty cells: who leaves first, and when a slot is used again."""
+"""Slots and empty cells: which is evicted first, and when a slot is used again."""
 
 from collections.abc import Iterator
 
@@ -25,7 +25,7 @@ def table() -> Iterator[CellTable]:
 
 
 def filled(table: CellTable) -> CellSlots:
-    """Slots of which each has a cell, wanted long ago and used by no frame since."""
+    """Full slots, whose cells were wanted long ago and have been used by no frame since."""
     slots = CellSlots(table)
     free = slots.next_free(table.n_slots)
     slots.take(free)
@@ -86,7 +86,7 @@ def test_there_is_nothing_to_evict_while_slots_are_free(table: CellTable) -> Non
 def test_empty_cells_keep_to_their_limit_and_the_urgent_ones_stay(
     arrivals: list[list[int]], urgent: list[int]
 ) -> None:
-    """As long as others can leave; the order of the others is that of their arrival."""
+    """Urgent cells leave only after all others; the others leave in order of arrival."""
     empty = EmptyCells(40)
     held: list[int] = []
     for cells in arrivals:

@@ -1,4 +1,4 @@
-"""A table of cells keeps to its budget, and readers of any process come and go."""
+"""A cell table keeps to its budget; readers of any process join and leave."""
 
 import itertools
 import os
@@ -91,11 +91,11 @@ def test_sixteen_readers_have_rows_of_their_own_and_the_next_is_refused() -> Non
 
 
 def test_a_row_says_nothing_of_who_had_it_before() -> None:
-    """Even if that one ended in the middle of saying something."""
+    """Nothing is left even if the former reader ended in the middle of a write."""
     with CellTable.create(LEAST_BUDGET) as table:
         row = table.join()
         sessions = table.desk.sessions
-        sessions[row] = 3  # all of its fields
+        sessions[row] = 3  # sets all fields of the row
         sessions["sequence"][row] = 5
         table.leave(row)
         assert table.join() == row
@@ -105,9 +105,9 @@ def test_a_row_says_nothing_of_who_had_it_before() -> None:
 
 
 def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
-    """Also while nobody has asked for its status; the living keep what they hold."""
+    """Also for a zombie, whose parent has not waited; living readers keep what they hold."""
     with child([sys.executable, "-c", "pass"]) as gone, CellTable.create(LEAST_BUDGET) as table:
-        until(lambda: not is_alive(gone.pid))  # a zombie
+        until(lambda: not is_alive(gone.pid))  # the process is a zombie
         dead, alive = table.join(), table.join()
         table.desk.pids[dead] = gone.pid
         table.cells.readers[[dead * READER_STRIDE, alive * READER_STRIDE]] = 9

@@ -1,4 +1,4 @@
-"""What a sweep proves: a closed form of a box that moves along an axis is the oracle."""
+"""What a sweep proves, against the closed form of a box that moves along an axis."""
 
 from pathlib import Path
 from typing import Any
@@ -76,7 +76,7 @@ def test_what_comes_out_meets_no_voxel_on_its_way_and_what_keeps_away_comes_out(
     high = np.maximum(start, end) + 0.5 * EDGES
     corner = np.array(placed) * SIZE
     gaps = np.maximum(np.maximum(low - corner - SIZE, corner - high), 0.0)
-    apart = float(np.linalg.norm(gaps, axis=1).min())  # of the whole box swept and any voxel
+    apart = float(np.linalg.norm(gaps, axis=1).min())  # the swept box's distance to any voxel
     if found.verdict == "comes out":
         assert apart > 0.0
         assert found.clearance is not None
@@ -104,7 +104,7 @@ def test_a_rod_between_the_points_is_not_missed(tmp_path: Path, seed: int) -> No
 def test_what_would_decide_does(tmp_path: Path) -> None:
     with scene(tmp_path / "s.db", dot=[(64, 64, 64)]) as env:
         poses = at((MIDDLE + 0.5 * SIZE, MIDDLE + 0.5 * SIZE, MIDDLE + 2.5 * SIZE + 0.04))
-        coarse = sweep(env, box_shell(300), poses)  # the box ends a voxel and a half above the dot
+        coarse = sweep(env, box_shell(300), poses)  # the box is 1.5 voxels above the dot
         assert coarse.verdict == "not decided"
         proof = coarse.proof
         assert proof.cover is not None
@@ -120,7 +120,7 @@ def test_a_shell_of_unknown_cover_comes_out_nowhere(tmp_path: Path) -> None:
     assert (found.hits, found.verdict) == (0, "not decided")
 
 
-# --- what lies inside ----------------------------------------------------------------------------
+# --- objects inside the tool ---------------------------------------------------------------------
 
 INSIDE = [(64, 64, 64), (65, 64, 64)]
 
@@ -150,7 +150,7 @@ def test_an_open_tool_and_a_void_enclose_nothing(tmp_path: Path) -> None:
 
 
 def test_many_voxels_inside_are_found_by_bricks_and_by_voxels(tmp_path: Path) -> None:
-    """A block whose bricks are inside whole, or cut by the limit near the wall."""
+    """A block of which some bricks lie wholly inside the tool, and some only in part."""
     block = [(i, j, k) for i in range(50, 78) for j in range(60, 69) for k in range(62, 67)]
     with scene(tmp_path / "s.db", block=block, far=[(10, 10, 10)]) as env:
         pose = at((MIDDLE, MIDDLE, MIDDLE + 0.5 * SIZE))
@@ -182,8 +182,8 @@ def test_a_ball_knows_its_inside(tmp_path: Path) -> None:
 
 
 def test_each_object_has_its_own_intervals(tmp_path: Path) -> None:
-    """One is in the tool's wall where it starts, and left at once; the other is met later."""
-    begins, end = 20, 20 + round(EDGES[0] / SIZE)  # voxels along x that the tool's box takes up
+    """The tool's wall starts inside one object and leaves it at once; it meets another later."""
+    begins, end = 20, 20 + round(EDGES[0] / SIZE)  # range of voxels along x of the tool's box
     with scene(tmp_path / "s.db", left=[(end - 1, 64, 64)], later=[(begins - 10, 64, 64)]) as env:
         start = np.array([(0.5 * (begins + end) - 0.2) * SIZE, MIDDLE, MIDDLE])
         there = start - np.array([0.3, 0.0, 0.0])
@@ -195,7 +195,7 @@ def test_each_object_has_its_own_intervals(tmp_path: Path) -> None:
         assert left.first_contact is not None
         assert left.first_contact.sample <= 1
         assert left.length == pytest.approx(0.8 * SIZE, abs=0.51 * SIZE)
-        # the front face passes it, and at the end the back face
+        # the front face passes the voxel, and at the end the back face does
         assert later.first == pytest.approx(8.8 * SIZE / 0.3, abs=0.51 * SIZE / 0.3)
         assert len(later.intervals) == 2
         again = sweep(env, shell, at(start, there, start)).objects

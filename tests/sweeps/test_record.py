@@ -1,4 +1,4 @@
-"""A sweep's result in words and for JSON: what a program reads is what the sweep found."""
+"""A sweep's result as text and as JSON: both say what the sweep found."""
 
 import json
 from collections.abc import Iterator
@@ -37,7 +37,7 @@ THROUGH = path((0.2, 0.6, 0.6), (1.0, 0.6, 0.6))
 
 @pytest.fixture
 def env(tmp_path: Path) -> Iterator[Environment]:
-    """A plate of one voxel's thickness, across the way."""
+    """An environment: a plate of one voxel's thickness across the tool's path."""
     with hapticdb.create(tmp_path / "plate.db", GRID) as made:
         ijk = np.stack(np.meshgrid([60], range(50, 70), range(50, 70), indexing="ij"), axis=-1)
         ijk = ijk.reshape(-1, 3)

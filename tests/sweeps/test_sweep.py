@@ -1,4 +1,4 @@
-"""A path as a batch, against plain Python: samples, hits, objects, clearance."""
+"""Sweeps of a path, against plain Python: samples, hits, objects, clearance."""
 
 import itertools
 from collections.abc import Iterator
@@ -61,12 +61,12 @@ def ball(n_points: int = 24, radius: float = 0.024, center: Any = (0, 0, 0)) -> 
 
 
 def block(low: Any, high: Any) -> Voxels:  # noqa: ANN401
-    """Voxels low .. high, the last left out."""
+    """Voxels (n, 3) from `low` to `high`, `high` excluded."""
     axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-# a wall with a hole across the way, a plate above, and a post that shares voxels with the wall
+# a wall with a hole across the path, a plate above, and a post that shares voxels with the wall
 WALL = np.array(
     [v for v in block((80, 40, 40), (82, 90, 90)) if not (60 <= v[1] < 68 and 60 <= v[2] < 68)]
 )
@@ -109,7 +109,7 @@ def naive(shell: PointShell, pose: Floats, exclude: tuple[int, ...] = ()) -> Nai
 
 
 def naive_clearance(shell: PointShell, poses: Floats, exclude: tuple[int, ...] = ()) -> float:
-    """Least distance of any point at any pose to the box of any occupied voxel, metres."""
+    """Least distance in metres of any point at any pose to the cube of any occupied voxel."""
     voxels = [v for v, ids in IDS_IN.items() if set(ids) - set(exclude)]
     low = np.array(GRID.origin) + SIZE * np.array(voxels, dtype=float)
     least = np.inf
@@ -163,7 +163,7 @@ def test_samples_are_rigid_and_blocks_of_them_are_the_same(poses: list[Any]) -> 
 
 
 def test_a_tool_far_from_its_origin_turns_about_its_middle() -> None:
-    """Where the file has its origin changes nothing: half a turn sweeps no arc of metres."""
+    """The file's origin does not matter: half a turn does not move the tool along a wide arc."""
     near, far = ball(), ball(center=(5.0, 0.0, 0.0))
     start, end = pose_of((0, 0, 0)), pose_of((0, 0, 0), (0, 0, 0, 1))
     shift = pose_of((-5.0, 0.0, 0.0))
@@ -259,7 +259,7 @@ def test_an_object_in_the_same_brick_is_not_hit(env: Environment) -> None:
 
 
 def test_hits_near_one_another_are_one_interval(env: Environment) -> None:
-    """Through the wall twice: there and back."""
+    """The tool passes through the wall twice, there and back; each pass is one interval."""
     far = 0.3
     found = sweep(env, ball(), line((0, -0.1, 0), (far, -0.1, 0), (0, -0.1, 0)))
     hits = [bool(naive(ball(), pose).hits) for pose in samples_of(found)]
@@ -322,7 +322,7 @@ def test_clearance_that_is_not_asked_for_is_not_given(env: Environment) -> None:
 
 
 def test_clearance_says_what_it_means_for_surfaces(env: Environment) -> None:
-    """A voxel and a half from the wall's box: its surface is at most a diagonal deeper."""
+    """1.5 voxels from the wall's voxels; the surface lies at most a voxel's diagonal deeper."""
     shell = PointShell(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), np.zeros(3), cover=0.002)
     place = env.grid.centers([[78, 60, 50]])[0]
     aside = place - (0.0, 0.25 * SIZE, 0.0)
@@ -348,7 +348,7 @@ def test_beside_the_grid_nothing_is_hit_and_the_border_counts(env: Environment) 
 
 
 def test_the_least_budget_finds_the_same(tmp_path: Path) -> None:
-    """A grid of many cells, of which the table holds few."""
+    """The grid has many cells, and the cell table holds few of them."""
     grid = Grid(0.002, (0.0, 0.0, 0.0), 10)
     spots = np.random.default_rng(3).integers(0, 1024, (4000, 3))
     shell = ball(60, 0.05)
@@ -430,7 +430,7 @@ def test_wrong_use_is_refused(env: Environment, tmp_path: Path) -> None:
 
 @pytest.fixture
 def boxes(tmp_path: Path) -> Iterator[Environment]:
-    """A small box that stands a few voxels above a large one, both mirrored and scaled by two."""
+    """A small box a few voxels above a large box, both mirrored and scaled by two."""
     scene = trimesh.Scene()
     doubled = np.diag([-2.0, 2.0, 2.0, 1.0])
     for name, side, height in (("small", 0.05, 0.1), ("large", 0.2, -0.11)):

@@ -66,7 +66,7 @@ class Leftovers:
             self._forked.add(found)
 
     def end(self) -> None:
-        """End all processes and remove all folders, until no process is found twice in a row."""
+        """End processes until two searches in a row find none; then remove all folders."""
         deadline = time.monotonic() + PATIENCE_S
         mark = f"HAPTICDB_TEST_RUN={self._run}"
         n_quiet, asked, folders = 0, set[int](), set[Path]()
@@ -106,7 +106,7 @@ def watch(parent: int, leftovers: Leftovers) -> None:
     """Read the input until it ends or the parent has ended."""
     rest = b""
     while True:
-        is_orphan = os.getppid() != parent  # before the read: an ended parent's lines are in the pipe
+        is_orphan = os.getppid() != parent  # asked before the last read of the pipe
         ready, _, _ = select.select([0], [], [], 0 if is_orphan else TICK_S)
         if ready:
             read = os.read(0, 1 << 16)

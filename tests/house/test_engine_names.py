@@ -35,7 +35,7 @@ def imported(path: Path) -> Iterator[str]:
 
 
 def branches_on_engines(source: str) -> Iterator[str]:
-    """Comparisons with an engine's name, and calls of `startswith` with one."""
+    """Comparisons with an engine's name, and methods of `ASKS_OF_TEXT` called with one."""
     engine = re.compile("sqlite|postgres", re.IGNORECASE)
     for node in ast.walk(ast.parse(source)):
         asked: list[ast.expr] = []

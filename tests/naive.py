@@ -1,7 +1,7 @@
-"""The oracle: what the kernels compute, in plain Python, slow and meant to be obviously right.
+"""The oracle: plain Python versions of the kernels, slow and meant to be obviously right.
 
-Numbers are exact here. Every float is a whole number over a power of two, so that predicates on
-integers decide without rounding what the kernels decide in float64.
+Numbers are exact here. Every float is an integer divided by a power of two, so tests on integers
+decide without rounding what the kernels decide in float64.
 """
 
 from collections.abc import Iterable, Sequence
@@ -55,15 +55,15 @@ def dot(a: Vector, b: Vector) -> int:
 
 
 def difference(a: Vector, b: Vector) -> Vector:
-    """From b to a."""
+    """Vector from b to a."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
 def separating_axes(corners: Sequence[Vector], one: int) -> list[Vector]:
-    """The 13 axes of triangle against box, less the null ones. `one` is the length of a voxel.
+    """The 13 axes of triangle against box, without null axes. `one` is the length of a voxel.
 
-    Null is a cross product of edge and box normal up to 1e-30 voxel long, and a normal of up to
-    2^-50 of the longest edge's square.
+    An axis is null if it is a cross product of an edge and a box normal up to 1e-30 voxel long, or
+    the triangle's normal with a length of up to 2^-50 of the longest edge's square.
     """
     box_normals = [(1, 0, 0), (0, 1, 0), (0, 0, 1)]
     a, b, c = corners
@@ -89,7 +89,7 @@ def voxels_of_triangle(triangle: Triangle, bits: int, touch: Fraction = TOUCH) -
     one = max(x.denominator for corner in exact for x in corner)
     corners = [(int(x * one), int(y * one), int(z * one)) for x, y, z in exact]
 
-    # each axis: the triangle's shadow, the shadow of the voxel at 0, and the slack, squared
+    # for each axis: the triangle's shadow, the shadow of the voxel at 0, the squared slack
     shadows = []
     for axis in separating_axes(corners, one):
         values = [dot(axis, corner) for corner in corners]
@@ -97,7 +97,7 @@ def voxels_of_triangle(triangle: Triangle, bits: int, touch: Fraction = TOUCH) -
         high = sum(max(x, 0) for x in axis) * one
         slack = floor(touch**2 * dot(axis, axis) * one**2)
         shadows.append((axis, min(values), max(values), low, high, slack))
-    # the axis that tells most voxels apart goes first; the order changes nothing else
+    # the axis that separates most voxels comes first, for speed only
     shadows.reverse()
 
     def meets(voxel: Voxel) -> bool:
@@ -119,7 +119,7 @@ def voxels_of_triangle(triangle: Triangle, bits: int, touch: Fraction = TOUCH) -
 def voxels_of_triangles(
     triangles: Iterable[Triangle], bits: int, touch: Fraction = TOUCH
 ) -> set[Voxel]:
-    """Voxels that any of the triangles meets."""
+    """Voxels that at least one of the triangles meets."""
     return set().union(*(voxels_of_triangle(triangle, bits, touch) for triangle in triangles))
 
 

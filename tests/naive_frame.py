@@ -1,7 +1,7 @@
-"""One frame in plain Python: slow, obviously right. The oracle of every strategy.
+"""One frame in plain Python, slow and obviously right: the oracle of every strategy.
 
-Sums and products are written in the order that hapticdb promises, so the wrench is the same bit
-for bit; the hits come from a plain set.
+Sums and products are in the order that hapticdb promises, so the wrench is the same bit for bit.
+The hits come from a plain set.
 """
 
 import math
@@ -14,7 +14,7 @@ Voxel = tuple[int, int, int]
 
 @dataclass
 class NaiveTouch:
-    """What a frame must find."""
+    """The result that a frame must have."""
 
     force: Triple
     torque: Triple
@@ -32,7 +32,7 @@ class NaiveTouch:
 
 
 def transform(pose: list[list[float]], v: Triple, *, shift: bool) -> Triple:
-    """Turn v by a pose, and shift it when it is a point."""
+    """Turn v by a pose; if v is a point, shift it, too."""
     turned = [row[0] * v[0] + row[1] * v[1] + row[2] * v[2] for row in pose[:3]]
     if shift:
         turned = [t + row[3] for t, row in zip(turned, pose, strict=False)]

@@ -1,4 +1,4 @@
-"""Cells and their directory stand against a dictionary and a plain set of voxels."""
+"""Cells and their directory are compared with a dictionary and a plain set of voxels."""
 
 from itertools import product
 
@@ -21,7 +21,7 @@ CAPACITY = 16
 
 
 def colliding(count: int) -> list[int]:
-    """Keys that a directory of 16 entries looks for at its end, so that their run goes round."""
+    """Keys whose search begins at the end of a directory of 16 entries, so that it wraps around."""
     ijk = np.random.default_rng(0).integers(0, 1 << 15, (4000, 3))
     keys = [cell_key(i, j, k) for i, j, k in (ijk << 5).tolist()]
     at_end = [int(key) for key in keys if spread_key(np.int64(key), CAPACITY) >= CAPACITY - 2]
@@ -58,7 +58,7 @@ def test_a_directory_is_a_dictionary_however_keys_collide(
 def filled(
     grid: Grid, layout: Layout, objects: list[NDArray[np.int64]], exclude: list[int]
 ) -> tuple[dict[int, set[Voxel]], dict[int, set[Voxel]]]:
-    """Voxels of each cell, by `fill_cells` from rows, and origins of the bricks of its mask."""
+    """Voxels that `fill_cells` puts into each cell, and origins of the bricks in its mask."""
     parts = [rows_of_voxels(ijk, grid, layout) for ijk in objects]
     keys = np.concatenate([rows.keys for rows in parts])
     ids = np.repeat(np.arange(1, len(parts) + 1), [len(rows) for rows in parts])
@@ -103,7 +103,7 @@ def filled(
 def test_cells_hold_the_voxels_of_their_rows(
     layout: Layout, curve: CurveName, bits: int, seed: int, n_left_out: int
 ) -> None:
-    """Also at the grid's border, in grids smaller than a cell, without the excluded objects."""
+    """This holds at the grid's border, in grids smaller than a cell, and with excluded objects."""
     grid = Grid(0.01, (0.0, 0.0, 0.0), bits, curve)
     rng = np.random.default_rng(seed)
     corners = np.array([[0, 0, 0], [grid.side - 1] * 3])
@@ -128,7 +128,7 @@ def test_cells_hold_the_voxels_of_their_rows(
 @given(st.integers(0, 1000), st.integers(1, 30))
 @settings(deadline=None, max_examples=40)
 def test_cells_met_are_those_of_the_points(seed: int, most: int) -> None:
-    """Of as many poses as have no more cells than asked for, and of the first in any case."""
+    """The first pose always counts, further poses while there are at most `most` cells."""
     grid = Grid(0.01, (0.0, 0.0, 0.0), 8)
     rng = np.random.default_rng(seed)
     points = np.hstack([rng.normal(0, 0.2, (40, 3)), np.zeros((40, 3))])

@@ -22,7 +22,7 @@ ONE_CELL[0][:, 1] = -1
 
 
 def a_cell(*occupied: tuple[int, int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Arrays of a table that knows one cell, at the grid's origin."""
+    """Arrays of a cell table with one resident cell, at the grid's origin."""
     keys, slots, words = (array.copy() for array in ONE_CELL)
     for i, j, k in occupied:
         words[1, (i << 5) | j] |= np.uint32(1 << k)
@@ -47,7 +47,7 @@ def test_an_anchor_is_found_again_from_its_code(
 def test_an_anchor_never_changes_sides(
     start: tuple[int, int], steps: list[tuple[int, int, int]]
 ) -> None:
-    """Over any walk that may be made, from above a sheet."""
+    """The walk begins above a sheet and makes every step that is allowed."""
     cells = a_cell(*SHEET)
     at = np.array([8, 8, 8])
     anchor = np.array([8 + start[0], 8 + start[1], 9])

@@ -1,4 +1,4 @@
-"""The three curves against definitions bit by bit in plain Python, and what makes them curves."""
+"""The three curves: compared with bitwise definitions in plain Python, and their properties."""
 
 from collections.abc import Callable
 from itertools import pairwise, product
@@ -19,8 +19,8 @@ CURVES = {"lexicographic": LEXICOGRAPHIC, "z": Z_ORDER, "hilbert": HILBERT}
 HIERARCHICAL = [Z_ORDER, HILBERT]
 LAST = (1 << 21) - 1
 
-# The Hilbert curve as eight copies of itself: the octant of each copy in the order of the path,
-# the axis that each of its own axes is taken from, and which of its axes run backwards.
+# The Hilbert curve consists of eight copies of itself. For each copy, in the order of the path: its
+# octant, the axis from which each of its own axes is taken, and which of its axes run backwards.
 COPIES: list[tuple[Voxel, Voxel, Voxel]] = [
     ((0, 0, 0), (1, 2, 0), (0, 0, 0)),
     ((0, 0, 1), (1, 0, 2), (0, 0, 0)),
@@ -34,7 +34,7 @@ COPIES: list[tuple[Voxel, Voxel, Voxel]] = [
 
 
 def lexicographic(key: int, bits: int) -> Voxel:
-    """Voxel of a key that counts k fastest and i slowest."""
+    """Voxel of a lexicographic key: k changes fastest, i slowest."""
     rest, k = divmod(key, 2**bits)
     i, j = divmod(rest, 2**bits)
     return i, j, k
@@ -180,7 +180,7 @@ def test_neighbours_on_a_long_hilbert_curve_share_a_face(bits: int, at: float) -
 def test_leading_bits_name_the_cube_that_holds_the_voxel(
     chosen: tuple[int, list[list[int]]], curve: int
 ) -> None:
-    """On the same curve of fewer bits: down to the whole grid, whose key is 0."""
+    """The cube's key is on the same curve with fewer bits; the whole grid has key 0."""
     bits, voxels = chosen
     keys = encode(np.array(voxels), bits, curve)
     for level in range(1, bits):
@@ -190,7 +190,7 @@ def test_leading_bits_name_the_cube_that_holds_the_voxel(
 
 @hierarchical
 def test_the_voxels_of_a_cube_have_neighbouring_keys(curve: int) -> None:
-    """What a brick's single key stands on."""
+    """Because of this property a brick needs only one key."""
     keys = encode(cube(3) + np.array([8, 24, 16]), 5, curve)
     assert all(b - a == 1 for a, b in pairwise(sorted(keys.tolist())))
 

@@ -1,4 +1,4 @@
-"""Expected rows and key ranges against plain definitions, on small grids by brute force."""
+"""Expected rows and key ranges, compared with plain definitions by brute force on small grids."""
 
 from fractions import Fraction
 from itertools import pairwise, product
@@ -19,7 +19,7 @@ LAST_KEY = 2**63 - 1
 BITS = 4
 SIDE = 1 << BITS
 
-# a few values, so that bounds coincide and ends fall on them; and the whole width of a key
+# few values, so that bounds coincide and ends fall on bounds; and the whole width of a key
 small = st.integers(0, 40)
 large = st.integers(0, LAST_KEY)
 
@@ -29,9 +29,9 @@ def bounds_of(values: st.SearchStrategy[int]) -> st.SearchStrategy[list[int]]:
 
 
 def expected_rows(left: int, right: int, bounds: list[int], per_bucket: Fraction) -> Fraction:
-    """Sum over the buckets of overlap / width with [left, right + 1), exact.
+    """Exact sum over the buckets of overlap with [left, right + 1) divided by width.
 
-    A bucket of zero width counts whole if its value lies in the range.
+    A bucket of zero width counts fully if its value lies in the range.
     """
     total = Fraction(0)
     for low, high in pairwise(bounds):
@@ -59,7 +59,7 @@ def test_expected_rows_are_the_overlaps_over_the_widths(
     left, right = sorted(ends)
     wanted = expected_rows(left, right, bounds, Fraction(eighths, 8))
     found = gap_rows(left, right, as_keys(bounds), eighths / 8)
-    # a difference of two sums, each as large as all rows
+    # the result is a difference of two sums, each up to the number of all rows
     assert found == pytest.approx(float(wanted), rel=1e-12, abs=1e-13 * eighths * len(bounds))
 
 
@@ -69,7 +69,7 @@ def test_expected_rows_are_the_overlaps_over_the_widths(
     cuts=st.lists(small, min_size=3, max_size=8, unique=True).map(sorted),
 )
 def test_rows_of_neighbouring_ranges_add(bounds: list[int], cuts: list[int]) -> None:
-    """Ranges are half-open inside, so no key counts twice or never."""
+    """Ranges are half-open internally, so each key counts exactly once."""
     keys = as_keys(bounds)
     whole = gap_rows(cuts[0], cuts[-1] - 1, keys, 2.0)
     parts = sum(gap_rows(low, high - 1, keys, 2.0) for low, high in pairwise(cuts))
@@ -86,7 +86,7 @@ def test_an_empty_range_holds_no_rows(bounds: list[int], ends: tuple[int, int]) 
 @pytest.mark.parametrize(
     ("left", "right", "wanted"),
     [
-        (5, 5, 2.2),  # two buckets of zero width, and a fifth of the one that begins there
+        (5, 5, 2.2),  # two buckets of zero width, and a fifth of the bucket from 5 on
         (4, 5, 2.4),
         (4, 4, 0.2),
         (6, 9, 0.8),
@@ -125,7 +125,7 @@ corners = st.lists(st.integers(0, SIDE - 1), min_size=3, max_size=3)
 
 
 def cubes_met(low: NDArray[np.int64], high: NDArray[np.int64], finest: int) -> int:
-    """How many aligned cubes of 2^finest voxels an edge a box meets."""
+    """Number of aligned cubes with an edge of 2^finest voxels that a box meets."""
     return int(np.prod((high >> finest) - (low >> finest) + 1))
 
 
@@ -135,7 +135,7 @@ def voxels_between(low: NDArray[np.int64], high: NDArray[np.int64]) -> NDArray[n
 
 
 def covered(ranges: NDArray[np.int64]) -> list[int]:
-    """Every key in the ranges, ascending, as often as it is covered."""
+    """All keys of the ranges, ascending; a key in several ranges is repeated."""
     return sorted(key for low, high in ranges.tolist() for key in range(low, high + 1))
 
 
@@ -145,7 +145,7 @@ def covered(ranges: NDArray[np.int64]) -> list[int]:
 def test_a_box_is_covered_by_the_cubes_that_it_meets(
     curve: int, a: list[int], b: list[int], finest: int
 ) -> None:
-    """Exactly so, each key once; whole where the cubes are single voxels."""
+    """Each key is covered once. Cubes of one voxel cover the box exactly."""
     low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
     ranges = ranges_of_box(low, high, BITS, curve, finest)
     keys = covered(ranges)
@@ -187,7 +187,7 @@ def test_the_whole_grid_lies_in_its_ranges(curve: int, bits: int) -> None:
 
 @pytest.mark.parametrize("curve", [Z_ORDER, HILBERT], ids=["z", "hilbert"])
 def test_ranges_grow_with_the_surface_of_a_box_and_not_with_its_volume(curve: int) -> None:
-    """A box of M cubes an edge: the outer two layers one by one, the rest in larger ones."""
+    """Box of M cubes an edge: one range a cube in the two outer layers, larger cubes inside."""
     low = np.array([1, 1, 1], dtype=np.int64)
     for n_cubes in (16, 32, 64):
         high = np.full(3, 8 * n_cubes - 2, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Where a hand may be: the kernel, with the JIT and without."""
+"""The poses and velocities that a hand may have: the kernel, with the JIT and without."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""How hands move: the kernels beside closed forms, with the JIT and without."""
+"""Motion of hands: the kernels compared with closed forms, with the JIT and without."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""Layouts of records: who writes what, and where."""
+"""Layouts of records: which process writes which field, and in which cache line."""
 
 import numpy as np
 import pytest

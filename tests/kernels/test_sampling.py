@@ -1,4 +1,4 @@
-"""The kernels of sampling against slow, plain forms of the same."""
+"""The kernels of sampling, compared with slow, plain versions."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -14,7 +14,7 @@ def test_elimination_drops_the_most_crowded_every_time(seed: int, n_keep: int) -
     points = np.concatenate((rng.random((80, 2)), np.zeros((80, 1))), axis=1)
     face_of = rng.integers(0, 2, 80).astype(np.int32)
     normals = np.array([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
-    reach = 0.6  # each sees many others: two that saw only one another would tie
+    reach = 0.6  # each point has many neighbours: two with only each other would have equal weights
     nearest = reach * (1.0 - (n_keep / 80) ** 1.5) * 0.65
     scale = np.where(face_of[:, None] == face_of, 1.0, 0.35)
     distances = np.linalg.norm(points[:, None] - points, axis=2)
@@ -24,7 +24,7 @@ def test_elimination_drops_the_most_crowded_every_time(seed: int, n_keep: int) -
     while alive.sum() > n_keep:
         load = np.where(alive, weights @ alive, -1.0)
         if load.max() < 1e-12:
-            return  # none is crowded: any may go
+            return  # no candidate is crowded: any of them may be dropped
         alive[np.argmax(load)] = False
     chosen = sampling.spread_points(points, face_of, normals, n_keep, reach)
     assert np.array_equal(chosen, np.flatnonzero(alive))

@@ -1,4 +1,4 @@
-"""The lines that tell a surface's inside against slow, plain forms of the same."""
+"""The lines that find the inside of a surface, compared with slow, plain versions."""
 
 import numpy as np
 from hypothesis import given, settings
@@ -11,7 +11,7 @@ Floats = NDArray[np.float64]
 
 
 def line_triangle(origin: Floats, direction: Floats, triangle: Floats) -> float:
-    """Signed distance to the crossing, by a linear system; NaN where there is none."""
+    """Signed distance to the crossing, by a linear system; NaN without a crossing."""
     along, across = triangle[1] - triangle[0], triangle[2] - triangle[0]
     u, v, t = np.linalg.solve(np.stack((along, across, -direction), axis=1), origin - triangle[0])
     return float(t) if min(u, v) >= 0.0 and u + v <= 1.0 else np.nan

@@ -1,4 +1,4 @@
-"""Voxelizing against the exact oracle of naive.py, on random, degenerate and border cases."""
+"""Voxelizing, compared with the exact oracle in naive.py: random, degenerate and border cases."""
 
 from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
@@ -18,7 +18,7 @@ JIT = not numba.config.DISABLE_JIT
 few = settings(max_examples=150 if JIT else 20, deadline=None)
 Triangles = NDArray[np.float64]
 
-# quarters meet the voxels' faces, edges and vertices; the range leaves the grid on both sides
+# quarters often lie on voxels' faces, edges and vertices; the range exceeds the grid on both sides
 quarters = st.integers(-8, 40).map(lambda n: n / 4)
 corner = st.tuples(quarters, quarters, quarters)
 triangle = st.tuples(corner, corner, corner)
@@ -26,7 +26,7 @@ triangles = st.lists(triangle, min_size=1, max_size=4).map(lambda rows: np.array
 
 
 def voxels(tris: Triangles, bits: int) -> set[Voxel]:
-    """Voxels that the kernel marks, by way of the bricks."""
+    """Voxels that the kernel marks, read from its bricks."""
     rows = brick_voxels(*voxelize(tris, bits)).tolist()
     found = {(i, j, k) for i, j, k in rows}
     assert len(found) == len(rows)
@@ -34,13 +34,13 @@ def voxels(tris: Triangles, bits: int) -> set[Voxel]:
 
 
 def rectangle(a: list[float], b: list[float], c: list[float]) -> Triangles:
-    """Build two triangles: the parallelogram of corner a and its neighbours b and c."""
+    """Two triangles that form the parallelogram of corner a and its neighbours b and c."""
     p, q, r = np.array(a), np.array(b), np.array(c)
     return np.array([[p, q, r], [q, q + r - p, r]])
 
 
 def random_triangles(seed: int, count: int, size: float, edge: float) -> Triangles:
-    """Triangles of about that size, their middles anywhere in the grid."""
+    """Triangles of about that size, with their middles anywhere in the grid."""
     rng = np.random.default_rng(seed)
     middles = rng.uniform(0, edge, (count, 1, 3))
     return middles + rng.uniform(-0.5, 0.5, (count, 3, 3)) * size
@@ -70,7 +70,7 @@ def test_random_triangles_equal_the_oracle(size: float, count: int) -> None:
 def test_flattened_triangles_equal_the_oracle(
     tri: tuple[tuple[float, ...], ...], order: list[int], planes: int, between: float
 ) -> None:
-    """Segments, points and triangles in border planes, square to the axes and not."""
+    """Segments, points, and triangles in border planes, along the axes and oblique."""
     corners = np.array(tri)
     for axis in range(3):
         if planes >> axis & 1:
@@ -98,7 +98,7 @@ def test_slivers_equal_the_oracle(
     aside: tuple[float, ...],
     order: list[int],
 ) -> None:
-    """Triangles with a corner 2^-4 to 2^-56 voxel beside a side; near the tolerance, bracketed."""
+    """One corner is 2^-4 to 2^-56 voxel from the opposite side; bracketed near the tolerance."""
     a, b = np.array(tri[0]), np.array(tri[1])
     sliver = np.array([a, b, a + between * (b - a) + 2.0**exponent * np.array(aside)])[order]
     found = voxels(sliver[None], 3)
@@ -108,7 +108,7 @@ def test_slivers_equal_the_oracle(
 
 @pytest.mark.parametrize("seed", range(3))
 def test_tilted_large_triangles_equal_the_oracle(seed: int) -> None:
-    """More columns than are buffered at once, and more bricks than the table first holds."""
+    """They have more columns than one buffer and more bricks than a new table has room for."""
     rng = np.random.default_rng(seed)
     edge = 64.0 if JIT else 48.0
     tri = np.array([[edge, 0, 0], [0, edge, 0], [0, 0, edge]]) + rng.uniform(-3, 3, (3, 3))
@@ -193,7 +193,7 @@ def test_threads_do_not_matter() -> None:
 def test_a_shift_by_whole_voxels_shifts_the_voxels(
     tris: Triangles, shift: tuple[int, int, int]
 ) -> None:
-    tris = tris + 4  # clear of the lower border
+    tris = tris + 4  # away from the lower border
     shifted = voxels(tris + np.array(shift, np.float64), 21)
     assert shifted == {(i + shift[0], j + shift[1], k + shift[2]) for i, j, k in voxels(tris, 5)}
 
@@ -232,7 +232,7 @@ def test_a_needle_through_the_grid_marks_what_it_passes(axis: int) -> None:
 def test_a_diagonal_through_the_grid_costs_its_length() -> None:
     bits = 18 if JIT else 9
     diagonal = np.array([[[0.0] * 3, [2.0**bits] * 3, [2.0**bits] * 3]])
-    # n voxels on the diagonal, and at each of the n - 1 vertices between them the six others
+    # n voxels on the diagonal, and six more at each of the n - 1 vertices between them
     assert count_voxels(voxelize(diagonal, bits)[1]) == 2**bits + 6 * (2**bits - 1)
 
 

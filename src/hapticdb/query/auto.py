@@ -1,4 +1,4 @@
-"""The strategy `auto`: one lookup of all keys, or ranges where many keys share few of them."""
+"""The strategy `auto`: one lookup of all keys, or a scan of ranges if few ranges hold many keys."""
 
 from collections.abc import Callable
 
@@ -8,13 +8,13 @@ from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import HasGroupingThreshold, Keys, Store
 
 DEFAULT_THRESHOLD = 1024
-"""Distinct keys of a frame from which `auto` groups, on engines that do not say.
+"""Distinct keys of a frame from which `auto` groups, on engines that set no number of their own.
 
 Measured on SQLite. A smaller value groups more frames whose lookup would have been faster; a larger
 one leaves more large frames to a lookup that is up to 1.1 times slower than their ranges."""
 KEYS_PER_RANGE = 2
 """Mean keys of a range from which `auto` scans ranges. A larger value scans fewer frames: a range
-costs more than a key of a lookup, so that ranges of one key each would be slower."""
+costs more than a key of a lookup, so ranges of one key each would be slower."""
 
 
 def grouping_threshold(store: Store) -> int | None:

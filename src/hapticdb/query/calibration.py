@@ -24,9 +24,9 @@ from hapticdb.store.base import (
 )
 
 CAUTIONS = tuple(2.0**n for n in range(-2, 8))
-"""Values that are tried for `CostModel.caution`."""
+"""Candidate values of `CostModel.caution`; the one with the least cost is used."""
 TOO_MANY_ROWS = 20_000
-"""Rows of a statement above which its ranges are not timed: no frame reads so many. A larger value
+"""Rows of a statement above which it is not timed, because no frame reads so many. A larger value
 makes calibrating slower."""
 
 
@@ -49,27 +49,27 @@ def calibrate(
     """Measure what queries cost on this database, in real scans around its own surface.
 
     Spheres of shell points of several sizes are placed on occupied voxels drawn by the quantile
-    vector, asked for in every form, and the medians of their times fitted by least squares with
-    non-negative figures.
+    vector. Each sphere is asked for in every form of query, and the medians of the times are fitted
+    by least squares with non-negative figures.
 
     Parameters
     ----------
     store : Store
         An environment with at least one row.
     seed : int
-        Of the drawn places.
+        Seed of the random places.
     repeats : int
-        Timings of each form at each place, of which the median is used, after a run untimed.
+        Timings of each form at each place, after an untimed run. Their median is used.
     budget : float
-        Seconds after which no further place is measured (at least 12 are).
+        Seconds after which no further place is measured. At least 12 places are measured.
     cold : bool
-        Empty all caches before each query: what frames cost where the hand has not been before.
+        Empty all caches before each query, to measure frames at places that are new to the hand.
 
     Raises
     ------
     UsageError
-        When the environment is empty, or cold figures are asked of a server, whose caches are its
-        own.
+        When the environment is empty, or when cold is asked of a server, whose caches hapticdb
+        cannot empty.
     """
     size = store.size()
     if size.rows == 0:
@@ -115,7 +115,7 @@ class _Trials:
         self._under_keys = np.zeros(2)
 
     def measure(self, probe: _Probe) -> None:
-        """Ask for one shell in every form."""
+        """Time every form of query for one shell."""
         store = self._store
         for gap in (0, 1 << 9, 1 << 13, 1 << 16):
             lows, highs = grouping.group_by_gap(probe.keys, probe.first, probe.last, gap)
@@ -164,7 +164,7 @@ class _Trials:
         return statistics.median(times) / 1000
 
     def _groupings(self) -> list[tuple[float, ...]]:
-        """Times of grouping by cost. Places take turns: a processor learns keys that it repeats."""
+        """Times of grouping by cost. Places take turns, since repeated keys are faster to group."""
         equal = CostModel.of_equal_parts()
         times = np.empty((self._repeats + 1, len(self._keys)))
         for row in times:
@@ -176,13 +176,13 @@ class _Trials:
         return [(1, len(keys), us) for keys, us in zip(self._keys, medians, strict=True)]
 
     def fit(self, rows_per_block: float) -> CostModel:
-        """Least squares over all that was measured."""
+        """Fit the cost model to all timings by least squares."""
         if not self._scans:  # every statement had more than `TOO_MANY_ROWS`
             return CostModel.of_equal_parts()
         (statement, descent, scanned), s_scan = _least_squares(self._scans)
         (_, _, counted), s_count = _least_squares(self._counts)
         counted = min(counted, scanned)
-        # What a row costs the client is what scanning costs beyond counting in the engine.
+        # A row's cost to the client is the cost of scanning it minus that of counting it.
         row = scanned - counted
         # Keys and rows of lookups are correlated, so the cost of a row is that of the scans.
         keyed = [(*n, max(us - row * rows, us / 10)) for *n, rows, us in self._lookups]
@@ -231,10 +231,10 @@ def _cautious(
     count: Callable[[Keys, Keys], int],
     under_keys: float,
 ) -> CostModel:
-    """Return the model with the caution that would have cost least for some frames.
+    """Return the model with the caution that costs least over the given frames.
 
-    frames : keys (U,) of each; count : returns how many rows ranges hold; under_keys : rows under
-    the keys of all frames.
+    frames : row keys (U,) of each frame; count : returns the number of rows in ranges;
+    under_keys : number of rows under the keys of all frames.
     """
     trials = []
     for caution in CAUTIONS:
@@ -246,14 +246,14 @@ def _cautious(
             rows += count(lows, highs)
             expected += in_gaps
         cost = model.descent * ranges + model.row_scanned * rows
-        # Of equal costs the greater caution, which reads fewer rows.
+        # Of two equal costs the greater caution is taken: it reads fewer rows.
         trials.append((cost, -caution, rows, expected))
     _, caution, rows, expected = min(trials)
     return replace(model, caution=-caution, crowding=_ratio(rows - under_keys, expected))
 
 
 def _ratio(found: float, expected: float) -> float:
-    """Rows found over rows expected; 1 where none are expected."""
+    """Rows found divided by rows expected; 1 when no rows are expected."""
     return max(found, 0.0) / expected if expected > 0 else 1.0
 
 
@@ -294,10 +294,10 @@ def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
         radius = min(grid.voxel_size * (12, 8, 4, 24)[n % 4], grid.edge / 4)
         normals = -fibonacci_sphere(n_points)
         points = -normals * radius
-        # Read-only, as the arrays of a PointShell: others would compile one more signature.
+        # Read-only like the arrays of a PointShell: writable arrays would compile a new signature.
         points.flags.writeable = normals.flags.writeable = False
         pose = np.eye(4)
-        # A tool lies on a surface or a little below it: half inside, its gaps would hold more.
+        # A tool lies on a surface or just below it; farther inside, gaps would hold more rows.
         away = rng.normal(size=3)
         pose[:3, 3] = surface + away / np.linalg.norm(away) * radius * rng.uniform(0.5, 1.0)
         placed, asked, keys = contact.locate(

@@ -18,31 +18,31 @@ class CostModel:
     Attributes
     ----------
     statement : float
-        One statement of ranges, whatever it reads.
+        Fixed cost of a statement of ranges.
     descent : float
-        One range more: a descent of the index and the start of a scan.
+        Each range: a descent of the index and the start of a scan.
     block : float
-        One leaf block scanned inside the engine.
+        Each leaf block scanned inside the engine.
     row : float
-        One row handed to the client.
+        Each row passed to the client.
     rows_per_block : float
-        Rows N over leaf blocks B.
+        Rows N divided by leaf blocks B.
     lookup, probe : float
-        One statement of keys, and each key in it (strategy `array`).
+        Fixed cost of a statement of keys, and each key in it (strategy `array`).
     single : float
         One point query of the sequence (strategy `points`).
     aggregate, point : float
-        The statement of Figure 3 with its second one, and each shell point in it.
+        Fixed cost of Figure 3 with its second statement, and each shell point in it.
     crowding, presence : float
-        Rows found in the gaps that grouping closes, and under a frame's keys, over the rows that
-        the quantile vector expects there. Above 1 where a tool touches: the histogram averages
-        over a whole bucket, surface or not.
+        Rows found divided by rows that the quantile vector expects: in the gaps that grouping
+        closes, and under a frame's keys. Both are above 1 near a surface, because the histogram
+        averages over whole buckets, with surface and without.
     caution : float
-        Factor on the expected rows of a gap when CBGroup decides on it: the one that would have
-        cost least at the places measured. Small gaps near a surface are empty or full, and seldom
-        hold what is expected.
+        Factor on the expected rows of a gap when CBGroup decides whether to close it. It is the
+        factor with the least cost at the places measured. Small gaps near a surface are empty or
+        full and seldom hold the expected number of rows. A larger factor closes fewer gaps.
     group, group_key : float
-        CBGroup itself: a frame, and each key in it.
+        CBGroup itself: fixed cost for a frame, and each key in it.
     spread : mapping
         Relative standard error of each fitted figure.
     """
@@ -66,12 +66,12 @@ class CostModel:
 
     @cached_property
     def row_scanned(self) -> float:
-        """One row read in a range: its share of a leaf block, and what it costs the client."""
+        """Cost of one row read in a range: its share of a leaf block and its cost to the client."""
         return self.block / self.rows_per_block + self.row
 
     @cached_property
     def row_in_gap(self) -> float:
-        """One row that the quantile vector expects in a gap, weighed by `caution`."""
+        """Cost of one row that the quantile vector expects in a gap, multiplied by `caution`."""
         return self.row_scanned * self.caution
 
     def of_ranges(self, n_ranges: int, rows: float) -> float:
@@ -107,7 +107,7 @@ class CostModel:
 
     @classmethod
     def from_figures(cls, figures: Mapping[str, float]) -> "CostModel":
-        """Rebuild from `figures`; those that an older version did not keep have their defaults."""
+        """Rebuild from `figures`; figures that an older version did not store get defaults."""
         spread = {k.removesuffix(".spread"): v for k, v in figures.items() if k.endswith(".spread")}
         plain = {k: v for k, v in figures.items() if not k.endswith(".spread")}
         return cls(**plain, spread=spread)

@@ -1,4 +1,4 @@
-"""Statistics and costs of an opened database, which grouping by cost decides by."""
+"""Statistics and costs of an opened database, on which grouping by cost decides."""
 
 from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
@@ -26,7 +26,7 @@ class QueryFigures:
         return self._quantiles, self._costs
 
     def analyze(self) -> QuantileVector:
-        """Make the store's statistics anew, however fresh they are."""
+        """Compute the store's statistics again, even if they are up to date."""
         self._store.analyze(DEFAULT_RESOLUTION, anew=True)
         self._quantiles = QuantileVector.of(self._store, DEFAULT_RESOLUTION)
         return self._quantiles
@@ -40,10 +40,10 @@ class QueryFigures:
         return costs
 
     def drop_statistics(self) -> None:
-        """Read the statistics again when they are needed next: the rows have changed."""
+        """Drop the statistics because rows have changed: they are read again when needed next."""
         self._quantiles = None
 
     def drop_empty_statistics(self) -> None:
-        """Read the statistics again if they are those of an environment without rows."""
+        """Drop the statistics if they are those of an environment without rows."""
         if self._quantiles is not None and not self._quantiles.n_rows:
             self._quantiles = None

@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 MOST_KEYS = 2048
-"""Row keys of neighbouring poses for which one statement is sent. A larger value sends fewer
-statements, but each pose then has more rows of other poses between its own."""
+"""Row keys of successive poses after which one statement is sent for all of them. A larger value
+sends fewer statements, but then there are more rows of other poses among the rows of each pose."""
 MOST_POINTS = 1 << 17
-"""Shell points of all poses for which one statement is sent: 12 MB. A larger value takes more
-memory."""
+"""Most shell points, summed over the poses that one statement serves: 12 MB. A larger value takes
+more memory."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 NO_POINTS = np.empty(0, dtype=np.int64)
 NO_DEPTHS = np.empty(0)
@@ -38,9 +38,9 @@ NO_DEPTHS = np.empty(0)
 class Query(NamedTuple):
     """How a frame asked the database.
 
-    strategy : the strategy used, never `auto`; statements : SQL statements run; ranges :
-    index ranges they named, each key of a point query counting as one; rows : rows read, false hits
-    included; elapsed_us : the whole frame, microseconds.
+    strategy : the strategy used, never `auto`; statements : SQL statements run; ranges : index
+    ranges in these statements, each single key is one; rows : rows read, false hits included;
+    elapsed_us : time of the whole frame, microseconds.
     """
 
     strategy: str
@@ -51,15 +51,15 @@ class Query(NamedTuple):
 
 
 _Asked = tuple[Strategy, int, int, int]
-"""Fields of `Query` but the last, which is known at a frame's end."""
+"""Fields of `Query` without the last, which is known only at the end of a frame."""
 
 
 class Answer(NamedTuple):
-    """What a frame found; `Touch` shows it to users.
+    """The result of a frame; users get it as a `Touch`.
 
     wrench (6,) N and N m; hits (H,) indices, ascending; depths (H,) metres; ids : objects of all
     hits, ascending; pairs : () -> (P, 2) int64, every (hit, object id), computed when asked for;
-    apart (A,) : indices of points that are felt without being hits, ascending, and apart_depths.
+    apart (A,) : indices of felt points that are no hits, ascending; apart_depths (A,) metres.
     """
 
     wrench: NDArray[np.float64]
@@ -78,7 +78,7 @@ class Answer(NamedTuple):
 
     @property
     def deepest(self) -> float:
-        """Greatest depth of a felt point, metres; 0 where nothing is felt."""
+        """Greatest depth of a felt point, metres; 0 when no point is felt."""
         deepest = float(self.depths.max(initial=0.0))
         return max(deepest, float(self.apart_depths.max())) if self.apart.size else deepest
 
@@ -144,7 +144,7 @@ class HapticQuery:
         query: _Asked,
         started: int,
     ) -> Answer:
-        """Answer of a frame from its rows, between which there may be rows of other poses."""
+        """Answer of a frame from its rows; rows of other poses may lie among them."""
         placed, asked, keys = located
         row_keys, row_ids, occupancy, payload = rows
         wrench, hits, depths, ids, apart, apart_depths = contact.refine(
@@ -186,7 +186,7 @@ class HapticQuery:
     ) -> Iterator[Answer]:
         """Answers at poses (n, 4, 4), in their order; see `Environment.touch_many`.
 
-        A statement that serves several poses is counted with the first of them.
+        A statement that serves several poses is counted in the first pose's answer only.
         """
         _check_options(strategy, gap)
         batch: list[contact.Located] = []
@@ -209,7 +209,7 @@ class HapticQuery:
     def _look_up_together(
         self, batch: "list[contact.Located]", exclude: Keys, law: ForceLaw
     ) -> Iterator[Answer]:
-        """Answers of poses, in their order; one statement fetches the rows of all."""
+        """Answers of poses, in their order; one statement fetches the rows of all poses."""
         started = time.perf_counter_ns()
         keys = np.unique(np.concatenate([located.keys for located in batch]))
         fetched = self._store.lookup(keys)
@@ -218,7 +218,7 @@ class HapticQuery:
         for located in batch:
             low = high = 0
             if located.keys.size:
-                # methods: the functions of the same name take twice as long, 1 us each
+                # methods, since numpy's functions of the same name take twice as long, 1 us each
                 low = int(row_keys.searchsorted(located.keys[0], "left"))
                 high = int(row_keys.searchsorted(located.keys[-1], "right"))
             rows = fetched.part(low, high)
@@ -248,7 +248,7 @@ class HapticQuery:
     def _fetch(
         self, strategy: Strategy, located: "contact.Located", gap: int
     ) -> tuple[_Asked, Rows]:
-        """Rows of a frame, and how they were asked for."""
+        """Rows of a frame, and the fields of `Query` that say how they were asked for."""
         _, asked, keys = located
         if strategy == "points":
             with self._store.snapshot():
@@ -278,7 +278,7 @@ class HapticQuery:
         law: ForceLaw,
         started: int,
     ) -> Answer:
-        """Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
+        """Run Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
         store = self._store
         if not isinstance(law, TangentPlane):
             raise UsageError(
@@ -337,7 +337,7 @@ def as_id(object_id: int) -> int:
 
 
 def as_ids(exclude: Iterable[int]) -> NDArray[np.int64]:
-    """Ids of objects, ascending and distinct, as kernels take them."""
+    """Object ids as an array for kernels, ascending and distinct."""
     if not isinstance(exclude, Iterable) or isinstance(exclude, (bytes, bytearray, memoryview)):
         raise UsageError(f"exclude {exclude!r}: give ids in a list")
     return np.array(sorted({as_id(i) for i in exclude}), dtype=np.int64)

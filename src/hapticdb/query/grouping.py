@@ -13,7 +13,7 @@ from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import Keys, Layout, row_shift
 
 DEFAULT_MAXGAP = 500
-"""The paper's choice of MAXGAP, in voxel keys."""
+"""The paper's MAXGAP, in voxel keys. A larger value gives fewer ranges, which hold more rows."""
 BOX_CUBES = 16
 """Cubes along a box's longest edge when it is covered by key ranges. A larger value gives more
 ranges, which hold fewer keys outside the box."""
@@ -29,7 +29,7 @@ class Ranges(NamedTuple):
 class Grouping(NamedTuple):
     """Ranges of CBGroup, and the rows that the quantile vector expects.
 
-    rows_asked : under the keys themselves; rows_in_gaps : in the gaps that were closed.
+    rows_asked : rows under the keys themselves; rows_in_gaps : rows in the closed gaps.
     """
 
     ranges: Ranges
@@ -38,7 +38,7 @@ class Grouping(NamedTuple):
 
 
 def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
-    """Group neighbours p < q if and only if q - p <= gap, in voxel keys on both layouts.
+    """Group neighbouring keys p < q if and only if q - p <= gap, in voxel keys on both layouts.
 
     Parameters
     ----------
@@ -51,15 +51,15 @@ def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
     """
     if gap < 0:
         raise UsageError(f"MAXGAP {gap}: give 0 or more")
-    # Keys, and so gaps between them, have at most 63 bits.
+    # Keys have at most 63 bits, and so have the gaps between them.
     return Ranges(*kernels.group_by_gap(keys, first, last, min(int(gap), 2**63 - 1)))
 
 
 def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping:
     """Close a gap if and only if scanning it costs no more than another descent of the index.
 
-    The gap between keys p < q covers p+1 .. q-1. Costs of neighbouring gaps add, so deciding each
-    by itself gives the least cost over all groupings.
+    The gap between keys p < q covers p+1 .. q-1. The costs of gaps add up, so deciding each gap by
+    itself gives the least cost over all groupings.
     """
     lows, highs = np.empty_like(keys), np.empty_like(keys)
     count, asked, scanned = kernels.group_by_cost(
@@ -75,7 +75,7 @@ def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping
 
 
 def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostModel) -> Ranges:
-    """CBGroup over closed spans of row keys (U,), ascending and disjoint, such as cells'.
+    """CBGroup over closed spans of row keys (U,), ascending and disjoint, such as spans of cells.
 
     The gap between two spans is closed on the same condition as between two keys.
     """
@@ -87,7 +87,7 @@ def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostM
 
 
 def object_ranges(grid: Grid, layout: Layout, bounds: NDArray[np.float64]) -> Ranges:
-    """Ranges of row keys that cover an object's bounds (2, 3), a voxel wider on each side."""
+    """Ranges of row keys that cover an object's bounds (2, 3), enlarged by a voxel on each side."""
     low, high = grid.voxels_of(bounds)
     return box_ranges(grid, layout, low - 1, high + 1)
 
@@ -95,7 +95,7 @@ def object_ranges(grid: Grid, layout: Layout, bounds: NDArray[np.float64]) -> Ra
 def box_ranges(
     grid: Grid, layout: Layout, low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> Ranges:
-    """Ranges of row keys that cover the voxels low .. high (3,) each; cut to the grid."""
+    """Ranges of row keys that cover the voxels low (3,) to high (3,), cut to the grid."""
     low = np.clip(low, 0, grid.side - 1)
     high = np.clip(high, 0, grid.side - 1)
     longest = int((high - low).max()) + 1

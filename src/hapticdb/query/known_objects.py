@@ -1,4 +1,4 @@
-"""The objects of the revision that frames have seen, by id."""
+"""The objects, by id, of the revision that the last frame read."""
 
 from collections.abc import Iterable
 
@@ -7,14 +7,15 @@ from hapticdb.store.believed import damaged
 
 
 class KnownObjects:
-    """Objects of a store as of one revision, so that a frame need not ask for them.
+    """Objects of a store at one revision, kept so that a frame need not ask the database for them.
 
     Attributes
     ----------
     by_id : dict
         The objects; replaced as a whole, so that a result that holds it does not change.
     version : int or None
-        The store's version when they were listed; None before, and after an edit of our own.
+        The store's version when the objects were listed; None before that, and after an edit
+        through the same environment.
     """
 
     def __init__(self, store: Store) -> None:
@@ -23,7 +24,7 @@ class KnownObjects:
         self.version: int | None = None
 
     def learn(self) -> bool:
-        """List the objects of the revision that this snapshot sees; whether it is another one."""
+        """List the objects if the snapshot's revision is new; returns whether it is new."""
         if self._store.version() == self.version:
             return False
         self.by_id = {obj.id: obj for obj in self._store.objects()}
@@ -31,16 +32,16 @@ class KnownObjects:
         return True
 
     def forget(self) -> None:
-        """List them again at the next frame."""
+        """Make the next frame list the objects again."""
         self.version = None
 
     def check_answer(self, ids: Iterable[int]) -> None:
-        """Refuse ids in rows that no object has.
+        """Refuse ids of rows if no object has such an id.
 
         Raises
         ------
         DamagedError
-            When there is one.
+            When a row has an id without an object.
         """
         for object_id in ids:
             if object_id not in self.by_id:
@@ -52,10 +53,10 @@ class KnownObjects:
         Raises
         ------
         ObjectNotFoundError
-            When there is one.
+            When no object has one of the ids.
         """
         wanted = ids.tolist()
-        if not set(wanted) <= set(self.by_id):  # a frame that asked nothing saw nothing new
+        if not set(wanted) <= set(self.by_id):  # frames without a query learn nothing
             self.by_id = {obj.id: obj for obj in self._store.objects()}
         for object_id in wanted:
             if object_id not in self.by_id:

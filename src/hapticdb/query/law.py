@@ -1,6 +1,6 @@
-"""The force law as users name it (the paper, section 3); its arithmetic is `hapticdb.kernels.law`.
+"""The force law for users (the paper, section 3); its arithmetic is in `hapticdb.kernels.law`.
 
-A law of this module is checked and immutable, and gives kernels the NamedTuple that they take.
+A law of this module is checked and immutable, and makes the NamedTuple that kernels take.
 """
 
 from dataclasses import dataclass
@@ -11,11 +11,11 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels import law as kernels
 
 MOST_STIFFNESS = 1e9
-"""N/m: stiffer than any hand, device or part."""
+"""Largest stiffness of a law, N/m: stiffer than any hand, device or part."""
 
 
 class ForceLaw(Protocol):
-    """A force law: how stiff it is, and what kernels take of it."""
+    """A force law: its stiffness, and its numbers for kernels."""
 
     @property
     def stiffness(self) -> float:
@@ -23,7 +23,7 @@ class ForceLaw(Protocol):
 
     @property
     def for_kernels(self) -> Any:  # noqa: ANN401 - a NamedTuple of a type of its own
-        """NamedTuple that `hapticdb.kernels.law` has functions for; made once, a frame reads it."""
+        """NamedTuple for which `hapticdb.kernels.law` has functions; made once, read by frames."""
 
 
 @dataclass(frozen=True)
@@ -52,5 +52,5 @@ class TangentPlane:
 
     @cached_property
     def for_kernels(self) -> Any:  # noqa: ANN401 - kernels are loaded when they are first used
-        """Law as kernels take it."""
+        """The law's NamedTuple for kernels."""
         return kernels.TangentPlaneLaw(self.stiffness)

@@ -9,9 +9,9 @@ from hapticdb.store.base import Keys, Store, row_shift
 from hapticdb.store.believed import damaged
 
 DEFAULT_RESOLUTION = 10_000
-"""Buckets of the quantile vector: the paper's best."""
+"""Buckets of the quantile vector: the paper's best value. Larger: more exact, slower to make."""
 MAX_RESOLUTION = 1_000_000
-"""Most buckets that may be asked for: 8 MB."""
+"""Largest resolution that may be asked for: 8 MB."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +40,11 @@ class QuantileVector:
 
     @cached_property
     def rows_per_bucket(self) -> float:
-        """Rows that each bucket stands for."""
+        """Number of rows in each bucket."""
         return self.n_rows / self.resolution
 
     def rows_between(self, left: int, right: int) -> float:
-        """Expected rows with a key in [left, right]. Those of neighbouring ranges add up."""
+        """Expected rows with a key in [left, right]. Rows of neighbouring ranges add up."""
         return float(grouping.gap_rows(left, right, self.bounds, self.rows_per_bucket))
 
     @classmethod

@@ -1,4 +1,4 @@
-"""What a tool felt: at one pose, and at many."""
+"""Results of the haptic query: what a tool felt at one pose, and at many poses."""
 
 from collections.abc import Iterable, Mapping
 from typing import Self
@@ -10,7 +10,7 @@ from hapticdb.query.frame import Answer, Query
 from hapticdb.store.base import Object
 
 CONTACT: np.dtype[np.void] = np.dtype([("pose", "<i8"), ("point", "<i8"), ("depth", "<f8")])
-"""A contact of many poses: number of the pose, index of the shell's point, metres."""
+"""A contact in `Touches`: number of the pose, index of the shell's point, depth in metres."""
 
 
 class Touch:
@@ -74,14 +74,15 @@ class Touches:
     torques : (n, 3) float64
         N m about the tool's centre of mass, world frame.
     hits, n_contacts : (n,) int64
-        How many of the shell's points are inside a voxel, and how many of those are below their
+        Number of the shell's points inside a voxel, and number of those that are below their
         tangent plane.
     deepest : (n,) float64
-        Metres of the deepest contact, 0 without any.
+        Depth of the deepest contact in metres, 0 without contacts.
     ids : list of lists of int
         Ids of the objects that each pose's hits are in, ascending.
     contacts : (C,) array of `CONTACT`, or None
-        Every contact: ``pose``, ``point``, ``depth``, ordered by the first two; where asked for.
+        Every contact: ``pose``, ``point``, ``depth``, ordered by the first two; None when contacts
+        were not asked for.
     query : Query
         How the database was asked, all statements together.
     """
@@ -112,7 +113,7 @@ class Touches:
         return [self._known[i] for i in sorted({i for ids in self.ids for i in ids})]
 
     def gather(self, answers: Iterable[Answer]) -> Self:
-        """Take the answers of all poses, in their order."""
+        """Collect the answers of all poses, in their order."""
         pieces = [np.empty(0, CONTACT)]
         total = self.query
         for n, answer in enumerate(answers):
@@ -139,7 +140,7 @@ class Touches:
         return self
 
     def name(self, known: Mapping[int, Object], elapsed_us: float) -> Self:
-        """Take the objects of the revision that was seen, and how long all of it took."""
+        """Set the objects of the revision that was read, and the time of all poses."""
         self._known = known
         self.query = self.query._replace(elapsed_us=elapsed_us)
         return self

@@ -1,1 +1,1 @@
-"""Hands: what a device is and may say, scripted and simulated devices, vendors' devices."""
+"""Devices that a hand holds: the protocol, scripted, simulated and vendors' devices."""

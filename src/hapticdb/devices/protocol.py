@@ -1,12 +1,13 @@
-"""What a device is, what it says, and the check of what it says, once a frame.
+"""The protocol of a device, its reading, and the check of each reading, once a frame.
 
-A device is two methods. What only some can do is a small Protocol of its own, and a device is
-pickled into the process of the loop before it is opened there.
+A device has two methods, `read` and `apply`. Each ability that only some devices have is a small
+Protocol of its own. A device is pickled into the process of the loop and opened there.
 
-`Reader` believes nothing that may change between two frames. A reading of the wrong kind (its
-arrays' shape or type) is a fault of the device's program: an error, which ends a session without
-force. Numbers that are no place (not finite, no rotation) may be a moment's: the hand is nowhere
-until the next reading that is somewhere, and the force falls as it does where nothing is known.
+`Reader` checks in every frame whatever may change between two frames. A reading of the wrong kind
+(shape or type of its arrays) is a fault of the device's program: it raises an error, and the
+session ends without force. Numbers that are no valid pose (not finite, no rotation) may last a
+moment only: the hand's place is unknown until the next valid reading, and the force falls as it
+does in cells that are not resident.
 """
 
 import operator
@@ -20,33 +21,34 @@ from hapticdb.errors import DeviceError, UsageError
 from hapticdb.kernels.hand.handle import FARTHEST, is_somewhere
 
 SKEW = 1e-3
-"""By how much products of a rotation's columns may be off: what single precision and drift leave
-passes, a turn that is scaled or mirrored does not."""
+"""Greatest error of the dot products of a rotation's columns, which are 0 or 1 when exact. Rounding
+to single precision and drift stay below it, a scaled rotation does not. Larger: less exact poses
+are accepted."""
 MOST_BUTTONS = (1 << 31) - 1
-"""Greatest mask of buttons: 31 of them, as a recording keeps them."""
+"""Greatest mask of buttons: 31 bits, as a recording stores them."""
 DOUBLE = np.dtype(np.float64)
 
 
 class Reading(NamedTuple):
-    """What a device reports."""
+    """Where the hand is, how fast it moves and which buttons it holds down."""
 
     pose: NDArray[np.float64]
     """(4, 4) rigid transform `world_from_hand`, metres, in the device's frame."""
 
     velocity: NDArray[np.float64]
-    """(6,) of the hand's origin in m/s, then angular in rad/s, in the device's frame."""
+    """(6,) linear velocity of the hand's origin in m/s, then angular in rad/s; device's frame."""
 
     buttons: int
-    """A bit for each button held down, the first button the least significant."""
+    """One bit for each button, 1 while it is held down; the first button is the lowest bit."""
 
 
 class Device(Protocol):
-    """What a hand holds."""
+    """A haptic device: it reports where the hand is, and pushes the hand."""
 
     def read(self) -> Reading:
-        """Where the hand is now; a pose of NaN while the device does not know.
+        """Return where the hand is now; a pose of NaN while the device does not know.
 
-        Checked in every frame, see `Reader`: a reading of another kind ends the session.
+        `Reader` checks the reading in every frame; a reading of the wrong kind ends the session.
 
         Raises
         ------
@@ -57,7 +59,7 @@ class Device(Protocol):
     def apply(self, wrench: NDArray[np.float64]) -> None:
         """Push the hand with a wrench (6,), N and N m in the device's frame, until the next call.
 
-        The device caps it to what it can do.
+        The device reduces the wrench to what its motors can do.
 
         Raises
         ------
@@ -68,57 +70,57 @@ class Device(Protocol):
 
 @runtime_checkable
 class SupportsOpen(Protocol):
-    """A device that is opened, once, in the process that uses it."""
+    """A device that is opened once, in the process that uses it."""
 
     def open(self) -> None:
-        """Take hold of the hardware.
+        """Connect to the hardware.
 
         Raises
         ------
         DeviceError
             If there is no such device.
         MissingExtraError
-            If the package that speaks to it is not installed.
+            If the package that drives the device is not installed.
         """
 
 
 @runtime_checkable
 class SupportsClose(Protocol):
-    """A device that wants to know when the session ends."""
+    """A device that is closed when the session ends."""
 
     def close(self) -> None:
-        """Take the force away and let go of the hardware; a second call does nothing."""
+        """Set the force to zero and release the hardware; a second call does nothing."""
 
 
 @runtime_checkable
 class SupportsEnd(Protocol):
-    """A device that comes to an end: a path that is over."""
+    """A device whose script ends, such as a path."""
 
     @property
     def is_over(self) -> bool:
-        """Whether the last reading was at the end, where the hand rests from then on."""
+        """Whether the last reading was at the end of the script; the hand rests there."""
 
 
 @runtime_checkable
 class SupportsRewind(Protocol):
-    """A device with a script, which can be begun again."""
+    """A device with a script that can start again."""
 
     def rewind(self) -> None:
-        """Begin anew at the next read."""
+        """Start the script again at the next read."""
 
 
 class Reader:
-    """Reads a device, and gives on what a reading may be: what kernels take without a look.
+    """Reads a device and returns only readings that kernels can take without a check of their own.
 
-    A pose (4, 4) and a velocity (6,) are arrays of float64. Others of real numbers (float32,
-    integers) and of another order in memory, and arrays that cannot be written, are copied;
-    lists, masked arrays, objects and complex numbers are refused.
+    A pose (4, 4) and a velocity (6,) are arrays of float64. Arrays of other real numbers (float32,
+    integers), of another memory order or read-only are copied; lists, masked arrays, objects and
+    complex numbers are refused.
 
     Notes
     -----
-    A frame's check takes 2 to 4 us of Python beside the device's own time, a fifth of them for the
-    arrays' type, shape and layout, the rest for the rotation; 11 us where arrays are copied
-    (one virtual processor of a shared Xeon, the host idle and busy).
+    The check adds 2 to 4 us to a frame: a fifth for the arrays' type, shape and layout, the rest
+    for the rotation. It adds 11 us where arrays are copied (one virtual processor of a shared Xeon,
+    with the host idle and busy).
     """
 
     def __init__(self, device: Device) -> None:
@@ -128,12 +130,12 @@ class Reader:
         self._last: Reading | None = None
 
     def read(self) -> Reading:
-        """Where the hand is now; a pose of NaN where it is no rigid transform.
+        """Return where the hand is now; the pose is NaN if the device's is no rigid transform.
 
         Raises
         ------
         DeviceError
-            The device's own, or when what it returns is of the wrong kind.
+            If the device raises it, or if the reading is of the wrong kind.
         """
         reading = self.device.read()
         if type(reading) is not Reading:
@@ -160,7 +162,7 @@ class Reader:
         return reading if is_rigid_enough(pose) else reading._replace(pose=self._nowhere)
 
     def complaint(self) -> str:
-        """What is wrong with the numbers of the last reading, in a line; nothing for none."""
+        """One line: what is wrong with the last reading's numbers; empty if nothing is wrong."""
         last = self._last
         if last is None:
             return ""
@@ -176,7 +178,7 @@ class Reader:
         return ""
 
     def _converted(self, reading: Reading) -> Reading:
-        """A reading whose arrays are ours, from one that is right but for its form."""
+        """Copy a reading whose arrays have another type or memory order into our own arrays."""
         self._take("pose", reading.pose, self._pose)
         self._take("velocity", reading.velocity, self._velocity)
         try:
@@ -214,8 +216,8 @@ class Reader:
 
 
 def is_rigid_enough(pose: NDArray[np.float64]) -> bool:
-    """Whether a pose (4, 4) turns by a rotation, to `SKEW`, and has the last row 0 0 0 1."""
-    # products written out on plain floats: a quarter of what array operations take
+    """Whether a pose (4, 4) has a rotation, exact to `SKEW`, and the last row 0 0 0 1."""
+    # plain floats, products written out: a quarter of the time that array operations take
     (a, b, c, _), (d, e, f, _), (g, h, i, _), last = pose.tolist()
     return bool(
         abs(a * a + d * d + g * g - 1.0) <= SKEW
@@ -230,12 +232,12 @@ def is_rigid_enough(pose: NDArray[np.float64]) -> bool:
 
 
 def check_device(device: object) -> None:
-    """Refuse what is no device, and say what to pass in its place.
+    """Refuse an object that is no device; the message says what to pass instead.
 
     Raises
     ------
     UsageError
-        When it lacks `read` or `apply`, or is a class.
+        If the object lacks `read` or `apply`, or is a class.
     """
     if isinstance(device, type):
         raise UsageError(
@@ -258,7 +260,7 @@ def check_device(device: object) -> None:
 
 
 def _kind_of(value: object) -> str:
-    """What something is, in a few words."""
+    """Type of a value in a few words, for messages."""
     if value is None:
         return "None"
     if isinstance(value, np.ndarray):

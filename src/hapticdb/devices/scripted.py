@@ -1,7 +1,7 @@
-"""Devices that follow a script; what any device is, is in `hapticdb.devices.protocol`.
+"""Devices that follow a script; `hapticdb.devices.protocol` defines what a device is.
 
 Scripted devices need no hardware. They read the time from a clock and start at their first read.
-What a read of theirs returns holds until the next read: its arrays are written anew each time.
+Every read writes into the same arrays, so a reading is valid only until the next read.
 """
 
 import math
@@ -43,22 +43,23 @@ __all__ = [
 ]
 
 Clock = Callable[[], float]
-"""Seconds since some instant, never going back."""
+"""Returns seconds since some fixed instant; the time never goes back."""
 
 LEVER = 0.1
-"""A turn counts as the way of a point this far (m) from the origin, where a path has a speed."""
+"""Metres. Along a path with a speed, a turn counts as the distance that a point this far from the
+origin moves. Larger: turns take longer."""
 
 CYCLE = 20.0
-"""Seconds after which `RandomHand` repeats itself."""
+"""Seconds after which `RandomHand` repeats itself; its frequencies are multiples of 1 / CYCLE."""
 
 SLOWEST, FASTEST = 0.3, 8.0
-"""Frequencies (Hz) of a hand's motion."""
+"""Lowest and highest frequency (Hz) of a `RandomHand`'s motion."""
 
 
 def capped(wrench: NDArray[np.float64], force: float, torque: float) -> NDArray[np.float64]:
-    """Copy of a wrench (6,), force and torque no longer than the caps (N, N m), directions kept.
+    """Copy of a wrench (6,) with force and torque shortened to the caps (N, N m).
 
-    What is not finite becomes zero: no motor is ever asked for it.
+    Directions are kept. A force or torque that is not finite becomes zero, so no motor receives it.
     """
     fx, fy, fz, tx, ty, tz = wrench.tolist()
     f, t = math.hypot(fx, fy, fz), math.hypot(tx, ty, tz)
@@ -71,7 +72,7 @@ def capped(wrench: NDArray[np.float64], force: float, torque: float) -> NDArray[
 
 
 def pose_at(place: ArrayLike) -> NDArray[np.float64]:
-    """Pose (4, 4) of a pose, or of a point (3,) with the hand upright."""
+    """Pose (4, 4) of a place: a pose as it is, a point (3,) with the hand upright."""
     given = np.array(place, dtype=np.float64)
     if given.shape not in {(3,), (4, 4)} or not np.isfinite(given).all():
         raise UsageError(
@@ -91,7 +92,7 @@ def _positive(name: str, value: float) -> float:
 
 
 class _Scripted:
-    """A device that needs no hardware and feels nothing."""
+    """A device that needs no hardware and ignores the wrench."""
 
     is_over = False
 
@@ -103,7 +104,7 @@ class _Scripted:
         self._reading = Reading(self._pose, self._velocity, 0)
 
     def rewind(self) -> None:
-        """Begin the script anew at the next read."""
+        """Start the script again at the next read."""
         self._start = None
 
     def _elapsed(self) -> float:
@@ -114,23 +115,23 @@ class _Scripted:
         return now - self._start
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
-        """Feel nothing: the hand follows its script whatever pushes it."""
+        """Ignore the wrench: the hand follows its script."""
 
 
 class Player(_Scripted):
-    """A hand that follows timed poses, moving straight and turning evenly between them.
+    """A hand that follows timed poses; between two poses it moves straight and turns evenly.
 
     Parameters
     ----------
     times : array_like
-        (M,) seconds, increasing; the first is when the first read is.
+        (M,) seconds, increasing; the first time is the instant of the first read.
     poses : array_like
         (M, 4, 4) rigid transforms, metres. Their differences give the velocity.
     loops : bool
-        Start anew at the end; to return smoothly, let the path end where it starts. Otherwise the
-        hand rests at the last pose.
+        Start again at the end; for a smooth return, the path must end where it starts. Otherwise
+        the hand rests at the last pose.
     clock : callable
-        Seconds; it must be possible to pickle it.
+        Returns seconds; it must be picklable.
     """
 
     def __init__(
@@ -159,7 +160,7 @@ class Player(_Scripted):
         )
 
     def read(self) -> Reading:
-        """Pose and velocity now."""
+        """Return pose and velocity now."""
         elapsed = self._elapsed()
         if self.loops:
             elapsed %= self.duration
@@ -175,13 +176,14 @@ class Path(Player):
     Parameters
     ----------
     path : path
-        The file. Where it has a column ``t``, its seconds are kept unless `speed` or `seconds` is
-        given.
+        The file. Its column ``t``, if it has one, gives the times (s) unless `speed` or `seconds`
+        is given.
     speed : float, optional
-        Metres a second, 0.1 if nothing else says how fast. A turn counts as the way of a point
-        0.1 m from the origin; poses that repeat the one before are left out.
+        Metres a second; 0.1 if neither the file nor `seconds` gives a time. A turn counts as the
+        distance that a point 0.1 m from the origin moves; poses that repeat the one before are left
+        out.
     seconds : float, optional
-        Time for the whole path.
+        Duration of the whole path.
     loops, clock
         As for `Player`.
 
@@ -215,9 +217,9 @@ class Path(Player):
 def _times_at(
     poses: NDArray[np.float64], speed: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times of poses that are run through at a speed, and the poses, repeated ones left out."""
+    """Times of the poses at a given speed, and the poses without repeated ones."""
     q = quaternion_of(poses[:, :3, :3])
-    # the chord between q and -q's nearer one; exact for small turns, where acos is not
+    # chord to q or -q, whichever is nearer; exact for small turns, where acos is not
     chord = np.minimum(
         np.linalg.norm(q[1:] - q[:-1], axis=1), np.linalg.norm(q[1:] + q[:-1], axis=1)
     )
@@ -229,7 +231,7 @@ def _times_at(
 
 
 class Line(Player):
-    """A hand that moves from one place straight to another.
+    """A hand that moves straight from one place to another.
 
     Parameters
     ----------
@@ -238,7 +240,7 @@ class Line(Player):
     speed : float
         Metres a second; a turn counts as in `Path`.
     there_and_back : bool
-        Go to and fro without end.
+        Move back and forth without end.
     clock
         As for `Player`.
     """
@@ -260,7 +262,7 @@ class Line(Player):
 
 
 class Circle(_Scripted):
-    """A hand that goes round a place, without turning.
+    """A hand that moves on a circle around a place, without turning.
 
     Parameters
     ----------
@@ -271,7 +273,7 @@ class Circle(_Scripted):
     speed : float
         Metres a second.
     axis : array_like
-        (3,) normal of the circle, counter-clockwise seen from its tip; of any length.
+        (3,) normal of the circle, of any length; the motion is counter-clockwise seen from its tip.
     clock
         As for `Player`.
     """
@@ -293,7 +295,7 @@ class Circle(_Scripted):
         self._pose[:] = pose_at(center)
         self._radius = _positive("radius", radius)
         self._speed = _positive("speed", speed)
-        # the axis of the world that leans least on the normal gives the circle's own axes
+        # the world axis farthest from the normal's direction, to construct the circle's axes
         side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
         side /= np.linalg.norm(side)
         self._center: list[float] = self._pose[:3, 3].tolist()
@@ -312,10 +314,10 @@ class Circle(_Scripted):
 
 
 class Tumble(_Scripted):
-    """A hand that stays in place and turns about axes that change all the time.
+    """A hand that stays in place and turns about an axis that changes all the time.
 
-    The rotation is Rz(a t) Rx(b t) after the center's, a and b in the golden ratio, so that it
-    comes close to every attitude; |w| = sqrt(a^2 + b^2) stays the same.
+    The rotation is Rz(a t) Rx(b t), applied after the center's; b / a is the golden ratio. The hand
+    therefore comes close to every attitude. Its angular speed sqrt(a^2 + b^2) is constant.
 
     Parameters
     ----------
@@ -355,22 +357,22 @@ class Tumble(_Scripted):
 
 
 class RandomHand(_Scripted):
-    """Smooth random motion about a place, like a hand's: always the same for a seed.
+    """Smooth random motion about a place, like a hand's; the same seed gives the same motion.
 
-    Each axis is a sum of sines between 0.3 and 8 Hz with amplitudes as 1 / f^2, all multiples of
-    one frequency, so that the motion repeats after 20 s. It starts at the center. Where the slow
-    waves would carry the hand farther than its reach, they are left out.
+    Each axis is a sum of sines between 0.3 and 8 Hz with amplitudes proportional to 1 / f^2. All
+    frequencies are multiples of one, and the motion repeats after 20 s. It starts at the center.
+    Slow waves that would carry the hand beyond its reach are left out.
 
     Parameters
     ----------
     center : array_like
         Point (3,) or pose (4, 4), metres.
     seed : int
-        Which motion.
+        Seed of the random motion.
     speed, angular_speed : float
-        Fastest in a cycle, m/s and rad/s; to within 0.1 %.
+        Greatest speeds in a cycle, m/s and rad/s, exact to 0.1 %.
     reach : float
-        Farthest from the center, metres.
+        Greatest distance from the center, metres.
     clock
         As for `Player`.
 
@@ -412,14 +414,14 @@ N_SAMPLES = 16384
 def _random_waves(
     seed: int, speed: float, angular_speed: float, reach: float
 ) -> NDArray[np.float64]:
-    """Waves (6, 8, 4) as the kernel `sway` takes them."""
+    """Waves (6, 8, 4) in the form that the kernel `sway` takes."""
     slowest = SLOWEST
     while slowest < FASTEST:
         waves = _waves_above(slowest, seed)
         farthest, fastest, _ = survey(waves, CYCLE, N_SAMPLES)
         if farthest * speed <= reach * fastest:
             waves[:3, :, 0] *= speed / fastest
-            # turns do not add: doubling the waves does not quite double the angular velocity
+            # rotations do not add: doubled waves do not give exactly twice the angular velocity
             for _ in range(20):
                 turning = survey(waves, CYCLE, N_SAMPLES)[2]
                 waves[3:, :, 0] *= angular_speed / turning
@@ -434,7 +436,7 @@ def _random_waves(
 
 
 def _waves_above(slowest: float, seed: int) -> NDArray[np.float64]:
-    """Waves (6, 8, 4) of random phases between a frequency and the fastest, amplitudes 1 / f^2."""
+    """Waves (6, 8, 4): random phases, `slowest` to `FASTEST` Hz, amplitudes 1 / f^2."""
     random = np.random.default_rng(seed)
     steps = np.linspace(0.0, 1.0, N_WAVES)
     spread = np.clip(steps + random.uniform(-0.5, 0.5, (6, N_WAVES)) / N_WAVES, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""A simulated device: a mass in a hand, pushed by capped forces that come late."""
+"""A simulated device: a mass that a hand holds; forces are capped and act after a latency."""
 
 import math
 import time
@@ -15,39 +15,39 @@ from hapticdb.kernels.motion import pull
 from hapticdb.poses import quaternion_of
 
 STEP = 1e-4
-"""Seconds of one step of the integration."""
+"""Seconds of one step of the integration. Larger: less work a read, but only softer grips."""
 
 LONGEST = 0.05
-"""Seconds that a read catches up at most; what lies before is skipped."""
+"""Greatest time (s) that one read integrates; after a longer pause the time before is skipped."""
 
 
 class SimulatedDevice:
-    """A device of some mass that a hand pulls by a spring, against the wrench applied.
+    """A device with a mass; the hand pulls it by a spring, the applied wrench pushes it.
 
-    The hand is critically damped: m x'' = k (h - x) + 2 sqrt(k m) (h' - x') + F, h the hand, x the
-    device; turns alike. Integrated in fixed steps of 0.1 ms; the pose is carried on from the last
-    step to the instant of the read.
+    The spring is critically damped: m x'' = k (h - x) + 2 sqrt(k m) (h' - x') + F, where h is the
+    hand and x the device. Rotations follow the same law. The integration has fixed steps of 0.1 ms;
+    the pose is extrapolated from the last step to the instant of the read.
 
     Parameters
     ----------
     hand : Device
-        Where the person wants the device to be.
+        Gives the pose that the person wants the device to have.
     mass, inertia : float
-        Of the device, kg and kg m^2, the same about every axis.
+        Mass and moment of inertia of the device, kg and kg m^2; the same about every axis.
     grip, turn_grip : float
         Stiffness of the hand, N/m and N m/rad.
     max_force, max_torque : float
-        What the motors can do, N and N m; longer wrenches are shortened.
+        Greatest force and torque of the motors, N and N m; longer wrenches are shortened.
     latency : float
         Seconds from `apply` until the motors push.
     clock : callable
-        Seconds; it must be possible to pickle it, and best be the hand's.
+        Returns seconds; it must be picklable, and should be the hand's clock.
 
     Raises
     ------
     UsageError
-        If a number is out of its range, the grip too stiff for steps of 0.1 ms, or the hand no
-        device.
+        If a number is out of its range, the grip is too stiff for steps of 0.1 ms, or the hand is
+        no device.
     """
 
     def __init__(
@@ -85,16 +85,16 @@ class SimulatedDevice:
 
     @property
     def is_over(self) -> bool:
-        """Whether the hand has come to its end."""
+        """Whether the hand's script is over."""
         return isinstance(self.hand, SupportsEnd) and self.hand.is_over
 
     @property
     def last_wrench(self) -> NDArray[np.float64]:
-        """The wrench (6,) applied last, N and N m, capped; the motors may not push it yet."""
+        """The last wrench (6,) applied, N and N m, capped; its latency may not be over yet."""
         return self._last.copy()
 
     def rewind(self) -> None:
-        """Begin anew at the next read, at rest in the hand's first pose, if the hand can."""
+        """Start again at the next read, in the hand's pose; the hand rewinds too if it can."""
         if isinstance(self.hand, SupportsRewind):
             self.hand.rewind()
         self._time = None
@@ -102,14 +102,14 @@ class SimulatedDevice:
         self._pushing = np.zeros(6)
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
-        """Push with a wrench (6,), N and N m, capped, from one latency later on."""
+        """Push with a wrench (6,), N and N m, capped; it acts after the latency."""
         self._last = capped(wrench, self.max_force, self.max_torque)
         self._pending.append((self.clock() + self.latency, self._last))
 
     def read(self) -> Reading:
-        """Pose and velocity of the device now; its arrays are written anew by the next read.
+        """Return pose and velocity of the device now; the next read overwrites its arrays.
 
-        While the hand is nowhere the device is, too; it rests meanwhile.
+        While the hand's place is unknown, the device's place is unknown too, and it does not move.
         """
         hand = self._reader.read()
         now = self.clock()
@@ -131,9 +131,9 @@ class SimulatedDevice:
         return Reading(self._pose, self._velocity, hand.buttons)
 
     def _move(self, hand: Reading, until: float, now: float) -> None:
-        """Integrate in whole steps up to an instant, given the hand at another."""
+        """Integrate in whole steps up to `until` (s); `hand` is the hand's reading at `now` (s)."""
         assert self._time is not None  # noqa: S101 - set by read
-        # a wrench that falls due within a step pushes from the step's end on
+        # a wrench that becomes due within a step acts from the end of that step
         n_steps = max(0, int((until - self._time) / STEP + 1e-6))
         ahead = now - self._time
         self._time += n_steps * STEP

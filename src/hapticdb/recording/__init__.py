@@ -1,1 +1,1 @@
-"""Sessions on file: frames laid out, packed, written, read and replayed."""
+"""Recorded sessions: the file format, its writer and reader, and replay."""

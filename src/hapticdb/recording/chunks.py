@@ -1,4 +1,4 @@
-"""Chunks of a recording: found and checked, their frames left packed."""
+"""Chunks of a recording: finds and checks them; does not unpack their frames."""
 
 import io
 import struct
@@ -8,17 +8,18 @@ from typing import NamedTuple, Self
 from hapticdb.recording.frame import FRAME
 
 MOST_FRAMES = 1 << 16
-"""Frames that a chunk may have: a reader needs no more memory than for so many."""
+"""Greatest number of frames in a chunk. Larger: a reader may need more memory."""
 MARK = b"HDBC"
 HEAD = struct.Struct("<4sIQIII")
 SEARCHED = 1 << 20
-"""Bytes looked through at once for a further chunk."""
+"""Bytes read at once in the search for a chunk behind a damaged one. Larger: more memory."""
 
 
 class Chunk(NamedTuple):
-    """Head of a chunk: index of its first frame, their number, size and CRC-32 of its payload.
+    """Head of a chunk.
 
-    No frames: the mark that a recorder was closed here.
+    first : index of its first frame; n_frames : number of its frames, 0 for the end mark that a
+    recorder writes when it closes; n_bytes, crc : size and CRC-32 of its payload.
     """
 
     first: int
@@ -27,19 +28,19 @@ class Chunk(NamedTuple):
     crc: int
 
     def packed(self) -> bytes:
-        """The head's bytes."""
+        """Return the head's bytes."""
         head = HEAD.pack(MARK, self.n_frames, self.first, self.n_bytes, self.crc, 0)[:-4]
         return head + struct.pack("<I", zlib.crc32(head))
 
     @classmethod
     def parse(cls, content: bytes) -> Self | None:
-        """Head in the first bytes, None where there is none."""
+        """Return the head at the start of `content`, or None if there is no valid one."""
         if len(content) < HEAD.size or not content.startswith(MARK):
             return None
         _, n_frames, first, n_bytes, crc, head_crc = HEAD.unpack(content[: HEAD.size])
         if zlib.crc32(content[: HEAD.size - 4]) != head_crc or n_frames > MOST_FRAMES:
             return None
-        # deflating makes nothing 1,033 times shorter, nor longer but by a few bytes
+        # deflate shrinks data less than 1,033 times and lengthens it by a few bytes at most
         plain = n_frames * FRAME.itemsize
         if not plain <= 1032 * n_bytes <= 1032 * (1.01 * plain + (4096 if n_frames else 0)):
             return None
@@ -47,9 +48,11 @@ class Chunk(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """Whole chunks of a file: where each payload begins, frames in all, where the last one ends.
+    """Whole chunks of a file.
 
-    damaged : index of the first frame that is lost although whole chunks follow, or -1.
+    chunks : start of each payload in the file (bytes), and the chunk's head; n_frames : in all of
+    them; end : end of the last one (bytes); damaged : index of the first frame that is lost although
+    whole chunks follow, or -1.
     """
 
     chunks: list[tuple[int, Chunk]]
@@ -59,7 +62,7 @@ class Scan(NamedTuple):
 
 
 def scan(file: io.RawIOBase, start: int, size: int) -> Scan:
-    """Whole chunks from `start` on, up to the first that is not: torn, or damaged."""
+    """Find the whole chunks from `start` (bytes) up to the first that is cut off or damaged."""
     chunks: list[tuple[int, Chunk]] = []
     n_frames, at = 0, start
     is_damaged = False
@@ -82,7 +85,7 @@ def _is_whole(payload: bytes, chunk: Chunk) -> bool:
 
 
 def _has_chunk_after(file: io.RawIOBase, at: int, size: int) -> bool:
-    """Whether a whole chunk begins behind `at`: then what is at `at` is no torn end."""
+    """Whether a whole chunk begins behind `at`; if so, the file is damaged there, not cut off."""
     while at + 1 < size:
         file.seek(at + 1)
         content = read_bytes(file, SEARCHED)
@@ -96,7 +99,7 @@ def _has_chunk_after(file: io.RawIOBase, at: int, size: int) -> bool:
 
 
 def read_bytes(file: io.RawIOBase, n_bytes: int) -> bytes:
-    """So many bytes, or fewer at the end of the file."""
+    """Read `n_bytes` bytes, or fewer at the end of the file."""
     content = b""
     while len(content) < n_bytes and (more := file.read(n_bytes - len(content))):
         content += more

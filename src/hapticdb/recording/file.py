@@ -1,7 +1,7 @@
-"""Sessions on disk: one file (.hdbrec), a header and chunks of frames, bit for bit.
+"""Recorded sessions: one file (.hdbrec) each, a header and chunks of frames, bit for bit.
 
-docs/format.md describes the bytes. A file that was cut off anywhere is read up to its last whole
-chunk, and a recorder that goes on with it removes the rest first. A recorder ends by itself at its
+docs/format.md describes the bytes. A file that was cut off is read up to its last whole chunk; a
+recorder that appends to the file first removes the rest. A recorder stops by itself at its size
 limit, and before the disk is full.
 """
 
@@ -29,32 +29,32 @@ from hapticdb.recording.packing import pack, unpack
 __all__ = ["FRAME", "MOST_FRAMES", "Frames", "Header", "Recorder", "Recording", "State"]
 
 CHUNK = 4096
-"""Frames that a recorder packs together: 1.3 MB in memory."""
+"""Frames that a recorder packs into one chunk: 1.3 MB in memory. Larger: more memory."""
 DEFAULT_LIMIT = 4 << 30
-"""Bytes that a recording may have unless told otherwise: six hours at 1 kHz, one at 5 kHz."""
+"""Default of the greatest size of a recording, bytes: six hours at 1 kHz, one at 5 kHz."""
 LEFT_FREE = 64 << 20
-"""Bytes of the disk that a recorder leaves free; others write there, too, such as the database."""
+"""Bytes of the disk that a recorder leaves free for other writers, such as the database."""
 
 
 class Recording:
-    """A recorded session, opened. Holds no file open between calls.
+    """A recorded session, to be read. The file is open only during a call.
 
     Parameters
     ----------
     path : path
-        The file. Frames that are added to it later are not seen.
+        The file. Frames that are added to the file later are not read.
 
     Raises
     ------
     FileError
-        When it is missing, no recording, or cut off within its header.
+        If the file is missing, is no recording, or is cut off within its header.
 
     Attributes
     ----------
     path : Path
         The file.
     header : Header
-        What was felt, and how.
+        Environment, tool and settings of the session.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
@@ -70,16 +70,16 @@ class Recording:
 
     @property
     def damaged_at(self) -> int | None:
-        """Index of the first frame that cannot be read although others follow, None if none."""
+        """Index of the first unreadable frame that whole frames follow; None if there is none."""
         return None if self._scan.damaged < 0 else self._scan.damaged
 
     @property
     def n_torn(self) -> int:
-        """Bytes behind the last whole chunk: more than 0 where the recorder was killed."""
+        """Bytes behind the last whole chunk; more than 0 if the recorder was killed."""
         return 0 if self._scan.damaged >= 0 else self._size - self._scan.end
 
     def frames(self, *, until_damage: bool = False) -> Iterator[Frames]:
-        """Frames in their order, chunk by chunk.
+        """Yield the frames in order, chunk by chunk.
 
         Parameters
         ----------
@@ -89,7 +89,7 @@ class Recording:
         Yields
         ------
         (n,) structured array
-            Of `FRAME`, n at most `MOST_FRAMES`.
+            Frames of dtype `FRAME`; n is at most `MOST_FRAMES`.
 
         Raises
         ------
@@ -103,14 +103,14 @@ class Recording:
             yield frames
 
     def columns(self, *names: str, until_damage: bool = False) -> tuple[NDArray[np.generic], ...]:
-        """Whole columns, in the order of their names, (M,) or (M, k) each; see `FRAME`.
+        """Read whole columns, (M,) or (M, k) each, in the order of `names`; see `FRAME`.
 
         Raises
         ------
         UsageError
-            When there is no such column.
+            If there is no such column.
         FileError
-            When a chunk is damaged, unless `until_damage`.
+            If a chunk is damaged, unless `until_damage`.
         """
         unknown = [name for name in names if name not in (FRAME.names or ())]
         if unknown or not names:
@@ -125,7 +125,7 @@ class Recording:
     def poses(
         self, *, until_damage: bool = False
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Times (M,), s, and poses (M, 4, 4) world_from_hand of the handle: to be played again."""
+        """Times (M,), s, and poses (M, 4, 4) world_from_hand of the handle, for a `Player`."""
         times, hands = self.columns("time", "hand", until_damage=until_damage)
         poses = np.empty((len(hands), 4, 4))
         poses_of(np.ascontiguousarray(hands, dtype=np.float64), poses)
@@ -134,12 +134,12 @@ class Recording:
     def _chunks(
         self, names: tuple[str, ...], *, until_damage: bool
     ) -> Iterator[list[NDArray[np.generic]]]:
-        """Columns of each chunk."""
+        """Yield the columns of each chunk."""
         with self._file() as file:
             for place, chunk in self._scan.chunks:
                 file.seek(place)
                 content = read_bytes(file, chunk.n_bytes)
-                try:  # the file may have changed since it was scanned
+                try:  # the file may have changed since the scan
                     if zlib.crc32(content) != chunk.crc:
                         raise ValueError("another checksum")  # noqa: TRY301 - as one that unpack finds
                     columns = list(unpack(content, chunk.n_frames, FRAME, names))
@@ -178,45 +178,46 @@ class Recording:
 
 
 class Recorder:
-    """Writes frames to a recording; a context manager, which closes it.
+    """Writes frames to a recording; a context manager, which closes the recording.
 
-    What `flush` or a full chunk has written survives the process; `close` has it on the disk.
+    Chunks that `flush` or a full buffer has written survive the process. `close` writes all to
+    the disk (fsync).
 
     Parameters
     ----------
     path : path
         The file, `.hdbrec` by custom.
     header : Header
-        What is felt, and how.
+        Environment, tool and settings of the session.
     append : bool
-        Go on with a recording that is there: under the same header, but for the revision, the
-        version and the start. Its frames stay; a torn end goes. Times are the caller's: `header`
-        has the start that they count from.
+        Continue an existing recording. The header must be the same, except for the revision, the
+        version and the start. Old frames stay; a cut-off end is removed. The caller sets the times
+        of new frames; they count from the start in the attribute `header`.
     replace : bool
-        Begin anew where a recording is there, which stays as it is until the first frames of the
-        new one are written: until then those go to a file ``.NAME.new`` beside it.
+        Replace an existing recording. The old one stays until the first frames of the new one are
+        written; until then the new one is a file ``.NAME.new`` beside it.
     limit_bytes : int or None
-        Greatest size of the file; none but the disk's free space, less `LEFT_FREE`, with None. The
-        frame that would exceed it is left out, and all after it: see `ended`.
+        Greatest size of the file; None: the disk's free space less `LEFT_FREE`, which always
+        applies. The first frame beyond the limit and all later ones are left out: see `ended`.
 
     Raises
     ------
     UsageError
-        When a file is there and neither is asked for, another header is given to append, another
-        recorder is at it, or the limit leaves no room for a frame.
+        If the file exists and neither `append` nor `replace` is given, the header to append has
+        other values, another recorder writes the file, or the limit leaves no room for a frame.
     FileError
-        When it cannot be written, or cannot be gone on with, or the disk has no room; or when what
-        is to be replaced is no recording.
+        If the file cannot be written or appended to, the disk has no room, or the file to be
+        replaced is no recording.
 
     Attributes
     ----------
     path : Path
         The file.
     header : Header
-        As it stands in the file.
+        The header in the file.
     ended : str or None
-        Why it takes no more frames although nobody has closed it, in a line; None while it does.
-        The file is whole then, and closed.
+        One line: why the recorder stopped by itself; None while it takes frames. The file is whole
+        and closed when this is set.
     """
 
     def __init__(
@@ -260,19 +261,19 @@ class Recorder:
         self.close()
 
     def __len__(self) -> int:
-        """Frames in the file, and those that wait for their chunk."""
+        """Count the frames in the file and those that wait in memory."""
         return self._n_written + self._n_waiting
 
     def append(self, frames: Frames) -> None:
-        """Add frames (n,) of `FRAME`; each full chunk is written. Left out once it has `ended`.
+        """Add frames (n,) of `FRAME`, and write each full chunk; does nothing if `ended` is set.
 
         Raises
         ------
         UsageError
-            When they are no frames, or the recorder is closed.
+            If `frames` has another dtype or shape, or the recorder is closed.
         FileError
-            When the disk is full, or fails; the recorder is closed then, and what was written
-            before stays whole.
+            If the disk is full or fails; the recorder is then closed, and the chunks written
+            before stay whole.
         """
         if self.ended is None:
             self._check_open()
@@ -288,7 +289,7 @@ class Recorder:
                 self.flush()
 
     def flush(self) -> None:
-        """Write the frames that wait, in a chunk of their own; as many as there is room for."""
+        """Write the waiting frames as one chunk, as many as there is room for."""
         if self.ended is not None:
             return
         self._check_open()
@@ -310,7 +311,7 @@ class Recorder:
             self._finish()
 
     def close(self) -> None:
-        """Write what waits and the mark of the end, and have all of it on the disk."""
+        """Write the waiting frames and the end mark, and wait until all is on the disk."""
         if self._file.closed:
             return
         try:
@@ -321,7 +322,7 @@ class Recorder:
             self._file.close()
 
     def _finish(self) -> None:
-        """Write the mark of the end, have all on the disk, and close."""
+        """Write the end mark, wait until all is on the disk, and close."""
         try:
             self._write(Chunk(self._n_written, 0, 0, 0).packed())
             with self._told():
@@ -331,7 +332,7 @@ class Recorder:
             self._leave_old()
 
     def _beside_old(self) -> Path | None:
-        """Where a recording begins that replaces one; None where there is none."""
+        """Path of the new file that will replace a recording; None if there is none to replace."""
         try:
             with io.FileIO(self.path, "rb") as old:
                 if os.fstat(old.fileno()).st_size and old.read(len(MAGIC)) != MAGIC:
@@ -344,7 +345,7 @@ class Recorder:
         return self.path.with_name(f".{self.path.name}.new")
 
     def _leave_old(self) -> None:
-        """Leave the recording that was to be replaced: no frame came."""
+        """Keep the old recording if no frame was written: remove the new file."""
         if self._beside is not None:
             self._beside.unlink(missing_ok=True)
 
@@ -355,14 +356,14 @@ class Recorder:
             self._beside = None
 
     def _packed(self, n: int) -> bytes:
-        """Chunk of the first n frames that wait; nothing for none."""
+        """Pack the first n waiting frames into a chunk; empty for n = 0."""
         if not n:
             return b""
         payload = pack(self._buffer[:n])
         return Chunk(self._n_written, n, len(payload), zlib.crc32(payload)).packed() + payload
 
     def _room(self) -> tuple[int, str]:
-        """Bytes that a chunk may have, the mark of the end after it; and what bounds them."""
+        """Bytes left for a chunk with room for the end mark, and the words for what limits them."""
         free = free_bytes(self._file) - LEFT_FREE
         limit = free if self._limit is None else self._limit - self._end
         if limit <= free and self._limit is not None:
@@ -391,7 +392,7 @@ class Recorder:
             raise UsageError(f"{self.path} is being recorded: give another name") from error
 
     def _begin(self, *, append: bool) -> None:
-        """Write the header, or stand at the end of what is to be gone on with."""
+        """Write the header, or go to the end of the recording to append to."""
         size = os.fstat(self._file.fileno()).st_size
         if not (append and size):
             content = self.header.packed()
@@ -415,7 +416,7 @@ class Recorder:
         self._n_written, self._end = found.n_frames, found.end
 
     def _check_room(self, n_bytes: int, freed: int) -> None:
-        """Refuse to begin where no frame would fit behind so many bytes of the file."""
+        """Raise an error if no frame would fit behind the first `n_bytes` bytes of the file."""
         least = n_bytes + 2 * HEAD.size + FRAME.itemsize
         if self._limit is not None and least > self._limit:
             raise UsageError(
@@ -430,7 +431,7 @@ class Recorder:
             )
 
     def _write(self, content: bytes) -> None:
-        """Write all of it, or none and close."""
+        """Write all of `content`; on an error, remove the part written, close and raise."""
         try:
             rest = memoryview(content)
             while rest:
@@ -460,7 +461,7 @@ class Recorder:
 
 
 def free_bytes(file: io.FileIO) -> int:
-    """Bytes that we may still write on the disk that an open file is on."""
+    """Bytes that this process may still write on the disk of an open file."""
     found = os.fstatvfs(file.fileno())
     return found.f_bavail * found.f_frsize
 

@@ -1,4 +1,4 @@
-"""One frame of the loop, as it is recorded."""
+"""One recorded frame of the loop."""
 
 import enum
 
@@ -18,6 +18,6 @@ class State(enum.IntFlag):
     HELD = 1
     """The wrench was kept from an earlier frame."""
     FADING = 2
-    """It was kept for so long that it fell towards zero."""
+    """The wrench was kept for so long that it fell towards zero."""
     CLUTCH_OPEN = 4
     """The handle did not follow the hand."""

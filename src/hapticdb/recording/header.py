@@ -1,4 +1,4 @@
-"""What stands at the head of a recording: everything that a replay needs beside the database."""
+"""Header of a recording: everything that a replay needs, except the database."""
 
 import datetime as dt
 import io
@@ -26,7 +26,7 @@ MAGIC = b"HDBREC\r\n"
 FORMAT_VERSION = 1
 PREAMBLE = struct.Struct("<8sIIII")
 MOST_TEXT = 1 << 24
-"""Bytes of JSON that a header may have."""
+"""Greatest size of a header's JSON text, bytes. Larger: more excluded objects fit."""
 
 Value = str | int | float | bool | None | list[Any] | dict[str, Any]
 
@@ -37,35 +37,35 @@ def _now() -> str:
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """What was felt, and how.
+    """Environment, tool and settings of a recorded session.
 
     Attributes
     ----------
     environment : str
-        Its URL; a password is left out.
+        URL of the environment, without a password.
     grid : Grid
-        Of the environment.
+        Grid of the environment.
     revision : int
-        Of the environment when the session began.
+        Revision of the environment when the session began.
     shell : PointShell
         The tool.
     law : TangentPlane
         The force law.
     rate : float
-        Frames a second that were asked for.
+        Frames a second that the session was set to.
     exclude : iterable of int
-        Ids of objects that were not felt.
+        Ids of objects that were left out of the force.
     coupling : mapping
-        Parameters of the virtual coupling by their names, of what JSON holds.
+        Parameters of the virtual coupling by their names; the values are those of JSON.
     version : str
-        Of hapticdb.
+        Version of hapticdb.
     started : str
-        When the session began: ISO 8601, UTC. Frames count their time from here.
+        When the session began: ISO 8601, UTC. The frames' times count from this instant.
 
     Raises
     ------
     UsageError
-        When the rate is no positive number or the parameters are not of JSON.
+        If the rate is no positive number or the parameters cannot be written as JSON.
     """
 
     environment: str
@@ -95,7 +95,7 @@ class Header:
         object.__setattr__(self, "rate", float(self.rate))
 
     def differing(self, other: "Header") -> list[str]:
-        """Names of what is not the same in another header, when and at which revision aside."""
+        """Names of the fields that differ from another header's; time, revision, version aside."""
         names = [
             name
             for name in ("environment", "grid", "law", "rate", "exclude", "coupling")
@@ -104,12 +104,12 @@ class Header:
         return names if _arrays(self.shell) == _arrays(other.shell) else [*names, "shell"]
 
     def packed(self) -> bytes:
-        """The header's bytes.
+        """Return the header's bytes.
 
         Raises
         ------
         UsageError
-            When its text is longer than a header may have.
+            If the JSON text is longer than `MOST_TEXT`.
         """
         shell = self.shell
         text = json.dumps(
@@ -134,12 +134,12 @@ class Header:
 
     @classmethod
     def read(cls, file: io.RawIOBase, where: str) -> tuple[Self, int]:
-        """Header of an opened recording, and where its chunks begin.
+        """Read the header of an open recording; return it and the start of the chunks (bytes).
 
         Raises
         ------
         FileError
-            When it is no recording, a newer one, or cut off or damaged within its header.
+            If the file is no recording, has a newer format, or is cut off or damaged in its header.
         """
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
@@ -193,6 +193,6 @@ class Header:
 
 
 def _arrays(shell: PointShell) -> bytes:
-    """Points, normals and centre, as they stand in the file."""
+    """Bytes of points, normals and centre in the file's form."""
     arrays = (shell.points, shell.normals, shell.center)
     return b"".join(array.astype("<f8").tobytes() for array in arrays)

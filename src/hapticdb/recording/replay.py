@@ -1,4 +1,4 @@
-"""A replay: the wrenches of a recorded session computed again, and compared bit for bit."""
+"""Replay: computes the wrenches of a recorded session again and compares them bit for bit."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -25,11 +25,11 @@ Feel = Callable[[Floats], tuple[Floats, NDArray[np.int64]]]
 
 
 class Parting(NamedTuple):
-    """The first frame that is felt otherwise than it was recorded.
+    """The first frame whose wrench or number of hits differs from the recorded one.
 
     frame : its index; time : s since the session's start; recorded, present : wrenches (6,), N and
-    N m; hits_recorded, hits_present : shell points inside a voxel; revision_recorded,
-    revision_present : of the database, then and now.
+    N m; hits_recorded, hits_present : numbers of shell points inside a voxel; revision_recorded,
+    revision_present : revisions of the database, then and now.
     """
 
     frame: int
@@ -53,20 +53,20 @@ class Parting(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """What a replay found.
+    """Result of a replay.
 
     Attributes
     ----------
     n_compared : int
         Frames whose wrench was computed again.
     n_skipped : int
-        Frames that had unknown points or held their wrench: nothing to compare.
+        Frames that were not compared: they had unknown points or held an earlier wrench.
     n_differing : int
         Frames compared whose wrench or number of hits is not the same.
     parting : Parting or None
-        The first of them.
+        The first differing frame.
     revision : int
-        Of the database at the end.
+        Revision of the database at the end.
     is_same_revision : bool
         Whether all frames were recorded at the database's present revision.
     """
@@ -80,7 +80,7 @@ class Replayed:
 
     @property
     def is_equal(self) -> bool:
-        """Whether frames were compared and none differs."""
+        """Whether at least one frame was compared and none differs."""
         return self.n_compared > 0 and self.parting is None
 
     def describe(self) -> str:
@@ -100,7 +100,7 @@ class Replayed:
 def touching(
     environment: Environment, shell: PointShell, law: TangentPlane, exclude: Iterable[int] = ()
 ) -> Feel:
-    """Feel by one touch of the database a pose: independent of resident cells, and slow."""
+    """Return a function that queries the database for each pose: no resident cells, slow."""
     excluded = _present(environment, exclude)
 
     def feel(poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
@@ -120,14 +120,14 @@ def touching(
 def resident(
     environment: Environment, shell: PointShell, law: TangentPlane, exclude: Iterable[int] = ()
 ) -> Iterator[Feel]:
-    """Feel among resident cells, each of them fetched before it is needed: as fast as a session.
+    """Provide a function that uses resident cells, fetched before their use: as fast as a session.
 
-    The wrenches and hits are those of `touching`, bit for bit. The memory is given back at the end.
+    Its wrenches and hits are those of `touching`, bit for bit. The memory is freed at the end.
 
     Raises
     ------
     UsageError
-        When the environment is in lexicographic order, which has no cells.
+        If the environment is in lexicographic order, which has no cells.
     """
     with CellTable.create() as table:
         residency = Residency(environment.store, table, _present(environment, exclude))
@@ -139,7 +139,7 @@ def resident(
 
 
 def _present(environment: Environment, ids: Iterable[int]) -> list[int]:
-    """Those of the ids that are objects of the environment: one that has gone is felt by nobody."""
+    """Ids that are still objects of the environment; a removed object exerts no force anyway."""
     present = {obj.id for obj in environment.objects()}
     return [i for i in ids if i in present]
 
@@ -154,29 +154,29 @@ def replay(
 ) -> Replayed:
     """Compute the contact wrench of every recorded frame again, at the recorded pose of the tool.
 
-    Frames that held their wrench, or had points in unknown cells, are not compared.
+    Frames that held an earlier wrench, or had points in unknown cells, are not compared.
 
     Parameters
     ----------
     recording : Recording
         The session.
     environment : Environment
-        Where it was recorded, at whatever revision it is now.
+        The environment of the session; its revision may differ.
     feel : callable or None
-        Computes wrenches and hits with the recording's shell, law and excluded objects. Unless
-        given, frames are felt among resident cells, in 256 MiB of memory at most; an environment in
-        lexicographic order has no cells, and is asked frame by frame.
+        Computes wrenches and hits with the recording's shell, law and excluded objects. None:
+        resident cells in 256 MiB of memory at most; in lexicographic order, which has no cells,
+        one query a frame.
     until_damage : bool
-        Compare the frames before a damaged chunk, and end there.
+        Stop at a damaged chunk instead of raising an error.
     progress : callable or None
         Called after each chunk with the number of frames done.
 
     Raises
     ------
     GridError
-        When the environment has another grid than the recording.
+        If the environment has another grid than the recording.
     FileError
-        When a chunk of the recording is damaged, unless `until_damage`.
+        If a chunk of the recording is damaged, unless `until_damage`.
     """
     header = recording.header
     if header.grid != environment.grid:
@@ -198,7 +198,7 @@ def replay(
 
 
 class _Comparison:
-    """Frames as they were recorded against frames as they are felt now."""
+    """Compares recorded frames with the same frames computed now."""
 
     def __init__(self, environment: Environment, feel: Feel) -> None:
         self._environment = environment
@@ -227,7 +227,7 @@ class _Comparison:
         self.n_done += len(frames)
 
     def result(self) -> Replayed:
-        """What was found in all frames."""
+        """Result over all frames."""
         revision = self._environment.store.revision()
         return Replayed(
             n_compared=self._n_compared,

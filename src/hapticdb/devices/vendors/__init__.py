@@ -1,7 +1,7 @@
-"""Devices that one can buy, each behind the package or service of its maker.
+"""Devices of vendors, each driven through a package or service.
 
-Nothing is imported and no hardware is touched before `open`, so that a device can be pickled into
-the process that uses it.
+Before `open` nothing is imported and no hardware is used, so a device can be pickled into the
+process that uses it.
 """
 
 import importlib
@@ -15,18 +15,18 @@ from numpy.typing import NDArray
 from hapticdb.errors import DeviceError, MissingExtraError
 
 WINDOW = 0.02
-"""Seconds over which a velocity is measured where the device gives none."""
+"""Seconds over which a velocity is measured if the device gives none. Larger: smoother, later."""
 
 
 def load(module: str, extra: str) -> ModuleType:
-    """A module that speaks to a device.
+    """Import a module that drives a device.
 
     Raises
     ------
     MissingExtraError
         If its package is not installed.
     DeviceError
-        If the package is there, but the maker's own library, which it calls, is not.
+        If the package is installed, but the vendor's own library that it calls is not.
     """
     try:
         return importlib.import_module(module)
@@ -40,7 +40,7 @@ def load(module: str, extra: str) -> ModuleType:
 
 
 class VelocityWindow:
-    """Velocity of a hand as the difference between its poses over 20 ms."""
+    """Velocity of a hand: the difference between its poses over 20 ms, divided by the time."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[float, NDArray[np.float64]]] = deque()
@@ -56,7 +56,7 @@ class VelocityWindow:
             turn = pose[:3, :3] @ last[:3, :3].T
             x, y, z = turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]
             sine, cosine = math.sqrt(x * x + y * y + z * z), float(np.trace(turn)) - 1.0
-            # both are doubled; the quotient tends to one half where the hand hardly turns
+            # sine and cosine are doubled; for small turns the quotient tends to one half
             scale = math.atan2(sine, cosine) / sine if sine > 1e-12 else 0.5
             velocity[:3] = pose[:3, 3] - last[:3, 3]
             velocity[3:] = scale * x, scale * y, scale * z

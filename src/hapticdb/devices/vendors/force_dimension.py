@@ -1,8 +1,8 @@
 """Devices of Force Dimension (omega, delta, sigma, lambda, Novint Falcon).
 
 Written from the documentation and the sources of `forcedimension-core` 1.0.0, which calls the Force
-Dimension SDK 3.16 or later: functions of `forcedimension_core.dhd`, which write into what they are
-given and return 0 or more on success, -1 on failure. The SDK itself comes from the maker.
+Dimension SDK 3.16 or later. The functions of `forcedimension_core.dhd` write into their arguments
+and return 0 or more on success, -1 on failure. The SDK itself comes from the vendor.
 """
 
 from typing import Any
@@ -15,18 +15,19 @@ from hapticdb.devices.vendors import load
 from hapticdb.errors import DeviceError
 
 TIMEOUT = 7
-"""ErrorNum.TIMEOUT: the velocity estimator has not yet seen two positions."""
+"""ErrorNum.TIMEOUT: the velocity estimator does not have two positions yet."""
 
 
 class ForceDimensionDevice:
-    """A device of Force Dimension, its frame the one of its manual.
+    """A device of Force Dimension; its frame is that of its manual.
 
-    Devices without a wrist report the hand upright; those without motors in the wrist drop torque.
+    A device without a wrist reports the hand upright; one without motors in its wrist ignores the
+    torque.
 
     Parameters
     ----------
     serial : int, optional
-        Serial number; the first device that is free otherwise.
+        Serial number; without one, the first free device is taken.
     max_force, max_torque : float
         Caps, N and N m.
     """
@@ -41,7 +42,7 @@ class ForceDimensionDevice:
         self._has_wrist = self._has_active_wrist = False
 
     def open(self) -> None:
-        """Open the device and let its motors push."""
+        """Open the device and enable its motors."""
         dhd = load("forcedimension_core.dhd", "force-dimension")
         self._id = dhd.open() if self.serial is None else dhd.openSerial(self.serial)
         if self._id < 0:
@@ -55,7 +56,7 @@ class ForceDimensionDevice:
         self._check(dhd.enableForce(True, ID=self._id))  # noqa: FBT003 - the SDK's own order
 
     def read(self) -> Reading:
-        """Pose, velocity and buttons now."""
+        """Return pose, velocity and buttons now."""
         dhd = self._opened()
         pose, velocity = np.eye(4), np.zeros(6)
         if self._has_wrist:
@@ -77,7 +78,7 @@ class ForceDimensionDevice:
             self._check(dhd.setForce(push[:3], ID=self._id))
 
     def close(self) -> None:
-        """Stop the motors and let go of the device."""
+        """Stop the motors and release the device."""
         if self._dhd is not None:
             dhd, self._dhd = self._dhd, None
             dhd.stop(ID=self._id)

@@ -1,10 +1,11 @@
 """Devices of Haply (Inverse3, Minverse) through the Haply Inverse Service on this machine.
 
 Written from the documentation of the Inverse SDK 3.5 (docs.haply.co: "WebSocket Protocol", "Control
-Commands", tutorials 01, 02 and 06). On connection the service sends all devices; then exactly one
-state for each message that it gets. Positions are metres, velocities m/s, forces N, x right, y
-forward, z up. A VerseGrip, where there is one, gives the orientation and the buttons; the Inverse3
-has no motors for torque, which is dropped. Angular velocity is measured over 20 ms.
+Commands", tutorials 01, 02 and 06). On connection the service sends the list of devices; after
+that, exactly one state for each message that it receives. Positions are in metres, velocities in
+m/s, forces in N; x is right, y forward, z up. A VerseGrip, if there is one, gives the orientation
+and the buttons. The Inverse3 has no motors for torque, so the torque is ignored. The angular
+velocity is measured over 20 ms.
 """
 
 import contextlib
@@ -26,10 +27,10 @@ URL = "ws://localhost:10001"
 LOOPBACK = {"localhost", "127.0.0.1", "::1"}
 
 SILENCE = 0.1
-"""Seconds without an answer after which the device counts as gone."""
+"""Seconds without an answer after which the device counts as lost."""
 
 HANDSHAKE = {"configure": {"profile": {"name": "hapticdb"}}}
-"""What the first message says of the session."""
+"""Session part of the first message: the name of the profile."""
 
 AXES = ("x", "y", "z")
 
@@ -40,18 +41,18 @@ class HaplyDevice:
     Parameters
     ----------
     device_id : str, optional
-        As the service names it ("049D"); the first one otherwise.
+        The service's name of the device ("049D"); without one, the first device is taken.
     url : str
         The service's address, on this machine.
     max_force : float
         Cap, N.
     clock : callable
-        Seconds; it must be possible to pickle it.
+        Returns seconds; it must be picklable.
 
     Raises
     ------
     UsageError
-        If the address leads to another machine.
+        If the address is of another machine.
     """
 
     def __init__(
@@ -83,7 +84,8 @@ class HaplyDevice:
         client = load("websockets.sync.client", "haply")
         self._exceptions = load("websockets.exceptions", "haply")
         try:
-            # every message is answered within the period: no pings, and no proxy to this machine
+            # every message is answered within the period, so no pings; the service is local, so no
+            # proxy
             connection = client.connect(
                 self.url,
                 open_timeout=2.0,
@@ -106,7 +108,7 @@ class HaplyDevice:
             raise
 
     def _find(self) -> str:
-        """The wanted device's name, from the list that the service sends first."""
+        """Name of the wanted device, from the list that the service sends first."""
         found = [each.get("device_id") for each in self._receive().get("inverse3", [])]
         if not found or self.device_id not in {None, *found}:
             which = "no Inverse3" if self.device_id is None else f"no Inverse3 {self.device_id}"
@@ -115,8 +117,8 @@ class HaplyDevice:
         return str(self.device_id or found[0])
 
     def read(self) -> Reading:
-        """Pose, velocity and buttons as the service answers to the force sent last."""
-        if not self._n_awaited:  # nothing is said unasked: ask by the same force again
+        """Return pose, velocity and buttons from the service's answer to the last force."""
+        if not self._n_awaited:  # the service only answers, so send the same force again
             self._send(self._force)
         state: dict[str, Any] = {}
         while self._n_awaited:
@@ -125,17 +127,17 @@ class HaplyDevice:
         return self._reading_of(state)
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
-        """Push with the force of a wrench (6,), N, capped; the torque is dropped."""
+        """Push with the force of a wrench (6,), N, capped; the torque is ignored."""
         self._send(capped(wrench, self.max_force, 0.0).tolist()[:3])
 
     def close(self) -> None:
-        """Take the force away and disconnect."""
+        """Set the force to zero and disconnect."""
         if self._socket is not None:
             try:
                 if self._id:
                     self._send([0.0, 0.0, 0.0])
             except DeviceError:
-                pass  # it is gone, and its force with it
+                pass  # the device is lost, so it pushes no more
             finally:
                 self._socket, self._id, self._n_awaited = None, "", 0
                 self._held.close()
@@ -187,15 +189,15 @@ class HaplyDevice:
         return Reading(pose, velocity, buttons)
 
     def _take_grip(self, state: dict[str, Any]) -> int:
-        """Take the orientation of the first VerseGrip, if there is one, and give its buttons."""
+        """Store the orientation of the first VerseGrip, if there is one; return its buttons."""
         grips = state.get("wireless_verse_grip") or state.get("verse_grip") or [{}]
         grip = grips[0].get("state", {})
         q = grip.get("orientation", {})
         values = [float(q.get(name, 0.0)) for name in ("w", *AXES)]
         norm = math.hypot(*values)
-        if norm > 0.5:  # a grip that has not yet spoken says zeros
+        if norm > 0.5:  # a grip without a measurement yet reports zeros
             self._rotation = rotation_of([value / norm for value in values])[0]
-        if "button" in grip:  # the wired grip has one
+        if "button" in grip:  # the wired grip has one button
             return int(bool(grip["button"]))
         held = grip.get("buttons", {})
         return sum(1 << bit for bit, name in enumerate(("a", "b", "c")) if held.get(name))

@@ -1,10 +1,10 @@
 """Devices of 3D Systems (Touch, Touch X, Phantom) through OpenHaptics.
 
-Written from the README and the sources of `pyopenhaptics` 1.0.1, which calls OpenHaptics 3.4: the
-device's state may only be asked in a callback of the OpenHaptics scheduler, 1000 times a second in
-a thread of its own. So the callback leaves what it saw for `read`, and takes the force that `apply`
-left. The package gives neither velocity nor torque: velocities are measured over 20 ms, torque is
-dropped. The library itself comes from the maker.
+Written from the README and the sources of `pyopenhaptics` 1.0.1, which calls OpenHaptics 3.4. The
+device's state can be read only in a callback of the OpenHaptics scheduler, which runs 1000 times a
+second in a thread of its own. So the callback stores the reading for `read`, and sends the force
+that `apply` stored. The package gives neither velocity nor torque: velocities are measured over
+20 ms, torque is ignored. The library itself comes from the vendor.
 """
 
 import contextlib
@@ -20,26 +20,27 @@ from hapticdb.devices.vendors import VelocityWindow, load
 from hapticdb.errors import DeviceError
 
 INVALID_HANDLE = 0xFFFFFFFF
-"""HD_INVALID_HANDLE, which hdInitDevice returns where there is no device."""
+"""HD_INVALID_HANDLE, which hdInitDevice returns if there is no device."""
 
 SILENCE = 0.1
-"""Seconds without a callback after which the device counts as gone."""
+"""Seconds without a callback after which the device counts as lost."""
 
 STALE = 0.05
-"""Seconds that a force lasts if no other follows: the scheduler goes on when the loop does not."""
+"""Seconds after which a force that no other replaced becomes zero: the scheduler would repeat the
+last force for ever if the loop stopped."""
 
 
 class OpenHapticsDevice:
-    """A device of 3D Systems, its frame OpenHaptics' own: x right, y up, z towards the user.
+    """A device of 3D Systems; its frame is that of OpenHaptics: x right, y up, z towards the user.
 
     Parameters
     ----------
     name : str
-        As it was given in the maker's setup.
+        Name of the device in the vendor's setup.
     max_force : float
         Cap, N; a Touch can do 3.3.
     clock : callable
-        Seconds; it must be possible to pickle it.
+        Returns seconds; it must be picklable.
     """
 
     def __init__(
@@ -55,15 +56,15 @@ class OpenHapticsDevice:
         self._hd: Any = None
         self._id = 0
         self._callback: Any = None
-        # each is replaced as a whole, so that no thread sees a half of it
+        # each tuple is replaced as a whole, so no thread reads a half-written one
         self._seen: tuple[float, Reading] | None = None
         self._push: tuple[float, list[float]] = (0.0, [0.0, 0.0, 0.0])
 
     def open(self) -> None:
-        """Open the device and wait until its scheduler has called."""
+        """Open the device and wait for the first callback of its scheduler."""
         hd = load("pyOpenHaptics.hd", "openhaptics")
         callbacks = load("pyOpenHaptics.hd_callback", "openhaptics")
-        # the package tells its progress and its errors on standard output
+        # the package prints its progress and its errors to standard output
         with contextlib.redirect_stdout(io.StringIO()) as told:
             device = hd.init_device(self.name)
             if device is None or device == INVALID_HANDLE:
@@ -76,7 +77,7 @@ class OpenHapticsDevice:
                 raise DeviceError(f"OpenHaptics failed to start: {told.getvalue().strip()[-200:]}")
         self._hd, self._id, self._seen = hd, device, None
         window = VelocityWindow()
-        # kept here, for OpenHaptics calls it as long as the scheduler runs
+        # the reference keeps the callback alive: OpenHaptics calls it while the scheduler runs
         self._callback = callbacks.hd_callback(lambda: self._serve(hd, window))
         callbacks.hdAsyncSheduler(self._callback)
         deadline = self.clock() + 1.0
@@ -87,9 +88,9 @@ class OpenHapticsDevice:
             raise DeviceError("the OpenHaptics scheduler does not call; restart its driver")
 
     def _serve(self, hd: Any, window: VelocityWindow) -> None:  # noqa: ANN401 - a module without types
-        """In a frame of the scheduler: see where the hand is, and push it."""
+        """Store the reading and send the force; runs in each frame of the scheduler."""
         now = self.clock()
-        # an OpenGL matrix, column after column, in millimetres
+        # an OpenGL matrix: column by column, in millimetres
         pose = np.array(hd.get_transform(), dtype=np.float64).T.copy()
         pose[:3, 3] *= 1e-3
         buttons = int(hd.get_buttons())
@@ -98,7 +99,7 @@ class OpenHapticsDevice:
         hd.set_force(force if now - since <= STALE else [0.0, 0.0, 0.0])
 
     def read(self) -> Reading:
-        """Pose, velocity and buttons as the scheduler saw them last."""
+        """Return pose, velocity and buttons of the scheduler's last callback."""
         if self._seen is None:
             raise DeviceError("the OpenHaptics device is not open; call open() first")
         when, reading = self._seen
@@ -107,11 +108,11 @@ class OpenHapticsDevice:
         return reading
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
-        """Push with the force of a wrench (6,), N, capped; the torque is dropped."""
+        """Push with the force of a wrench (6,), N, capped; the torque is ignored."""
         self._push = self.clock(), capped(wrench, self.max_force, 0.0).tolist()[:3]
 
     def close(self) -> None:
-        """Stop the scheduler and let go of the device."""
+        """Stop the scheduler and release the device."""
         if self._hd is not None:
             hd, self._hd = self._hd, None
             hd.stop_scheduler()
@@ -123,5 +124,5 @@ def _has_failed(hd: Any) -> bool:  # noqa: ANN401 - a module without types
     """Whether OpenHaptics reports an error."""
     try:
         return bool(hd.get_error())
-    except KeyError:  # the package knows names for five of the codes only
+    except KeyError:  # the package has names for only five of the codes
         return True

@@ -50,9 +50,9 @@ class Chunk(NamedTuple):
 class Scan(NamedTuple):
     """Whole chunks of a file.
 
-    chunks : start of each payload in the file (bytes), and the chunk's head; n_frames : in all of
-    them; end : end of the last one (bytes); damaged : index of the first frame that is lost although
-    whole chunks follow, or -1.
+    chunks : start of each payload in the file (bytes), and the chunk's head; n_frames : number of
+    frames in all of them; end : end of the last one (bytes); damaged : index of the first frame that
+    is lost although whole chunks follow, or -1.
     """
 
     chunks: list[tuple[int, Chunk]]

@@ -1,8 +1,8 @@
-"""Sizes and places of a tool, its path and the scene compared: what does not fit, by which factor.
+"""Compares the sizes and places of a tool, its path and the scene, to find wrong units.
 
-A length in a wrong unit makes an answer that looks like any other: nothing is hit. Only what is off
-beyond doubt is told: a tool larger than the whole scene, or smaller than a voxel; a path that stays
-farther from the scene than the scene or the tool is long, or is a hundred times as long as both.
+A length in a wrong unit gives an answer that looks valid: nothing is hit. Only clear cases are
+reported: a tool larger than the whole scene or smaller than a voxel; a path that stays farther from
+the scene than the scene or the tool is long; a path a hundred times as long as both.
 """
 
 from collections.abc import Iterable
@@ -22,21 +22,23 @@ Floats = NDArray[np.float64]
 What = Literal["tool", "path", "scene"]
 
 LARGE_TOOL = 5.0
-"""Metres; a shorter tool may be larger than a scene, which may be one small part."""
+"""Metres. A shorter tool may be larger than the scene, because a scene may be one small part.
+Larger: fewer large tools are reported."""
 LONG_PATH = 100.0
-"""Lengths of scene and tool that a path may span: it may begin far away."""
+"""Greatest length of a path, in lengths of the scene or tool. Larger: fewer paths are reported."""
 PAIRS = 2_000_000
-"""Boxes of the path against boxes of objects; where there are more, the path's are joined."""
+"""Greatest number of pairs of a path's box and an object's box. If there are more, neighbouring
+boxes of the path are joined. Larger: a more exact gap, more time."""
 LIKELY = ("mm", "in", "cm", "ft", "m", "um", "yd", "km")
-"""Units in the order in which they are suspected."""
+"""Units that may explain a misfit, in the order in which they are tried."""
 
 
 class Misfit(NamedTuple):
-    """One thing that does not fit the others.
+    """A tool, path or scene that does not fit the others.
 
-    what : which; factor : by which its lengths are too large (below 1: too small) if its numbers
-    are in another unit than they were taken for, and unit : that one; None where no unit explains
-    it; text : all of it in a line.
+    what : which of the three; factor : its lengths are this many times too large (below 1: too
+    small) if its numbers are in another unit than assumed; unit : that other unit; both None if no
+    unit explains the misfit; text : one line for people.
     """
 
     what: What
@@ -47,21 +49,21 @@ class Misfit(NamedTuple):
 
 @dataclass(frozen=True)
 class Proportions:
-    """How large tool, path and scene are beside one another, and how near they come.
+    """Sizes of tool, path and scene, and the distance between path and scene.
 
     Attributes
     ----------
     scene : (2, 3) float64 or None
-        Lower and upper corner of what can be hit, metres; None when nothing can.
+        Lower and upper corner of the objects that can be hit, metres; None if there are none.
     tool : float
         Longest side of the tool's box, metres.
     path : (2, 3) float64 or None
-        Corners of the box that the tool's middle moves in, metres; None where it is not known.
+        Corners of the box that the tool's middle moves in, metres; None if the path is unknown.
     gap : float or None
-        The tool comes no nearer than that to the box of any object, metres; 0 where boxes meet, and
-        None where path or scene are not there.
+        Lower bound of the distance from the tool to the box of any object, metres; 0 if boxes meet,
+        None without a path or a scene.
     misfits : tuple of Misfit
-        What is off; empty where nothing is, or nothing is known.
+        Sizes and places that do not fit; empty if all fit or too little is known.
     """
 
     scene: Floats | None
@@ -72,11 +74,11 @@ class Proportions:
 
     @property
     def text(self) -> str:
-        """All that is off, in one line; empty when nothing is."""
+        """All misfits in one line; empty if there are none."""
         return "; ".join(misfit.text for misfit in self.misfits)
 
     def record(self) -> dict[str, Any]:
-        """All of it for JSON: metres."""
+        """All fields for JSON, in metres."""
         return {
             "scene": None if self.scene is None else self.scene.tolist(),
             "tool": self.tool,
@@ -103,27 +105,27 @@ def compare_proportions(
     Parameters
     ----------
     objects : iterable of Object
-        Of the environment.
+        Objects of the environment.
     voxel_size : float
-        Its voxels' edge, metres.
+        Edge of its voxels, metres.
     shell : PointShell
         The tool, metres.
     poses : (M, 4, 4) array or None
-        `world_from_tool`, metres; None where nobody knows them before.
+        `world_from_tool`, metres; None if the path is not known in advance.
     exclude : iterable of int
-        Ids of objects that are not felt.
+        Ids of objects that are left out.
     tool_unit, path_unit : str
-        Of `hapticdb.mesh.UNITS`: what the numbers of either were taken for. None for a tool that is
-        a part of the same scene, whose size is not in question.
+        Units in which the numbers of tool and path were read, of `hapticdb.mesh.UNITS`. A
+        `tool_unit` of None skips the check of the tool's size: the tool is a part of the scene.
     is_moving : bool
-        Whether the tool moves from pose to pose, in straight lines; else it is at the poses alone.
+        Whether the tool moves in straight lines between the poses; else it is only at the poses.
     margin : float
-        Metres by which the tool may leave them.
+        Metres by which the tool may leave the path.
 
     Raises
     ------
     UsageError
-        When poses have another shape, or are none, or a unit is unknown.
+        If the poses have another shape, there are none, or a unit is unknown.
     """
     left_out = set(exclude)
     felt = [obj for obj in objects if obj.id not in left_out]
@@ -140,12 +142,16 @@ def compare_proportions(
     misfits = [] if tool_unit is None else _tool_misfits(look, tool_unit)
     misfits += _path_misfits(look, gap, path_unit)
     scenes = [misfit for misfit in misfits if misfit.what == "scene"]
-    # what the scene explains is not the tool's or the path's fault as well
+    # a misfit of the scene explains those of tool and path, so it is reported alone
     return Proportions(scene, tool.length, path, gap, tuple(scenes[:1] or misfits))
 
 
 class _Tool(NamedTuple):
-    """Middle of a tool's box (3,), tool frame, its reach from there, and its longest side."""
+    """A tool's box, metres.
+
+    middle (3,) : of the box, tool frame; radius : distance from the middle to the farthest point;
+    length : longest side.
+    """
 
     middle: Floats
     radius: float
@@ -160,7 +166,11 @@ class _Tool(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """What is compared: objects' boxes (O, 2, 3), all of them (2, 3), tool and way (M, 3)."""
+    """Boxes to compare, metres.
+
+    boxes (O, 2, 3) : of the objects; scene (2, 3) : of all objects; centers (M, 3) : places of the
+    tool's middle, or None; is_moving, margin : as for `compare_proportions`.
+    """
 
     boxes: Floats
     scene: Floats
@@ -177,14 +187,14 @@ class _Look(NamedTuple):
 
     @property
     def way(self) -> float:
-        """Longest side of the box that the tool's middle moves in; 0 where it is not known."""
+        """Longest side of the box that the tool's middle moves in, metres; 0 if it is unknown."""
         return 0.0 if self.centers is None else float(np.ptp(self.centers, axis=0).max())
 
     def gap(self, path_factor: float = 1.0, scene_factor: float = 1.0) -> float:
-        """Metres that the tool stays away from all boxes, if lengths were so many times as large.
+        """Lower bound of the distance from the tool to all boxes, metres.
 
-        From the box of each straight piece of the way, widened by the tool's reach: no tool comes
-        nearer, whatever its shape.
+        Path and scene are scaled by the factors first. The bound uses the box of each straight
+        piece of the path and the tool's radius, so it holds for a tool of any shape.
         """
         assert self.centers is not None  # noqa: S101 - asked for paths alone
         at = self.centers * path_factor
@@ -219,7 +229,7 @@ def _centers(poses: ArrayLike, tool: _Tool) -> Floats:
 
 
 def _tool_misfits(look: _Look, unit: str) -> list[Misfit]:
-    """What the tool's size beside the scene and its voxels says."""
+    """Compare the tool's size with the scene and the voxels."""
     length, extent = look.tool.length, look.extent
     if length > max(extent, LARGE_TOOL):
         is_off = f"{length / extent:.3g} times as long as the scene, {length_text(extent)}"
@@ -237,7 +247,7 @@ def _tool_misfits(look: _Look, unit: str) -> list[Misfit]:
 
 
 def _scene_misfit(look: _Look, is_off: str) -> Misfit:
-    """Tool and path agree, and the scene is large beyond both."""
+    """Misfit of a scene that is far larger than both tool and path."""
     extent, tool, way = map(length_text, (look.extent, look.tool.length, look.way))
     text = f"the scene is {extent} long, but the tool {tool}, {is_off}, and its path {way}"
     for other, factor in _suspects("m"):
@@ -248,12 +258,12 @@ def _scene_misfit(look: _Look, is_off: str) -> Misfit:
 
 
 def _path_misfits(look: _Look, gap: float | None, unit: str) -> list[Misfit]:
-    """What the path's place and length beside the scene and the tool say."""
+    """Compare the path's place and length with the scene and the tool."""
     if gap is None:
         return []
     extent, way = look.extent, look.way
     larger, long = max(extent, look.tool.length), length_text(extent)
-    # a tool that touches is meant to meet the scene; one that is swept may pass on purpose
+    # single poses are meant to touch the scene; a moving tool may pass the scene on purpose
     is_far = gap > (larger if look.is_moving else 0.25 * extent)
     if is_far:
         text = f"the path never comes within {length_text(gap)} of the scene, {long} long"
@@ -262,12 +272,12 @@ def _path_misfits(look: _Look, gap: float | None, unit: str) -> list[Misfit]:
     else:
         return []
     if is_far and 5.0 * extent < min(look.tool.length, way) and look.tool.length < LARGE_TOOL:
-        # tool and path agree
+        # tool and path fit each other, so the scene is the misfit
         for other, factor in _suspects("m"):
             if look.tool.length <= extent * factor and look.gap(1.0, factor) == 0.0:
                 return [_explained("scene", text, "the scene would fit", other, "m")]
     for other, factor in _suspects(unit):
-        # shrunk towards the origin, any path meets a scene that is there: it must keep a length
+        # a path shrunk to the origin meets any scene there, so a least length is required
         is_likely = way * factor >= 0.1 * extent or gap > LONG_PATH * larger
         if is_likely and way * factor <= 10.0 * larger and look.gap(factor) == 0.0:
             return [_explained("path", text, "it would meet it", other, unit)]
@@ -275,16 +285,16 @@ def _path_misfits(look: _Look, gap: float | None, unit: str) -> list[Misfit]:
 
 
 def _suspects(unit: str) -> list[tuple[str, float]]:
-    """Other units, and by which factor a length changes that is in them and not in `unit`."""
+    """Other units, each with the factor of a length that is in that unit instead of `unit`."""
     own = metres_of(unit)
     return [(other, UNITS[other] / own) for other in LIKELY if UNITS[other] != own]
 
 
 def _explained(what: What, text: str, outcome: str, other: str, unit: str) -> Misfit:
-    """Misfit that goes away where numbers are in another unit than they were taken for."""
+    """Misfit that disappears if the numbers are in the unit `other` instead of `unit`."""
     factor = UNITS[other] / UNITS[unit]
     by = 1.0 / factor if factor < 1.0 else factor
-    if other == "km":  # which nobody draws in: lengths were made metres twice
+    if other == "km":  # no file is in km: a conversion to metres was applied twice
         return Misfit(what, 1.0 / factor, None, f"{text}: {outcome} {by:.4g} times as large")
     guess = f"{outcome} if its numbers were {NAMES[other]}, not {NAMES[unit]} (factor {by:.4g})"
     return Misfit(what, 1.0 / factor, other, f"{text}: {guess}")

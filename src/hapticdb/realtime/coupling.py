@@ -1,4 +1,4 @@
-"""Coupling: the tool as a body, and what pulls it to the handle."""
+"""Coupling: the tool as a body, and the spring and damper that pull it to the handle."""
 
 import math
 from dataclasses import dataclass
@@ -15,32 +15,32 @@ from hapticdb.pointshell.shell import PointShell
 class Coupling:
     """The tool as a body, and the spring and damper that pull it to the hand.
 
-    The damper is critical, for turns as for moves. The moment of inertia is that of all mass at
-    the point farthest from the centre, m r^2, more than any tool of that mass has: a push at any
-    lever then moves no point more than twice as easily as one at the centre, so that long tools are
-    as stable as round ones. Stiffness and damping of turns are those of moves, times r^2.
+    Translations and rotations are critically damped. The moment of inertia is m r^2: all mass at
+    the point farthest from the centre, more than any tool of that mass has. A push anywhere then
+    moves no point more than twice as easily as a push at the centre, so long tools are as stable
+    as round ones. Stiffness and damping of rotations are those of translations, times r^2.
 
     In contact the spring is stretched by half a voxel at most, and the damper pulls no harder than
-    that spring, so that the force is `stiffness` times a voxel at most, however fast the hand is
-    said to be; likewise for turns. What is sent to the device is about the handle's origin.
+    that spring. So the force is at most `stiffness` times a voxel, however fast the hand moves;
+    the torque is bounded likewise. The torque sent to the device is about the handle's origin.
 
     Attributes
     ----------
     mass : float
-        kg.
+        Mass of the tool, kg.
     stiffness : float
-        Of the spring, N/m.
+        Stiffness of the spring, N/m.
     hold, fade : float
-        Seconds that the last wrench is kept where cells are unknown, and in which it then falls to
-        zero; it rises again within `fade`, in four frames at least, as it does when a session
-        starts, and as it falls and rises when the clutch opens and closes.
+        In unknown cells the last wrench is kept for `hold` seconds and then falls to zero in `fade`
+        seconds. It rises again within `fade`, in at least four frames. It rises in the same way
+        when a session starts, and falls and rises when the clutch opens and closes.
     most_substeps : int
-        Of a period; the rest of a period that needs more is dropped.
+        Greatest number of substeps of a period. If a period needs more, its rest is dropped.
 
     Raises
     ------
     UsageError
-        When a number is out of its range.
+        If a number is out of its range.
     """
 
     mass: float = 0.012
@@ -58,17 +58,17 @@ class Coupling:
             raise UsageError(f"{self.most_substeps} substeps a period: give 1 or more")
 
     def body(self, shell: PointShell, place: Place, stiffness: float) -> Body:
-        """Body of a shell in a grid, as the kernel takes it; stiffness of a contact, N/m.
+        """Body of a shell in a grid, in the kernel's form; `stiffness` is a contact's, N/m.
 
         Raises
         ------
         UsageError
-            When the stiffness is negative or not finite.
+            If the stiffness is negative or not finite.
         """
         if not (math.isfinite(stiffness) and stiffness >= 0.0):
             raise UsageError(f"a contact's stiffness of {stiffness} N/m: give 0 or more")
         reach = float(np.linalg.norm(shell.points - shell.center, axis=1).max())
-        radius = max(reach, place.size)  # a single point would turn without resistance
+        radius = max(reach, place.size)  # a single point would have no inertia
         inertia = self.mass * radius**2
         damping = 2.0 * math.sqrt(self.stiffness * self.mass)
         return Body(

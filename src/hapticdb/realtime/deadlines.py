@@ -1,4 +1,4 @@
-"""Deadlines: a loop on time, and what a process does to be left alone while it runs."""
+"""Deadlines: keeps a loop on time, and settings of the process that make it less disturbed."""
 
 import contextlib
 import ctypes
@@ -24,7 +24,7 @@ _PR_GET_TIMERSLACK = 30
 """Numbers of two operations of Linux's prctl."""
 DEFAULT_SLACK_NS = 50_000
 MOST_PROCESSORS = 4096
-"""Processors are numbered below this; a machine with more has the others unused."""
+"""Processor numbers are below this; the loop cannot be bound to higher ones."""
 
 
 @dataclass(frozen=True)
@@ -57,19 +57,19 @@ class Timing:
             )
 
     def check_granted(self) -> None:
-        """Refuse a processor that the system does not let this process run on; names those it does.
+        """Refuse a processor that this process may not use; the message names those it may.
 
         Raises
         ------
         UsageError
-            When it is not there, or not among those of this container or cpuset.
+            If the processor does not exist, or is not in this container's or cpuset's set.
         """
         if self.processor is not None and self.processor not in (allowed := _allowed()):
             raise _not_granted(self.processor, allowed)
 
 
 class Deadlines:
-    """A fixed grid of deadlines, and how well they are kept.
+    """A fixed grid of deadlines, and statistics of how late the frames begin.
 
     `wait` sleeps until shortly before the next deadline, then watches the clock until the deadline,
     and returns the time at which the frame begins, ns. A frame that takes longer than its period
@@ -78,7 +78,7 @@ class Deadlines:
     Parameters
     ----------
     period_ns : int
-        Between two deadlines.
+        Nanoseconds between two deadlines.
     lateness, elapsed : Times
         Collect every frame's lateness and computing time, s.
     clock, sleep : callable
@@ -105,7 +105,7 @@ class Deadlines:
 
     @property
     def passed(self) -> int:
-        """Number of deadlines that are over: those kept and those missed."""
+        """Number of past deadlines, kept and missed."""
         return self.frames + self.missed
 
     def wait(self) -> int:
@@ -125,7 +125,7 @@ class Deadlines:
         return now
 
     def done(self) -> None:
-        """End a frame: the next deadline is the first on the grid that is still to come."""
+        """End a frame: the next deadline is the first one in the future."""
         now = self._clock()
         self._elapsed.add((now - self._begun) * 1e-9)
         self.due += self.period
@@ -136,7 +136,7 @@ class Deadlines:
         self._before = now
 
     def figures(self) -> LoopFigures:
-        """How the loop kept its time."""
+        """Statistics of the loop so far."""
         return LoopFigures(
             frames=self.frames,
             seconds=(self._before - self.started) * 1e-9,
@@ -147,7 +147,7 @@ class Deadlines:
 
 
 def empty_loop(timing: Timing, seconds: float) -> LoopFigures:
-    """Run a loop of that rate that does nothing; its figures are this machine's own lateness."""
+    """Run a loop that does nothing at the rate of `timing`, to measure the machine's lateness."""
     deadlines = Deadlines(round(1e9 / timing.rate), Times(), Times())
     while deadlines.passed < seconds * timing.rate:
         deadlines.wait()
@@ -157,10 +157,10 @@ def empty_loop(timing: Timing, seconds: float) -> LoopFigures:
 
 @contextlib.contextmanager
 def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
-    """No garbage collection, quick thread switches, exact sleeps, and what `timing` asks for.
+    """Disable garbage collection, shorten thread switches, sleep exactly, and apply `timing`.
 
-    Yields in words what the system granted; at the end all is as before. A processor that is not
-    granted is a UsageError. SCHED_FIFO is asked for, and the words say whether it was granted.
+    Yields a description of what the system granted; at the end all settings are restored. A
+    processor that is not granted is a UsageError; SCHED_FIFO that is not granted is no error.
     """
     granted: dict[str, str] = {}
     switch, was_enabled = sys.getswitchinterval(), gc.isenabled()
@@ -201,13 +201,13 @@ def _bind(processor: int) -> str:
 
 
 def _allowed() -> set[int]:
-    """Processors that a thread of this process may be bound to; none where none can be."""
+    """Processors that a thread of this process may be bound to; empty if the system binds none."""
     if not hasattr(os, "sched_setaffinity"):
         return set()
     found: set[int] = set()
 
-    def ask() -> None:  # of a thread of its own, whose processors end with it
-        with contextlib.suppress(OSError):  # refused where a sandbox forbids it
+    def ask() -> None:  # in a thread of its own, so the other threads keep their processors
+        with contextlib.suppress(OSError):  # a sandbox may forbid the call
             os.sched_setaffinity(0, range(MOST_PROCESSORS))
         found.update(os.sched_getaffinity(0))
 
@@ -233,7 +233,7 @@ def _not_granted(processor: int, allowed: set[int]) -> UsageError:
 
 
 def _ask_for_fifo(granted: dict[str, str]) -> tuple[int, os.sched_param] | None:
-    """The policy that was there before, when another was granted."""
+    """Ask for SCHED_FIFO; returns the former policy if it was granted, else None."""
     if not hasattr(os, "sched_setscheduler"):
         granted["scheduling"] = "SCHED_FIFO not on this system"
         return None

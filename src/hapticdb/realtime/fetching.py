@@ -1,8 +1,8 @@
 """The fetching process: brings in the cells that tools are heading for.
 
-It has a connection of its own and is the only writer of its table. Sessions tell it where tool and
-hand are and how they move; it asks the database for the cells within reach, nearest first, looks
-for what others have written, and names the objects that tools touch.
+The process has a connection of its own and is the only writer of its table. Sessions report where
+tool and hand are and how they move. The process asks the database for the cells within reach,
+nearest first, follows the writes of others, and names the objects that tools touch.
 """
 
 import contextlib
@@ -31,43 +31,46 @@ from hapticdb.store.connect import open_store
 from hapticdb.store.objects_at import ids_of_voxels
 
 LOOKAHEAD = 0.05
-"""Least seconds that cells are fetched ahead of the hand. A larger value meets fewer unknown cells
-and fetches more that are never used."""
+"""Least time (s) that cells are fetched ahead of the hand. Larger: fewer unknown cells, more cells
+that are fetched and never used."""
 MOST_LOOKAHEAD = 0.5
-"""Greatest seconds that cells are fetched ahead, however slow the database is."""
+"""Greatest time (s) that cells are fetched ahead, however slow the database is. Larger: a slower
+database can serve the hand, more cells are fetched and never used."""
 LATENCIES = 3.0
-"""Cells are fetched ahead for at least so many times the slowest of the last batches."""
+"""The look-ahead time is at least this many times the latency of the slowest recent batch. Larger:
+fewer unknown cells, more cells that are never used."""
 LATENCY_MARGIN = 0.02
-"""Seconds added to that, for what a round does beside the batch."""
+"""Seconds added to that product, for the other work of a round."""
 BATCHES_REMEMBERED = 32
 """Batches whose latencies count. A larger value follows a database that gets faster more slowly."""
 IDLE = 1e-3
 """Seconds between rounds while no cell is missing. A larger value notices a moving hand later."""
 ASK_EVERY = 5e-3
-"""Seconds between questions for the objects that a tool touches."""
+"""Seconds between queries for the objects that a tool touches. Larger: names come later."""
 POLL_EVERY = 0.02
-"""Seconds between questions for the revision, where an engine cannot tell of commits. A write of
-others is felt later by as much."""
+"""Seconds between queries for the revision if the engine does not report commits. Larger: the
+writes of others are felt later."""
 CONFIRM_EVERY = 0.1
-"""Seconds between such questions where an engine can tell of commits. A watch may cost no round
-trip, so that only a question shows that the database is still there."""
+"""Seconds between queries for the revision if the engine reports commits. Such a report may need no
+round trip, so only a query shows that the database still answers."""
 RELEASE_EVERY = 1.0
-"""Seconds between looks for sessions whose processes have ended."""
+"""Seconds between checks for sessions whose processes have ended. Larger: their rows stay longer."""
 RETRY = (0.05, 0.5)
-"""Seconds until a lost database is tried again: at first, and at most; doubled each time."""
+"""Seconds until a lost database is tried again: first and greatest delay; it doubles each time."""
 
 Wrap = Callable[[Store], Store]
-"""Given the store that a fetching process has opened, returns the one that it uses."""
+"""Takes the store that a fetching process has opened, and returns the store that it uses."""
 Clock = Callable[[], float]
-"""Seconds, from any moment on, never less than before."""
+"""Returns seconds since some fixed instant; the time never goes back."""
 
 
 @dataclass(frozen=True)
 class FetchRequest:
-    """What a fetching process is to do.
+    """Request to a fetching process.
 
-    url, grid : of the environment, which must have that grid; descriptor, n_slots : of the memory
-    of the table; exclude : ids of objects that are left out; wrap : for tests.
+    url, grid : of the environment, which must have that grid; descriptor, n_slots : file descriptor
+    and number of slots of the table's memory; exclude : ids of objects that are left out; wrap : a
+    hook for tests.
     """
 
     url: str
@@ -86,14 +89,14 @@ class Fetcher:
     request : FetchRequest
         Environment and table.
     clock : callable
-        Seconds, by which rounds and batches are timed.
+        Returns seconds, to time rounds and batches.
 
     Raises
     ------
     GridError
-        When the environment is another than the request's.
+        If the environment has another grid than the request's.
     DatabaseError
-        When it cannot be opened.
+        If the environment cannot be opened.
     """
 
     def __init__(self, request: FetchRequest, *, clock: Clock = time.monotonic) -> None:
@@ -106,7 +109,7 @@ class Fetcher:
         self._latencies: list[float] = [0.0]
         self.store = self._open()
         try:
-            # sessions are there already where a fetching process has died before this one
+            # if an earlier fetching process has died, sessions already use the table
             self.tracker.read_desk(0.0, self.lookahead)
             self.residency = Residency(
                 self.store, self.table, request.exclude,
@@ -136,7 +139,7 @@ class Fetcher:
         return store
 
     def warm_up(self) -> None:
-        """Do once, on one cell, all that rounds do, so that no later round waits for a compiler."""
+        """Run all steps of a round once, on one cell, so that no later round compiles a kernel."""
         grid = self.request.grid
         wish = Wish.of_motion(grid, Motion.at_rest(np.array(grid.origin)), LOOKAHEAD, 0.0)
         assert wish is not None  # noqa: S101 - the origin is finite
@@ -146,12 +149,12 @@ class Fetcher:
 
     @property
     def lookahead(self) -> float:
-        """Seconds that cells are fetched ahead of the hand: longer than the database takes."""
+        """Seconds that cells are fetched ahead of the hand; more than the database's latency."""
         needed = LATENCIES * max(self._latencies) + LATENCY_MARGIN
         return min(max(LOOKAHEAD, needed), MOST_LOOKAHEAD)
 
     def round(self) -> bool:
-        """Follow writes, bring in a batch, name objects; whether any cell came."""
+        """Follow writes, fetch a batch, name objects; returns whether any cell was fetched."""
         before, self._now = self._now, self._clock()
         begun = time.monotonic_ns()
         self._is_confirmed = False
@@ -167,15 +170,15 @@ class Fetcher:
             self._released_at = self._now
             self.table.release_dead()
         if self._is_confirmed:
-            # Only now: every question of this round was answered, so all that is resident was true
-            # when the round began.
+            # Set only here: the database has answered every query of this round, so all resident
+            # cells were up to date when the round began.
             self._confirmed_at = self._now
             self.table.cells.control[HEARTBEAT] = begun
             self.table.cells.control[AWAY] = 0
         return is_busy
 
     def _has_changed(self) -> bool:
-        """Whether others have written; asked only as often as the engine needs it."""
+        """Whether others have written; queries the database only as often as the engine needs."""
         is_watched = isinstance(self.store, SupportsWatch)
         if isinstance(self.store, SupportsWatch) and self.store.has_changed():
             return True
@@ -185,7 +188,7 @@ class Fetcher:
         return self.store.revision() != self.residency.revision
 
     def _bring_in(self, elapsed: float) -> bool:
-        """Fetch a batch of the most urgent missing cells of all sessions; whether any came."""
+        """Fetch the most urgent missing cells of all sessions; returns whether any was fetched."""
         has_moved = self.tracker.read_desk(elapsed, self.lookahead)
         missing = NO_KEYS
         has_new_version = self._version_seen != self.table.version
@@ -196,12 +199,12 @@ class Fetcher:
         if not len(missing):
             return False
         loaded = self.residency.load(missing[:BATCH])
-        self._is_confirmed |= loaded.ranges > 0  # without room in the table, nothing is asked
+        self._is_confirmed |= loaded.ranges > 0  # without room in the table, no query is sent
         self._record_figures(loaded)
         return loaded.cells > 0
 
     def _record_figures(self, loaded: Loaded) -> None:
-        """Put on the desk what has been done so far."""
+        """Write the figures so far to the desk."""
         self._latencies = [*self._latencies[1 - BATCHES_REMEMBERED :], loaded.elapsed]
         figures, writer = self._figures, self.residency.writer
         figures["cells"] += loaded.cells
@@ -217,14 +220,14 @@ class Fetcher:
     # -- when the database is away -----------------------------------------------------------
 
     def report_lost(self) -> None:
-        """Tell all sessions that the database cannot be reached: their forces fall to zero."""
+        """Mark the database as unreachable for all sessions, so that their forces fall to zero."""
         self.table.cells.control[AWAY] = 1
         self._figures["losses"] += 1
 
     def reopen(self) -> None:
-        """Open the database anew, and follow what was written meanwhile."""
+        """Open the database again, and follow the writes made meanwhile."""
         opened = self._open()
-        # Not before: while the old file is held open, no other file can have its identity.
+        # Close only now: while the old file is open, no other file can have the same identity.
         self.close()
         self.store = opened
         self._confirmed_at = -np.inf
@@ -232,21 +235,21 @@ class Fetcher:
         self._version_seen = -1
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         with contextlib.suppress(HapticDBError, OSError):  # closing a broken connection may fail
             self.store.close()
 
 
 def fetch(request: FetchRequest, sender: MessageSender) -> None:
-    """Fetch until told to stop, whatever happens to the database meanwhile: a process's work.
+    """Fetch until told to stop, even if the database is lost meanwhile; the work of the process.
 
-    A database that cannot be opened ends the process only if its table is new. A process that goes
-    on with the table of one that has ended tries again.
+    If the database cannot be opened, the process ends only if its table is new. A process that
+    continues with the table of an earlier one tries again.
 
     Raises
     ------
     GridError
-        When an environment of another grid has taken the place of the request's.
+        If the environment was replaced by one with another grid.
     """
     table = CellTable(request.descriptor, request.n_slots)
     is_first = table.version == FIRST_VERSION

@@ -9,13 +9,14 @@ from hapticdb.poses import rotation_of
 from hapticdb.realtime.handle import Handle
 
 SWAY = 1.0
-"""Metres that a hand which moves about one place stays within. No scripted hand goes farther."""
+"""Greatest distance (m) of a `RandomHand` or `Tumble` from its centre. Larger: fewer misfits of the
+path are reported."""
 
 
 def path_of_hand(device: Device, handle: Handle) -> tuple[NDArray[np.float64] | None, float]:
     """Poses (M, 4, 4) that the tool will take, and how far it may leave them; metres of the scene.
 
-    None and 0 where nobody knows the path before: a device, or a handle that starts elsewhere.
+    None and 0 if the path is not known in advance: a real device, or a handle with its own start.
     """
     hand = device.hand if isinstance(device, SimulatedDevice) else device
     if isinstance(hand, Player):

@@ -22,27 +22,27 @@ NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 
 
 class Handle:
-    """Where the hand is in the scene: the handle, which the tool is pulled to.
+    """The handle: the hand's pose in the scene, to which the tool is pulled.
 
     While the clutch is open the hand moves and the handle stays; when the clutch closes the handle
-    goes on from its place. After a reading that is not finite, or beyond 1e6 m, m/s or rad/s, the
-    handle has no place (its x is not a number) until the next valid reading. A handle holds the
-    state of one session.
+    moves on from its place. After a reading that is not finite, or beyond 1e6 m, m/s or rad/s, the
+    handle has no place (its x is NaN) until the next valid reading. A handle has the state of one
+    session.
 
     Parameters
     ----------
     scale : float
         Metres of the scene for one metre of the device; turns are not scaled, nor are wrenches.
     start : array_like or None
-        Pose (4, 4) or point (3,) of the handle at the start, scene metres. Unless given, the handle
-        is where the hand is, its position scaled.
+        Pose (4, 4) or point (3,) of the handle at the start, scene metres. None: the hand's pose,
+        its position scaled.
     clutch : int or None
-        Number of the button that opens the clutch while it is held down; none unless given.
+        Number of the button that opens the clutch while it is held down; None: no clutch.
 
     Raises
     ------
     UsageError
-        When a number is out of its range or the start is no rigid transform.
+        If a number is out of its range or the start is no rigid transform.
     """
 
     def __init__(
@@ -60,17 +60,17 @@ class Handle:
         self.is_open = False
         self._offset = np.zeros((), OFFSET)
         self._is_placed = False
-        self._x = 0.0  # where the handle was before it was nowhere
+        self._x = 0.0  # x of the handle's last known place
 
     @property
     def starts_elsewhere(self) -> bool:
-        """Whether it starts where it was told to, and not where the hand is."""
+        """Whether the handle starts at a given place and not at the hand."""
         return self._start is not None
 
     def start(self, reading: Reading, hand: Hand) -> None:
-        """Place the handle for a reading, at rest: into `hand`, whose `is_stale` stays.
+        """Place the handle for a reading, at rest; writes `hand`, except its `is_stale`.
 
-        When the reading is nowhere, the next that is somewhere places it, in `follow`.
+        If the reading has no valid place, `follow` places the handle at the next one that has.
         """
         self.is_open = False
         self._is_placed = is_somewhere(reading.pose, reading.velocity)
@@ -79,7 +79,7 @@ class Handle:
         if self._start is not None:
             hand["position"] = self._start[:3, 3]
             hand["quaternion"] = quaternion_of(self._start[:3, :3])[0]
-        # also where it is not needed: what is compiled before the loop runs is not compiled in it
+        # called even if it is not needed, so that the kernel is compiled before the loop runs
         grip(reading.pose, self.scale, self._offset, hand)
         if self._start is None:
             pose_numbers(self._offset)[:] = NO_POSE
@@ -89,7 +89,7 @@ class Handle:
             pose_numbers(hand)[:] = (math.nan, *NO_POSE[1:])
 
     def follow(self, reading: Reading, hand: Hand) -> None:
-        """Move the handle on to where a reading carries it: into `hand`."""
+        """Move the handle as far as the reading says; writes `hand`."""
         position = hand["position"]
         if not is_somewhere(reading.pose, reading.velocity):
             if not math.isnan(position[0]):

@@ -1,7 +1,7 @@
-"""The servo loop, in a process of its own: every frame on time, none of them asks the database.
+"""The servo loop, in a process of its own: every frame on time, no frame queries the database.
 
-Absolute deadlines: the loop sleeps until shortly before each, and spins the rest. Nothing is
-compiled or collected once it runs.
+Deadlines are absolute: the loop sleeps until shortly before each one, and then watches the clock.
+While the loop runs, no kernel is compiled and no garbage is collected.
 """
 
 import contextlib
@@ -43,25 +43,26 @@ from hapticdb.resident.frames import clusters_of
 from hapticdb.resident.table import HEARTBEAT, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
-"""Seconds that the empty loop lasts at most; in a shorter session it lasts as long as the session.
-A longer one knows the machine's own lateness better, and delays the first frame."""
+"""Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
+Larger: the machine's own lateness is measured better, the first frame comes later."""
 TELL_EVERY = 1e-3
-"""Seconds between two reports of the tool's place to the fetching process. With a larger value
-cells are asked for later; with a smaller one the loop computes more."""
+"""Seconds between two reports of the tool's place to the fetching process. Larger: cells are
+requested later. Smaller: the loop computes more."""
 ASK_EVERY = 1e-2
-"""Seconds between two questions for the names of the objects that the tool touches."""
+"""Seconds between two requests for the ids of the objects that the tool touches. Larger: ids come
+later, and short touches may be missed."""
 LOOK_EVERY = 0.25
-"""Seconds between two looks whether the process that started the loop is still there."""
+"""Seconds between two checks whether the process that started the loop still runs."""
 WITHDRAWN_NS = 250_000_000
-"""Nanoseconds. The loop withdraws its question for names once the database has answered this much
+"""Nanoseconds. The loop withdraws its request for ids once the database has answered this much
 later: by then the objects are named, and the process that began the session has read them."""
 WARM_PATIENCE = 30.0
-"""Seconds that the loop waits for its first cells, and for a device to say where it is."""
+"""Greatest time (s) that the loop waits for its first cells and for a device's first valid pose."""
 
 
 @dataclass(frozen=True)
 class LoopRequest:
-    """What a loop's process is to do: see `hapticdb.realtime.session.Session`."""
+    """Request to a loop's process: see `hapticdb.realtime.session.Session`."""
 
     descriptor: int
     n_slots: int
@@ -87,7 +88,7 @@ class Loop:
     Parameters
     ----------
     request : LoopRequest
-        The table's reader row is taken already.
+        Its reader row of the table is already taken.
     """
 
     def __init__(self, request: LoopRequest) -> None:
@@ -118,13 +119,13 @@ class Loop:
         )
         self.counts = Counts()
         self.is_warm = False
-        self._asked_at = 0  # ns; 0 when nothing is asked
+        self._asked_at = 0  # ns; 0 without a request
         self.lateness, self.elapsed = Times(), Times()
 
     # -- before the first frame --------------------------------------------------------------
 
     def prepare(self) -> float:
-        """Place the tool at the hand and wait for its cells; returns the seconds of that."""
+        """Place the tool at the hand and wait for its cells; returns the seconds taken."""
         started = time.monotonic()
         session, asked = self.session, 0
         self._place()
@@ -134,7 +135,7 @@ class Loop:
                     self.is_warm = True
                     break
                 asked = 0
-            if not asked:  # a hand of flesh does not wait: where it is by now is what counts
+            if not asked:  # a person's hand has moved while the loop waited
                 self._place()
                 self._tell()
                 asked = int(session["sequence"])
@@ -148,12 +149,12 @@ class Loop:
         if isinstance(self.device, SupportsRewind):
             self.device.rewind()
         self.request.handle.start(self._read(), self.hand)
-        # all of it: a first frame that is held must not tell of an earlier place's hits
+        # reset every field: a held first frame must not report hits at an earlier place
         self.tool[()] = np.zeros((), self.tool.dtype)
         pose_numbers(self.tool)[:] = pose_numbers(self.hand)
 
     def _read(self) -> Reading:
-        """Read where the hand is: a device that has just been opened may not know at once."""
+        """Read the hand's pose; wait for a device that does not know it yet after its opening."""
         until = time.monotonic() + WARM_PATIENCE
         reading = self.reader.read()
         while not is_somewhere(reading.pose, reading.velocity):
@@ -185,7 +186,7 @@ class Loop:
     # -- one frame ---------------------------------------------------------------------------
 
     def _step(self, dt: float, *, is_stale: bool) -> None:
-        """Advance the tool by a period; `sent` has what is sent to the device."""
+        """Advance the tool by a period `dt` (s); `sent` then has the wrench for the device."""
         self.hand["is_stale"] = is_stale
         kernels.advance(
             self.cells, self.request.row, self.clusters, self.place, self.body, self.servo, dt,
@@ -193,11 +194,11 @@ class Loop:
         )  # fmt: skip
 
     def _step_exactly(self, reading: Reading, dt: float, ends: int) -> Reading:
-        """Advance by a period once all cells that it needs are there.
+        """Advance by a period `dt` (s) once all cells that it needs are resident.
 
-        After the coupling's `hold` seconds of waiting no force is sent. The wait ends at `ends`,
-        ns, when the session ends. Returns the reading that was followed: a hand that was let go
-        has moved meanwhile, and its latest reading counts.
+        After the coupling's `hold` seconds of waiting no force is sent. The wait ends at `ends`
+        (ns), the end of the session. Returns the reading that was used: without force the hand
+        moves meanwhile, so its latest reading is used.
         """
         clock = time.perf_counter_ns
         holds = clock() + round(min(self.request.coupling.hold, 1e9) * 1e9)
@@ -208,7 +209,7 @@ class Loop:
             if not is_let_go and clock() > holds:
                 self.device.apply(np.zeros(6))
                 is_let_go = True
-                before["risen"] = 0.0  # from nothing, not back to where it was
+                before["risen"] = 0.0  # the force rises again from zero
             self.tool[()] = before
             self.met[:] = met
             self._tell()
@@ -222,7 +223,7 @@ class Loop:
         return reading
 
     def _tell(self) -> None:
-        """Say where tool and hand are, and which cells the last frame missed."""
+        """Report where tool and hand are, and which cells the last frame missed."""
         told, center = self.told, self.request.shell.center
         poses_of(self._tool_pose, self._pose)
         told["is_active"] = True
@@ -233,7 +234,7 @@ class Loop:
         servo.tell(self.session, told, self.missed)
 
     def _ask(self, n_hits: int) -> None:
-        """Have the objects named that the last frame's hits are in."""
+        """Request the ids of the objects at the last frame's hits."""
         grid = self.request.grid
         poses_of(self._tool_pose, self._pose)
         servo.name_voxels(
@@ -242,10 +243,10 @@ class Loop:
         )  # fmt: skip
 
     def _ask_or_withdraw(self, now: int) -> None:
-        """Ask for the objects at the last frame's hits; without hits, withdraw the last question.
+        """Request the ids at the last frame's hits; without hits, withdraw the last request.
 
-        A question that stayed would be asked again at each write, of voxels that are no longer
-        touched. A question withdrawn at once would never be answered by a slow database.
+        A request that stays would be answered again at each write, for voxels that are no longer
+        touched. A request withdrawn at once would never be answered by a slow database.
         """
         if self.sent.hits:
             self._ask(self.sent.hits.item())
@@ -275,7 +276,7 @@ class Loop:
     # -- the loop ----------------------------------------------------------------------------
 
     def run(self) -> LoopFigures:
-        """Frames on time, for as long as was asked, or until the device ends or all shall stop."""
+        """Run frames until the time is over, the device's script ends, or a stop is requested."""
         request, control = self.request, self.cells.control
         clock, device, reader = time.perf_counter_ns, self.device, self.reader
         rate = request.timing.rate
@@ -324,7 +325,7 @@ class Loop:
         return deadlines.figures()
 
     def _count(self, is_clutch_open: bool, is_stale: bool) -> int:  # noqa: FBT001 - of a frame
-        """Count a frame in; returns its recorded state."""
+        """Add a frame to the counts; returns its recorded state."""
         counts, sent = self.counts, self.sent
         flags = sent.flags.item()
         state = State(0)
@@ -360,8 +361,8 @@ class Loop:
         return int(state)
 
     def close(self) -> None:
-        """Take the force away, however the loop ended, and give the device back."""
-        with contextlib.suppress(Exception):  # one that has failed may fail in this, too
+        """Set the force to zero, however the loop ended, and close the device."""
+        with contextlib.suppress(Exception):  # a device that has failed may fail here, too
             self.device.apply(np.zeros(6))
         if isinstance(self.device, SupportsClose):
             self.device.close()
@@ -374,17 +375,17 @@ def ring_of(descriptor: int, n_frames: int) -> Frames:
 
 
 def ring_bytes(n_frames: int) -> int:
-    """Bytes of a ring of so many frames."""
+    """Bytes of a ring of `n_frames` frames."""
     return FRAME.itemsize * n_frames
 
 
 def n_compiled() -> int:
-    """Signatures of all kernels that have been compiled or loaded."""
+    """Number of signatures of all kernels that have been compiled or loaded."""
     return sum(len(entry.signatures) for entry in ENTRIES if hasattr(entry, "signatures"))
 
 
 def work(request: LoopRequest, sender: MessageSender) -> None:
-    """Run a session's loop in this process, and say how it went."""
+    """Run a session's loop in this process, and send its results."""
     loop = Loop(request)
     try:
         loop.warm_up()
@@ -401,7 +402,7 @@ def work(request: LoopRequest, sender: MessageSender) -> None:
         loop.counts.conditions.update(granted)
         sender.send("done", LoopAnswer(figures, empty, loop.counts, warm_up, loop.is_warm))
     finally:
-        try:  # whoever asks for the end has it: the device is not to be left half closed for that
+        try:  # the loop is ending, so SIGTERM is ignored: the device must be closed completely
             before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
         finally:
             loop.close()

@@ -1,4 +1,4 @@
-"""Which objects the tools touch: loops ask, and the fetching process answers."""
+"""Ids of the objects that the tools touch: loops request them, the fetching process answers."""
 
 from collections.abc import Iterable
 
@@ -16,9 +16,9 @@ class ObjectAnswers:
     Parameters
     ----------
     table : CellTable
-        Of the sessions.
+        Table of the sessions.
     exclude : (E,) int64
-        Ids of objects that are not felt, and are not named.
+        Ids of objects that are left out of the force and of the answers.
     """
 
     def __init__(self, table: CellTable, exclude: Keys) -> None:
@@ -27,11 +27,11 @@ class ObjectAnswers:
         self._answered: dict[int, bytes] = {}
 
     def forget(self) -> None:
-        """Answer every question again: the database has changed."""
+        """Forget all answers, so that every request is answered again: the database has changed."""
         self._answered.clear()
 
     def answer(self, store: Store, rows: Iterable[int]) -> None:
-        """Answer the sessions in these rows that ask for other voxels than before."""
+        """Answer the sessions in `rows` whose requests have changed since the last answer."""
         before, self._answered = self._answered, {}
         for row in rows:
             n_asked = int(self._desk["n_asked"][row])

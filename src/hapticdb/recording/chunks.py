@@ -51,8 +51,8 @@ class Scan(NamedTuple):
     """Whole chunks of a file.
 
     chunks : start of each payload in the file (bytes), and the chunk's head; n_frames : number of
-    frames in all of them; end : end of the last one (bytes); damaged : index of the first frame that
-    is lost although whole chunks follow, or -1.
+    frames in all chunks; end : end of the last chunk (bytes); damaged : index of the first frame
+    that is lost although whole chunks follow, or -1.
     """
 
     chunks: list[tuple[int, Chunk]]

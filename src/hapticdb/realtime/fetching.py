@@ -54,7 +54,7 @@ CONFIRM_EVERY = 0.1
 """Seconds between queries for the revision if the engine reports commits. Such a report may need no
 round trip, so only a query shows that the database still answers."""
 RELEASE_EVERY = 1.0
-"""Seconds between checks for sessions whose processes have ended. Larger: their rows stay longer."""
+"""Seconds between checks for sessions whose processes have ended. Larger: rows stay longer."""
 RETRY = (0.05, 0.5)
 """Seconds until a lost database is tried again: first and greatest delay; it doubles each time."""
 

@@ -1,8 +1,8 @@
-"""Processes of a real-time session: started with a request, sending messages over a pipe.
+"""Processes of a real-time session: each gets a request and sends messages over a pipe.
 
-Each is a plain ``python -c`` that calls a function of this package, so that a user's script needs
-no guard around its main part. The request and the messages are pickles between a process and its
-own child.
+Each process is a plain ``python -c`` that calls a function of this package, so a user's script
+needs no ``if __name__ == "__main__"`` guard. The request and the messages are pickles, exchanged
+only between a process and its own child.
 """
 
 import contextlib
@@ -21,31 +21,31 @@ from typing import Any, BinaryIO, NamedTuple, Self
 from hapticdb.errors import HapticDBError, UsageError
 
 END_PATIENCE = 5.0
-"""Seconds that a process has to end by itself before it is killed. A device may take long to
-close."""
+"""Seconds that a process has to end by itself before it is killed. Larger: slower devices can
+close, a hanging process delays the end longer."""
 _starter = 0
-"""Process id of the one that started this one."""
+"""Id of the process that started this one."""
 
 
 class Message(NamedTuple):
-    """What a process sends: a word that says which message it is, and its content."""
+    """A message of a process: a word for its kind, and its content."""
 
     word: str
     content: Any = None
 
 
 class Process:
-    """One process of a session, seen from the one that started it.
+    """One process of a session, used by the process that started it.
 
     Parameters
     ----------
     work : str
-        What it does: a function of a module, as ``package.module:function``, that takes the request
-        and a `MessageSender`.
+        Function that the process calls, as ``package.module:function``; its arguments are the
+        request and a `MessageSender`.
     request : object
-        What it is to do; picklable.
+        Argument of that function; picklable.
     descriptors : sequence of int
-        Files that it inherits, under the same numbers.
+        File descriptors that the process inherits, under the same numbers.
     """
 
     def __init__(self, work: str, request: object, descriptors: Sequence[int]) -> None:
@@ -56,15 +56,15 @@ class Process:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             pass_fds=tuple(descriptors),
-            # Ctrl-C in a terminal goes to the whole group: the parent alone decides what follows
+            # Ctrl-C in a terminal goes to a whole process group; only the parent shall handle it
             start_new_session=True,
         )
         assert self._popen.stdin is not None  # noqa: S101 - asked for above
-        with contextlib.suppress(BrokenPipeError):  # it died at once, which `receive` reports
+        with contextlib.suppress(BrokenPipeError):  # the child died at once; `receive` reports that
             self._popen.stdin.write(content)
             self._popen.stdin.flush()
-        # The input stays open: when it closes, the child knows that this process is gone. A Popen
-        # that nobody refers to any more would keep its pipes open, so they are closed here.
+        # The input stays open: when it closes, the child knows that this process has ended. The
+        # pipes of an unreferenced Popen would stay open, so the finalizer closes them.
         weakref.finalize(self, _close, self._popen)
 
     def __enter__(self) -> Self:
@@ -75,21 +75,21 @@ class Process:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Process id."""
         return self._popen.pid
 
     @property
     def is_alive(self) -> bool:
-        """Whether it runs."""
+        """Whether the process runs."""
         return self._popen.poll() is None
 
     def receive(self, seconds: float) -> Message | None:
-        """Next message, or None when none came in that time or the process has ended.
+        """Return the next message, or None if none comes in `seconds` or the process has ended.
 
         Raises
         ------
         HapticDBError
-            The error that the process ended with.
+            If the process ended with this error.
         """
         assert self._popen.stdout is not None  # noqa: S101 - asked for above
         descriptor = self._popen.stdout.fileno()
@@ -111,7 +111,7 @@ class Process:
         return message
 
     def _take(self) -> Message | None:
-        """Take the first message out of the buffer, if it is whole."""
+        """Take the first message out of the buffer, if it is complete."""
         if len(self._buffer) < 8:
             return None
         size = int.from_bytes(self._buffer[:8], "little")
@@ -123,7 +123,7 @@ class Process:
         return message
 
     def wait(self, seconds: float) -> bool:
-        """Wait for its end; whether it came in that time."""
+        """Wait for the end of the process; returns whether it ended in `seconds`."""
         try:
             self._popen.wait(seconds)
         except subprocess.TimeoutExpired:
@@ -131,7 +131,7 @@ class Process:
         return True
 
     def end(self) -> None:
-        """Make it end: by closing its input, and by force where that is not enough."""
+        """End the process: close its input, and kill it if it does not end then."""
         _close(self._popen)
         if not self.wait(END_PATIENCE):
             self._popen.kill()
@@ -139,7 +139,7 @@ class Process:
 
 
 def _close(popen: "subprocess.Popen[bytes]") -> None:
-    """Close the pipes to a process. It ends when it sees its input closed."""
+    """Close the pipes to a process, which ends when its input is closed."""
     for stream in (popen.stdin, popen.stdout):
         if stream is not None:
             with contextlib.suppress(OSError):
@@ -147,7 +147,7 @@ def _close(popen: "subprocess.Popen[bytes]") -> None:
 
 
 class _EndQuietly(SystemExit):
-    """Ends the process without a message: the system asked for it, or the parent is gone."""
+    """Ends the process without a message: after a signal, or because the parent has ended."""
 
     def __init__(self, status: int) -> None:
         super().__init__(status)
@@ -161,7 +161,7 @@ class MessageSender:
         self._stream = stream
 
     def send(self, word: str, content: object = None) -> None:
-        """Send a message. Where nobody can receive it any more, nothing happens."""
+        """Send a message; does nothing if no process can receive it any more."""
         packed = pickle.dumps(Message(word, content))
         with contextlib.suppress(OSError, ValueError):
             self._stream.write(len(packed).to_bytes(8, "little") + packed)
@@ -169,13 +169,13 @@ class MessageSender:
 
 
 def serve(work: str, starter: int) -> None:
-    """Do what the request says, in the process that `Process` started, and end it."""
+    """Run the request in the process that `Process` started, and end that process."""
     global _starter  # noqa: PLW0603 - one a process
     _starter = starter
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     status = 0
     sender = MessageSender(os.fdopen(os.dup(1), "wb"))
-    os.dup2(2, 1)  # what drivers print must not mix with messages
+    os.dup2(2, 1)  # output of drivers must not mix with messages
     try:
         signal.signal(signal.SIGTERM, _end)
         sys.path[:] = _load()
@@ -195,12 +195,12 @@ def serve(work: str, starter: int) -> None:
             "error", HapticDBError(f"the session's process ended: {type(error).__name__}: {cause}")
         )
     sys.stderr.flush()
-    os._exit(status)  # exit handlers would tidy up what another process still uses
+    os._exit(status)  # exit handlers would remove resources that other processes still use
 
 
 def _end(number: int, _: object) -> None:
-    """End by way of every `finally`, so that no device keeps its force; a signal handler."""
-    signal.signal(number, signal.SIG_IGN)  # a second signal must not interrupt the tidying up
+    """Signal handler: raise an exit, so that each `finally` runs and no device keeps its force."""
+    signal.signal(number, signal.SIG_IGN)  # a second signal must not interrupt the clean-up
     raise _EndQuietly(128 + number)
 
 
@@ -213,7 +213,7 @@ def _load() -> Any:  # noqa: ANN401 - whatever was sent
 
 
 def _request() -> object:
-    """Read what the process is to do, once the modules that it names can be found."""
+    """Read the request of the process; a UsageError if a module that it names cannot be found."""
     try:
         return _load()
     except (AttributeError, ImportError) as error:

@@ -1,4 +1,4 @@
-"""What a session was like: rate, lateness and computing time beside an empty loop's."""
+"""Report of a session: its rate, lateness and computing time, and those of an empty loop."""
 
 from dataclasses import asdict, dataclass, field
 from typing import NamedTuple
@@ -11,11 +11,12 @@ from hapticdb.realtime.resident_cells import CacheFigures
 
 BINS = 200_000
 BIN = 1e-7
-"""Seconds: times are counted in bins of 0.1 us up to 20 ms, and the worst is kept beside them."""
+"""Width of a bin of the histogram of times, seconds; the bins cover 0 to 20 ms. Larger: less exact
+percentiles. The worst time is kept exactly."""
 
 
 class Spread(NamedTuple):
-    """How a time is spread over frames, seconds: percentiles to 0.1 us, and the worst."""
+    """Distribution of a time over frames, seconds: percentiles exact to 0.1 us, and the worst."""
 
     p50: float
     p99: float
@@ -24,21 +25,21 @@ class Spread(NamedTuple):
 
 
 class Times:
-    """Times of many frames, counted in bins: as much memory for an hour as for a second."""
+    """Histogram of the times of many frames; its memory does not grow with their number."""
 
     def __init__(self) -> None:
         self.counts: NDArray[np.int64] = np.zeros(BINS + 1, dtype=np.int64)
         self.worst = 0.0
 
     def add(self, seconds: float) -> None:
-        """Count one in."""
+        """Add one time (s)."""
         at = int(seconds / BIN)
         self.counts[at if at < BINS else BINS] += 1  # noqa: FURB136 - min() costs 0.2 us
         if seconds > self.worst:  # noqa: PLR1730 - likewise
             self.worst = seconds
 
     def spread(self) -> Spread:
-        """Percentiles of what was counted; zeros for nothing."""
+        """Percentiles of the times added; zeros if there are none."""
         total = int(self.counts.sum())
         if not total:
             return Spread(0.0, 0.0, 0.0, 0.0)
@@ -51,11 +52,12 @@ class Times:
 
 @dataclass(frozen=True)
 class LoopFigures:
-    """How a loop kept its time.
+    """Timing of a loop.
 
-    frames : how many; seconds : that they took; missed : deadlines for which no frame began in
-    time, because the one before was still at work or the machine was elsewhere; lateness : of each
-    frame's begin behind its deadline; elapsed : that each frame computed, device and all.
+    frames : number of frames; seconds : time that they took; missed : deadlines at which no frame
+    began, because the frame before was not finished or the machine did other work; lateness : time
+    from each deadline to the begin of its frame; elapsed : computing time of each frame, with the
+    device's.
     """
 
     frames: int
@@ -72,7 +74,7 @@ class LoopFigures:
 
 @dataclass
 class Counts:
-    """What a loop counts, frame by frame."""
+    """Counts of a loop over its frames."""
 
     frames: int = 0
     hit_frames: int = 0
@@ -93,7 +95,7 @@ class Counts:
 
 
 class LoopAnswer(NamedTuple):
-    """What a loop's process says at its end."""
+    """Last message of a loop's process."""
 
     loop: LoopFigures
     empty: LoopFigures | None
@@ -104,49 +106,50 @@ class LoopAnswer(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """What a session was like.
+    """Report of a session.
 
     Attributes
     ----------
     rate : float
-        Asked for, Hz.
+        Frames a second that the session was set to.
     loop, empty : LoopFigures
-        The session's loop, and one of the same rate that did nothing, on this machine just before:
-        a shared machine is late by itself. The latter is None where none was measured.
+        Timing of the session's loop, and of an empty loop at the same rate on this machine just
+        before. The empty loop shows the machine's own lateness; None if it was not run.
     hit_frames, contact_frames, unknown_frames, held_frames, stale_frames : int
-        Frames with a point in a voxel, below its tangent plane, in a cell that was not resident;
-        those that kept an earlier wrench; those in which the database had been silent for too long.
+        Numbers of frames: with a point in a voxel; with a point below its tangent plane; with a
+        point in a cell that was not resident; that kept an earlier wrench; in which the database
+        had not answered for too long.
     points, unknown_points : int
-        Looked up in all frames, and those of them in cells that were not resident.
+        Points looked up in all frames, and those of them in cells that were not resident.
     substeps : int
-        Of the coupling, in all frames.
+        Substeps of the coupling in all frames.
     dropped_frames : int
         Frames whose period was too long to be simulated to its end.
     cut_frames : int
-        Frames in which the tool was held back at surfaces: a step was cut back, or not made.
+        Frames in which a surface held the tool back: a step was shortened or left out.
     nowhere_frames : int
-        Frames whose reading was no place: its numbers not finite, too large, or no rotation.
+        Frames with an invalid reading: numbers not finite or too large, or no rotation.
     bad_reading : str or None
-        The first of them in a line: which device, what it returned, what was expected.
+        One line on the first invalid reading: the device, what it returned, what was expected.
     peak_force, peak_torque, deepest : float
-        Greatest norm sent to the device, N and N m; deepest contact, metres.
+        Greatest norms sent to the device, N and N m; deepest contact, metres.
     warm_up : float
         Seconds until all wanted cells were resident, before the first frame; after
         `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
     is_warm : bool
-        Whether they were there.
+        Whether all wanted cells were resident before the first frame.
     cache : CacheFigures
-        What the fetching process did.
+        Figures of the fetching process.
     objects : tuple of int
-        Ids of objects touched, as far as they were asked for: a hundred times a second.
+        Ids of objects touched; sampled a hundred times a second.
     recorded_frames, lost_records : int
-        Frames in the recording, and frames that nobody took out of memory in time.
+        Frames in the recording, and frames that were overwritten before they were recorded.
     recording_ended : str or None
-        Why the recording ended before the session, in a line; None when it did not.
+        One line: why the recording ended before the session; None if it did not.
     proportions : Proportions or None
-        Sizes and places of tool, path and scene at the start, and what of them did not fit.
+        Sizes and places of tool, path and scene at the start, and their misfits.
     conditions : dict
-        Points, scheduling, processor: what the figures hold for.
+        Conditions of the measurement: points, scheduling, processor.
     """
 
     rate: float
@@ -183,7 +186,7 @@ class Report:
         return 1.0 - self.unknown_points / self.points if self.points else 1.0
 
     def figures(self) -> dict[str, object]:
-        """All of it as plain numbers and words, for JSON; times in seconds."""
+        """All fields as plain numbers and strings, for JSON; times in seconds."""
         plain = asdict(self)
         for name in ("loop", "empty"):
             part = getattr(self, name)

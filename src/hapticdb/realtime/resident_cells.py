@@ -18,22 +18,22 @@ from hapticdb.resident.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellT
 from hapticdb.store.connect import open_store
 
 START_PATIENCE = 60.0
-"""Seconds in which a fetching process must be ready. It may have to calibrate, which takes seconds.
-A larger value keeps a caller waiting longer for a process that hangs."""
+"""Seconds in which a fetching process must be ready; a calibration may take seconds. Larger: a
+caller waits longer for a process that hangs."""
 RESTART_EVERY = 1.0
-"""Seconds between two starts, at least. A smaller value tries more often where none can live."""
+"""Least time (s) between two starts of the process. Smaller: more attempts if each one fails."""
 SILENCE_NS = 1_000_000_000
-"""Nanoseconds after which a database that was asked and has not answered counts as away."""
+"""Nanoseconds since the last answer after which the database counts as away."""
 
 
 class CacheFigures(NamedTuple):
-    """What a fetching process has done.
+    """Figures of a fetching process.
 
-    budget_bytes : memory of the table, fixed; resident, empty : cells in memory, and known to be
-    empty; loaded, evicted, rows, ranges, statements : so far; latency, worst : seconds that the
-    database took for a batch, median of late and worst ever; hit_rate : share of the wanted cells
-    that were there when they were looked for; losses : how often the database was lost; restarts :
-    of the process itself.
+    budget_bytes : memory of the table, fixed; resident, empty : cells in memory, and cells known to
+    be empty; loaded, evicted, rows, ranges, statements : numbers so far; latency, worst : seconds
+    that the database took for a batch, median of recent batches and greatest; hit_rate : share of
+    the wanted cells that were resident when they were wanted; losses : how often the database was
+    lost; restarts : how often the process was started again.
     """
 
     budget_bytes: int
@@ -52,7 +52,7 @@ class CacheFigures(NamedTuple):
 
 
 def start_error(process: Process, name: str, seconds: float) -> HapticDBError:
-    """End a process that was not ready in that time, and make the error that says why."""
+    """End a process that was not ready in `seconds`; returns the error that says why."""
     is_slow = process.is_alive
     process.end()
     if is_slow:
@@ -64,31 +64,31 @@ def start_error(process: Process, name: str, seconds: float) -> HapticDBError:
 
 
 class ResidentCells:
-    """Cells of an environment in memory, kept there by a process of their own.
+    """Cells of an environment in memory, fetched by a separate process.
 
-    Sessions that leave out the same objects may share one. Also as a context manager.
+    Sessions that exclude the same objects may share one. Also a context manager.
 
     Parameters
     ----------
     url : str
-        The environment, as `hapticdb.open` takes it.
+        URL of the environment, in the form of `hapticdb.open`.
     budget_bytes : int
         Memory for cells, never exceeded; 1 MiB at least.
     exclude : iterable of int
-        Ids of objects that are not felt.
+        Ids of objects that are left out of the force.
     wrap : callable or None
-        Given the fetching process's store, returns the one that it uses; importable. For tests.
+        Takes the fetching process's store and returns the store to use; importable. For tests.
 
     Raises
     ------
     UsageError
-        When the environment's curve has no cells, or the budget is too small.
+        If the environment's curve has no cells, or the budget is too small.
     DatabaseError
-        When it cannot be opened.
+        If the environment cannot be opened.
     """
 
     _pid = 0
-    """Process id of the maker. In a process forked from it, `close` must not end anything."""
+    """Id of the process that made this object. In a forked copy `close` does nothing."""
 
     def __init__(
         self,
@@ -118,7 +118,7 @@ class ResidentCells:
         self._pid = os.getpid()
 
     def _read_environment(self) -> Grid:
-        """Grid of the environment. It must have cells, and the objects that are left out."""
+        """Grid of the environment, after a check of its curve and of the excluded objects."""
         store = open_store(self.url, read_only=True)
         try:
             check_cells(store)
@@ -164,7 +164,7 @@ class ResidentCells:
 
     @property
     def is_away(self) -> bool:
-        """Whether the database cannot be reached now, or does not answer."""
+        """Whether the database cannot be reached now or does not answer."""
         control = self.table.cells.control
         return bool(control[AWAY]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
 
@@ -174,7 +174,7 @@ class ResidentCells:
         Raises
         ------
         GridError
-            When an environment of another grid has taken the place of this one.
+            If the environment was replaced by one with another grid.
         """
         with self._supervising:
             if self._process.is_alive or self.table.cells.control[STOP]:
@@ -186,14 +186,14 @@ class ResidentCells:
             self._restarted_at = now
             self.restarts += 1
             ended = self._process
-            # The table stays in use until the new process has read again: its version is whole.
+            # Sessions use the table meanwhile: its last published version is complete.
             self._process = Process(
                 "hapticdb.realtime.fetching:fetch", self._request, [self.table.descriptor]
             )
             ended.end()
 
     def _raise_fatal_error(self) -> None:
-        """Raise the error that ended the process, if a new one would end with it, too."""
+        """Raise the error that ended the process, if a new process would fail with it, too."""
         try:
             while self._failure is None and self._process.receive(0.0):
                 pass
@@ -205,7 +205,7 @@ class ResidentCells:
             raise self._failure
 
     def figures(self) -> CacheFigures:
-        """What the fetching process has done so far."""
+        """Figures of the fetching process so far."""
         counted = self.table.desk.figures
         wanted = float(counted["wanted"])
         return CacheFigures(
@@ -225,7 +225,7 @@ class ResidentCells:
         )
 
     def close(self) -> None:
-        """End the fetching process and give the memory back; nothing in a forked copy."""
+        """End the fetching process and free the memory; does nothing in a forked copy."""
         if os.getpid() != self._pid:
             return
         self.table.cells.control[STOP] = 1

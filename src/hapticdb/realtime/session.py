@@ -31,24 +31,24 @@ RING_SECONDS = 4.0
 """Seconds of frames that the ring in shared memory holds until they are recorded. A larger value
 loses no frame over longer pauses of this process, and takes more memory."""
 LEAST_RING = 1024
-"""Frames that the ring holds at least, however low the rate."""
+"""Least number of frames in the ring, however low the rate."""
 DRAIN_EVERY = 0.05
-"""Seconds between two looks at the loop in `wait`. A larger value reports its end later."""
+"""Seconds between two checks of the loop in `wait`. A larger value reports its end later."""
 START_PATIENCE = 120.0
 """Seconds in which the loop's process must be ready. A device may take long to open."""
 END_PATIENCE = 10.0
-"""Seconds in which the loop must end when asked to: it ends after a frame."""
+"""Seconds in which the loop must end after a request to end; normally it ends after a frame."""
 FOREVER = 1e9
-"""Seconds that stand for no limit: thirty years."""
+"""Seconds that mean "no limit": thirty years."""
 DEFAULT_STALENESS = 1.0
-"""Seconds that the database may be silent, unless others are given."""
+"""Default of `staleness`, seconds without an answer of the database."""
 
 
 class Session:
     """A hand in an environment, felt in real time.
 
-    The loop runs in a process of its own, and so does what fetches cells for it; this object starts
-    them, looks after them, records, and reports. Also as a context manager.
+    The loop and the fetching of its cells run in two separate processes. This object starts and
+    supervises them, records, and reports. Also a context manager.
 
     Parameters
     ----------
@@ -57,53 +57,54 @@ class Session:
     shell : PointShell
         The tool.
     device : Device
-        The hand; sent to the loop's process, so its class must be importable there.
+        The device; it is sent to the loop's process, so its class must be importable there.
     rate : float
         Frames a second, 10 to 20,000.
     seconds : float or None
-        How long; until the device ends or `stop` unless given.
+        Duration; None: until the device's script ends or `stop` is called.
     law : TangentPlane or None
-        Of the contacts; 1000 N/m unless given.
+        Force law of the contacts; 1000 N/m unless given.
     coupling : Coupling or None
-        Between hand and tool.
+        Coupling between hand and tool.
     handle : Handle or None
-        How the hand maps to the scene: scale and clutch.
+        Mapping of the hand to the scene: scale and clutch.
     policy : {"hold", "wait"}
-        What a frame does whose cells are not resident: keep its wrench for a moment and let it
-        fall, or wait for them, exact and late.
+        For a frame whose cells are not resident. "hold": keep the last wrench for a moment, then
+        let it fall to zero. "wait": wait for the cells; the frame is exact, but late.
     staleness : float
-        Seconds that the database may be silent until all frames do as if nothing were known; with
-        the policy "wait", what is resident goes on being felt.
+        Seconds without an answer of the database after which all frames act as if all cells were
+        unknown. With the policy "wait", resident cells are used on.
     budget_bytes : int or None
     exclude : iterable of int
-        As `ResidentCells` takes them; only with a URL: who shares cells feels the same objects.
+        As for `ResidentCells`; only with a URL, because sessions that share cells feel the same
+        objects.
     record : path or None
         A file for the recording; see `hapticdb.recording.file.Recorder`.
     append_recording, replace_recording : bool
-        Go on with the recording that is there, of the same tool, scene and law; or begin anew in
-        its place, once there is a frame to record.
+        Append to an existing recording of the same tool, scene and law; or replace it when the
+        first frame is recorded.
     record_limit_bytes : int or None
-        Greatest size of the recording, 4 GiB unless given; with None, and in any case, 64 MiB of
-        the disk stay free. There the recording ends, whole, and the session goes on without it;
-        likewise where the disk fails: see `recording_ended`.
+        Greatest size of the recording, 4 GiB unless given; None: no limit of its own. 64 MiB of the
+        disk always stay free. At the limit, or if the disk fails, the recording ends and stays
+        whole, and the session continues: see `recording_ended`.
     is_fifo, processor
-        As `hapticdb.realtime.deadlines.Timing` has them.
+        As for `hapticdb.realtime.deadlines.Timing`.
     has_baseline : bool
-        Run an empty loop of the same rate before the first frame, for 2 s at most, so that the
-        report can tell how late the machine is by itself; without, `Report.empty` is None.
+        Run an empty loop at the same rate before the first frame, for 2 s at most, to report the
+        machine's own lateness; if False, `Report.empty` is None.
 
     Raises
     ------
     UsageError
-        When a number is out of its range, options contradict one another, or the device is none.
+        If a number is out of its range, options contradict one another, or `device` is no device.
     DeviceError
-        When the device fails, or what it returns is of the wrong kind; here or in `wait`.
+        If the device fails, or its reading is of the wrong kind; here or in `wait`.
     DatabaseError
-        When the environment cannot be opened.
+        If the environment cannot be opened.
     """
 
     _pid = 0
-    """Process id of the maker. In a process forked from it, `close` must not end anything."""
+    """Id of the process that made this object. In a forked copy `close` does nothing."""
 
     def __init__(
         self,
@@ -155,7 +156,7 @@ class Session:
         except BaseException:
             try:
                 self.close()
-            finally:  # also when a second signal interrupts the closing
+            finally:  # runs even if a second signal interrupts the closing
                 if self._recording is not None:
                     self._recording.remove_new_file()
             raise
@@ -175,7 +176,7 @@ class Session:
         staleness: float,
         seconds: float | None,
     ) -> None:
-        compile_missing(entries_for("feel"))  # here: the loop must not wait for it
+        compile_missing(entries_for("feel"))  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
             self._recording.begin(self._header())
@@ -232,7 +233,7 @@ class Session:
 
     @property
     def n_frames(self) -> int:
-        """Frames so far."""
+        """Number of frames so far."""
         return int(self.cells.table.desk.sessions["n_frames"][self._open_row])
 
     @property
@@ -248,12 +249,12 @@ class Session:
 
     @property
     def objects(self) -> tuple[int, ...]:
-        """Ids of the objects touched so far; asked for a hundred times a second."""
+        """Ids of the objects touched so far; sampled a hundred times a second."""
         return tuple(sorted(self._objects))
 
     @property
     def recording_ended(self) -> str | None:
-        """Why the recording has ended before the session, in a line; None while it goes on."""
+        """One line: why the recording has ended before the session; None while it continues."""
         return None if self._recording is None else self._recording.ended
 
     def last(self) -> Frames | None:
@@ -262,17 +263,17 @@ class Session:
         return self._ring[[(done - 1) % len(self._ring)]] if done else None
 
     def wait(self, seconds: float | None = None) -> Report | None:
-        """Look after the session until it ends; its report, or None when that time is over.
+        """Supervise the session until it ends; returns its report, or None after `seconds`.
 
-        Call it again and again, or without a time: only while it runs are frames recorded, and is a
-        fetching process that has died started again.
+        Call this again and again, or without a time: only during the call frames are recorded, and
+        a fetching process that has died is started again.
         """
         process = self._process
         if process is None:
             raise UsageError("the session is closed: begin another")
         until = time.monotonic() + (FOREVER if seconds is None else seconds)
         while self._answer is None and time.monotonic() < until:
-            is_alive = process.is_alive  # asked first: its last message may come with its end
+            is_alive = process.is_alive  # read first: the last message may come with the end
             message = process.receive(min(DRAIN_EVERY, max(until - time.monotonic(), 0.0)))
             self._drain()
             if message is not None:
@@ -289,7 +290,7 @@ class Session:
         self.cells.table.desk.sessions["is_asked_to_end"][self._open_row] = True
 
     def stop(self) -> Report:
-        """End the session; its report."""
+        """End the session; returns its report."""
         self.ask_to_end()
         report = self.wait(END_PATIENCE)
         if report is None:
@@ -297,7 +298,7 @@ class Session:
         return report
 
     def _drain(self) -> None:
-        """Note the objects that were touched, and record the frames that have come."""
+        """Add the touched objects to the list, and record the new frames."""
         sessions, done = self.cells.table.desk.sessions, self.n_frames
         n_objects = int(sessions["n_objects"][self._row])
         self._objects.update(sessions["objects"][self._row, :n_objects].tolist())
@@ -330,9 +331,9 @@ class Session:
         )
 
     def close(self) -> None:
-        """End the processes and close the recording; what was recorded stays.
+        """End the processes and close the recording, which stays.
 
-        In a copy that was forked it does nothing: the session is the parent's.
+        Does nothing in a forked copy, because the session belongs to the parent process.
         """
         if os.getpid() != self._pid:
             return
@@ -362,7 +363,7 @@ class Session:
 def _cells_of(
     cells: ResidentCells | str, budget_bytes: int | None, exclude: Iterable[int]
 ) -> ResidentCells:
-    """Cells that are given, or new ones of the environment that a URL leads to."""
+    """Return the given resident cells, or make new ones for the environment at a URL."""
     if isinstance(cells, str):
         budget_bytes = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
         return ResidentCells(cells, budget_bytes=budget_bytes, exclude=exclude)

@@ -1,4 +1,4 @@
-"""A session's recording: frames are taken out of the loop's ring and written to a file."""
+"""A session's recording: copies frames from the loop's ring to a file."""
 
 import os
 import time
@@ -13,15 +13,14 @@ from hapticdb.recording.file import Header, Recorder
 from hapticdb.recording.frame import Frames
 
 FLUSH_EVERY = 1.0
-"""Seconds of frames that are lost at most when this process is killed. A smaller value writes more
-often."""
+"""Greatest time (s) whose frames are lost if this process is killed. Smaller: more writes."""
 UNSAFE_FRAMES = 64
-"""Frames beside the newest that the loop may be writing over while they are read. A larger value
-gives frames up earlier."""
+"""Oldest frames of the ring that are not read, because the loop may overwrite them meanwhile.
+Larger: frames are lost after shorter pauses."""
 
 
 class SessionRecording:
-    """Records the frames of one session as far as file and disk take them.
+    """Records the frames of one session while the file's limit and the disk permit.
 
     A recording that ends early, because the disk is full or fails, does not end the session.
 
@@ -30,14 +29,14 @@ class SessionRecording:
     path : path
         The file.
     limit_bytes, append, replace :
-        As `hapticdb.recording.file.Recorder` takes them.
+        As for `hapticdb.recording.file.Recorder`.
 
     Attributes
     ----------
     ended : str or None
-        Why it has ended before the session, in a line; None while it goes on.
+        One line: why the recording has ended before the session; None while it continues.
     n_lost : int
-        Frames that the loop has written over before they were taken out of the ring.
+        Frames that the loop has overwritten before they were copied from the ring.
     """
 
     def __init__(
@@ -65,7 +64,7 @@ class SessionRecording:
 
     def begin(self, header: Header) -> None:
         """Make or open the file."""
-        # noted before the file is made: a signal may interrupt the making at any moment
+        # set before the file is made: a signal may interrupt that at any moment
         self._new_file = None if os.path.lexists(self._path) else self._path
         try:
             self._recorder = Recorder(
@@ -79,19 +78,19 @@ class SessionRecording:
         self._flushed_at = time.monotonic()
 
     def remove_new_file(self) -> None:
-        """Remove the file if `begin` made it: no frame was recorded, and the name stays free."""
+        """Remove the file if `begin` made it; for a recording without frames."""
         if self._new_file is not None:
             with suppress(OSError):
                 self._new_file.unlink()
 
     def take(self, ring: Frames, n_frames: int) -> None:
-        """Record the frames that have come since the last time.
+        """Record the frames that are new since the last call.
 
-        ring (R,) of `FRAME` : frame n stands at n modulo R; n_frames : of the session so far.
+        ring (R,) of `FRAME` : frame n is at index n modulo R; n_frames : number of frames so far.
         """
         if self._recorder is None or not self._is_going_on:
             return
-        self._is_going_on = False  # unless this goes well: a recorder that failed takes no more
+        self._is_going_on = False  # stays so if this fails: a failed recorder takes no more
         size = len(ring)
         if n_frames - self._n_taken > size - UNSAFE_FRAMES:
             self.n_lost += n_frames - self._n_taken - size // 2
@@ -106,20 +105,20 @@ class SessionRecording:
         self._is_going_on = self.ended is None
 
     def finish(self) -> None:
-        """Write what is left and close the file; an error is noted in `ended`."""
+        """Write the remaining frames and close the file; an error is stored in `ended`."""
         self._is_going_on = False
         if self._recorder is not None:
             with self._noting_the_end(self._recorder):
                 self._recorder.close()
 
     def close(self) -> None:
-        """Close the file; an error is raised."""
+        """Close the file; errors are raised."""
         if self._recorder is not None:
             self._recorder.close()
 
     @contextmanager
     def _noting_the_end(self, recorder: Recorder) -> Iterator[None]:
-        """Note why the recording has ended, if it has: a full disk must not end the session."""
+        """Store in `ended` why the recording has ended; a full disk must not end the session."""
         try:
             yield
         except FileError as error:

@@ -1,4 +1,4 @@
-"""Sessions as the fetching process sees them: where their tools are, and which cells they need."""
+"""Tracks sessions for the fetching process: where their tools are, and which cells they need."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -14,16 +14,17 @@ from hapticdb.resident.table import CellTable
 from hapticdb.store.base import NO_KEYS, Keys
 
 SPEED_HALF_LIFE = 0.7
-"""Seconds after which the greatest speed that a hand has shown counts half. A larger value fetches
-more cells around a hand that has slowed down."""
+"""Half-life (s) of a hand's greatest observed speed. A larger value fetches more cells around a
+hand that has slowed down."""
 SHARE_OF_TABLE = 0.75
-"""Share of the table that all sessions together may want. What is left lets cells of a moment ago
-stay. A larger value serves larger tools and evicts more."""
+"""Share of the table that all sessions together may want. The rest keeps recently used cells. A
+larger value serves larger tools and evicts more."""
 READ_ATTEMPTS = 100
-"""Attempts to read a row that a loop is writing. Writing takes microseconds: a row that stays
-unfinished is one of a loop that died."""
+"""Attempts to read a row that a loop is writing. Writing takes microseconds, so a row that stays
+unfinished belongs to a loop that died."""
 MET = -1.0
-"""Urgency of cells that a frame has met already. All others have 0 or more and come after them."""
+"""Urgency of unknown cells that a frame has already met; all other cells have 0 or more, and come
+later."""
 
 Ranked = tuple[Keys, NDArray[np.float64]]
 """Cells (n,) int64 and their urgency (n,), smallest first."""
@@ -31,11 +32,11 @@ Ranked = tuple[Keys, NDArray[np.float64]]
 
 @dataclass
 class TrackedSession:
-    """What is known of one session.
+    """State of one session.
 
-    sequence : of the row on the desk, as read last; wish : from which its cells were found; cells,
-    urgency (n,) : most urgent first; speed : m/s that the hand has shown of late; n_missing : cells
-    wanted and unknown at the last look.
+    sequence : number of the desk's row at its last reading; wish : the wish whose cells were
+    computed; cells, urgency (n,) : most urgent first; speed : recent greatest speed of the hand,
+    m/s; n_missing : wanted cells that were unknown at the last check.
     """
 
     sequence: int = 0
@@ -52,14 +53,14 @@ class SessionTracker:
     Parameters
     ----------
     table : CellTable
-        On its desk, sessions say where their tools are.
+        Sessions report on its desk where their tools are.
     grid : Grid
-        Of the environment.
+        Grid of the environment.
 
     Attributes
     ----------
     sessions : dict
-        By row of the desk, ascending.
+        Sessions by their rows of the desk, ascending.
     """
 
     def __init__(self, table: CellTable, grid: Grid) -> None:
@@ -68,9 +69,9 @@ class SessionTracker:
         self.sessions: dict[int, TrackedSession] = {}
 
     def read_desk(self, elapsed: float, lookahead: float) -> bool:
-        """Read where the tools are; whether any has moved so far that other cells are wanted.
+        """Read where the tools are; returns whether any now wants other cells.
 
-        elapsed : seconds since the last time; lookahead : seconds that cells are fetched ahead.
+        elapsed : seconds since the last call; lookahead : seconds that cells are fetched ahead.
         """
         desk = self._table.desk.sessions
         active = set(np.flatnonzero(desk["told"]["is_active"]).tolist())
@@ -92,7 +93,7 @@ class SessionTracker:
         return has_moved
 
     def _read_motion(self, row: int, session: TrackedSession) -> Motion | None:
-        """Motion on a row of the desk, read whole; None where its loop died while it wrote."""
+        """Read a row of the desk completely; None if its loop died while it wrote the row."""
         desk = self._table.desk.sessions
         for _ in range(READ_ATTEMPTS):
             session.sequence = int(desk["sequence"][row])
@@ -110,7 +111,7 @@ class SessionTracker:
         return ranked([(one.cells, one.urgency) for one in self.sessions.values()])
 
     def missing_cells(self, residency: Residency) -> Keys:
-        """Unknown cells that sessions want, most urgent first. The known ones are kept resident."""
+        """Unknown cells that sessions want, most urgent first; protects the known ones."""
         residency.begin_round()
         wanted = [part for row in self.sessions for part in self._wanted(row, residency)]
         return residency.missing(ranked(wanted))
@@ -136,7 +137,7 @@ class SessionTracker:
             yield missed, np.full(len(missed), MET)
 
     def report_missing(self) -> None:
-        """Tell each session how many of its cells are missing, and of which position that holds."""
+        """Report to each session how many of its cells are missing, and for which position."""
         desk = self._table.desk.sessions
         for row, session in self.sessions.items():
             desk["n_missing"][row] = session.n_missing

@@ -1,4 +1,4 @@
-"""Which cells a tool may meet soon. The fetching process brings them in, most urgent first."""
+"""Cells that a tool may meet soon; the fetching process fetches them, most urgent first."""
 
 from typing import NamedTuple
 
@@ -13,10 +13,11 @@ REACH_VOXELS = 500.0
 """Voxels a second that a hand may reach from rest: 1 m/s in voxels of 2 mm. A larger value fetches
 more cells around a resting hand."""
 SLACK_VOXELS = 1.0
-"""Voxels that a wish may move until its cells are searched anew. A larger value searches less often
-and fetches a wider margin."""
+"""Voxels that a wish may move until its cells are computed again. A larger value computes less
+often and fetches a wider margin."""
 MOST_CELLS_WANTED = 1 << 15
-"""Cells of one wish, at most: the box around a faster or larger tool is cut at its far ends."""
+"""Greatest number of cells of one wish: the box around a faster or larger tool is cut at its far
+ends. A larger value serves larger tools and takes more time."""
 CELL = float(1 << CELL_BITS)
 """Voxels on a cell's edge."""
 
@@ -24,10 +25,10 @@ Floats = NDArray[np.float64]
 
 
 class Motion(NamedTuple):
-    """Where a loop's tool is and where its hand wants it: metres and m/s, world frame.
+    """Place and motion of a loop's tool: metres and m/s, world frame.
 
-    tool (3,): the shell's centre; handle (3,): where the hand wants that centre; velocity (3,): of
-    the handle; radius: of the shell's point farthest from its centre.
+    tool (3,): the shell's centre; handle (3,): target of that centre, set by the hand; velocity
+    (3,): of the handle; radius: distance from the centre to the shell's farthest point.
     """
 
     tool: Floats
@@ -37,7 +38,7 @@ class Motion(NamedTuple):
 
     @classmethod
     def of_told(cls, told: NDArray[np.void]) -> "Motion":
-        """Motion in what a loop told: told () of `kernels.records.TOLD`, which is not copied."""
+        """Motion from a loop's report: told () of `kernels.records.TOLD`, which is not copied."""
         return cls(told["tool"], told["handle"], told["velocity"], float(told["radius"]))
 
     @classmethod
@@ -47,15 +48,15 @@ class Motion(NamedTuple):
 
     @property
     def is_finite(self) -> bool:
-        """Whether all of its numbers are."""
+        """Whether all numbers are finite."""
         return all(bool(np.isfinite(part).all()) for part in self)
 
 
 class Wish(NamedTuple):
     """Where a tool is and may soon be, in voxels of the grid.
 
-    start, move (3,): the bounding sphere's centre, and its way to where the hand will be; radius:
-    of the sphere; margin: how far beside its way it may be.
+    start, move (3,): the bounding sphere's centre, and its displacement to the hand's expected
+    place; radius: of the sphere; margin: greatest distance of the sphere from that path.
     """
 
     start: Floats
@@ -67,11 +68,11 @@ class Wish(NamedTuple):
     def of_motion(
         cls, grid: Grid, motion: Motion, lookahead: float, peak_speed: float
     ) -> "Wish | None":
-        """Wish of a session's motion, or None when not all of its numbers are finite.
+        """Wish for a session's motion, or None if not all of its numbers are finite.
 
         The bounding sphere moves from the tool to the hand, and on with the hand's velocity for
-        `lookahead` seconds. The margin is the distance that the hand can leave this way by in that
-        time, at 1.5 times `peak_speed` (m/s, shown of late), at least at `REACH_VOXELS`.
+        `lookahead` seconds. The margin is the greatest distance of the hand from this path after
+        that time, at 1.5 times its recent `peak_speed` (m/s), or at `REACH_VOXELS` if that is more.
         """
         if not motion.is_finite:
             return None
@@ -86,7 +87,7 @@ class Wish(NamedTuple):
         )
 
     def is_near(self, other: "Wish") -> bool:
-        """Whether the cells of one wish serve for the other."""
+        """Whether the cells of this wish can be used for the other wish."""
         away = [
             *(self.start - other.start),
             *(self.start + self.move - other.start - other.move),

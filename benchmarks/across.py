@@ -1,7 +1,7 @@
-"""A session from one end of an environment to the other, whose cells do not fit into its budget.
+"""A session across a whole environment, whose cells do not all fit into the memory budget.
 
-The hand flies over every object of a name, in a zigzag, and dips into each: `scale.py --build`
-makes the sample car 104 times, 1.4 billion voxels.
+The hand flies in a zigzag over every object with a given name, and dips into each one. `scale.py
+--build` makes such an environment: the sample car 104 times, 1.4 billion voxels.
 
     python benchmarks/across.py DIR/scale_1404082368.db --over roof --speed 4 --budget 64
 """
@@ -20,14 +20,14 @@ from hapticdb.devices.scripted import Player
 
 ABOVE = 0.05
 DIP = 0.004
-"""Metres above each object's top on the way, and into it at its middle."""
+"""Metres: height above each object's top between dips, and depth of a dip below the top."""
 RATE = 1000.0
 LONGEST_S = 3600.0
-"""After this a session has gone wrong: the flight in docs/realtime.md takes five minutes."""
+"""Seconds after which a session counts as failed; docs/realtime.md's flight takes five minutes."""
 
 
 def places_over(env: Environment, word: str) -> NDArray[np.float64]:
-    """Top centres (n, 3) of the objects of that name, in a zigzag, metres."""
+    """Top centres (n, 3) of the objects whose name ends in a word, in a zigzag, metres."""
     found = [obj.bounds for obj in env.objects() if obj.name.endswith(word)]
     if not found:
         raise SystemExit(f"no object of {env.url} is named {word}")
@@ -42,11 +42,11 @@ def places_over(env: Environment, word: str) -> NDArray[np.float64]:
 
 
 def over(tops: NDArray[np.float64], speed: float) -> Player:
-    """A hand that flies over all places and dips into each."""
+    """A hand that flies at `speed` (m/s) over all places and dips into each."""
     stops = np.repeat(tops, 3, axis=0)
     stops[:, 2] += np.tile([ABOVE, -DIP, ABOVE], len(tops))
     ways = np.linalg.norm(np.diff(stops, axis=0), axis=1)
-    # a dip is slow: a tenth of a metre a second
+    # a dip is slow: 0.1 m/s
     paces = np.where(np.arange(len(ways)) % 3 == 2, speed, 0.1)
     poses = np.tile(np.eye(4), (len(stops), 1, 1))
     poses[:, :3, 3] = stops

@@ -1,8 +1,8 @@
 """Processors that do not sleep while times are measured.
 
-A frame on a server goes to and fro between two processes that each sleep while the other works, and
-a virtual processor that sleeps can take longer to wake than a frame lasts: times double and
-scatter. A process of idle priority on each keeps them awake, and yields to whatever else runs.
+A frame on a server runs alternately in two processes, of which one sleeps while the other works. A
+virtual processor can take longer to wake than a frame lasts: times double and scatter. One process
+of idle priority on each processor keeps it awake, and yields to all other work.
 """
 
 import contextlib

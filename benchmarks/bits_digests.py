@@ -1,6 +1,6 @@
-"""What `same_bits` compares: rows, touches, sessions and sweeps of an environment, as digests.
+"""Digests that `same_bits` compares: of an environment's rows, touches, sessions and sweeps.
 
-Only public names of hapticdb and its command line are used, here, too.
+As in `same_bits`, only public names of hapticdb and its command line are used.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ from bits_inputs import Floats, Place, Tool, command
 Strategy = Literal["statement", "array", "points", "maxgap", "cbgroup", "auto"]
 STRATEGIES: tuple[Strategy, ...] = ("statement", "array", "points", "maxgap", "cbgroup", "auto")
 MEASURED = ("cbgroup", "auto")
-"""Strategies whose statements follow from measured costs, and so differ from run to run."""
+"""Strategies whose statements depend on measured costs, and so differ between runs."""
 SESSION = "--rate 512 --speed 0.1 --policy wait --simulate --no-baseline --replace --record"
 CLOCK = '''"""A clock that counts its calls: whole ticks, of which 625 are a frame of 1/512 s.
 
@@ -42,28 +42,28 @@ COLUMNS = (
     *("time", "dt", "hand", "hand_velocity", "tool", "wrench", "applied"),
     *("hits", "contacts", "unknown", "deepest", "revision", "state"),
 )
-"""Of a recorded frame: all but what was measured."""
+"""Columns of a recorded frame that are compared: all but measured times."""
 
 
 class Digest:
-    """SHA-256 of arrays; their types and shapes count, so that none runs into the next."""
+    """SHA-256 of arrays with their types and shapes, which keep neighbouring arrays apart."""
 
     def __init__(self) -> None:
         self._sha = hashlib.sha256()
 
     def feed(self, *values: ArrayLike) -> None:
-        """Add arrays, or numbers, or text."""
+        """Add arrays, numbers or text."""
         for value in values:
             array = np.ascontiguousarray(value)
             self._sha.update(f"{array.dtype.str}{array.shape}".encode() + array.tobytes())
 
     def entry(self, n: int, of: str, differing: int = 0) -> dict[str, Any]:
-        """Build what a JSON file holds: the digest of how many things, and how many are wrong."""
+        """Entry of the JSON file: digest, number `n` of things `of` a kind, number differing."""
         return {"sha256": self._sha.hexdigest(), "n": n, "of": of, "differing": differing}
 
 
 class Results(dict[str, dict[str, Any]]):
-    """Entries by name; each is told when it is there."""
+    """Entries by name; each is printed when it is added, with the seconds it took."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -78,7 +78,7 @@ class Results(dict[str, dict[str, Any]]):
 
 
 def stored(place: Place, env: hapticdb.Environment, results: Results) -> None:
-    """Objects, their voxels, the histogram of keys, and all rows: of a server, those of a copy."""
+    """Digest objects, voxels, the histogram of keys, and all rows (on a server: of a copy)."""
     digest, n_voxels = Digest(), 0
     for obj in env.objects():
         described = json.dumps(dict(obj.attributes), sort_keys=True, default=str)
@@ -103,7 +103,7 @@ def stored(place: Place, env: hapticdb.Environment, results: Results) -> None:
 
 
 def touched(place: Place, env: hapticdb.Environment, tool: Tool, results: Results) -> None:
-    """All poses by each strategy, and together."""
+    """Digest touches at all poses, by each strategy and by `touch_many`."""
     for strategy in STRATEGIES:
         felt, asked, n_hit = Digest(), Digest(), 0
         for pose in tool.poses:
@@ -124,7 +124,7 @@ def touched(place: Place, env: hapticdb.Environment, tool: Tool, results: Result
 
 
 def recorded(place: Place, tool: Tool, file: Path, results: Results) -> None:
-    """Record a session on the clock that counts: a hand on the path, which the force pushes."""
+    """Record and digest a session on `CLOCK`: a hand on the path, which the force pushes back."""
     with tempfile.TemporaryDirectory() as folder:
         Path(folder, "sitecustomize.py").write_text(CLOCK, encoding="utf-8")
         modules = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
@@ -139,7 +139,7 @@ def recorded(place: Place, tool: Tool, file: Path, results: Results) -> None:
 
 
 def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Results) -> None:
-    """Feel a recording again: frame by frame, frames together, and in resident cells."""
+    """Replay a recording three ways: frames together, frame by frame, and in resident cells."""
     recording, digest = hapticdb.Recording(file), Digest()
     header, felt_again = recording.header, []
 
@@ -151,7 +151,7 @@ def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Resul
 
     of = f"of {len(recording)} recorded frames compared"
     found = hapticdb.replay(recording, env, feel)
-    digest.feed(np.concatenate(felt_again))  # chunks of a recording follow from the load
+    digest.feed(np.concatenate(felt_again))  # chunk sizes depend on the load
     results[f"{place.name}/replay"] = digest.entry(found.n_compared, of, found.n_differing)
     found = hapticdb.replay(recording, env)
     (digest := Digest()).feed(found.n_compared, found.n_skipped)
@@ -164,7 +164,7 @@ def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Resul
 
 
 def swept(place: Place, tool: Tool, results: Results) -> None:
-    """All that the verb ``sweep`` says of the wrench's path, but for how long it took."""
+    """Digest the result of ``sweep`` on the wrench's path, without the elapsed time."""
     verdict = command("sweep", place.url, "--tool", tool.mesh, "--path", tool.path)
     del verdict["elapsed"]
     (digest := Digest()).feed(json.dumps(verdict, sort_keys=True))

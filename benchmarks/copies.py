@@ -1,8 +1,8 @@
-"""An environment many times as large: an object's rows repeated under other keys.
+"""Copies of all objects make an environment larger: their rows are repeated under other keys.
 
-In Z-order the leading bits of a key name the cube that holds the voxel. So a copy that stands
-2^bits voxels further along has the same keys but for those leading bits, and the same bricks: no
-triangle is voxelized again. Copies stand side by side on a plane, like parked cars.
+In Z-order the leading bits of a key name the cube that holds the voxel. A copy that is moved by
+2^bits voxels therefore has the same keys except for the leading bits, and the same bricks: no
+triangle is voxelized again. Copies lie side by side on a plane, like parked cars.
 """
 
 import math
@@ -20,12 +20,12 @@ from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Rows, Store, row_shift
 
 MAX_BITS = 15
-"""Of the larger grid."""
+"""Most bits an axis of the larger grid; one more allows four times as many copies on the plane."""
 
 
 @dataclass(frozen=True)
 class Source:
-    """What is repeated: objects with their rows, on a grid that the copies share the voxels of."""
+    """The objects and rows that are repeated, on a grid whose voxels the copies' grid continues."""
 
     grid: Grid
     layout: Layout
@@ -48,7 +48,7 @@ class Source:
         return cls(env.grid, env.layout, tuple(parts))
 
     def within(self, voxels: float) -> "Source":
-        """Those objects nearest to the middle that together stay within so many voxels."""
+        """A source of the objects nearest to the middle that together have at most `voxels`."""
         middles = np.array([obj.bounds.mean(axis=0) for obj, _ in self.parts])
         distances = np.linalg.norm(middles - middles.mean(axis=0), axis=1)
         room = voxels
@@ -64,7 +64,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Plan:
-    """Where copies stand: `tiles` (C, 3), in edges of the source's grid, and the grid of all."""
+    """Places of copies: `tiles` (C, 3), in edges of the source's grid, and the grid of all."""
 
     source: Source
     grid: Grid
@@ -72,7 +72,7 @@ class Plan:
 
     @classmethod
     def of(cls, source: Source, copies: int) -> "Plan":
-        """As near to a square as can be, in the order of their keys: rows come ascending."""
+        """Copies nearly in a square, in the order of their keys: rows are written ascending."""
         side = math.isqrt(copies - 1) + 1
         bits = source.grid.bits + (side - 1).bit_length()
         if bits > MAX_BITS:
@@ -94,7 +94,7 @@ class Plan:
         return int(np.argmin(np.linalg.norm(self.tiles - self.tiles.mean(axis=0), axis=1)))
 
     def offsets(self) -> NDArray[np.float64]:
-        """How far each copy stands from the source, (C, 3) metres."""
+        """Offset of each copy from the source, (C, 3) metres."""
         return self.tiles.astype(np.float64) * self.source.grid.edge
 
     def parts_of(self, copy: int) -> list[tuple[Object, Rows]]:
@@ -121,7 +121,7 @@ class Plan:
 
 
 def write_copies(store: Store, plan: Plan, progress: Callable[[int], None]) -> None:
-    """Write all copies into an empty environment on the plan's grid; told how many are there."""
+    """Write all copies into an empty store on the plan's grid; `progress` gets their count."""
     with store.loading():
         for copy in range(len(plan.tiles)):
             for obj, rows in plan.parts_of(copy):

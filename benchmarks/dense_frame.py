@@ -1,7 +1,7 @@
 """The limit of a real-time frame: the same flat loop over one dense bitmap in memory.
 
-Word ``(i * side + j) * side / 32 + k / 32``, bit ``k & 31``. All of a frame's arithmetic, and the
-order of its sums, are those of `hapticdb.kernels.resident.cells.felt`; only the lookup differs.
+Voxel (i, j, k) is bit ``k & 31`` of word ``(i * side + j) * side / 32 + k / 32``. Arithmetic and
+order of sums equal those of `hapticdb.kernels.resident.cells.felt`; only the lookup differs.
 """
 
 import numpy as np
@@ -26,7 +26,7 @@ from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 @entry(INTS, INTS32, WORDS32_2, INT, types.uint32[::1])
 def spread_out(keys: NDArray[np.int64], slots, words, side, bitmap):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
-    """Resident cells of one directory into a bitmap, zero before."""
+    """Write the resident cells of one directory into a bitmap of zeros."""
     row = side // 32
     for entry_at in range(keys.shape[0]):
         if keys[entry_at] < 0 or slots[entry_at] == EMPTY_SLOT:
@@ -79,7 +79,7 @@ def dense_felt(bitmap, shell, pose, place, law, met, out):  # type: ignore[no-un
 
 @entry(types.uint32[::1], CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, FLOATS2)
 def dense_feel(bitmap, shell, poses, place, law, met, out):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
-    """`dense_felt` at poses (M, 4, 4) into out (M, RESULTS), as `feel_kernel`."""
+    """`dense_felt` at poses (M, 4, 4) into out (M, RESULTS), as `feel_kernel` does."""
     for n in range(poses.shape[0]):
         if not is_rigid(poses[n]):
             return n
@@ -88,7 +88,7 @@ def dense_feel(bitmap, shell, poses, place, law, met, out):  # type: ignore[no-u
 
 
 def dense_bitmap(cells: Cells, which: int, side: int) -> NDArray[np.uint32]:
-    """Bitmap of all that is resident in one directory; what is not is empty there."""
+    """Bitmap of the resident cells of one directory; other cells are empty in the bitmap."""
     bitmap = np.zeros(side**3 // 32, dtype=np.uint32)
     spread_out(cells.keys[which], cells.slots[which], cells.words, side, bitmap)
     return bitmap

@@ -1,7 +1,7 @@
 """How soon a running session feels what another process commits.
 
-A writer in a process of its own lifts an object that the tool slides along and puts it back, again
-and again; this one looks, twice a millisecond, at the revision of the session's last frame.
+A writer in its own process lifts an object that the tool slides along and puts it back, again and
+again. This process looks, twice a millisecond, at the revision of the session's last frame.
 """
 
 import subprocess
@@ -21,7 +21,7 @@ from hapticdb.poses import read_poses
 RATE = 1000.0
 EDITS = 60
 LIFT = 5.0
-"""Voxels."""
+"""Height in voxels by which the object is lifted."""
 LOOK = 0.0005
 PAUSE = 0.2
 PATIENCE = 60.0
@@ -35,7 +35,7 @@ def touched_object(url: str, shell: PointShell, path: FilePath) -> int:
 
 
 def write(url: str, object_id: int, n_edits: int) -> None:
-    """Lift and lower the object, told by a line each time, and tell when it was committed."""
+    """Lift or lower the object at each line of input; print revision, time and duration."""
     with hapticdb.open(url) as env:
         poses = [env.object(object_id).transform, env.object(object_id).transform.copy()]
         poses[1][2, 3] += LIFT * env.grid.voxel_size
@@ -49,7 +49,7 @@ def write(url: str, object_id: int, n_edits: int) -> None:
 
 
 def edits(url: str, tool: FilePath, path: FilePath, n_edits: int = EDITS) -> dict[str, Any]:
-    """Milliseconds from a commit until a frame was of its revision; the object is put back."""
+    """Milliseconds from a commit to a frame of its revision; at the end the object is put back."""
     shell = PointShell.from_file(tool, 300)
     object_id = touched_object(url, shell, path)
     delays, took = [], []
@@ -63,7 +63,7 @@ def edits(url: str, tool: FilePath, path: FilePath, n_edits: int = EDITS) -> dic
     ):
         assert writer.stdin is not None
         assert writer.stdout is not None
-        late = threading.Timer(n_edits * PATIENCE, writer.kill)  # so that no line is waited for
+        late = threading.Timer(n_edits * PATIENCE, writer.kill)  # ends `readline` below
         late.daemon = True
         late.start()
         for _ in range(n_edits):
@@ -96,7 +96,7 @@ def revision_of(session: Session) -> int:
 
 
 def until_after(session: Session, revision: int) -> float:
-    """When a frame was of a later revision."""
+    """Wait for a frame of a later revision; the time at which it was seen, in seconds."""
     deadline = time.monotonic() + PATIENCE
     while revision_of(session) <= revision:
         if time.monotonic() > deadline:

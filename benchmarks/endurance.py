@@ -2,11 +2,11 @@
 
     python benchmarks/endurance.py --minutes 10
 
-The sample car goes to a private PostgreSQL server in a temporary folder, and a hand slides a
-spanner over it at 1 kHz. Meanwhile, at random, the server is killed and started again after a
-while, its backends are terminated, the fetching process is killed, and statements fail. Asserts
+The sample car is imported into a private PostgreSQL server in a temporary folder, and a hand slides
+a spanner over it at 1 kHz. At random times the server is killed and started again later, its
+backends are terminated, the fetching process is killed, and statements fail. The script asserts
 that nothing crashes, that no force is left while the database is away, and that frames are exact
-again afterwards. Prints one JSON object.
+again afterwards. It prints one JSON object.
 """
 
 import argparse
@@ -45,19 +45,19 @@ from hapticdb.store.postgres.private_server import PrivateServer
 
 STALENESS = 0.5
 FALLING = 0.04
-"""Seconds in which a force that nothing confirms has fallen to zero."""
+"""Seconds after which a held force is zero."""
 SPARE = 0.02
-"""Seconds more, for a frame that a busy machine begins late."""
+"""Seconds of tolerance for a frame that a busy machine begins late."""
 APART = (2.0, 6.0)
 AWAY = (1.0, 5.0)
-"""Seconds between two disturbances, and for which the server stays away."""
+"""Ranges in seconds: between two disturbances, and for which the server stays away."""
 RECOVERY_PATIENCE = 30.0
 
 Frames = NDArray[np.void]
 
 
 class Trouble(NamedTuple):
-    """What was done, and in which seconds of the session; until when its server was surely away."""
+    """A disturbance: kind, begin and end, and until when the server was surely away (seconds)."""
 
     kind: str
     begun: float
@@ -79,17 +79,17 @@ class Course:
         self.started = min(self.start_by_last_frame() for _ in range(100))
 
     def start_by_last_frame(self) -> float:
-        """When the session's seconds began to count; later than that where a frame is late."""
+        """Start of the session's time, from its last frame; too late by that frame's lateness."""
         self.look_after(2e-3)
         last = self.session.last()
         return time.monotonic() - (float(last["time"][0]) if last is not None else 0.0)
 
     def now(self) -> float:
-        """Seconds since the session's start, as its recording has them."""
+        """Seconds since the session's start, on the recording's time scale."""
         return time.monotonic() - self.started
 
     def run(self, seconds: float) -> None:
-        """One trouble after another, of each kind in turn, at random moments."""
+        """Cause one disturbance after another, of each kind in turn, at random moments."""
         while self.now() < seconds:
             self.look_after(self.rng.uniform(*APART))
             trouble = self.kinds[len(self.troubles) % len(self.kinds)]
@@ -99,16 +99,16 @@ class Course:
         self.look_after(max(*APART))
 
     def look_after(self, seconds: float) -> None:
-        """Let that time pass."""
+        """Let so many seconds pass; the session must go on."""
         assert self.session.wait(seconds) is None, "the session has ended by itself"
 
     def kill_server(self) -> None:
-        """End it as a crash does, and start it again later."""
+        """End the server as a crash does, and start it again later."""
         assert self.server is not None
         self.server.kill()
         self.look_after(self.rng.uniform(*AWAY))
-        self.away_until = self.now()  # it answers some time before `start` returns
-        starting = threading.Thread(target=self.server.start)  # frames are recorded meanwhile
+        self.away_until = self.now()  # the server answers before `start` returns
+        starting = threading.Thread(target=self.server.start)  # frames go on meanwhile
         starting.start()
         while starting.is_alive():
             self.look_after(0.05)
@@ -127,13 +127,13 @@ class Course:
 
 
 def is_exact(frames: Frames) -> NDArray[np.bool_]:
-    """Which frames were computed from what the database confirmed."""
+    """Whether each frame is exact: neither held nor with unknown points."""
     found: NDArray[np.bool_] = (frames["state"] & State.HELD == 0) & (frames["unknown"] == 0)
     return found
 
 
 def held_for(frames: Frames) -> NDArray[np.float64]:
-    """Seconds (n,) for which each frame's wrench had been kept."""
+    """Seconds (n,) for which each frame's wrench had been held."""
     is_held = frames["state"] & State.HELD > 0
     total = np.cumsum(frames["dt"])
     before = np.maximum.accumulate(np.where(is_held, 0.0, total))
@@ -142,10 +142,10 @@ def held_for(frames: Frames) -> NDArray[np.float64]:
 
 
 def outage(trouble: Trouble, until: float, frames: Frames) -> dict[str, object]:
-    """What the recording says of one trouble, before the next one: times in seconds.
+    """Effect of one disturbance on the recording, until the next; times in seconds.
 
-    until_zero : from its begin to a force that has fallen, None where frames noticed nothing;
-    until_exact : from its end to the first frame after which all are exact, 0 likewise.
+    until_zero : from its begin until the force has fallen, None if the force never fell;
+    until_exact : from its end to the first frame after which all are exact, 0 if all were exact.
     """
     times = frames["time"]
     within = (times >= trouble.begun) & (times < until)
@@ -163,25 +163,25 @@ def outage(trouble: Trouble, until: float, frames: Frames) -> dict[str, object]:
 
 
 def check(troubles: list[Trouble], frames: Frames) -> None:
-    """What must hold, whatever happened."""
+    """Assert the rules that hold after any disturbance."""
     times = frames["time"]
     assert np.isfinite(frames["applied"]).all()
-    is_fallen = held_for(frames) >= FALLING + 1e-9  # sums of the same periods, rounded elsewhere
+    is_fallen = held_for(frames) >= FALLING + 1e-9  # the loop rounds the same sums differently
     assert not frames["applied"][is_fallen].any()
     for trouble in troubles:
         after = (times >= trouble.ended) & (times <= trouble.ended + RECOVERY_PATIENCE)
         assert is_exact(frames)[after].any(), f"no recovery after {trouble}"
         if trouble.kind != "kill_server":
             continue
-        # the loop goes by the last answer, which may be younger than the kill was noted
+        # staleness counts from the last answer, which may come after `begun`
         silent = trouble.begun + STALENESS + FALLING + SPARE
         is_away = (times >= silent) & (times < trouble.away_until)
-        # from the third such frame on: the fall is measured by periods, which may be long here
+        # from the third frame on: the fall counts periods, and a period may be long here
         assert not frames["applied"][np.flatnonzero(is_away)[2:]].any(), f"force during {trouble}"
 
 
 def check_exact(path: Path, url: str) -> int:
-    """Feel every frame again that was exact, bit for bit; how many that were."""
+    """Replay every exact frame and compare bit for bit; the number of frames."""
     recording = Recording(path)
     with hapticdb.open(url, read_only=True) as env:
         felt = ResidentFrames(Residency(env.store, CellTable.create()), recording.header.shell)
@@ -191,10 +191,10 @@ def check_exact(path: Path, url: str) -> int:
 
 
 def summary(report: Report, troubles: list[Trouble], frames: Frames) -> dict[str, object]:
-    """What to print."""
+    """Figures of the session and of each disturbance, to print."""
     ends = [trouble.begun for trouble in troubles[1:]] + [math.inf]
     outages = [outage(*pair, frames) for pair in zip(troubles, ends, strict=True)]
-    assert report.empty is not None  # it was asked for
+    assert report.empty is not None  # the session measures an empty loop by default
     return {
         "frames": report.loop.frames,
         "missed": report.loop.missed,
@@ -213,7 +213,7 @@ def summary(report: Report, troubles: list[Trouble], frames: Frames) -> dict[str
 
 
 def run(args: argparse.Namespace, folder: Path, url: str, server: PrivateServer | None) -> None:
-    """Hold a session through all of it, and print what it was like."""
+    """Run a session with disturbances, check it, and print its figures."""
     files = write_sample(folder)
     shell = PointShell.from_file(files.wrench)
     there = read_poses(files.path)
@@ -249,7 +249,7 @@ def main() -> None:
         "--url", help="an environment on another server, which is not killed; it holds the sample"
     )
     args = parser.parse_args()
-    hapticdb.warm_up()  # what compiles for longer than errors are spared would never begin
+    hapticdb.warm_up()  # compiling must not take longer than the time without errors (`GRACE`)
     with tempfile.TemporaryDirectory(prefix="hapticdb-endurance-") as name:
         folder = Path(name)
         if args.url:

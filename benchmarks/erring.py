@@ -14,7 +14,7 @@ from hapticdb.store.base import Store
 ROUND_TRIPS = {"revision", "changes", "scan", "lookup"}
 ERRORS: list[type[DatabaseError]] = [ConnectionLostError, BusyError, StuckError]
 GRACE = 5.0
-"""Seconds in which nothing fails: a session that cannot begin is another matter."""
+"""Seconds after opening without errors, so that sessions can start; then round trips may fail."""
 
 
 class Erring:
@@ -53,5 +53,5 @@ class Erring:
 
 
 def erring(store: Store, share: float, seed: int) -> Store:
-    """As `ResidentCells` takes it."""
+    """A wrapper of stores for the argument `wrap` of `ResidentCells`."""
     return cast("Store", Erring(store, share, seed))

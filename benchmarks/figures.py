@@ -3,8 +3,9 @@
     make figures                    # the sample at 11 bits: a quarter of an hour on two processors
     make figures ARGS=--quick       # a coarse sample and few frames: whether all of it runs
 
-Everything is made in a temporary folder: the sample, its environments on SQLite and on a private
-server of every PostgreSQL that is found, with 4 MB of cache as in the paper, then with a large one.
+All inputs are made in a temporary folder: the sample, and its environments on SQLite and on a
+private server of every PostgreSQL found. They are measured with 4 MB of cache as in the paper, then
+with a large cache.
 """
 
 import argparse
@@ -56,7 +57,7 @@ CAD = (
 """Real assemblies of Table 1: folder and file under HAPTICDB_TEST_DATA, extent of the grid."""
 VOXELIZED = Path("assembly_vw_t1/vw_t1.glb")
 POINTCLOUD_MAJOR = 15
-"""PostgreSQL that Debian's package of pgpointcloud is for."""
+"""Major version of PostgreSQL for which Debian has a package of pgpointcloud."""
 CACHES = {"4 MB": "4MB", "all cached": "2GB"}
 SETTINGS = {"max_wal_size": "4GB", "fsync": "off"}
 
@@ -81,7 +82,7 @@ class Evaluation:
         print(f"{time.perf_counter() - self.seconds:6.0f} s  {line}", file=sys.stderr, flush=True)
 
     def keep(self, name: str, measured: PeerResults) -> None:
-        """Keep measured cells, and notes on what could not be measured."""
+        """Keep measured cells, and notes on measurements that were not possible."""
         self.add(name, measured.cells)
         self.notes += measured.notes
 
@@ -90,7 +91,7 @@ class Evaluation:
         self.found.setdefault(name, []).extend(cells)
 
     def make(self, url: str, layout: Layout, curve: CurveName = "z") -> str:
-        """Import the sample; the same grid everywhere, curve and layout aside."""
+        """Import the sample; all environments have the same grid except for curve and layout."""
         grid = GridOptions(bits=self.bits, extent=EXTENT, curve=curve)
         import_file(url, self.files.car, ImportOptions(grid=grid, layout=layout))
         return url
@@ -108,14 +109,14 @@ class Evaluation:
 
 
 def import_file(url: str, file: Path, options: ImportOptions) -> None:
-    """Import one file, or raise what was wrong with it."""
+    """Import one file, or raise its error."""
     (report,) = hapticdb.import_files(url, [file], options)
     if report.error is not None:
         raise report.error
 
 
 def table_1(evaluation: Evaluation) -> None:
-    """Voxels, objects and cells of real assemblies, beside the sample's."""
+    """Add real assemblies to Table 1, beside the sample."""
     if evaluation.data is None:
         evaluation.notes.append("real CAD assemblies: HAPTICDB_TEST_DATA names no folder")
         return
@@ -130,7 +131,7 @@ def table_1(evaluation: Evaluation) -> None:
 
 
 def on_sqlite(evaluation: Evaluation) -> None:
-    """The inputs, then all experiments on SQLite, in both layouts."""
+    """Make the inputs, then run all experiments on SQLite, in both layouts."""
     budget = evaluation.budget
     for layout in LAYOUTS:
         evaluation.say(f"SQLite, {layout}: import")
@@ -146,7 +147,7 @@ def on_sqlite(evaluation: Evaluation) -> None:
         work = run.workload_of(env, budget, recorded)
     for layout in LAYOUTS:
         with hapticdb.open(evaluation.folder / f"{layout}.db", read_only=True) as env:
-            # the same rows on every engine, so the same vector
+            # every engine has the same rows, so the same quantile vector
             evaluation.work[layout] = replace(work, finest=env.quantiles(max(budget.resolutions)))
             for cache, is_paper in run.caches_of(env):
                 subject = Subject(env, "sample", cache, run.drop_of(env))
@@ -154,7 +155,7 @@ def on_sqlite(evaluation: Evaluation) -> None:
 
 
 def measure(evaluation: Evaluation, subject: Subject, *, is_paper: bool) -> None:
-    """All experiments at the paper's point; with a large cache those that it changes."""
+    """Run all experiments with the paper's cache; with a large cache those that it affects."""
     work, budget = evaluation.work[subject.env.layout], evaluation.budget
     evaluation.say(f"{subject.env.engine}, {subject.env.layout}: cache {subject.cache}")
     for name, more in run.measured(subject, work, budget, is_paper=is_paper).items():
@@ -162,7 +163,7 @@ def measure(evaluation: Evaluation, subject: Subject, *, is_paper: bool) -> None
 
 
 def on_postgres(evaluation: Evaluation, binaries: Binaries) -> None:
-    """All experiments on one PostgreSQL, started anew for each size of its cache."""
+    """Run all experiments on one PostgreSQL server, restarted for each size of its cache."""
     folder = evaluation.folder / f"postgres{binaries.major}"
     large = SETTINGS | {"shared_buffers": CACHES["all cached"]}
     with serving(folder, binaries, large) as server:
@@ -182,7 +183,7 @@ def on_postgres(evaluation: Evaluation, binaries: Binaries) -> None:
                 env = opened.enter_context(hapticdb.open(url))
                 subject = Subject(env, "sample", limited(env, 0), drop)
                 if (layout, subject.cache) in measured:
-                    continue  # a small environment was all cached from the start
+                    continue  # a small environment was already fully cached
                 measured.add((layout, subject.cache))
                 measure(evaluation, subject, is_paper=cache == "4 MB")
                 if evaluation.with_peers and layout == "brick" and cache == "4 MB":
@@ -190,7 +191,7 @@ def on_postgres(evaluation: Evaluation, binaries: Binaries) -> None:
 
 
 def curves(evaluation: Evaluation) -> None:
-    """The three curves on SQLite, bricks and voxels; lexicographic order has no bricks."""
+    """Measure the three curves on SQLite in both layouts; lexicographic order has no bricks."""
     made: list[tuple[Layout, CurveName, str]] = [
         ("brick", "z", str(evaluation.folder / "brick.db")),
         ("voxel", "z", str(evaluation.folder / "voxel.db")),
@@ -214,7 +215,7 @@ def curves(evaluation: Evaluation) -> None:
 
 
 def peers(evaluation: Evaluation) -> None:
-    """Other systems on the same poses, and other voxelizers."""
+    """Measure other systems on the same poses, and other voxelizers."""
     evaluation.say("peers")
     with hapticdb.open(evaluation.folder / "brick.db", read_only=True) as env:
         compare(evaluation, env, None)
@@ -226,7 +227,7 @@ def peers(evaluation: Evaluation) -> None:
 
 
 def compare(evaluation: Evaluation, env: Environment, among: Sequence[Peer] | None) -> None:
-    """Frames of an environment in bricks and of its peers: all of them unless given."""
+    """Measure frames of an environment in bricks, and of the given peers (None: all peers)."""
     task = evaluation.work["brick"].slide
     radius = RADIUS_VOXELS * env.grid.voxel_size
     ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
@@ -256,7 +257,7 @@ ENGINES = "engines"
 def evaluate(
     folder: Path, bits: int, budget: Budget, data: Path | None, parts: tuple[str, ...]
 ) -> dict[str, dict[str, Any]]:
-    """Run the parts named, and return results by name."""
+    """Run the named parts, and return results by name."""
     files = write_sample(folder / "sample", budget.frames)
     evaluation = Evaluation(folder, files, bits, budget, data, with_peers=peers.__name__ in parts)
     hapticdb.warm_up()
@@ -294,7 +295,7 @@ def main(arguments: list[str] | None = None) -> None:
     out = chosen.out or Path("results-quick" if chosen.quick else "results")
     report = chosen.report or (out / run.PAGE if chosen.quick else Path("docs/evaluation.md"))
     data = os.environ.get("HAPTICDB_TEST_DATA")
-    # an exit instead of an end at once: servers are stopped and files removed
+    # SIGTERM raises an exit, so that servers are stopped and files removed
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with awake(), tempfile.TemporaryDirectory(prefix="hapticdb-figures-") as folder:
         found = evaluate(
@@ -310,7 +311,7 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def redraw(out: Path, report: Path) -> None:
-    """Plots and report from the JSON that is there, that of `make scale` included."""
+    """Draw plots and write the report from all JSON in a folder, also that of `make scale`."""
     results = records.read(out)
     draw(results, out, REPORT_KINDS)
     report.parent.mkdir(parents=True, exist_ok=True)

@@ -3,9 +3,9 @@
     make realtime                              # the sample car, ten seconds a session
     python benchmarks/in_real_time.py --model FILE --seconds 60 --out results/realtime.json
 
-Frames: the resident cells' kernels and the same flat loop over one dense bitmap, in turns, the
+Frames: the resident cells' kernels and the same flat loop over one dense bitmap take turns on the
 same poses. Sessions: `hapticdb feel` as a user runs it, on SQLite and on a private server. Edits:
-how soon a session feels what another process commits.
+the time until a session feels a commit of another process.
 """
 
 import argparse
@@ -43,18 +43,18 @@ from places import serving
 BITS = 11
 EXTENT = 1.6
 ROUNDS = 15
-"""Timed passes over all poses, of which the median counts."""
+"""Number of timed passes over all poses; the result is their median."""
 LIFT = 1.0
-"""Metres that a part is lifted out of the car."""
+"""Way in metres by which a part is lifted out of the car."""
 N_LIFTED = 40
 PARTS = ("body/hood", "body/door_front_left", "supply/fuel_tank", "seats/bench_cushion")
 RUNS = {"flat": 0, "clusters": None}
-"""Option `run` of `Frames` for each way that is measured."""
+"""Argument `run` of `ResidentFrames` (points of a cluster): 0 for none, None for the default."""
 RATES = (1000, 5000, 10_000)
 LARGE = 100_000
-"""Points of the large shells."""
+"""Number of points of the large shells."""
 PATIENCE = 600.0
-"""Seconds after which a command is killed, beyond those that it was asked to last."""
+"""Seconds beyond its own duration after which a command is killed."""
 SETTINGS = {"shared_buffers": "256MB"}
 
 
@@ -108,7 +108,7 @@ def measure_frames(
 
 
 def lifted(database: Path, model: Path, name: str) -> dict[str, Any]:
-    """A part of the car with 100,000 points, lifted out of it."""
+    """Frames of a part of the car, with 100,000 points, that is lifted out of the car."""
     with hapticdb.open(database, read_only=True) as env:
         (own,) = [obj for obj in env.objects() if obj.name == name]
     (part,) = [part for part in read_file(model).parts if part.name == name]
@@ -121,7 +121,7 @@ def lifted(database: Path, model: Path, name: str) -> dict[str, Any]:
 
 
 def session(url: str, tool: Path, path: Path, rate: int, seconds: float) -> dict[str, Any]:
-    """What `hapticdb feel` reports; a failure names itself."""
+    """Report of `hapticdb feel`; if it fails, exit with its error text."""
     command = [
         str(Path(sys.executable).with_name("hapticdb")), "feel", url, "--tool", str(tool),
         "--device", str(path), "--loop", "--speed", "0.2", "--rate", str(rate),
@@ -137,7 +137,7 @@ def session(url: str, tool: Path, path: Path, rate: int, seconds: float) -> dict
 
 @contextlib.contextmanager
 def environments(folder: Path, model: Path) -> Iterator[dict[str, str]]:
-    """The model in SQLite and on the newest PostgreSQL that is found: engine -> URL."""
+    """The model on SQLite and on the newest PostgreSQL found: engine -> URL."""
     options = ImportOptions(grid=GridOptions(bits=BITS, extent=EXTENT))
     file = str(folder / "environment.db")
     hapticdb.import_files(file, [model], options)
@@ -149,7 +149,7 @@ def environments(folder: Path, model: Path) -> Iterator[dict[str, str]]:
 
 
 def about() -> dict[str, Any]:
-    """What both files of one run begin with."""
+    """Commit, machine and versions: the head of both result files of a run."""
     return {
         "commit": records.commit(),
         "machine": records.machine(),
@@ -160,7 +160,7 @@ def about() -> dict[str, Any]:
 def measure(
     folder: Path, model: Path | None, seconds: float, rates: Sequence[int]
 ) -> dict[str, Any]:
-    """All of it, as records."""
+    """Measure frames, sessions and edits; results as records for JSON."""
     sample = write_sample(folder)
     results: dict[str, Any] = about() | {"seconds": seconds}
     with environments(folder, model or sample.car) as urls:
@@ -176,7 +176,7 @@ def measure(
             results["object_voxels"] = sum(obj.voxels for obj in env.objects())
             results["voxel_size"] = env.grid.voxel_size
         poses = read_poses(path)
-        round_trip = folder / "round_trip.csv"  # no hand jumps from a path's end to its start
+        round_trip = folder / "round_trip.csv"  # a loop without a jump back
         write_poses(round_trip, np.concatenate([poses, poses[::-1]]))
         results["frames"] = [
             {"part": "wrench, sliding"}
@@ -243,7 +243,7 @@ def _spread(spread: dict[str, float]) -> str:
 
 
 def main() -> None:
-    """Measure, print the figures, and keep them."""
+    """Measure, print the figures, and write them to files."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--model", type=Path, help="a car or another model; the sample otherwise")
     parser.add_argument("--seconds", type=float, default=10.0, help="of each session")

@@ -13,7 +13,7 @@ from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find
 from hapticdb.store.sqlite.file import remove_file
 
 CACHE = "4 MB"
-"""The paper's 500 blocks of 8 KB."""
+"""Page cache of each engine: the paper's 500 blocks of 8 KB."""
 SETTINGS = {"shared_buffers": "4MB", "max_wal_size": "2GB"}
 
 
@@ -63,7 +63,7 @@ class Server:
 
 @contextlib.contextmanager
 def place_of(engine: str, folder: Path) -> Iterator[EnginePlace]:
-    """Prepare the place of an engine's environments: ``sqlite``, or a major of PostgreSQL."""
+    """Prepare the place of an engine: ``sqlite``, or a major version of PostgreSQL."""
     if engine == "sqlite":
         yield Files(folder)
         return
@@ -75,7 +75,7 @@ def place_of(engine: str, folder: Path) -> Iterator[EnginePlace]:
 def serving(
     folder: Path, binaries: Binaries, settings: Mapping[str, str]
 ) -> Iterator[PrivateServer]:
-    """A server in a folder, with those settings, while inside."""
+    """A server in a folder, with the given settings, that runs inside the block."""
     server = PrivateServer.at(folder, binaries, settings)
     server.start()
     try:

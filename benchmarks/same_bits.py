@@ -8,18 +8,17 @@ Each commit runs this script once, on the same machine, and writes digests into 
     python benchmarks/same_bits.py /tmp/bits/after --out after.json --replay /tmp/bits/before-*.rec
     python benchmarks/same_bits.py --compare before.json after.json
 
-The first argument is a folder for databases. Where it holds them already they are not imported
-again: a copy of the folder of one commit shows whether the other commit reads it alike. Each run
-records a session an environment, beside the folder (``before-sqlite-brick.rec``); ``--replay``
-feels the recordings of another commit, instead of its own, again.
+The first argument is a folder for databases. Databases that exist there are not imported again: a
+copy of one commit's folder shows whether the other commit reads it equally. Each run records one
+session for each environment, beside the folder (``before-sqlite-brick.rec``); ``--replay`` replays
+the recordings of another commit instead of the run's own.
 
-What is compared, of the vintage car at 2048 voxels an axis, on SQLite in both layouts and on every
-PostgreSQL that is found: the stored rows; force, torque, hits, depths and objects at 10,000 poses,
-for each strategy and for `touch_many`; the statements that a strategy asks, but for those that
-follow from measured costs; the verdict of ``sweep``; and all frames of a simulated hand that the
-force pushes back. A session runs on a clock that counts its calls, so that its frames do not depend
-on the machine's load. Only public names and the command line are used: modules may move between
-the two commits.
+The environments hold the vintage car at 2048 voxels an axis, on SQLite in both layouts and on every
+PostgreSQL found. Compared are: the stored rows; force, torque, hits, depths and objects at 10,000
+poses, for each strategy and for `touch_many`; the statements of a strategy, unless they depend on
+measured costs; the verdict of ``sweep``; and all frames of a simulated hand that the force pushes
+back. A session runs on a clock that counts its calls, so its frames do not depend on the machine's
+load. Only public names and the command line are used: modules may move between the two commits.
 """
 
 import argparse
@@ -37,7 +36,7 @@ from bits_inputs import Place, command, import_car, sample_tool
 
 
 def recordings_of(places: Sequence[Place], given: Sequence[Path]) -> dict[str, Path]:
-    """Recordings by the environment that the end of each file's name tells."""
+    """Environment -> recording; the end of a file's name is the environment's name."""
     found: dict[str, Path] = {}
     for file in given:
         names = [place.name for place in places if file.stem.endswith(place.name)]
@@ -60,7 +59,7 @@ def measure(folder: Path, given: list[Path], n_poses: int) -> Results:
     recordings = recordings_of(places, given)
     for place in places:
         own = folder.with_name(f"{folder.name}-{place.name}.rec")
-        with hapticdb.open(place.url, read_only=True) as env:  # keeps a private server running
+        with hapticdb.open(place.url, read_only=True) as env:  # keeps the private server running
             stored(place, env, results)
             touched(place, env, tool, results)
             recorded(place, tool, own, results)
@@ -77,7 +76,7 @@ def measure(folder: Path, given: list[Path], n_poses: int) -> Results:
 
 
 def versions() -> dict[str, str]:
-    """Which code has run, and on what: shown, not compared."""
+    """Versions of the code, Python and numpy: printed, not compared."""
     source = Path(hapticdb.__file__).parent
     asked = ["git", "-C", str(source), "describe", "--always", "--dirty"]
     commit = subprocess.run(asked, capture_output=True, text=True, timeout=60, check=False)
@@ -90,7 +89,7 @@ def versions() -> dict[str, str]:
 
 
 def compare(sides: Sequence[Path]) -> int:
-    """Print how two files differ; 1 when they do, when one lacks something, or nothing was felt."""
+    """Print how two files differ; return 1 if any entry is different, missing, wrong or empty."""
     a, b = (json.loads(path.read_text(encoding="utf-8")) for path in sides)
     for letter, side in zip("AB", (a, b), strict=True):
         print(letter, *(f"{name} {value}" for name, value in side["versions"].items()))

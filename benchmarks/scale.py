@@ -1,8 +1,8 @@
 """Whether a frame costs more in an environment a thousand times as large, and what a voxel costs.
 
-The sample car is parked 1, 10 and 104 times side by side, and once only a tenth of its voxels; the
-same shell goes over the same surfaces in all of them. Building takes minutes and its result may be
-kept; measuring needs a quiet machine, so each can be asked for alone.
+Environments hold the sample car 1, 10 and 104 times side by side, and once a tenth of its voxels;
+the same shell goes over the same surfaces in all of them. Building takes minutes, and its result
+can be kept. Measuring needs a quiet machine, so each step can be run alone.
 
     python benchmarks/scale.py --folder DIR --out results/scale.json
 """
@@ -47,11 +47,11 @@ BITS = 11
 EXTENT = 1.6
 STRATEGIES: tuple[Strategy, ...] = ("array", "cbgroup", "auto")
 BYTES_A_VOXEL = {"sqlite": 1.3, "postgres": 3.0}
-"""Bytes a voxel that are reserved on the disk, above all that was measured. More refuse sooner."""
+"""Bytes of disk reserved for each voxel, above all measured values; more refuses sooner."""
 SPARE_BYTES = 3 << 30
-"""Bytes of the disk that are kept free for write-ahead logs and the sample."""
+"""Bytes of disk kept free for write-ahead logs and the sample; more refuses a build sooner."""
 ROUNDS = 5
-"""Turns of every size, so that what disturbs the machine for a while disturbs all sizes."""
+"""Turns of every size: a short disturbance of the machine then affects all sizes alike."""
 LIMIT_S = 60.0
 PROGRESS_S = 5.0
 
@@ -77,8 +77,8 @@ def say(line: str) -> None:
 class ScaleSize:
     """One size of environment.
 
-    plan : what stands where; copies : how many, below 1 that part of one car; home : the
-    environment of one copy by itself, in which poses are found.
+    plan : places of the copies; copies : number of cars, below 1 a share of one car; home : file of
+    the environment with one copy, in which poses are chosen.
     """
 
     plan: Plan
@@ -104,7 +104,7 @@ class ScaleSize:
 
 
 def car_at_home(folder: Path, bits: int) -> tuple[Source, Path]:
-    """The sample car and its environment, imported unless it is there."""
+    """The sample car and its environment's file, imported if it does not exist."""
     home = folder / f"sample_{bits}.db"
     files = write_sample(folder / "sample", count=2)
     grid = hapticdb.GridOptions(bits=bits, extent=EXTENT)
@@ -114,7 +114,7 @@ def car_at_home(folder: Path, bits: int) -> tuple[Source, Path]:
 
 
 def sizes_of(folder: Path, wanted: Sequence[float], bits: int) -> list[ScaleSize]:
-    """Sizes nearest to those wanted, in voxels: whole cars, or part of one."""
+    """Sizes nearest to the wanted numbers of voxels: whole cars, or a part of one."""
     car, home = car_at_home(folder, bits)
     return [
         ScaleSize(Plan.of(car, round(voxels / car.voxels)), round(voxels / car.voxels), home)
@@ -135,7 +135,7 @@ def _part(car: Source, voxels: float, folder: Path) -> ScaleSize:
 
 @dataclass(frozen=True)
 class Built:
-    """The environment of one size on one engine, there or yet to be built."""
+    """The environment of one size on one engine, whether it is built or not."""
 
     engine: str
     place: EnginePlace
@@ -151,14 +151,14 @@ class Built:
         return self.folder / f"{self.engine}_{self.size.name}.json"
 
     def cell(self) -> Cell | None:
-        """Cell that building it gave; None until it is built completely."""
+        """The cell measured when the environment was built; None until it is complete."""
         if not (self._record.exists() and exists(self.url)):
             return None
         cell: Cell = json.loads(self._record.read_text())
         return cell if self.size.cell.items() <= cell.items() else None
 
     def build(self) -> Cell:
-        """Write it anew."""
+        """Delete the environment, write it again, and measure its size and time."""
         plan = self.size.plan
         self._record.unlink(missing_ok=True)
         self.place.remove(self.size.name)
@@ -190,7 +190,7 @@ class Built:
 
 
 def check_room(wanted: Sequence[Built], folder: Path) -> None:
-    """Refuse what the disk cannot hold."""
+    """Raise `DatabaseError` if the disk cannot hold the environments that are to be built."""
     missing = [built for built in wanted if built.cell() is None]
     if not missing:
         return
@@ -209,7 +209,7 @@ def check_room(wanted: Sequence[Built], folder: Path) -> None:
 
 
 def poses_at_home(home: Path, shell: PointShell, count: int) -> dict[str, Poses]:
-    """Poses over one copy, by itself."""
+    """Sliding and random poses in the environment of one copy."""
     with hapticdb.open(home, read_only=True) as env:
         return {
             "slide": slide_poses(env, shell, count),
@@ -218,7 +218,7 @@ def poses_at_home(home: Path, shell: PointShell, count: int) -> dict[str, Poses]
 
 
 def parked_poses(plan: Plan, at_home: dict[str, Poses]) -> dict[str, Poses]:
-    """The same poses among all copies: sliding over the middle one, or each at any of them."""
+    """The same poses among all copies: sliding ones at the middle copy, random ones at any copy."""
     offsets = plan.offsets()
     count = len(at_home["random"])
     copies = np.random.default_rng(SEED).integers(len(offsets), size=count)
@@ -247,7 +247,7 @@ class Run:
         return lambda pose: self._env.touch(self._shell, pose, strategy).query
 
     def turn(self, number: int) -> None:
-        """Measure one share of the poses."""
+        """Measure all strategies on one of `ROUNDS` parts of the poses."""
         share = np.array_split(self._poses, ROUNDS)[number]
         in_turns(self._alternatives, share, limit_s=self._limit_s)
 
@@ -267,7 +267,7 @@ class Run:
 
 
 def measure(builds: Sequence[Built], n_poses: int, limit_s: float) -> list[Cell]:
-    """Frames in all sizes of one engine, the sizes in turns."""
+    """Measure frames in all sizes on one engine, in turns."""
     runs = []
     at_home: dict[Path, dict[str, Poses]] = {}
     with contextlib.ExitStack() as opened:
@@ -277,7 +277,7 @@ def measure(builds: Sequence[Built], n_poses: int, limit_s: float) -> list[Cell]
             if size.home not in at_home:
                 at_home[size.home] = poses_at_home(size.home, shell, n_poses)
             env = opened.enter_context(hapticdb.open(built.url, read_only=True))
-            if isinstance(env.store, SupportsCaches):  # a server was started with it
+            if isinstance(env.store, SupportsCaches):  # a server got its cache when it was started
                 env.store.limit_cache(PAPER_CACHE)
             env.calibrate(keep=False)
             storage = built.cell() or {}
@@ -324,7 +324,7 @@ def evaluate(
 
 
 def stored(built: Built, *, may_build: bool) -> Cell:
-    """What an environment takes on disk; built first where it is not there."""
+    """The cell of an environment's size on disk; build the environment first if it is missing."""
     cell = built.cell()
     voxels = f"{built.engine}, {built.size.plan.voxels:,} voxels"
     if cell is None:
@@ -344,7 +344,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     chosen = _parser().parse_args(arguments)
     steps = [step for step in ("build", "measure") if getattr(chosen, step)]
     engines = chosen.engines.split(",")
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # so that servers and files go, too
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))  # servers end, files are removed
     with contextlib.ExitStack() as stack:
         try:
             wanted = [float(word) for word in chosen.sizes.split(",")]
@@ -364,7 +364,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def result_of(cells: Sequence[Cell], chosen: argparse.Namespace) -> dict[str, Any]:
-    """The result as the evaluation reads it."""
+    """The result in the form that the evaluation reads."""
     inputs = {
         "sample": f"the sample car, {chosen.bits} bits of its own, extent {EXTENT}",
         "poses": f"{chosen.poses} of each kind, seed {SEED}",

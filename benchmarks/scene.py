@@ -1,4 +1,4 @@
-"""What the benchmarks of frames and imports share."""
+"""Scene and settings that the benchmarks of frames and imports share."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ from hapticdb.store.base import Layout
 
 @dataclass(frozen=True)
 class BenchScene:
-    """The sample car in both layouts, a tool, and where it goes."""
+    """The sample car in both layouts, a tool's shell, and its poses."""
 
     files: SampleFiles
     environments: dict[Layout, Environment]
@@ -22,6 +22,6 @@ class BenchScene:
 
 
 def is_measuring(config: pytest.Config) -> bool:
-    """Whether times count; else the benchmarks run once, as tests."""
+    """Whether times are measured; otherwise the benchmarks run once, as tests."""
     enabled = config.getoption("benchmark_enable") or not config.getoption("benchmark_disable")
     return bool(enabled)

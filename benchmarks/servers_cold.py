@@ -1,4 +1,4 @@
-"""Emptying the caches of a private server: its own, and the operating system's."""
+"""Empties the page caches that a private server uses: its own and the operating system's."""
 
 import os
 from pathlib import Path
@@ -6,14 +6,14 @@ from pathlib import Path
 import psycopg
 
 BLOCKS = 2000
-"""Blocks of 8 KB that are read to push all others out of a cache of 4 MB."""
+"""Number of 8 KB blocks that are read to evict all others from a cache of 4 MB."""
 FILL = f"""
 CREATE TABLE IF NOT EXISTS public.filler (n int PRIMARY KEY, pad text);
 ALTER TABLE public.filler ALTER COLUMN pad SET STORAGE PLAIN;
 INSERT INTO public.filler SELECT n, repeat('x', 7000) FROM generate_series(1, {BLOCKS}) AS s(n)
     ON CONFLICT DO NOTHING;
 CHECKPOINT"""
-# by the index: PostgreSQL reads a whole table through a small ring of buffers, and fills no cache
+# by the index: a scan of the whole table uses a small ring of buffers and does not fill the cache
 PUSH_OUT = f"SELECT sum(length(pad)) FROM public.filler WHERE n BETWEEN 1 AND {BLOCKS}"
 
 
@@ -29,7 +29,7 @@ class Cold:
         self._files = [path for path in (data / "base").rglob("*") if path.is_file()]
 
     def __call__(self) -> None:
-        """Forget all pages."""
+        """Empty both caches."""
         self._connection.execute(PUSH_OUT)
         for path in self._files:
             try:
@@ -40,5 +40,5 @@ class Cold:
             os.close(descriptor)
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         self._connection.close()

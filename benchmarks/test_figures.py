@@ -1,4 +1,4 @@
-"""The whole evaluation at a tiny size: every engine, layout and experiment, plots and report."""
+"""The whole evaluation at a tiny size: all engines, layouts, experiments, plots and the report."""
 
 import json
 from pathlib import Path

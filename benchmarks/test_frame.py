@@ -1,9 +1,9 @@
-"""One frame: every strategy and layout, beside the limit and the start.
+"""Time of one frame: every strategy and layout, beside a lower bound and a plain program.
 
-The limit is a dense in-memory bitmap with the same kernels; the start is one warm statement a shell
-point through the standard library's ``sqlite3`` on the voxel layout, what a program without any of
-this would do. Each round is one pass over all poses, so that no pose stays in a processor's cache;
-`us_per_frame` in the extra info is the median round over their number.
+The lower bound is a dense in-memory bitmap with the same kernels. The plain program, without
+hapticdb, sends one warm statement a shell point through the standard library's ``sqlite3`` on the
+voxel layout. Each round is one pass over all poses, so that no pose stays in a processor's cache;
+`us_per_frame` in the extra info is the median round divided by the number of poses.
 
     make bench                      # the sample at 11 bits: about 13.5 million object voxels
 """
@@ -30,7 +30,7 @@ CACHE_KIB = 256 * 1024
 def measure(
     benchmark: BenchmarkFixture, scene: BenchScene, frame: Callable[[Pose], object], group: str
 ) -> None:
-    """Time passes over all poses, after one that warms up."""
+    """Time passes over all poses, after two passes of warm-up."""
 
     def all_poses() -> None:
         for pose in scene.poses:
@@ -84,7 +84,7 @@ def test_dense_bitmap(benchmark: BenchmarkFixture, scene: BenchScene, dense: Den
 
 
 def point_statements(scene: BenchScene, cache_kib: int) -> Callable[[Pose], int]:
-    """One warm statement a shell point, by the standard library, keys already computed."""
+    """A frame of one warm statement a shell point by ``sqlite3``; the keys are computed before."""
     env = scene.environments["voxel"]
     connection = sqlite3.connect(f"{Path(env.url).resolve().as_uri()}?mode=ro", uri=True)
     connection.execute(f"PRAGMA cache_size = -{cache_kib}")
@@ -119,7 +119,7 @@ def test_one_statement_a_point_by_the_standard_library(
 def test_touch_and_one_statement_a_point_in_turns(
     benchmark: BenchmarkFixture, scene: BenchScene, pytestconfig: pytest.Config
 ) -> None:
-    """The ratio that holds while a machine's speed drifts: pass by pass, medians of the ratios."""
+    """Passes alternate; the median of their ratios does not depend on drifts of machine speed."""
     env = scene.environments["brick"]
     look_up = point_statements(scene, CACHE_KIB)
 
@@ -132,7 +132,7 @@ def test_touch_and_one_statement_a_point_in_turns(
     def touch(pose: Pose) -> object:
         return env.touch(scene.shell, pose, "array")
 
-    for pose in scene.poses[::20]:  # both find the same
+    for pose in scene.poses[::20]:  # both find the same hits
         assert look_up(pose) == len(env.touch(scene.shell, pose, "array").hits)
     rounds = 2 + (2 * ROUNDS if is_measuring(pytestconfig) else 1)
     ratios: list[float] = []

@@ -1,6 +1,6 @@
 """Import of the sample car: from the file to a database that answers, in both layouts.
 
-`object_voxels_per_s` counts everything: the child that parses, voxelizing, writing, statistics.
+`object_voxels_per_s` covers the whole import: parsing in a child, voxelizing, writing, statistics.
 """
 
 import shutil

@@ -1,4 +1,4 @@
-"""The real-time benchmarks run, on a tiny scene."""
+"""The real-time benchmarks run on a tiny scene."""
 
 from pathlib import Path
 
@@ -31,7 +31,7 @@ def database(sample: SampleFiles) -> Path:
 
 
 def test_cells_and_the_dense_bitmap_feel_the_same(database: Path, sample: SampleFiles) -> None:
-    """`measure_frames` itself compares every bit; here, that there was something to compare."""
+    """`measure_frames` compares every bit itself; this test asserts that there were hits."""
     shell = PointShell.from_file(sample.wrench, 3000)
     found = measure_frames(database, shell, read_poses(sample.path), [])
     assert found["hits"] > 0

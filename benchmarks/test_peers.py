@@ -1,4 +1,4 @@
-"""The peers give the same hits where they answer the same question; each one missing is named."""
+"""Peers that answer the same question give the same hits; each missing peer is named."""
 
 import os
 import sys

@@ -1,9 +1,8 @@
-"""PostgreSQL, every version found: strategies and layouts, forms of Figure 3, what choices cost.
+"""PostgreSQL, every version found: strategies, layouts, forms of Figure 3, costs of choices.
 
-The server is private, on this machine, reached by a Unix socket; all pages are cached. A frame goes
-to and fro between two processes that each sleep while the other works, and a virtual processor that
-sleeps can take longer to wake than a frame lasts. So while this measures, a process of idle
-priority keeps each processor awake; without, times double and scatter.
+The server is private and local, reached by a Unix socket; all pages are cached. During measurements
+a process of idle priority keeps each processor awake; without it, times double and scatter (the
+module `awake` says why).
 
     make bench                      # beside the frames on SQLite, over the same scene and poses
 """
@@ -41,7 +40,7 @@ from servers import FOUND, named
 
 ROUNDS = 5
 SETTINGS = {"shared_buffers": "1GB", "max_wal_size": "4GB"}
-# the same wrench by built-in sums, without an aggregate of ours: what that costs
+# the same wrench by built-in sums, to compare their cost with the aggregate force()
 SUMS = """
 SELECT sum(fx), sum(fy), sum(fz),
        sum(ry * fz - rz * fy), sum(rz * fx - rx * fz), sum(rx * fy - ry * fx)
@@ -67,7 +66,7 @@ SELECT {statements.PACKED[layout]}, {statements.SEEN}
 
 @pytest.fixture(scope="module", autouse=True)
 def _awake(pytestconfig: pytest.Config) -> Iterator[None]:
-    """No processor sleeps while times count."""
+    """Keep processors awake while times are measured."""
     with awake() if is_measuring(pytestconfig) else contextlib.nullcontext():
         yield
 
@@ -120,7 +119,7 @@ def served(request: pytest.FixtureRequest, scene: BenchScene, bits: int) -> Iter
 def measure(
     benchmark: BenchmarkFixture, poses: list[Any], frame: Callable[[Any], object], group: str
 ) -> None:
-    """Median time of a frame, over passes that go through all poses."""
+    """Measure the median time of a frame over passes through all poses."""
     times: list[float] = []
 
     def once() -> None:
@@ -131,7 +130,7 @@ def measure(
 
     benchmark.group = group
     benchmark.pedantic(once, rounds=ROUNDS, warmup_rounds=1)
-    counted = times[len(poses) :] or times  # the first pass warms up
+    counted = times[len(poses) :] or times  # the first pass is the warm-up
     benchmark.extra_info["us_per_frame"] = round(float(np.median(counted)), 1)
     benchmark.extra_info["p99_us"] = round(float(np.percentile(counted, 99)), 1)
 
@@ -169,7 +168,7 @@ def wrench_of(touch: Touch) -> NDArray[np.float64]:
 
 
 def frames_of(scene: BenchScene, env: Environment) -> list[LocatedShell]:
-    """Located shells along the path, as a store gets them."""
+    """Located shells along the path, in the form that a store gets."""
     grid = env.grid
     origin = np.array(grid.origin)
     shift = row_shift(env.layout)
@@ -190,7 +189,7 @@ def frames_of(scene: BenchScene, env: Environment) -> list[LocatedShell]:
 def test_figure_3(
     benchmark: BenchmarkFixture, scene: BenchScene, served: Served, form: str, layout: Layout
 ) -> None:
-    """What the paper's aggregate costs, beside the hits alone and beside sums of the engine's."""
+    """Cost of the paper's aggregate, beside the hits alone and beside the engine's own sums."""
     session = served.session(layout)
     force = statements.WRENCH[layout]
     exists = force.partition("WHERE ")[2]
@@ -216,7 +215,7 @@ def test_figure_3(
         elif form == "force()":
             wrench = np.zeros(6) if found[0] is None else wire.read_float8s(found[0])
             assert wrench.tobytes() == wrench_of(wanted).tobytes()
-        else:  # sums in the engine's own order, before force() averages them
+        else:  # sums in the engine's order, without force()'s average
             sums = [0.0 if one is None else struct.unpack(">d", one)[0] for one in found]
             tenths = max(1.0, len(wanted.hits) / 10)
             np.testing.assert_allclose(
@@ -229,7 +228,7 @@ def test_figure_3(
 def test_forms_of_a_lookup(
     benchmark: BenchmarkFixture, scene: BenchScene, served: Served, form: str, layout: Layout
 ) -> None:
-    """Keys as an array that the index scan takes, or as rows that a join descends for."""
+    """Keys as one array for an index scan, or as rows of a join with one descent for each."""
     session = served.session(layout)
     text = {"any": statements.LOOKUP, "join": JOINED}[form][layout]
     shift = row_shift(layout)
@@ -246,7 +245,7 @@ def test_forms_of_a_lookup(
 def test_occupancy_in_the_index(
     benchmark: BenchmarkFixture, scene: BenchScene, served: Served, form: str
 ) -> None:
-    """Whether bricks read from the index alone are worth an index that holds them all."""
+    """Frames with an index that includes all occupancy, against an index of keys alone."""
     env = served.environments["brick"]
     session = served.session("brick")
     if form != "key alone":
@@ -275,7 +274,7 @@ def test_occupancy_in_the_index(
 
 @pytest.mark.parametrize("form", ["one statement", "in a snapshot"])
 def test_snapshot(benchmark: BenchmarkFixture, served: Served, form: str) -> None:
-    """What REPEATABLE READ costs a frame of several statements: a BEGIN and a COMMIT."""
+    """Cost of REPEATABLE READ for a frame of several statements: a BEGIN and a COMMIT."""
     session = served.session("brick")
 
     def alone(_: object) -> None:
@@ -299,7 +298,7 @@ def test_import_beside_sqlite(
     tmp_path: Path,
     layout: Layout,
 ) -> None:
-    """The same file into both engines, in turns."""
+    """Import the same file into both engines, in turns."""
     options = hapticdb.ImportOptions(
         grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout
     )

@@ -1,4 +1,4 @@
-"""Copies are what they copy, elsewhere: at tiny sizes, on every engine found."""
+"""Copies equal their source at another place: at tiny sizes, on every engine found."""
 
 import json
 import shutil
@@ -31,7 +31,7 @@ COUNTS = (1, 2, 4)
 
 
 class Car(NamedTuple):
-    """The sample car by itself, and the folder in which everything is built."""
+    """One sample car, its file, and the folder in which environments are built."""
 
     source: Source
     home: Path
@@ -60,7 +60,7 @@ def place(engine: str, car: Car) -> Iterator[EnginePlace]:
 
 @pytest.fixture(scope="module")
 def builds(engine: str, place: EnginePlace, car: Car) -> dict[int, Built]:
-    """An environment of each number of copies."""
+    """Number of copies -> built environment."""
     found = {n: Built(engine, place, car.size(n), car.folder) for n in COUNTS}
     for built in found.values():
         stored(built, may_build=True)
@@ -140,7 +140,7 @@ def test_shifted_keys_are_shifted_voxels(
     found = brick_voxels(there.keys, there.occupancy.reshape(-1, 64))
     assert sorted(map(tuple, (found - plan.tiles[copy] * grid.side).tolist())) == sorted(voxels)
     assert plan.grid.contains(found).all()
-    # its record stands where its rows do
+    # the record's bounds fit the rows
     first = plan.grid.voxels_of(moved.bounds[:1]) - plan.tiles[copy] * grid.side
     assert first.tolist() == ijk[:1].tolist()
     np.testing.assert_allclose(moved.transform[:3, 3], plan.offsets()[copy])
@@ -258,4 +258,4 @@ def test_a_full_disk_is_told_before_anything_is_built(
         with pytest.raises(DatabaseError, match=r"1\.0 GB free"):
             scale.check_room([built], tmp_path)
         built.build()
-        scale.check_room([built], tmp_path)  # nothing is missing
+        scale.check_room([built], tmp_path)  # everything is built, so no room is needed

@@ -1,12 +1,12 @@
 """Voxelizing an assembly at 1024^3: hapticdb beside a plain test of every voxel, and Open3D.
 
-The assembly is `assembly_vw_t1/vw_t1.glb` under HAPTICDB_TEST_DATA, every instance a part of its
-own, or a ring of tori where that is not set. Its grid is the tight cube: the edge is the longest
-side of the bounding box, a hair larger so that the upper border lies inside. A speed counts object
+The assembly is `assembly_vw_t1/vw_t1.glb` under HAPTICDB_TEST_DATA, each instance as a part, or a
+ring of tori if the variable is not set. Its grid is the tight cube: the edge is the longest side of
+the bounding box, slightly enlarged so that the upper border lies inside. A speed counts object
 voxels: each part's voxels, once for each part. With --benchmark-disable a few parts run as a test.
 
-Open3D merges no voxels over parts either: it is run on the same parts, one grid a part, and on a
-part of them only, since it is slow; its count differs, as its boxes are not closed in the same way.
+Open3D also does not merge voxels of different parts: each part has its own grid. It runs on a share
+of the parts, as it is slow. Its count differs, since it closes boxes in another way.
 """
 
 import os
@@ -30,7 +30,7 @@ Bricks = tuple[NDArray[np.int64], NDArray[np.uint8]]
 
 
 def tori() -> trimesh.Scene:
-    """Build a ring of 60 tori, turned about the ring, of a size that gives small triangles."""
+    """Build a ring of 60 tori in different directions, with small triangles."""
     torus = trimesh.creation.torus(0.1, 0.03, major_sections=96, minor_sections=40)
     scene = trimesh.Scene()
     for angle in np.linspace(0, 2 * np.pi, 60, endpoint=False):
@@ -56,14 +56,14 @@ def assembly() -> CadAssembly:
 
 
 def subset(assembly: CadAssembly, benchmark: BenchmarkFixture, one_in: int = 1) -> list[Triangles]:
-    """Every n-th part; of all a few small ones where benchmarks only run as tests."""
+    """Every n-th part; only the three smallest when benchmarks run as tests."""
     if benchmark.disabled:
         return sorted(assembly.parts, key=len)[:3]
     return assembly.parts[::one_in]
 
 
 def measure(benchmark: BenchmarkFixture, run: Callable[[], list[T]], rounds: int) -> list[T]:
-    """Time `run`, warmed up, and return what it returns."""
+    """Time `run` after a warm-up, and return its result."""
     result: list[T] = benchmark.pedantic(run, rounds=rounds, warmup_rounds=1)
     return result
 
@@ -71,7 +71,7 @@ def measure(benchmark: BenchmarkFixture, run: Callable[[], list[T]], rounds: int
 def report(
     benchmark: BenchmarkFixture, assembly: CadAssembly, parts: list[Any], voxels: int
 ) -> None:
-    """Print the speed beside the conditions, and keep both with the benchmark's results."""
+    """Print speed and conditions, and store both in the benchmark's extra info."""
     benchmark.extra_info.update(
         model=assembly.name,
         parts=len(parts),
@@ -86,10 +86,10 @@ def report(
 
 @numba.njit(nogil=True)  # type: ignore[untyped-decorator] # numba has no types
 def plain_kernel(triangles: Triangles, edge: int, dense: NDArray[np.uint8]) -> None:
-    """Mark dense (n, n, n) by the 13 axes in every voxel of each bounding box.
+    """Mark dense (n, n, n) by testing 13 axes in every voxel of each triangle's bounding box.
 
-    axes (10, 5): a direction, and its least and greatest value over the corners of voxels that
-    touch; the box normals are the bounding box.
+    axes (10, 5): a direction (3), and its least and greatest value at the lower corner of voxels
+    that touch. The other three axes are the box normals, tested by the bounding box.
     """
     axes = np.zeros((10, 5))
     local = np.empty((3, 3))
@@ -110,7 +110,7 @@ def plain_kernel(triangles: Triangles, edge: int, dense: NDArray[np.uint8]) -> N
             axes[1 + 3 * n, 1], axes[1 + 3 * n, 2] = -z, y
             axes[2 + 3 * n, 0], axes[2 + 3 * n, 2] = z, -x
             axes[3 + 3 * n, 0], axes[3 + 3 * n, 1] = -y, x
-        # the normal, from the components of the first and last edge that stand in their axes
+        # the normal, from components of the first and last edge, which their axes contain
         axes[0, 0] = axes[1, 2] * axes[8, 0] - axes[2, 0] * axes[7, 2]
         axes[0, 1] = axes[2, 0] * axes[9, 1] - axes[3, 1] * axes[8, 0]
         axes[0, 2] = axes[3, 1] * axes[7, 2] - axes[1, 2] * axes[9, 1]
@@ -134,12 +134,12 @@ def plain_kernel(triangles: Triangles, edge: int, dense: NDArray[np.uint8]) -> N
 
 
 def plain(part: Triangles) -> int:
-    """Count the part's voxels by the plain test, into a dense array over its bounding box."""
+    """Count the part's voxels by the plain test, in a dense array over its bounding box."""
     corner = np.floor(part.min(axis=(0, 1))) - 1
     size = int(np.ceil(part.max() - corner.min())) + 2
     shape = np.ceil(part.max(axis=(0, 1)) - corner).astype(np.int64) + 2
     dense = np.zeros(shape, np.uint8)
-    # the grid's border cuts here as it does there
+    # cut at the grid's border, as hapticdb does
     low = np.maximum(-corner, 0).astype(np.int64)
     high = np.minimum(EDGE - corner, shape).astype(np.int64)
     plain_kernel(part - corner, size, dense)

@@ -69,8 +69,8 @@ def row_shift(layout: Layout) -> int:
 def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int64]:
     """Ranges of voxel keys (C, 2) that a write of these rows touched, as `Change` holds them.
 
-    Ranges are rounded outwards to cells. A cell is no range of keys in lexicographic order: there
-    they are rounded to slabs, which are all voxels of one i.
+    Ranges are rounded outwards to cells. In lexicographic order a cell is not a range of keys:
+    there the ranges are rounded to slabs, each of all voxels of one i.
     """
     shift = CELL_SHIFT if grid.is_hierarchical else 2 * grid.bits
     cubes = np.unique(row_keys >> (shift - row_shift(layout)))
@@ -86,7 +86,7 @@ class Object:
     Attributes
     ----------
     id : int
-        The store gives it when the object is written, and never to another object. 0 before.
+        The store assigns it when the object is written, and never reuses it. 0 before that.
     name : str
         Path of the part inside its file.
     link : str
@@ -149,7 +149,7 @@ def present_already(record: Object, url: str) -> EnvironmentExistsError:
 
 
 NOBODY = 0
-"""Thread of a store that is lent to nobody: no thread has this number."""
+"""Owner of a store that no thread may use: no thread has this number."""
 _forked_as = 0
 """Process id, in a process that was forked after this module was loaded; 0 in any other."""
 
@@ -204,7 +204,7 @@ class Change:
 
 
 Covering = Callable[[Object], Iterable[tuple[int, int]]]
-"""Gives, for an object as it stands when a write begins, closed key ranges that hold its rows."""
+"""Gives, for an object as it is when a write begins, closed key ranges that hold its rows."""
 
 
 class Histogram(NamedTuple):
@@ -222,8 +222,8 @@ class Histogram(NamedTuple):
 class Freshness(NamedTuple):
     """How old the statistics of the keys are, which the strategy `cbgroup` uses.
 
-    revision : revision of the environment when they were made, None without any; changes : writes
-    committed since; rows : rows that these wrote, as far as the engine counts them.
+    revision : revision of the environment when the statistics were made, None without statistics;
+    changes : writes committed since; rows : rows that these wrote, if the engine counts them.
     """
 
     revision: int | None
@@ -293,8 +293,8 @@ class WritesObjects(Protocol):
     def loading(self) -> AbstractContextManager[None]:
         """A context in which many objects are written. May be nested.
 
-        Inside, an engine may postpone what only readers need, such as an index. At its end, an
-        error or not, that is made up for, and what was committed inside is safe.
+        Inside, an engine may postpone work that only readers need, such as an index. At the end it
+        does this work, after an error, too. Writes that were committed inside are safe.
         """
 
     def add(self, record: Object, rows: Rows) -> int:
@@ -327,7 +327,7 @@ class KeepsStatistics(Protocol):
         """How old the statistics are that `quantiles` uses at that resolution."""
 
     def analyze(self, resolution: int, *, anew: bool = False) -> None:
-        """Renew the statistics that `quantiles` uses; fresh ones only if `anew`."""
+        """Renew the statistics that `quantiles` uses; statistics that are fresh only if `anew`."""
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""
@@ -345,7 +345,7 @@ class Store(ReadsRows, ReadsObjects, WritesObjects, KeepsStatistics, Protocol):
 
     @property
     def url(self) -> str:
-        """Where it is, as messages name it: without a password."""
+        """URL of the environment, as messages name it: without a password."""
 
     @property
     def name(self) -> str:
@@ -369,7 +369,7 @@ class Store(ReadsRows, ReadsObjects, WritesObjects, KeepsStatistics, Protocol):
 
     @property
     def identity(self) -> object:
-        """A value that another environment, made in its place, does not have."""
+        """A value that differs for another environment made later in the same place."""
 
     @property
     def is_closed(self) -> bool:
@@ -391,7 +391,7 @@ class Store(ReadsRows, ReadsObjects, WritesObjects, KeepsStatistics, Protocol):
         """All reads inside see one committed revision."""
 
     def checker(self) -> "Checker":
-        """What only `hapticdb check` asks."""
+        """The checks of this engine for `hapticdb check`."""
 
 
 class LocatedShell(NamedTuple):
@@ -432,11 +432,11 @@ class SupportsCaches(Protocol):
 
 @runtime_checkable
 class HasGroupingThreshold(Protocol):
-    """An engine that says from which size on the strategy `auto` groups a frame's keys."""
+    """An engine that says from how many keys on the strategy `auto` groups a frame's keys."""
 
     @property
     def grouping_threshold(self) -> int | None:
-        """Distinct keys of a frame; None where a lookup reads each leaf page once by itself."""
+        """Least number of distinct keys; None if a lookup reads each leaf page only once anyway."""
 
 
 @runtime_checkable
@@ -455,7 +455,7 @@ class SupportsServer(Protocol):
 
 
 class Checker(Protocol):
-    """What `hapticdb check` asks an engine: pages, indexes, and all rows in their order."""
+    """Answers of an engine for `hapticdb check`: pages, indexes, and all rows in their order."""
 
     def has_page_checksums(self) -> bool:
         """Whether pages carry checksums that are compared when they are read."""
@@ -469,7 +469,7 @@ class Checker(Protocol):
 
 @runtime_checkable
 class SupportsWatch(Protocol):
-    """An engine that tells cheaply whether others have committed."""
+    """An engine that can tell at little cost whether others have committed."""
 
     def watch(self) -> None:
         """Begin to notice commits from now on; may be called again."""
@@ -478,6 +478,6 @@ class SupportsWatch(Protocol):
         """Whether something was committed since `watch` or the last call. Never waits.
 
         Cheap enough for hundreds of calls a second. It may be true without a commit, as at the
-        first call without a `watch`. It is not false when a commit came before the call; on a
-        server the notification of a commit takes a moment. Raises UsageError inside a snapshot.
+        first call without a `watch`. It is not false when a commit came before the call, but on
+        a server the notification of a commit takes a moment. Raises UsageError inside a snapshot.
         """

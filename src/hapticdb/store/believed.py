@@ -24,9 +24,9 @@ KEY_END = 1 << 63
 ROWS_CRC = "rows_crc"
 """Name under which the checksum of an object's rows is stored among its attributes."""
 ACTIONS = ("add", "move", "remove")
-"""What a change may have done."""
+"""Actions that a row of `change` may have."""
 TABLES = ("brick", "change", "cost", "environment", "object", "quantile", "voxel")
-"""Tables that every environment has, of whatever format."""
+"""Tables that every environment has, in every format."""
 Floats = NDArray[np.float64]
 
 
@@ -100,7 +100,7 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
 def object_of(url: str, row: Sequence[Any]) -> Object:
     """Read an object: id, name, link, digest, transform, voxels, bounds, attributes, revision.
 
-    Doubles are bytes, little-endian, or a list.
+    Arrays of doubles are little-endian bytes or a list.
     """
     object_id, name, link, digest, transform, voxels, bounds, attributes, revision = row
 
@@ -196,7 +196,7 @@ def _is_finite(value: object) -> bool:
 
 
 def _doubles(stored: object, count: int) -> Floats | None:
-    """That many finite float64, from bytes or a list of numbers; None when they are not."""
+    """That many finite float64, from bytes or a list of numbers; None for anything else."""
     if isinstance(stored, bytes) and len(stored) == 8 * count:
         found = np.frombuffer(stored, dtype="<f8")
     elif isinstance(stored, list) and all(_is_finite(value) for value in stored):
@@ -207,7 +207,7 @@ def _doubles(stored: object, count: int) -> Floats | None:
 
 
 def _int64s(stored: object) -> Keys | None:
-    """Int64s from bytes or a list of numbers; None when they are none."""
+    """Int64s from bytes or a list of numbers; None for anything else."""
     if isinstance(stored, bytes) and len(stored) % 8 == 0:
         return np.frombuffer(stored, dtype="<i8").astype(np.int64)
     if isinstance(stored, list) and all(type(value) is int for value in stored):
@@ -216,7 +216,7 @@ def _int64s(stored: object) -> Keys | None:
 
 
 def _json_of(stored: object) -> dict[str, Any] | None:
-    """A JSON object, or None when it is none."""
+    """JSON object in a text, or None if the text holds none."""
     if not isinstance(stored, str):
         return None
     try:

@@ -1,4 +1,4 @@
-"""Environments by their URLs: opened, made, copied, and rights on them given.
+"""Opens, makes and copies environments by their URLs, and grants rights on them.
 
 A URL's scheme picks the engine (`hapticdb.store.engines`).
 """
@@ -162,12 +162,12 @@ def restore_environment(
 
 
 def _refusal(engine: Engine, url: Url, capability: Capability) -> UsageError:
-    """Build the error for what an engine cannot do: the engine says why, and what else can."""
+    """Build the error for a missing capability; the engine's text says why, and what to use."""
     return UsageError(f"{redact(os.fspath(url))}{engine.lacks[capability]}")
 
 
 def _check_one_engine(engine: Engine, file: Url) -> None:
-    """Refuse a copy that would be of another engine than its environment."""
+    """Refuse a copy between two different engines."""
     other = engine_of(file)
     if other is not engine:
         raise UsageError(f"{redact(os.fspath(file))} is on {other.title}, not a file: give a path")

@@ -1,9 +1,9 @@
 """Which engine a URL means: a registry from URL schemes to engines.
 
-The engines of this package stand in `BUILT_IN`. Another distribution adds its own by an entry point
-of the group `hapticdb.engines`, whose name is the scheme and whose object is an `Engine`
-(docs/engines.md). An entry point, and not a function to call: the command line and the processes of
-a session find the engine, too, and no program has to import it first.
+The engines of this package are listed in `BUILT_IN`. Another distribution adds its own engine by
+an entry point of the group `hapticdb.engines`: its name is the scheme, its object an `Engine`
+(docs/engines.md). The command line and the processes of a session find an entry point, too; a
+function that registers an engine would have to be called in each of them.
 
 An engine's module is imported when a URL first names it, so that a verb on a file loads no driver
 of a server.
@@ -25,7 +25,7 @@ Url = str | os.PathLike[str]
 Capability = Literal["grant", "backup", "restore"]
 """What only some engines can do with an environment that is not open."""
 Right = Literal["viewer", "toucher", "editor", "nobody"]
-"""What a role may do with an environment: read and touch; keep cost figures, too; edit; nothing."""
+"""Rights of a role: read and touch; also keep cost figures; also edit; nothing."""
 GROUP = "hapticdb.engines"
 """Entry points of other distributions that name an engine."""
 
@@ -38,7 +38,7 @@ class BackupProgress(NamedTuple):
 
 
 class BackupReport(NamedTuple):
-    """What a backup or restore has copied.
+    """Result of a backup or restore.
 
     revision : of the environment in the copy; objects : how many it holds; bytes : of its file.
     """
@@ -63,8 +63,8 @@ class Engine(Protocol):
     title : str
         Its name in messages: ``PostgreSQL``.
     lacks : mapping of str to str
-        For each of the capabilities `grant`, `backup` and `restore` that this engine has not: how
-        the refusal goes on after the URL. It says why, and what to use instead.
+        For each of the capabilities `grant`, `backup` and `restore` that this engine lacks: the
+        text of the refusal after the URL. It says why, and what to use instead.
     """
 
     title: str
@@ -91,7 +91,7 @@ class Engine(Protocol):
 
 @runtime_checkable
 class SupportsGrant(Protocol):
-    """An engine that knows users, and keeps what each of them may do."""
+    """An engine that has users, and stores the rights of each."""
 
     def grant(self, url: str, role: str, right: Right) -> None:
         """Give a role one right on an environment; it replaces the role's former one."""
@@ -150,7 +150,7 @@ def engine_of(url: Url) -> Engine:
     MissingExtraError
         When the engine's driver is not installed.
     """
-    # an object of a path is a path, whatever its name looks like
+    # a Path object is a path, whatever its name looks like
     scheme = scheme_of(url) if isinstance(url, str) else ""
     built_in = BUILT_IN.get(scheme or FILE_SCHEME)
     if built_in is None:
@@ -158,7 +158,7 @@ def engine_of(url: Url) -> Engine:
     if built_in.driver:
         try:
             import_module(built_in.driver)
-        except ImportError as error:  # it is not there, or finds no library of its own
+        except ImportError as error:  # the driver is missing, or does not find its own library
             raise MissingExtraError(
                 f"{redact(os.fspath(url))} needs {built_in.driver}: install it with "
                 f"pip install '{built_in.extra}'"

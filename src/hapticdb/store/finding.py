@@ -1,4 +1,4 @@
-"""Objects by their ids, names and patterns."""
+"""Finds objects by ids, names and patterns."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -10,7 +10,7 @@ from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.store.base import Object, Store, no_object
 
 MOST_IDS = 1 << 63
-"""Ids lie below it: they are 64-bit integers in the databases."""
+"""All ids lie below this value: they are signed 64-bit integers in the databases."""
 
 
 def find_objects(store: Store, words: Iterable[int | str]) -> list[Object]:
@@ -19,14 +19,14 @@ def find_objects(store: Store, words: Iterable[int | str]) -> list[Object]:
     Parameters
     ----------
     store : Store
-        Where they are; objects are listed once, and only for names.
+        Store of the objects. It is asked for all objects once, and only if a word is a name.
     words : iterable of int or str
         An int, or a text of digits, is an id; ``3,4`` is several. Any other text is a name or a
         pattern as of `fnmatch`: ``*`` stands for any characters, ``?`` for one, ``[ab]`` for one of
         those; case counts. Names are paths, such as ``body/door/handle``: a text without ``/`` is
         compared with every element of the path, one with ``/`` with the path from its beginning.
-        Where that ends at a sub-assembly, everything below it is chosen. A text that is a name as
-        it stands is no pattern, and one with commas is several unless it fits as a whole.
+        If the match is a sub-assembly, everything below it is chosen. A text that is exactly a name
+        is no pattern. A text with commas is several words, unless it matches as a whole.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def find_objects(store: Store, words: Iterable[int | str]) -> list[Object]:
 
 
 def named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
-    """Those objects that a name or pattern chooses, as `find_objects` says, in their order."""
+    """Objects that a name or pattern chooses, by the rules of `find_objects`, in their order."""
     pattern = pattern.rstrip("/") or pattern
     branches = [_branches(obj.name, is_path="/" in pattern) for obj in objects]
     as_it_stands = [obj for obj, some in zip(objects, branches, strict=True) if pattern in some]
@@ -68,7 +68,7 @@ def named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
 
 
 def _branches(name: str, *, is_path: bool) -> list[str]:
-    """What a pattern is compared with: a path's elements, or each beginning of the path."""
+    """Texts to compare a pattern with: a path's elements, or each beginning of the path."""
     elements = name.split("/")
     if not is_path:
         return elements
@@ -76,7 +76,7 @@ def _branches(name: str, *, is_path: bool) -> list[str]:
 
 
 def _checked(words: Iterable[int | str]) -> list[int | str]:
-    """Words as ids and texts; what is neither is refused before anything is looked up."""
+    """Words as ids and texts; anything else is refused before the first lookup."""
     if isinstance(words, (str, bytes)) or not isinstance(words, Iterable):
         raise UsageError(f"objects {words!r}: give ids, names and patterns in a list")
     checked: list[int | str] = []
@@ -91,7 +91,7 @@ def _checked(words: Iterable[int | str]) -> list[int | str]:
 
 
 def _id_of(digits: str, url: str) -> int:
-    if len(digits.lstrip("0")) > len(str(MOST_IDS)):  # Python refuses numbers of 4,300 digits
+    if len(digits.lstrip("0")) > len(str(MOST_IDS)):  # Python refuses texts of 4,300 digits
         raise ObjectNotFoundError(f"no object {digits[:40]}... in {url}")
     return int(digits)
 

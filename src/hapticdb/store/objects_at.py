@@ -1,4 +1,4 @@
-"""Which objects are in given voxels: asked of the store, exactly."""
+"""Which objects are in given voxels, exactly, by queries of the store."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,9 @@ def ids_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
 
 
 def pairs_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
-    """Every voxel with every object in it, (P, 2): its place in `keys`, and an id; ordered by both.
+    """Every voxel with every object in it, (P, 2): index in `keys`, and object id; ordered by both.
 
-    As `ids_of_voxels` takes them.
+    The arguments are those of `ids_of_voxels`.
     """
     if store.layout == "voxel":
         rows = store.lookup(keys)

@@ -1,4 +1,4 @@
-"""Which steps led to the format of today: one line of version numbers for all engines.
+"""Steps that led to the present format, with the same version numbers for all engines.
 
 The format of an environment is the number of steps that it has gone through. Each engine has the
 statements of a step in its own dialect, under the step's name (`store/sqlite/migrations.py`,
@@ -13,7 +13,7 @@ from typing import NamedTuple
 class Step(NamedTuple):
     """One step of the format, by name.
 
-    readers_need_it : whether an environment without it is refused to who may only read it.
+    readers_need_it : whether a reader, who cannot run the step, refuses an environment without it.
     """
 
     name: str
@@ -22,7 +22,7 @@ class Step(NamedTuple):
 
 STEPS = (
     Step("tables"),
-    # a mark of each commit, and of the one before: store/sqlite/log.py
+    # a mark of each commit, and of the commit before: store/sqlite/log.py
     Step("lineage", readers_need_it=False),
     Step("removed parts", readers_need_it=False),
 )

@@ -1,4 +1,4 @@
-"""What all URLs of environments have in common: a scheme, and secrets that nobody is shown."""
+"""Parts that all URLs of environments have: a scheme, and secrets that are never shown."""
 
 import re
 from urllib.parse import unquote
@@ -7,7 +7,7 @@ SECRET = re.compile(r"password|secret|passphrase|token|scram", re.IGNORECASE)
 """Names of parameters whose values are not shown."""
 PASSWORD = re.compile(r"(?P<user>\w+://[^:/?@\[]*):(?P<password>.*)@", re.DOTALL)
 PORTS = re.compile(r"\d*(?:,[^@/?]*)?(?:/[^@?]*)?\?(?:.*&)?[a-z_]+=")
-"""Not the begin of a password, but of a port: host:5432/database?user=me@there."""
+"""Text that begins with a port and not with a password: host:5432/database?user=me@there."""
 
 
 def scheme_of(url: str) -> str:
@@ -19,7 +19,7 @@ def scheme_of(url: str) -> str:
 def redact(url: str) -> str:
     """Hide the passwords of a URL, wherever they stand.
 
-    Of a password whose @ was not escaped, everything up to the last @ is hidden.
+    If a password contains an unescaped @, everything up to the last @ is hidden.
     """
     if "://" not in url:
         return url

@@ -22,8 +22,8 @@ LONGEST_NAME = 63
 class Address(NamedTuple):
     """A URL taken apart.
 
-    conninfo : for libpq, without what is ours; environment : the schema; data : folder of the
-    private server, if one is meant; shown : the whole URL as messages may show it.
+    conninfo : for libpq, without hapticdb's own parameters; environment : the schema; data : folder
+    of the private server, if one is meant; shown : the whole URL as messages may show it.
     """
 
     conninfo: str
@@ -38,8 +38,8 @@ def parse(url: str) -> Address:
     Raises
     ------
     UsageError
-        When the environment's name cannot be a schema's, or is given twice; when the URL is none,
-        or names a user or a database that no server has.
+        When the environment's name cannot be a schema's, or is given twice; when the text is no
+        URL; when the URL names a user or a database that no server can have.
     """
     parts = _split(url)
     _check_login(parts, url)
@@ -80,7 +80,7 @@ def _split(url: str) -> SplitResult:
     """
     try:
         parts = urlsplit(url)
-    except ValueError:  # its words may hold the password
+    except ValueError:  # the error's text may hold the password
         raise UsageError(f"{redact(url)} is no URL: check the host and its brackets") from None
     pairs = [pair.partition("=") for pair in parts.query.split("&") if pair]
     if (
@@ -122,7 +122,7 @@ def check_name(name: str, what: str) -> None:
         raise UsageError(f"{what} {name!r}: give a str, not {type(name).__name__}")
     try:
         n_bytes = len(name.encode())
-    except UnicodeEncodeError:  # bytes of a command line that are no UTF-8, or half a character
+    except UnicodeEncodeError:  # bytes that are not UTF-8, or half a surrogate pair
         raise UsageError(f"{what} {name!r} is no text: give it in UTF-8") from None
     if "\0" in name or not name:
         raise UsageError(f"{what} {name!r}: give one that is not empty, without a byte 0")
@@ -134,7 +134,7 @@ def check_name(name: str, what: str) -> None:
 
 
 def _check_login(parts: SplitResult, url: str) -> None:
-    """Refuse names of users and databases that the server would cut off: it would mean another."""
+    """Refuse long names of users and databases: the server would cut them off to other names."""
     pairs = [pair.partition("=") for pair in parts.query.split("&")]
     user = parts.netloc.rpartition("@")[0].partition(":")[0]
     names = [("a user's name", user), ("a database's name", parts.path.removeprefix("/"))]
@@ -152,7 +152,7 @@ def _check_login(parts: SplitResult, url: str) -> None:
 def _check_name(name: str, url: str) -> None:
     if (
         not name
-        or not name.isprintable()  # nor half a character, which no server takes
+        or not name.isprintable()  # nor half a surrogate pair, which no server accepts
         or "$$" in name  # would end the text of a function
         or len(name.encode("utf-8", "surrogateescape")) > LONGEST_NAME
         or name.startswith("pg_")

@@ -1,4 +1,4 @@
-"""What `hapticdb check` asks a server beside what every store answers."""
+"""Checks of a server for `hapticdb check`, beside the checks of every store."""
 
 from collections.abc import Callable, Iterator
 
@@ -10,7 +10,7 @@ from hapticdb.store.postgres.tables import statements
 
 
 class PostgresChecker:
-    """Pages are the server's own: it compares their checksums when it reads them, if it has any."""
+    """Checks a server. The server itself compares its pages' checksums, if they have any."""
 
     def __init__(
         self,

@@ -1,7 +1,7 @@
 """The paper's own form of a scan: a loop inside the server that reads one range at a time.
 
-The paper ran its loop in PL/SQL, so that its figures count descents of the index and no round
-trips. Here the loop is PL/pgSQL, sent the same ranges that the one statement gets.
+The paper ran its loop in PL/SQL, so its figures count descents of the index and no round trips.
+Here the loop is PL/pgSQL, and gets the same ranges as the single statement.
 """
 
 from typing import Any

@@ -1,7 +1,7 @@
 """The tables and functions of an environment in PostgreSQL, and how older ones become newer ones.
 
-All steps that are missing run in one transaction, with the environment's schema as search path;
-`{schema}` stands for its name where a function's text outlives that path.
+All missing steps run in one transaction, with the environment's schema as search path. `{schema}`
+stands for the schema's name in functions, which are later called with other search paths.
 """
 
 from hapticdb.store.schema import Dialect
@@ -32,7 +32,7 @@ CREATE TABLE object (
   attributes json NOT NULL,
   revision   bigint NOT NULL
 )"""
-# digests: an index holds no names of thousands of characters
+# digests, because an index cannot hold names of thousands of characters
 PART = "CREATE UNIQUE INDEX object_part ON object (md5(link), md5(name))"
 
 # statistics: the paper's best resolution, and the server's largest. Autovacuum: rows are read from
@@ -43,7 +43,7 @@ VOXEL = (
     "ALTER TABLE voxel ALTER z_val SET STATISTICS 10000, ALTER id SET STATISTICS 0",
     "CREATE UNIQUE INDEX voxel_key ON voxel (z_val, id)",
 )
-# 64 bytes are never worth compressing, nor a table of their own
+# 64 bytes are too few to compress or to store in a table of their own
 BRICK = (
     f"""
 CREATE TABLE brick (
@@ -80,7 +80,7 @@ CREATE TABLE cost (
   figures json NOT NULL
 )"""
 
-# ANALYZE is the table owner's; editors may ask for it through this, and nobody else
+# only a table's owner may ANALYZE; this function lets editors do so, too, and nobody else
 REFRESH = (
     """
 CREATE FUNCTION refresh_statistics() RETURNS void
@@ -152,7 +152,7 @@ CREATE AGGREGATE force(hit) (
 )""",
 )
 
-# as the owner: roles that were granted rights before the table was there write it, too
+# as the owner, so that roles with rights from before this table can write it, too
 REMOVED = (
     "CREATE TABLE removed (link text NOT NULL, name text NOT NULL)",
     "CREATE UNIQUE INDEX removed_part ON removed (md5(link), md5(name))",
@@ -191,6 +191,6 @@ MIGRATIONS: Dialect = {
         *REFRESH,
         *FORCE,
     ),
-    "lineage": (),  # a file of SQLite has its log beside it, a server keeps its own
+    "lineage": (),  # only SQLite needs it: its log lies beside the file, a server keeps its own log
     "removed parts": REMOVED,
 }

@@ -39,18 +39,18 @@ __all__ = ["Binaries", "PrivateServer", "find_binaries"]
 USER = "hapticdb"
 """The superuser of a private server."""
 PORT = 5432
-"""Part of the socket's name; no network port is opened."""
+"""Number in the name of the socket. No network port is opened."""
 OWN_NAMES = {"data", "data.new", "socket", "log", "lock", "users"}
 SOCKET_BYTES = 107 - len(f"/.s.PGSQL.{PORT}")
-"""Longest folder of a socket."""
+"""Bytes of the longest path of a socket's folder."""
 LOG_BYTES = 8 << 20
 START_S = 600.0
-"""Recovery after a crash replays up to ``max_wal_size`` of changes."""
+"""Seconds that a start may take: recovery after a crash replays up to ``max_wal_size``."""
 STOP_S = 120.0
 ORPHANS_S = 10.0
-"""For the children of a killed server to notice its end and follow."""
+"""Seconds for the children of a killed server to notice its end, and to end, too."""
 PARTING_S = 0.5
-"""For the server to notice that a client has closed its connection."""
+"""Seconds for the server to notice that a client has closed its connection."""
 POLL_S = 0.01
 
 
@@ -89,16 +89,16 @@ class PrivateServer:
         folder : path
             For the server alone; made where it is missing, with its parents.
         binaries : Binaries, optional
-            What to run; by default what fits the folder, for a new one the first found.
+            Programs to run; by default those that fit the folder, for a new folder the first found.
         settings : mapping, optional
-            PostgreSQL's settings by name, for a start by this object; what they leave out is as
-            ``data/postgresql.conf`` in the folder says.
+            PostgreSQL's settings by name, for a start by this object. All other settings are those
+            of ``data/postgresql.conf`` in the folder.
 
         Raises
         ------
         UsageError
-            A setting that says where the server is reached: by its socket only. A folder with a
-            line break in its name, which PostgreSQL's own files cannot hold.
+            A setting is for the server's address: only its socket leads to it. Or the folder's name
+            has a line break, which PostgreSQL's own files cannot hold.
         DatabaseError
             The folder holds something else, or data of a major version that is not found; no
             PostgreSQL is found at all; the folder cannot be set up.
@@ -128,7 +128,7 @@ class PrivateServer:
         Raises
         ------
         DatabaseError
-            It does not start; the message ends as its log does.
+            The server does not start; the message ends with the end of the server's log.
         """
         with self._locked():
             deadline = time.monotonic() + ORPHANS_S
@@ -158,7 +158,7 @@ class PrivateServer:
                 self._stop()
 
     def kill(self) -> None:
-        """End the server as a crash does, its children, too; nothing if it does not run."""
+        """End the server and its children as a crash does; nothing if it does not run."""
         pid = self._postmaster()
         if pid is None:
             return
@@ -234,7 +234,7 @@ class PrivateServer:
     # -- its folder --------------------------------------------------------------------------
 
     def _open(self, name: str, flags: int) -> int:
-        """Open a file of the folder for its owner; never what a link there names."""
+        """Open a file of the folder for its owner; refuses a symbolic link."""
         try:
             opened = os.open(self.folder / name, flags | os.O_CREAT | os.O_NOFOLLOW, 0o600)
             if os.geteuid() == 0:
@@ -248,7 +248,7 @@ class PrivateServer:
 
     @contextlib.contextmanager
     def _locked(self) -> Iterator[int]:
-        """One process at a time sets up, starts and stops."""
+        """Lets one process at a time set up, start and stop the server."""
         lock = self._open("lock", os.O_RDWR)
         try:
             fcntl.flock(lock, fcntl.LOCK_EX)
@@ -262,14 +262,14 @@ class PrivateServer:
             self._users = None
 
     def _set_up(self, lock: int) -> None:
-        """Fill a folder beside and rename it: one that is cut off leaves nothing in `data`."""
+        """Fill a folder beside `data` and rename it, so that a cut-off start leaves no `data`."""
         fresh = self.folder / "data.new"
         shutil.rmtree(fresh, ignore_errors=True)
         command = [self.binaries.path("initdb"), "-D", str(fresh), "-U", USER, "-A", "trust"]
         command += ["--encoding=UTF8", "--locale=C", "--data-checksums"]
         if self._settings.get("fsync") == "off":
             command.append("--no-sync")
-        # initdb holds our lock, too: should we be killed, others wait until it has ended
+        # initdb holds our lock, too: if we are killed, others wait until it has ended
         done = run(command, self._account, self.folder, kept=(lock,))
         if done.returncode != 0:
             cause = " ".join(done.stderr.split()) or f"initdb ends with {done.returncode}"
@@ -277,7 +277,7 @@ class PrivateServer:
         fresh.rename(self._data)
 
     def _socket_folder(self) -> Path:
-        """`socket` in the folder; where that has no proper address, a link to a short path."""
+        """`socket` in the folder; if libpq cannot use that path, a link with a short path."""
         here = self.folder / "socket"
         if _is_address(here):
             if here.is_symlink():
@@ -300,7 +300,7 @@ class PrivateServer:
         return there
 
     def _make_private(self, folder: Path) -> None:
-        """Make a folder that its owner alone may enter, or make sure that it is such a one."""
+        """Make a folder that only its owner may enter, or check that an existing one is such."""
         with contextlib.suppress(FileExistsError):
             folder.mkdir(mode=0o700)
             hand_over([folder], self._account)
@@ -316,20 +316,20 @@ class PrivateServer:
         lines = self._pid_file()
         if not lines or not lines[0].isdecimal():
             return None
-        # after a restart of the machine the number may be anybody's
+        # after a restart of the machine another process may have this number
         command = _command_of(int(lines[0]))
         is_ours = Path(command[0]).name == "postgres" and str(self._data) in command
         return int(lines[0]) if is_ours else None
 
     def _pid_file(self) -> list[str]:
-        """Lines of postmaster.pid: first the process id, last how far the server is."""
+        """Lines of postmaster.pid: the first is the process id, the last the server's state."""
         try:
             return (self._data / "postmaster.pid").read_text(errors="replace").splitlines()
         except FileNotFoundError:
             return []
 
     def _try_start(self) -> str | None:
-        """Start the server unless it runs, and wait for it; returns why it does not start."""
+        """Start the server unless it runs, and wait for it; returns the reason of a failure."""
         log = self._open("log", os.O_RDWR | os.O_APPEND)
         try:
             if os.fstat(log).st_size > LOG_BYTES:
@@ -349,7 +349,7 @@ class PrivateServer:
             os.close(log)
 
     def _launch(self, log: int) -> int:
-        """Start the server's process, away from our terminal and our pipes; returns its id."""
+        """Start the server's process without our terminal and our pipes; returns its id."""
         self._forget_stale()
         socket = str(self._socket).replace('"', '""')  # an element of a list, quoted
         settings = {
@@ -362,16 +362,16 @@ class PrivateServer:
         command = [self.binaries.path("postgres"), "-D", str(self._data)]
         for name, value in settings.items():
             command += ["-c", f"{name}={value}"]
-        # the shell leaves at once, so that the server is nobody's child and no zombie of ours
+        # the shell ends at once, so the server is not our child and leaves us no zombie
         shell = ["/bin/sh", "-c", 'exec "$@" >&2 & echo $!', "sh", *self._account.prefix]
         account = Account(uid=self._account.uid, gid=self._account.gid)
         return int(run([*shell, *command], account, self.folder, errors=log).stdout)
 
     def _forget_stale(self) -> None:
-        """Remove the pid files of a server that is gone, where its number is still taken.
+        """Remove the pid files of a server that has ended, if its process id is still in use.
 
-        By another process, or by what is left of it until somebody waits for it. PostgreSQL sees
-        for itself when the number is free, but refuses to start while it is not.
+        Another process may have the id, or the ended process is a zombie. PostgreSQL itself removes
+        the files when the id is free, but refuses to start while it is in use.
         """
         lines = self._pid_file()
         if not (lines and lines[0].isdecimal() and Path(f"/proc/{lines[0]}").exists()):
@@ -395,12 +395,12 @@ class PrivateServer:
 
 
 def _is_address(folder: Path) -> bool:
-    """Whether libpq can reach a socket in that folder: it takes a comma for the end of a host."""
+    """Whether libpq can reach a socket in that folder: a comma in it would end the host's name."""
     return len(os.fsencode(folder)) <= SOCKET_BYTES and "," not in str(folder)
 
 
 def _command_of(pid: int) -> list[str]:
-    """Command line of a process, [""] where there is none."""
+    """Command line of a process, [""] without one."""
     try:
         line = Path(f"/proc/{pid}/cmdline").read_bytes()
     except OSError:
@@ -409,7 +409,7 @@ def _command_of(pid: int) -> list[str]:
 
 
 def _parent_of(pid: int) -> int | None:
-    """Parent of a living process; None of one that has ended, even if nobody waited for it."""
+    """Parent of a living process; None for a process that has ended, even for a zombie."""
     try:
         line = Path(f"/proc/{pid}/stat").read_text(errors="replace")
     except OSError:
@@ -425,7 +425,7 @@ def _children_of(pid: int) -> list[int]:
 
 
 def _complaint(log: str) -> str:
-    """What the end of a server's log complains of, on one line."""
+    """Complaint at the end of a server's log, on one line."""
     lines = [re.sub(r"^\d{4}-.*?\] ", "", line) for line in log.splitlines() if line]
     told = [line for line in lines if not line.startswith("LOG:")] or lines
     return " ".join(" ".join(told[-4:]).split()) or "its log is empty"

@@ -35,7 +35,7 @@ EDITOR = (
     "GRANT INSERT ON {schema}.change TO {role}",  # what was written stays written
     "GRANT INSERT, UPDATE ON {schema}.quantile TO {role}",
     "GRANT UPDATE (revision) ON {schema}.environment TO {role}",
-    # UPDATE: a copy brings ids along, and the sequence has to follow
+    # UPDATE: a copy keeps its ids, so the sequence must be set after them
     "GRANT USAGE, SELECT, UPDATE ON SEQUENCE {schema}.object_id_seq TO {role}",
     "GRANT EXECUTE ON FUNCTION {schema}.refresh_statistics() TO {role}",
 )
@@ -45,7 +45,7 @@ GRANTED: dict[Right, tuple[str, ...]] = {
     "editor": EDITOR,
     "nobody": (),
 }
-# a lock: two who change the same rights at once would conflict in the server's catalog
+# a lock: two changes of the same rights at once would conflict in the server's catalog
 GRANTERS = 0x4841505447524E54
 KNOWN_ROLE = """
 SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')
@@ -63,16 +63,16 @@ def grant(connection: ServerConnection, role: str, right: Right) -> None:
     role : str
         Name of a role of the server, a person's or a group's, written as it is.
     right : {"viewer", "toucher", "editor", "nobody"}
-        Replaces what was granted to that role on this environment before. What the role has
-        through a group that it belongs to stays.
+        Replaces the role's former right on this environment. Rights that the role has through a
+        group stay.
 
     Raises
     ------
     AccessError
         When the connection's user does not own the environment.
     UsageError
-        When there is no such role, none that the server would hold back, or no role can have that
-        name: the server would cut it off at 63 bytes, and mean another.
+        When there is no such role; when the role may do everything anyway; when the name is longer
+        than 63 bytes, so that the server would cut it off to another name.
     """
     check_name(role, "a role's name")
     if right not in GRANTED:

@@ -107,7 +107,7 @@ def opened(url: str, *, read_only: bool) -> ServerConnection:
 
 
 def check(connection: ServerConnection) -> None:
-    """Refuse what is no environment of ours or may not be read; migrate an older one."""
+    """Refuse a schema that is no environment or may not be read; migrate an older environment."""
     shown, name = connection.shown, connection.address.environment
     if not _has_schema(connection):
         raise _not_found(connection.address)
@@ -144,9 +144,9 @@ def check(connection: ServerConnection) -> None:
 
 
 def _check_writable(connection: ServerConnection) -> None:
-    """Refuse a user who may write nothing, before a minute's work.
+    """Refuse a user without the right to write, before minutes of work.
 
-    A toucher may write cost figures; `Loading` refuses it when it begins to write objects.
+    A toucher may write cost figures; `Loading` refuses a toucher who begins to write objects.
     """
     ((may_write, is_standby),) = connection.rows(
         "SELECT has_table_privilege('cost', 'INSERT'), pg_is_in_recovery()"
@@ -168,7 +168,7 @@ SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'v' THEN 'view'
 
 
 def read_environment(connection: ServerConnection) -> tuple[Grid, Layout, int]:
-    """Grid and layout of an environment, and the oid that another made in its place has not."""
+    """Grid and layout of an environment, and an oid that differs if the environment is remade."""
     rows = connection.rows(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, tableoid::bigint"
         " FROM environment"
@@ -208,7 +208,7 @@ def created(url: str, grid: Grid, layout: Layout) -> None:
 
 
 def _migrate_once(connection: ServerConnection) -> None:
-    """Migrate from the version that is there once nobody else migrates."""
+    """Migrate from the stored version, after any other process has finished migrating."""
     row = connection.execute("SELECT format FROM environment FOR UPDATE").fetchone()
     assert row is not None  # noqa: S101 - it was there before
     _migrate(connection, int(row[0]))

@@ -14,11 +14,11 @@ from pathlib import Path
 from hapticdb.errors import DatabaseError
 
 UNSHARE = ("unshare", "--user", "--map-user=65534", "--map-group=65534")
-"""Hides root from the server, which refuses it; files stay root's, and no account is needed."""
+"""Program that hides root from the server, which refuses to run as root. Files stay root's."""
 ACCOUNTS = ("postgres", "nobody")
-"""Who runs the server for root where `UNSHARE` is not allowed."""
+"""Account that runs the server for root if `UNSHARE` is not allowed."""
 SYSTEM_FOLDERS = ("lib/postgresql/*/bin", "pgsql-*/bin")
-"""Below /usr: Debian's packages, and the PostgreSQL project's own for Red Hat."""
+"""Folders below /usr: of Debian's packages, and of the PostgreSQL project's for Red Hat."""
 ENVIRONMENT = {"PATH": os.defpath, "LC_ALL": "C", "TZ": "UTC"}
 
 
@@ -77,12 +77,12 @@ def _versions(folders: list[Path]) -> Iterator[Binaries]:
 
 
 def fitting(data: Path, wanted: Binaries | None) -> Binaries:
-    """Binaries that can run what a data folder holds, or the first if it is not there.
+    """Binaries of the version of a data folder; the first found if the folder does not exist.
 
     Raises
     ------
     DatabaseError
-        There are none, or none of that major version; or the folder holds no PostgreSQL.
+        No binaries are found, or none of that major version; or the folder holds no PostgreSQL.
     """
     offered = find_binaries() if wanted is None else [wanted]
     if not offered:
@@ -109,10 +109,10 @@ def account_for(folder: Path, binaries: Binaries) -> Account:
     Raises
     ------
     DatabaseError
-        Only root is there; or the account cannot enter the folder or reach the programs.
+        There is no account but root, or the account cannot enter the folder or reach the programs.
     """
     if os.geteuid() != 0:
-        # initdb asks for the name of its user, and an id of a container's may have none
+        # initdb needs a name for its user, and a user id in a container may have none
         is_known = any(entry.pw_uid == os.geteuid() for entry in pwd.getpwall())
         return OURSELVES if is_known or not _can_unshare(binaries) else Account(UNSHARE)
     owner = folder.stat()
@@ -160,7 +160,7 @@ def run(
 ) -> subprocess.CompletedProcess[str]:
     """Run a command to its end, in a session of its own and a clean environment.
 
-    `kept` are open files that it inherits; `errors` is where it writes them, by default its result.
+    `kept` : open files that it inherits; `errors` : file for its errors, by default the result.
     """
     return subprocess.run(  # noqa: S603 - no shell reads what a user wrote
         [*account.prefix, *command],

@@ -18,14 +18,14 @@ from hapticdb.store.postgres.watching import Watch
 GROUPS_KEYS_ITSELF = 170_000
 """Server version, as libpq numbers it, from which `= ANY` reads each leaf page once."""
 GROUPING_THRESHOLD = 256
-"""Distinct keys from which `auto` groups on older servers: docs/decisions/0014."""
+"""Least number of distinct keys that `auto` groups on older servers: docs/decisions/0014."""
 
 
 class PostgresStore:
     """An environment on a PostgreSQL server. Open with `open`, make with `create`.
 
-    Each job is a class of its own: reading, writing, statistics, watching. Their methods are the
-    store's.
+    Reading, writing, statistics and watching are classes of their own. The store takes over their
+    methods.
     """
 
     def __init__(self, connection: ServerConnection) -> None:
@@ -73,7 +73,7 @@ class PostgresStore:
 
     @property
     def connection(self) -> ServerConnection:
-        """The connection below: for what only this engine has."""
+        """The connection, for features that only this engine has."""
         return self._connection
 
     def close(self) -> None:
@@ -90,7 +90,7 @@ class PostgresStore:
         self._connection.give_to(thread)
 
     def discard(self) -> None:
-        """Close and delete an environment that nothing went into, unless another writes to it."""
+        """Close and delete an environment without any write, unless another writes to it."""
         self._loading.drop_unused()
         self.close()
 
@@ -99,7 +99,7 @@ class PostgresStore:
         return self._connection.snapshot()
 
     def loading(self) -> contextlib.AbstractContextManager[None]:
-        """Inside, an empty table has no index."""
+        """Inside, an empty table may have no index; the index is made at the end."""
         return self._loading
 
     def looping(self) -> Store:
@@ -112,5 +112,5 @@ class PostgresStore:
         return int(rows[0][0])
 
     def checker(self) -> PostgresChecker:
-        """What `hapticdb check` asks beside the rest."""
+        """Answers of this engine for `hapticdb check`."""
         return PostgresChecker(self._connection, self.layout, self._unpacked)

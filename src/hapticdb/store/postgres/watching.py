@@ -24,12 +24,13 @@ from hapticdb.store.postgres.connecting.connection import ServerConnection, iden
 
 REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 DIGEST_DIGITS = 32
-"""Of the digest in place of a name that is too long for a channel. Fewer risk equal channels."""
+"""Hex digits of the digest that replaces too long a name. Fewer digits risk equal channels."""
 HEARING_S = 1.0
 """Longest time that a commit without a notification goes unnoticed, where LISTEN works. A smaller
 value costs each watching reader more round trips."""
 DEAF_S = 0.02
-"""Longest time that a commit goes unnoticed where LISTEN does not work. Smaller costs the same."""
+"""Longest time that a commit goes unnoticed where LISTEN does not work. A smaller value costs each
+watching reader more round trips."""
 HINTED_S = 0.005
 """Shortest time between two round trips because of notifications. It keeps a flood of forged
 notifications at 200 round trips a second."""
@@ -45,7 +46,7 @@ def channel_of(environment: str) -> str:
 
 
 class Watch:
-    """What one connection has heard of the commits of others."""
+    """Commits of others that one connection has noticed."""
 
     def __init__(self, connection: ServerConnection, identity: int) -> None:
         self._connection = connection
@@ -65,9 +66,9 @@ class Watch:
     def has_changed(self) -> bool:
         """Whether something was committed since `begin` or the last call.
 
-        It costs a round trip after a notification, after `HEARING_S` or `DEAF_S` without one, and
-        after a lost connection. After a lost connection it is true: notifications may have been
-        missed. Raises ConnectionLostError when the environment was made anew.
+        The call costs a round trip after a notification, after `HEARING_S` or `DEAF_S` without one,
+        and after a lost connection. After a lost connection it returns true, because notifications
+        may have been missed. Raises ConnectionLostError when the environment was made anew.
         """
         self._connection.check_outside()
         if self._connection.again(self._listen):
@@ -93,7 +94,7 @@ class Watch:
                 raise
             self._is_deaf = True
         self._listening_on = driver
-        self._due = 0.0  # if the question that follows fails, the next call asks again
+        self._due = 0.0  # if the query that follows fails, the next call asks again
         return True
 
     def _hear(self, _: psycopg.Notify) -> None:
@@ -101,7 +102,7 @@ class Watch:
 
     def _ask(self) -> bool:
         """Whether the revision has changed since it was last asked for."""
-        # the hint is taken back before asking: a commit after the answer gives a new hint
+        # cleared before the question, so that a commit after the answer sets it again
         before, self._is_hinted = self._revision, False
         found, identity = self._connection.fetch(REVISION)
         if wire.read_int8(identity or b"") != self._identity:

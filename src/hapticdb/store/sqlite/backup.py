@@ -2,8 +2,8 @@
 
 SQLite's backup API copies pages in steps. It begins again when another connection has written
 between two steps: with a busy writer it never ends. Here one read transaction covers all steps; in
-WAL mode no writer changes the pages that it sees, and the log grows meanwhile. VACUUM INTO would
-also copy, but it sorts all rows again, in one statement that tells no progress.
+WAL mode no writer changes the pages that this transaction reads, and the log grows meanwhile.
+VACUUM INTO could copy, too, but it sorts all rows again, in one statement that reports no progress.
 """
 
 import contextlib
@@ -32,9 +32,9 @@ from hapticdb.store.sqlite.file import named_errors
 from hapticdb.store.sqlite.migrations import APPLICATION_ID
 
 STEP_PAGES = 512
-"""Pages copied between two reports of progress: 4 MiB. More makes the bar jump."""
+"""Pages copied between two reports of progress: 4 MiB. With a larger value the bar jumps."""
 SOURCE_CACHE_KIB = 4096
-"""Page cache of the source. A larger one gains nothing: each page is read once."""
+"""KiB of the source's page cache. A larger cache gains nothing: each page is read once."""
 
 
 def back_up(
@@ -102,7 +102,7 @@ def _copied(source: Path, unfinished: Path, progress: BackupCallback | None) -> 
                 _finish(made)
         if Path(f"{unfinished}-wal").exists():
             raise DatabaseError(f"{unfinished}-wal could not be folded into the copy: try again")
-        file.look()  # what was copied is what the path leads to
+        file.look()  # the path must still lead to the file that was copied
         if file.stamp is not None:
             file.check_stamp()
     return int(str(revision)), int(str(objects))
@@ -119,7 +119,7 @@ def _copy_pages(
     if is_checked:
         made.reserve_bytes(reserve=sqlite_pages.TAIL_BYTES)
     made.execute("PRAGMA journal_mode = OFF").fetchall()
-    made.execute("PRAGMA synchronous = OFF")  # nobody knows the file yet; it is synced as a whole
+    made.execute("PRAGMA synchronous = OFF")  # nobody uses the file yet; `_sync` comes later
     with made.backup("main", source, "main") as copying:
         while not copying.done:
             copying.step(STEP_PAGES)
@@ -130,11 +130,11 @@ def _copy_pages(
 
 
 def _finish(made: apsw.Connection) -> None:
-    """Bring a copy up to date, and draw a mark for it: no log may follow it but its own."""
+    """Bring a copy up to date and draw a new mark, so that only its own log can be applied."""
     ((version,),) = made.execute("PRAGMA user_version").fetchall()
     sqlite_file.migrate(made, sqlite_file.tables_version(int(str(version))))
     made.execute("UPDATE environment SET lineage = ?", (sqlite_log.first_lineage(),))
-    if made.vfsname("main") != sqlite_pages.LAYER:  # no page has told whether it is whole
+    if made.vfsname("main") != sqlite_pages.LAYER:  # its pages have no checksums
         found = made.execute("PRAGMA quick_check(1)").fetchall()
         if found != [("ok",)]:
             raise DamagedError(
@@ -145,17 +145,17 @@ def _finish(made: apsw.Connection) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Have a file on disk that no connection has open."""
+    """Write a file to disk that no connection has open."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
 
 @contextlib.contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Hold off all others from a database that is there; refuse when one has it open.
+    """Lock all others out of an existing database inside; refuse if another has it open.
 
-    Whoever has read from a database in WAL mode holds a lock on it until he closes it. Readers of
-    a folder that they cannot write hold none; they notice by the file's time.
+    A connection that has read from a database in WAL mode holds a lock on it until it is closed.
+    Readers that cannot write the folder hold no lock; they notice the change by the file's time.
     """
     with contextlib.ExitStack() as held:
         if path.exists():
@@ -174,8 +174,8 @@ def _alone(path: Path) -> Iterator[None]:
 def _put_in_place(unfinished: Path, path: Path) -> None:
     """Replace a database, and remove what belonged to the former one.
 
-    Cut off in between, the former log lies beside the new file, whose mark it does not know: that
-    is refused in one line, and the same command finishes.
+    If the process is killed in between, the former log lies beside the new file, but does not have
+    its mark. Opening is then refused in one line, and the same command run again finishes the work.
     """
     with _alone(path):
         unfinished.replace(path)

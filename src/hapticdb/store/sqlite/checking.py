@@ -27,7 +27,7 @@ from hapticdb.store.sqlite.raw import read_from
 Fetch = Callable[[str, Sequence[Any]], list[Any]]
 PAGES_AT_ONCE = 512
 MOST = 100
-"""Findings of one kind that are listed. More only makes the report of a ruined file longer."""
+"""Findings of one kind that are listed. A larger value makes the report of a ruined file longer."""
 LOOKS = 5
 """Times that a page with a wrong checksum is read again: another process may be writing it."""
 AFTER: dict[Layout, str] = {
@@ -41,7 +41,7 @@ SELECT z_val, id, occupancy FROM brick
 
 
 class SQLiteChecker:
-    """What `hapticdb check` asks a file: SQLite's own check, statistics, rows in their order."""
+    """What `hapticdb check` asks a file: SQLite's own check, statistics, all rows in order."""
 
     def __init__(
         self, path: Path, layout: Layout, fetch: Fetch, rows: Callable[[list[Any]], Rows]
@@ -70,7 +70,7 @@ class SQLiteChecker:
 
 
 def page_findings(path: Path) -> Iterator[str]:
-    """Compare the checksum of every page of a file, also of pages that no query reads."""
+    """Check the checksum of every page of a file, also of pages that no query reads."""
     with sqlite_bytes.opened_bytes(path) as file:
         first = read_from(file, PAGE_BYTES)
         if not sqlite_pages.is_checked(first):
@@ -101,7 +101,7 @@ def _is_whole_later(file: apsw.VFSFile, number: int, nonce: bytes) -> bool:
 
 
 def log_findings(path: Path) -> Iterator[str]:
-    """Commits in the log after a broken frame, which SQLite leaves out without a word.
+    """Commits in the log after a broken frame, which SQLite ignores without an error.
 
     Call it before the file is opened: closing the file may remove the log.
     """
@@ -120,7 +120,7 @@ def log_findings(path: Path) -> Iterator[str]:
         number, broken = 0, 0
         while len(frame := file.read(FRAME_BYTES)) == FRAME_BYTES:
             number += 1
-            is_of_this_round = frame[8:16] == header[16:24]  # others are left from before
+            is_of_this_round = frame[8:16] == header[16:24]  # others are from an earlier log
             if not broken:
                 sums = log_checksum(np.frombuffer(frame, f"{order}u4"), *sums)
                 told = sums[0].to_bytes(4, "big") + sums[1].to_bytes(4, "big")

@@ -13,7 +13,7 @@ from hapticdb.store.sqlite.checking import first_findings
 from hapticdb.store.sqlite.store import SQLiteStore
 
 PREFIX = "sqlite:///"
-# what libpq takes beside URLs, and a URL without its slashes: it may hold a password
+# libpq's other form of an address, and a URL without its slashes: either may hold a password
 KEYWORDS = re.compile(r"^postgres(ql)?:|(^|\s)\w*password\s*=", re.IGNORECASE)
 
 

@@ -26,10 +26,10 @@ from hapticdb.store.sqlite.migrations import APPLICATION_ID, CHECKED_VERSION, MI
 from hapticdb.store.sqlite.place import OpenedFile
 
 BUSY_TIMEOUT_MS = 10_000
-"""How long a write waits for another process's write before it gives up."""
+"""Milliseconds that a write waits for another process's write before it gives up."""
 CACHE_KIB = 256 * 1024
-"""Page cache of one connection, enough for the bricks of a large car. Memory is taken as pages are
-read. A smaller one reads pages again from the operating system."""
+"""KiB of one connection's page cache, enough for the bricks of a large car. Memory is taken as
+pages are read. A smaller cache reads pages again from the operating system."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
 
@@ -57,7 +57,7 @@ def named_errors(path: str) -> Iterator[None]:
     except apsw.CantOpenError as error:
         raise DatabaseError(f"{path} cannot be opened: check its folder's rights") from error
     except (apsw.SQLError, apsw.MismatchError, apsw.ConstraintError) as error:
-        # the statements fit the tables of an environment: these are other tables
+        # the statements are right for an environment's tables, so these are other tables
         raise damaged(path, str(error)) from error
 
 
@@ -154,7 +154,7 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
 
 
 def check_free(path: Path) -> None:
-    """Refuse a path where a file is, or the log of one that is gone."""
+    """Refuse a path where a file is, or where the log of a deleted file is."""
     if path.exists():
         raise EnvironmentExistsError(f"{path} exists already; open it, or give another path")
     log = Path(f"{path}-wal")
@@ -188,7 +188,7 @@ def unfinished_beside(path: Path) -> Iterator[Path]:
 def publish(unfinished: Path, path: Path) -> None:
     """Give a finished file its path, unless another has taken it."""
     try:
-        os.link(unfinished, path)  # unlike a renaming, it never replaces another's file
+        os.link(unfinished, path)  # unlike renaming, a link never replaces another file
     except FileExistsError as error:
         raise EnvironmentExistsError(f"{path} exists already; open it") from error
     except OSError:
@@ -202,7 +202,7 @@ def remove_file(path: Path) -> None:
 
 
 def _sweep_unfinished(path: Path) -> None:
-    """Remove what a process that was killed while making this file left behind."""
+    """Remove the unfinished file of a process that was killed while it made this file."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.new*"):
         pid = left.name.split(".")[-2]
         if pid.isdigit() and not Path(f"/proc/{pid}").exists():
@@ -280,13 +280,13 @@ def _settle(connection: apsw.Connection) -> None:
     # in WAL mode NORMAL survives the death of the process; only a power cut can lose the last
     # commits, and leaves the database valid even then
     connection.execute("PRAGMA synchronous = NORMAL")
-    # a blob is never taken for text, nor a string in double quotes for a literal
+    # never read a blob as text, nor a string in double quotes as a literal
     connection.config(apsw.SQLITE_DBCONFIG_DQS_DML, 0)
     connection.config(apsw.SQLITE_DBCONFIG_DQS_DDL, 0)
 
 
 def _version(connection: apsw.Connection, path: Path) -> int:
-    """Version of a file's tables; refuses what is no environment, or newer."""
+    """Version of a file's tables; refuses a file that is no environment, or a newer one."""
     found = _pragma(connection, "user_version")
     if _pragma(connection, "application_id") != APPLICATION_ID:
         raise _foreign(path)
@@ -299,7 +299,7 @@ def _version(connection: apsw.Connection, path: Path) -> int:
 def _bring_up_to_date(
     connection: apsw.Connection, path: Path, version: int, *, read_only: bool
 ) -> None:
-    """Run the migrations that an older file lacks; a reader does without some of them."""
+    """Run the migrations that an older file lacks; a reader does not need all of them."""
     if not read_only:
         migrate(connection, version)
     elif any(step.readers_need_it for step in migrations_after(version, MIGRATIONS)):

@@ -1,4 +1,4 @@
-"""Whether a write-ahead log belongs to the file that it lies beside.
+"""Whether a write-ahead log belongs to the file beside it.
 
 A log of SQLite does not name its file. SQLite applies whatever ``-wal`` lies beside a file, even to
 an old copy that was put in the file's place. So the row of the table `environment` has a lineage: a
@@ -29,29 +29,30 @@ from hapticdb.store.sqlite.pages import FRAME_BYTES, FRAME_HEADER, LOG_HEADER, P
 
 MARK_BYTES = 16
 NO_MARK = bytes(MARK_BYTES)
-"""Mark of a file from before format 2. The first mark of a file names it as the mark before."""
+"""Mark of a file older than format 2, and the previous mark of a file without earlier commits."""
 LINEAGE_COLUMN = 8
-"""Place of `lineage` in the table `environment`."""
+"""Index of the column `lineage` in the table `environment`."""
 LINEAGE_PAGE = 2
-"""Root of that table, which is made first, and its only page."""
+"""Number of the only page of the table `environment`, which is made first."""
 LINEAGE_AT = (LINEAGE_PAGE - 1) * PAGE_BYTES
 RENEW_LINEAGE = """
 UPDATE environment SET lineage = CAST(randomblob(16) || substr(lineage, 1, 16) AS BLOB)"""
-"""A statement of every transaction that writes."""
+"""Statement that every writing transaction runs: draws a new mark, and keeps the former one."""
 
 LEAF_OF_TABLE = 13
 BLOB_TYPE = 12
-"""Serial type of an empty blob; two more for each byte."""
+"""SQLite's serial type of an empty blob. Each byte of a blob adds 2."""
 NUMBER_BYTES = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)
-"""Of the serial types below 10."""
+"""Bytes of a value of each serial type below 10."""
 
 LOG_MAGIC = 0x377F0682
-"""With 1 added where checksums are of big-endian words."""
+"""First word of a log. It is 1 more if checksums are computed from big-endian words."""
 SUMS = struct.Struct(">2I")
 ATTEMPTS = 10
-"""Times that file and log are read before the log is refused. More waits longer for a writer."""
+"""Times that file and log are read before the log is refused. A larger value waits longer for a
+writer."""
 PAUSE_SECONDS = 0.02
-"""Between attempts. A writer may be at work: file and log cannot be read at one moment."""
+"""Pause between attempts. A writer may change the log between the reads of file and log."""
 
 
 class Lineage(NamedTuple):
@@ -62,31 +63,31 @@ class Lineage(NamedTuple):
 
 
 def first_lineage() -> bytes:
-    """What the row of a new file holds: a mark that no log knows."""
+    """Lineage of a new file: a mark that is in no log, and no previous mark."""
     return os.urandom(MARK_BYTES) + NO_MARK
 
 
 def check_log(path: Path, log_path: Path | None = None) -> bytes | None:
     """Refuse a log beside a database that was written for another file; returns the file's mark.
 
-    None without a mark that can be read: page 2 may be half written where power was lost, and the
-    log holds it whole then. `log_path` is where a log is read whose own name is gone.
+    Returns None if no mark can be read. After a power loss page 2 may be half written; the log then
+    holds the whole page. `log_path` is another path of the log, for a log whose name is gone.
 
     Raises
     ------
     DamagedError
-        When the log has commits, and the file is none that they can be applied to.
+        When the log has commits that cannot be applied to this file.
     """
     for attempt in range(ATTEMPTS):
         if attempt:
             time.sleep(PAUSE_SECONDS)
         try:
             with contextlib.closing(_Log.at(log_path or Path(f"{path}-wal"))) as log:
-                mark = file_mark(path)  # before the log's frames: it may be the newest of them
+                mark = file_mark(path)  # before the log's frames: may be their newest
                 if mark is None or log.follows(mark):
                     return mark
         except OSError:
-            return None  # the engine says better what cannot be read
+            return None  # SQLite's own error for an unreadable file is clearer
     raise not_its_log(path)
 
 
@@ -101,7 +102,7 @@ def not_its_log(path: Path) -> DamagedError:
 
 
 def file_mark(path: Path) -> bytes | None:
-    """Mark in the database file itself, whatever its log says; None where it cannot be told."""
+    """Mark in the database file itself, without its log; None if it cannot be read."""
     return mark_in(sqlite_bytes.read_bytes(path, PAGE_BYTES, LINEAGE_AT))
 
 
@@ -112,7 +113,7 @@ def mark_in(page: bytes) -> bytes | None:
 
 
 def lineage_in(page: bytes) -> Lineage | None:
-    """Lineage on the page of the table `environment`; None when it is no such page, or broken."""
+    """Lineage on the page of the table `environment`; None if the page is another one or broken."""
     try:
         if page[0] != LEAF_OF_TABLE or int.from_bytes(page[3:5], "big") != 1:
             return None
@@ -127,7 +128,7 @@ def lineage_in(page: bytes) -> Lineage | None:
         if len(kinds) < LINEAGE_COLUMN:
             return None
         if len(kinds) == LINEAGE_COLUMN or kinds[LINEAGE_COLUMN] == 0:
-            return Lineage(NO_MARK, NO_MARK)  # the column is not there yet
+            return Lineage(NO_MARK, NO_MARK)  # the file has no such column yet
         if kinds[LINEAGE_COLUMN] != BLOB_TYPE + 2 * 2 * MARK_BYTES:
             return None
         at = head + sum(_bytes_of(kind) for kind in kinds[:LINEAGE_COLUMN])
@@ -140,7 +141,7 @@ def lineage_in(page: bytes) -> Lineage | None:
 
 
 def _varint(page: bytes, at: int) -> tuple[int, int]:
-    """Integer of variable length, and where the next thing begins."""
+    """Integer of variable length, and the offset after it."""
     value = 0
     for n in range(9):
         byte = page[at + n]
@@ -153,7 +154,7 @@ def _varint(page: bytes, at: int) -> tuple[int, int]:
 
 
 def _bytes_of(kind: int) -> int:
-    """Length of a value of that serial type."""
+    """Bytes of a value of that serial type."""
     return NUMBER_BYTES[kind] if kind < BLOB_TYPE else (kind - BLOB_TYPE) // 2
 
 
@@ -173,14 +174,14 @@ class _Log:
 
     @classmethod
     def at(cls, path: Path) -> "_Log":
-        """The log at a path; a void one when there is none."""
+        """The log at a path; an empty log if there is none."""
         try:
             return cls(os.open(path, os.O_RDONLY | os.O_CLOEXEC))
         except FileNotFoundError:
             return cls(None)
 
     def close(self) -> None:
-        """Give the descriptor back: nobody takes locks on a log."""
+        """Close the descriptor. No lock is lost by this: SQLite takes no locks on a log."""
         if self._descriptor is not None:
             os.close(self._descriptor)
 
@@ -188,14 +189,14 @@ class _Log:
         return b"" if self._descriptor is None else os.pread(self._descriptor, amount, at)
 
     def follows(self, mark: bytes) -> bool:
-        """Whether this log can be applied to a file with that mark; true of one without commits."""
+        """Whether this log can be applied to a file with that mark; true if it has no commits."""
         if self._is_void:
             return True
-        if self._page != PAGE_BYTES:  # of no file of ours
+        if self._page != PAGE_BYTES:  # no hapticdb file has such pages
             return False
         is_marked = False
         for number, _, at in self._frames():
-            # one that is not committed cannot have its mark in any file, so no checksum is needed
+            # the mark of an uncommitted frame is in no file, so its checksum need not be checked
             if number == LINEAGE_PAGE and (lineage := self._lineage(at)):
                 if mark in lineage:
                     return True
@@ -203,7 +204,7 @@ class _Log:
         return not (is_marked and self._has_commit_of_ours())
 
     def _frames(self) -> Iterator[tuple[int, int, int]]:
-        """Page number, pages after a commit or 0, and place of each frame."""
+        """For each frame: page number, pages after its commit or 0 without one, and offset."""
         at = LOG_HEADER
         while True:
             head = self._read(FRAME_HEADER, at)
@@ -216,7 +217,7 @@ class _Log:
         return lineage_in(self._read(PAGE_BYTES, at + FRAME_HEADER))
 
     def _has_commit_of_ours(self) -> bool:
-        """Whether the engine would apply any page 2 of this log: by its checksums."""
+        """Whether SQLite would apply a page 2 of this log, judged by the checksums."""
         sums, is_ours = self._sums, False
         for number, pages, at in self._frames():
             frame = self._read(FRAME_BYTES, at)

@@ -6,9 +6,9 @@ Each step runs in one transaction with the number that it leads to (`hapticdb.st
 from hapticdb.store.schema import Dialect
 
 APPLICATION_ID = 0x48415054  # "HAPT"
-"""In the header of each of our files: tells it from another program's database."""
+"""Number in the header of each hapticdb file. Another program's database does not have it."""
 CHECKED_VERSION = 1000
-"""Added to the version of a file whose pages carry checksums: who writes none must refuse it."""
+"""Added to the version of a file with checksums, so that a program that writes none refuses it."""
 
 ENVIRONMENT = """
 CREATE TABLE environment (
@@ -79,7 +79,7 @@ LINEAGE = (
     "UPDATE environment SET lineage = CAST(randomblob(16) || zeroblob(16) AS BLOB)",
 )
 
-# names of removed parts, for who imports their file again: kept by triggers, whoever removes
+# names of removed parts, for the next import of their file; triggers keep them, for any program
 REMOVED = (
     """
 CREATE TABLE removed (

@@ -2,7 +2,7 @@
 
 Each page of a checked file ends with `TAIL_BYTES` that SQLite does not use: a mark, a random number
 of the file (its nonce), and a CRC-32 over the page's number, its content, the mark and the nonce.
-They are written with the page and compared when the page is read. So a page that was altered,
+The tail is written with the page and compared when the page is read. So a page that was altered,
 zeroed, moved to another place or taken from another file is found. For pages in the write-ahead log
 the layer compares SQLite's own checksum of each frame, which SQLite looks at only after a crash.
 See docs/decisions/0011.
@@ -33,34 +33,34 @@ TAIL_BYTES = 16
 CONTENT_BYTES = PAGE_BYTES - TAIL_BYTES
 """Bytes of a page that SQLite uses."""
 CRC_AT = PAGE_BYTES - 4
-"""Place of the CRC-32 in a page."""
+"""Offset of the CRC-32 in a page."""
 PENDING_PAGE = (1 << 30) // PAGE_BYTES + 1
-"""SQLite locks bytes of this page and never writes it."""
+"""Number of the page that SQLite uses for locks and never writes."""
 # https://sqlite.org/fileformat2.html, section 4: the write-ahead log
 LOG_HEADER = 32
 FRAME_HEADER = 24
 FRAME_BYTES = FRAME_HEADER + PAGE_BYTES
 _SUMS = struct.Struct(">2I")
 NEVER = 1 << 62
-"""No log is so long."""
+"""Offset beyond the end of every log."""
 
 
 def tail_of(content: bytes | memoryview, number: int, nonce: bytes) -> bytes:
-    """Last 16 bytes of a page, from the others, its number from 1, and its file's nonce."""
+    """Last 16 bytes of a page, from its other bytes, its number (from 1) and its file's nonce."""
     start = MARK + nonce
     crc = zlib.crc32(content, zlib.crc32(start + number.to_bytes(4, "big")))
     return start + crc.to_bytes(4, "big")
 
 
 def is_whole(page: bytes, number: int, nonce: bytes) -> bool:
-    """Whether a page holds what was written as that page of that file."""
+    """Whether a page is as it was written: the page of that number in the file with that nonce."""
     return page[CONTENT_BYTES:] == tail_of(memoryview(page)[:CONTENT_BYTES], number, nonce)
 
 
 def is_checked(first: bytes) -> bool:
-    """Whether the pages of a file carry checksums, by its first one.
+    """Whether the pages of a file carry checksums, judged by its first page.
 
-    Three places tell, and each alone is enough: damage to one place does not switch checking off.
+    Each of three marks in the page is enough alone, so damage to one does not switch checking off.
     """
     version = int.from_bytes(first[60:64], "big")
     return is_marked(first) or first[20:21] == bytes([TAIL_BYTES]) or version >= CHECKED_VERSION
@@ -86,7 +86,7 @@ class _PageFile(apsw.VFSFile):
         self._is_read_only = bool(flags[1] & apsw.SQLITE_OPEN_READONLY)
 
     def _nonce_known(self) -> bytes:
-        """Nonce of the file; drawn when it is new."""
+        """Nonce of the file; a new file draws one."""
         if not self._nonce:
             self._nonce = (
                 super().xRead(NONCE_BYTES, CONTENT_BYTES + len(MARK))
@@ -98,7 +98,7 @@ class _PageFile(apsw.VFSFile):
     def xRead(self, amount: int, offset: int) -> bytes:  # noqa: N802 - SQLite's name
         page: bytes = super().xRead(amount, offset)
         if amount != PAGE_BYTES:
-            return page  # the header alone, before SQLite reads all of the first page
+            return page  # SQLite reads the header alone before it reads the whole first page
         number = offset // PAGE_BYTES + 1
         if len(page) < PAGE_BYTES:
             if super().xFileSize() == 0:
@@ -116,13 +116,13 @@ class _PageFile(apsw.VFSFile):
         super().xWrite(content + tail, offset)
 
     def xLock(self, level: int) -> None:  # noqa: N802 - SQLite's name
-        """The last reader that closes a file asks for it alone, and does without when refused."""
+        """Refuse a reader exclusive locks: the last one to close asks for one, but needs none."""
         if self._is_read_only and level > apsw.SQLITE_LOCK_SHARED:
             raise apsw.BusyError("opened to read")
         super().xLock(level)
 
     def xDeviceCharacteristics(self) -> int:  # noqa: N802 - SQLite's name
-        """Without reads of parts of pages, which could not be compared."""
+        """Forbid reads of parts of pages: their checksums could not be compared."""
         return super().xDeviceCharacteristics() & ~apsw.SQLITE_IOCAP_SUBPAGE_READ
 
 
@@ -160,11 +160,11 @@ class _LogFile(apsw.VFSFile):
         return sums == _SUMS.unpack_from(frame, 16)
 
     def xWrite(self, data: Any, offset: int) -> None:  # noqa: ANN401, N802 - a buffer; SQLite's name
-        """A page written again inside a transaction; its checksums then follow at the commit."""
+        """Note a page written again in a transaction: its checksum follows at the commit."""
         super().xWrite(data, offset)
         if len(data) == FRAME_HEADER:
             self._header_end = offset + FRAME_HEADER
-            if any(memoryview(data)[4:8]):  # it commits
+            if any(memoryview(data)[4:8]):  # the frame commits
                 self._unsettled = NEVER
         elif len(data) == PAGE_BYTES and offset != self._header_end:
             self._unsettled = min(self._unsettled, offset - FRAME_HEADER)
@@ -177,7 +177,7 @@ class _Layer(apsw.VFS):
         super().__init__(LAYER, "")
 
     def xFullPathname(self, name: str) -> str:  # noqa: N802 - SQLite's name
-        """Links followed, as the engine's own does; the binding takes its word for that amiss."""
+        """Path with links resolved. SQLite's own method does so, but apsw misreads its result."""
         return os.path.realpath(name)
 
     def xOpen(self, name: Any, flags: list[int]) -> apsw.VFSFile:  # noqa: ANN401, N802 - apsw's own kinds of names; SQLite's name
@@ -197,7 +197,7 @@ def damaged_page(path: str, cause: str) -> DamagedError:
 
 
 def log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:
-    """Both sums after a frame's words (2054,), from those before it, modulo 2^32.
+    """Both sums after a frame's words (2054,), from the sums before the frame, modulo 2^32.
 
     SQLite adds the page's number and size and then its content, word after word: s1 += word + s2,
     s2 += the next + s1. Both are linear in the words, with Fibonacci's numbers for weights.
@@ -219,7 +219,7 @@ def words_checksum(words: list[int], s1: int = 0, s2: int = 0) -> tuple[int, int
 
 
 def _weights() -> tuple[tuple[NDArray[np.uint32], NDArray[np.uint32]], list[int]]:
-    """Of a page's words in both sums, and of the sums before it."""
+    """Weights of a page's words in both sums, and of the sums before the page."""
     n_words = PAGE_BYTES // 4
     numbers = [0, 1]
     while len(numbers) < n_words + 2:

@@ -1,7 +1,7 @@
 """The files that an open database consists of, and whether its path still leads to them.
 
-In WAL mode SQLite does not check that. It goes on writing into files that were deleted or replaced,
-and reports every commit as done.
+In WAL mode SQLite does not check the path. It goes on writing into files that were deleted or
+replaced, and reports every commit as done.
 """
 
 import contextlib
@@ -17,7 +17,7 @@ from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.pages import PAGE_BYTES
 
 LOOK_SECONDS = 0.25
-"""Longest time that a reader does not notice that its path leads to another file. Smaller costs
+"""Longest time until a reader notices that its path leads to another file. A smaller value costs
 more calls of the operating system."""
 
 Identity = tuple[int, int]
@@ -73,7 +73,7 @@ class OpenedFile:
             self.look()
 
     def look(self, *, has_committed: bool = False) -> None:
-        """Refuse to go on when the path leads elsewhere, or to other contents.
+        """Refuse to go on when the path leads to another file or to other contents.
 
         Raises
         ------
@@ -114,7 +114,7 @@ class OpenedFile:
         return _stamp(self._path) != self.stamp
 
     def close(self) -> None:
-        """Close the connection; the last one's log goes into the file that it belongs to."""
+        """Close the connection. The last one folds the log into the file that it belongs to."""
         if self._connection is None:
             return
         if not self._may_fold():
@@ -123,7 +123,7 @@ class OpenedFile:
         self._connection = None
 
     def __del__(self) -> None:
-        """Close if nobody has. SQLite would write its log into whatever file is there then."""
+        """Close if nobody has, or SQLite would write its log into whatever file is there then."""
         with contextlib.suppress(Exception):
             self.close()
 
@@ -138,7 +138,7 @@ class OpenedFile:
         return True
 
     def _owns_its_log(self) -> bool:
-        """Whether only the names beside the file are gone, so that its log can still go into it."""
+        """Whether only the names beside the file are gone, so its log can still go into the file."""
         descriptor = sqlite_bytes.descriptor_of(self._beside.get(self._log, (0, 0)))
         if _identity(str(self._path)) != self.identity or descriptor is None:
             return False
@@ -151,7 +151,7 @@ class OpenedFile:
     def _check_mark(self) -> None:
         if self._connection is None or self.stamp is not None:
             return
-        # in halves, which are not compared with the page's checksum: another may be writing it
+        # read in halves, without the checksum: another process may be writing the page
         half, at = PAGE_BYTES // 2, sqlite_log.LINEAGE_AT
         first, second = (self._connection.read("main", 0, at + n * half, half)[1] for n in (0, 1))
         if (mark := sqlite_log.mark_in(first + second)) != self._mark:

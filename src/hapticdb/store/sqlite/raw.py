@@ -1,8 +1,9 @@
 """The bytes of a database file, read beside SQLite.
 
-Never by `open`: a process that closes any descriptor of a file loses all POSIX locks that it holds
-on that file, also those of its open connections (https://sqlite.org/howtocorrupt.html, section
-2.2). SQLite's own file object, used here, closes its descriptor when these locks are released.
+This module never uses `open`: a process that closes any descriptor of a file loses all POSIX locks
+that it holds on that file, also those of its open connections
+(https://sqlite.org/howtocorrupt.html, section 2.2). SQLite's own file object, used here, closes its
+descriptor when these locks are released.
 """
 
 import contextlib
@@ -40,13 +41,13 @@ def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
 
 
 def read_bytes(path: Path, amount: int, offset: int = 0) -> bytes:
-    """Bytes of a database file, fewer where it ends before."""
+    """Bytes of a database file; fewer if the file ends before."""
     with opened_bytes(path) as file:
         return read_from(file, amount, offset)
 
 
 def read_from(file: apsw.VFSFile, amount: int, offset: int = 0) -> bytes:
-    """Bytes of an opened file, fewer where it ends before."""
+    """Bytes of an opened file; fewer if the file ends before."""
     try:
         there = max(min(amount, file.xFileSize() - offset), 0)
         return file.xRead(there, offset) if there else b""
@@ -65,9 +66,9 @@ def descriptor_of(identity: tuple[int, int]) -> int | None:
 
 
 def forget_pages(path: Path) -> None:
-    """Ask the operating system to drop what it caches of an open database.
+    """Ask the operating system to drop the cached pages of an open database.
 
-    What is not yet on disk stays. Does nothing when this process does not have the file open.
+    Pages that are not yet on disk stay. Does nothing when this process does not have the file open.
     """
     status = path.stat()
     descriptor = descriptor_of((status.st_dev, status.st_ino))

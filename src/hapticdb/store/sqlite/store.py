@@ -21,8 +21,8 @@ from hapticdb.store.sqlite.watching import SQLiteWatch
 class SQLiteStore:
     """An environment in one SQLite file. Open with `open`, make with `create`.
 
-    Each job is a class of its own: reading, writing, statistics, watching. Their methods are the
-    store's.
+    Reading, writing, statistics and watching are classes of their own. The store takes over their
+    methods.
     """
 
     def __init__(self, connection: FileConnection) -> None:
@@ -80,7 +80,7 @@ class SQLiteStore:
         return self._connection.is_closed
 
     def close(self) -> None:
-        """Close the connection; the last one folds the write-ahead log into its file, no other."""
+        """Close the connection. Only the last one folds the write-ahead log into its file."""
         self._connection.close()
 
     def give_to(self, thread: int) -> None:
@@ -88,23 +88,23 @@ class SQLiteStore:
         self._connection.give_to(thread)
 
     def discard(self) -> None:
-        """Close and delete an environment that nothing went into."""
-        self._connection.file.look()  # another's file is not to be deleted
+        """Close and delete an environment to which nothing was written."""
+        self._connection.file.look()  # another environment's file must not be deleted
         self.close()
         sqlite_file.remove_file(self.path)
 
     def loading(self) -> contextlib.AbstractContextManager[None]:
-        """Nothing is put off here: rows go into the tree in which they stay."""
+        """Postpones nothing: rows go at once into the tree where they stay."""
         return contextlib.nullcontext()
 
     def checker(self) -> SQLiteChecker:
-        """What `hapticdb check` asks beside the rest."""
+        """Answers of this engine for `hapticdb check`."""
         return SQLiteChecker(self.path, self.layout, self._connection.fetch, self._unpacked)
 
     # -- caches ------------------------------------------------------------------------------
 
     def limit_cache(self, size_bytes: int) -> None:
-        """Pages that the connection may keep in memory, from now on."""
+        """Limit the bytes of pages that the connection keeps in memory, from now on."""
         self._connection.fetch(f"PRAGMA cache_size = -{max(int(size_bytes) // 1024, 1)}")
 
     def drop_caches(self) -> None:

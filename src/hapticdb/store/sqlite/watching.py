@@ -4,7 +4,7 @@ from hapticdb.store.sqlite.connection import FileConnection
 
 
 class SQLiteWatch:
-    """What one connection has noticed of the commits of others."""
+    """Commits of others that one connection has noticed."""
 
     def __init__(self, connection: FileConnection) -> None:
         self._connection = connection
@@ -17,9 +17,9 @@ class SQLiteWatch:
     def has_changed(self) -> bool:
         """Whether another connection has committed since `watch` or the last call.
 
-        By the pragma, which looks at the file's log: the binding's own `data_version` says what the
-        last read has seen. Of an immutable opening by its stamp, and then for good. Raises
-        ConnectionLostError when the path leads to another file than the one that was opened.
+        The pragma looks at the file's log; apsw's own `data_version` only says what the last read
+        has seen. A file that was opened as immutable is judged by its stamp, and once changed, it
+        stays so. Raises ConnectionLostError when the path leads to another file than the opened one.
         """
         self._connection.check_outside()
         if self._connection.file.stamp is not None:

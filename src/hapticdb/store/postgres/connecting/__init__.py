@@ -1,1 +1,1 @@
-"""A connection to a server: made, waited for, made again after a loss; its errors by name."""
+"""A connection to a server: how it is made, waits, comes back after a loss, and reports errors."""

@@ -1,4 +1,4 @@
-"""A connection to one environment's schema: statements, transactions, a way back after a loss."""
+"""A connection to one environment's schema: statements, transactions, reconnecting."""
 
 import contextlib
 import time
@@ -18,13 +18,14 @@ from hapticdb.store.postgres.connecting.wire import Parameter
 Result = TypeVar("Result")
 
 RECONNECT_SECONDS = 15.0
-"""How long a lost server is tried again. Longer survives a slower restart; a read waits as long."""
+"""Seconds of tries to reach a lost server. A larger value survives a slower restart, but a read
+waits longer for its error."""
 FIRST_PAUSE_SECONDS = 0.05
-"""Between the first two tries to connect again; each next pause is twice as long."""
+"""Pause between the first two tries to connect again; each next pause is twice as long."""
 MOST_PAUSE_SECONDS = 0.5
-"""Between two tries at most. Longer asks a struggling server less often."""
+"""Longest pause between two tries. A larger value asks a struggling server less often."""
 WRITE_TRIES = 3
-"""Times that a write is begun when the server goes away during it."""
+"""Tries of a write whose server goes away. A larger value survives more losses in a row."""
 
 
 class ServerConnection:
@@ -50,7 +51,7 @@ class ServerConnection:
 
     @property
     def driver(self) -> psycopg.Connection[tuple[Any, ...]]:
-        """Psycopg's connection of this moment: another one after a loss."""
+        """Psycopg's present connection; after a loss it is a new one."""
         return self._link.driver
 
     @property
@@ -63,7 +64,7 @@ class ServerConnection:
         self._link.connect()
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         self._is_closed = True
         self._link.close()
 
@@ -93,7 +94,7 @@ class ServerConnection:
         self._thread = thread
 
     def check_thread(self) -> None:
-        """Refuse a call from another thread than the one that this belongs to."""
+        """Refuse a call from any thread but the connection's owner."""
         check_thread(self._thread, self.shown)
 
     def check_outside(self) -> None:
@@ -146,7 +147,7 @@ class ServerConnection:
         self._link.command(text)
 
     def hear(self) -> None:
-        """Hand what has come between statements to psycopg's notify handlers; never waits."""
+        """Pass notifications that have arrived to psycopg's notify handlers; never waits."""
         self._link.hear()
 
     # -- transactions ------------------------------------------------------------------------
@@ -190,7 +191,7 @@ class ServerConnection:
         )
 
     def _finds(self, is_committed: Callable[[], bool]) -> bool:
-        """Whether a commit that was sent but not answered was done. Never guesses."""
+        """Whether a commit that was sent but not confirmed was done. Never guesses."""
         try:
             self._reconnect()
             return is_committed()
@@ -201,7 +202,7 @@ class ServerConnection:
             ) from error
 
     def _write_once(self, work: Callable[[], Result]) -> tuple[Result, bool]:
-        """Result of `work`, and whether the commit was answered."""
+        """Result of `work`, and whether the server confirmed the commit."""
         if self._is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
         if self._link.is_lost:
@@ -211,7 +212,7 @@ class ServerConnection:
             self._depth += 1
             try:
                 self.command("SET LOCAL statement_timeout = 0")
-                if self.is_loading:  # another loader may be making its index
+                if self.is_loading:  # another loader may be making the index
                     self.command("SET LOCAL lock_timeout = 0")
                 result = work()
             except BaseException:
@@ -242,7 +243,7 @@ class ServerConnection:
 
     @contextlib.contextmanager
     def without_limit(self, *limits: str) -> Iterator[None]:
-        """Lift time limits inside; `statement_timeout` unless others are named."""
+        """Lift the named time limits inside; `statement_timeout` if none is named."""
         names = limits or ("statement_timeout",)
         with failures.named_errors(self.shown), self._link.unhurried():
             # the connection may have been lost since it was last used

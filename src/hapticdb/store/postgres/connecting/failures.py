@@ -49,7 +49,7 @@ def named(error: psycopg.Error, shown: str) -> HapticDBError:
             "'hapticdb grant URL ROLE --as editor'"
         )
     if isinstance(error, (errors.UndefinedTable, errors.UndefinedColumn, errors.UndefinedFunction)):
-        return DamagedError(  # the server hides a schema without rights as if it did not exist
+        return DamagedError(  # to a user without rights, a schema looks as if it did not exist
             f"{shown} is damaged ({cause}), or this user may no longer use it: ask its owner, "
             "restore a copy, or import the files again"
         )
@@ -68,7 +68,7 @@ def named(error: psycopg.Error, shown: str) -> HapticDBError:
 
 
 def is_lost(error: BaseException) -> bool:
-    """Whether the connection failed, and not the statement."""
+    """Whether the error is of the connection and not of the statement."""
     return isinstance(
         error,
         (
@@ -85,10 +85,10 @@ def is_lost(error: BaseException) -> bool:
 def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
     """Error for a connection that could not be made.
 
-    libpq gives no code here, only text. The usual causes are told apart by their words.
+    libpq gives no code here, only text. The text tells the usual causes apart.
     """
     cause = _line(error)
-    if cause.startswith("connection is bad: invalid"):  # a parameter that libpq does not take
+    if cause.startswith("connection is bad: invalid"):  # a parameter that libpq does not know
         return unusable(error, shown)
     if re.search(r'database ".*" does not exist', cause):
         return EnvironmentNotFoundError(f"{shown}: {cause}; make it first with 'createdb'")

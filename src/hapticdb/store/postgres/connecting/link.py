@@ -1,8 +1,8 @@
 """The link to a server: psycopg's connection with our settings, waited for with a limit.
 
-The hot path goes to libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
-statement. It waits by polling the socket. So Ctrl-C is heard, and a server that has stopped
-answering ends in an error instead of a hang.
+The hot path uses libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
+statement. It waits by polling the socket. So Ctrl-C interrupts the wait, and a server that stops
+answering causes an error instead of a hang.
 """
 
 import contextlib
@@ -42,13 +42,13 @@ SETTINGS = {
     "client_min_messages": "warning",
 }
 CONNECT_SECONDS = 10
-"""How long a server may take to accept a connection, unless the URL says otherwise."""
+"""Seconds that a server may take to accept a connection, unless the URL says otherwise."""
 GRACE_MS = 3000
 """Milliseconds that the network and a busy server may add to the server's own time limit."""
 
 
 class _Connection(psycopg.Connection[tuple[Any, ...]]):
-    """psycopg's connection, which waits only as long as its link does; else it waits for ever."""
+    """psycopg's connection with the time limit of its link; psycopg alone would wait for ever."""
 
     link: "Link"
 
@@ -62,7 +62,7 @@ class _Connection(psycopg.Connection[tuple[Any, ...]]):
 
 
 class Link:
-    """One psycopg connection at a time, made again by `connect`.
+    """Holds one psycopg connection at a time; `connect` makes a new one.
 
     driver : psycopg's connection, autocommit, for statements that no frame waits on.
     """
@@ -134,7 +134,7 @@ class Link:
         return self._pgconn.server_version
 
     def close(self) -> None:
-        """Give the connection back."""
+        """Close the connection."""
         self.driver.close()
 
     @property
@@ -170,8 +170,8 @@ class Link:
     def hear(self) -> None:
         """Give notifications that have arrived to the notify handlers. Never waits.
 
-        Those that arrive during a statement stay in libpq until the next call, or psycopg has given
-        them to the handlers already.
+        Notifications that arrive during a statement stay in libpq until the next call, unless
+        psycopg has already given them to the handlers.
         """
         self._pgconn.consume_input()
         while (notify := self._pgconn.notifies()) and self._pgconn.notify_handler:
@@ -194,14 +194,14 @@ class Link:
             self._leisure -= 1
 
     def _result(self) -> pq.abc.PGresult:
-        """Result of what was sent. Closes the connection when no result comes."""
+        """Result of the statement that was sent. Closes the connection when no result comes."""
         try:
             return self._receive()
         except psycopg.Error as error:
             if failures.is_lost(error):
                 self.driver.close()
             raise
-        except BaseException:  # Ctrl-C or a timeout: a late result would be taken for the next one
+        except BaseException:  # Ctrl-C or a timeout: the next statement would get a late result
             self.driver.close()
             raise
 

@@ -1,6 +1,6 @@
 """Arrays in PostgreSQL's binary format, packed and read by NumPy without a Python loop.
 
-Statements take and return them, and COPY loads them.
+Statements take and return such arrays, and COPY loads them.
 
 An array is a header (dimensions, flags, element type, length, lower bound), then for each element
 its length and its value, all big-endian (PostgreSQL: array_send in arrayfuncs.c;
@@ -36,7 +36,7 @@ _BRICK = np.dtype([*_FIELDS, ("bits_length", ">i4"), ("bits", f"V{BRICK_BYTES}")
 
 
 class Parameter(NamedTuple):
-    """A value on its way into a statement: the type's OID and its binary form."""
+    """A parameter of a statement: the OID of its type, and its binary form."""
 
     oid: int
     value: bytes
@@ -107,7 +107,7 @@ def read_float8s(value: bytes) -> NDArray[np.float64]:
 
 
 def copy_rows(rows: Rows, object_id: int) -> bytes:
-    """Rows of an object as COPY takes them, header and trailer apart."""
+    """Rows of an object in the form of COPY, without header and trailer."""
     count = len(rows)
     has_bits = rows.occupancy.size > 0
     packed = np.empty(count, _BRICK if has_bits else _VOXEL)

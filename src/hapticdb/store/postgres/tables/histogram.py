@@ -8,11 +8,11 @@ from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 SERVER_RESOLUTION = 10_000
-"""The largest statistics target, at which both index tables are analysed, and the paper's best."""
+"""Buckets of the server's histogram: the most that it keeps, and the paper's best resolution."""
 ENOUGH_ROWS = 10 * SERVER_RESOLUTION
-"""Rows from which the server's statistics are used. Below, an exact histogram takes little time."""
+"""Rows from which the server's statistics are used. With fewer, an exact histogram is quick."""
 
-# one row, of NULLs before the first ANALYZE
+# returns one row, which holds NULLs before the first ANALYZE
 STATISTICS = """
 SELECT histogram_bounds::text::bigint[], most_common_vals::text::bigint[],
        most_common_freqs::float8[],
@@ -20,7 +20,7 @@ SELECT histogram_bounds::text::bigint[], most_common_vals::text::bigint[],
          WHERE oid = to_regclass(quote_ident(schemaname) || '.' || quote_ident(tablename)))
   FROM (SELECT) AS one LEFT JOIN pg_stats
     ON schemaname = $1::text::name AND tablename = $2::text::name AND attname = 'z_val'"""
-# the fraction of the middle of each rank: the fraction of the rank itself rounds to its neighbour
+# (r - 0.5) / N, because r / N may be rounded to the neighbour of rank r
 EXACT = {
     layout: f"""
 SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
@@ -53,7 +53,7 @@ def server_histogram(connection: ServerConnection, layout: Layout) -> tuple[Keys
 def with_common_values(
     bounds: Keys, common: Keys, shares: NDArray[np.float64], resolution: int
 ) -> Keys:
-    """Equi-count bounds (R + 1,) of all rows, from a histogram that leaves the most common out.
+    """Equi-count bounds (R + 1,) of all rows, from a histogram without the most common keys.
 
     Parameters
     ----------
@@ -66,8 +66,8 @@ def with_common_values(
 
     Notes
     -----
-    The share of rows with a key <= x grows along each bucket of the histogram, in proportion, and
-    jumps at each common key; the bounds of the result are where it reaches i / R.
+    The share of rows with a key <= x grows linearly within each bucket of the histogram, and jumps
+    at each common key. Bound i of the result is where this share reaches i / R.
     """
     order = np.argsort(common)
     common, shares = common[order], shares[order]
@@ -79,7 +79,7 @@ def with_common_values(
         return np.zeros(resolution + 1, dtype=np.int64)
     smooth = np.zeros(len(places))
     if len(bounds):
-        # of several equal bounds the last is right: all of their buckets lie at or below that key
+        # of equal bounds the last one counts: all of their buckets end at or below that key
         last = np.append(bounds[1:] != bounds[:-1], True)
         known = np.flatnonzero(last)
         smooth = rest * np.interp(

@@ -2,8 +2,8 @@
 
 Measured on 15 million voxel rows: COPY and then the index take 21 s. COPY into an index takes 57 s,
 and that index is half as large again. A loader that was killed leaves no index; the next user who
-opens the environment to write makes it. Every commit waits for the disk, a millisecond each: what
-was reported as written is there after a crash, and an import may go on from it.
+opens the environment to write makes it. Every commit waits for the disk, a millisecond each. So
+an object that was reported as written is there after a crash, and an import can go on after it.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
 
 class Loading:
-    """The context in which a connection loads. May be nested."""
+    """The context in which a connection writes many objects. May be nested."""
 
     def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
@@ -68,7 +68,7 @@ class Loading:
         if self._depth or isinstance(error, ConnectionLostError):
             return  # the next one who opens the environment to write makes the index
         connection = self._connection
-        if connection.driver.closed:  # by Ctrl-C in the middle of a statement
+        if connection.driver.closed:  # Ctrl-C came in the middle of a statement
             try:
                 connection.connect()
             except ConnectionLostError:
@@ -115,7 +115,7 @@ class Loading:
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[bool]:
-        """Whether nobody else loads. Nobody can begin to load inside."""
+        """Whether nobody else is loading. Inside, nobody can begin to load."""
         found = self._connection.rows(f"SELECT pg_try_advisory_lock({KEY})", (LOADERS,))
         try:
             yield bool(found[0][0])
@@ -124,7 +124,7 @@ class Loading:
                 self._unlock("", LOADERS)
 
     def _unlock(self, kind: str, lock: int) -> None:
-        """Give a lock back, unless it went with a lost connection."""
+        """Release a lock, unless it was lost with the connection."""
         if not self._connection.driver.closed:
             with contextlib.suppress(psycopg.Error):  # the environment itself may be gone
                 self._connection.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
@@ -139,7 +139,7 @@ class Loading:
         return bool(self._connection.rows(IS_EMPTY[self._layout])[0][0])
 
     def _drop_index(self) -> None:
-        """Drop the index, unless somebody is reading: then it stays, and nobody waits."""
+        """Drop the index. If somebody is reading, the index stays, and nobody waits."""
         connection = self._connection
         with contextlib.suppress(psycopg.errors.LockNotAvailable):
             connection.command("BEGIN")

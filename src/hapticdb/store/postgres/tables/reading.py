@@ -24,7 +24,7 @@ from hapticdb.store.postgres.tables import records, statements
 
 
 class PostgresReader:
-    """What is read of one environment. It remembers the revision that the last read has seen."""
+    """Reads of one environment. The reader remembers the revision that its last read has seen."""
 
     def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
@@ -145,7 +145,7 @@ class PostgresReader:
     def removed(self, link: str) -> set[str]:
         """Names of a file's parts that were removed and are not there again."""
         if self._connection.rows("SELECT to_regprocedure('removed_parts(text)')") == [(None,)]:
-            return set()  # format 2 or older: only its owner can bring it up to date
+            return set()  # the format is 2 or older, and only the owner can bring it up to date
         return {row[0] for row in self._connection.rows("SELECT removed_parts(%s)", (link,))}
 
     def changes(self, since: int = 0) -> Iterator[Change]:

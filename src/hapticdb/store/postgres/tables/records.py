@@ -1,4 +1,4 @@
-"""Objects as rows of the table `object`; `believed` reads them back."""
+"""Objects written as rows of the table `object`; `believed` reads them back."""
 
 from typing import Any
 

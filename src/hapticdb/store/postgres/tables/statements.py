@@ -78,7 +78,7 @@ SELECT count(*)
     for layout in LAYOUTS
 }
 
-# The paper's Figure 3. Only hits fetch their point, by its ordinal: to unnest all seven arrays of
+# The paper's Figure 3. Only hits fetch their point, by its ordinal: unnesting all seven arrays of
 # the shell takes half as long again.
 WRENCH: dict[Layout, str] = {
     "voxel": """
@@ -110,6 +110,6 @@ KEY_TEST: dict[Layout, str] = {"voxel": "z_val = shell.key", "brick": "z_val = s
 
 
 def without_excluded(sql: str, layout: Layout, number: int) -> str:
-    """Leave objects out of a statement: their ids are its parameter of that number."""
+    """Exclude objects from a statement; their ids are its parameter of that number."""
     test = KEY_TEST[layout]
     return sql.replace(test, f"{test} AND id <> ALL (${number})")

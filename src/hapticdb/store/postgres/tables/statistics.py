@@ -19,7 +19,7 @@ from hapticdb.store.postgres.tables.reading import PostgresReader
 
 
 class PostgresStatistics:
-    """What is known about one environment's tables, and kept beside them."""
+    """Sizes and statistics of one environment's tables, and the figures kept beside them."""
 
     def __init__(
         self, connection: ServerConnection, layout: Layout, reader: PostgresReader
@@ -67,7 +67,7 @@ class PostgresStatistics:
         return Histogram(*exact_histogram(self._connection, self._layout, resolution), "computed")
 
     def freshness(self, resolution: int) -> Freshness:
-        """How old the histogram of that resolution is, by its own revision."""
+        """How old the histogram of that resolution is, by the revision stored with it."""
         ((revision, made, changed, unseen),) = self._connection.rows(
             "SELECT e.revision, q.revision,"
             "       (SELECT coalesce(sum(voxels), 0) FROM object WHERE object.revision > "
@@ -80,7 +80,7 @@ class PostgresStatistics:
         since = 0 if made is None else int(made)
         rows = int(changed if made is None or unseen is None else unseen)
         changes = int(revision) - since
-        # the server counts a moment late: what it adds after its own ANALYZE was there before
+        # the server counts with a delay: rows counted after its ANALYZE were written before it
         return Freshness(None if made is None else since, changes, rows if changes else 0)
 
     def analyze(self, resolution: int, *, anew: bool = False) -> None:

@@ -28,16 +28,16 @@ from hapticdb.store.postgres.watching import channel_of
 Result = TypeVar("Result")
 
 COPY_CHUNK = 1 << 17
-"""Rows that are packed for COPY at a time. More takes more memory and no less time."""
-# not from a sequence, which also counts rolled-back writes: an import that is run again would end
-# with other ids
+"""Rows that are packed for COPY at a time. A larger value takes more memory, not less time."""
+# not from a sequence, which also counts rolled-back writes: an import that is run again would
+# give other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
-# the write lock: revisions follow one another, and no reader waits for it
+# the write lock: writers take revisions one after the other, and no reader waits for it
 NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
 
 
 class PostgresWriter:
-    """What is written to one environment."""
+    """Writes to one environment."""
 
     def __init__(
         self,
@@ -97,7 +97,7 @@ class PostgresWriter:
         self._commit(work)
 
     def _next_revision(self) -> int:
-        """Take the write lock, and the number of the revision to come."""
+        """Take the write lock; returns the number of the new revision."""
         return int(self._execute(NEXT_REVISION)[0][0])
 
     def _new_id(self, revision: int) -> int:
@@ -130,7 +130,7 @@ class PostgresWriter:
             copy.write(wire.COPY_TRAILER)
 
     def _delete(self, known: Object, covering: Covering) -> Keys:
-        """Delete the rows of an object as it stands now; returns their keys."""
+        """Delete the rows of an object as it is now; returns their keys."""
         ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
         (found,) = self._connection.fetch(
             statements.DELETE_ROWS[self._layout],
@@ -151,7 +151,7 @@ class PostgresWriter:
         self._written = (revision, action, object_id, transaction)
 
     def _is_written(self) -> bool:
-        """Whether the write was committed whose commit was under way when the connection broke."""
+        """Whether a write was committed although the connection broke during its commit."""
         # the commit may still be under way: wait for its lock before looking
         self._connection.rows("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")
         found = "SELECT 1 FROM change WHERE (revision, action, id, xmin::text) = (%s, %s, %s, %s)"

@@ -73,8 +73,8 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
 class _Force:
     """The user-defined aggregate ``force(shell, ordinal, key)``.
 
-    A step only collects; the wrench is summed at the end, in the order of the ordinals. (An ORDER
-    BY inside the call would say the same in SQL, but SQLite drops a bound pointer when it sorts.)
+    A step only collects a hit. The wrench is summed at the end, in the order of the ordinals. (An
+    ORDER BY inside the call would do the same, but SQLite drops a bound pointer when it sorts.)
     """
 
     def __init__(self, grid: Grid, layout: Layout) -> None:

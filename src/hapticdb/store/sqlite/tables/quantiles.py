@@ -1,7 +1,7 @@
 """Exact quantiles of the index by one scan inside SQLite.
 
-The paper takes them from the engine's statistics; SQLite's own (``sqlite_stat4``) hold 24 samples,
-too few, so they are computed and kept.
+The paper takes quantiles from the engine's statistics. SQLite's own (``sqlite_stat4``) hold only 24
+samples, so hapticdb computes the quantiles and keeps them.
 """
 
 from typing import cast
@@ -17,9 +17,9 @@ def exact_quantiles(
 ) -> tuple[Keys, int]:
     """Bounds (v + 1,) of the v-quantile vector (the paper's Definition 2), and the rows N.
 
-    Bound i is the key of the row of rank j = ceil(i N / v), i = 1 .. v; bound 0 the lowest key.
-    Each step skips to the next rank from the row before it, inside the engine, by (z_val, id): rows
-    of one key count one by one.
+    Bound i is the key of the row of rank j = ceil(i N / v), i = 1 .. v; bound 0 is the lowest key.
+    Each step skips, inside the engine, from the row of one rank to the row of the next, in the
+    order of (z_val, id). Rows with the same key count one by one.
     """
 
     def ask(sql: str, *bindings: int) -> list[tuple[int, ...]]:

@@ -1,7 +1,7 @@
 """How ranges of keys reach SQLite: one prepared statement for any number of ranges.
 
-If one integer has room for the lower end and the width of a range, it carries both. That is so in
-every frame on a grid of 11 bits. Otherwise the lower ends are bound, and the SQL function `nth`
+If one integer has room for the lower end and the width of a range, it carries both. This is so
+in every frame on a grid of 11 bits. Otherwise the lower ends are bound, and the SQL function `nth`
 returns the upper ends (docs/decisions/0004).
 """
 
@@ -13,7 +13,7 @@ import numpy as np
 from hapticdb.store.base import Keys, Layout, row_shift
 
 KEY_BITS = 63
-"""Bits of an int64 that is not negative."""
+"""Value bits of a non-negative int64."""
 
 NARROW: dict[Layout, str] = {
     "voxel": """

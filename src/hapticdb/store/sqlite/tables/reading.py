@@ -2,8 +2,8 @@
 
 Three traps of the binding, each covered by a test: an ``np.int64`` binds as an eight-byte blob, a
 bare array to ``carray(?)`` binds as nothing (both in silence), and an empty array cannot be bound.
-So keys cross as ``apsw.carray`` of contiguous int64 arrays that are not empty, and single numbers
-as Python's own.
+So keys are passed as ``apsw.carray`` of contiguous, non-empty int64 arrays, and single numbers as
+Python's own.
 """
 
 from collections.abc import Iterator
@@ -52,7 +52,7 @@ def read_environment(connection: FileConnection) -> tuple[Grid, Layout]:
 
 
 class SQLiteReader:
-    """What is read of one environment."""
+    """Reads of one environment."""
 
     def __init__(self, connection: FileConnection, grid: Grid, layout: Layout) -> None:
         self._connection = connection

@@ -1,4 +1,4 @@
-"""Rows and objects as the binding hands them over, and as it takes them."""
+"""Rows and objects converted from and to the values that apsw returns and takes."""
 
 from typing import Any
 

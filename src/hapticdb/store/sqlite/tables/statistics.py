@@ -13,7 +13,7 @@ from hapticdb.store.sqlite.tables.reading import SQLiteReader
 
 
 class SQLiteStatistics:
-    """What is known about one environment's tables, and kept beside them."""
+    """Sizes and statistics of one environment's tables, and the figures kept beside them."""
 
     def __init__(self, connection: FileConnection, layout: Layout, reader: SQLiteReader) -> None:
         self._connection = connection
@@ -44,7 +44,7 @@ class SQLiteStatistics:
             return Histogram(bounds, n_rows, "computed")
 
     def freshness(self, resolution: int) -> Freshness:
-        """How old the kept histogram of that resolution is; rows are those of later writes' ids."""
+        """How old the kept histogram is; its rows are the voxels of objects written since."""
         with self._connection.snapshot():
             revision = self._reader.revision()
             kept = self._connection.fetch(

@@ -19,7 +19,7 @@ from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
 
-# whole arrays cross at once: 8 times faster than executemany, and without the interpreter lock
+# whole arrays are bound at once: 8 times faster than executemany, without the interpreter lock
 INSERT = {
     "voxel": "INSERT INTO voxel SELECT value, ?2 FROM carray(?1)",
     "brick": f"""INSERT INTO brick SELECT value, ?2,
@@ -27,7 +27,7 @@ INSERT = {
                    FROM carray(?1)""",
 }
 CHUNK = 1 << 22
-"""Rows that one statement inserts. Each takes up to 80 bytes of memory meanwhile."""
+"""Rows that one statement inserts. A larger value takes more memory, up to 80 bytes a row."""
 INSERT_OBJECT = """
 INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
 SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN ?9 END,
@@ -35,7 +35,7 @@ SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN
 
 
 class SQLiteWriter:
-    """What is written to one environment."""
+    """Writes to one environment."""
 
     def __init__(
         self, connection: FileConnection, grid: Grid, layout: Layout, reader: SQLiteReader
@@ -100,7 +100,7 @@ class SQLiteWriter:
                 self._connection.execute(INSERT["brick"], (keys, object_id, part.tobytes()))
 
     def _delete(self, object_id: int, covering: Covering) -> Keys:
-        """Delete the rows of an object as it stands now; returns their keys."""
+        """Delete the rows of an object as it is now; returns their keys."""
         known = self._reader.object(object_id)
         sql = f"DELETE FROM {self._layout} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
         gone: list[int] = []

@@ -1,4 +1,4 @@
-"""Whether an environment is sound: pages, rows, objects, the log of changes."""
+"""Checks whether an environment is sound: pages, rows, objects, the log of changes."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -25,15 +25,15 @@ from hapticdb.store.believed import RowsChecksum
 from hapticdb.store.connect import findings_before_opening, open_store
 
 ROWS_AT_ONCE = 1 << 17
-"""Rows that are read at a time. More takes more memory and hardly less time."""
+"""Rows that are read at a time. A larger value takes more memory and hardly less time."""
 MOST_FINDINGS = 1000
-"""Findings that a report keeps; it counts all of them."""
+"""Most findings that a report keeps. The report counts all findings."""
 BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
 """Number of set bits of each byte."""
 
 
 class CheckProgress(NamedTuple):
-    """How far a check is: rows read of those there are."""
+    """Progress of a check: rows read, and all rows."""
 
     done: int
     total: int
@@ -44,18 +44,18 @@ CheckCallback = Callable[[CheckProgress], None]
 
 @dataclass
 class CheckReport:
-    """What a check found.
+    """Result of a check.
 
     Attributes
     ----------
     url : str
         The environment, as messages name it.
     findings : list of str
-        What is wrong, a line each, the first `MOST_FINDINGS` of them.
+        One line for each fault, at most the first `MOST_FINDINGS`.
     n_findings : int
-        All of them.
+        Number of all faults.
     objects, voxels, rows : int
-        What was read.
+        Numbers of objects, voxels and rows that were read.
     has_page_checksums : bool
         Whether the engine's pages carry checksums that are compared when they are read.
     without_row_checksums : int
@@ -73,11 +73,11 @@ class CheckReport:
 
     @property
     def is_sound(self) -> bool:
-        """Whether nothing was found."""
+        """Whether the check found no fault."""
         return self.n_findings == 0
 
     def add(self, finding: str) -> None:
-        """Add a finding, unless it is there already."""
+        """Add a finding, unless the report has it already."""
         if finding in self.findings:
             return
         self.n_findings += 1
@@ -90,11 +90,11 @@ def check_environment(
 ) -> CheckReport:
     """Read all of an environment and say what is wrong with it.
 
-    All pages that carry checksums are compared (SQLite), the engine's own check is run; every row
-    must belong to an object, lie in order, in the grid and within its object's bounds, and its
-    bricks hold a voxel and none outside the grid; every object must have its count of voxels, and
-    its rows the checksum that was written with them; the log of changes must be without gaps and
-    agree with the objects. Rows are read in batches: memory does not grow with them.
+    The check compares the checksums of all pages (SQLite) and runs the engine's own check. Every
+    row must belong to an object, be in order, and lie in the grid and in its object's bounds. A
+    brick must hold a voxel, and none outside the grid. Every object must have its number of voxels, and
+    its rows the checksum that was written with them. The log of changes must have no gaps and agree
+    with the objects. Rows are read in batches, so memory does not grow with their number.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ def check_environment(
     Raises
     ------
     DatabaseError
-        When it cannot be read for another reason than damage.
+        When the environment cannot be read for another reason than damage.
     """
     report = CheckReport(os.fspath(url))
     for finding in findings_before_opening(url):
@@ -254,7 +254,7 @@ class _Places:
         self._boxes = np.array(boxes, dtype=np.int64).reshape(-1, 2, 3)
 
     def findings(self, rows: Rows) -> Iterator[str]:
-        """What is wrong with the places of a batch: the first row of each kind of fault."""
+        """Faults in the places of a batch: the first row of each kind of fault."""
         outside = (rows.keys < 0) | (rows.keys >= self._key_end)
         if outside.any():
             yield f"key {int(rows.keys[outside][0])} lies outside the grid"
@@ -300,7 +300,7 @@ def _voxel_box(grid: Grid, obj: Object) -> NDArray[np.int64]:
 
 
 def _cause(error: DamagedError) -> str:
-    """What is between the brackets of a message: the place is the report's."""
+    """Text between the brackets of a message; the report names the place itself."""
     text = str(error)
     start, end = text.find("is damaged ("), text.rfind("): ")
     return text[start + len("is damaged (") : end] if 0 <= start < end else text

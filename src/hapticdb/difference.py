@@ -1,4 +1,4 @@
-"""Two environments compared: grids, objects, and every voxel, whatever the layouts and curves."""
+"""Compares two environments: grids, objects, and every voxel, whatever their layouts and curves."""
 
 from collections.abc import Iterator, Sequence
 from contextlib import closing
@@ -32,7 +32,7 @@ BRICK_EDGE = 1 << BRICK_BITS
 
 
 class VoxelDifference(NamedTuple):
-    """One part in both environments: voxels that only one of them has, and those of both."""
+    """One part in both environments: voxels that only one has, and voxels that both have."""
 
     a: Object
     b: Object
@@ -42,15 +42,16 @@ class VoxelDifference(NamedTuple):
 
     @property
     def share(self) -> float:
-        """Share of all voxels of either that both have, 0 .. 1; 1 without any."""
+        """Share of the voxels of either that both have, 0 .. 1; 1 if neither has a voxel."""
         total = self.only_in_a + self.only_in_b + self.shared
         return self.shared / total if total else 1.0
 
 
 class Totals(NamedTuple):
-    """Voxels of all objects that only a has, only b, and both; of two objects in one, both count.
+    """Voxels that only a has, that only b has, and that both have, summed over all objects.
 
-    n_changed : objects that only one has, or that both have otherwise.
+    A voxel with two objects counts twice. n_changed : objects that only one environment has, or
+    that differ between them.
     """
 
     only_in_a: int
@@ -65,7 +66,7 @@ def moved_by(a: Object, b: Object) -> NDArray[np.float64]:
 
 
 def farthest_corner(a: Object, b: Object) -> float:
-    """Metres by which a corner of the bounding box has moved at most: more, where it has turned."""
+    """Longest way of a bounding box's corner, metres; longer than `moved_by` after a turn."""
     return float(np.linalg.norm(np.abs(b.bounds - a.bounds).max(axis=0)))
 
 
@@ -78,7 +79,7 @@ class Difference:
     a, b : str
         The environments, as messages name them.
     grids : tuple of two Grid
-        Theirs; voxels are compared only where `is_same_grid`.
+        Their grids; voxels are compared only if `is_same_grid`.
     only_in_a, only_in_b : tuple of Object
         Parts that the other environment lacks.
     changed : tuple of pairs of Object
@@ -88,15 +89,15 @@ class Difference:
     voxels : tuple of VoxelDifference
         The same geometry in the same place, but with other voxels.
     elsewhere : tuple of VoxelDifference
-        The voxels of those that are changed or moved; empty where the grids are not the same.
+        The voxels of the changed and moved parts; empty if the grids are not the same.
     renumbered, described : tuple of pairs of Object
         The same part with another id, or with other attributes or another bounding box. These
         differences change no wrench.
     compared, n_voxels : int
-        Objects of the same geometry at the same place, whose voxels were compared, and those
-        voxels.
+        Number of objects with the same geometry in the same place, whose voxels were compared,
+        and number of these voxels.
     n_shared : int
-        Voxels, of all objects that were compared, which both have.
+        Number of voxels of all compared objects that both environments have.
     """
 
     a: str
@@ -121,7 +122,7 @@ class Difference:
 
     @property
     def totals(self) -> Totals | None:
-        """By how much they differ in all; None where the grids are not the same."""
+        """Sums over all objects; None if the grids are not the same."""
         if not self.is_same_grid:
             return None
         both = (*self.voxels, *self.elsewhere)
@@ -145,7 +146,7 @@ def diff_environments(
 ) -> Difference:
     """Compare two environments: their grids, their objects, and every voxel of each object.
 
-    Engines, layouts and curves make no difference. Each environment is read at one revision, and
+    Engines, layouts and curves may differ. Each environment is read at one revision, and
     voxels in batches, whatever the size of an object.
 
     Parameters
@@ -247,7 +248,7 @@ def _compare_voxels(
 def _boxes(
     stores: Sequence[Store], vectors: Sequence[QuantileVector], low: Corner, high: Corner
 ) -> Iterator[tuple[Corner, Corner]]:
-    """Boxes of whole bricks that make up low .. high (3,), of few enough rows in each store."""
+    """Boxes of whole bricks that together are low .. high (3,), each of few enough rows."""
     edges = high - low + 1
     if edges.max() <= 1 << CELL_BITS or all(
         are_few_rows(box_ranges(store.grid, store.layout, low, high), quantiles)
@@ -255,7 +256,7 @@ def _boxes(
     ):
         yield low, high
         return
-    # in lexicographic order only slabs of i are ranges that hold few rows of other places
+    # in lexicographic order only slabs of i are ranges with few rows outside the box
     is_sliced = edges[0] > BRICK_EDGE and not all(store.grid.is_hierarchical for store in stores)
     axis = 0 if is_sliced else int(edges.argmax())
     middle = low[axis] + (edges[axis] // 2 & -BRICK_EDGE)

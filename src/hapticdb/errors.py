@@ -4,7 +4,7 @@
 
     HapticDBError
     ├── UsageError (ValueError)               options that contradict one another
-    │   └── GridError                         a grid that cannot be, or does not match
+    │   └── GridError                         a grid that is not possible, or does not match
     ├── FileError (ValueError)                an input file that cannot be used
     │   ├── OutsideGridError                  a part that does not fit the grid
     │   └── GeometryChangedError              an object's file is gone or has changed
@@ -24,8 +24,8 @@
         ├── BusyError (TimeoutError)          another writer held the database too long
         └── StuckError (TimeoutError)         the database took longer than a frame may
 
-Every message is one line: what, where, and what next. Where a builtin fits, the error is one of
-that kind, too.
+Every message is one line: what is wrong, where, and what to do next. If a builtin error fits, the
+class is a subclass of it, too.
 """
 
 
@@ -102,7 +102,7 @@ class AccessError(DatabaseError, PermissionError):
 
 
 class ConflictError(DatabaseError):
-    """Another has written the object since it was read."""
+    """Somebody else has written the object since it was read."""
 
 
 class ConnectionLostError(DatabaseError, ConnectionError):

@@ -14,13 +14,13 @@ from hapticdb.kernels import curves
 CurveName = Literal["z", "hilbert", "lexicographic"]
 CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
 CURVE_CODES = {"lexicographic": 0, "z": 1, "hilbert": 2}
-"""Numbers of the curves. `kernels.curves` has the same; this copy spares its import."""
+"""Numbers of the curves, as in `kernels.curves`. This copy avoids the import of that module."""
 MAX_BITS = 21
-"""Most bits an axis: three axes fit into the 63 bits of a key."""
+"""Most bits on one axis: three axes fit into the 63 bits of a key."""
 BRICK_BITS = 3
-"""Bits an axis of a voxel's place in its brick."""
+"""Bits on one axis of a voxel's place in its brick."""
 CELL_BITS = 5
-"""Bits an axis of a voxel's place in its cell."""
+"""Bits on one axis of a voxel's place in its cell."""
 ROOM = 1.6
 """Edge of a fitted grid, in longest sides of the first file's bounding box. A larger value leaves
 more room around the file, and makes voxels larger."""
@@ -28,7 +28,7 @@ more room around the file, and makes voxels larger."""
 
 @dataclass(frozen=True)
 class Grid:
-    """A cube of ``2^bits`` voxels an axis, and the order of its keys.
+    """A cube of ``2^bits`` voxels on each axis, and the order of its keys.
 
     Attributes
     ----------
@@ -37,7 +37,7 @@ class Grid:
     origin : tuple of 3 floats
         Lower corner of voxel (0, 0, 0), metres, world frame.
     bits : int
-        Bits an axis, 1 to 21.
+        Bits on each axis, 1 to 21.
     curve : {"z", "hilbert", "lexicographic"}
         Order of the keys; see `hapticdb.kernels.curves`.
 
@@ -68,7 +68,7 @@ class Grid:
 
     @property
     def side(self) -> int:
-        """Voxels an axis."""
+        """Voxels on each axis."""
         return 1 << self.bits
 
     @property
@@ -84,7 +84,7 @@ class Grid:
 
     @property
     def curve_code(self) -> int:
-        """Number of the curve, as kernels take it."""
+        """Number of the curve, for kernels."""
         return CURVE_CODES[self.curve]
 
     @property
@@ -120,7 +120,7 @@ class Grid:
         Raises
         ------
         GridError
-            When a voxel lies outside the grid, or is no integer.
+            When a voxel lies outside the grid, or is not of integers.
         """
         given = np.asarray(ijk)
         if given.dtype.kind not in "iu" and given.size:
@@ -151,7 +151,7 @@ class Grid:
         return curves.decode(values, self.bits, self.curve_code)
 
     def describe(self) -> str:
-        """One line for people: voxels an axis, voxel size, curve."""
+        """One line for people: voxels on each axis, voxel size, curve."""
         return (
             f"{self.side}^3 voxels of {self.voxel_size * 1000:.4g} mm, origin "
             f"({', '.join(f'{x:.6g}' for x in self.origin)}) m, {self.curve} order"
@@ -160,14 +160,14 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridOptions:
-    """A user's wishes for a grid. Everything that is left out is fitted to the first file.
+    """Options of a user for a grid. All others are fitted to the first file.
 
     Attributes
     ----------
     bits : int or None
-        Bits an axis; 10 unless the other options determine it.
+        Bits on each axis; 10 unless the other options determine them.
     voxel_size : float or None
-        Metres.
+        Edge of a voxel, metres.
     extent : float or None
         Edge of the grid in longest sides of the first file's bounding box.
     origin : sequence of 3 floats or None
@@ -207,7 +207,7 @@ class GridOptions:
         return Grid(size, _triple(origin), bits, self.curve or "z")
 
     def _resolve(self, longest: float) -> tuple[int, float]:
-        """Bits an axis and voxel size for a scene of that longest side."""
+        """Bits on each axis and voxel size for a scene of that longest side."""
         wanted = (self.extent or ROOM) * longest
         if self.voxel_size is None:
             bits = self.bits or 10

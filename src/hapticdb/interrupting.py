@@ -1,8 +1,8 @@
 """Ctrl-C at any moment of the command line: one line, exit code 130, no traceback.
 
 A signal may raise its exception in any line of code. Within an import it may turn into another
-error, or into a traceback that Python prints and ignores. So Ctrl-C ends the process at once until
-a verb begins, since nothing is open yet; afterwards it waits until no import is running.
+error, or into a traceback that Python prints and ignores. Until a verb begins, nothing is open, so
+Ctrl-C ends the process at once. Afterwards the interrupt waits until no import is running.
 """
 
 import os
@@ -15,14 +15,15 @@ from typing import Literal
 EXIT_CODE = 130
 MESSAGE = b"hapticdb: interrupted\n"
 AGAIN_S = 0.01
-"""Seconds until an interrupt that came within an import is raised again. Longer: a later answer."""
+"""Seconds until an interrupt that came within an import is raised again. A larger value answers
+later."""
 
 Phase = Literal["not ours", "starting", "working", "leaving"]
 _phase: Phase = "not ours"
 
 
 def begin() -> None:
-    """Handle Ctrl-C from now on, unless it has another handler already, or is ignored."""
+    """Handle Ctrl-C from now on, unless the signal has another handler already, or is ignored."""
     global _phase  # noqa: PLW0603 - a process has one Ctrl-C
     is_main = threading.current_thread() is threading.main_thread()
     if is_main and signal.getsignal(signal.SIGINT) is signal.default_int_handler:
@@ -49,7 +50,7 @@ def leave() -> None:
 
 
 def interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise KeyboardInterrupt, or end the process, as the phase asks: a signal handler."""
+    """Signal handler: raise KeyboardInterrupt or end the process, depending on the phase."""
     global _phase  # noqa: PLW0603
     if _phase == "starting":
         os.write(2, MESSAGE)
@@ -71,7 +72,7 @@ def _is_importing(frame: FrameType | None) -> bool:
 
 
 def _try_again() -> bool:
-    """Have the handler called again after `AGAIN_S`; False if the alarm is taken by another."""
+    """Have the handler called again after `AGAIN_S`; False if the alarm has another handler."""
     if signal.getsignal(signal.SIGALRM) not in {signal.SIG_DFL, interrupt}:
         return False
     signal.signal(signal.SIGALRM, interrupt)

@@ -15,7 +15,7 @@ from hapticdb.store.base import NOBODY, this_thread
 
 
 class Pool:
-    """At most so many opened environments of one database, lent to threads one at a time.
+    """A limited number of open environments of one database, lent to threads one at a time.
 
     Opening costs a connection, the statistics and the cost model. In a pool each member pays them
     once. A borrower gets the member that was given back last: its caches are the warmest.
@@ -25,16 +25,16 @@ class Pool:
     url : str or path
         As for `hapticdb.open`.
     size : int
-        Members at most. The first is opened at once, the others when they are needed.
+        Most members. The first is opened at once, the others when they are needed.
     read_only : bool
         Refuse every write.
     timeout : float
-        Seconds that a borrower waits when all members are out.
+        Seconds that a borrower waits when all members are lent.
 
     Raises
     ------
     UsageError
-        When the size or the timeout cannot be.
+        When the size or the timeout is out of range.
     DatabaseError
         When the environment cannot be opened.
 
@@ -85,7 +85,7 @@ class Pool:
         self.close()
 
     def close(self) -> None:
-        """Close all members; those that are lent, when they are given back."""
+        """Close all members; lent members are closed when they are given back."""
         with self._changed:
             self._is_closed = True
             left, self._free = self._free, []
@@ -101,12 +101,12 @@ class Pool:
         Parameters
         ----------
         timeout : float or None
-            Seconds to wait when all are out; the pool's unless given.
+            Seconds to wait when all members are lent; by default the pool's.
 
         Raises
         ------
         BusyError
-            When none was given back in that time.
+            When no member was given back in that time.
         DatabaseError
             When the pool is closed, or a new member cannot be opened.
         """
@@ -142,7 +142,7 @@ class Pool:
             else:
                 raise DatabaseError(f"the pool of {self._shown} has been closed: make a new one")
         try:
-            return self._opened()  # outside the lock: others go on meanwhile
+            return self._opened()  # outside the lock, so that others can go on meanwhile
         except BaseException:
             self._forget_one()
             raise

@@ -1,8 +1,8 @@
-"""Files of poses: a line a pose, position in metres and unit quaternion, the scalar first.
+"""Files of poses: a line for each pose, position in metres and unit quaternion, scalar first.
 
-The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order; further columns are ignored, but
-for a column ``t``, seconds, where it is asked for. Quaternions are normalised; ``q`` and ``-q`` are
-the same pose.
+The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order. Other columns are ignored, except
+``t``, seconds, when a caller asks for it. Quaternions are normalised; ``q`` and ``-q`` are the same
+pose.
 """
 
 import csv
@@ -20,18 +20,18 @@ from hapticdb.units import metres_of
 COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 FARTHEST = 1e9
-"""Metres of a place: beyond it, there is none."""
+"""Largest coordinate of a position, metres. A larger value accepts less likely positions."""
 
 _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
 
 
 def as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Values as a C-contiguous array of float64; itself where they are one.
+    """Values as a C-contiguous array of float64. Such an array is returned itself.
 
     Raises
     ------
     UsageError
-        Where converting them would invent or lose something: complex numbers, masked arrays, text,
+        When the conversion would invent or lose something: complex numbers, masked arrays, text,
         lists of unequal lengths.
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
@@ -61,8 +61,8 @@ def rotation_of(quaternions: ArrayLike) -> NDArray[np.float64]:
 def quaternion_of(rotations: ArrayLike) -> NDArray[np.float64]:
     """Unit quaternions (M, 4), the scalar first and not negative, of rotations (M, 3, 3).
 
-    Each of the four products of a quaternion's component with all of it is linear in the matrix;
-    the longest is taken, so that no rotation divides by a small number (Shepperd 1978).
+    Each of the four products of one component with the whole quaternion is linear in the matrix.
+    The longest product is used, so no rotation divides by a small number (Shepperd 1978).
     """
     r = np.asarray(rotations, dtype=np.float64).reshape(-1, 3, 3)
     xx, yy, zz = r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]
@@ -88,7 +88,7 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
     Parameters
     ----------
     path : path
-        The file; one that is there is replaced.
+        The file. An existing file is replaced.
     poses : array_like
         (M, 4, 4) rigid transforms `world_from_tool`, metres.
     """
@@ -111,14 +111,14 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
 
 
 def read_poses(path: str | os.PathLike[str], *, unit: str = "m") -> NDArray[np.float64]:
-    """Poses (M, 4, 4) `world_from_tool` of a file, in its order, in metres.
+    """Poses (M, 4, 4) `world_from_tool` of a file, in the file's order, in metres.
 
     Parameters
     ----------
     path : path
         The file.
     unit : str
-        Of its positions, one of `hapticdb.mesh.UNITS`.
+        Unit of the file's positions, one of `hapticdb.mesh.UNITS`.
     """
     metres = metres_of(unit)
     poses = _poses_of(_read_rows(Path(path)))
@@ -176,7 +176,7 @@ def _read_text(path: Path) -> str:
 def _read_rows(path: Path, optional: str | None = None) -> NDArray[np.float64]:
     """Numbers (M, 7) in the order of `COLUMNS`, the quaternions normalised.
 
-    With an eighth column, if the header names the `optional` one.
+    There is an eighth column if the header names the `optional` one.
     """
     reader = csv.reader(io.StringIO(_read_text(path), newline=""), strict=True)
     places: dict[str, int] = {}
@@ -198,7 +198,7 @@ def _read_rows(path: Path, optional: str | None = None) -> NDArray[np.float64]:
 
 
 def _columns(fields: list[str], where: str, optional: str | None) -> dict[str, int]:
-    """Where the header has each of `COLUMNS`, and the optional one if it has it."""
+    """Index of each of `COLUMNS` in the header, and of the optional column if it is there."""
     names = [field.strip().lower() for field in fields]
     missing = [name for name in COLUMNS if name not in names]
     if len(missing) == len(COLUMNS):
@@ -213,7 +213,7 @@ def _columns(fields: list[str], where: str, optional: str | None) -> dict[str, i
 
 
 def _pose(fields: list[str], places: dict[str, int], where: str) -> list[float]:
-    """Finite numbers of one line, the quaternion normalised."""
+    """Numbers of one line, all finite, with the quaternion normalised."""
     values: list[float] = []
     for name, place in places.items():
         if place >= len(fields):

@@ -1,4 +1,4 @@
-"""Environments copied between engines, layouts and curves."""
+"""Copies environments between engines, layouts and curves."""
 
 import os
 from collections.abc import Callable, Iterable, Iterator
@@ -32,9 +32,9 @@ Url = str | os.PathLike[str]
 
 
 class CopyProgress(NamedTuple):
-    """How far a copy or a comparison is: sent after each object.
+    """Progress of a copy or a comparison, sent after each object.
 
-    voxels : of the objects that were copied or compared until now.
+    voxels : number of voxels of the objects that were copied or compared so far.
     """
 
     objects_done: int
@@ -47,7 +47,7 @@ CopyCallback = Callable[[CopyProgress], None]
 
 @dataclass(frozen=True)
 class CopyReport:
-    """What a copy did.
+    """Result of a copy.
 
     Attributes
     ----------
@@ -58,7 +58,7 @@ class CopyReport:
     present : int
         Objects that were there already.
     renumbered : int
-        Objects written under another id, since their own was taken.
+        Objects written with another id, because their own was taken.
     """
 
     source: str
@@ -77,34 +77,34 @@ def copy_environment(
     curve: CurveName | None = None,
     progress: CopyCallback | None = None,
 ) -> CopyReport:
-    """Copy an environment's objects into another, which is made when it does not exist.
+    """Copy an environment's objects into another, which is made if it does not exist.
 
     Each object is copied in one transaction, with its id if that is free. Objects that are in the
     target already are left alone: an interrupted copy goes on when it is started again. Everything
-    is read at one revision of the source, so that later edits are not copied. The memory needed is
-    in proportion to the largest object.
+    is read at one revision of the source, so later edits are not copied. The memory needed is
+    proportional to the largest object.
 
     Parameters
     ----------
     source_url, target_url : str or path
         The environments; engines, layouts and curves may differ.
     layout : {"voxel", "brick"} or None
-        Of a new target, the source's unless given; must agree with an existing one.
+        Layout of a new target; by default the source's. An existing target must have this layout.
     curve : curve name or None
-        Likewise.
+        Curve of the target, by the same rule.
     progress : callable or None
         Called after each object that was written.
 
     Raises
     ------
     UsageError, GridError
-        When both are one, when bricks are asked for in lexicographic order, or when the target
-        exists with another grid, layout or curve.
+        When both URLs lead to one environment, when bricks are requested in lexicographic order, or
+        when the target exists with another grid, layout or curve.
     ConflictError
-        When the target holds a part of the source with another geometry or in another place; then
-        nothing is written.
+        When the target has a part of the source with another geometry or in another place. Nothing
+        is written then.
     DamagedError
-        When an object of the source has not the voxels that it should.
+        When an object of the source does not have the voxels that its record counts.
     """
     with closing(open_store(source_url, read_only=True)) as source:
         target, is_new = _target(target_url, source, layout, curve)
@@ -125,7 +125,7 @@ def copy_environment(
 def _target(
     url: Url, source: Store, layout: Layout | None, curve: CurveName | None
 ) -> tuple[Store, bool]:
-    """Open the target, or make it; and whether it was made."""
+    """Open or make the target; also returns whether it was made."""
     if not exists(url):
         grid = source.grid if curve is None else replace(source.grid, curve=curve)
         with suppress(EnvironmentExistsError):  # another process may be faster
@@ -159,12 +159,12 @@ def _is_same_place(a: Store, b: Store) -> bool:
 
 
 def is_same_grid(a: Grid, b: Grid) -> bool:
-    """Whether a voxel of one is the same voxel of the other."""
+    """Whether two grids divide space into the same voxels."""
     return (a.voxel_size, a.origin, a.bits) == (b.voxel_size, b.origin, b.bits)
 
 
 def is_same_kind(a: Store, b: Store) -> bool:
-    """Whether rows of one are rows of the other."""
+    """Whether two stores have rows of the same form and keys."""
     return (a.layout, a.grid.curve) == (b.layout, b.grid.curve)
 
 
@@ -215,17 +215,17 @@ def _missing(objects: Iterable[Object], source: Store, target: Store) -> list[Ob
             f"object {obj.id} ({obj.name}) of {source.url} is in {target.url} {word}: remove "
             f"object {there.id} there, or copy into a new environment"
         )
-    # objects that need a new id come last: a new id must not be one that a later object brings
+    # objects that need a new id come last: a new id must not be the id of a later object
     return sorted(missing, key=lambda obj: (obj.id in taken, obj.id))
 
 
 def part_of(obj: Object) -> tuple[str, str]:
-    """What makes an object the same part in another environment."""
+    """Key by which an object is the same part in another environment."""
     return obj.link, obj.name
 
 
 def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVector) -> Rows:
-    """All rows of an object of the source, as the target has them."""
+    """All rows of an object of the source, in the layout and curve of the target."""
     ranges = object_ranges(source.grid, source.layout, obj.bounds)
     batches = _batches(source, obj, ranges, quantiles)
     if is_same_kind(source, target):
@@ -252,7 +252,7 @@ def are_few_rows(ranges: Ranges, quantiles: QuantileVector) -> bool:
 def _batches(
     store: Store, obj: Object, ranges: Ranges, quantiles: QuantileVector
 ) -> Iterator[Rows]:
-    """Rows of an object, ascending by key, a statement each."""
+    """Rows of an object in batches, ascending by key; one statement reads one batch."""
     lows, highs = ranges
     is_one_key = len(lows) == 1 and lows[0] == highs[0]
     if is_one_key or are_few_rows(ranges, quantiles):

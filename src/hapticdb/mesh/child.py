@@ -1,7 +1,7 @@
 """The process that parses one file, within limits of memory and time, and returns arrays.
 
-It is run by its path with a request on standard input (see `reader.py`), and answers on standard
-output. A parser that takes too much memory, crashes or hangs ends only this process.
+The script is run by its path with a request on standard input (see `reader.py`), and answers on
+standard output. A parser that takes too much memory, crashes or hangs ends only this process.
 """
 
 # The package's own __init__ may import modules that parsing does not need. An empty package with
@@ -28,12 +28,13 @@ _PR_SET_PDEATHSIG = 1
 BASE_BYTES = 512 << 20
 BYTES_PER_BYTE = 64
 BYTES_PER_PACKED_BYTE = 500
-"""Memory limit of a file: a base, plus so much for each of its bytes, more for packed formats.
+"""Memory limit of a file in bytes: a base, plus a number for each byte of the file, which is larger
+for packed formats.
 Larger values let a damaged file take more memory before it is refused.
 
-Measured at a mesh of 327,680 triangles, bytes of resident memory a byte of the file: OBJ 12,
-OFF 12, PLY 11 (text 15), STL 7 (text 5), GLB 12, 3MF 10, DAE 5; LAZ 21, and 101 where every point
-is alike but for its place; STEP 114 (0.2 MB).
+Measured at a mesh of 327,680 triangles, bytes of resident memory per byte of the file: OBJ 12,
+OFF 12, PLY 11 (text 15), STL 7 (text 5), GLB 12, 3MF 10, DAE 5; LAZ 21, and 101 if all points
+differ only in their positions; STEP 114 (0.2 MB).
 """
 _PACKED = {
     ".3mf",
@@ -45,11 +46,11 @@ _PACKED = {
 
 def main() -> None:
     """Answer one request, and end."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's; it ends this process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     request = json.loads(sys.stdin.buffer.read())
     _die_with_parent(request["parent"])
     answer = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)  # what libraries print must not mix with the arrays
+    os.dup2(2, 1)  # output of libraries must not mix with the arrays
     sys.path[:] = request["sys_path"]
     _answer(answer, Path(request["path"]), request)
     answer.flush()
@@ -73,7 +74,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
 
     before = None
     try:
-        reader_of(path)  # before the limit: its libraries do not count as the file's memory
+        reader_of(path)  # before the limit, so that its libraries do not count as the file's memory
         np.linalg.det(np.eye(3))  # OpenBLAS allocates its buffers now, before the limit
         before = limit_memory(allowance(path), request["memory_limit"])
         limit_time(request["time_limit"])
@@ -106,7 +107,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
 
 
 def _memory_kind() -> int:
-    """Which limit: of data on Linux, without reserved address space; else of address space."""
+    """Kind of limit: data on Linux, without reserved address space; elsewhere address space."""
     return resource.RLIMIT_DATA if sys.platform == "linux" else resource.RLIMIT_AS
 
 
@@ -120,7 +121,7 @@ def _bytes_now() -> int:
 
 
 def bytes_available() -> int:
-    """Memory that the machine can give without swapping; where it is not known, 2^62 bytes."""
+    """Memory that the machine can give without swapping; 2^62 bytes if this is not known."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/meminfo").read_text().splitlines():
             if line.startswith("MemAvailable:"):
@@ -129,7 +130,7 @@ def bytes_available() -> int:
 
 
 def allowance(path: Path, n_beside: int = 0) -> int:
-    """Bytes that parsing may take: in proportion to a file, and to what the machine has.
+    """Bytes that parsing may take: in proportion to the file, limited by the machine's memory.
 
     n_beside: bytes of the files that it refers to.
     """
@@ -139,7 +140,7 @@ def allowance(path: Path, n_beside: int = 0) -> int:
 
 
 def _bytes_beside(path: Path) -> int:
-    """Bytes of the files that a glTF file refers to; 0 where parsing will say what is wrong."""
+    """Bytes of the files that a glTF file refers to; 0 if parsing will fail with an error."""
     from hapticdb.mesh.formats.gltf import bytes_beside  # noqa: PLC0415 - a reader
     from hapticdb.mesh.raw import UnreadableError  # noqa: PLC0415
 
@@ -150,7 +151,7 @@ def _bytes_beside(path: Path) -> int:
 
 
 def limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
-    """Set the limit of memory on top of what is held already; returns the limit before."""
+    """Limit the memory to what is held already plus a number of bytes; returns the former limit."""
     kind = _memory_kind()
     before = resource.getrlimit(kind)
     wanted = _bytes_now() + (allowed if limit is None else limit)
@@ -160,9 +161,9 @@ def limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
 
 
 def limit_time(seconds: float) -> None:
-    """Set the limit of processor time, for when the parent is gone and cannot end this process."""
+    """Limit the processor time, in case the parent is gone and cannot end this process."""
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    # The times of a parser's threads add up.
+    # The limit counts the sum over a parser's threads.
     wanted = int(seconds * (os.cpu_count() or 1)) + 10
     resource.setrlimit(resource.RLIMIT_CPU, (wanted if hard < 0 else min(wanted, hard), hard))
 

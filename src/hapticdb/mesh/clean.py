@@ -15,7 +15,7 @@ Geometry = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 
 _FLAT = 1e-12
 """A triangle is degenerate when twice its area is at most this times its longest edge squared:
-rounding errors of float64 edges are smaller. A larger value counts thin triangles, too."""
+rounding errors of float64 edges are smaller. A larger value also counts thin triangles."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class CleanPart:
 
 @dataclass(frozen=True)
 class Cleaned:
-    """Sound parts of a file in metres, the arrays that they share, and what was wrong in all.
+    """Sound parts of a file in metres, the arrays that they share, and the defects of the file.
 
-    names_unit : whether the file says its unit; up : the axis that it says points up, or None.
+    names_unit : whether the file names its unit; up : the axis that points up by the file, or None.
     """
 
     geometries: list[Geometry]
@@ -43,14 +43,14 @@ class Cleaned:
 
 
 def clean(parsed: Parsed, metres: float | None) -> Cleaned:
-    """Refuse and count what cannot be used; bring the rest to metres.
+    """Refuse and count geometry that cannot be used; convert the rest to metres.
 
     Parameters
     ----------
     parsed : Parsed
         Contents of a file.
     metres : float or None
-        Length of the unit of a file that carries none; None where none was given.
+        Length of the unit of a file without a unit of its own; None if none was given.
     """
     said = (parsed.metres, metres, parsed.likely_metres)
     scale = next((length for length in said if length is not None), 1.0)
@@ -94,7 +94,7 @@ def clean(parsed: Parsed, metres: float | None) -> Cleaned:
 
 
 def _checked(shape: Shape, scale: float) -> tuple[Geometry, Defects]:
-    """Sound geometry of a shape in metres, and what was wrong with it."""
+    """Sound geometry of a shape in metres, and the shape's defects."""
     vertices = np.asarray(shape.vertices)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise UnreadableError("its vertices do not have three coordinates each")
@@ -147,7 +147,7 @@ def _count_degenerate(
     positions: NDArray[np.float64], faces: NDArray[np.int64], linear: NDArray[np.float64]
 ) -> int:
     """Triangles without area once `linear` (3, 3) is applied."""
-    # Edges are taken before the transform, which would lose their digits far from the origin.
+    # Edges are computed before the transform: far from the origin they would lose digits.
     first = positions[faces[:, 0]]
     a = (positions[faces[:, 1]] - first) @ linear.T
     b = (positions[faces[:, 2]] - first) @ linear.T
@@ -175,7 +175,7 @@ def _worlds(
     if len(bent):
         name = _printable(placements[bent[0]].name)
         raise UnreadableError(f"the transform of '{name}' is not affine")
-    # Once for each geometry, however many placements share it.
+    # Once for each geometry, also when many placements share it.
     farthest = np.array([np.abs(v).max(axis=0, initial=0.0) for v, _ in geometries]).reshape(-1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
         worlds[:, :3, 3] *= scale
@@ -187,7 +187,7 @@ def _worlds(
 
 
 def _are_flat(worlds: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether a transform flattens what it places, so that triangles may lose their areas."""
+    """Whether a transform flattens geometry, so that triangles may lose their areas."""
     linear = worlds[:, :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         lengths = np.sqrt(np.einsum("pij,pij->p", linear, linear))
@@ -210,7 +210,7 @@ class _Names:
         self._count: dict[str, int] = {}
 
     def unique(self, name: str) -> str:
-        """Name, numbered if it was given before."""
+        """Name, with a number if the same name was given before."""
         candidate = name
         while candidate in self._taken:
             self._count[name] = self._count.get(name, 1) + 1

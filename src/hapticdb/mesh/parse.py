@@ -28,7 +28,7 @@ READERS = {
 
 
 def reader_of(path: Path) -> Callable[[Path], Parsed]:
-    """Reader of a format; importing it brings in its libraries and no others."""
+    """Reader of a format. Its import loads only the libraries of this format."""
     module = importlib.import_module(f"hapticdb.mesh.formats.{READERS[path.suffix.lower()]}")
     reader: Callable[[Path], Parsed] = module.read
     return reader
@@ -42,7 +42,7 @@ def parse(path: Path, metres: float | None) -> Cleaned:
     path : Path
         A file with one of the suffixes in `READERS`.
     metres : float or None
-        Length of the unit of a file that carries none; None where none was given.
+        Length of the unit of a file without a unit of its own; None if none was given.
 
     Raises
     ------
@@ -56,12 +56,12 @@ def parse(path: Path, metres: float | None) -> Cleaned:
         raise
     except KeyboardInterrupt:
         raise
-    except BaseException as error:  # parsers fail in every way; Rust ones panic
+    except BaseException as error:  # parsers raise errors of every kind; Rust parsers panic
         raise UnreadableError(cause_of(error)) from error
 
 
 def cause_of(error: BaseException) -> str:
-    """Cause of a library's failure, in words that need no knowledge of the library."""
+    """Cause of a library's failure, in words for a reader who does not know the library."""
     detail = " ".join(str(error).split())
     if isinstance(error, MemoryError):
         return (

@@ -19,12 +19,12 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class Defects:
-    """Counts of what was wrong in a file or a part; they add.
+    """Counts of the defects of a file or a part; `+` adds them.
 
     Parameters
     ----------
     degenerate : int
-        Triangles without area, as placed. Kept: they mark the voxels that they touch.
+        Triangles without area after placement. They are kept and mark the voxels that they touch.
     non_finite : int
         Triangles and points with a coordinate that is NaN or infinite. Refused.
     out_of_range : int
@@ -57,7 +57,7 @@ class Defects:
         return {name: getattr(self, name) for name in _WORDS}
 
     def describe(self) -> str:
-        """Put the counts above zero in words, '12 degenerate, 3 non-finite'; '' when clean."""
+        """Put the counts above zero in words, '12 degenerate, 3 non-finite'; '' without defects."""
         return ", ".join(f"{n} {_WORDS[name]}" for name, n in self.as_dict().items() if n)
 
 
@@ -73,14 +73,14 @@ class Part:
     name : str
         Node path below the root, joined by '/'; unique within the file.
     vertices : NDArray[float64]
-        (V, 3) metres, part frame, finite; of a mesh, those that a triangle uses. Instances of
-        one mesh share the array.
+        (V, 3) metres, part frame, finite. A mesh has only vertices that a triangle uses. Instances
+        of one mesh share the array.
     faces : NDArray[int64] | None
         (F, 3) indices of vertices; None for a point cloud.
     world_from_part : NDArray[float64]
-        (4, 4) affine, metres; may mirror, scale or flatten.
+        (4, 4) affine transform, metres; it may mirror, scale or flatten.
     defects : Defects
-        What was wrong with this instance.
+        Defects of this instance.
     """
 
     name: str
@@ -88,7 +88,7 @@ class Part:
     faces: NDArray[np.int64] | None
     world_from_part: NDArray[np.float64]
     defects: Defects = field(default_factory=Defects)
-    # Instances of one mesh share this, so that its digest is computed once.
+    # Instances of one mesh share this, so the digest is computed once.
     shared: dict[str, str] = field(default_factory=dict, repr=False)
 
     @property
@@ -115,7 +115,7 @@ class Part:
     def world_points(
         self, world_from_part: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Vertices (V, 3), metres, world frame; placed elsewhere by `world_from_part`."""
+        """Vertices (V, 3), metres, world frame; `world_from_part` replaces the file's placement."""
         placed = self.world_from_part if world_from_part is None else world_from_part
         return np.asarray(self.vertices @ placed[:3, :3].T + placed[:3, 3], dtype=np.float64)
 
@@ -149,11 +149,11 @@ class MeshFile:
     parts : list[Part]
         At least one; each has at least one triangle or point.
     defects : Defects
-        Sum over the parts, and over what was refused or empty and became no part.
+        Sum over the parts, and over refused or empty geometry that became no part.
     names_unit : bool
-        Whether the file says which unit its lengths are in.
+        Whether the file names the unit of its lengths.
     up : {'x', 'y', 'z'} or None
-        Which axis points up, None where neither the format nor the file says.
+        Axis that points up; None if neither the format nor the file says it.
     """
 
     link: str

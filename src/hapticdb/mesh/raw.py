@@ -1,4 +1,4 @@
-"""What a format's reader returns: shapes as the file has them, and their placements."""
+"""Results of a format's reader: shapes as the file has them, and their placements."""
 
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
@@ -13,20 +13,20 @@ from hapticdb.mesh.part import Defects
 Node = TypeVar("Node", bound=Hashable)
 
 MAX_NODES = 2_000_000
-"""Most placements in a file: those of assemblies nested in assemblies multiply. A larger value lets
-a small file take more memory and time."""
+"""Most placements in a file: placements of nested assemblies multiply. A larger value lets a small
+file take more memory and time."""
 MOST_CHARACTERS = 50_000_000
 """Most characters in the names of all placements: with nodes nested deeply, names grow as the depth
 squared. A larger value lets a small file take more memory."""
 
 
 class UnreadableError(Exception):
-    """Why a file cannot be read, in words that need neither the file's name nor a traceback."""
+    """Reason why a file cannot be read. The text needs neither the file's name nor a traceback."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """Geometry as read: indices may lie outside, coordinates may be NaN.
+    """Geometry as read: indices may be out of range, coordinates may be NaN.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Shape:
     faces : NDArray | None
         (F, 3) of any integer type; None for a point cloud.
     defects : Defects
-        What the reader itself had to drop.
+        Defects that the reader itself dropped.
     """
 
     vertices: NDArray[np.generic]
@@ -56,9 +56,9 @@ class Placement:
 class Parsed:
     """A file's contents before any check.
 
-    `metres` is the length of the file's unit, None where the format has none. `likely_metres` is
-    the length of a unit that the file only hints at, such as that of its reference system; an
-    option overrides it. `up` is the axis that points up, None where the file does not say.
+    `metres` is the length of the file's unit, None if the format has none. `likely_metres` is the
+    length of a unit that the file only suggests, such as the unit of its reference system; an
+    option overrides it. `up` is the axis that points up, None if the file does not say.
     """
 
     shapes: list[Shape]
@@ -70,13 +70,13 @@ class Parsed:
 
 
 class NameBudget:
-    """Joins names of nodes to names of parts; refuses when all names together are too long."""
+    """Joins names of nodes to names of parts; raises an error if their total is too long."""
 
     def __init__(self) -> None:
         self._left = MOST_CHARACTERS
 
     def joined(self, names: Sequence[str]) -> str:
-        """Name of a part: those of the nodes that lead to it, joined by '/'."""
+        """Name of a part: the names of the nodes that lead to it, joined by '/'."""
         name = "/".join(names)
         self._left -= len(name)
         if self._left < 0:
@@ -88,7 +88,7 @@ class NameBudget:
 
 
 def placed_once(named: Iterable[tuple[str, Shape]], defects: Defects | None = None) -> Parsed:
-    """Contents of a file without placements: each shape once, where it is."""
+    """Contents of a file without placements: each shape once, with the identity as transform."""
     pairs = list(named)
     placements = [Placement(name, i, np.eye(4)) for i, (name, _) in enumerate(pairs)]
     return Parsed([shape for _, shape in pairs], placements, None, defects or Defects())
@@ -99,7 +99,7 @@ def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.g
     if not text or text.isspace():
         return np.empty(0, dtype=dtype)
     with warnings.catch_warnings():
-        # numpy stops at the first word that is no number, and by default only warns.
+        # numpy stops at the first word that is not a number, and by default only warns.
         warnings.simplefilter("error", DeprecationWarning)
         try:
             return np.fromstring(text, dtype=dtype, sep=" ")
@@ -108,7 +108,7 @@ def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.g
 
 
 def fan(polygons: Sequence[Sequence[int]]) -> tuple[NDArray[np.int64], int]:
-    """Triangles (F, 3) that fan out from each polygon's first corner, and how many had under 3."""
+    """Triangles (F, 3) fanned from polygons' first corners, and how many polygons had under 3."""
     by_size: dict[int, list[Sequence[int]]] = {}
     for polygon in polygons:
         by_size.setdefault(len(polygon), []).append(polygon)
@@ -132,8 +132,8 @@ def walk(
 ) -> Iterator[tuple[list[Node], NDArray[np.float64]]]:
     """Every placement of every node under `roots`: path from the root, and world_from_node.
 
-    Depth first, in the order of the file; a node reached along two paths comes twice. The yielded
-    list is used again: copy what is to be kept. Not recursive, so depth takes no stack.
+    Depth first, in the order of the file; a node on two paths comes twice. The yielded list is used
+    again, so copy it to keep it. The walk is not recursive, so deep nesting takes no stack.
     """
     path: list[Node] = []
     on_path: set[Node] = set()

@@ -30,14 +30,14 @@ _CHILD = Path(__file__).with_name("child.py")
 _SECONDS = 20.0
 _SECONDS_PER_MIB = 5.0
 _SECONDS_PER_MIB_OF = {"step": 20.0, "threemf": 10.0}
-"""Time limit of a file: so many seconds, plus so many for each MiB; at least ten times what sound
-files take. STEP files are tessellated, and 3MF files unpack to a multiple of their size. Larger
-values let a damaged file take longer before it is refused."""
+"""Time limit of a file, seconds: a base, plus a number for each MiB. It is at least ten times the
+time of sound files. STEP files are tessellated, and 3MF files unpack to a multiple of their size.
+Larger values let a damaged file take longer before it is refused."""
 _LIBRARIES = {
     "step": ("OpenCASCADE", "save it anew as STEP AP214 or AP242, or as glTF or STL"),
     "las": ("lazrs, its decompressor,", "unpack it to LAS with another program, or save it anew"),
 }
-"""Libraries that may crash on a damaged file, by reader, and what helps then."""
+"""Libraries that may crash on a damaged file, by reader: name, and advice for the user."""
 _LONGEST_CAUSE = 300
 """Characters of a message's cause; longer ones are cut."""
 _MORE_TIME = "if it is sound, give more: import --time-limit, read_file(time_limit=...)"
@@ -61,21 +61,21 @@ def read_file(
         GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); LAS, LAZ (extra
         `pointcloud`). The suffix says which.
     unit : str, optional
-        One of `hapticdb.mesh.UNITS`: of a file whose format carries none (OBJ, STL, PLY, OFF, LAS,
-        LAZ). If not given, that of the reference system which a LAS or LAZ file names, else metres.
-        A glTF, 3MF, DAE or STEP file carries its own, and that one holds.
+        One of `hapticdb.mesh.UNITS`: the unit of a file whose format has none (OBJ, STL, PLY, OFF,
+        LAS, LAZ). By default the unit of the reference system that a LAS or LAZ file names, else
+        metres. A glTF, 3MF, DAE or STEP file has its own unit, which is always used.
     memory_limit : int, optional
-        Bytes that parsing may take; by default 512 MiB and a multiple of the file's size (that of
-        the files it refers to included, each once), and three quarters of the machine's free memory
-        at most.
+        Bytes that parsing may take. By default 512 MiB plus a multiple of the size of the file and
+        of the files that it refers to (each counts once), but at most three quarters of the
+        machine's free memory.
     time_limit : float, optional
-        Seconds that parsing may take; by default 20 and 5 for each MiB of the file, of a 3MF file
-        10, of a STEP file 20.
+        Seconds that parsing may take. By default 20, plus 5 for each MiB of the file (10 for a 3MF
+        file, 20 for a STEP file).
 
     Returns
     -------
     MeshFile
-        Parts in the order of the file, and counts of what was wrong.
+        Parts in the order of the file, and counts of the defects.
 
     Raises
     ------
@@ -104,7 +104,7 @@ def read_file(
 
 
 def parse_in_process(path: str | os.PathLike[str], *, unit: str | None = None) -> MeshFile:
-    """`read_file` without a child and without limits: for files that are known and sound."""
+    """`read_file` without a child process and without limits, for files known to be sound."""
     metres, file = _checked(path, unit)
     try:
         return _mesh_file(file, parse(file, metres))
@@ -119,7 +119,7 @@ def _seconds_for(file: Path) -> float:
 
 
 def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | None, Path]:
-    """Length of the unit that is given, and the file as far as it can be judged from outside."""
+    """Length of the given unit, and the file's path; refuses a file that is wrong at first sight."""
     metres = None if unit is None else metres_of(unit)
     file = Path(path)
     try:
@@ -134,7 +134,7 @@ def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | No
 
 
 def _refusal(file: Path) -> str | None:
-    """Why a file is refused before it is parsed; None if it is not."""
+    """Reason to refuse a file before it is parsed; None if there is none."""
     if file.is_dir():
         return "it is a directory; name the files in it"
     if not file.exists():
@@ -149,7 +149,7 @@ def _refusal(file: Path) -> str | None:
 
 
 def _require_extra(reader: str, suffix: str) -> None:
-    """Say which extra a format needs, before a child fails for want of it."""
+    """Raise an error that names a missing extra, before a child fails without it."""
     extra, modules = _EXTRAS.get(reader, ("", ()))
     if any(importlib.util.find_spec(module) is None for module in modules):
         raise MissingExtraError(
@@ -168,7 +168,7 @@ def _one_line(path: str | os.PathLike[str], cause: object) -> str:
 
 def _ask_child(request: dict[str, Any], seconds: float) -> Cleaned:
     """Start a child, send the request, take its answer; no child outlives this call."""
-    # One arena and one thread: what a library reserves per thread would count as the file's.
+    # One arena and one thread: memory reserved per thread would count as the file's.
     settings = {
         "OPENBLAS_NUM_THREADS": "1",
         "OMP_NUM_THREADS": "1",
@@ -260,7 +260,7 @@ def _fill(array: NDArray[Any], stream: IO[bytes]) -> None:
 
 
 def _why_ended(returncode: int, words: IO[bytes], path: str) -> str:
-    """Why a child ended without an answer."""
+    """Reason why a child ended without an answer."""
     if returncode == -signal.SIGXCPU:
         return f"reading it took too long; {_MORE_TIME}"
     if returncode < 0:

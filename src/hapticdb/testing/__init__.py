@@ -1,4 +1,4 @@
-"""What every engine must pass: the contract suites, and scenes with a closed form.
+"""Tests that every engine must pass: the contract suites, and scenes with a closed form.
 
 An engine's tests subclass `StoreContract` and say how a store is made and opened again::
 
@@ -11,9 +11,9 @@ An engine's tests subclass `StoreContract` and say how a store is made and opene
         def reopen(self, store):
             return MyStore.open(store.url)
 
-They subclass `EngineContract`, too, for what an engine does with URLs. `lacks` names the
-capabilities that the engine has not: the tests of those are skipped, each with its reason, and
-every other capability is tested. docs/engines.md leads from the first line to a tested engine.
+They also subclass `EngineContract`, which tests what an engine does with URLs. `lacks` names the
+capabilities that the engine lacks. Their tests are skipped, each with its reason; every other
+capability is tested. docs/engines.md leads from the first line to a tested engine.
 
 Needs pytest.
 """

@@ -1,4 +1,4 @@
-"""What only some engines have: each is tested where it is claimed."""
+"""Tests of the capabilities that only some engines have; an engine without one skips its tests."""
 
 from typing import Any
 
@@ -27,22 +27,23 @@ STORE_CAPABILITIES: dict[str, Any] = {
     "server": SupportsServer,
     "grouping threshold": HasGroupingThreshold,
 }
-"""What only some stores can do, by the words of `StoreContract.lacks`: a protocol each."""
+"""Capabilities that only some stores have: the protocol of each, by its name in
+`StoreContract.lacks`."""
 
 
 class CapabilitiesContract(StoreCase):
-    """The capabilities but `watch`."""
+    """Tests of all capabilities except `watch`."""
 
     @pytest.mark.parametrize("capability", sorted(STORE_CAPABILITIES))
     def test_the_engine_has_what_it_does_not_say_to_lack(self, capability: str) -> None:
-        """And lacks what it says to lack, so that no test is skipped without need."""
+        """The engine also lacks what `lacks` names, so no test is skipped without need."""
         store = self.make(Grid(0.01, (0, 0, 0), 5), "brick")
         has_it = isinstance(store, STORE_CAPABILITIES[capability])
         store.discard()
         assert has_it != (capability in self.lacks)
 
     def test_figure_3_finds_the_hits_and_leaves_out_the_excluded(self, store: Store) -> None:
-        """EXISTS and force() inside the engine, where it can."""
+        """The statements use EXISTS and force() inside the engine, if it has the capability."""
         self.need("statement")
         assert isinstance(store, SupportsStatement)
         both = np.array([[22, 20, 20], [16, 20, 20], [60, 60, 60]], dtype=np.int64)
@@ -66,7 +67,7 @@ class CapabilitiesContract(StoreCase):
         assert not len(store.statement_hits(nothing)[0])
 
     def test_caches_are_emptied_and_limited_without_a_row_lost(self, store: Store) -> None:
-        """The same rows, from less memory."""
+        """With less memory, reads return the same rows."""
         self.need("caches")
         assert isinstance(store, SupportsCaches)
         before = everything(store)
@@ -78,7 +79,7 @@ class CapabilitiesContract(StoreCase):
     def test_a_loop_inside_the_server_scans_the_same_rows(
         self, store: Store, plain: dict[int, set[int]]
     ) -> None:
-        """One range at a time, and many of them."""
+        """Scans of one range and of many ranges are tested."""
         self.need("server")
         assert isinstance(store, SupportsServer)
         known = np.array(sorted(plain), dtype=np.int64)
@@ -90,7 +91,7 @@ class CapabilitiesContract(StoreCase):
         assert store.server_cache() > 0
 
     def test_a_grouping_threshold_is_a_number_of_keys(self, store: Store) -> None:
-        """Or None, where grouping never pays."""
+        """It is None if grouping never saves time."""
         self.need("grouping threshold")
         assert isinstance(store, HasGroupingThreshold)
         threshold = store.grouping_threshold

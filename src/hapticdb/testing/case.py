@@ -1,4 +1,4 @@
-"""What the tests of a store share: how one is made, what it holds, what its engine lacks."""
+"""Parts that all tests of a store share: how it is made, what it holds, what its engine lacks."""
 
 import pytest
 
@@ -14,7 +14,7 @@ class StoreCase:
     """Keys of `hapticdb.testing.STORE_CAPABILITIES`; tests of these capabilities are skipped."""
 
     def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
-        """Make a new store; another name, another one beside it."""
+        """Make a new store; each name gives another store in the same place."""
         raise NotImplementedError
 
     def reopen(self, store: Store) -> Store:
@@ -37,7 +37,7 @@ class StoreCase:
 
     @pytest.fixture
     def plain(self, store: Store) -> dict[int, set[int]]:
-        """What the store holds, as row key -> ids."""
+        """Contents of the store, as row key -> ids."""
         found: dict[int, set[int]] = {}
         for object_id, ijk in ((1, blob(1, (20, 20, 20))), (2, blob(2, (24, 20, 20)))):
             for key in (store.grid.encode(ijk) >> row_shift(store.layout)).tolist():

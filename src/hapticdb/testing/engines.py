@@ -1,4 +1,4 @@
-"""URLs of an engine: opened, made, named, refused."""
+"""Tests of an engine's URLs: opening, making, naming, refusing."""
 
 from collections.abc import Callable
 from typing import Any
@@ -32,7 +32,7 @@ ENGINE_CAPABILITIES: dict[str, Any] = {
     "backup": SupportsBackup,
     "first findings": SupportsFirstFindings,
 }
-"""What only some engines can do with a URL, by the words of `EngineContract.lacks`."""
+"""Capabilities that only some engines have, by their names in `EngineContract.lacks`."""
 
 
 class EngineContract:
@@ -64,7 +64,7 @@ class EngineContract:
         return engine_of(self.url())
 
     def test_what_was_made_is_opened(self) -> None:
-        """To read only, and to write."""
+        """It is opened to read only, and to write."""
         url = self.url()
         assert not self.engine().exists(url)
         self.engine().create(url, self.grid, "voxel").close()
@@ -76,14 +76,14 @@ class EngineContract:
             store.close()
 
     def test_what_is_not_there_is_not_opened(self) -> None:
-        """And not made by the way."""
+        """Opening a missing environment does not make it."""
         url = self.url()
         with pytest.raises(EnvironmentNotFoundError):
             self.engine().open(url, read_only=True)
         assert not self.engine().exists(url)
 
     def test_nothing_is_made_twice(self) -> None:
-        """What is there stays."""
+        """The existing environment stays as it is."""
         url = self.make()
         with pytest.raises(EnvironmentExistsError):
             self.engine().create(url, self.grid, "brick")
@@ -92,7 +92,7 @@ class EngineContract:
         store.close()
 
     def test_another_environment_stands_beside(self) -> None:
-        """Of its own name, at a URL that leads to it alone."""
+        """It has its own name, and a URL that leads only to it."""
         url = self.make()
         other = self.engine().beside(url, f"{self.engine().name_of(url)}_beside")
         assert self.engine().name_of(other) == f"{self.engine().name_of(url)}_beside"
@@ -106,12 +106,12 @@ class EngineContract:
 
     @pytest.mark.parametrize("capability", sorted(ENGINE_CAPABILITIES))
     def test_the_engine_has_what_it_does_not_say_to_lack(self, capability: str) -> None:
-        """And lacks what it says to lack, so that no test is skipped without need."""
+        """The engine also lacks what `lacks` names, so no test is skipped without need."""
         has_it = isinstance(self.engine(), ENGINE_CAPABILITIES[capability])
         assert has_it != (capability in self.lacks)
 
     def test_what_the_engine_lacks_is_refused_with_a_reason(self) -> None:
-        """Its own words follow the URL."""
+        """The message has the URL and then the engine's own reason."""
         url, engine = self.make(), self.engine()
         refusals: dict[str, Callable[[], object]] = {
             "grant": lambda: grant(url, "anna", "viewer"),
@@ -127,7 +127,7 @@ class EngineContract:
             assert str(refused.value).endswith(words)
 
     def test_a_right_is_given_to_a_role_that_is_there(self) -> None:
-        """No other role is made by the way."""
+        """A grant to a missing role does not make the role."""
         self.need("grant")
         engine = self.engine()
         assert isinstance(engine, SupportsGrant)
@@ -135,7 +135,7 @@ class EngineContract:
             engine.grant(self.make(), "nobody of that name", "viewer")
 
     def test_a_copy_holds_the_same_and_is_put_back(self) -> None:
-        """Whole, though the environment has changed since."""
+        """A restore brings back the whole copy, although the environment has changed since."""
         self.need("backup")
         engine = self.engine()
         assert isinstance(engine, SupportsBackup)
@@ -155,7 +155,7 @@ class EngineContract:
             store.close()
 
     def test_a_sound_environment_has_no_findings_before_it_is_opened(self) -> None:
-        """Damage is each engine's own: its tests make some."""
+        """Each engine has its own kinds of damage, so its own tests make some."""
         self.need("first findings")
         engine = self.engine()
         assert isinstance(engine, SupportsFirstFindings)

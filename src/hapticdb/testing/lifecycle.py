@@ -1,4 +1,4 @@
-"""One store among others: snapshots, threads, closing, reading only."""
+"""Tests of a store's life: snapshots, threads, closing, opening to read only."""
 
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -28,23 +28,23 @@ from hapticdb.testing.scenes import (
 )
 
 ANSWER_S = 60.0
-"""Seconds to wait for another thread. More is only felt when a test fails."""
+"""Seconds to wait for another thread. A larger value only delays the failure of a test."""
 
 
 Result = TypeVar("Result")
 
 
 def in_another_thread(call: Callable[[], Result]) -> Result:
-    """Result of a call, or its error, from a thread of its own."""
+    """Run a call in a thread of its own; returns its result or raises its error."""
     with ThreadPoolExecutor(1) as threads:
         return threads.submit(call).result(ANSWER_S)
 
 
 class LifecycleContract(StoreCase):
-    """To whom a store belongs, and what it sees of the others."""
+    """Tests of a store's owner thread, and of the commits of others that a store reads."""
 
     def test_a_snapshot_sees_one_revision(self, store: Store) -> None:
-        """Another connection's commit shows after it, and changes the version."""
+        """Another connection's commit appears after the snapshot, and changes the version."""
         reader = self.reopen(store)
         before = reader.size().rows
         with reader.snapshot():
@@ -58,7 +58,7 @@ class LifecycleContract(StoreCase):
         reader.close()
 
     def test_an_environment_is_told_from_another(self) -> None:
-        """However it was opened, and however alike the other is."""
+        """Identities differ even if both are alike; all stores of one have the same identity."""
         grid = Grid(0.01, (0, 0, 0), 5)
         one, other = self.make(grid, "brick"), self.make(grid, "brick", "other")
         again = self.reopen(one)
@@ -68,13 +68,13 @@ class LifecycleContract(StoreCase):
         other.discard()
 
     def test_a_store_belongs_to_the_thread_that_opened_it(self, store: Store) -> None:
-        """Another thread is refused, and nothing is broken for the first."""
+        """Another thread is refused, and the first can go on."""
         with pytest.raises(UsageError, match="belongs to the thread that opened it"):
             in_another_thread(store.objects)
         assert len(store.objects()) == 2
 
     def test_a_store_is_handed_from_thread_to_thread(self, store: Store) -> None:
-        """By way of nobody, as a pool does."""
+        """In between nobody owns it, as in a pool."""
         expected = everything(store)
         store.give_to(NOBODY)
         with pytest.raises(UsageError, match="belongs to the thread that opened it"):
@@ -100,7 +100,7 @@ class LifecycleContract(StoreCase):
             store.objects()
 
     def test_a_store_opened_to_read_refuses_to_write(self, store: Store) -> None:
-        """Objects and figures."""
+        """It refuses to write objects and cost figures."""
         reader = self.reopen(store)
         if reader.is_read_only:
             with pytest.raises(ReadOnlyError):

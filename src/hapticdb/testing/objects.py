@@ -1,4 +1,4 @@
-"""Objects: written, replaced, removed, each write in one transaction."""
+"""Tests of objects: writing, replacing, removing, each write in one transaction."""
 
 import contextlib
 from dataclasses import replace
@@ -28,10 +28,10 @@ from hapticdb.testing.scenes import (
 
 
 class ObjectsContract(StoreCase):
-    """What an edit does, and what is left when it is refused."""
+    """Tests of the effect of an edit, and of the state after a refused edit."""
 
     def test_objects_return_as_written(self, store: Store) -> None:
-        """Records, ordered by id, revisions counted."""
+        """Records come ordered by id, with the right revisions."""
         first, second = store.objects()
         assert (first.id, second.id) == (1, 2)
         assert store.object(2).name == "two"
@@ -53,7 +53,7 @@ class ObjectsContract(StoreCase):
         assert store.revision() == 2
 
     def test_loading_ends_as_single_writes_do(self, store: Store) -> None:
-        """Rows, ids and revisions; also when it is left by an error."""
+        """Rows, ids and revisions are equal, also if an error ends the loading."""
         fresh = self.make(store.grid, store.layout, "loaded")
         with contextlib.suppress(ZeroDivisionError), fresh.loading(), fresh.loading():
             write_voxels(fresh, blob(1, (20, 20, 20)), "one")
@@ -65,7 +65,7 @@ class ObjectsContract(StoreCase):
         assert fresh.revision() == 2
 
     def test_an_id_is_kept_where_it_is_free(self, store: Store) -> None:
-        """What moves house keeps its ids."""
+        """So objects that are copied to another store keep their ids."""
         ijk = blob(5, (40, 40, 40))
         rows = rows_of_voxels(ijk, *kind(store))
         nine = replace(voxel_object(store.grid, ijk, "nine"), id=9)
@@ -74,7 +74,7 @@ class ObjectsContract(StoreCase):
         assert write_voxels(store, ijk, "next") == 11
 
     def test_an_object_written_meanwhile_is_not_replaced(self, store: Store) -> None:
-        """Whoever read it before is told, and nothing is changed."""
+        """The writer with the old revision gets an error, and nothing is changed."""
         rows = rows_of_voxels(blob(7, (44, 30, 10)), *kind(store))
         seen = store.object(1)
         store.replace(seen, rows, covering(store))
@@ -97,7 +97,7 @@ class ObjectsContract(StoreCase):
             store.remove(2, covering(store))
 
     def test_removed_parts_are_known_until_they_are_there_again(self, store: Store) -> None:
-        """By the name of their file; of another file none."""
+        """They are listed by their file; another file has none."""
         link = store.object(1).link
         assert store.removed(link) == set()
         store.remove(1, covering(store))

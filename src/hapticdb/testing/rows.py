@@ -1,4 +1,4 @@
-"""Rows: looked up, scanned, counted, by key and by object."""
+"""Tests of reading rows: lookups, scans and counts, by key and by object."""
 
 from collections.abc import Callable
 
@@ -19,12 +19,12 @@ from hapticdb.testing.scenes import (
 
 
 class RowsContract(StoreCase):
-    """What a frame asks."""
+    """Tests of the reads that a frame needs."""
 
     def test_lookup_finds_every_row_of_a_key_and_no_other(
         self, store: Store, plain: dict[int, set[int]]
     ) -> None:
-        """Both forms of asking for keys."""
+        """Tests `lookup` and `lookup_each`."""
         keys = np.arange(0, max(plain) + 3, dtype=np.int64)[::3].copy()
         expected = [(k, i) for k in keys.tolist() for i in sorted(plain.get(k, ()))]
         asking: list[Callable[[Keys], object]] = [store.lookup, store.lookup_each]
@@ -35,7 +35,7 @@ class RowsContract(StoreCase):
     def test_scan_reads_closed_ranges_in_order(
         self, store: Store, plain: dict[int, set[int]]
     ) -> None:
-        """Also ranges of one key, and many at once."""
+        """Ranges of a single key and many ranges at once are tested, too."""
         known = sorted(plain)
         cuts = np.array(known, dtype=np.int64)
         lows, highs = cuts[::5].copy(), cuts[2::5].copy()
@@ -53,7 +53,7 @@ class RowsContract(StoreCase):
         assert store.count(lows, highs) == len(expected)
 
     def test_occupancy_returns_as_written(self, store: Store) -> None:
-        """Each brick's 512 bits."""
+        """All 512 bits of each brick return."""
         if store.layout == "voxel":
             assert not store.lookup(np.zeros(1, dtype=np.int64)).occupancy.size
             return
@@ -63,13 +63,13 @@ class RowsContract(StoreCase):
         np.testing.assert_array_equal(mine, written.occupancy.reshape(-1, 64))
 
     def test_nothing_asked_is_nothing_found(self, store: Store) -> None:
-        """Empty arrays cannot be bound by every engine."""
+        """Some engines cannot bind empty arrays."""
         none = np.empty(0, dtype=np.int64)
         assert len(store.lookup(none)) == len(store.scan(none, none)) == 0
         assert len(store.lookup_each(none)) == store.count(none, none) == 0
 
     def test_rows_of_leaves_the_others_out(self, store: Store) -> None:
-        """Of two objects that overlap."""
+        """The two objects overlap."""
         written = rows_of_voxels(blob(2, (24, 20, 20)), *kind(store))
         rows = store.rows_of(2, *EVERYWHERE)
         np.testing.assert_array_equal(rows.keys, written.keys)
@@ -78,7 +78,7 @@ class RowsContract(StoreCase):
         assert not len(store.rows_of(3, *EVERYWHERE))
 
     def test_an_empty_environment_answers(self) -> None:
-        """No rows, no objects, no revision."""
+        """It has no rows and no objects, and its revision is 0."""
         store = self.make(Grid(0.01, (0, 0, 0), 5), "brick")
         assert store.revision() == store.size().rows == len(store.objects()) == 0
         assert not list(store.changes())

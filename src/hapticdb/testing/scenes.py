@@ -1,4 +1,4 @@
-"""Scenes with a closed form, and what tests ask of a store again and again."""
+"""Scenes with a closed form, and reads and writes that many tests need."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,12 +60,12 @@ def blob(seed: int, center: tuple[int, int, int], radius: int = 8) -> NDArray[np
 
 
 def kind(store: Store) -> tuple[Grid, Layout]:
-    """Grid and layout of a store: what rows are made with."""
+    """Grid and layout of a store, the arguments that make rows."""
     return store.grid, store.layout
 
 
 def covering(store: Store) -> Covering:
-    """What tells a write where the rows of an object are."""
+    """Argument `covering` of a write: says where the rows of an object are."""
 
     def ranges(obj: Object) -> list[tuple[int, int]]:
         found = object_ranges(store.grid, store.layout, obj.bounds)

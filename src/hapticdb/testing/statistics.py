@@ -1,4 +1,4 @@
-"""Statistics: quantiles of the keys, how old they are, cost figures."""
+"""Tests of statistics: quantiles of the keys, their age, cost figures."""
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from hapticdb.testing.scenes import (
 
 
 class StatisticsContract(StoreCase):
-    """What grouping by cost stands on."""
+    """Tests of the statistics that grouping by cost needs."""
 
     @pytest.mark.parametrize("resolution", [1, 3, 7, 100, 5000])
     def test_quantiles_follow_definition_2(self, store: Store, resolution: int) -> None:
@@ -27,7 +27,7 @@ class StatisticsContract(StoreCase):
         assert bounds.tolist() == [int(keys[rank - 1]) for rank in ranks]
 
     def test_kept_quantiles_are_never_stale(self, store: Store) -> None:
-        """After a write they are computed anew."""
+        """After a write they are computed again."""
         store.analyze(10)
         kept = store.quantiles(10)
         assert kept.source == "kept"
@@ -37,7 +37,7 @@ class StatisticsContract(StoreCase):
         assert anew.n_rows < kept.n_rows
 
     def test_freshness_counts_the_writes_since(self, store: Store) -> None:
-        """Unknown before, none right after, one after a removal."""
+        """The age is unknown before `analyze`, 0 right after it, and 1 after a removal."""
         assert store.freshness(10).revision is None
         store.analyze(10)
         assert store.freshness(10) == (2, 0, 0)

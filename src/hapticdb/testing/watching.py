@@ -1,4 +1,4 @@
-"""Watching: commits of others are noticed, each of them, and none that was not made."""
+"""Tests of watching: every commit of others is noticed, and nothing else."""
 
 import time
 from collections.abc import Callable
@@ -25,11 +25,11 @@ from hapticdb.testing.scenes import (
 )
 
 NOTICED_S = 10.0
-"""Seconds to wait for a notification of a commit. More is only felt when a test fails."""
+"""Seconds to wait for a notification of a commit. A larger value only delays a test's failure."""
 
 
 def is_noticed(watcher: SupportsWatch) -> bool:
-    """Whether a commit comes to be noticed: on a server, as soon as its notification is here."""
+    """Whether a commit is noticed in time; on a server its notification takes a moment."""
     deadline = time.monotonic() + NOTICED_S
     while not watcher.has_changed():
         if time.monotonic() > deadline:
@@ -39,10 +39,10 @@ def is_noticed(watcher: SupportsWatch) -> bool:
 
 
 class WatchContract(StoreCase):
-    """The capability `watch`."""
+    """Tests of the capability `watch`."""
 
     def test_a_commit_of_another_is_noticed_once(self, store: Store) -> None:
-        """Of every kind of write; a rolled-back one hides none that comes after it."""
+        """Every kind of write is noticed. A rolled-back write hides no later commit."""
         self.need("watch")
         reader = self.reopen(store)
         assert isinstance(reader, SupportsWatch)
@@ -63,7 +63,7 @@ class WatchContract(StoreCase):
         reader.close()
 
     def test_none_of_many_commits_is_missed(self, store: Store) -> None:
-        """Each after it was committed; and those of one moment together."""
+        """Single commits are noticed one by one, and several quick commits together."""
         self.need("watch")
         reader = self.reopen(store)
         assert isinstance(reader, SupportsWatch)
@@ -80,7 +80,7 @@ class WatchContract(StoreCase):
         reader.close()
 
     def test_reading_neither_hides_a_commit_nor_invents_one(self, store: Store) -> None:
-        """Though what was read holds the commit already."""
+        """The read returned the commit already, but `has_changed` still reports it."""
         self.need("watch")
         reader = self.reopen(store)
         assert isinstance(reader, SupportsWatch)
@@ -96,7 +96,7 @@ class WatchContract(StoreCase):
         reader.close()
 
     def test_a_commit_during_a_snapshot_is_noticed_after_it(self, store: Store) -> None:
-        """Inside, asking is refused: nothing changes there."""
+        """Inside the snapshot `has_changed` is refused, because no commit is visible there."""
         self.need("watch")
         reader = self.reopen(store)
         assert isinstance(reader, SupportsWatch)

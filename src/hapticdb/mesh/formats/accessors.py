@@ -1,7 +1,7 @@
 """Numbers of a glTF file: its buffers, each distinct one read once, and the arrays in them.
 
-Not read through trimesh, which reads an external file once for each buffer that names it, makes
-arrays of all accessors even if no mesh uses them, and takes half a second to import.
+This module does not use trimesh, which reads an external file once for each buffer that names it,
+makes arrays of all accessors even if no mesh uses them, and takes half a second to import.
 """
 
 import base64
@@ -23,7 +23,7 @@ _BIN = b"BIN\0"
 
 
 def objects_of(tree: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    """List of objects that a glTF keeps under a key; empty where it keeps none."""
+    """List of objects that a glTF has under a key; empty if the key is missing."""
     found = tree.get(key, [])
     if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
         raise UnreadableError(f"it is damaged: its '{key}' is no list of objects")
@@ -38,7 +38,7 @@ def whole(value: object, what: str, least: int = 0) -> int:
 
 
 def item(items: list[dict[str, Any]], number: object, what: str) -> dict[str, Any]:
-    """Item that another refers to by its number."""
+    """Item of a list, by the number that refers to it."""
     n = whole(number, f"the number of {what}")
     if n >= len(items):
         raise UnreadableError(f"it is damaged: it refers to {what} {n} of {len(items)}")
@@ -46,7 +46,7 @@ def item(items: list[dict[str, Any]], number: object, what: str) -> dict[str, An
 
 
 def external_name(buffer: dict[str, Any]) -> str | None:
-    """File that a buffer is kept in, None where the glTF holds it."""
+    """File that holds a buffer; None if the glTF file itself holds it."""
     name = buffer.get("uri")
     if name is not None and not isinstance(name, str):
         raise UnreadableError("it is damaged: the 'uri' of a buffer is no text")
@@ -54,7 +54,7 @@ def external_name(buffer: dict[str, Any]) -> str | None:
 
 
 def external_bytes(tree: dict[str, Any], folder: Path) -> int:
-    """Size of the files that a glTF file refers to, as far as they are there, each once."""
+    """Size of the existing files that a glTF file refers to; each file counts once."""
     sizes: dict[tuple[int, int], int] = {}
     for name in {external_name(buffer) for buffer in objects_of(tree, "buffers")} - {None}:
         file = _beside(folder, str(name))
@@ -91,7 +91,7 @@ def chunks_of(content: bytes) -> list[memoryview]:
 
 
 class Accessors:
-    """Arrays of a glTF file's accessors: made when asked for, and views where they can be.
+    """Arrays of a glTF file's accessors: made when they are needed, and views if possible.
 
     Parameters
     ----------
@@ -100,7 +100,7 @@ class Accessors:
     chunks : list of memoryview
         Binary chunks: the n-th is the n-th buffer without a URI.
     folder : Path
-        Where the files lie that it refers to.
+        Folder of the files that the glTF refers to.
     """
 
     def __init__(self, tree: dict[str, Any], chunks: list[memoryview], folder: Path) -> None:
@@ -112,7 +112,7 @@ class Accessors:
         self._arrays: dict[int, NDArray[np.generic]] = {}
 
     def entry(self, number: object) -> dict[str, Any]:
-        """Accessor as the JSON has it."""
+        """JSON object of an accessor."""
         return item(self._accessors, number, "accessor")
 
     def array(self, number: int) -> NDArray[np.generic]:

@@ -1,6 +1,6 @@
 """COLLADA through pycollada: one part for each placed geometry, named along its nodes.
 
-Nodes are not walked by trimesh's loader, which forgets their names and copies the geometry for
+This module walks the nodes itself: trimesh's loader loses their names and copies the geometry for
 every placement. pycollada keeps numbers as float32.
 """
 
@@ -18,7 +18,7 @@ _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 
 
 def read(path: Path) -> Parsed:
-    """Parts of the document's scene, in its unit; its axes left as they are."""
+    """Parts of the document's scene, in its unit and with its axes."""
     # A missing texture or an unknown effect must not lose the geometry.
     lenient = [collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
     document = collada.Collada(str(path), ignore=lenient)
@@ -46,7 +46,7 @@ def read(path: Path) -> Parsed:
 
 
 def _links(nodes: list[Any]) -> list[tuple[Any, NDArray[np.float64]]]:
-    """Nodes with their transforms; an instance of a node of the library counts as that node."""
+    """Nodes with their transforms; an instance of a library node counts as that node."""
     found = []
     for node in nodes:
         if isinstance(node, collada.scene.NodeNode):
@@ -62,7 +62,7 @@ def _children(node: Any) -> list[tuple[Any, NDArray[np.float64]]]:  # noqa: ANN4
 
 
 def _geometries(node: Any) -> list[Any]:  # noqa: ANN401 - untyped library
-    """Geometries of a node itself, skinned ones in their rest pose."""
+    """Geometries of a node itself; skinned geometries are in their rest pose."""
     found = []
     for child in node.children:
         if isinstance(child, collada.scene.GeometryNode):

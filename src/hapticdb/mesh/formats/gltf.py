@@ -1,8 +1,8 @@
 """glTF and GLB: one part for each placed mesh, its pieces joined, named along its nodes.
 
-Not read through trimesh, whose scene graph names the pieces of one mesh at random, drops nodes
-below a camera, and keeps one of several placements of a node. `accessors` says why trimesh does not
-read the numbers, either.
+This module does not use trimesh, whose scene graph names the pieces of one mesh at random, drops
+nodes below a camera, and keeps one of several placements of a node. `accessors` says why trimesh
+does not read the numbers, either.
 """
 
 import json
@@ -26,7 +26,7 @@ from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableEr
 
 _MAGIC = b"glTF"
 _POINTS, _TRIANGLES, _STRIP = 0, 4, 5
-# Extensions that leave the geometry where it is; a file that requires another is refused.
+# Extensions that do not change geometry; a file that requires another extension is refused.
 _HARMLESS = (
     "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp",
     "KHR_animation_", "KHR_node_", "KHR_mesh_quantization", "AGI_", "CESIUM_", "EXT_mesh_features",
@@ -92,7 +92,7 @@ def load_tree(content: bytes, suffix: str) -> dict[str, Any]:
 
 
 def bytes_beside(path: Path) -> int:
-    """Size of the files that a glTF file refers to, as far as they are there, each once."""
+    """Size of the existing files that a glTF file refers to; each file counts once."""
     return external_bytes(load_tree(path.read_bytes(), path.suffix.lower()), path.parent)
 
 
@@ -120,7 +120,7 @@ def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:
 
 
 def _shape(mesh: dict[str, Any], number: int, accessors: Accessors) -> Shape:
-    """One shape of a mesh's pieces; vertices that pieces share are kept once."""
+    """One shape from a mesh's pieces; vertices that pieces share are kept once."""
     vertices: dict[int, NDArray[np.generic]] = {}
     offsets: dict[int, int] = {}
     faces: list[NDArray[np.int64]] = []
@@ -143,7 +143,7 @@ def _shape(mesh: dict[str, Any], number: int, accessors: Accessors) -> Shape:
         if position not in offsets:
             offsets[position], vertices[position] = n_vertices, corners
             n_vertices += len(corners)
-        # An index out of its own piece must not reach into the next one's vertices.
+        # An index outside its own piece must not reach into the next piece's vertices.
         found = _corners(piece, mode, len(corners), accessors, number)
         inside = (found >= 0) & (found < len(corners))
         faces.append(np.where(inside, found + offsets[position], -1))
@@ -157,7 +157,7 @@ def _shape(mesh: dict[str, Any], number: int, accessors: Accessors) -> Shape:
 
 
 def _one(arrays: list[Any]) -> NDArray[Any]:
-    """Join arrays; a single one is not copied, since thousands of meshes may share it."""
+    """Join arrays. A single array is not copied, because thousands of meshes may share it."""
     return np.asarray(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
 
 
@@ -217,7 +217,7 @@ def _roots(tree: dict[str, Any], nodes: list[dict[str, Any]]) -> list[int]:
 
 
 def _numbers(holder: dict[str, Any], key: str, n_nodes: int) -> list[int]:
-    """Nodes that a node or scene names, each once; refuses those that are not there."""
+    """Nodes that a node or scene names, each once; refuses missing nodes."""
     found = holder.get(key, [])
     if not isinstance(found, list):
         raise UnreadableError(f"it is damaged: the '{key}' of a node or scene are no list")
@@ -228,7 +228,7 @@ def _numbers(holder: dict[str, Any], key: str, n_nodes: int) -> list[int]:
 
 
 def _name(node: dict[str, Any], number: int) -> str:
-    """Name of a node, or its number where it has none."""
+    """Name of a node, or its number if it has no name."""
     return str(node.get("name") or number)
 
 
@@ -247,7 +247,7 @@ def _parent_from_node(node: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def _rotation(xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation (3, 3) of a quaternion x, y, z, w of any length; of a zero one, none."""
+    """Rotation (3, 3) of a quaternion x, y, z, w of any length; the identity for a zero one."""
     length = np.linalg.norm(xyzw)
     if length == 0:
         return np.eye(3)

@@ -60,7 +60,7 @@ def read(path: Path) -> Parsed:
 
 
 def _unit_of(records: Iterable[object]) -> float | None:
-    """Metres of the unit that the file's projected reference system names, else None."""
+    """Metres of the unit that the file's projected reference system names, or None."""
     for record in records:
         if isinstance(record, GeoKeyDirectoryVlr):
             keys = {key.id: key.value_offset for key in record.geo_keys}
@@ -72,7 +72,7 @@ def _unit_of(records: Iterable[object]) -> float | None:
 
 
 def _unit_of_wkt(text: str) -> float | None:
-    """Metres of a projected system's unit in well-known text: the last unit, after angles."""
+    """Metres of a projected system's unit in well-known text: the last unit, after angle units."""
     start = max(text.find("PROJCS["), text.find("PROJCRS["))
     if start < 0:
         return None
@@ -99,8 +99,8 @@ def _check_chunks(header: laspy.LasHeader) -> None:
 def _check_layers(path: Path, header: laspy.LasHeader) -> None:
     """Refuse layers longer than their chunk: lazrs allocates what a chunk promises.
 
-    A chunk in layers begins with one point unpacked, the number of its points and the length of
-    each layer (LASzip's compressor 3, for point formats from 6 on).
+    A chunk in layers begins with one unpacked point, the number of points and the length of each
+    layer (LASzip's compressor 3, for point formats from 6 on).
     """
     for record in header.vlrs.get("LasZipVlr"):
         content = record.record_data

@@ -16,8 +16,8 @@ def read(path: Path) -> Parsed:
     content = path.read_bytes()
     if content[:3].lower() != b"ply":
         raise UnreadableError("it is no PLY file: its first line is not 'ply'")
-    # The loader's arguments for a mesh, before trimesh builds one: building one drops faces with
-    # NaN corners in silence unless told not to, and merges vertices.
+    # The arguments for a mesh, before trimesh builds it: building it merges vertices and, by
+    # default, drops faces with NaN corners without an error.
     loaded = load_ply(io.BytesIO(content), skip_materials=True, fix_texture=False)
     elements = loaded["metadata"]["_ply_raw"]
     if "tristrips" in elements:
@@ -33,7 +33,7 @@ def read(path: Path) -> Parsed:
 
 
 def _check_length(name: str, element: dict[str, Any]) -> None:
-    """Refuse a text file with fewer rows than its header promises; the loader takes it."""
+    """Refuse a text file with fewer rows than its header promises; trimesh's loader accepts it."""
     promised, rows = element.get("length", 0), element.get("data")
     if not promised:
         return

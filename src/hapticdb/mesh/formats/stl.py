@@ -1,7 +1,7 @@
 """STL, binary and text. Each solid of a text file is a part of its own.
 
-Not read through trimesh, which drops empty solids and an unfinished last solid without an error,
-and takes the word 'solid' in the name behind 'endsolid' for the start of another solid.
+This module does not use trimesh, which drops empty solids and an unfinished last solid without an
+error, and takes the word 'solid' in the name after 'endsolid' for the start of another solid.
 """
 
 import re
@@ -19,7 +19,7 @@ _VERTEX = re.compile(r"\bvertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 
 
 def read(path: Path) -> Parsed:
-    """Solids of an STL file, named as in the file, else after it."""
+    """Solids of an STL file, named as in the file, or after the file."""
     content = path.read_bytes()
     n_facets = int.from_bytes(content[80:_HEADER], "little") if len(content) >= _HEADER else 0
     n_bytes = _HEADER + n_facets * _FACET.itemsize

@@ -1,6 +1,6 @@
 """3MF: one part a build item and component, named along the objects that hold it.
 
-Not read through trimesh, which stops without an error after (edges times nodes) steps, so that
+This module does not use trimesh, which stops without an error after (edges times nodes) steps, so
 nested assemblies lose instances, and keeps one of two build items of the same part number.
 """
 
@@ -74,7 +74,7 @@ def read(path: Path) -> Parsed:
 
 
 def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
-    """Root model, and those that its components lie in."""
+    """Root model, and the models that hold its components."""
     members = {name.lower().strip("/"): name for name in archive.namelist()}
     root = next((name for name in members if name.endswith("3d/3dmodel.model")), None)
     if root is None:
@@ -129,7 +129,7 @@ def _read_model(
     parser.StartDoctypeDeclHandler = _refuse_doctype
     if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise UnreadableError("its model is packed by another method than deflate: save it anew")
-    # Parsed as a stream, without a tree, so that memory is in proportion to the geometry.
+    # Parsed as a stream, without a tree, so memory is in proportion to the geometry.
     with archive.open(name) as stream:
         try:
             while piece := stream.read(_PIECE):
@@ -164,7 +164,7 @@ def _index(word: str) -> int:
 
 
 def _link(attributes: dict[str, str], member: str) -> Link:
-    """Object that a component or build item places, and where."""
+    """Object that a component or build item places, and its transform."""
     file = next((v for k, v in attributes.items() if k.endswith(" path")), member)
     key = (file.lower().strip("/"), attributes["objectid"])
     transform = np.eye(4)

@@ -1,8 +1,8 @@
 """OBJ: each object and group of a Wavefront file a part, named 'object/group'.
 
-Not read through trimesh, which joins both names by '_', counts negative indices from the end of the
-file instead of from the line that holds them, takes index 0 for the first vertex, and refuses the
-whole file for one face out of range.
+This module does not use trimesh, which joins both names by '_', counts negative indices from the
+end of the file instead of from the line that holds them, takes index 0 for the first vertex, and
+refuses the whole file for one face out of range.
 """
 
 import re
@@ -31,7 +31,7 @@ _OUTSIDE = -1
 
 @dataclass
 class _Group:
-    """Faces of one object and group: lines, and how many vertices stood before each."""
+    """Faces of one object and group: their lines, and the number of vertices before each line."""
 
     lines: list[str] = field(default_factory=list)
     n_before: list[int] = field(default_factory=list)
@@ -39,7 +39,7 @@ class _Group:
 
 
 def read(path: Path) -> Parsed:
-    """Objects and groups of an OBJ file; without any, one part named after the file."""
+    """Objects and groups of an OBJ file; if there are none, one part named after the file."""
     text = path.read_bytes().decode("utf-8", "replace")
     vertex_lines: list[str] = []
     groups: dict[tuple[str, str], _Group] = {}
@@ -98,7 +98,7 @@ def _shape(group: _Group, vertices: NDArray[np.float64]) -> Shape:
 
 
 def _polygon(line: str, n_before: int) -> list[int]:
-    """Corners of one face, from 0; a negative index counts back from the line that holds it."""
+    """Corners of one face, counted from 0; a negative index counts back from its own line."""
     corners = []
     for word in line.split():
         try:
@@ -107,6 +107,6 @@ def _polygon(line: str, n_before: int) -> list[int]:
             raise UnreadableError("a face holds a word where an index should be") from None
         if index < 0:
             index += n_before + 1
-        # An index that is still not above 0 is outside, whether it was absolute or relative.
+        # An index that is still not above 0 is out of range, whether it was absolute or relative.
         corners.append(index - 1 if 0 < index < 2**62 else _OUTSIDE)
     return corners

@@ -138,7 +138,7 @@ class OpenedFile:
         return True
 
     def _owns_its_log(self) -> bool:
-        """Whether only the names beside the file are gone, so its log can still go into the file."""
+        """Whether only the names beside the file are gone, so that its log can go into the file."""
         descriptor = sqlite_bytes.descriptor_of(self._beside.get(self._log, (0, 0)))
         if _identity(str(self._path)) != self.identity or descriptor is None:
             return False

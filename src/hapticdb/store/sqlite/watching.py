@@ -19,7 +19,7 @@ class SQLiteWatch:
 
         The pragma looks at the file's log; apsw's own `data_version` only says what the last read
         has seen. A file that was opened as immutable is judged by its stamp, and once changed, it
-        stays so. Raises ConnectionLostError when the path leads to another file than the opened one.
+        stays so. Raises ConnectionLostError when the path leads to another file than before.
         """
         self._connection.check_outside()
         if self._connection.file.stamp is not None:

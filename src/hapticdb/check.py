@@ -92,9 +92,9 @@ def check_environment(
 
     The check compares the checksums of all pages (SQLite) and runs the engine's own check. Every
     row must belong to an object, be in order, and lie in the grid and in its object's bounds. A
-    brick must hold a voxel, and none outside the grid. Every object must have its number of voxels, and
-    its rows the checksum that was written with them. The log of changes must have no gaps and agree
-    with the objects. Rows are read in batches, so memory does not grow with their number.
+    brick must hold a voxel, and none outside the grid. Every object must have its number of voxels,
+    and its rows the checksum that was written with them. The log of changes must have no gaps and
+    agree with the objects. Rows are read in batches, so memory does not grow with their number.
 
     Parameters
     ----------

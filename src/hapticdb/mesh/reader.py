@@ -119,7 +119,7 @@ def _seconds_for(file: Path) -> float:
 
 
 def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | None, Path]:
-    """Length of the given unit, and the file's path; refuses a file that is wrong at first sight."""
+    """Length of the given unit, and the file's path; refuses what needs no parsing to refuse."""
     metres = None if unit is None else metres_of(unit)
     file = Path(path)
     try:

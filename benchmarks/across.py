@@ -22,6 +22,7 @@ ABOVE = 0.05
 DIP = 0.004
 """Metres: height above each object's top between dips, and depth of a dip below the top."""
 RATE = 1000.0
+"""Frames a second of the session."""
 LONGEST_S = 3600.0
 """Seconds after which a session counts as failed; docs/realtime.md's flight takes five minutes."""
 

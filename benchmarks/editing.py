@@ -19,12 +19,17 @@ from hapticdb.devices.scripted import Path
 from hapticdb.poses import read_poses
 
 RATE = 1000.0
+"""Frames a second of the session."""
 EDITS = 60
+"""Number of commits of the writer."""
 LIFT = 5.0
 """Height in voxels by which the object is lifted."""
 LOOK = 0.0005
+"""Seconds between two looks at the last frame: the resolution of the measured times."""
 PAUSE = 0.2
+"""Seconds before each edit."""
 PATIENCE = 60.0
+"""Seconds that one edit may take before the run fails."""
 
 
 def touched_object(url: str, shell: PointShell, path: FilePath) -> int:

@@ -44,6 +44,7 @@ from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
 
 STALENESS = 0.5
+"""Seconds without an answer of the database after which resident cells count as unknown."""
 FALLING = 0.04
 """Seconds after which a held force is zero."""
 SPARE = 0.02
@@ -52,6 +53,7 @@ APART = (2.0, 6.0)
 AWAY = (1.0, 5.0)
 """Ranges in seconds: between two disturbances, and for which the server stays away."""
 RECOVERY_PATIENCE = 30.0
+"""Seconds after a disturbance within which a frame must be exact again."""
 
 Frames = NDArray[np.void]
 

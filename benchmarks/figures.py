@@ -49,7 +49,7 @@ from report.plots import REPORT_KINDS
 from servers_cold import Cold
 
 EXTENT = 1.6
-"""Edge of the sample's grid, as a multiple of the car's longest side."""
+"""Edge of the sample's grid, as a multiple of the car's longest side; more gives larger voxels."""
 CAD = (
     ("demo_vintage_car", "*.glb", 1.6),
     ("assembly_vw_t1", "vw_t1.glb", 2.4),

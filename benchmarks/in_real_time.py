@@ -42,11 +42,13 @@ from places import serving
 
 BITS = 11
 EXTENT = 1.6
+"""Grid: bits an axis, and its edge as a multiple of the model's longest side."""
 ROUNDS = 15
 """Number of timed passes over all poses; the result is their median."""
 LIFT = 1.0
 """Way in metres by which a part is lifted out of the car."""
 N_LIFTED = 40
+"""Number of poses on that way."""
 PARTS = ("body/hood", "body/door_front_left", "supply/fuel_tank", "seats/bench_cushion")
 RUNS = {"flat": 0, "clusters": None}
 """Argument `run` of `ResidentFrames` (points of a cluster): 0 for none, None for the default."""

@@ -45,6 +45,7 @@ SIZES = (1.4e6, 1.4e7, 1.4e8, 1.4e9)
 ENGINES = ("sqlite", "18")
 BITS = 11
 EXTENT = 1.6
+"""Grid of one car: bits an axis, and its edge as a multiple of the car's longest side."""
 STRATEGIES: tuple[Strategy, ...] = ("array", "cbgroup", "auto")
 BYTES_A_VOXEL = {"sqlite": 1.3, "postgres": 3.0}
 """Bytes of disk reserved for each voxel, above all measured values; more refuses sooner."""
@@ -54,6 +55,7 @@ ROUNDS = 5
 """Turns of every size: a short disturbance of the machine then affects all sizes alike."""
 LIMIT_S = 60.0
 PROGRESS_S = 5.0
+"""Least seconds between two lines of progress."""
 
 NOTES = [
     "The sample car repeated by shifting keys; the smallest size is some of its objects.",

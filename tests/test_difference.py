@@ -30,7 +30,7 @@ def make(path: Path, kind: Kind = ("brick", "z"), bits: int = 5) -> Environment:
 
 
 def write(env: Environment, ijk: NDArray[np.int64], name: str, **fields: object) -> int:
-    """An object that claims the same geometry, whatever its voxels are."""
+    """Add an object with the given voxels; the digest of its geometry is always "same"."""
     record = replace(voxel_object(env.grid, ijk, name), digest="same")
     rows = rows_of_voxels(ijk, env.grid, env.layout)
     return env.store.add(replace(record, **fields), rows)  # type: ignore[arg-type]

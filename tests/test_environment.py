@@ -1,4 +1,4 @@
-"""An opened environment: its objects, moving and removing them, and what others see of it."""
+"""An opened environment: its objects, moving and removing them, and what other readers see."""
 
 import sys
 from collections.abc import Callable
@@ -247,7 +247,7 @@ def test_an_object_whose_file_is_gone_or_another_cannot_be_moved(
         assert words in str(raised.value)
     assert "\n" not in str(raised.value)
     assert rows_of(Path(env.url)) == before
-    env.remove(2)  # needs no file
+    env.remove(2)  # removing needs no file
     assert [o.id for o in env.objects()] == [1, 3, 4]
 
 
@@ -329,7 +329,7 @@ def test_a_closed_environment_says_so(env: Environment, sphere: PointShell) -> N
             ask()
 
 
-# --- what others see ----------------------------------------------------------------------------
+# --- other readers ------------------------------------------------------------------------------
 
 EDIT = """
 import sys

@@ -1,4 +1,4 @@
-"""Wrong uses of the Python API end in one clear line, never in a silent wrong answer."""
+"""Wrong uses of the Python API raise an error of one clear line; no wrong answer is returned."""
 
 import os
 import sys

@@ -1,4 +1,4 @@
-"""The sample: closed, outward, distinct parts; a path that touches; the same bytes every time."""
+"""The sample: closed, outward, distinct parts; a path that touches; reproducible bytes."""
 
 import os
 import sys

@@ -41,7 +41,7 @@ def make(path: Path, kind: Kind = ("brick", "z"), bits: int = 5) -> Environment:
 
 
 def make_blobs(path: Path, kind: Kind = ("brick", "z")) -> Path:
-    """Four objects of ids 2, 3, 5 and 9, three of which share voxels."""
+    """An environment of four objects with ids 2, 3, 5 and 9; three of them share voxels."""
     with make(path, kind) as env:
         for n, object_id in enumerate((2, 3, 5, 9)):
             add(env, blob(n, PLACES[n]), f"blob {n}", id=object_id)
@@ -382,7 +382,7 @@ N_OBJECTS = 40
 
 @pytest.fixture(scope="module")
 def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An environment of forty objects, each of some thousand voxels."""
+    """An environment of forty objects with some thousand voxels each."""
     path = tmp_path_factory.mktemp("many") / "a.db"
     rng = np.random.default_rng(5)
     with make(path, bits=8) as env:

@@ -1,4 +1,4 @@
-"""Ctrl-C at any moment of the command line is one line and exit code 130."""
+"""Ctrl-C at any moment of the command line gives one line and exit code 130."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 

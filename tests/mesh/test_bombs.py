@@ -23,7 +23,7 @@ from mesh_files import MESH_3MF, TRIANGLE, cause, glb_of, gltf, text, threemf
 def test_a_glTF_that_lists_itself_is_read_once(  # noqa: N802
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Reading 9,000 buffers, each the file itself, once took 5.6 GB."""
+    """9,000 buffers that all name the file itself once took 5.6 GB of memory."""
     n = 500
     tree = {
         "buffers": [{"byteLength": 100, "uri": "self.gltf"}] * n,
@@ -166,7 +166,7 @@ def _shell(path: Path, **changes: Any) -> Path:  # noqa: ANN401 - arrays
 
 
 def test_a_saved_shell_that_unpacks_to_much_more_is_refused(tmp_path: Path) -> None:
-    """A saved shell of 2.3 MB that once unpacked to 5.9 GB."""
+    """A saved shell of 2.3 MB once took 5.9 GB when it was unpacked."""
     assert len(PointShell.load(_shell(tmp_path / "a.npz"))) == 8
     with pytest.raises(FileError, match="more than 10 times as many"):
         PointShell.load(_shell(tmp_path / "b.npz", points=np.zeros((200_000, 3))))
@@ -224,7 +224,7 @@ def test_packed_points_of_every_kind_are_read_in_their_chunks(
 
 @pytest.mark.parametrize("layer", [0, 1, 5, 8, 18])
 def test_a_layer_that_is_longer_than_its_chunk_is_refused(tmp_path: Path, layer: int) -> None:
-    """A length of 2^28 in a file of 787 bytes once took 244 MiB."""
+    """A layer length of 2^28 in a file of 787 bytes once took 244 MiB of memory."""
     path = _laz(tmp_path / "a.laz", 6, 40)
     content = bytearray(path.read_bytes())
     (points_at,) = struct.unpack_from("<I", content, 96)

@@ -1,7 +1,7 @@
-"""Every file of the dirty folder reads with known counts, or is refused in one line.
+"""Every file of the dirty folder is read with known counts, or refused with a one-line error.
 
-Triangles and defects below were checked against the files: the text ones by reading them, the
-derived ones against how they were made, the others against trimesh's own load of the same file.
+The numbers of triangles and defects were checked: for text files by reading the file, for derived
+files against the way they were made, for the others against trimesh's load of the same file.
 """
 
 from collections.abc import Callable

@@ -1,4 +1,4 @@
-"""Files become parts: names, placements, units, and counts of what was wrong."""
+"""Files become parts: names, placements, units, and counts of defects."""
 
 import json
 from pathlib import Path
@@ -186,7 +186,7 @@ def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
         read_file(gltf({}, tmp_path / "a.gltf"), unit="furlong")
 
 
-# --- what is wrong is counted -----------------------------------------------------------------
+# --- counts of defects ------------------------------------------------------------------------
 
 
 def test_every_kind_of_bad_triangle_is_counted_and_only_sound_ones_stay(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""A short run of `mutate_files`: damaged files of every format are read, or refused in one line."""
+"""A short run of `mutate_files`: damaged files are read, or refused with a one-line error."""
 
 import sys
 from pathlib import Path

@@ -21,6 +21,7 @@ from realtime.worlds import cells_of
 
 Floats = NDArray[np.float64]
 SIZE = 0.005
+"""Voxel size in metres."""
 BITS = 6
 SIDE = 1 << BITS
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)

@@ -67,7 +67,7 @@ def pressing(world: World) -> Tool:
     return tool
 
 
-# --- about which point ----------------------------------------------------------------------------
+# --- the point of the wrench ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -96,7 +96,7 @@ def test_the_wrench_is_the_energys_gradient_at_the_handles_origin(floor: World, 
     np.testing.assert_allclose(tool.sent.wrench, -gradient, rtol=1e-5, atol=1e-7)
 
 
-# --- how much at most -----------------------------------------------------------------------------
+# --- the limit of the damper ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("speed", [5.0, 1e3])
@@ -127,7 +127,7 @@ def test_a_slow_hand_feels_all_of_the_damper(floor: World) -> None:
     assert tool.sent.wrench[0] == pytest.approx(damped, abs=1e-4)
 
 
-# --- rising and falling ---------------------------------------------------------------------------
+# --- rise and fall --------------------------------------------------------------------------------
 
 
 def test_a_session_that_starts_in_material_begins_softly(floor: World) -> None:
@@ -198,7 +198,7 @@ def test_an_open_clutch_lets_the_hand_go_and_takes_it_again_softly(
     assert found[-1] == 1.0
 
 
-# --- what is not a number -------------------------------------------------------------------------
+# --- NaN, infinities and absurd values ------------------------------------------------------------
 
 
 @pytest.mark.parametrize("field", ["position", "quaternion", "velocity", "kept", "held_for"])

@@ -34,6 +34,7 @@ from realtime.troubled import refuse, refuse_strangely, troubled
 from realtime.worlds import Reader, block, expected, ids_by_voxel, make, move, scatter
 
 RADIUS_M = 0.012
+"""Radius of the tool in metres, as a session reports it."""
 Pose = NDArray[np.float64]
 
 
@@ -163,7 +164,7 @@ def world(tmp_path: Path) -> Environment:
     return env
 
 
-# --- what is wanted -----------------------------------------------------------------------------
+# --- wanted cells -------------------------------------------------------------------------------
 
 
 @given(st.integers(0, 10_000))

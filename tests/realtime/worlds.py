@@ -36,6 +36,7 @@ HIERARCHICAL: list[tuple[Layout, CurveName]] = [
     ("brick", "hilbert"),
 ]
 SIZE = 0.002
+"""Voxel size in metres."""
 
 
 def make(

@@ -19,6 +19,7 @@ from realtime.worlds import make
 from recordings import HEADER, motion, read, write
 
 LIMIT = 1_000_000
+"""Most bytes of a recording."""
 
 
 def noise(n: int) -> Frames:

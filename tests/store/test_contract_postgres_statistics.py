@@ -1,4 +1,4 @@
-"""Quantiles from the server's statistics, and plans that read the index alone."""
+"""Quantiles from the server's statistics, and plans that read only the index."""
 
 import re
 

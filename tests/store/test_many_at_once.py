@@ -38,7 +38,9 @@ from validity import assert_valid
 
 N_READERS = 8
 ENOUGH_FRAMES = 10
+"""Frames of a reader before it may report "seen"."""
 N_IMPORTS = 2
+"""How often the balls are imported and removed."""
 LEFT, RIGHT = (-0.09, 0.0, 0.0), (0.09, 0.0, 0.0)
 """The shuttle's two places (metres); half of the shell's points are at each."""
 

@@ -74,7 +74,7 @@ def stale(path: Path, tmp_path: Path) -> Path:
     return path
 
 
-# --- a file in another's place --------------------------------------------------------------------
+# --- a file that replaces another -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize("read_only", [False, True])

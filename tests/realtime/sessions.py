@@ -15,7 +15,7 @@ from hapticdb.recording.file import Recording
 from hapticdb.testing import floor_voxels, write_voxels
 
 RATE = 500.0
-"""Frames a second of the tests' sessions; low, so that a busy machine keeps it."""
+"""Frames a second of the tests' sessions."""
 NEVER_STALE = 1e6
 """A staleness in seconds that no test reaches."""
 Recorded = NDArray[np.void]

@@ -96,7 +96,7 @@ def test_the_wrench_is_the_energys_gradient_at_the_handles_origin(floor: World, 
     np.testing.assert_allclose(tool.sent.wrench, -gradient, rtol=1e-5, atol=1e-7)
 
 
-# --- the limit of the damper ----------------------------------------------------------------------
+# --- the limit of the wrench ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("speed", [5.0, 1e3])

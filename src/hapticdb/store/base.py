@@ -36,7 +36,7 @@ class Rows(NamedTuple):
     keys : (R,) int64, ascending: voxel keys, or brick keys.
     ids : (R,) int64, ids of objects.
     occupancy : (64 R,) uint8, row after row; empty on the voxel layout.
-    payload : what force laws read beside the occupancy, an array whose first axis is (R,), or None.
+    payload : values that laws read beside the occupancy, an array with first axis (R,), or None.
     """
 
     keys: Keys
@@ -256,14 +256,14 @@ class ReadsRows(Protocol):
         """Rows with a key in any closed range, ascending and disjoint, in one statement."""
 
     def count(self, lows: Keys, highs: Keys) -> int:
-        """Count what `scan` would return, inside the engine."""
+        """Number of rows that `scan` would return, counted inside the engine."""
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
         """Rows of one object with a key in any closed range, ascending and disjoint."""
 
 
 class ReadsObjects(Protocol):
-    """Reads objects, and what was committed."""
+    """Reads objects and committed changes."""
 
     def revision(self) -> int:
         """Number of the last committed write; 0 for an empty environment."""
@@ -327,7 +327,7 @@ class KeepsStatistics(Protocol):
         """How old the statistics are that `quantiles` uses at that resolution."""
 
     def analyze(self, resolution: int, *, anew: bool = False) -> None:
-        """Renew the statistics that `quantiles` uses; statistics that are fresh only if `anew`."""
+        """Renew the statistics that `quantiles` uses; fresh ones are renewed only if `anew`."""
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""
@@ -379,7 +379,7 @@ class Store(ReadsRows, ReadsObjects, WritesObjects, KeepsStatistics, Protocol):
         """Close the connection."""
 
     def give_to(self, thread: int) -> None:
-        """Belong to another thread from now on (`this_thread`), or to `NOBODY`.
+        """Give the store to another thread (`this_thread`), or to `NOBODY`.
 
         Any thread may call it, while no other call is under way.
         """

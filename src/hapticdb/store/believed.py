@@ -87,7 +87,7 @@ def grid_of(url: str, rows: Sequence[Sequence[Any]]) -> tuple[Grid, Layout]:
 def check_tables(url: str, kinds: Mapping[str, str]) -> None:
     """Refuse an environment in which a table is missing, or is a view: a view can return anything.
 
-    `kinds` : for each name ``table``, or what it is instead.
+    `kinds` : for each name ``table``, or the kind of object that it names instead.
     """
     for name in TABLES:
         kind = kinds.get(name)

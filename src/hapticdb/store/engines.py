@@ -122,7 +122,7 @@ class BuiltIn(NamedTuple):
     """An engine of this package, not imported yet.
 
     module : its attribute `ENGINE` is the engine; driver : module that it needs and that may be
-    missing, or empty; extra : what pip installs to bring that driver.
+    missing, or empty; extra : name of the extra that installs that driver.
     """
 
     module: str

@@ -35,8 +35,8 @@ CREATE TABLE object (
 # digests, because an index cannot hold names of thousands of characters
 PART = "CREATE UNIQUE INDEX object_part ON object (md5(link), md5(name))"
 
-# statistics: the paper's best resolution, and the server's largest. Autovacuum: rows are read from
-# the index alone only where the visibility map says so
+# statistics: the paper's best resolution, and the server's largest. Autovacuum: the server reads
+# rows only from the index if the visibility map marks their page
 AUTOVACUUM = "autovacuum_vacuum_insert_scale_factor = 0.02, autovacuum_analyze_scale_factor = 0.05"
 VOXEL = (
     f"CREATE TABLE voxel (z_val bigint NOT NULL, id bigint NOT NULL) WITH ({AUTOVACUUM})",

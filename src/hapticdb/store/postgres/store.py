@@ -86,7 +86,7 @@ class PostgresStore:
         return self._connection.is_closed
 
     def give_to(self, thread: int) -> None:
-        """Belong to another thread from now on, or to none (0); only while nobody uses it."""
+        """Give the store to another thread, or to none (0); only while nobody uses it."""
         self._connection.give_to(thread)
 
     def discard(self) -> None:

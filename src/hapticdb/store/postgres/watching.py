@@ -68,7 +68,7 @@ class Watch:
 
         The call costs a round trip after a notification, after `HEARING_S` or `DEAF_S` without one,
         and after a lost connection. After a lost connection it returns true, because notifications
-        may have been missed. Raises ConnectionLostError when the environment was made anew.
+        may have been missed. Raises ConnectionLostError when the environment was remade.
         """
         self._connection.check_outside()
         if self._connection.again(self._listen):

@@ -172,7 +172,7 @@ def _alone(path: Path) -> Iterator[None]:
 
 
 def _put_in_place(unfinished: Path, path: Path) -> None:
-    """Replace a database, and remove what belonged to the former one.
+    """Replace a database, and remove the files beside the former one.
 
     If the process is killed in between, the former log lies beside the new file, but does not have
     its mark. Opening is then refused in one line, and the same command run again finishes the work.

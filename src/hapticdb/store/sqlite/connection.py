@@ -38,7 +38,7 @@ class FileConnection:
         self.file.close()
 
     def give_to(self, thread: int) -> None:
-        """Belong to another thread from now on, or to `NOBODY`."""
+        """Give the connection to another thread, or to `NOBODY`."""
         self._thread = thread
 
     def check_thread(self) -> None:

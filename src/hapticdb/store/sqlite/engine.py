@@ -58,7 +58,7 @@ class SQLiteEngine:
         return back_up(path_of(url), path_of(copy), replace=replace, progress=progress)
 
     def restore(self, copy: str, url: str, *, progress: BackupCallback | None) -> BackupReport:
-        """Put a copy in a file's place, and remove the log of what was there."""
+        """Put a copy in a file's place, and remove the log of the former file."""
         from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 
         return back_up(path_of(copy), path_of(url), replace=True, progress=progress)

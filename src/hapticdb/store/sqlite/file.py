@@ -36,7 +36,7 @@ MAGIC = b"SQLite format 3\0"
 
 @contextlib.contextmanager
 def named_errors(path: str) -> Iterator[None]:
-    """Turn the engine's errors into ours: what, where, what next."""
+    """Turn SQLite's errors into hapticdb's, which say what, where, and what next."""
     try:
         yield
     except (apsw.CorruptError, apsw.NotADBError, apsw.FormatError) as error:
@@ -196,7 +196,7 @@ def publish(unfinished: Path, path: Path) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Delete a database and what the engine keeps beside it."""
+    """Delete a database and the files that SQLite keeps beside it."""
     for suffix in ("", "-wal", "-shm"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
@@ -227,7 +227,7 @@ def migrate(connection: apsw.Connection, version: int) -> None:
 
 
 def needs_immutable(path: Path) -> bool:
-    """Whether only an immutable opening can read this file: nobody here can write its folder.
+    """Whether this file can only be opened as immutable: this user cannot write its folder.
 
     A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, SQLite can still
     read the file alone, if there is no log whose pages would be missed.

@@ -78,7 +78,7 @@ class OpenedFile:
         Raises
         ------
         ConnectionLostError
-            When the file, or what the engine keeps beside it, was moved, deleted or replaced.
+            When the file, or SQLite's files beside it, were moved, deleted or replaced.
         DamagedError
             When another file was copied over it.
         """

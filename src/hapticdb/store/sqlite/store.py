@@ -84,7 +84,7 @@ class SQLiteStore:
         self._connection.close()
 
     def give_to(self, thread: int) -> None:
-        """Belong to another thread from now on, or to `NOBODY`; only while nobody uses it."""
+        """Give the store to another thread, or to `NOBODY`; only while nobody uses it."""
         self._connection.give_to(thread)
 
     def discard(self) -> None:

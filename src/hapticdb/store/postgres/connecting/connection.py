@@ -90,7 +90,7 @@ class ServerConnection:
         return self._is_closed
 
     def give_to(self, thread: int) -> None:
-        """Belong to another thread from now on, or to `NOBODY`. No call may be under way."""
+        """Give the connection to another thread, or to `NOBODY`. No call may be under way."""
         self._thread = thread
 
     def check_thread(self) -> None:

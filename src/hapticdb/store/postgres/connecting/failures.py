@@ -24,7 +24,7 @@ from hapticdb.store.believed import damaged
 
 @contextlib.contextmanager
 def named_errors(shown: str) -> Iterator[None]:
-    """Turn the engine's errors into ours. `shown` is the URL as messages may show it."""
+    """Turn psycopg's errors into hapticdb's. `shown` is the URL as messages may show it."""
     try:
         yield
     except psycopg.Error as error:
@@ -124,7 +124,7 @@ def denied(shown: str, name: str) -> AccessError:
 
 
 def no_editor(shown: str) -> ReadOnlyError:
-    """Build the error for a user who may open the environment to write, but not its objects."""
+    """Build the error for a user who may write to the environment, but not to its objects."""
     return ReadOnlyError(
         f"{shown}: this user may not change objects; its owner can allow it with "
         "'hapticdb grant URL ROLE --as editor'"

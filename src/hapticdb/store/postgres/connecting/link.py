@@ -77,7 +77,7 @@ class Link:
     # -- connecting --------------------------------------------------------------------------
 
     def connect(self) -> None:
-        """Connect once, with `SETTINGS`; what the URL's `options` set is left as it is."""
+        """Connect once, with `SETTINGS`; settings in the URL's `options` override them."""
         try:
             made = _Connection.connect(
                 self._conninfo,

@@ -19,7 +19,7 @@ from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 IS_EMPTY = {layout: f"SELECT NOT EXISTS (SELECT 1 FROM {layout})" for layout in LAYOUTS}
-# Advisory locks of an environment: one for those who load, one for the one who makes the index.
+# Advisory locks of an environment: one for its loaders, one for the maker of the index.
 # The key is the oid of a table of the environment. An oid has 32 bits without a sign, a key 32 bits
 # with a sign.
 LOADERS, MAKERS = 0x48415054, 0x48415055
@@ -77,7 +77,7 @@ class Loading:
             try:
                 if self._is_owner:
                     self._make_index()
-                    if self._has_written:  # so that frames are read from the index alone
+                    if self._has_written:  # so that frames read the index only
                         connection.command(f"VACUUM {self._layout}")
             finally:
                 self._unlock("_shared", LOADERS)

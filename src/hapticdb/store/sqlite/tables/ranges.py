@@ -38,7 +38,7 @@ SELECT z_val, id, occupancy
 
 
 class RangeStatements:
-    """Statements of ranges on one environment, with what binds to their first three parameters."""
+    """Statements of ranges on one environment, with the values of their first three parameters."""
 
     def __init__(self, connection: apsw.Connection, layout: Layout, bits: int) -> None:
         # the bits that a row key leaves free hold the width of a range

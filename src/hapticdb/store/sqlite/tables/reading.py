@@ -70,7 +70,7 @@ class SQLiteReader:
     # -- rows -----------------------------------------------------------------------------------
 
     def unpacked(self, found: list[Any]) -> Rows:
-        """Rows as arrays, from what a statement returned."""
+        """Rows as arrays, from the tuples of a statement."""
         return sqlite_rows.rows_of(self._connection.url, found, has_bricks=self._has_bricks)
 
     def lookup(self, keys: Keys) -> Rows:

@@ -14,7 +14,7 @@ SELECT name, CASE WHEN sql LIKE 'CREATE VIRTUAL%' THEN 'virtual table' ELSE type
 
 
 def rows_of(url: str, found: list[Any], *, has_bricks: bool) -> Rows:
-    """Rows from what a statement returned: (key, id), or (key, id, occupancy)."""
+    """Rows from the tuples of a statement: (key, id), or (key, id, occupancy)."""
     if not found:
         return NO_ROWS
     if not has_bricks:

@@ -1,1 +1,1 @@
-"""Cells of an environment in memory, and frames that read nothing else."""
+"""Resident cells of an environment, and frames that read only these cells."""

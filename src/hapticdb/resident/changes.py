@@ -1,4 +1,4 @@
-"""Which cells the writes of others have touched."""
+"""Finds the cells that the writes of others have touched."""
 
 from collections.abc import Callable
 
@@ -11,8 +11,8 @@ from hapticdb.kernels.resident.cells import UNKNOWN
 from hapticdb.store.base import CELL_SHIFT, NO_KEYS, Change, Keys, Store
 
 MOST_CHANGES = 4096
-"""Writes that are followed one by one; after more, every cell counts as touched. A larger value
-keeps cells over long absences and takes longer to catch up."""
+"""Greatest number of writes that are followed one by one; after more, every cell counts as touched.
+A larger value keeps cells after long absences and takes longer to catch up."""
 FEW_CELLS = 1 << 14
 """Cells in the ranges of writes up to which each of them is looked up. Where there are more, the
 known cells are searched for those in the ranges. The result is the same; the value decides only
@@ -20,11 +20,11 @@ which way is faster."""
 
 
 def writes_since(store: Store, known_revision: int, revision: int) -> list[Change] | None:
-    """Writes after the known revision up to the present one, or None where they cannot be told.
+    """Writes after the known revision up to the present one, or None if they cannot be listed.
 
-    That is so where nothing is known (below 0), where a server came back without its last commits
-    (the known revision is ahead), where there are more than `MOST_CHANGES`, or where the store has
-    not kept them all.
+    They cannot be listed if no revision is known (below 0), if a server came back without its last
+    commits (the known revision is ahead), if there are more than `MOST_CHANGES`, or if the store
+    has not kept all of them.
     """
     n_missed = revision - known_revision
     if known_revision < 0 or not 0 <= n_missed <= MOST_CHANGES:
@@ -39,7 +39,7 @@ def known_cells_touched(
     slots_of: Callable[[Keys], Keys],
     known: Callable[[], Keys],
 ) -> Keys:
-    """Cells (n,) that are known, resident or empty, and that writes have touched.
+    """Known cells (n,), resident or empty, that writes have touched.
 
     slots_of : slots of cells, UNKNOWN for the unknown ones; known : all known cells.
     """
@@ -61,7 +61,7 @@ def known_cells_touched(
     kernels.curve_keys_of_cells(cells, bits, curve, on_curve)
     order = np.argsort(on_curve)
     on_curve = on_curve[order]
-    # how many spans hold each cell: one more from where a span begins, one less from its end on
+    # number of spans that hold each cell: +1 at the begin of a span, -1 at its end
     n_holding = np.zeros(len(cells) + 1, dtype=np.int64)
     np.add.at(n_holding, np.searchsorted(on_curve, first), 1)
     np.add.at(n_holding, np.searchsorted(on_curve, last, side="right"), -1)

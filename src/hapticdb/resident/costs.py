@@ -1,4 +1,4 @@
-"""What statements for cells cost: how those who fetch learn it without keeping anybody waiting."""
+"""Cost model for statements that fetch cells, found at the start without a long wait."""
 
 from collections.abc import Callable
 
@@ -7,25 +7,26 @@ from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.store.base import Store
 
 FAR = 2e-3
-"""Seconds of a round trip: more, and the thousands of a calibration keep a start waiting."""
+"""Greatest round trip (s) at which a calibration, which takes thousands of round trips, is done at
+the start. Larger: slower starts."""
 ASKED = 3
-"""Round trips that are timed; the shortest counts."""
+"""Number of timed round trips; the shortest counts."""
 
 
 def costs_at_start(
     store: Store, clock: Callable[[], float], *, may_measure: bool = True
 ) -> CostModel:
-    """Figures that the store keeps for this machine, or else what may be measured.
+    """Cost model from the figures that the store keeps for this machine, or else from measurement.
 
     Parameters
     ----------
     store : Store
         An environment.
     clock : callable
-        Seconds, by which a round trip is timed.
+        Returns seconds, to time a round trip.
     may_measure : bool
-        Whether there is time for that, and a row. Without them, and where a round trip takes longer
-        than `FAR`, all parts cost the same: right all the same, and joined with less skill.
+        Whether there is time for a measurement, and a row to measure. If not, or if a round trip
+        takes longer than `FAR`, all parts cost the same: results are equal, ranges less efficient.
     """
     kept = store.costs(machine_name())
     if kept:
@@ -36,7 +37,7 @@ def costs_at_start(
 
 
 def _round_trip(store: Store, clock: Callable[[], float]) -> float:
-    """Seconds until the store answers a small question."""
+    """Seconds until the store answers a small query."""
     times = []
     for _ in range(ASKED):
         started = clock()

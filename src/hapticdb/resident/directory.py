@@ -1,8 +1,8 @@
-"""The directory of a cell table, seen from its one writer.
+"""The directory of a cell table, as its only writer uses it.
 
-A table holds several copies of its directory. Frames read the copy of the published version, from
-the frame's start to its end. The writer changes the copy that is out of date longest, once no frame
-reads it, and publishes it as the next version: whole, and at once.
+A table has several copies of its directory. A frame reads one copy, the published version, from its
+start to its end. The writer changes the oldest copy after all frames have left it, and publishes it
+as the next version in one step.
 """
 
 import time
@@ -17,17 +17,17 @@ from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Keys
 
 PATIENCE = 0.02
-"""Seconds that the writer waits for frames of old versions before it looks whether the processes of
-these readers still run. A larger value holds the writer up longer when a reader has died."""
+"""Seconds that the writer waits for frames of old versions before it checks whether the processes
+of these readers still run. A larger value delays the writer longer after a reader has died."""
 PAUSE = 5e-5
-"""Seconds between two looks at the readers. A larger value delays each eviction by as much; a
-smaller one takes processor time from the frames that are waited for."""
+"""Seconds between two checks of the readers. A larger value delays each eviction; a smaller one
+takes processor time from the frames that the writer waits for."""
 
 
 class DirectoryChange(NamedTuple):
-    """What one version changes: cells (G,) that leave, and cells (n,) that come, with their slots.
+    """Changes of one version: cells (G,) that leave, and cells (n,) that come, with their slots.
 
-    A cell among both has a new slot.
+    A cell in both gets a new slot.
     """
 
     leaving: Keys
@@ -36,12 +36,12 @@ class DirectoryChange(NamedTuple):
 
 
 class CellDirectory:
-    """Which cell is in which slot, version after version.
+    """Map from cells to slots, in successive versions.
 
     Parameters
     ----------
     table : CellTable
-        Its directory has no other writer.
+        The table; its directory has no other writer.
     """
 
     def __init__(self, table: CellTable) -> None:
@@ -68,11 +68,11 @@ class CellDirectory:
         return table.keys[which][filled], table.slots[which][filled].astype(np.int64)
 
     def take_over(self) -> None:
-        """Go on where another writer ended: only its published copy is whole."""
+        """Continue after another writer has ended: only its published copy is complete."""
         self._n_unknown_copies = BUFFERS - 1
 
     def publish(self, change: DirectoryChange, revision: int) -> None:
-        """Publish the next version, and the revision of the database that it is of."""
+        """Publish the next version, with the database's revision of its cells."""
         version = self.version + 1
         self.wait_for_readers(version - BUFFERS + 1)
         table, which = self._table.cells, version % BUFFERS
@@ -89,11 +89,11 @@ class CellDirectory:
         kernels.publish(table.control, version, revision)
 
     def oldest_version_read(self) -> int:
-        """Oldest version that a frame is reading; a very large number where no frame runs."""
+        """Oldest version that a frame is reading; a very large number if no frame runs."""
         return int(kernels.oldest_version_read(self._table.cells.readers))
 
     def wait_for_readers(self, version: int) -> None:
-        """Wait until no frame reads a version older than that one. A frame takes microseconds."""
+        """Wait until no frame reads a version older than `version`; a frame takes microseconds."""
         waited_since = time.monotonic()
         while self.oldest_version_read() < version:
             time.sleep(PAUSE)

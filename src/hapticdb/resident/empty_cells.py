@@ -1,4 +1,4 @@
-"""Cells that are known to be empty: they take no slot, but an entry of the directory each."""
+"""Cells that are known to be empty: each takes an entry of the directory, but no slot."""
 
 from collections.abc import Iterable
 
@@ -8,12 +8,12 @@ from hapticdb.store.base import NO_KEYS, Keys
 
 
 class EmptyCells:
-    """Cells known to be empty, in the order in which they came.
+    """Cells known to be empty, oldest first.
 
     Parameters
     ----------
     limit : int
-        So many at most.
+        Greatest number of cells.
     """
 
     def __init__(self, limit: int) -> None:
@@ -25,24 +25,24 @@ class EmptyCells:
         return len(self._cells)
 
     def keys(self) -> Keys:
-        """All of them, (n,) int64, oldest first."""
+        """All cells, (n,) int64, oldest first."""
         return np.fromiter(self._cells, np.int64, len(self._cells))
 
     def add(self, cells: Iterable[int]) -> None:
-        """Note cells, for which `forget_for` has made room."""
+        """Add cells, after `forget_for` has made room for them."""
         self._cells.update(dict.fromkeys(cells))
 
     def discard(self, cells: Iterable[int]) -> None:
-        """Forget cells, where they are known."""
+        """Remove cells; unknown ones are ignored."""
         for cell in cells:
             self._cells.pop(cell, None)
 
     def forget_for(self, n_new: int, urgent: Keys) -> Keys:
-        """Forget cells so that `n_new` others have room; returns the forgotten ones.
+        """Remove cells so that `n_new` others have room; returns the removed ones.
 
-        None where there is room. Else the oldest leave, an eighth of the limit more than must so
-        that this is seldom needed. Urgent cells (U,), most urgent first, leave only where the
-        others are too few, and then from the least urgent on.
+        If there is room, no cell is removed. Otherwise the oldest leave, and an eighth of the limit
+        more than necessary, so that this happens seldom. Urgent cells (U,), most urgent first,
+        leave only if the other cells are not enough; the least urgent ones leave first.
         """
         surplus = len(self._cells) + n_new - self._limit
         if surplus <= 0:

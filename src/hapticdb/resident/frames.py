@@ -29,23 +29,23 @@ from hapticdb.resident.residency import Residency
 RUN = 64
 """Points of a cluster. A larger value tests fewer spheres and skips fewer points."""
 FLAT_RUN = 512
-"""Points that are placed at once without clusters: as many as a processor's first cache holds."""
+"""Points that are transformed at once without clusters: as many as a processor's L1 cache holds."""
 LEAST_FOUND = 1 << 16
-"""Entries, at least, of the hash table of cells that poses meet. A larger one has fewer collisions
-and takes longer to clear."""
+"""Least number of entries of the hash table of cells that poses meet. A larger table has fewer
+collisions and takes longer to clear."""
 SMALL = 16.0
-"""Voxels of a run's radius up to which the run's middle stands for its points where cells are
-looked for. A larger value looks up fewer places and fetches more cells that no point meets."""
+"""Greatest radius of a run, voxels, for which the search for cells uses the run's middle instead of
+its points. A larger value looks up fewer places and fetches more cells that no point meets."""
 
 Floats = NDArray[np.float64]
 
 
 class FeltFrames(NamedTuple):
-    """What a shell felt at M poses.
+    """Wrenches and counts of a shell at M poses.
 
     wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
-    int64: points in a voxel, below their tangent plane, in a cell that is not resident; deepest
-    (M,): metres, of the deepest contact.
+    int64: numbers of points in a voxel, below their tangent plane, in a cell that is not resident;
+    deepest (M,): depth of the deepest contact, metres.
     """
 
     wrenches: Floats
@@ -56,17 +56,17 @@ class FeltFrames(NamedTuple):
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
-    """Lay a shell out for frames: points with normals, and spheres around runs of neighbours.
+    """Prepare a shell for frames: points with normals, and bounding spheres of clusters.
 
     Parameters
     ----------
     shell : PointShell
-        In any order. Clusters skip most points where neighbours by index are neighbours in space,
-        as in shells made from files.
+        Its points may have any order. Clusters skip most points if neighbours by index are
+        neighbours in space, as in shells made from files.
     voxel_size : float
-        Metres. Spheres are larger by a thousandth of it, which is more than all rounding errors.
+        Metres. A sphere is larger by a thousandth of a voxel, which is more than rounding errors.
     run : int or None
-        Points of a cluster, 0 for no clusters; 64 unless given.
+        Points of a cluster, 0 for no clusters; 64 unless given, 0 for small shells.
     """
     if run is None:
         run = RUN if len(shell) > RUN else 0
@@ -83,11 +83,11 @@ def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) ->
 
 
 class Surroundings(NamedTuple):
-    """Places that stand for a shell's points where cells are looked for.
+    """Places used instead of a shell's points in the search for cells.
 
-    places (P, 3+): the points, or the middles of small runs of them and the points of the others;
-    reach : voxels around a place within which its points are; run : points of a run; first (C,)
-    int64: the first place of each run.
+    places (P, 3+): the middles of small runs, and the points of all other runs; reach : greatest
+    distance of a point from its place, voxels; run : points of a run; first (C,) int64: index of
+    the first place of each run.
     """
 
     places: Floats
@@ -96,7 +96,7 @@ class Surroundings(NamedTuple):
     first: NDArray[np.int64]
 
     def place_of(self, point: int) -> int:
-        """Index of the place that stands for a point."""
+        """Index of a point's place."""
         run, within = divmod(point, self.run)
         first = int(self.first[run])
         end = int(self.first[run + 1]) if run + 1 < len(self.first) else len(self.places)
@@ -104,7 +104,7 @@ class Surroundings(NamedTuple):
 
 
 def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
-    """Places for runs of points, one for a run with a radius of `SMALL` voxels or less."""
+    """Places of the runs: one place for a run with a radius of `SMALL` voxels or less."""
     n_points = len(clusters.points)
     starts = np.arange(0, n_points, clusters.run)
     radii = clusters.spheres[:, 3] / voxel_size
@@ -122,18 +122,18 @@ def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
 
 
 class ResidentFrames:
-    """Frames of one shell. Each waits until its cells are resident, so that all are exact.
+    """Frames of one shell. Each frame waits until its cells are resident, so all are exact.
 
     Parameters
     ----------
     residency : Residency
-        Of the environment; this is its table's only reader or one of several.
+        Residency of the environment; its table may have other readers.
     shell : PointShell
         The tool.
     law : ForceLaw or None
-        1000 N/m unless given.
+        Force law; 1000 N/m unless given.
     run : int or None
-        As `clusters_of` takes it.
+        As for `clusters_of`.
     """
 
     def __init__(
@@ -154,16 +154,16 @@ class ResidentFrames:
         self._row = residency.table.join()
 
     def close(self) -> None:
-        """Give the table's reader row back."""
+        """Free the table's reader row."""
         self.residency.table.leave(self._row)
 
     def feel(self, poses: ArrayLike) -> FeltFrames:
-        """Wrenches at poses (M, 4, 4) `world_from_tool`; fetches every cell that they need first.
+        """Fetch the cells for poses (M, 4, 4) `world_from_tool`, and compute the wrenches there.
 
         Raises
         ------
         UsageError
-            When a pose is not rigid.
+            If a pose is not rigid.
         """
         matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
         out = np.zeros((len(matrices), RESULTS))
@@ -181,12 +181,12 @@ class ResidentFrames:
         )
 
     def wrenches(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        """Wrenches (M, 6) and numbers of hits (M,) at poses, as a replay asks for them."""
+        """Wrenches (M, 6) and numbers of hits (M,) at poses, in the form that a replay needs."""
         felt = self.feel(poses)
         return felt.wrenches, felt.hits
 
     def _fetch(self, poses: Floats) -> int:
-        """Make all cells of the first poses resident; returns how many poses that are."""
+        """Make the cells of the first poses resident; returns the number of these poses."""
         residency = self.residency
         most = (residency.table.n_slots - 1) // 2
         around = self.surroundings
@@ -202,7 +202,7 @@ class ResidentFrames:
         return int(n_poses)
 
     def _run(self, poses: Floats, out: Floats, start: int, n_poses: int) -> None:
-        """Frames at poses start .. start + n_poses, whose cells are resident."""
+        """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
         part = slice(start, start + n_poses)
         done = feel_kernel(
             self.residency.table.cells, self._row, self.clusters, poses[part],

@@ -1,7 +1,7 @@
-"""Residency: brings cells of an environment into a table, and keeps them true.
+"""Residency: fetches cells of an environment into a table, and keeps them up to date.
 
-The only writer of its table. What it changes becomes visible at once and whole, as a new version of
-the directory.
+It is the only writer of its table. Each change becomes visible in one step, as a new version of the
+directory.
 """
 
 import time
@@ -21,13 +21,13 @@ from hapticdb.resident.writer import CellWriter, UnpublishedCells
 from hapticdb.store.base import NO_KEYS, Keys, Store
 
 BATCH = 256
-"""Cells that one statement asks for at most. A larger value brings more cells a second; a smaller
-one brings the most urgent ones sooner."""
+"""Greatest number of cells in one statement. A larger value fetches more cells a second; a smaller
+one fetches the most urgent ones sooner."""
 MOST_RENEWED = 512
-"""Cells that are read again at once when others have written. A larger value keeps more of what is
-known; a smaller one shows the write sooner: it shall be felt within 50 ms."""
+"""Greatest number of cells that are read again at once after a write of others. A larger value
+keeps more cells; a smaller one makes the write felt sooner: it shall be felt within 50 ms."""
 NOTHING_KNOWN = -1
-"""Stands for a revision of the database, and for its commit counter, before the first look."""
+"""Value of the database's revision, and of its commit counter, before the first query."""
 
 
 def check_cells(store: Store) -> None:
@@ -40,10 +40,9 @@ def check_cells(store: Store) -> None:
 
 
 class Loaded(NamedTuple):
-    """What a load did: cells brought in, rows read, ranges asked, seconds that the database took.
+    """Result of a load: cells fetched, rows read, ranges queried, seconds that the database took.
 
-    Fewer cells than were asked for when the table has no room for more: 0 when all others are
-    wanted just now.
+    There are fewer cells than requested if the table has no room; 0 if all others are still wanted.
     """
 
     cells: int
@@ -53,35 +52,35 @@ class Loaded(NamedTuple):
 
 
 class Residency:
-    """Cells of one environment in one table, without the objects that are not felt.
+    """Cells of one environment in one table, without the excluded objects.
 
-    It decides what is read, and when. `CellSource` reads, `CellWriter` holds and publishes.
+    It decides which cells are read, and when. `CellSource` reads; `CellWriter` writes the table.
 
     Parameters
     ----------
     store : Store
-        A connection of its own; `reopened` exchanges it.
+        A connection of its own; `reopened` replaces it.
     table : CellTable
-        Made for this; nobody else writes to it. Where another writer has filled it and has ended,
-        the urgent cells are read again and all others are forgotten, in one version.
+        A table without another writer. If an earlier writer has filled it and has ended, the urgent
+        cells are read again and all others are forgotten, in one version.
     exclude : iterable of int
         Ids of objects that are left out of all cells.
     urgent : (n,) int64
-        Cells that tools are near, distinct, most urgent first.
+        Cells near tools, distinct, most urgent first.
     clock : callable
-        Seconds, for what a load reports.
+        Returns seconds, to time loads.
 
     Attributes
     ----------
     writer : CellWriter
-        What is in the table.
+        Writer of the table's cells.
     n_loaded : int
-        Cells brought in so far.
+        Cells fetched so far.
 
     Raises
     ------
     UsageError
-        When the environment's curve has no cells.
+        If the environment's curve has no cells.
     """
 
     def __init__(
@@ -109,10 +108,10 @@ class Residency:
         self.refresh()
 
     def _take_over(self, urgent: Keys) -> None:
-        """Go on with the table of a writer that has ended: its last version is whole.
+        """Continue with the table of a writer that has ended: its last version is complete.
 
-        None of its cells is known to be true. The environment may have been replaced since, and a
-        new file may have the same number of writes as the old one.
+        Its cells may be out of date: the environment may have been replaced since then, and a new
+        file may have the same number of writes as the old one.
         """
         self.writer.take_over()
         self.table.cells.control[LOADING] = 0
@@ -121,14 +120,14 @@ class Residency:
         self.want(urgent, self.slots_of(urgent))
 
     def reopened(self, store: Store) -> None:
-        """Go on with another connection to the same environment, after the first was lost.
+        """Continue with a new connection to the environment, after the old one was lost.
 
-        Another environment of the same grid in the same place makes all cells unknown.
+        If it is now another environment with the same grid, all cells become unknown.
 
         Raises
         ------
         GridError
-            When an environment of another grid has taken its place.
+            If the environment was replaced by one with another grid.
         """
         if store.grid != self.grid:
             raise GridError(
@@ -143,7 +142,7 @@ class Residency:
 
     @property
     def store(self) -> Store:
-        """The connection by which cells are read."""
+        """The connection that reads cells."""
         return self._source.store
 
     @property
@@ -153,34 +152,34 @@ class Residency:
 
     @property
     def place(self) -> Place:
-        """The grid, as kernels take it."""
+        """The grid in the kernels' form."""
         return Place(*self.grid.origin, self.grid.voxel_size, float(self.grid.side))
 
     @property
     def revision(self) -> int:
-        """The database's revision that all resident cells are of."""
+        """Revision of the database at which all resident cells were read."""
         return self._revision
 
     # -- what is wanted and known ------------------------------------------------------------------
 
     def begin_round(self) -> None:
-        """Begin to name wanted cells anew: those of a few rounds ago may be evicted."""
+        """Begin a round of wanted cells; cells last wanted a few rounds ago may be evicted."""
         self.writer.slots.begin_round()
 
     def slots_of(self, cells: Keys) -> Keys:
-        """Slots (n,) of cells (n,): UNKNOWN, EMPTY_SLOT, or where they are."""
+        """Slots (n,) of cells (n,): UNKNOWN, EMPTY_SLOT, or a slot."""
         return self.writer.directory.slots_of(cells)
 
     def want(self, cells: Keys, slots: Keys) -> None:
-        """Keep cells (n,), most urgent first, in slots (n,), from eviction for a few rounds.
+        """Protect cells (n,), most urgent first, in slots (n,), from eviction for a few rounds.
 
-        When others write, these are read again at once, in this order.
+        After a write of others, these cells are read again at once, in this order.
         """
         self.writer.slots.want(slots)
         self._urgent = cells
 
     def missing(self, cells: Keys) -> Keys:
-        """Those of the cells (n,) that are unknown, in their order. All of them become wanted."""
+        """Return the unknown ones of cells (n,), in their order; all the cells become wanted."""
         slots = self.slots_of(cells)
         self.want(cells, slots)
         return np.compress(slots == UNKNOWN, cells)
@@ -188,12 +187,12 @@ class Residency:
     # -- bringing in -------------------------------------------------------------------------------
 
     def make_resident(self, cells: Keys) -> None:
-        """Make cells (n,) resident, all of them together, however many statements that takes.
+        """Make all cells (n,) resident at the same time, by as many statements as necessary.
 
         Raises
         ------
         UsageError
-            When they do not fit into the table together.
+            If they do not fit into the table together.
         """
         self.begin_round()
         missing = self.missing(cells)
@@ -209,15 +208,15 @@ class Residency:
         )
 
     def warm_up(self) -> None:
-        """Compile what is first called at an eviction or a write."""
+        """Compile the kernels that an eviction or a write calls first."""
         kernels.cells_of_curve_keys(NO_KEYS, self.grid.bits, self.grid.curve_code, NO_KEYS.copy())
         self.writer.slots.warm_up()
 
     def load(self, cells: Keys) -> Loaded:
-        """Bring in cells (n,), distinct and unknown, by one statement; at most `BATCH` are taken.
+        """Fetch up to `BATCH` of cells (n,), distinct and unknown, by one statement.
 
         If others have written meanwhile, their writes are followed in the same version, so that all
-        that is resident is of one revision.
+        resident cells have one revision.
         """
         cells = cells[: min(BATCH, max(self.table.n_slots // 4, 1))]
         self._make_room(len(cells))
@@ -237,20 +236,19 @@ class Residency:
         return Loaded(len(read.cells), read.n_rows, read.n_ranges, elapsed)
 
     def refresh(self) -> int:
-        """Follow what others have written; returns how many writes that were.
+        """Follow the writes of others; returns their number.
 
-        Cells that a write has touched are read again or become unknown, in one version: no frame
+        Cells that a write has touched are read again or become unknown, in one version, so no frame
         mixes two revisions of an object.
         """
         n_writes, _ = self._follow_writes(NO_KEYS)
         return n_writes
 
     def _follow_writes(self, asked: Keys) -> tuple[int, UnpublishedCells]:
-        """Bring known cells to the last revision, and unknown ones (n,) with them.
+        """Update the known cells to the last revision, and read the unknown cells `asked` (n,).
 
-        Of the touched cells the most urgent are read again and the others are forgotten, so that
-        memory and time have a bound however much was written. Returns the number of writes, and all
-        cells that were read.
+        The most urgent touched cells are read again, the others are forgotten. So memory and time
+        are bounded, however much was written. Returns the number of writes, and all cells read.
         """
         with self.store.snapshot():
             revision = self.store.revision()
@@ -269,7 +267,7 @@ class Residency:
         return len(writes), read
 
     def _read_all(self, cells: Keys) -> UnpublishedCells:
-        """Read cells (n,), batch by batch, as far as there is room."""
+        """Read cells (n,), batch by batch, while there is room."""
         self._make_room(len(cells))
         parts = [self._read_batch(cells[at : at + BATCH]) for at in range(0, len(cells), BATCH)]
         return UnpublishedCells(
@@ -280,7 +278,7 @@ class Residency:
         )
 
     def _read_batch(self, cells: Keys) -> UnpublishedCells:
-        """Read cells (n,) by one statement, as many of them as slots are free."""
+        """Read cells (n,) by one statement; no more than the free slots."""
         slots = self.writer.slots.next_free(len(cells))
         if not len(slots):
             return UnpublishedCells()
@@ -292,10 +290,10 @@ class Residency:
         return UnpublishedCells(cells, slots, read.n_rows, read.n_ranges)
 
     def _make_room(self, n_cells: int) -> None:
-        """Free so many slots, as far as there are cells that are not wanted just now."""
+        """Free slots for `n_cells` cells, but keep cells that are still wanted."""
         surplus = min(4 * BATCH, self.table.n_slots // 8)
         self.writer.evict_for(n_cells, surplus, self._urgent, self._revision)
 
     def _publish(self, leaving: Keys, read: UnpublishedCells) -> None:
-        """Publish what has left and come, as of the present revision."""
+        """Publish the cells that leave and come, with the present revision."""
         self.writer.publish(leaving, read, self._urgent, self._revision)

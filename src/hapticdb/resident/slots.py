@@ -1,4 +1,4 @@
-"""The slots of a cell table, seen from its one writer: which cell is where, and which leaves."""
+"""The slots of a cell table, as its only writer uses them: their cells, and evictions."""
 
 from collections import deque
 
@@ -10,19 +10,19 @@ from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Keys
 
 ROUNDS_KEPT = 4
-"""Rounds for which a wanted cell is not evicted, as long as others can be. A larger value keeps the
-cells of a tool that turns back; in a small table it leaves less to evict."""
+"""Rounds in which a wanted cell is not evicted if others can be. A larger value keeps the cells of
+a tool that turns back; in a small table it leaves fewer cells to evict."""
 
 
 class CellSlots:
     """Slots of one table: free, filled, or retired until no frame can see them.
 
-    Slot `EMPTY_SLOT` belongs to no cell: it stands for all that are known to be empty.
+    Slot `EMPTY_SLOT` belongs to no cell: it represents all cells that are known to be empty.
 
     Attributes
     ----------
     n_filled : int
-        Slots with a cell that the directory names.
+        Number of slots with a cell in the directory.
     """
 
     def __init__(self, table: CellTable) -> None:
@@ -37,7 +37,7 @@ class CellSlots:
 
     @property
     def n_free(self) -> int:
-        """Slots that a cell can be read into now."""
+        """Number of slots that a cell can be read into now."""
         return len(self._free)
 
     def cells(self) -> Keys:
@@ -45,30 +45,30 @@ class CellSlots:
         return self._cell_of_slot[self._cell_of_slot >= 0]
 
     def begin_round(self) -> None:
-        """Begin a round in which wanted cells are named anew."""
+        """Begin a round of wanted cells."""
         self._round += 1
 
     def want(self, slots: Keys) -> None:
-        """Keep the cells of slots (n,) for `ROUNDS_KEPT` rounds; ignores EMPTY_SLOT and UNKNOWN."""
+        """Protect cells in slots (n,) for `ROUNDS_KEPT` rounds; ignores EMPTY_SLOT and UNKNOWN."""
         self._wanted_at[slots[slots > EMPTY_SLOT]] = self._round
 
     # -- from free to filled ----------------------------------------------------------------------
 
     def next_free(self, count: int) -> Keys:
-        """Slots that are free, `count` of them at most. They stay free until `take`."""
+        """Return up to `count` free slots; they stay free until `take`."""
         count = min(count, len(self._free))
         return np.array(self._free[len(self._free) - count :], dtype=np.int64)
 
     def take(self, slots: Keys) -> None:
-        """Take slots (n,), just as `next_free` gave them, out of the free ones."""
+        """Remove slots (n,) from the free ones; they must be the result of `next_free`."""
         del self._free[len(self._free) - len(slots) :]
 
     def give_back(self, slots: Keys) -> None:
-        """Free slots (n,) that were taken and that no directory has named; ignores EMPTY_SLOT."""
+        """Free slots (n,) that were taken but are in no directory; ignores EMPTY_SLOT."""
         self._free += slots[slots > EMPTY_SLOT].tolist()
 
     def fill(self, slots: Keys, cells: Keys) -> None:
-        """Note the cells (n,) of slots (n,). They count as used, and as wanted in this round."""
+        """Store the cells (n,) of slots (n,); they count as used, and as wanted in this round."""
         self._cell_of_slot[slots] = cells
         self._wanted_at[slots] = self._round
         self._used[slots] = 1
@@ -77,10 +77,10 @@ class CellSlots:
     # -- from filled to free ----------------------------------------------------------------------
 
     def cells_to_evict(self, n_free: int, surplus: int) -> Keys:
-        """Cells that may leave so that `n_free` slots are free; fewer where all others are wanted.
+        """Cells to evict so that `n_free` slots are free; fewer if all others are wanted.
 
-        Cells that no frame has used since the clock's hand last passed leave first. If any must
-        leave, `surplus` leave where so many can. Cells wanted in the present round stay.
+        The clock algorithm: cells that no frame has used since the hand last passed leave first.
+        If any must leave, `surplus` cells leave if possible. Cells wanted in this round stay.
         """
         if self.n_free >= n_free:
             return np.empty(0, dtype=np.int64)
@@ -98,24 +98,24 @@ class CellSlots:
         return self._cell_of_slot[out[:count]]
 
     def clear(self, slots: list[int]) -> None:
-        """Forget the cells of slots. They are not free yet: see `retire`."""
+        """Forget the cells of slots; the slots are not free yet, see `retire`."""
         self._cell_of_slot[slots] = UNKNOWN
         self.n_filled -= len(slots)
 
     def retire(self, slots: list[int], version: int) -> None:
-        """Keep cleared slots back until no frame reads a version before that one."""
+        """Reserve cleared slots until no frame reads a version before `version`."""
         if slots:
             self._retired.append((version, slots))
 
     def free_retired(self, oldest_version_read: int) -> None:
-        """Free the retired slots that no frame can see any more."""
+        """Free the retired slots that no running frame can read."""
         while self._retired and self._retired[0][0] <= oldest_version_read:
             self._free += self._retired.popleft()[1]
 
     # -- after a failure --------------------------------------------------------------------------
 
     def take_over(self, cells: Keys, slots: Keys) -> None:
-        """Go on with the cells (n,) that another writer has left in slots (n,)."""
+        """Continue with the cells (n,) that an earlier writer has left in slots (n,)."""
         self._cell_of_slot[slots] = cells
         self.n_filled = len(slots)
         self._free = [slot for slot in self._free if self._cell_of_slot[slot] == UNKNOWN]
@@ -127,6 +127,6 @@ class CellSlots:
         self._free = [slot for slot in unnamed if slot != EMPTY_SLOT and slot not in retired]
 
     def warm_up(self) -> None:
-        """Compile what an eviction calls."""
+        """Compile the kernels that an eviction calls."""
         nothing = np.empty(0, dtype=np.int64)
         kernels.slots_to_free(self._cell_of_slot, self._wanted_at, self._used, 0, 0, 0, nothing)

@@ -15,9 +15,9 @@ from hapticdb.store.base import CELL_SHIFT, Keys, Store, row_shift
 
 
 class CellsRead(NamedTuple):
-    """What one statement has read.
+    """Result of one statement.
 
-    is_empty (n,) : which of the cells hold no voxel; n_rows : rows; n_ranges : ranges asked for.
+    is_empty (n,) : whether each cell has no voxel; n_rows : rows read; n_ranges : ranges queried.
     """
 
     is_empty: NDArray[np.bool_]
@@ -28,19 +28,19 @@ class CellsRead(NamedTuple):
 class CellSource:
     """Reads cells of one environment, a batch by one statement.
 
-    The cells of a batch are grouped into ranges by what a gap and another descent of the index cost
-    on this database, as the strategy `cbgroup` groups the keys of a frame.
+    The cells of a batch are grouped into ranges by cost, as in the strategy `cbgroup`: a gap is
+    scanned if that costs no more than another descent of the index on this database.
 
     Parameters
     ----------
     store : Store
-        Another connection to the same environment may take its place.
+        A connection; it may be replaced by another one to the same environment.
     exclude : (E,) int64
         Ids of objects that are left out of all cells.
     clock : callable
-        Seconds, by which round trips are timed at the start.
+        Returns seconds, to time round trips at the start.
     may_measure : bool
-        Whether there is time at the start to measure what statements cost.
+        Whether there is time at the start to measure the cost of statements.
     """
 
     def __init__(
@@ -53,7 +53,7 @@ class CellSource:
         self._costs = costs_at_start(store, clock, may_measure=may_measure)
 
     def read(self, cells: Keys, table: CellTable, slots: Keys) -> CellsRead:
-        """Read cells (n,), distinct, by one statement into slots (n,) that no frame can see."""
+        """Read cells (n,), distinct, by one statement into slots (n,) that no frame can read."""
         grid, shift = self.store.grid, row_shift(self.store.layout)
         on_curve = np.empty(len(cells), dtype=np.int64)
         kernels.curve_keys_of_cells(cells, grid.bits, grid.curve_code, on_curve)

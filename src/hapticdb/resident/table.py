@@ -1,7 +1,7 @@
-"""CellTable: a fixed budget of memory that one process fills with cells and others read.
+"""CellTable: a fixed amount of memory that one process fills with cells and others read.
 
-The memory is anonymous and inherited by file descriptor: it goes when the last process that maps it
-ends, however that happens.
+The memory is anonymous and inherited by file descriptor. The system frees it when the last process
+that maps it ends, even after a crash.
 """
 
 import mmap
@@ -24,21 +24,21 @@ from hapticdb.kernels.resident import cells as kernels
 DEFAULT_BUDGET = 256 << 20
 LEAST_BUDGET = 1 << 20
 FIRST_VERSION = 1
-"""Of a table into which nothing was written."""
+"""Version number of a table before the first write."""
 MOST_READERS = 16
 CONTROL_WORDS = 16
 HEARTBEAT, AWAY, LOADING, STOP = 8, 9, 10, 11
-"""Words of the control block beside `kernels.cells`': when the database last answered (ns,
-CLOCK_MONOTONIC), whether it is away, cells being fetched, and whether all shall end."""
+"""Indices in the control block, after those of `kernels.cells`: time of the database's last answer
+(ns, CLOCK_MONOTONIC), whether it is away, cells being fetched, whether all processes must end."""
 _PAGE = 4096
 _joining = threading.Lock()
 
 
 class Desk(NamedTuple):
-    """What sessions and the fetching process tell one another; `kernels.records` has the fields.
+    """Messages between sessions and the fetching process; `kernels.records` defines the fields.
 
-    sessions (16,) of SESSION, a row a session; pids (16,) int64: the processes that hold the rows,
-    0 for none; figures () of FIGURES: what the fetching process counts.
+    sessions (16,) of SESSION, one row for each session; pids (16,) int64: ids of the processes that
+    own the rows, 0 for none; figures () of FIGURES: counts of the fetching process.
     """
 
     sessions: NDArray[np.void]
@@ -70,7 +70,7 @@ def _fields(n_slots: int, capacity: int) -> list[_Field]:
 
 
 def _bytes_of(n_slots: int) -> int:
-    """Bytes of a table of so many slots, each array on a page of its own."""
+    """Bytes of a table with `n_slots` slots, each array on a page of its own."""
     sizes = [
         int(np.prod(f.shape)) * np.dtype(f.dtype).itemsize
         for f in _fields(n_slots, _capacity(n_slots))
@@ -79,17 +79,17 @@ def _bytes_of(n_slots: int) -> int:
 
 
 def _capacity(n_slots: int) -> int:
-    """Entries of a directory: as many cells known to be empty as slots leave it half full."""
+    """Entries of a directory; half full with a cell in each slot and as many empty cells."""
     return 1 << (4 * n_slots - 1).bit_length()
 
 
 def slots_within(budget_bytes: int) -> int:
-    """How many cells fit into a budget, the empty one counted.
+    """Number of slots that fit into a budget, with the slot for empty cells.
 
     Raises
     ------
     UsageError
-        When the budget is below `LEAST_BUDGET`.
+        If the budget is below `LEAST_BUDGET`.
     """
     if budget_bytes < LEAST_BUDGET:
         raise UsageError(
@@ -110,11 +110,11 @@ class CellTable:
     cells : Cells
         The arrays that frames read; see `hapticdb.kernels.resident.cells`.
     desk : Desk
-        What sessions and the fetching process tell one another.
+        Messages between sessions and the fetching process.
     descriptor : int
         File descriptor of the memory, for a process to inherit.
     size_bytes : int
-        Of the memory: never more than the budget.
+        Size of the memory: never more than the budget.
     """
 
     def __init__(self, descriptor: int, n_slots: int) -> None:
@@ -132,7 +132,7 @@ class CellTable:
 
     @classmethod
     def create(cls, budget_bytes: int = DEFAULT_BUDGET) -> "CellTable":
-        """Make a table of at most so many bytes, in which every cell is unknown."""
+        """Make a table of at most `budget_bytes`, in which every cell is unknown."""
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         if budget_bytes > memory:
             raise UsageError(
@@ -152,14 +152,14 @@ class CellTable:
         self.close()
 
     def close(self) -> None:
-        """Give the memory back, here; other processes keep theirs."""
+        """Free the memory in this process; other processes keep their mappings."""
         if self.descriptor >= 0:
-            os.close(self.descriptor)  # the mapping itself goes with the last array
+            os.close(self.descriptor)  # the mapping is freed with the last array
             self.descriptor = -1
 
     @property
     def capacity(self) -> int:
-        """Entries that a directory has room for; half of them are used at most."""
+        """Entries of a directory; half of them are used at most."""
         return int(self.cells.keys.shape[1])
 
     @property
@@ -169,7 +169,7 @@ class CellTable:
 
     @property
     def revision(self) -> int:
-        """The database's revision that the published cells are of."""
+        """Revision of the database at which the published cells were read."""
         return int(self.cells.control[kernels.REVISION + self.version % kernels.BUFFERS])
 
     def join(self) -> int:
@@ -178,7 +178,7 @@ class CellTable:
         Raises
         ------
         UsageError
-            When the table has as many readers as it can.
+            If the table has no free reader row.
         """
         with _joining:
             free = np.flatnonzero(self.desk.pids == 0)
@@ -186,18 +186,18 @@ class CellTable:
                 row = int(free[0])
                 self._clear(row)
                 sequence = self.desk.sessions["sequence"]
-                sequence[row] += sequence[row] % 2  # odd where the last session died as it wrote
+                sequence[row] += sequence[row] % 2  # odd if the last session died while it wrote
                 self.desk.pids[row] = os.getpid()
                 return row
         raise UsageError(f"a table of cells has {MOST_READERS} readers at most: end one first")
 
     def leave(self, row: int) -> None:
-        """Be a reader no more."""
+        """Stop being a reader."""
         self._clear(row)
         self.desk.pids[row] = 0
 
     def release_dead(self) -> None:
-        """Let go of what readers hold whose processes have ended; their rows stay taken."""
+        """Release the versions and sessions of readers that have died; their rows stay taken."""
         for row in np.flatnonzero(self.desk.pids).tolist():
             if not is_alive(int(self.desk.pids[row])):
                 self.cells.readers[row * kernels.READER_STRIDE] = 0
@@ -211,7 +211,7 @@ class CellTable:
 
     @contextmanager
     def reading(self) -> Iterator[int]:
-        """Be a reader inside; yields its row."""
+        """Be a reader inside the block; yields its row."""
         row = self.join()
         try:
             yield row
@@ -220,7 +220,7 @@ class CellTable:
 
 
 def is_alive(pid: int) -> bool:
-    """Whether a process runs; one that has ended and waits to be asked for its status does not."""
+    """Whether a process runs; a zombie (ended, but not yet waited for) does not."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -229,13 +229,13 @@ def is_alive(pid: int) -> bool:
         return True
     try:
         status = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:  # no such folder on this system, or it ended just now
+    except OSError:  # no such folder on this system, or the process ended just now
         return True
     return status.rpartition(")")[2].split()[0] not in {"Z", "X"}
 
 
 def anonymous_memory(name: str, size: int) -> int:
-    """File descriptor of memory without a name, zero."""
+    """File descriptor of new anonymous memory, filled with zeros."""
     if sys.platform == "linux":
         descriptor = os.memfd_create(name)
     else:

@@ -1,7 +1,7 @@
-"""What a cell table holds, written by one: slots, empty cells and the directory agree.
+"""The only writer of a cell table: keeps slots, empty cells and the directory consistent.
 
-Every change is published as one version of the directory, which frames see whole. Slots and copies
-of the directory are used again when no frame can see them any more.
+Every change is published as one version of the directory; a frame never reads a part of a change.
+Slots and copies of the directory are used again when no frame can read them any more.
 """
 
 from typing import NamedTuple
@@ -17,7 +17,7 @@ from hapticdb.store.base import NO_KEYS, Keys
 
 
 class UnpublishedCells(NamedTuple):
-    """Cells (n,) in slots (n,) that no directory names yet, and what it took to read them.
+    """Cells (n,) in slots (n,) that are in no directory yet, and the cost of reading them.
 
     The slot of a cell without a voxel is EMPTY_SLOT.
     """
@@ -29,23 +29,23 @@ class UnpublishedCells(NamedTuple):
 
 
 class CellWriter:
-    """The one writer of a table's cells.
+    """The only writer of a table's cells.
 
     Parameters
     ----------
     table : CellTable
-        Nobody else writes to it.
+        The table; it has no other writer.
 
     Attributes
     ----------
     slots : CellSlots
         Cells with voxels.
     empty : EmptyCells
-        Cells without.
+        Cells without voxels.
     directory : CellDirectory
-        What frames see of both.
+        Published map of both, for frames.
     n_evicted : int
-        Cells that left for want of room, so far.
+        Number of cells evicted so far.
     """
 
     def __init__(self, table: CellTable) -> None:
@@ -56,12 +56,12 @@ class CellWriter:
 
     @property
     def n_resident(self) -> int:
-        """Cells with voxels, each in a slot."""
+        """Number of cells with voxels, each in a slot."""
         return self.slots.n_filled
 
     @property
     def n_empty(self) -> int:
-        """Cells known to be empty."""
+        """Number of cells known to be empty."""
         return len(self.empty)
 
     def known(self) -> Keys:
@@ -69,19 +69,19 @@ class CellWriter:
         return np.concatenate([self.slots.cells(), self.empty.keys()])
 
     def take_over(self) -> None:
-        """Go on with the cells that another writer, which has ended, published last."""
+        """Continue with the cells that an earlier writer, which has ended, published last."""
         cells, slots = self.directory.entries()
         is_filled = slots > EMPTY_SLOT
         self.slots.take_over(cells[is_filled], slots[is_filled])
         self.empty.add(cells[~is_filled].tolist())
         self.directory.take_over()
-        # slots that only older versions name are free once no frame reads those
+        # slots of older versions are free when no frame reads these versions
         self.directory.wait_for_readers(self.directory.version)
 
     def evict_for(self, n_free: int, surplus: int, urgent: Keys, revision: int) -> None:
-        """Evict cells until `n_free` slots are free, as far as cells are not wanted just now.
+        """Evict cells until `n_free` slots are free, but keep cells that are still wanted.
 
-        surplus : as `CellSlots.cells_to_evict` has it; urgent, revision : as for `publish`.
+        surplus : as for `CellSlots.cells_to_evict`; urgent, revision : as for `publish`.
         """
         self.slots.free_retired(self.directory.oldest_version_read())
         leaving = self.slots.cells_to_evict(n_free, surplus)
@@ -92,10 +92,10 @@ class CellWriter:
             self.slots.free_retired(self.directory.oldest_version_read())
 
     def publish(self, leaving: Keys, read: UnpublishedCells, urgent: Keys, revision: int) -> None:
-        """Take cells out and others in, in one version; cells in both have new slots.
+        """Remove cells and add others in one version; cells in both get new slots.
 
-        urgent : cells that are forgotten last where too many are empty; revision : of the database,
-        that all cells are of.
+        urgent : cells that are forgotten last if too many are empty; revision : of the database,
+        the same for all cells.
         """
         slots = self.directory.slots_of(leaving)
         self.empty.discard(leaving[slots == EMPTY_SLOT].tolist())

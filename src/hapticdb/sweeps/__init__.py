@@ -1,1 +1,1 @@
-"""Whether a part comes out along a path: what it hits, and how much clearance it keeps."""
+"""Sweeps: whether a part comes out along a path, what it hits, and its clearance."""

@@ -1,7 +1,7 @@
 """Clearance along a path: from the shell's points to the nearest occupied voxel's box.
 
-Between two samples no point moves more than half a voxel, so a distance once found bounds those to
-come: a point is looked at again only when it may have come nearer than what is nearest already.
+Between two samples no point moves more than half a voxel, so a known distance bounds the later
+ones. A point is measured again only when it may be nearer than the nearest one so far.
 """
 
 import numpy as np
@@ -16,7 +16,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 STRIDE = 16
-"""Samples between those whose surroundings are fetched ahead, half a voxel apart each."""
+"""Samples, each half a voxel or less apart, from one fetch ahead to the next. Larger: fewer
+fetches, each of more cells."""
 CELL = 32
 
 
@@ -26,21 +27,22 @@ class ClearanceSearch:
     Parameters
     ----------
     frames : ResidentFrames
-        Of the shell; their cells are used, and more are fetched around the points.
+        Frames of the shell; their table is used, and more cells are fetched around the points.
     limit : float
-        Voxels: what is farther is not looked for.
+        Voxels; greater distances are not searched.
     n_windows : int or None
-        Poses far apart, each a window of its own; all samples of a path are one unless given.
+        Number of windows; each is a separate pose, far from the others. None: one window with all
+        samples of the path.
 
     Raises
     ------
     UsageError
-        When the cells within the limit of one point are more than the table can hold.
+        If the cells within the limit of one point are more than the table can hold.
 
     Attributes
     ----------
     least : (W,) float64
-        Voxels, of each window; the limit where nothing is nearer.
+        Least distance in each window, voxels; the limit if nothing is nearer.
     """
 
     def __init__(self, frames: ResidentFrames, limit: float, n_windows: int | None = None) -> None:
@@ -68,7 +70,7 @@ class ClearanceSearch:
         )
 
     def look(self, first: int, poses: Floats, travels: Floats, windows: Ints) -> None:
-        """Look around at samples from `first` on.
+        """Search around the points at the samples from `first` on.
 
         poses (B, 4, 4); travels (B,), as `SweepPath.travels` gives them; windows (B,) int64.
         """
@@ -87,17 +89,17 @@ class ClearanceSearch:
 
     @property
     def distance(self) -> float:
-        """Least distance so far, voxels; the limit when nothing was nearer."""
+        """Least distance so far, voxels; the limit if nothing was nearer."""
         return float(self._bounds.state[kernels.LEAST])
 
     @property
     def nearest(self) -> tuple[int, int, int]:
-        """Sample, point and packed voxel of the least distance; meaningless without any."""
+        """Sample, point and packed voxel of the least distance; valid if it is below the limit."""
         sample, point, voxel = self._bounds.where[:3].tolist()
         return sample, point, voxel
 
     def _fetch(self, poses: Floats, point: int) -> None:
-        """Bring in what surrounds that point, or its run, at the first pose; then what follows."""
+        """Fetch the cells around a point, or its run, at the first pose and at later ones."""
         residency = self._frames.residency
         places = self._frames.surroundings.places
         found = np.full(1 << (2 * self._most).bit_length(), UNKNOWN, dtype=np.int64)

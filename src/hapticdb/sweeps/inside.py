@@ -1,7 +1,7 @@
-"""What lies inside a closed tool where its path starts.
+"""Finds the objects inside a closed tool at the start of its path.
 
-While no surface of an object meets the tool's, what is inside stays inside: one pose says it for
-the whole path.
+While no surface of an object meets the tool's, an object inside stays inside, so one pose is enough
+for the whole path.
 """
 
 import numpy as np
@@ -17,7 +17,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MOST_CELLS = 1 << 18
-"""Cells within the tool's bounding box that are looked at; in more, what is inside is not known."""
+"""Greatest number of cells in the tool's bounding box that are searched; with more cells the result
+is unknown. Larger: larger tools, more time."""
 CELL, BRICK = 32, 8
 CELLS_AT_ONCE = 1024
 
@@ -25,9 +26,9 @@ CELLS_AT_ONCE = 1024
 def enclosed_ids(residency: Residency, shell: PointShell, pose: Floats) -> Ints | None:
     """Ids of objects with voxels inside the tool's closed bodies at a pose, ascending.
 
-    A voxel is inside when its centre is, by more than half a voxel. None where that is not known:
-    the shell says that it is closed, has no surface and something lies in its bounding box; the
-    covering radius is not known; or the box is too large.
+    A voxel is inside if its centre is inside by more than half a voxel. None if the result is not
+    known: the bounding box has too many cells; or it holds an occupied brick, and either the
+    covering radius or the surface of a closed shell is not known.
     """
     interior = None if shell.surface is None else Interior(shell.surface)
     if not (shell.is_closed if interior is None else interior):
@@ -52,7 +53,7 @@ def enclosed_ids(residency: Residency, shell: PointShell, pose: Floats) -> Ints 
 def _cells_around(residency: Residency, shell: PointShell, pose: Floats) -> Ints:
     """Keys of the cells that the tool's bounding box meets at a pose, ascending.
 
-    More than `MOST_CELLS` zeros where they are more.
+    If there are more than `MOST_CELLS`, an array of `MOST_CELLS` + 1 zeros.
     """
     grid = residency.grid
     world = shell.points @ pose[:3, :3].T + pose[:3, 3]
@@ -70,7 +71,7 @@ def _cells_around(residency: Residency, shell: PointShell, pose: Floats) -> Ints
 
 
 def _bricks_of(residency: Residency, cells: Ints) -> tuple[Ints, Ints]:
-    """Occupied bricks in cells, made resident: the slot (B,) of each and its least voxel (B, 3)."""
+    """Make cells resident; returns the slot (B,) and least voxel (B, 3) of each occupied brick."""
     residency.make_resident(cells)
     slots = residency.slots_of(cells)
     filled = slots != EMPTY_SLOT
@@ -82,7 +83,7 @@ def _bricks_of(residency: Residency, cells: Ints) -> tuple[Ints, Ints]:
 
 
 class _Search:
-    """The tool at a pose, asked about bricks."""
+    """Searches bricks for voxels inside the tool at a pose."""
 
     def __init__(
         self,
@@ -98,7 +99,7 @@ class _Search:
         self._points = cKDTree(shell.points)
 
     def ids_in(self, slots: Ints, corners: Ints) -> Ints:
-        """Ids of the objects in voxels inside the tool, of bricks (B,) with least voxels (B, 3)."""
+        """Ids of objects in voxels inside the tool; bricks with slots (B,), least voxels (B, 3)."""
         size = self._residency.grid.voxel_size
         middles = self._local(corners + 0.5 * BRICK)
         distances, _ = self._points.query(middles)
@@ -118,7 +119,7 @@ class _Search:
         return np.unique(pairs_in_voxels(store, inside, exclude).ids)
 
     def _local(self, places: NDArray[np.floating]) -> Floats:
-        """Places (n, 3) from voxels to the tool's frame, metres."""
+        """Convert places (n, 3) from voxels to metres in the tool's frame."""
         grid, pose = self._residency.grid, self._pose
         world = places * grid.voxel_size + np.asarray(grid.origin)
         return np.asarray((world - pose[:3, 3]) @ pose[:3, :3])

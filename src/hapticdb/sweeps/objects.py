@@ -1,4 +1,4 @@
-"""Which objects a sweep hits: hit voxels looked up in the database, exactly, and tallied."""
+"""Objects that a sweep hits: looks the hit voxels up in the database, and counts the hits."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -14,15 +14,16 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 KEYS_AT_ONCE = 4096
-"""Row keys that one statement asks for."""
+"""Row keys in one statement. Larger: fewer statements, each one longer."""
 JOINED = 2
-"""Samples between two hits that leave them one interval: a voxel's way."""
+"""Greatest distance, in samples, of two hits of one interval: a movement of one voxel. Larger:
+fewer, longer intervals."""
 
 
 class Pairs(NamedTuple):
-    """Every hit with every object in its voxel, P of them.
+    """P pairs of a hit and an object in its voxel.
 
-    hits (P,) int64: which hit, ascending; ids (P,) int64.
+    hits (P,) int64: indices of the hits, ascending; ids (P,) int64: of the objects.
     """
 
     hits: Ints
@@ -30,14 +31,14 @@ class Pairs(NamedTuple):
 
 
 class Runs:
-    """Samples, ascending, as runs without gaps to speak of."""
+    """Ascending samples as runs; gaps of up to `JOINED` samples do not end a run."""
 
     def __init__(self) -> None:
         self.count = 0
         self._runs: list[list[int]] = []
 
     def add(self, samples: Ints) -> None:
-        """Count distinct samples (n,) in, all after those before."""
+        """Add distinct samples (n,), all later than those before."""
         if not len(samples):
             return
         self.count += len(samples)
@@ -55,10 +56,11 @@ class Runs:
 
 
 class Met:
-    """What a sweep had to do with one object.
+    """Hits of a sweep on one object.
 
-    hits, contacts : samples that hit it, that were in contact with it; points : most of the tool's
-    points in its voxels at one sample; deepest : metres below a tangent plane, of its deepest hit.
+    hits, contacts : samples that hit the object, and samples in contact with it; points : greatest
+    number of the tool's points in its voxels at one sample; deepest : greatest depth below a
+    tangent plane, metres.
     """
 
     def __init__(self) -> None:
@@ -67,7 +69,7 @@ class Met:
         self.deepest = 0.0
 
     def add(self, samples: Ints, depths: Floats) -> None:
-        """Count hits in: samples (H,), ascending, and depths (H,), metres."""
+        """Add hits: samples (H,), ascending, and depths (H,), metres."""
         distinct, counts = np.unique(samples, return_counts=True)
         self.hits.add(distinct)
         self.contacts.add(np.unique(samples[depths > 0.0]))
@@ -97,7 +99,7 @@ def pairs_in_voxels(store: Store, ijk: Ints, exclude: Keys) -> Pairs:
 
 
 def pairs_of_hits(places: Ints, voxel_table: Ints, store: Store, exclude: Keys) -> Pairs:
-    """Every hit (H,) with every object in its voxel; places (H,) are where the table has it."""
+    """Pairs of each hit (H,) and each object in its voxel; places (H,) index `voxel_table`."""
     filled = np.flatnonzero(voxel_table >= 0)
     ijk = np.empty((len(filled), 3), dtype=np.int64)
     kernels.unpack(voxel_table[filled], ijk)
@@ -113,7 +115,7 @@ def pairs_of_hits(places: Ints, voxel_table: Ints, store: Store, exclude: Keys) 
 
 
 def tally(met: dict[int, Met], pairs: Pairs, samples: Ints, depths: Floats) -> None:
-    """Count pairs in; samples, ascending, and depths are the hits' (H,)."""
+    """Add pairs to the counts; samples (H,), ascending, and depths (H,), metres, of the hits."""
     order = np.argsort(pairs.ids, kind="stable")
     ids, hits = pairs.ids[order], pairs.hits[order]
     starts = np.flatnonzero(np.diff(ids, prepend=ids[:1] - 1))

@@ -14,33 +14,33 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 MOST_SAMPLES = 1e9
-"""A path of more is in another unit than its environment, or takes days."""
+"""Greatest number of samples; a longer path is in a wrong unit, or would take days."""
 RIGID = 1e-6
-"""What a rotation's columns may deviate from orthonormal ones, as in a frame."""
+"""Greatest deviation of a rotation's columns from orthonormal ones; the same as for a frame."""
 
 
 @dataclass(frozen=True, eq=False)
 class SweepPath:
-    """Poses M, and samples between them.
+    """M given poses, and samples between them.
 
-    No place of the tool's surface moves more than half a voxel between two samples, nor any within
-    the covering radius of a point. The middle of the shell's bounding box moves on straight lines
-    while the tool turns about it, evenly, about one axis (slerp): the same motion wherever the file
-    of the tool has its origin. A point at distance r from the middle then moves along a segment by
-    no more than the middle moves plus the angle times r, so that many steps of half a voxel,
-    rounded up, are enough for all. Given poses are samples as they are.
+    Between two samples, no place on the tool's surface or within the covering radius of a point
+    moves more than half a voxel. The middle of the shell's bounding box moves on straight lines;
+    the tool turns about the middle evenly, about one axis (slerp). So the motion does not depend on
+    the origin of the tool's file. Along a segment, a point at distance r from the middle moves at
+    most the middle's distance plus the angle times r; this bound divided by half a voxel, rounded
+    up, is the number of steps. Given poses are samples, unchanged.
 
     Attributes
     ----------
     poses : (M, 4, 4)
         As given, `world_from_tool`.
     motion : (M - 1,)
-        Metres that a point may move at most from each pose to the next.
+        Greatest distance that a point may move from each pose to the next, metres.
     starts : (M,) int64
-        Which sample each pose is.
+        Index of each pose's sample.
     off : float
-        Metres between a place of the tool at any time and the same place at the nearer of the two
-        samples about that time, at most: half a step, a quarter of a voxel or less.
+        Greatest distance, metres, of a place of the tool at any time from the same place at the
+        nearest sample: half a step, a quarter of a voxel or less.
     """
 
     poses: Floats
@@ -55,12 +55,12 @@ class SweepPath:
 
     @classmethod
     def of(cls, poses: ArrayLike, shell: PointShell, voxel_size: float) -> "SweepPath":
-        """Path through poses (M, 4, 4), at least one, of a shell over voxels of that size, metres.
+        """Path of a shell through poses (M, 4, 4), at least one; voxel size in metres.
 
         Raises
         ------
         UsageError
-            When there is none, one that is not rigid, or the path is too long for its voxels.
+            If there is no pose, a pose is not rigid, or the path is too long for its voxels.
         """
         given = _checked(poses)
         low, high = shell.points.min(axis=0), shell.points.max(axis=0)
@@ -74,7 +74,7 @@ class SweepPath:
         with np.errstate(over="ignore"):
             motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
         motion += radius * np.linalg.norm(turns, axis=1)
-        # a given rotation is not quite that of its quaternion, from which the samples between start
+        # a given rotation differs slightly from its quaternion's, which the samples between use
         off = radius * np.linalg.norm(rotations - rotation_of(quaternions), axis=(1, 2))
         slack = off[:-1] + off[1:]
         step = np.maximum(0.5 * voxel_size - slack, 0.25 * voxel_size)
@@ -100,7 +100,7 @@ class SweepPath:
         return int(self.starts[-1]) + 1
 
     def sample(self, first: int, last: int) -> Floats:
-        """Poses (last - first, 4, 4) of samples first .. last, the last one left out."""
+        """Poses (last - first, 4, 4) of the samples first .. last - 1."""
         out = np.empty((last - first, 4, 4))
         kernels.poses_between(
             self.poses, self._centers, self._quaternions, self._turns, self.starts, self._center,
@@ -109,12 +109,12 @@ class SweepPath:
         return out
 
     def segments(self, samples: ArrayLike) -> Ints:
-        """After which given pose samples (n,) come, (n,): 0 .. M - 2; 0 for a path of one pose."""
+        """Segments (n,) of samples (n,), 0 .. M - 2: index of the last given pose before each."""
         found = np.searchsorted(self.starts, np.asarray(samples), side="right") - 1
         return np.asarray(np.clip(found, 0, max(len(self.starts) - 2, 0)))
 
     def fractions(self, samples: ArrayLike) -> Floats:
-        """Share of the path's motion, 0 .. 1, that lies before samples (n,), (n,)."""
+        """Share (n,) of the path's motion, 0 .. 1, before each of the samples (n,)."""
         asked = np.asarray(samples)
         total = float(self.motion.sum())
         if total == 0.0:
@@ -123,7 +123,7 @@ class SweepPath:
         return np.asarray(np.interp(asked, self.starts, before / before[-1]))
 
     def travels(self, first: int, last: int) -> Floats:
-        """Voxels, at most, that any point has moved until each sample of `sample`, (n,)."""
+        """Bound (n,), voxels, on any point's movement until the samples first .. last - 1."""
         if not len(self.motion):
             return np.zeros(last - first)
         samples = np.arange(first, last)
@@ -132,7 +132,7 @@ class SweepPath:
 
 
 def _checked(poses: ArrayLike) -> Floats:
-    """Poses (M, 4, 4), each a rigid transform."""
+    """Check that poses (M, 4, 4) are rigid transforms, and return them."""
     given = as_floats(poses, "a path")
     if given.ndim != 3 or given.shape[1:] != (4, 4) or not len(given):
         raise UsageError(f"a path of shape {given.shape}: give poses (M, 4, 4), one at least")
@@ -152,7 +152,7 @@ def _checked(poses: ArrayLike) -> Floats:
 
 
 def _turns_between(quaternions: Floats) -> Floats:
-    """Rotation vectors (M - 1, 3), world frame, the shorter way from each (M, 4) to the next."""
+    """Rotation vectors (M - 1, 3), world frame: smallest turn from each quaternion to the next."""
     aw, a = quaternions[1:, :1], quaternions[1:, 1:]
     bw, b = quaternions[:-1, :1], -quaternions[:-1, 1:]
     w = aw * bw - (a * b).sum(axis=1, keepdims=True)

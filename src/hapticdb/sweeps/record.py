@@ -13,10 +13,10 @@ from hapticdb.sweeps.verdict import verdict_line
 def sweep_record(
     found: Swept, shell: PointShell, parts: list[int], excluded: list[int]
 ) -> dict[str, Any]:
-    """Put a sweep's result in numbers and words, as `hapticdb sweep --json` prints it.
+    """Convert a sweep's result to numbers and strings, as `hapticdb sweep --json` prints it.
 
-    shell : the tool; parts : ids of the objects that it was made of, none for a tool from a file;
-    excluded : ids of the objects that were left out of what is felt.
+    shell : the tool; parts : ids of the objects that it was made of, empty for a tool from a file;
+    excluded : ids of the objects that the sweep left out.
     """
     deepest, clearance, proof = found.deepest, found.clearance, found.proof
     return {
@@ -99,7 +99,7 @@ def _moment(moment: Moment | None) -> dict[str, object] | None:
 def median_spacing(shell: PointShell) -> float:
     """Median distance from a point to its nearest neighbour, metres; 0 for a single point.
 
-    Taken over about a thousand of the shell's points, spread evenly by index.
+    Computed from about a thousand of the shell's points, spread evenly by index.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
 

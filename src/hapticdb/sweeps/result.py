@@ -1,4 +1,4 @@
-"""What a sweep found, in metres and fractions of the path."""
+"""Results of a sweep, in metres and fractions of the path."""
 
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -15,7 +15,8 @@ Ints = NDArray[np.int64]
 
 
 STRETCH = 1e-5
-"""By which a given pose, which is rigid to 1e-6, may stretch the tool, and roundings with it."""
+"""Relative safety margin: a given pose is rigid to 1e-6 only and may stretch the tool; the margin
+also covers rounding. Larger: fewer tools are proved clear."""
 
 Verdict = Literal["hits", "comes out", "not decided"]
 
@@ -23,9 +24,9 @@ Verdict = Literal["hits", "comes out", "not decided"]
 class Moment(NamedTuple):
     """A sample of the path.
 
-    fraction : 0 .. 1, the share of the path's motion before it; segment : of the given poses, from
-    which on it comes, 0 .. M - 2; pose (4, 4) : `world_from_tool`; objects : those that are hit
-    there, as the field's owner says.
+    fraction : share of the path's motion before the sample, 0 .. 1; segment : index of the given
+    pose where its segment starts, 0 .. M - 2; pose (4, 4) : `world_from_tool`; objects : objects
+    there, as the field with this moment says.
     """
 
     sample: int
@@ -36,10 +37,10 @@ class Moment(NamedTuple):
 
 
 class Deepest(NamedTuple):
-    """The deepest hit: metres below its tangent plane, when, and where (3,), metres, world frame.
+    """The deepest hit: its depth below the tangent plane, its moment, its place (3,), world frame.
 
-    A tangent plane goes through its voxel's centre, so that a depth is below 0.87 voxels: it says
-    how squarely a surface is met, not how far the tool would have gone in.
+    Metres. A tangent plane goes through its voxel's centre, so a depth is below 0.87 voxels: it
+    does not say how far the tool would penetrate.
     """
 
     depth: float
@@ -50,13 +51,13 @@ class Deepest(NamedTuple):
 class Clearance(NamedTuple):
     """Least distance of the shell's points at the samples to an occupied voxel's box, metres.
 
-    distance : 0 when anything was hit; the limit when nothing is nearer; at_least, at_most : what
-    that says of the distance between the surfaces, anywhere on the path: the object's lies
-    somewhere in its voxels, the tool's within the covering radius of a point (where that is not
-    known, at_least is of the points alone), and the tool moves between two samples; at_most is
-    infinite beyond the limit; is_beyond : nothing was nearer than the limit; moment : when, with
-    the objects in that voxel, or None beyond the limit; point, voxel (3,) : the point and the
-    voxel's centre, world frame, or None when nothing is near or something was hit.
+    distance : 0 if anything was hit; the limit if nothing is nearer; at_least, at_most : bounds of
+    the distance between the surfaces on the whole path. They allow for the voxel size, the covering
+    radius and the motion between two samples; if the covering radius is not known, at_least holds
+    for the points only; at_most is infinite beyond the limit; is_beyond : whether nothing was
+    nearer than the limit; moment : of the least distance, with the objects in that voxel, or None
+    beyond the limit; point, voxel (3,) : the point and the voxel's centre, world frame, or None if
+    nothing is near or something was hit.
     """
 
     distance: float
@@ -69,17 +70,17 @@ class Clearance(NamedTuple):
 
 
 class Proof(NamedTuple):
-    """What the verdict of a sweep without a hit stands on, metres.
+    """Proof behind the verdict of a sweep without a hit, metres.
 
-    Every place of an object's surface is in an occupied voxel, every place of the tool's surface
-    within `cover` of a point, and every time of the path within `off` of a sample. So no surface
-    meets the tool's while the points, at the samples, keep more than `cover + off` from every
+    Every place of an object's surface is in an occupied voxel. Every place of the tool's surface is
+    within `cover` of a point, and at any time within `off` of its place at a sample. So no surface
+    meets the tool's if the points, at the samples, are farther than `cover + off` from every
     occupied voxel's box.
 
-    cover : the shell's covering radius, None where it is not known; off : how far any place of the
-    tool is, at any time, from where it is at one of two samples; nearest : least distance of a
-    point at a sample to an occupied voxel's box, or how far was looked; is_near : whether anything
-    was found so far; is_inside_known : whether it was seen what lies in the tool's closed bodies.
+    cover : the shell's covering radius, None if it is not known; off : as `SweepPath.off`; nearest
+    : least distance of a point at a sample to an occupied voxel's box, or the search limit;
+    is_near : whether anything was found within that limit; is_inside_known : whether the contents
+    of the tool's closed bodies are known.
     """
 
     cover: float | None
@@ -95,18 +96,19 @@ class Proof(NamedTuple):
 
     @property
     def cover_needed(self) -> float:
-        """Covering radius that would decide it, if no point then came nearer; 0 when none would."""
+        """Covering radius (m) that would give a proof if no point came nearer; 0 if none would."""
         return max(self.nearest - self.off, 0.0)
 
 
 class MetObject(NamedTuple):
     """An object that the tool hits.
 
-    intervals (K, 2) : fractions of the path, first and last hit of each run, gaps of a voxel's way
-    closed; samples : that hit it; contacts : in which it was below a tangent plane; first_contact :
-    the first of those, or None; length : of path from the first to the last hit of each run,
-    metres, as `SweepPath.motion` counts them; points : most of the tool's points in its voxels at
-    once; deepest : of the deepest hit, as in `Deepest`.
+    intervals (K, 2) : fractions of the path, first and last hit of each run; gaps of up to a
+    voxel's movement are closed; samples : number of samples that hit the object; contacts : number
+    of those with a point below a tangent plane; first_contact : the first contact, or None; length
+    : path from the first to the last hit of each run, metres, summed as in `SweepPath.motion`;
+    points : greatest number of the tool's points in its voxels at one sample; deepest : depth of
+    the deepest hit, metres, as in `Deepest`.
     """
 
     object: Object
@@ -120,26 +122,26 @@ class MetObject(NamedTuple):
 
     @property
     def first(self) -> float:
-        """Fraction of the path at its first hit."""
+        """Fraction of the path at the first hit."""
         return float(self.intervals[0, 0])
 
     @property
     def last(self) -> float:
-        """Fraction of the path at its last hit."""
+        """Fraction of the path at the last hit."""
         return float(self.intervals[-1, 1])
 
     @property
     def is_left_at_once(self) -> bool:
-        """Whether the tool is in it where the path starts, leaves it, and does not come back."""
+        """Whether the tool hits the object at the path's start, leaves it, and never returns."""
         return len(self.intervals) == 1 and self.first == 0.0 and self.last < 1.0
 
 
 class Profile(NamedTuple):
-    """The path in W stretches of about as many samples each.
+    """The path in W sections with about the same number of samples.
 
-    fractions (W,) : where each begins; hits (W,) int64 : most points hit at once; depths (W,) :
-    deepest, metres; clearances (W,) : metres, at the sample where each begins, the limit where
-    nothing is nearer; all NaN unless it was asked for.
+    fractions (W,) : begin of each section; hits (W,) int64 : greatest number of points hit at one
+    sample; depths (W,) : greatest depth, metres; clearances (W,) : at the first sample of each
+    section, metres, the limit if nothing is nearer; all NaN if they were not requested.
     """
 
     fractions: Floats
@@ -150,7 +152,7 @@ class Profile(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Swept:
-    """What came of a sweep.
+    """Result of a sweep.
 
     Attributes
     ----------
@@ -159,34 +161,33 @@ class Swept:
     voxel_size : float
         Metres.
     samples, hits, contacts : int
-        Samples in all, with a point inside a voxel, and with one below its tangent plane.
+        Numbers of samples: all; with a point inside a voxel; with a point below its tangent plane.
     first_hit, first_contact : Moment or None
-        With the objects that are hit, or in contact, there.
+        First hit and first contact, with the objects there.
     deepest : Deepest or None
-        None without a hit.
+        The deepest hit; None without a hit.
     objects : list of MetObject
         All objects hit, in the order in which the tool met them.
     enclosed : tuple of Object
-        What lies, in part at least, inside a closed body of the tool where the path starts. It is
-        hit, too: the tool cannot leave without it.
+        Objects at least partly inside a closed body of the tool at the path's start. They count as
+        hit: the tool cannot leave without them.
     proof : Proof
-        What "comes out" stands on.
+        Distances that prove or do not prove "comes out".
     hit_intervals, contact_intervals : (K, 2) float64
-        Fractions of the path, first and last hit (contact) of each run; gaps of a voxel's way are
-        closed.
+        Fractions of the path, first and last hit (contact) of each run; gaps of up to a voxel's
+        movement are closed.
     clearance : Clearance or None
-        None when it was not looked for.
+        Least distance; None if it was not requested.
     profile : Profile
-        The path in short.
+        The path in sections.
     revision : int
-        The database's, that all of this is of; others may have written meanwhile.
+        Revision of the database that was read; others may have written meanwhile.
     elapsed : float
-        Seconds, those included in which cells were fetched.
+        Seconds, with the fetching of cells.
     cells : int
-        Fetched from the database.
+        Number of cells fetched from the database.
     proportions : Proportions
-        Sizes and places of tool, path and scene beside one another; where something does not fit,
-        "no hit" says nothing.
+        Sizes and places of tool, path and scene; if there is a misfit, "no hit" has no meaning.
     """
 
     path: SweepPath
@@ -211,14 +212,14 @@ class Swept:
 
     @property
     def caught(self) -> Moment | None:
-        """First contact with an object in the way: one that is not only left at once."""
+        """First contact with an object that the tool does not only leave at the path's start."""
         in_way = [one.first_contact for one in self.objects if not one.is_left_at_once]
         contacts = [moment for moment in in_way if moment is not None]
         return min(contacts, key=lambda moment: moment.sample, default=None)
 
     @property
     def verdict(self) -> Verdict:
-        """What is proved: it hits something, it comes out, or neither."""
+        """Proved result: the tool hits something, it comes out, or neither is proved."""
         if self.hits or self.enclosed:
             return "hits"
         if self.proof.is_clear and self.proof.is_inside_known:

@@ -1,8 +1,8 @@
-"""Sweep: a whole path as a batch, which says whether a part comes out.
+"""Sweep: computes a whole path as a batch, and decides whether a part comes out.
 
-Exact for the shell's points at the samples: every cell that they need is waited for. What lies
-between two samples and between two points is bounded (`swept.Proof`): "comes out" is said when that
-bound proves it, and otherwise "not decided".
+The sweep is exact for the shell's points at the samples, because it waits for every cell that they
+need. A bound covers the space between samples and between points (`result.Proof`). The result is
+"comes out" if that bound proves it, and otherwise "not decided".
 """
 
 import time
@@ -31,15 +31,16 @@ from hapticdb.sweeps.path import SweepPath
 from hapticdb.sweeps.result import Clearance, Deepest, MetObject, Moment, Profile, Proof, Swept
 
 DEFAULT_LIMIT = 32
-"""Voxels up to which clearance is looked for."""
+"""Default limit of the clearance, voxels. Larger: more cells are fetched around the tool."""
 WINDOWS = 256
-"""Stretches that a path's profile has at most."""
+"""Greatest number of sections of a path's profile. Larger: a finer profile, more time."""
 LOOKED = 1.5
-"""Times the distance that proves a tool clear, up to which is looked at least."""
+"""Least search distance, as a multiple of the distance that proves a tool clear. Larger: more cells
+are fetched."""
 BLOCK = 1024
-"""Samples at a time, at most."""
+"""Greatest number of samples in a block. Larger: more memory, fewer calls of `progress`."""
 BLOCK_POINTS = 1 << 21
-"""Points that are looked up in a block at most; a sample is not divided."""
+"""Greatest number of points looked up in a block, but at least one sample. Larger: more memory."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -59,39 +60,39 @@ def sweep(
     proportions: Proportions | None = None,
     progress: SampleCallback | None = None,
 ) -> Swept:
-    """Move a tool along a path and say what it hits, whatever the size of the environment.
+    """Move a tool along a path and report what it hits, in an environment of any size.
 
     Parameters
     ----------
     env : Environment
-        Not in lexicographic order. All of the sweep reads one revision of it.
+        An environment whose order is not lexicographic. The sweep reads one revision of it.
     shell : PointShell
-        The tool. That it comes out can be proved where the covering radius is known (shells of a
-        mesh or sphere; it is found here unless it was before) and about as small as a voxel:
-        `PointShell.from_file(path, spacing=0.5 * env.grid.voxel_size)`.
+        The tool. "Comes out" can be proved only if the covering radius is about as small as a
+        voxel: `PointShell.from_file(path, spacing=0.5 * env.grid.voxel_size)`. The radius is known
+        for shells of a mesh or sphere; it is computed here if necessary.
     poses : (M, 4, 4) array
-        `world_from_tool`, rigid, metres; one at least. Between two, the middle of the tool's
-        bounding box moves on a line while the tool turns about it, the shorter way round.
+        `world_from_tool`, rigid, metres; at least one. Between two poses the middle of the tool's
+        bounding box moves on a line, and the tool turns about it by the smaller angle.
     exclude : iterable of int
-        Ids of objects that are not felt: a part taken out must not hit itself.
+        Ids of objects to leave out: a part that is taken out must not hit itself.
     budget_bytes : int
-        For resident cells; never exceeded.
+        Memory for resident cells; never exceeded.
     clearance_limit : float or None
-        Metres up to which clearance is looked for, 32 voxels unless given; 0: not at all.
+        Greatest clearance that is searched, metres; 32 voxels unless given; 0: no search.
     profile : bool
-        Look for clearance along the path, too, and not only for the least.
+        Compute the clearance along the path, too, and not only the least one.
     proportions : Proportions or None
-        What `compare_proportions` found for the same tool, path and scene, with the units that
-        their numbers were taken for. Unless given, they are compared here, as metres.
+        Result of `compare_proportions` for the same tool, path and scene, with their units. Unless
+        given, they are compared here, in metres.
     progress : callable or None
         Called after each block with the samples done and their total.
 
     Raises
     ------
     UsageError
-        When a pose is not rigid, or the budget too small for the tool.
+        If a pose is not rigid, or the budget is too small for the tool.
     ObjectNotFoundError
-        When an excluded object does not exist.
+        If an excluded object does not exist.
     """
     shell = shell.with_cover()
     path = SweepPath.of(poses, shell, env.grid.voxel_size)
@@ -102,12 +103,12 @@ def sweep(
     run = _Run(env, shell, path, limit, profile, proportions, progress)
     try:
         return run.swept(excluded, budget_bytes)
-    except ConnectionLostError:  # in the middle of a snapshot: once more, from its start
+    except ConnectionLostError:  # a lost snapshot: repeat all of it once
         return run.swept(excluded, budget_bytes)
 
 
 class _Run:
-    """One sweep while it runs."""
+    """State of one sweep."""
 
     def __init__(
         self,
@@ -123,7 +124,7 @@ class _Run:
         self.grid = env.grid
         self.shell = shell
         self.path = path
-        self.is_asked = limit > 0.0  # for clearance; the proof needs some of it in any case
+        self.is_asked = limit > 0.0  # clearance is requested; the proof needs some in any case
         if shell.cover is not None:
             limit = max(limit, LOOKED * (shell.cover + path.off))
         self.limit = limit
@@ -184,7 +185,7 @@ class _Run:
                 self.progress(last, total)
 
     def _note_clearance(self, first: int, poses: Floats, is_hit: NDArray[np.bool_]) -> None:
-        """Look around at a block's samples, of which those that hit (B,) are at 0."""
+        """Measure the clearance at a block's samples; it is 0 for samples with a hit (B,)."""
         last = first + len(poses)
         travels = self.path.travels(first, last)
         if self.search is not None and self.first_hit is None:
@@ -199,7 +200,7 @@ class _Run:
     def _note_hits(
         self, frames: ResidentFrames, first: int, poses: Floats, felt: FeltFrames
     ) -> None:
-        """Find the objects of a block's hits, and count them in."""
+        """Find the objects of a block's hits, and add them to the counts."""
         self.hit_runs.add(first + np.flatnonzero(felt.hits))
         self.contact_runs.add(first + np.flatnonzero(felt.contacts))
         found = find_hits(frames, poses, felt.hits)
@@ -306,7 +307,7 @@ class _Run:
         )
 
     def _compared(self, exclude: Keys) -> Proportions:
-        """Compare tool, path and scene as metres, unless the caller has compared them."""
+        """Compare tool, path and scene in metres, unless the caller has compared them."""
         if self.proportions is not None:
             return self.proportions
         return compare_proportions(
@@ -316,7 +317,7 @@ class _Run:
 
 
 def find_hits(frames: ResidentFrames, poses: Floats, n_hits: Ints) -> kernels.Found:
-    """Hits at poses (B, 4, 4), of which there are n_hits (B,), in the order of the poses."""
+    """Hits at poses (B, 4, 4), in the order of the poses; n_hits (B,) are their numbers."""
     samples = np.flatnonzero(n_hits)
     total = int(n_hits.sum())
     room = 1 << (2 * total).bit_length()
@@ -337,4 +338,4 @@ def find_hits(frames: ResidentFrames, poses: Floats, n_hits: Ints) -> kernels.Fo
             )  # fmt: skip
         if done == len(samples):
             return found
-        frames.feel(poses[samples[done] : samples[done] + 1])  # fetches what was evicted since
+        frames.feel(poses[samples[done] : samples[done] + 1])  # fetches evicted cells again

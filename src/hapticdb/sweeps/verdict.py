@@ -1,4 +1,4 @@
-"""The verdict of a sweep in one line of words."""
+"""The verdict of a sweep in one line."""
 
 from collections.abc import Sequence
 
@@ -10,11 +10,11 @@ from hapticdb.sweeps.result import Clearance, MetObject, Moment, Swept
 from hapticdb.units import length_text
 
 MOST_NAMED = 3
-"""Objects that a line names; the others are counted."""
+"""Greatest number of objects that a line names; the others are only counted."""
 
 
 def percent(fraction: float) -> str:
-    """Put a fraction of the path, 0 .. 1, in words: ``31.2 %``."""
+    """Write a fraction of the path, 0 .. 1, as a percentage: ``31.2 %``."""
     return f"{100 * fraction:.3g} %"
 
 
@@ -26,9 +26,9 @@ def names_of(objects: Sequence[Object]) -> str:
 
 
 def verdict_line(found: Swept, shell: PointShell) -> str:
-    """Say in one line whether the tool comes out, what is in its way first, or what would decide.
+    """Say in one line whether the tool comes out, the first obstacle, or what would decide it.
 
-    shell : the tool as it was swept, with its covering radius where that is known.
+    shell : the tool of the sweep, with its covering radius if that is known.
     """
     samples = f"{found.samples:,} sample{'s' * (found.samples > 1)}"
     if found.verdict == "comes out":
@@ -59,7 +59,7 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
 
 
 def _obstacle_clause(found: Swept, obstacles: Sequence[MetObject]) -> str:
-    """What is first in the way, among objects that the tool does not only leave at the start."""
+    """Name the first of the obstacles: objects that the tool does not only leave at the start."""
     first_contact = found.caught
     if first_contact is None:
         first = min(one.first for one in obstacles)
@@ -75,7 +75,7 @@ def _obstacle_clause(found: Swept, obstacles: Sequence[MetObject]) -> str:
 
 
 def _doubt(found: Swept, shell: PointShell) -> str:
-    """Why neither verdict is proved, and what would decide it."""
+    """Say why neither verdict is proved, and what would decide it."""
     proof = found.proof
     if proof.cover is None:
         return (
@@ -118,6 +118,6 @@ def _clearance_clause(clearance: Clearance | None) -> str:
 
 
 def _where(found: Swept, moment: Moment) -> str:
-    """Where on the path: ``31 % of the path (segment 4)``."""
+    """Write a moment's place on the path: ``31 % of the path (segment 4)``."""
     segment = f" (segment {moment.segment})" if len(found.path.poses) > 2 else ""
     return f"{percent(moment.fraction)} of the path{segment}"

@@ -40,9 +40,9 @@ _NOBODY: tuple[int, ...] = ()
 
 
 class Environment:
-    """A static scene in one database, opened. Belongs to the thread that opened it.
+    """An opened database with a static scene. Only the thread that opened it may use it.
 
-    Use `hapticdb.open` and `hapticdb.create`; also as a context manager, which closes it.
+    Use `hapticdb.open` and `hapticdb.create` to make one. It is also a context manager.
     """
 
     def __init__(self, store: Store) -> None:
@@ -66,12 +66,12 @@ class Environment:
 
     @property
     def url(self) -> str:
-        """Where the environment is."""
+        """URL of the environment."""
         return self._store.url
 
     @property
     def name(self) -> str:
-        """Its name among the environments at the same place."""
+        """Name among the environments in the same database."""
         return self._store.name
 
     @property
@@ -86,12 +86,12 @@ class Environment:
 
     @property
     def layout(self) -> Layout:
-        """``voxel`` or ``brick``: which index table it has."""
+        """Layout of the index table: ``voxel`` or ``brick``."""
         return self._store.layout
 
     @property
     def store(self) -> Store:
-        """The engine below: for tools that ask it directly, such as benchmarks."""
+        """The store of the engine: for tools that query it directly, such as benchmarks."""
         return self._store
 
     def size(self) -> Size:
@@ -105,12 +105,12 @@ class Environment:
         return self._store.objects()
 
     def object(self, object_id: int) -> Object:
-        """One object.
+        """Return one object.
 
         Raises
         ------
         ObjectNotFoundError
-            When there is none of that id.
+            If no object has this id.
         """
         return self._store.object(as_id(object_id))
 
@@ -129,10 +129,10 @@ class Environment:
         spacing: float | None = None,
         seed: int = 0,
     ) -> PointShell:
-        """Make objects one rigid tool, where they sit: their surfaces, read from their files again.
+        """Make one rigid tool from objects at their places; reads their files again.
 
-        The shell is in the world's frame, metres, so that its own pose is the identity, and the
-        poses of a path are displacements. Leave the objects out of what is felt:
+        The shell is in the world's frame, metres. So its present pose is the identity, and the
+        poses of a path are displacements. Exclude the objects from the force:
         ``exclude=[obj.id for obj in env.find(*words)]``.
 
         Parameters
@@ -140,16 +140,16 @@ class Environment:
         words : int or str
             As for `find`.
         points, spacing, seed
-            As for `PointShell.from_file`, spread over all surfaces together.
+            As for `PointShell.from_file`, for all surfaces together.
 
         Raises
         ------
         ObjectNotFoundError
-            When a word chooses nothing.
+            If a word chooses nothing.
         GeometryChangedError
-            When an object's file is gone or holds another geometry.
+            If an object's file is missing or has another geometry now.
         UsageError
-            When no word is given, or an object is a point cloud, which has no surface.
+            If no word is given, or an object is a point cloud, which has no surface.
         """
         return shell_of_objects(self.find(*words), points, spacing, seed)
 
@@ -170,20 +170,21 @@ class Environment:
         file : path
             Mesh, CAD or point-cloud file; see `hapticdb.mesh.read_file`.
         unit : str or None
-            One of `hapticdb.mesh.UNITS`, of a file that carries none; metres unless given.
+            Unit of a file that names none, one of `hapticdb.mesh.UNITS`; metres unless given.
         jobs : int or None
-            Threads that voxelize; one a processor unless given.
+            Threads that voxelize; one for each processor unless given.
         keep_removed : bool
-            Leave parts out that were removed; they come in again otherwise.
+            Skip parts that were removed from the environment; otherwise they are added again.
         replace : bool
-            Replace objects of the file that it holds otherwise now, and remove those it lacks.
+            Replace objects whose parts have changed in the file, and remove objects whose parts it
+            no longer has.
         progress : callable or None
             Called after each part with a `hapticdb.ingest.files.ImportProgress`.
 
         Raises
         ------
         FileError
-            When the file cannot be used, or a part lies outside the grid: nothing is written then.
+            If the file cannot be used, or a part lies outside the grid; then nothing is written.
         """
         self._check_writable()
         options = ImportOptions(
@@ -204,25 +205,25 @@ class Environment:
         self._forget()
 
     def move(self, object_id: int, transform: ArrayLike, *, revision: int | None = None) -> Object:
-        """Place an object anew, in one transaction; its geometry is read from its file again.
+        """Move an object to a new placement, in one transaction; reads its file again.
 
         Parameters
         ----------
         object_id : int
-            Which object.
+            Id of the object.
         transform : (4, 4) array
-            world_from_part, metres; replaces the present one, scale and all.
+            world_from_part, metres; replaces the present transform with its scale.
         revision : int or None
-            Of the object that the placement was derived from, as `Object.revision` gave it.
+            The `Object.revision` on which the new placement is based.
 
         Raises
         ------
         ConflictError
-            When `revision` is given and another has written the object since.
+            If `revision` is given and the object has been written since.
         GeometryChangedError
-            When the object's file is gone or holds another geometry.
+            If the object's file is missing or has another geometry now.
         OutsideGridError
-            When it would leave the grid.
+            If the object would leave the grid.
         """
         self._check_writable()
         old = self.object(object_id)
@@ -231,19 +232,20 @@ class Environment:
         return self.object(object_id)
 
     def shift(self, object_ids: Iterable[int], way: ArrayLike) -> list[Object]:
-        """Shift objects alike from where each is, in a transaction each; files are read once.
+        """Shift all objects by the same vector, one transaction an object; reads each file once.
 
         Parameters
         ----------
         object_ids : iterable of int
-            Which objects; `find` chooses them by name.
+            Ids of the objects; `find` chooses them by name.
         way : (3,) array
-            Metres, world frame. Where another moves an object meanwhile, it counts from there.
+            Metres, world frame. If another user moves an object meanwhile, it is shifted from its
+            new place.
 
         Raises
         ------
         GeometryChangedError, OutsideGridError
-            As for `move`; then none is shifted.
+            As for `move`; then no object is shifted.
         """
         self._check_writable()
         shifted = shift_objects(self._store, object_ids, way, self._covering)
@@ -278,22 +280,23 @@ class Environment:
         pose : (4, 4) array
             world_from_tool, rigid, metres.
         strategy : str
-            How the database is asked: ``statement``, ``array``, ``points``, ``maxgap``,
-            ``cbgroup``, or ``auto``: ``cbgroup`` where a frame has many keys and few ranges hold
-            them, else ``array``. All find the same hits, ids and wrench, bit for bit.
+            Form of the query: ``statement``, ``array``, ``points``, ``maxgap``, ``cbgroup``, or
+            ``auto``: ``cbgroup`` for a frame with many keys in few ranges, else ``array``. All
+            strategies find the same hits, ids and wrench, bit for bit.
         exclude : iterable of int
-            Ids of objects that are not felt: a part taken out must not hit itself.
+            Ids of objects to leave out: a part that is taken out must not hit itself.
         maxgap : int
-            Of the strategy ``maxgap``: neighbours at most so many voxel keys apart share a range.
+            For the strategy ``maxgap``: greatest distance, in voxel keys, of neighbours that share
+            a range.
         law : TangentPlane or None
             The force law; 1000 N/m unless given.
 
         Raises
         ------
         UsageError
-            When the pose is not rigid or the strategy unknown.
+            If the pose is not rigid or the strategy is unknown.
         ObjectNotFoundError
-            When an excluded object does not exist.
+            If an excluded object does not exist.
 
         Notes
         -----
@@ -303,7 +306,7 @@ class Environment:
         force_law = law or _DEFAULT_LAW
         try:
             answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
-        except ConnectionLostError:  # in the middle of a snapshot: once more, from its start
+        except ConnectionLostError:  # a lost snapshot: repeat all of it once
             answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
         if ids.size:
             self._known.check_excluded(ids)
@@ -319,7 +322,7 @@ class Environment:
         ids: Keys,
         law: ForceLaw,
     ) -> Answer:
-        """Answer of a frame; afterwards the objects of the revision that it saw are known."""
+        """Answer of a frame; also loads the objects of the revision that the frame read."""
         answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
         if self._store.version() != self._known.version:
             with self._store.snapshot():
@@ -328,7 +331,7 @@ class Environment:
         return answer
 
     def _learn_objects(self) -> None:
-        """Know the objects of the revision that this snapshot sees."""
+        """Load the objects of the revision that this snapshot reads."""
         if self._known.learn():
             self._figures.drop_empty_statistics()
 
@@ -343,15 +346,15 @@ class Environment:
         law: ForceLaw | None = None,
         contacts: bool = False,
     ) -> Touches:
-        """Force and torque at many poses, as `touch` gives them one by one, bit for bit.
+        """Force and torque at many poses; the same as `touch` for each pose, bit for bit.
 
         Parameters
         ----------
         poses : (n, 4, 4) array
-            Each a world_from_tool, rigid, metres.
+            world_from_tool for each frame, rigid, metres.
         strategy : str
-            ``auto`` asks for the rows of neighbouring poses in one statement; any other asks pose
-            by pose, as `touch` does.
+            ``auto`` reads the rows of neighbouring poses in one statement; any other strategy
+            queries pose by pose, as `touch` does.
         contacts : bool
             Whether to list every contact, too.
         shell, exclude, maxgap, law
@@ -376,7 +379,7 @@ class Environment:
             self._figures.both()  # measured outside the snapshot
         try:
             touches = felt()
-        except ConnectionLostError:  # once more, from its start
+        except ConnectionLostError:  # a lost snapshot: repeat all of it once
             touches = felt()
         if ids.size:
             self._known.check_excluded(ids)
@@ -389,31 +392,31 @@ class Environment:
         return QuantileVector.of(self._store, resolution)
 
     def freshness(self) -> Freshness:
-        """How old the statistics are that grouping by cost uses."""
+        """Age of the statistics that grouping by cost uses."""
         return self._store.freshness(DEFAULT_RESOLUTION)
 
     def analyze(self) -> QuantileVector:
-        """Renew the statistics that grouping by cost uses, however fresh they are."""
+        """Renew the statistics that grouping by cost uses, even if they are up to date."""
         self._check_writable()
         return self._figures.analyze()
 
     def calibrate(self, *, seed: int = 0, keep: bool = True, cold: bool = False) -> CostModel:
-        """Measure what queries cost here; the figures are used from now on, and kept.
+        """Measure the cost of queries on this database; the figures are used and stored.
 
         Parameters
         ----------
         seed : int
-            Of the random choice of the places that are measured.
+            Seed of the random choice of the measured places.
         keep : bool
-            Write the figures into the database, when it can be written.
+            Write the figures into the database, if it can be written.
         cold : bool
-            Measure with empty caches, where this process can empty them: for environments that
-            are larger than memory.
+            Measure with empty caches, if this process can empty them: for environments that are
+            larger than memory.
         """
         return self._figures.calibrate(seed=seed, keep=keep, cold=cold)
 
     def _forget(self) -> None:
-        """Forget what an edit of this environment has made stale."""
+        """Drop cached values that an edit of this environment has made stale."""
         self._figures.drop_statistics()
         self._known.forget()
 
@@ -445,19 +448,19 @@ def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment
     Raises
     ------
     EnvironmentNotFoundError, NotAnEnvironmentError, NewerVersionError, DamagedError
-        When there is none, or something else, or one that cannot be read.
+        If there is no environment, something else, or one that cannot be read.
     """
     return Environment(open_store(url, read_only=read_only))
 
 
 def create(url: str | os.PathLike[str], grid: Grid, *, layout: Layout = "brick") -> Environment:
-    """Make an environment with that grid and open it.
+    """Make an environment with a given grid and open it.
 
     Raises
     ------
     EnvironmentExistsError
-        When something is there already.
+        If something exists there already.
     UsageError
-        When bricks are asked for in lexicographic order.
+        If the layout is bricks and the order is lexicographic.
     """
     return Environment(create_store(url, grid, layout))

@@ -1,1 +1,1 @@
-"""Parts to rows: files read, voxelized and written, objects placed and replaced."""
+"""Import: reads, voxelizes and writes files; moves and replaces objects."""

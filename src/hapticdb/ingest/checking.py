@@ -1,4 +1,4 @@
-"""Whether the parts of a file may go into an environment: by their names, and by its grid."""
+"""Checks whether the parts of a file fit into an environment: their names and their places."""
 
 from collections.abc import Iterable
 
@@ -10,8 +10,8 @@ from hapticdb.grid import Grid
 from hapticdb.mesh import MeshFile, Part
 
 AT_BORDER = 1e-6
-"""Voxels by which a part may lie beyond the grid's border without an error, for rounding. A larger
-value lets parts in that are cut off at the border."""
+"""Voxels by which a part may lie beyond the grid's border without an error, because of rounding. A
+larger value accepts parts that are cut off at the border."""
 
 
 def check_names(mesh_file: MeshFile) -> None:
@@ -28,7 +28,7 @@ def check_names(mesh_file: MeshFile) -> None:
 
 
 def check_inside(parts: Iterable[Part], link: str, grid: Grid) -> None:
-    """Refuse a part of the file `link` that leaves the grid where the file places it."""
+    """Refuse a part of the file `link` that leaves the grid at its placement in the file."""
     for part in parts:
         bounds_inside(part, link, grid)
 
@@ -36,12 +36,12 @@ def check_inside(parts: Iterable[Part], link: str, grid: Grid) -> None:
 def bounds_inside(
     part: Part, link: str, grid: Grid, world_from_part: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Bounds (2, 3) of a part in metres, world frame, at a placement, or at the file's.
+    """Bounds (2, 3) of a part in metres, world frame, at a given placement or at the file's.
 
     Raises
     ------
     OutsideGridError
-        When the part leaves the grid.
+        If the part leaves the grid.
     """
     points = part.world_points(world_from_part)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])

@@ -1,4 +1,4 @@
-"""Files -> objects and their rows: one transaction an object, in the order of the file.
+"""Imports files as objects and their rows: one transaction an object, in the order of the file.
 
 Objects are written in the order of the files and of their parts, whatever the number of jobs. So an
 import that was interrupted and is run again ends with the same rows and ids as an undisturbed one.
@@ -32,9 +32,9 @@ from hapticdb.store.connect import check_curve, create_store, exists, open_store
 
 
 class ImportProgress(NamedTuple):
-    """How far an import is: sent after each part, and five times a second during a long one.
+    """Progress of an import: sent after each part, and five times a second during a long part.
 
-    share : of the present part, 0 to 1; 0 after a part.
+    share : done share of the present part, 0 to 1; 0 after a part.
     """
 
     link: str
@@ -49,31 +49,31 @@ ImportCallback = Callable[[ImportProgress], None]
 
 @dataclass(frozen=True)
 class FileReport:
-    """What became of one file.
+    """Result of the import of one file.
 
     Attributes
     ----------
     link : str
         The file.
     status : {"imported", "complete", "failed"}
-        Something was written; everything was there already; nothing was, see `error`.
+        Objects were written; all objects were in the environment already; the file was skipped, see
+        `error`.
     added : tuple of Object
         Objects written now, in the file's order.
     present : int
-        Objects that were there already.
+        Number of objects that were in the environment already.
     restored : int
-        Of those written now, parts that had been removed from the environment.
+        Number of added parts that had been removed from the environment before.
     kept_removed : int
-        Parts that were removed and were left out: `ImportOptions.keep_removed`.
+        Number of removed parts that were skipped: `ImportOptions.keep_removed`.
     replaced, dropped : int
-        Objects that were replaced, and that were removed: `ImportOptions.replace`.
+        Numbers of objects replaced and removed: `ImportOptions.replace`.
     defects : Defects
-        What was wrong in the file.
+        Defects of the file.
     error : HapticDBError or None
         Why the file was skipped.
     is_unit_assumed : bool
-        Whether neither the file nor the options say a unit, so that its numbers are taken as
-        metres.
+        Whether neither the file nor the options give a unit, so its numbers were read as metres.
     """
 
     link: str
@@ -91,26 +91,26 @@ class FileReport:
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """How files are read and voxelized.
+    """Options of reading and voxelizing files.
 
     Attributes
     ----------
     unit : str or None
-        One of `hapticdb.mesh.UNITS`, of files that carry none; metres unless given.
+        Unit of files that name none, one of `hapticdb.mesh.UNITS`; metres unless given.
     grid : GridOptions
-        For a new environment; must agree with an existing one.
+        Grid of a new environment; must agree with an existing one.
     layout : {"voxel", "brick"} or None
-        For a new environment (bricks unless given); must agree with an existing one.
+        Layout of a new environment (bricks unless given); must agree with an existing one.
     jobs : int or None
-        Threads that voxelize; one a processor unless given.
+        Threads that voxelize; one for each processor unless given.
     keep_removed : bool
-        Leave parts out that were removed from the environment; they come in again otherwise.
+        Skip parts that were removed from the environment; otherwise they are added again.
     time_limit, memory_limit : float, int or None
-        Seconds and bytes that reading one file may take; in proportion to the file unless given,
-        see `hapticdb.mesh.read_file`.
+        Greatest time (s) and memory (bytes) for reading one file; in proportion to the file unless
+        given, see `hapticdb.mesh.read_file`.
     replace : bool
-        Make the environment hold what the file holds now: its objects that have another geometry,
-        placement or unit there are replaced, under their ids, and those that it lacks are removed.
+        Make the environment agree with the file: replace objects, under their ids, whose parts have
+        another geometry, placement or unit now, and remove objects whose parts the file lacks.
     """
 
     unit: str | None = None
@@ -144,17 +144,17 @@ def import_files(
     options: ImportOptions | None = None,
     progress: ImportCallback | None = None,
 ) -> list[FileReport]:
-    """Import files into an environment, which is made when it does not exist.
+    """Import files into an environment, which is made if it does not exist.
 
-    A file that cannot be used is reported and skipped; the others go in. A new environment into
-    which nothing went is not left behind.
+    A file that cannot be used is reported and skipped; the others are imported. If nothing was
+    written to a new environment, it is removed.
 
     Parameters
     ----------
     url : str or path
         The environment: a path, ``sqlite:///path``, or ``postgresql://host/database``.
     files : sequence of paths
-        The first usable one decides on the grid of a new environment.
+        The first usable file decides on the grid of a new environment.
     options : ImportOptions or None
         Units, grid, layout, jobs.
     progress : callable or None
@@ -163,15 +163,14 @@ def import_files(
     Returns
     -------
     list of FileReport
-        One a file, in order; look at each one's `status`, and at its `error` where that is
-        ``failed``.
+        One for each file, in order. If a report's `status` is ``failed``, its `error` says why.
 
     Raises
     ------
     GridError, UsageError
-        When the options cannot be, or contradict an existing environment.
+        If the options are invalid, or contradict an existing environment.
     DatabaseError
-        When the environment cannot be opened or written.
+        If the environment cannot be opened or written.
     """
     chosen = options or ImportOptions()
     if isinstance(files, (str, bytes, os.PathLike)):
@@ -196,7 +195,7 @@ def _import_file(
     options: ImportOptions,
     progress: ImportCallback | None,
 ) -> FileReport:
-    """Import one file; one that cannot be used gets a report that says why."""
+    """Import one file; if it cannot be used, the report says why."""
     try:
         mesh_file = read_file(file, unit=options.unit, **options.limits)
         return ingest_file(target.store_for(mesh_file), mesh_file, options, progress)
@@ -212,9 +211,9 @@ class _Target:
     store : Store or None
         None until the environment exists.
     loading : ExitStack
-        Holds `Store.loading` from the first file that can be written.
+        Keeps `Store.loading` active from the first usable file on.
     is_first_file, has_written : bool
-        Whether no file came before; whether any object was written.
+        Whether this is the first file; whether any object was written.
     """
 
     def __init__(self, url: str | os.PathLike[str], options: ImportOptions) -> None:
@@ -235,7 +234,7 @@ class _Target:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the store; an environment that was made here and got nothing is removed."""
+        """Close the store; remove an environment that was made here if nothing was written."""
         if self.store is None:
             return
         if self._is_new and not self.has_written and not self.store.revision():
@@ -244,7 +243,7 @@ class _Target:
             self.store.close()
 
     def store_for(self, mesh_file: MeshFile) -> Store:
-        """Give the store, ready to load a file; the first usable file makes the environment."""
+        """Return the store, ready to load a file; the first usable file makes the environment."""
         grid_options = self._options.grid
         if self.store is None:
             grid = grid_options.fit(mesh_file.bounds)
@@ -279,14 +278,14 @@ def ingest_file(
     options: ImportOptions,
     progress: ImportCallback | None = None,
 ) -> FileReport:
-    """Write those parts of a file that the environment does not hold yet.
+    """Write the parts of a file that the environment does not have yet.
 
     Raises
     ------
     OutsideGridError
-        When a part leaves the grid; then no part of the file is written.
+        If a part leaves the grid; then no part of the file is written.
     GeometryChangedError
-        When the environment holds a part of that name with another geometry, unless it is to be
+        If the environment has a part of the same name with another geometry, unless it is to be
         replaced.
     """
     plan = _planned(store, mesh_file, options)
@@ -312,11 +311,11 @@ def ingest_file(
 
 
 class _Plan(NamedTuple):
-    """What is to be done with a file's parts.
+    """Planned changes for a file's parts.
 
-    known : parts that the environment holds; missing : parts to add, in the file's order; removed :
-    names of the file's parts that were removed from the environment; changed : parts to put in the
-    place of objects, by the ids of those.
+    known : parts that the environment has; missing : parts to add, in the file's order; removed :
+    names of the file's parts that were removed from the environment; changed : new parts, by the
+    ids of the objects that they replace.
     """
 
     known: KnownParts
@@ -326,7 +325,7 @@ class _Plan(NamedTuple):
 
 
 def _planned(store: Store, mesh_file: MeshFile, options: ImportOptions) -> _Plan:
-    """Compare a file with the environment; refuses what cannot be written, before any write."""
+    """Compare a file with the environment; refuse unsuitable parts before any write."""
     check_names(mesh_file)
     known = KnownParts(store, mesh_file.link)
     missing = [part for part in mesh_file.parts if known.digest_of(part.name) is None]
@@ -351,7 +350,7 @@ def _add_missing(
     unit_and_jobs: tuple[str | None, int],
     progress: ImportCallback | None,
 ) -> set[int]:
-    """Add the missing parts, but those that another process adds meanwhile; ids of the added."""
+    """Add the missing parts, except those that another process adds meanwhile; returns the ids."""
     added: set[int] = set()
     n_parts = len(mesh_file.parts)
     n_done = n_parts - len(plan.missing)
@@ -387,7 +386,7 @@ def _check_layout(store: Store, layout: Layout | None) -> None:
 
 
 def _first_bounds(store: Store, mesh_file: MeshFile) -> NDArray[np.float64] | None:
-    """Bounds of a file if it is the one that decided on the grid: `--extent` is meant for it."""
+    """Bounds of a file if it decided on the grid, because `--extent` is meant for that file."""
     first = next(iter(store.objects()), None)
     if first is None or first.link == mesh_file.link:
         return mesh_file.bounds
@@ -396,7 +395,7 @@ def _first_bounds(store: Store, mesh_file: MeshFile) -> NDArray[np.float64] | No
 
 @contextlib.contextmanager
 def _closing_on_error(store: Store) -> Iterator[None]:
-    """Close a store when the block raises."""
+    """Close a store if the block raises an error."""
     try:
         yield
     except BaseException:

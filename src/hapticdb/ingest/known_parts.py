@@ -1,4 +1,4 @@
-"""Parts of a file that an environment holds already: found, added while others add, replaced."""
+"""Parts of a file that an environment already has; adds and replaces parts beside other writers."""
 
 import contextlib
 import dataclasses
@@ -12,14 +12,14 @@ from hapticdb.query.grouping import object_ranges
 from hapticdb.store.base import Covering, Object, Rows, Store
 
 MOST_ATTEMPTS = 100
-"""Attempts to add a part that other processes add and remove meanwhile, before it is an error."""
+"""Attempts to add a part that other processes add and remove meanwhile; then an error is raised."""
 
 
 class KnownParts:
-    """Parts of a file that an environment holds, brought up to date by its log of changes.
+    """Parts of a file that an environment has, updated from the environment's log of changes.
 
-    Measured with two imports of one file of 1,500 parts at once: the second took 4.6 s, and 33 s
-    when it listed all objects again for each part that the other had added.
+    Measured with two imports of one file of 1,500 parts at once: the second took 4.6 s, but 33 s
+    if it listed all objects again for each part that the other had added.
     """
 
     def __init__(self, store: Store, link: str) -> None:
@@ -32,7 +32,7 @@ class KnownParts:
             self._enter(obj)
 
     def digest_of(self, name: str) -> str | None:
-        """Digest of the part's geometry, or None where the environment lacks that part."""
+        """Digest of the part's geometry, or None if the environment lacks that part."""
         return self._digest_of.get(name)
 
     def changed(self, parts: Sequence[Part], unit: str | None) -> dict[int, Part]:
@@ -54,7 +54,7 @@ class KnownParts:
         return found
 
     def refresh(self) -> None:
-        """Take in what was written since the last call."""
+        """Update from the writes since the last call."""
         changes = list(self._store.changes(self._revision))
         for object_id in {change.id for change in changes}:
             self._digest_of.pop(self._name_of.pop(object_id, ""), None)
@@ -70,12 +70,12 @@ class KnownParts:
 
 
 def added_or_present(store: Store, part: Object, rows: Rows, known: KnownParts) -> int | None:
-    """Id of a part that is added now, or None where another has added the same one meanwhile.
+    """Add a part; returns its id, or None if another process has added the same part meanwhile.
 
     Raises
     ------
     EnvironmentExistsError
-        When the environment holds a part of that name with another geometry.
+        If the environment has a part of the same name with another geometry.
     """
     for attempt in range(MOST_ATTEMPTS):
         try:
@@ -94,7 +94,7 @@ def added_or_present(store: Store, part: Object, rows: Rows, known: KnownParts) 
 def replace_changed(
     store: Store, anew: Iterable[tuple[Object, Rows]], id_of: dict[str, int]
 ) -> int:
-    """Put parts in the place of the objects of their names, in a transaction each; counts them."""
+    """Replace the objects with the parts' names, one transaction each; returns their number."""
     n_replaced = 0
     for part, rows in anew:
         with contextlib.suppress(ObjectNotFoundError):  # another process has removed it
@@ -104,7 +104,7 @@ def replace_changed(
 
 
 def drop_others(store: Store, mesh_file: MeshFile) -> int:
-    """Remove the objects of a file that it holds no more, in a transaction each; counts them."""
+    """Remove objects whose parts the file lacks now, one transaction each; returns the count."""
     names = {part.name for part in mesh_file.parts}
     n_dropped = 0
     for obj in store.objects():

@@ -1,7 +1,7 @@
-"""Voxels <-> rows of the index table, in either layout and on any curve.
+"""Converts voxels to rows of the index table and back, in either layout and on any curve.
 
-Bricks in Z-order are the form between them: the voxelizer makes them, and rows of any layout and
-curve are converted by way of them.
+Bricks in Z-order are the common form: the voxelizer makes them, and rows of any layout and curve
+are converted from and to them.
 """
 
 from collections.abc import Sequence
@@ -20,10 +20,10 @@ BRICKS_AT_ONCE = 1 << 15
 
 
 class Bricks(NamedTuple):
-    """Voxels as bricks in Z-order, whatever the curve of their environment.
+    """Voxels as bricks in Z-order, for any curve of the environment.
 
-    keys (B,) int64, ascending, each once; occupancy (B, 64) uint8, bit number n the voxel of
-    Z-order n modulo 8, least significant first.
+    keys (B,) int64, ascending, distinct; occupancy (B, 64) uint8: bit n, least significant first,
+    is the voxel whose (i, j, k) modulo 8 has Z-order n.
     """
 
     keys: Keys
@@ -31,7 +31,7 @@ class Bricks(NamedTuple):
 
 
 def rows_of_bricks(bricks: Bricks, grid: Grid, layout: Layout) -> tuple[Rows, int]:
-    """Rows in that layout and the grid's order, and how many voxels they hold."""
+    """Rows of bricks in a layout and the grid's order, and the number of their voxels."""
     keys, occupancy = bricks
     n_voxels = voxelize.count_voxels(occupancy)
     if layout == "voxel":
@@ -45,7 +45,7 @@ def rows_of_bricks(bricks: Bricks, grid: Grid, layout: Layout) -> tuple[Rows, in
 
 
 def _voxel_keys(bricks: Bricks, n_voxels: int, grid: Grid) -> Keys:
-    """Keys (n_voxels,) of all voxels, ascending; a few bricks are unpacked at a time."""
+    """Keys (n_voxels,) of all voxels, ascending; unpacks `BRICKS_AT_ONCE` bricks at a time."""
     keys = np.empty(n_voxels, dtype=np.int64)
     at = 0
     for start in range(0, len(bricks.keys), BRICKS_AT_ONCE):
@@ -58,7 +58,7 @@ def _voxel_keys(bricks: Bricks, n_voxels: int, grid: Grid) -> Keys:
 
 
 def bricks_of_rows(rows: Rows, grid: Grid, layout: Layout) -> Bricks:
-    """Bricks of one object's rows: undoes `rows_of_bricks`."""
+    """Bricks of one object's rows; the inverse of `rows_of_bricks`."""
     if layout == "voxel":
         return bricks_of_voxels(grid.decode(rows.keys), grid)
     keys = rows.keys
@@ -87,7 +87,7 @@ def voxels_of_rows(rows: Rows, grid: Grid, layout: Layout) -> NDArray[np.int64]:
 
 
 def merged(parts: Sequence[Bricks]) -> Bricks:
-    """Bricks of one or more parts together; a brick of several parts has the bits of all."""
+    """Bricks of one or more parts together; a brick in several parts gets the bits of all."""
     if len(parts) == 1:
         return parts[0]
     keys = np.concatenate([part.keys for part in parts])
@@ -101,6 +101,6 @@ def merged(parts: Sequence[Bricks]) -> Bricks:
 
 
 def _reordered(keys: Keys, bits: int, curve: int, onto: int) -> Keys:
-    """Brick keys converted to another curve, not sorted anew."""
+    """Brick keys converted to another curve, in the old order."""
     level = max(bits - BRICK_BITS, 0)
     return curves.encode(curves.decode(keys, level, curve), level, onto)

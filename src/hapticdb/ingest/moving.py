@@ -1,4 +1,4 @@
-"""Objects moved: their geometry is read again, voxelized, and exchanged in one transaction."""
+"""Moves objects: reads their geometry again, voxelizes it, and replaces their rows."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -16,7 +16,7 @@ from hapticdb.query.frame import as_ids
 from hapticdb.store.base import Covering, Object, Store
 
 RESTORE = "restore the file, or remove the object and import it again"
-"""What a message advises where an object's file has changed."""
+"""Advice in messages about an object whose file has changed."""
 
 Floats = NDArray[np.float64]
 
@@ -24,7 +24,7 @@ Floats = NDArray[np.float64]
 def move_object(
     store: Store, old: Object, transform: ArrayLike, revision: int | None, covering: Covering
 ) -> None:
-    """Place an object anew, as `Environment.move` documents it."""
+    """Move an object; see `Environment.move`."""
     placed = _as_transform(transform)
     ((_, part),) = parts_of([old], "moved", RESTORE)
     _write_moved(store, old, part, placed, revision or 0, covering)
@@ -33,7 +33,7 @@ def move_object(
 def shift_objects(
     store: Store, ids: Iterable[int], way: ArrayLike, covering: Covering
 ) -> list[Object]:
-    """Shift objects alike, as `Environment.shift` documents it."""
+    """Shift objects by the same vector; see `Environment.shift`."""
     shift = np.eye(4)
     shift[:3, 3] = _as_way(way)
     pairs = list(parts_of([store.object(int(i)) for i in as_ids(ids)], "moved", RESTORE))
@@ -45,7 +45,7 @@ def shift_objects(
             try:
                 _write_moved(store, obj, part, shift @ obj.transform, obj.revision, covering)
                 break
-            except ConflictError:  # another has moved it meanwhile: shift it from there
+            except ConflictError:  # another user has moved it: shift it from its new place
                 obj = store.object(obj.id)
                 if obj.digest != part.digest:
                     raise
@@ -55,7 +55,7 @@ def shift_objects(
 def _write_moved(
     store: Store, old: Object, part: Part, placed: Floats, revision: int, covering: Covering
 ) -> None:
-    """Exchange an object's rows for those of its part at the placement `placed` (4, 4)."""
+    """Replace an object's rows by those of its part at the placement `placed` (4, 4)."""
     bounds = bounds_inside(part, old.link, store.grid, placed)
     rows, n_voxels = rows_of_part(part, store.grid, store.layout, placed)
     new = replace(

@@ -11,19 +11,19 @@ from hapticdb.store.base import Object
 
 
 def parts_of(objects: Sequence[Object], to_be: str, instead: str) -> Iterator[tuple[Object, Part]]:
-    """Objects with their geometry, checked to be the one that was imported; a file is read once.
+    """Yield objects with their geometry, checked against the imported one; reads each file once.
 
     Parameters
     ----------
     objects : sequence of Object
-        In any order; they come ordered by file.
+        In any order; they are yielded ordered by file.
     to_be, instead : str
-        For messages: what cannot be done with them (``moved``), and what to do instead.
+        Words for messages: the failed action (``moved``), and what to do instead.
 
     Raises
     ------
     GeometryChangedError
-        When an object's file is gone or holds another geometry.
+        If an object's file is missing or has another geometry now.
     """
     of_file: dict[tuple[str, str | None], list[Object]] = {}
     for obj in objects:
@@ -49,7 +49,7 @@ def parts_of(objects: Sequence[Object], to_be: str, instead: str) -> Iterator[tu
 def shell_of_objects(
     objects: Sequence[Object], points: int | None, spacing: float | None, seed: int
 ) -> PointShell:
-    """One shell of several objects where they sit, as `Environment.shell` documents it."""
+    """Make one shell of several objects at their places; see `Environment.shell`."""
     if not objects:
         raise UsageError("a shell of no objects: name at least one")
     triangles = []

@@ -1,4 +1,4 @@
-"""Parts -> their rows: each part in pieces of bounded size, several parts at once in threads."""
+"""Voxelizes parts into rows: a part in pieces of bounded size, several parts at once in threads."""
 
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -18,12 +18,12 @@ from hapticdb.store.base import BRICK_BYTES, Layout, Object, Rows, Store
 ShareCallback = Callable[[float], None]
 """Called with the share of a part that is done, 0 to 1; from any thread."""
 SHARE_EVERY_S = 0.2
-"""Seconds between two calls with the share of a part that takes long."""
+"""Seconds between two calls with the share of a long part. Larger: fewer calls."""
 BYTES_A_BRICK = 8 + BRICK_BYTES
-"""Memory of a brick: its key and its occupancy."""
+"""Memory of a brick, bytes: its key and its occupancy."""
 _MERGE_FROM = 8 * voxelize.MOST_BRICKS
-"""Bricks in pieces after which the pieces are merged for the first time. A larger value merges less
-often and takes more memory."""
+"""Number of bricks in all pieces at which the pieces are merged for the first time. A larger value
+merges less often and takes more memory."""
 
 
 def rows_of_part(
@@ -33,12 +33,12 @@ def rows_of_part(
     world_from_part: NDArray[np.float64] | None = None,
     progress: ShareCallback | None = None,
 ) -> tuple[Rows, int]:
-    """Voxelize a part: its rows, ascending by key, and how many voxels its surface touches.
+    """Voxelize a part; returns its rows, ascending by key, and the number of its voxels.
 
     Parameters
     ----------
     part : Part
-        Triangles mark every voxel whose closed box they meet; points the voxel that holds them.
+        A triangle marks every voxel whose closed box it meets; a point marks its voxel.
     world_from_part : (4, 4) float64 or None
         Placement in metres; the file's unless given.
     progress : callable or None
@@ -47,7 +47,7 @@ def rows_of_part(
     Raises
     ------
     FileError
-        When its voxels would take more memory than the machine has left.
+        If its voxels would take more memory than the machine has left.
     """
     if part.is_cloud:
         points = _on_grid(part.world_points(world_from_part), grid)
@@ -61,7 +61,7 @@ def rows_of_part(
 
 
 def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
-    """Points (..., 3) in voxels; what rounding carried over the border is set back onto it."""
+    """Points (..., 3) in voxels; points that rounding moved over the border are set onto it."""
     scaled = grid.to_voxel_units(points)
     return np.clip(scaled, 0.0, float(grid.side), out=scaled)
 
@@ -75,12 +75,12 @@ def bricks_of_triangles(
 ) -> Bricks:
     """Bricks of the voxels that triangles (T, 3, 3) meet, in voxels from the grid's origin.
 
-    Takes memory for the result twice, and for one piece of `most` bricks. what: named in errors.
+    Needs memory for twice the result and one piece of `most` bricks. what : the name in errors.
 
     Raises
     ------
     FileError
-        When the bricks would take more memory than the machine has left.
+        If the bricks would take more memory than the machine has left.
     """
     pieces: list[Bricks] = []
     n_waiting, merge_from = 0, _MERGE_FROM
@@ -98,7 +98,7 @@ def bricks_of_triangles(
 
 
 def merged_in_turn(pieces: list[Bricks]) -> Bricks:
-    """Bricks of all pieces; empties the list as it goes, so that no piece is held twice."""
+    """Merge the bricks of all pieces; empties the list meanwhile, so no piece is stored twice."""
     if len(pieces) == 1:
         return pieces.pop()
     keys = np.unique(np.concatenate([piece.keys for piece in pieces]))
@@ -110,7 +110,7 @@ def merged_in_turn(pieces: list[Bricks]) -> Bricks:
 
 
 def check_room(n_bytes: int, what: str) -> None:
-    """Refuse what needs more memory than the machine has left."""
+    """Raise an error if `n_bytes` is more memory than the machine has left."""
     left = bytes_available()
     if n_bytes > left:
         raise FileError(
@@ -127,14 +127,14 @@ def voxelize_parts(
     jobs: int,
     progress: ShareCallback = lambda _share: None,
 ) -> Iterator[tuple[Object, Rows]]:
-    """Objects and rows of parts, in their order; threads voxelize a few parts ahead of the caller.
+    """Yield objects and rows of parts, in order; threads voxelize a few parts in advance.
 
-    Threads suffice: the voxelizer runs without the interpreter lock.
+    Threads suffice because the voxelizer runs without the interpreter lock.
 
     Parameters
     ----------
     unit : str or None
-        That the file was read with; kept with the objects.
+        Unit in which the file was read; stored with the objects.
     jobs : int
         Threads that voxelize.
     progress : callable
@@ -177,7 +177,7 @@ def _object_of(
     attributes: Mapping[str, object],
     progress: ShareCallback,
 ) -> tuple[Object, Rows]:
-    """Object and rows of a part where its file places it."""
+    """Object and rows of a part at its placement in the file."""
     try:
         rows, n_voxels = rows_of_part(part, store.grid, store.layout, progress=progress)
     except FileError as error:

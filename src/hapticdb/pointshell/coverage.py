@@ -1,7 +1,7 @@
-"""How well points cover the surface that they were spread over, and what lies inside of it.
+"""Covering radius of points on a surface, and which positions the surface encloses.
 
 The covering radius of points on a surface is the least r such that each position on the surface has
-a point within r. It bounds the size of what may pass between the points unseen.
+a point within r. It bounds the size of a detail that may pass between the points without a hit.
 """
 
 import contextlib
@@ -16,13 +16,12 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
 
 CLOSE = 0.1
-"""How close a computed covering radius is to the least one: at most this share above it, or it
-comes from triangles with sides of at most this share of the points' spacing. A smaller value cuts
-more triangles."""
+"""Tolerance of a computed covering radius: it exceeds the least one by at most this share, or comes
+from triangles with sides of at most this share of the points' spacing. A smaller value cuts more
+triangles."""
 COVER_OF_SPACING = 1.45
-"""Covering radius to expect of a shell made of a mesh, in spacings of its points. Measured on a
-cube: 0.98 at 300 points, 1.37 at 400,000. A larger value makes a sweep that is not decided ask for
-more points."""
+"""Expected covering radius of a mesh's shell, in spacings of its points. Measured on a cube: 0.98
+at 300 points, 1.37 at 400,000. Larger: an undecided sweep recommends more points."""
 AT_ONCE = 1 << 16
 """Triangles that are cut and measured at a time. A larger value takes more memory."""
 
@@ -30,12 +29,12 @@ Floats = NDArray[np.float64]
 
 
 def spacing_of(area: float, n_points: int) -> float:
-    """Distance of neighbours if the points were a hexagonal lattice, metres."""
+    """Distance of neighbours, metres, for a hexagonal lattice of `n_points` on an area (m^2)."""
     return float(np.sqrt(2.0 * area / (np.sqrt(3.0) * n_points)))
 
 
 def points_for(area: float, spacing: float) -> int:
-    """How many points a hexagonal lattice of that spacing has on an area: undoes `spacing_of`."""
+    """Number of points of a hexagonal lattice on an area; the inverse of `spacing_of`."""
     return int(np.ceil(2.0 * area / (np.sqrt(3.0) * spacing**2)))
 
 
@@ -43,9 +42,9 @@ def covering_radius(triangles: Floats, points: Floats) -> float:
     """Bound the covering radius of points (N, 3) on triangles (F, 3, 3) from above, metres.
 
     The distance to a point is convex, so no position in a triangle is farther from a point than the
-    triangle's farthest corner. Triangles are cut in halves across their longest side until that
-    bound, for the point nearest to their middle, is within `CLOSE` of a distance that was found.
-    The bound is raised by a millionth, which is more than its rounding errors.
+    triangle's farthest corner. Triangles are halved across their longest side until that bound,
+    for the point nearest to their middle, is within `CLOSE` of a distance that occurs. The result
+    is raised by a millionth, which is more than its rounding errors.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for sweeps alone
 
@@ -81,15 +80,16 @@ def _halves(triangles: Floats) -> Floats:
 
 
 class Ball(NamedTuple):
-    """A sphere about the origin, its radius in metres."""
+    """A sphere about the origin; radius in metres."""
 
     radius: float
 
     def covering_radius(self, points: Floats) -> float:
         """Bound the covering radius of points (N, 3) on the sphere from above, metres.
 
-        The farthest positions are the middles of the caps that the faces of the points' convex hull
-        cut off. The bound of points without a hull, or on one side, is the sphere's diameter.
+        The faces of the points' convex hull cut caps off the sphere; the farthest positions are the
+        middles of these caps. If the points have no hull, or all lie on one side, the bound is the
+        sphere's diameter.
         """
         from scipy.spatial import ConvexHull, QhullError  # noqa: PLC0415 - as above
 
@@ -103,12 +103,12 @@ class Ball(NamedTuple):
 
 
 class Interior:
-    """What lies inside the closed bodies of a surface.
+    """The inside of a surface's closed bodies.
 
     Parameters
     ----------
     surface : Surface or Ball
-        As `orient` makes it. Open bodies enclose nothing, and a void is outside.
+        A result of `orient`, or a ball. Open bodies enclose nothing, and a void is outside.
     """
 
     def __init__(self, surface: "Surface | Ball") -> None:
@@ -130,9 +130,9 @@ class Interior:
         return self._ball is not None or bool(self._bodies)
 
     def holds(self, positions: Floats) -> NDArray[np.bool_]:
-        """Whether positions (Q, 3), metres, the surface's frame, are inside, (Q,).
+        """Whether each of the positions (Q, 3), metres, surface's frame, is inside: (Q,).
 
-        By the parity of lines through them. On the surface itself the answer may be either.
+        Decided by the parity of crossings of lines; on the surface itself either answer may come.
         """
         if self._ball is not None:
             return np.asarray(np.linalg.norm(positions, axis=1) < self._ball.radius)

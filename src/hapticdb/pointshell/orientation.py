@@ -1,9 +1,9 @@
-"""Which side of a surface is inside, from where its triangles lie, not from their winding.
+"""Finds the inner side of a surface from the places of its triangles, not from their winding.
 
-Files wind faces any way, repeat them and tear their edges. So corners that coincide are joined,
-faces that share edges form patches of one winding and closed bodies, and lines through the patches
-vote on the side (`kernels.surfaces.sides`). A patch without votes is guessed from its shape.
-docs/decisions/0015 has the reasons.
+In files, faces may have any winding, may be repeated, and may not share their edges. So corners
+that coincide are joined, faces that share edges form patches of one winding and closed bodies, and
+lines through the patches vote on the side (`kernels.surfaces.sides`). For a patch without votes the
+side is guessed from its shape. docs/decisions/0015 gives the reasons.
 """
 
 from typing import NamedTuple
@@ -15,15 +15,15 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.surfaces import sides as kernels
 
 JOIN = 1e-6
-"""Distance up to which corners of open edges are joined, as a part of the bounding box's diagonal.
-A larger value closes wider gaps, and joins corners of details that are that small."""
+"""Distance up to which corners of open edges are joined, as a share of the bounding box's diagonal.
+A larger value closes wider gaps, and also joins the corners of small details."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 class Surface(NamedTuple):
-    """Triangles whose inside is known: what points are spread over."""
+    """Triangles whose inner side is known; the points of a shell are spread over them."""
 
     triangles: Floats  # (F, 3, 3), none twice
     areas: Floats  # (F,), zero where degenerate
@@ -34,32 +34,32 @@ class Surface(NamedTuple):
 
 
 class _Edges(NamedTuple):
-    """Edges of the faces (F, 3) of a topology, every edge of a face with a number of its own."""
+    """Numbered edges of the faces (F, 3) of a mesh; sides that coincide have one edge number."""
 
     number: Ints  # (3 F,) edge of each face's side: corners 0 1, 1 2, 2 0
-    is_forward: NDArray[np.bool_]  # (3 F,) whether the side runs from the lesser corner on
+    is_forward: NDArray[np.bool_]  # (3 F,) whether the side starts at the lower corner
     uses: Ints  # (E,) faces at each edge
 
 
 class _Sides(NamedTuple):
-    """Faces in the course of learning which of their sides is inside, about a common origin."""
+    """Intermediate results of `orient` for each face, relative to a common origin."""
 
     triangles: Floats  # (F, 3, 3)
     centroids: Floats  # (F, 3)
-    normals: Floats  # (F, 3) unit, by a winding that agrees in each patch; zero where degenerate
+    normals: Floats  # (F, 3) unit, one winding in each patch; zero where degenerate
     areas: Floats  # (F,)
     patch: Ints  # (F,)
-    body: Ints  # (F,) 0 all open bodies together, then the closed ones
+    body: Ints  # (F,) 0 for all open bodies together, then the closed ones
     is_flipped: NDArray[np.bool_]  # (F,) whether the file winds the face the other way
 
 
 def orient(triangles: Floats) -> Surface:
-    """Find for each triangle (F, 3, 3) the side that is inside, whatever its winding.
+    """Find the inner side of each triangle (F, 3, 3), for any winding.
 
-    Faces that share edges get one winding, and lines through them vote on the side: a line that
-    crosses a body an odd number of times ahead comes from inside it. Each closed body votes by
-    itself, so bodies may overlap. A body whole inside another is a void in it, and one inside a
-    void is solid again. All open bodies vote together; `_guess` decides what no line has decided.
+    Faces that share edges get one winding, and lines through them vote on the side: if a line
+    crosses a body an odd number of times ahead, it starts inside the body. Each closed body votes
+    alone, so bodies may overlap. A body completely inside another is a void in it; a body inside a
+    void is solid again. All open bodies vote together; `_guess` decides faces without votes.
     """
     if not np.isfinite(triangles).all():
         n_bad = int((~np.isfinite(triangles)).any(axis=(1, 2)).sum())
@@ -105,8 +105,8 @@ def _join_corners(triangles: Floats) -> Ints:
     """Number the corners (F, 3) so that corners that coincide have one number.
 
     Some formats, such as STL, do not share corners between faces. Corners with equal bits are one.
-    Where that leaves open edges, their corners are also joined within `JOIN`: two faces may hold
-    one edge with different rounding errors.
+    If edges stay open, their corners are also joined within `JOIN`, because two faces may store one
+    edge with different rounding errors.
     """
     corners = triangles.reshape(-1, 3) + 0.0  # -0.0 is 0.0
     order = np.lexsort(corners.T)
@@ -149,18 +149,18 @@ def _components(pairs: Ints, n: int) -> Ints:
 
 
 def _neighbours(number: Ints, sides: Ints) -> Ints:
-    """Pairs (P, 2) of given sides that lie on the same edge, each side with the next one."""
+    """Pairs (P, 2) of the given sides on the same edge, each side with the next one."""
     order = sides[np.argsort(number[sides], kind="stable")]
     is_pair = number[order[1:]] == number[order[:-1]]
     return np.stack((order[:-1][is_pair], order[1:][is_pair]), axis=1)
 
 
 def _drop_repeated(faces: Ints) -> Ints:
-    """Numbers of the faces to keep, ascending: of faces with the same corners, one.
+    """Numbers of the faces to keep, ascending: one of the faces with the same corners.
 
-    Two bodies that are glued together may have the wall between them twice. Kept once, the wall
-    would leave its border edges with an odd number of faces: open. So a patch of repeated faces is
-    dropped as a whole where more of its border edges would be open than closed.
+    Two bodies that are glued together may have the wall between them twice. If the wall is kept
+    once, its border edges have an odd number of faces, so they are open. So a patch of repeated
+    faces is dropped completely if more of its border edges would be open than closed.
     """
     is_face = (faces != np.roll(faces, -1, axis=1)).all(axis=1)
     whole = np.flatnonzero(is_face)
@@ -187,15 +187,15 @@ def _drop_repeated(faces: Ints) -> Ints:
 
 
 def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
-    """Form patches of faces that share edges of two faces, with one winding in each patch.
+    """Form patches of faces across edges with two faces, with one winding in each patch.
 
-    Returns the patch (F,) of each face, and whether the face is to be flipped (F,). A patch with
-    one side only (a Moebius strip) is split into single faces.
+    Returns the patch (F,) of each face, and whether to flip the face (F,). A patch with only one
+    side (a Moebius strip) is split into single faces.
     """
     n = len(faces)
     pairs = _neighbours(edges.number, np.flatnonzero((edges.uses == 2)[edges.number]))
     f, g = pairs[:, 0] // 3, pairs[:, 1] // 3
-    # The double cover: node f is the face as it stands, node n + f the face flipped.
+    # The double cover: node f is the face with its own winding, node n + f the flipped face.
     agrees = edges.is_forward[pairs[:, 0]] != edges.is_forward[pairs[:, 1]]
     links = np.concatenate(
         (
@@ -223,7 +223,7 @@ def _bodies(n_faces: int, edges: _Edges) -> Ints:
 
 
 def _vote(sides: _Sides) -> Floats:
-    """For each face (F,) 1 where its normal points inside, -1 where outside."""
+    """Signs (F,): 1 if the face's normal points inside, -1 if it points outside."""
     tree = kernels.triangle_tree(sides.triangles, sides.body)
     votes = kernels.side_votes(
         tree, sides.patch, sides.body, sides.areas, sides.centroids, sides.normals
@@ -237,9 +237,9 @@ def _vote(sides: _Sides) -> Floats:
 def _guess(sides: _Sides, signs: Floats) -> None:
     """Guess the signs (F,) that are still zero because no line has decided them.
 
-    The inside of a patch that bulges is on the side of its middle. Flat patches all face one way:
-    outwards by the file's winding, or, where that contradicts itself, towards the positive end of
-    the axis that they face most.
+    The inner side of a curved patch is the side of its middle. All flat patches face one way:
+    outwards by the file's winding, or, if that contradicts itself, towards the positive end of the
+    axis that they face most.
     """
     silent = np.flatnonzero(signs == 0.0)
     if len(silent) == 0:
@@ -264,7 +264,7 @@ def _guess(sides: _Sides, signs: Floats) -> None:
 
 
 def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
-    """Tell which bodies (B,) are walls of voids: whole inside an odd number of closed bodies."""
+    """Whether each body (B,) is a void's wall: completely inside an odd number of closed bodies."""
     n_bodies = int(sides.body.max()) + 1
     low = np.full((n_bodies, 3), np.inf)
     high = np.full((n_bodies, 3), -np.inf)
@@ -288,7 +288,7 @@ def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
 def _center(sides: _Sides, inward: Floats) -> tuple[Floats, bool]:
     """Centre of mass of the solid, and whether its volume is more than rounding errors."""
     a, b, c = sides.triangles[:, 0], sides.triangles[:, 1], sides.triangles[:, 2]
-    # A face with its outward normal n spans with the origin the volume (centroid . n) area / 3.
+    # A face with outward normal n and the origin span the volume (centroid . n) area / 3.
     volumes = -(inward * sides.centroids).sum(axis=1) * sides.areas / 3.0
     volume = float(volumes.sum())
     if not volume > 1e-9 * float(np.abs(volumes).sum()):

@@ -2,8 +2,8 @@
 
 A mesh becomes a shell in three steps: the inner side of each face is found (`orientation`), points
 are spread over the faces (`kernels.surfaces.sampling`), and the points are sorted along a Z-order
-curve. So points that follow one another are close in space, and a frame finds the same brick many
-times in a row wherever a brick holds many points.
+curve. So successive points are close in space, and a frame looks up the same brick many times in a
+row if the brick has many points.
 """
 
 import math
@@ -25,21 +25,22 @@ from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.poses import as_floats
 
 MAX_POINTS = 10_000_000
-"""Most points of a shell."""
+"""Greatest number of points of a shell."""
 DEFAULT_POINTS = 300
-"""Points of a shell unless given. More points feel finer details, and take longer."""
+"""Default number of points of a shell. More points feel finer details, and take longer."""
 DENSE_POINTS = 200_000
-"""Most points of a shell with a given spacing, unless more are asked for: they take a few
+"""Default of the greatest number of points of a shell with a given spacing; these take a few
 seconds."""
 ORDER_BITS = 10
 """Bits of the curve that orders the points: 2^10 steps along the longest side of their bounding
-box. A larger value orders points of finer shells too, and changes every shell."""
+box. A larger value orders points of finer shells better, and changes every shell."""
 
 FORMAT = "hapticdb.pointshell.shell 1"
-"""Names the format in a saved shell."""
+"""Name of the file format, stored in a saved shell."""
 MOST_INFLATION, INFLATED_ANYWAY = 10, 1 << 20
-"""A saved shell may unpack to that many times its size, plus that many bytes. `save` does not
-compress; compressed by another program, a surface's numbers take two thirds of their size."""
+"""A saved shell may unpack to at most this many times its size, plus this many bytes. Larger: a
+damaged file may use more memory. `save` does not compress; if another program compresses the file,
+a surface's numbers take two thirds of their size."""
 
 Floats = NDArray[np.float64]
 
@@ -53,32 +54,31 @@ error."""
 class PointShell:
     """The tool: points on its surface and unit normals that point into it.
 
-    Shells made by `from_mesh` and `from_file` have their points along a Z-order curve, so that
-    points next to each other by index are mostly close in space; given arrays and saved shells keep
-    their order.
+    `from_mesh` and `from_file` sort the points along a Z-order curve, so neighbours by index are
+    mostly close in space. Given arrays and saved shells keep their order.
 
     Parameters
     ----------
     points : (N, 3)
-        Metres, the tool's frame: the file's own, not re-centred.
+        Metres, tool's frame, which is the file's own, not re-centred.
     normals : (N, 3)
         Unit normals, into the tool.
     center : (3,)
-        Centre of mass, metres, the same frame: of a solid of uniform density where the surface is
-        closed (bodies that overlap count twice where they do), of the surface where it is open.
+        Centre of mass, metres, the same frame. For a closed surface, of a solid of uniform density
+        (overlaps of bodies count twice); for an open one, of the surface.
     is_closed : bool
-        False where the surface has open edges, so that its inside is a guess.
+        False if the surface has open edges, so its inside is a guess.
     link : str
-        The file that it was made from, absolute; empty if from none.
+        Absolute path of the file that the shell was made from; empty if there is none.
     seed : int
-        The seed that the points were drawn with.
+        Random seed of the points.
     defects : str
-        What was wrong in that file, in words; not saved.
+        Defects of that file, in words; not saved.
     cover : float, optional
         Covering radius, metres: no position on the tool's surface is farther from the nearest
-        point. None where it is not known; `with_cover` finds it for shells made of a mesh.
+        point. None if it is not known; `with_cover` computes it for shells made of a mesh.
     surface : Surface or Ball, optional
-        What the points were spread over; not saved.
+        Surface on which the points lie; not saved.
 
     Raises
     ------
@@ -138,17 +138,17 @@ class PointShell:
         Parameters
         ----------
         path : path
-            A mesh file. From a `.npz` the shell is loaded as it was saved, and `points`, `spacing`
-            and `seed` are those of the file.
+            A mesh file, or a shell saved as `.npz`; a saved shell is loaded unchanged, whatever
+            `points`, `spacing` and `seed` say.
         points : int, optional
-            Number of points, 1 to 10^7; 300 unless given. With a spacing, the most there may be;
+            Number of points, 1 to 10^7; 300 unless given. With a spacing, the greatest number;
             200,000 unless given.
         spacing : float, optional
-            Metres between neighbours, about: as many points as that takes, 300 at least.
+            Approximate distance of neighbours, metres; sets the number of points, at least 300.
         unit : str, optional
-            Unit of a file that names none; metres otherwise.
+            Unit of a file that names none; metres unless given.
         seed : int
-            Seed of the points: equal seeds, equal points.
+            Random seed of the points: equal seeds give equal points.
 
         Raises
         ------
@@ -256,7 +256,7 @@ class PointShell:
     def with_cover(self) -> "PointShell":
         """Return the shell with its covering radius, if it was made of a mesh or is a sphere.
 
-        It takes about as long as making the shell. Any other shell is returned as it is.
+        This takes about as long as making the shell. Any other shell is returned unchanged.
         """
         if self.cover is not None or self.surface is None:
             return self
@@ -334,7 +334,7 @@ def _check_request(points: int, spacing: float | None, seed: int) -> None:
 
 
 def _check_members(file: BinaryIO, path: str | PathLike[str]) -> None:
-    """Refuse an archive by its headers, before any of it is unpacked."""
+    """Check an archive's headers before any part of it is unpacked; refuse a bad one."""
     n_bytes = file.seek(0, SEEK_END)
     most = INFLATED_ANYWAY + MOST_INFLATION * n_bytes
     with zipfile.ZipFile(file) as archive:
@@ -372,7 +372,7 @@ def _check_format(saved: object, path: str | PathLike[str]) -> None:
 
 
 def _saved_cover(saved: "np.lib.npyio.NpzFile") -> float | None:
-    """Covering radius; None where it was not known, or an older version saved the shell."""
+    """Covering radius; None if it was not known, or if an older version saved the shell."""
     cover = float(saved["cover"]) if "cover" in saved else np.nan
     return None if np.isnan(cover) else cover
 
@@ -388,12 +388,12 @@ def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:
 def _curve_order(points: Floats) -> NDArray[np.intp]:
     """Indices (N,) that put points (N, 3) in order along a Z-order curve over their bounding box.
 
-    Steps of the curve are cubes, whatever the box's proportions.
+    Steps of the curve are cubes, for a box of any proportions.
     """
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max()) or 1.0
-    # Half a step less than all. Planes of a tool lie at its box's ends, middle and quarters; a
-    # border between steps there would let rounding errors decide on the order of their points.
+    # Half a step less than 2^ORDER_BITS. Planes of a tool often lie at its box's ends, middle and
+    # quarters; with a step's border there, rounding errors would decide the order of the points.
     steps = ((points - low) * ((2**ORDER_BITS - 0.5) / extent)).astype(np.int64)
     return np.argsort(curves.encode(steps, ORDER_BITS, curves.Z_ORDER), kind="stable")
 

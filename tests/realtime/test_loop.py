@@ -120,7 +120,8 @@ def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
     hand = stroking(0.010, 0.2)
     hand.apply = applied.append  # type: ignore[assignment]
     answer, frames = run(hand, seconds=1e9)
-    assert frames["time"][-1] >= 0.2
+    # a frame's time is its deadline; a late frame reads the device later than that
+    assert frames["time"][-1] >= 0.2 - answer.loop.lateness.worst
     assert answer.counts.peak_force > 0.0
     assert not applied[-1].any()
 

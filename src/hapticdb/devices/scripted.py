@@ -408,7 +408,9 @@ class RandomHand(_Scripted):
 
 
 N_WAVES = 8
+"""Sines on each axis of a `RandomHand`. Larger: a more irregular motion, slower reads."""
 N_SAMPLES = 16384
+"""Instants of a cycle at which speed and reach are measured. Larger: more exact, slower to make."""
 
 
 def _random_waves(

@@ -43,7 +43,7 @@ class Timing:
     Raises
     ------
     UsageError
-        When no processor can have that number.
+        If no processor can have that number.
     """
 
     rate: float = 1000.0

@@ -10,7 +10,9 @@ from hapticdb.recording.frame import FRAME
 MOST_FRAMES = 1 << 16
 """Greatest number of frames in a chunk. Larger: a reader may need more memory."""
 MARK = b"HDBC"
+"""First bytes of each chunk."""
 HEAD = struct.Struct("<4sIQIII")
+"""Head of a chunk: mark, frames, first frame, payload's bytes and CRC-32, CRC-32 of the head."""
 SEARCHED = 1 << 20
 """Bytes read at once in the search for a chunk behind a damaged one. Larger: more memory."""
 

@@ -23,8 +23,11 @@ from hapticdb.query.law import TangentPlane
 from hapticdb.store.connect import redact
 
 MAGIC = b"HDBREC\r\n"
+"""First bytes of each recording."""
 FORMAT_VERSION = 1
+"""Version of the format that is written; files of later versions are refused."""
 PREAMBLE = struct.Struct("<8sIIII")
+"""First fields of a header: magic, format version, bytes of JSON, points, CRC-32 of the header."""
 MOST_TEXT = 1 << 24
 """Greatest size of a header's JSON text, bytes. Larger: more excluded objects fit."""
 

@@ -22,11 +22,15 @@ from hapticdb.kernels.records import FIGURES, SESSION
 from hapticdb.kernels.resident import cells as kernels
 
 DEFAULT_BUDGET = 256 << 20
+"""Default size of a table, bytes. Larger: more resident cells."""
 LEAST_BUDGET = 1 << 20
+"""Smallest size of a table, bytes."""
 FIRST_VERSION = 1
 """Version number of a table before the first write."""
 MOST_READERS = 16
+"""Greatest number of readers of a table at the same time."""
 CONTROL_WORDS = 16
+"""Number of int64 words in the control block."""
 HEARTBEAT, AWAY, LOADING, STOP = 8, 9, 10, 11
 """Indices in the control block, after those of `kernels.cells`: time of the database's last answer
 (ns, CLOCK_MONOTONIC), whether it is away, cells being fetched, whether all processes must end."""

@@ -21,6 +21,7 @@ MOST_CELLS = 1 << 18
 is unknown. Larger: larger tools, more time."""
 CELL, BRICK = 32, 8
 CELLS_AT_ONCE = 1024
+"""Greatest number of cells made resident together. Larger: fewer fetches."""
 
 
 def enclosed_ids(residency: Residency, shell: PointShell, pose: Floats) -> Ints | None:

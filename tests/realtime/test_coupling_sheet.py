@@ -13,7 +13,7 @@ from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.hand.anchors import LOOSE
 from hapticdb.kernels.surfaces.voxelize import voxelize
 from hapticdb.poses import rotation_of
-from realtime.coupled import BITS, SIDE, SIZE, Tool, World, box, punch
+from realtime.coupled import BITS, SIDE, SIZE, Tool, World, box, numbers_in, punch
 from realtime.worlds import block
 
 Floats = NDArray[np.float64]
@@ -116,7 +116,7 @@ def test_no_hand_brings_a_tool_through_a_sheet(
             if not ((tool.voxels > 0) & (tool.voxels < SIDE - 1)).all():
                 return  # a jump took the tool to the grid's border, where the sheet ends
             assert is_on_the_entry_side(tool, normal, distance)
-            assert np.isfinite(tool.state).all()
+            assert np.isfinite(numbers_in(tool.servo["tool"])).all()
             assert (tool.met[2] != LOOSE).all()
     assert n_hit > 0
 

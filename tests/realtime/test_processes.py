@@ -1,8 +1,10 @@
 """A session's process reports what happened, and ends when its session ends."""
 
+import contextlib
 import gc
 import os
 import pickle
+import resource
 import signal
 import sys
 from pathlib import Path
@@ -33,6 +35,18 @@ def test_messages_come_whole_and_in_order_whatever_is_printed() -> None:
         assert (word, content) == ("again", (large, process.pid))
         assert process.receive(LONG) is None
         assert process.wait(LONG)
+
+
+def test_messages_come_in_a_program_with_many_open_files() -> None:
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(4096, before[1]), before[1]))
+    with contextlib.ExitStack() as opened:
+        opened.callback(resource.setrlimit, resource.RLIMIT_NOFILE, before)
+        while opened.enter_context(Path(os.devnull).open()).fileno() < 1024:
+            pass
+        with Process(WORKERS, ("wait", None), []) as process:
+            assert process.receive(LONG) == Message("waiting")
+            assert process.receive(0.01) is None
 
 
 def test_its_errors_are_raised_here() -> None:

@@ -94,13 +94,14 @@ class Process:
         assert self._popen.stdout is not None  # noqa: S101 - asked for above
         descriptor = self._popen.stdout.fileno()
         until = time.monotonic() + seconds
+        arrived = select.poll()  # `select` refuses descriptors from 1024 on
+        arrived.register(descriptor, select.POLLIN)
         while True:
             message = self._take()
             if message is not None:
                 break
             left = until - time.monotonic()
-            ready, _, _ = select.select([descriptor], [], [], max(left, 0.0))
-            if not ready:
+            if not arrived.poll(max(1000.0 * left, 0.0)):
                 return None
             read = os.read(descriptor, 1 << 16)
             if not read:

@@ -5,7 +5,6 @@ import os
 import time
 from collections.abc import Iterator
 from threading import Condition
-from types import TracebackType
 from typing import Self
 
 from hapticdb.environment import Environment
@@ -76,12 +75,7 @@ class Pool:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

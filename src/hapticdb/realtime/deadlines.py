@@ -22,7 +22,6 @@ value is 5e-3, five periods at 1 kHz; a smaller one costs more switches."""
 _PR_SET_TIMERSLACK = 29
 _PR_GET_TIMERSLACK = 30
 """Numbers of two operations of Linux's prctl."""
-DEFAULT_SLACK_NS = 50_000
 MOST_PROCESSORS = 4096
 """Processor numbers are below this; the loop cannot be bound to higher ones."""
 

@@ -31,6 +31,7 @@ from hapticdb.kernels.resident.cells import (
     cell_of_key,
     column_of,
     key_of_cell,
+    place_in_set,
     slot_of,
     spread_key,
 )
@@ -265,7 +266,6 @@ def cells_met(points, reach, poses, place, found, most):
     2 (most + N) if reach is 0. Returns the number of poses taken and the number of cells: at least
     one pose is taken, and more as long as there are at most `most` cells.
     """
-    capacity = found.shape[0]
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
     r, top = reach, side - 1.0
     count = 0
@@ -294,9 +294,7 @@ def cells_met(points, reach, poses, place, found, most):
                 for cj in range(low_j, high_j + 1):
                     for ck in range(low_k, high_k + 1):
                         key = key_of_cell(ci, cj, ck)
-                        at = spread_key(key, capacity)
-                        while found[at] >= 0 and found[at] != key:
-                            at = (at + 1) & (capacity - 1)
+                        at = place_in_set(found, key)
                         if found[at] < 0:
                             found[at] = key
                             before[added] = at

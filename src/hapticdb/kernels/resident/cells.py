@@ -191,6 +191,16 @@ def spread_key(key, capacity):
 
 
 @inlined
+def place_in_set(found, key):
+    """Index of a key in found (capacity,), an open-addressing set; where it goes if it is new."""
+    capacity = found.shape[0]
+    at = spread_key(key, capacity)
+    while found[at] >= 0 and found[at] != key:
+        at = (at + 1) & (capacity - 1)
+    return at
+
+
+@inlined
 def slot_of(keys, slots, which, key):
     """Slot of a cell in directory `which`, or UNKNOWN."""
     capacity = keys.shape[1]
@@ -219,15 +229,6 @@ def end_frame(cells, reader):
     """End the frame that `begin_frame` announced; its directory may be reused."""
     fence()
     cells.readers[reader * READER_STRIDE] = 0
-
-
-@leaf
-def voxel_state(cells, which, i, j, k):
-    """1 where voxel (i, j, k), inside the grid, is occupied, 0 where it is free, or UNKNOWN."""
-    slot = slot_of(cells.keys, cells.slots, which, cell_key(i, j, k))
-    if slot < 0:
-        return np.int64(UNKNOWN)
-    return np.int64(bit_in(cells.words[slot, column_of(i, j)], k))
 
 
 @inlined

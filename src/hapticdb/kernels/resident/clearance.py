@@ -30,8 +30,8 @@ from hapticdb.kernels.resident.cells import (
     begin_frame,
     end_frame,
     key_of_cell,
+    place_in_set,
     slot_of,
-    spread_key,
 )
 from hapticdb.kernels.resident.sweep import CAUTION, packed, unpacked
 from hapticdb.kernels.rigid import moved, transform_of
@@ -303,7 +303,6 @@ def cells_near(points, poses, place, first, stride, reach, found, most):
     open-addressing set, all -1 before; its capacity is a power of two, above 2 most. The search
     ends before there are more than `most` cells. Returns the number of cells.
     """
-    capacity = found.shape[0]
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
     top = side - 1.0
     r = reach / size
@@ -331,9 +330,7 @@ def cells_near(points, poses, place, first, stride, reach, found, most):
                 for cj in range(first_j, last_j + 1):
                     for ck in range(first_k, last_k + 1):
                         key = key_of_cell(ci, cj, ck)
-                        at = spread_key(key, capacity)
-                        while found[at] >= 0 and found[at] != key:
-                            at = (at + 1) & (capacity - 1)
+                        at = place_in_set(found, key)
                         if found[at] < 0:
                             found[at] = key
                             count += 1

@@ -34,8 +34,8 @@ from hapticdb.kernels.resident.cells import (
     column_of,
     end_frame,
     free_runs,
+    place_in_set,
     slot_of,
-    spread_key,
 )
 from hapticdb.kernels.rigid import (
     moved,
@@ -135,10 +135,7 @@ def unpack(voxels, out):
 @inlined
 def entered(voxels, voxel):
     """Index of a packed voxel in the set `voxels`; enters the voxel if it is not there."""
-    capacity = voxels.shape[0]
-    at = spread_key(voxel, capacity)
-    while voxels[at] >= 0 and voxels[at] != voxel:
-        at = (at + 1) & (capacity - 1)
+    at = place_in_set(voxels, voxel)
     voxels[at] = voxel
     return at
 

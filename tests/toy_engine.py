@@ -37,15 +37,14 @@ from hapticdb.store.base import (
     Rows,
     Size,
     Store,
-    check_thread,
     check_unwritten,
     no_object,
     present_already,
-    this_thread,
     touched_ranges,
 )
 from hapticdb.store.believed import rows_crc
 from hapticdb.store.engines import Capability
+from hapticdb.store.threads import check_thread, this_thread
 
 
 class State:

@@ -10,7 +10,7 @@ from typing import Self
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import BusyError, ConnectionLostError, DatabaseError, UsageError
-from hapticdb.store.base import NOBODY, this_thread
+from hapticdb.store.threads import NOBODY, this_thread
 
 
 class Pool:

@@ -229,8 +229,8 @@ def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVect
     ranges = object_ranges(source.grid, source.layout, obj.bounds)
     batches = _batches(source, obj, ranges, quantiles)
     if is_same_kind(source, target):
-        columns = zip(*(batch[:3] for batch in batches), strict=True)
-        rows = Rows(*(np.concatenate(column) for column in columns))
+        keys, ids, occupancy = zip(*(batch[:3] for batch in batches), strict=True)
+        rows = Rows(np.concatenate(keys), np.concatenate(ids), np.concatenate(occupancy))
         n_voxels = len(rows) if source.layout == "voxel" else voxelize.count_voxels(rows.occupancy)
     else:
         parts = [bricks_of_rows(batch, source.grid, source.layout) for batch in batches]

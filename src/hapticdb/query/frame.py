@@ -146,7 +146,7 @@ class HapticQuery:
     ) -> Answer:
         """Answer of a frame from its rows; rows of other poses may lie among them."""
         placed, asked, keys = located
-        row_keys, row_ids, occupancy, payload = rows
+        row_keys, row_ids, occupancy, _ = rows
         wrench, hits, depths, ids, apart, apart_depths = contact.refine(
             placed,
             asked,
@@ -154,7 +154,7 @@ class HapticQuery:
             row_keys,
             row_ids,
             occupancy,
-            payload,
+            None,
             exclude,
             self._origin,
             self._size,

@@ -1,10 +1,8 @@
 """What an engine does for an opened environment: the protocol `Store`, and what crosses it."""
 
-import os
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from threading import get_ident
 from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 
 import numpy as np
@@ -30,19 +28,39 @@ BRICK_BYTES = 64
 Keys = NDArray[np.int64]
 
 
+class Band(NamedTuple):
+    """Distances to surfaces of R rows, packed (`hapticdb.kernels.field`).
+
+    data : (n,) uint8, packed distances, row after row.
+    ends : (R,) int64, where the bytes of each row end in `data`.
+    """
+
+    data: NDArray[np.uint8]
+    ends: NDArray[np.int64]
+
+    def part(self, low: int, high: int) -> "Band":
+        """Rows low .. high; their bytes are a view."""
+        start = int(self.ends[low - 1]) if low else 0
+        ends = self.ends[low:high]
+        stop = int(ends[-1]) if len(ends) else start
+        return Band(self.data[start:stop], ends - start)
+
+
 class Rows(NamedTuple):
-    """A batch of rows of the index table.
+    """A batch of rows of the index table, and of the table of distances beside it.
 
     keys : (R,) int64, ascending: voxel keys, or brick keys.
     ids : (R,) int64, ids of objects.
     occupancy : (64 R,) uint8, row after row; empty on the voxel layout.
-    payload : values that laws read beside the occupancy, an array with first axis (R,), or None.
+    distances : the rows' distances to surfaces. None if they were not asked for, or the object has
+        none. With distances there is a row for each brick near the object's surface; the occupancy
+        of a brick without a voxel is zero.
     """
 
     keys: Keys
     ids: NDArray[np.int64]
     occupancy: NDArray[np.uint8]
-    payload: NDArray[np.uint8] | None = None
+    distances: Band | None = None
 
     def __len__(self) -> int:
         """Number of rows, not of this tuple's four fields."""
@@ -50,9 +68,9 @@ class Rows(NamedTuple):
 
     def part(self, low: int, high: int) -> "Rows":
         """Rows low .. high, as views."""
-        payload = None if self.payload is None else self.payload[low:high]
+        distances = None if self.distances is None else self.distances.part(low, high)
         bits = self.occupancy[BRICK_BYTES * low : BRICK_BYTES * high]
-        return Rows(self.keys[low:high], self.ids[low:high], bits, payload)
+        return Rows(self.keys[low:high], self.ids[low:high], bits, distances)
 
 
 NO_KEYS = np.empty(0, dtype=np.int64)
@@ -146,33 +164,6 @@ def present_already(record: Object, url: str) -> EnvironmentExistsError:
     return EnvironmentExistsError(
         f"{record.name} of {record.link} is in {url} already; remove it first"
     )
-
-
-NOBODY = 0
-"""Owner of a store that no thread may use: no thread has this number."""
-_forked_as = 0
-"""Process id, in a process that was forked after this module was loaded; 0 in any other."""
-
-
-def _note_fork() -> None:
-    global _forked_as  # noqa: PLW0603 - one number a process, read in every call
-    _forked_as = os.getpid()
-
-
-os.register_at_fork(after_in_child=_note_fork)
-
-
-def this_thread() -> int:
-    """Number of the calling thread. A thread and its copy in a forked process have two numbers."""
-    return get_ident() + _forked_as
-
-
-def check_thread(owner: int, url: str) -> None:
-    """Refuse a call from another thread, or process, than the one that a store belongs to."""
-    if this_thread() != owner:
-        raise UsageError(
-            f"{url} belongs to the thread that opened it, in its own process: open it here, too"
-        )
 
 
 def check_outside(depth: int, url: str) -> None:

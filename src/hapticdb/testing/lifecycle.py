@@ -14,11 +14,10 @@ from hapticdb.errors import (
 )
 from hapticdb.grid import Grid
 from hapticdb.store.base import (
-    NOBODY,
     Rows,
     Store,
-    this_thread,
 )
+from hapticdb.store.threads import NOBODY, this_thread
 from hapticdb.testing.case import StoreCase
 from hapticdb.testing.scenes import (
     blob,

@@ -1,0 +1,69 @@
+"""The band: unsigned distances to surfaces at voxel centres, in rows and in resident cells.
+
+A distance u is in voxels, from a voxel's centre to the nearest triangle of an object, or to the
+nearest point of a point cloud. It is stored in 8 bits: q = min(round(254 u / h), 254), and 255
+where u is above h, the half width of the band.
+
+A row of the table `band` belongs to one brick and one object. It has the distances at 10^3 centres:
+the brick's own 8^3 and one more on each side. So each point in the brick finds in this one row the
+8 centres around it that trilinear interpolation needs, and the 27 that a quadratic B-spline needs.
+A resident cell has 34^3 distances for the same reason. In both, k runs fastest.
+"""
+
+from hapticdb.kernels._jit import leaf
+
+HALF_WIDTH = 2.75
+"""h, voxels: distances up to h are stored. Larger: smoother forces and larger databases. It is part
+of the file format."""
+STEPS = 254
+"""Steps from distance 0 to h."""
+BEYOND = 255
+"""Stored value where the surface is farther away than h."""
+ROW_SIDE = 10
+"""Centres of a row on each axis: a brick's 8, and one on each side."""
+ROW_VALUES = ROW_SIDE**3
+"""Distances in a row."""
+CELL_SIDE = 34
+"""Centres of a resident cell on each axis: its 32, and one on each side."""
+CELL_VALUES = CELL_SIDE**3
+"""Distances in a resident cell."""
+VOXELS_A_STEP = HALF_WIDTH / STEPS
+"""Length of a step, voxels."""
+
+
+@leaf
+def step_of(distance):
+    """Stored value of a distance in voxels."""
+    if distance > HALF_WIDTH:
+        return BEYOND
+    return int(distance / VOXELS_A_STEP + 0.5)
+
+
+@leaf
+def distance_of(step):
+    """Distance in voxels of a stored value; h where it is BEYOND."""
+    return min(step, STEPS) * VOXELS_A_STEP
+
+
+@leaf
+def row_place(x, y, z):
+    """Index into a row's distances of centre (x, y, z), counted from the brick's first: -1 to 8."""
+    return ((x + 1) * ROW_SIDE + (y + 1)) * ROW_SIDE + (z + 1)
+
+
+@leaf
+def cell_place(x, y, z):
+    """Index into a cell's distances of centre (x, y, z), from the cell's first: -1 to 32."""
+    return ((x + 1) * CELL_SIDE + (y + 1)) * CELL_SIDE + (z + 1)
+
+
+@leaf
+def trilinear(u000, u001, u010, u011, u100, u101, u110, u111, x, y, z):
+    """Trilinear interpolation between 8 corners; x, y, z in [0, 1] from corner 000."""
+    u00 = u000 + z * (u001 - u000)
+    u01 = u010 + z * (u011 - u010)
+    u10 = u100 + z * (u101 - u100)
+    u11 = u110 + z * (u111 - u110)
+    u0 = u00 + y * (u01 - u00)
+    u1 = u10 + y * (u11 - u10)
+    return u0 + x * (u1 - u0)

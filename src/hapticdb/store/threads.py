@@ -1,0 +1,32 @@
+"""Which thread a store belongs to."""
+
+import os
+from threading import get_ident
+
+from hapticdb.errors import UsageError
+
+NOBODY = 0
+"""Owner of a store that no thread may use: no thread has this number."""
+_forked_as = 0
+"""Process id, in a process that was forked after this module was loaded; 0 in any other."""
+
+
+def _note_fork() -> None:
+    global _forked_as  # noqa: PLW0603 - one number a process, read in every call
+    _forked_as = os.getpid()
+
+
+os.register_at_fork(after_in_child=_note_fork)
+
+
+def this_thread() -> int:
+    """Number of the calling thread. A thread and its copy in a forked process have two numbers."""
+    return get_ident() + _forked_as
+
+
+def check_thread(owner: int, url: str) -> None:
+    """Refuse a call from another thread, or process, than the one that a store belongs to."""
+    if this_thread() != owner:
+        raise UsageError(
+            f"{url} belongs to the thread that opened it, in its own process: open it here, too"
+        )

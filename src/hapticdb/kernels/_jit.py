@@ -24,6 +24,7 @@ INT, FLOAT, NONE = types.int64, types.float64, types.none
 INTS, INTS2 = INT[::1], INT[:, ::1]
 INTS32, INTS32_2, INTS32_3 = types.int32[::1], types.int32[:, ::1], types.int32[:, :, ::1]
 BYTES, WORDS32_2, WORDS = types.uint8[::1], types.uint32[:, ::1], types.uint64[::1]
+BYTES2, BOOLS = types.uint8[:, ::1], types.boolean[::1]
 FLOATS, FLOATS2, FLOATS3 = FLOAT[::1], FLOAT[:, ::1], FLOAT[:, :, ::1]
 READ_BYTES = types.Array(types.uint8, 1, "C", readonly=True)
 READ_FLOATS = types.Array(FLOAT, 1, "C", readonly=True)

@@ -41,6 +41,7 @@ ENTRIES = {
     ),
     "surfaces.sides": "side_votes_kernel nesting_kernel",
     "motion": "play sway survey pull",
+    "field.packing": "pack_kernel unpack_kernel",
     "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
     "resident.sweep": "poses_between unpack find_hits",
     "surfaces.sampling": "eliminate_kernel",
@@ -67,6 +68,7 @@ _VOXELIZE = (
     "surfaces.bricks.z_keys_kernel",
     "surfaces.bricks.mark_points_kernel",
     "surfaces.bricks.count_kernel",
+    "field.packing.pack_kernel",
 )
 _RANGES = ("query.grouping.ranges_of_box", "surfaces.bricks.brick_voxels_kernel")
 _COST = (

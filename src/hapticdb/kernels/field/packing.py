@@ -1,0 +1,355 @@
+"""Rows of distances packed without loss: predicted from their neighbours, then few bits a residual.
+
+A row (`lattice`) is 10 planes of 10 lines of 10 values. Each value is predicted from the 7 before
+it in its cube of 2^3, with 255 outside the row: the three-dimensional Lorenzo predictor of Ibarria,
+Lindstrom, Rossignac and Szymczak, "Out-of-core compression and decompression of large n-dimensional
+scalar fields", 2003. The residual, modulo 256, is 0 beyond the band, and wherever the distance is a
+sum of functions of two coordinates each, as along a flat surface.
+
+The bits of a row, the lowest of each byte first, are, for each plane:
+
+- a bit that is 1 where every line's mask equals that of the same line in the plane before;
+- for each line, its mask, unless that bit told it, and then its residuals other than 0.
+
+A mask has a bit for each value of the line whose residual is not 0. Masks before the first line or
+plane are 0. A mask is coded as
+
+- 0: that of the plane before;
+- 1, 0: that of the line before, only where the two differ;
+- 1, where they do not differ, or 1, 1: another; its 10 bits follow.
+
+A residual r of -127 to 128 is the number 2 r - 1 if r is positive, and -2 r if not. Its highest bit
+has number n; 3 bits for n and the n bits below it are stored. A row ends at a whole byte; the bits
+left over are 0.
+
+No row takes more than `MOST_ROW_BYTES`, whatever its bits are. `unpack` copies the bytes of one row
+into a buffer of that size, so damaged bytes give wrong distances and never an access beyond an
+array. A row with more or fewer bytes than its bits need is damaged.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import BOOLS, BYTES, BYTES2, INT, INTS, READ_BYTES, entry, leaf
+from hapticdb.kernels.field.lattice import BEYOND, ROW_SIDE, ROW_VALUES
+
+LINES = ROW_SIDE * ROW_SIDE
+"""Lines of a row."""
+PADDED = ROW_SIDE + 1
+"""Side of a row with one value before it on each axis."""
+MOST_ROW_BYTES = (ROW_SIDE + LINES * 12 + ROW_VALUES * 10 + 7) // 8
+"""Most bytes of a packed row: 1 bit a plane, 12 a mask, 10 a residual."""
+ROWS_AT_ONCE = 2048
+"""Rows that are packed together, into a buffer of 3 MB. Fewer need less memory and more calls."""
+LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
+"""The seven low bits of each of eight bytes."""
+ALL_BEYOND = np.uint64(BEYOND * 0x0101010101010101)
+"""Eight values outside the row."""
+NONE = np.uint64(0)
+
+
+@leaf
+def put_bits(out, at, held, n_held, value, n):
+    """Append the n bits of value to the bits held; whole bytes go to out from place `at` on."""
+    held |= value << n_held
+    n_held += n
+    while n_held >= 8:
+        out[at] = held & 255
+        at += 1
+        held >>= 8
+        n_held -= 8
+    return at, held, n_held
+
+
+@leaf
+def place_padded(line):
+    """Index of a line's first value in a padded row (11^3)."""
+    return ((line // ROW_SIDE + 1) * PADDED + line % ROW_SIDE + 1) * PADDED + 1
+
+
+@leaf
+def set_residuals(values, n, padded, residuals):
+    """Set the residuals of row n of values (R, 1000), in the layout of `padded`.
+
+    padded, residuals (11^3,) uint8. One loop without branches, which LLVM computes in vectors.
+    """
+    for line in range(LINES):
+        to = place_padded(line)
+        for z in range(ROW_SIDE):
+            padded[to + z] = values[n, line * ROW_SIDE + z]
+    y, x = PADDED, PADDED * PADDED
+    for at in range(x + y + 1, x * PADDED):
+        here = np.int64(padded[at]) - padded[at - 1] - padded[at - y] + padded[at - y - 1]
+        back = np.int64(padded[at - x]) - padded[at - x - 1]
+        back = back - padded[at - x - y] + padded[at - x - y - 1]
+        residuals[at] = (here - back) & 255
+
+
+@leaf
+def set_masks(residuals, masks):
+    """Set the mask of each line, masks (100,) int64."""
+    for line in range(LINES):
+        at = place_padded(line)
+        mask = np.int64(0)
+        for z in range(ROW_SIDE):
+            mask |= np.int64(residuals[at + z] != 0) << z
+        masks[line] = mask
+
+
+@leaf
+def put_mask(out, at, held, n_held, mask, back, up):
+    """Append a line's mask, given those of the plane before and of the line before."""
+    if mask == back:
+        return put_bits(out, at, held, n_held, np.int64(0), np.int64(1))
+    if back == up:
+        return put_bits(out, at, held, n_held, (mask << 1) | 1, np.int64(11))
+    if mask == up:
+        return put_bits(out, at, held, n_held, np.int64(1), np.int64(2))
+    return put_bits(out, at, held, n_held, (mask << 2) | 3, np.int64(12))
+
+
+@leaf
+def put_residuals(out, at, held, n_held, residuals, line, mask):
+    """Append the residuals of a line that its mask names."""
+    first, z = place_padded(line), np.int64(0)
+    while mask >> z:
+        if (mask >> z) & 1:
+            residual = np.int64(residuals[first + z])
+            number = 2 * residual - 1 if residual <= 128 else 2 * (256 - residual)
+            n = np.int64(0)
+            while number >> (n + 1):
+                n += 1
+            code = n | ((number - (1 << n)) << 3)
+            at, held, n_held = put_bits(out, at, held, n_held, code, n + 3)
+        z += 1
+    return at, held, n_held
+
+
+@leaf
+def is_like_before(masks, first):
+    """Whether the masks of the plane from line `first` on are those of the plane before."""
+    for line in range(first, first + ROW_SIDE):
+        if masks[line] != (masks[line - ROW_SIDE] if first else 0):
+            return False
+    return True
+
+
+@leaf
+def pack_row(masks, residuals, out, at):
+    """Write the packed bytes of a row to out from `at` on; return where they end."""
+    held, n_held = np.int64(0), np.int64(0)
+    for first in range(0, LINES, ROW_SIDE):
+        is_same = is_like_before(masks, first)
+        at, held, n_held = put_bits(out, at, held, n_held, np.int64(is_same), np.int64(1))
+        up = np.int64(0)
+        for line in range(first, first + ROW_SIDE):
+            mask = masks[line]
+            if not is_same:
+                back = masks[line - ROW_SIDE] if first else np.int64(0)
+                at, held, n_held = put_mask(out, at, held, n_held, mask, back, up)
+            if mask:
+                at, held, n_held = put_residuals(out, at, held, n_held, residuals, line, mask)
+            up = mask
+    if n_held:
+        out[at] = held
+        at += 1
+    return at
+
+
+@entry(BYTES2, INT, INTS, BYTES)
+def pack_kernel(values, first, ends, out):
+    """Pack rows of values (R, 1000) from row `first` on; return how many bytes were written.
+
+    As many rows as ends (P,) has places; ends counts from the first byte of out, which has room
+    for P times `MOST_ROW_BYTES`.
+    """
+    padded = np.full(PADDED**3, BEYOND, np.uint8)
+    residuals = np.empty(PADDED**3, np.uint8)
+    masks = np.empty(LINES, np.int64)
+    at = np.int64(0)
+    for n in range(ends.shape[0]):
+        set_residuals(values, first + n, padded, residuals)
+        set_masks(residuals, masks)
+        at = pack_row(masks, residuals, out, at)
+        ends[n] = at
+    return at
+
+
+@leaf
+def bits_at(row, at):
+    """Return 25 bits or more of a row's bytes from bit `at` on. Reads 4 bytes."""
+    byte = at >> 3
+    word = np.int64(row[byte]) | (np.int64(row[byte + 1]) << 8)
+    word |= (np.int64(row[byte + 2]) << 16) | (np.int64(row[byte + 3]) << 24)
+    return word >> (at & 7)
+
+
+@leaf
+def added(a, b):
+    """Sum of the eight bytes of a and of b, each modulo 256."""
+    return ((a & LOW_BITS) + (b & LOW_BITS)) ^ ((a ^ b) & ~LOW_BITS)
+
+
+@leaf
+def take_mask(row, at, back, up):
+    """Return a line's mask and the bit behind its code."""
+    word = bits_at(row, at)
+    if not word & 1:
+        return back, at + 1
+    if back == up:
+        return (word >> 1) & ((1 << ROW_SIDE) - 1), at + 11
+    if not word & 2:
+        return up, at + 2
+    return (word >> 2) & ((1 << ROW_SIDE) - 1), at + 12
+
+
+@leaf
+def take_line(row, at, mask):
+    """Read the residuals of a line that its mask names, and sum them up along the line.
+
+    Returns the sums in bytes, 8 in the first word and 2 in the second, and the bit behind.
+    """
+    low, high = NONE, NONE
+    total, z = np.int64(0), np.int64(0)
+    while z < ROW_SIDE:
+        if (mask >> z) & 1:
+            word = bits_at(row, at)
+            n = word & 7
+            number = (1 << n) | ((word >> 3) & ((1 << n) - 1))
+            at += n + 3
+            total += (number + 1) >> 1 if number & 1 else -(number >> 1)
+        byte = np.uint64(total & 255)
+        if z < 8:
+            low |= byte << np.uint64(8 * z)
+        else:
+            high |= byte << np.uint64(8 * (z - 8))
+        z += 1
+    return low, high, at
+
+
+@leaf
+def put_line(out, n, at, low, high):
+    """Write a line's values to row n of out."""
+    for z in range(8):
+        out[n, at + z] = low >> np.uint64(8 * z) & np.uint64(255)
+    out[n, at + 8] = high & np.uint64(255)
+    out[n, at + 9] = high >> np.uint64(8) & np.uint64(255)
+
+
+@leaf
+def unpack_row(row, masks, lines, out, n):
+    """Unpack the bytes in `row` into row n of out (R, 1000); return how many bits they were.
+
+    masks (10,) int64 and lines (20,) uint64 are the last plane's masks and values.
+    """
+    for y in range(ROW_SIDE):
+        masks[y] = 0
+        lines[2 * y], lines[2 * y + 1] = ALL_BEYOND, ALL_BEYOND
+    at = np.int64(0)
+    for plane in range(ROW_SIDE):
+        is_same = bits_at(row, at) & 1
+        at += 1
+        up = np.int64(0)
+        low, high = NONE, NONE  # change of the line's values from plane to plane
+        for y in range(ROW_SIDE):
+            if not is_same:
+                up, at = take_mask(row, at, masks[y], up)
+                masks[y] = up
+            if masks[y]:
+                low_more, high_more, at = take_line(row, at, masks[y])
+                low, high = added(low, low_more), added(high, high_more)
+            lines[2 * y] = added(lines[2 * y], low)
+            lines[2 * y + 1] = added(lines[2 * y + 1], high)
+            place = (plane * ROW_SIDE + y) * ROW_SIDE
+            put_line(out, n, place, lines[2 * y], lines[2 * y + 1])
+    return at
+
+
+@entry(READ_BYTES, INTS, BOOLS, BYTES2)
+def unpack_kernel(data, ends, wanted, out):
+    """Unpack the wanted rows; return the first row that is damaged, or -1.
+
+    data (n,), ends (R,) as `pack` gives them; wanted (R,) bool; out (R, 1000), left as it is in
+    rows that are not wanted.
+    """
+    row = np.zeros(MOST_ROW_BYTES + 4, np.uint8)
+    masks = np.empty(ROW_SIDE, np.int64)
+    lines = np.empty(2 * ROW_SIDE, np.uint64)
+    for n in range(ends.shape[0]):
+        start = ends[n - 1] if n else np.int64(0)
+        size = ends[n] - start
+        if start < 0 or size < 1 or size > MOST_ROW_BYTES or ends[n] > data.shape[0]:
+            return n
+        if not wanted[n]:
+            continue
+        for byte in range(size):
+            row[byte] = data[start + byte]
+        n_bits = unpack_row(row, masks, lines, out, n)
+        if (n_bits + 7) >> 3 != size or np.int64(row[size - 1]) >> (((n_bits - 1) & 7) + 1):
+            return n
+    return -1
+
+
+def pack(values: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Pack rows of distances.
+
+    Parameters
+    ----------
+    values : NDArray[np.uint8]
+        (R, 1000), stored values as `lattice` has them, k fastest.
+
+    Returns
+    -------
+    data : NDArray[np.uint8]
+        (n,) packed bytes, row after row. Equal rows give equal bytes, whatever stands beside them.
+    ends : NDArray[np.int64]
+        (R,) where the bytes of each row end in `data`.
+    """
+    rows = np.ascontiguousarray(values, dtype=np.uint8).reshape(-1, ROW_VALUES)
+    ends = np.empty(len(rows), dtype=np.int64)
+    out = np.empty(min(len(rows), ROWS_AT_ONCE) * MOST_ROW_BYTES, dtype=np.uint8)
+    pieces: list[NDArray[np.uint8]] = []
+    n_bytes = 0
+    for first in range(0, len(rows), ROWS_AT_ONCE):
+        some = ends[first : first + ROWS_AT_ONCE]
+        size = pack_kernel(rows, first, some, out)
+        some += n_bytes
+        n_bytes += size
+        pieces.append(out[:size].copy())
+    return np.concatenate(pieces) if pieces else np.empty(0, dtype=np.uint8), ends
+
+
+def unpack(
+    data: NDArray[np.uint8], ends: NDArray[np.int64], wanted: NDArray[np.bool_] | None = None
+) -> NDArray[np.uint8]:
+    """Unpack rows of distances.
+
+    Parameters
+    ----------
+    data : NDArray[np.uint8]
+        (n,) packed bytes, row after row. They may be damaged.
+    ends : NDArray[np.int64]
+        (R,) where the bytes of each row end in `data`.
+    wanted : NDArray[np.bool_] or None
+        (R,) rows to unpack; all unless given.
+
+    Returns
+    -------
+    values : NDArray[np.uint8]
+        (R, 1000). Rows that are not wanted are left unset.
+
+    Raises
+    ------
+    ValueError
+        If the bytes of a wanted row are no packed row, or an end lies outside the data. Not every
+        damage is found, since many changed rows are rows, too.
+    """
+    packed = np.ascontiguousarray(data, dtype=np.uint8).reshape(-1).view()
+    packed.flags.writeable = False
+    ends = np.ascontiguousarray(ends, dtype=np.int64)
+    chosen = np.ones(len(ends), dtype=np.bool_) if wanted is None else wanted
+    out = np.empty((len(ends), ROW_VALUES), dtype=np.uint8)
+    damaged = unpack_kernel(packed, ends, np.ascontiguousarray(chosen, dtype=np.bool_), out)
+    if damaged >= 0:
+        raise ValueError(f"row {damaged} of {len(ends)} packed rows of distances is damaged")
+    return out

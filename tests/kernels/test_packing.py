@@ -1,0 +1,182 @@
+"""Packed rows of distances: nothing is lost, little is stored, and damaged bytes do no harm."""
+
+import numba
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb.kernels.field import lattice
+from hapticdb.kernels.field.packing import MOST_ROW_BYTES, pack, unpack
+
+JIT = not numba.config.DISABLE_JIT
+few = settings(max_examples=100 if JIT else 8, deadline=None)
+Values = NDArray[np.uint8]
+seeds = st.integers(0, 2**32 - 1)
+
+
+def centres() -> NDArray[np.float64]:
+    """Centres of a row (1000, 3), from the brick's first one, in the order of the row."""
+    axis = np.arange(-1.0, 9.0)
+    return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+
+
+def stored(distances: NDArray[np.float64]) -> Values:
+    """Stored values of distances, as `lattice.step_of` gives them."""
+    steps = np.floor(np.abs(distances) / lattice.VOXELS_A_STEP + 0.5)
+    return np.where(np.abs(distances) > lattice.HALF_WIDTH, lattice.BEYOND, steps).astype(np.uint8)
+
+
+def of_planes(seed: int, n: int) -> Values:
+    """Rows of the distances to one, two or three planes through the brick."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for _ in range(n):
+        normals = rng.normal(size=(rng.integers(1, 4), 3))
+        normals /= np.linalg.norm(normals, axis=1)[:, None]
+        away = np.abs(centres() @ normals.T - rng.uniform(-2.0, 9.0, len(normals)))
+        rows.append(stored(away.min(axis=1)))
+    return np.array(rows)
+
+
+def random_rows(seed: int) -> Values:
+    """Rows from nothing but noise to nothing but BEYOND."""
+    rng = np.random.default_rng(seed)
+    noise = rng.integers(0, 256, (6, 1000))
+    rare = rng.random((6, 1000)) < np.array([1.0, 0.5, 0.1, 0.01, 0.001, 0.0])[:, None]
+    return np.where(rare, noise, lattice.BEYOND).astype(np.uint8)
+
+
+def check_round_trip(rows: Values) -> None:
+    data, ends = pack(rows)
+    assert data.dtype == np.uint8
+    assert ends.dtype == np.int64
+    assert len(data) == (ends[-1] if len(ends) else 0)
+    sizes = np.diff(ends, prepend=0)
+    assert (sizes > 0).all()
+    assert (sizes <= MOST_ROW_BYTES).all()
+    np.testing.assert_array_equal(unpack(data, ends), rows)
+
+
+@few
+@given(seeds)
+def test_noise_comes_back(seed: int) -> None:
+    check_round_trip(random_rows(seed))
+
+
+@few
+@given(seeds)
+def test_distances_to_planes_come_back(seed: int) -> None:
+    check_round_trip(of_planes(seed, 3))
+
+
+@pytest.mark.parametrize("value", [0, 1, 127, 128, 254, 255])
+def test_constant_rows_come_back(value: int) -> None:
+    check_round_trip(np.full((2, 1000), value, np.uint8))
+
+
+def test_every_residual_comes_back() -> None:
+    """A row of 255 but for one value has residuals of that value and its opposite."""
+    rows = np.full((256, 1000), lattice.BEYOND, np.uint8)
+    rows[np.arange(256), 555] = np.arange(256)
+    check_round_trip(rows if JIT else rows[[0, 1, 126, 127, 128, 129, 254, 255]])
+
+
+def test_the_largest_row_fits() -> None:
+    """Residuals of 128 at every place, and masks that differ from those before."""
+    x, y, z = np.indices((10, 10, 10)).reshape(3, -1)
+    most = (x + y + z) % 2 * 128 + (x * 64 + y * 16 + z * 4)
+    check_round_trip(most.astype(np.uint8)[None])
+
+
+def test_no_rows_are_no_bytes() -> None:
+    data, ends = pack(np.empty((0, 1000), np.uint8))
+    assert (data.shape, ends.shape) == ((0,), (0,))
+    assert unpack(data, ends).shape == (0, 1000)
+
+
+def test_flat_surfaces_and_nothing_cost_little() -> None:
+    beyond = np.full((1, 1000), lattice.BEYOND, np.uint8)
+    flat = stored(centres()[:, 1] - 3.3)[None]
+    assert len(pack(beyond)[0]) <= 4
+    assert len(pack(flat)[0]) <= 30
+    assert len(pack(of_planes(1, 20))[0]) < 20 * 600
+
+
+def test_a_row_does_not_depend_on_the_rows_beside_it() -> None:
+    rows = np.concatenate([random_rows(1), of_planes(2, 3)])
+    data, ends = pack(rows)
+    one_by_one = [pack(row[None])[0] for row in rows]
+    np.testing.assert_array_equal(data, np.concatenate(one_by_one))
+    np.testing.assert_array_equal(ends, np.cumsum(list(map(len, one_by_one))))
+
+
+def test_rows_are_packed_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = of_planes(3, 8)
+    whole = pack(rows)
+    monkeypatch.setattr("hapticdb.kernels.field.packing.ROWS_AT_ONCE", 3)
+    for a, b in zip(pack(rows), whole, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_only_wanted_rows_are_unpacked() -> None:
+    rows = of_planes(4, 5)
+    data, ends = pack(rows)
+    data[ends[1] : ends[2]] = 255  # row 2 is damaged, and not wanted
+    wanted = np.array([True, False, False, True, True])
+    np.testing.assert_array_equal(unpack(data, ends, wanted)[wanted], rows[wanted])
+    with pytest.raises(ValueError, match="row 2 of 5 packed rows of distances is damaged"):
+        unpack(data, ends)
+
+
+def test_what_is_given_stays_as_it_is() -> None:
+    rows = of_planes(5, 2)
+    data, ends = pack(rows)
+    unpack(data, ends)
+    assert data.flags.writeable
+    frozen = np.frombuffer(data.tobytes(), np.uint8)
+    np.testing.assert_array_equal(unpack(frozen, ends), rows)
+
+
+@few
+@given(seeds)
+def test_changed_bytes_are_rows_or_told(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rows = np.concatenate([of_planes(seed, 2), random_rows(seed)[2:]])
+    data, ends = pack(rows)
+    places = rng.integers(0, len(data), rng.integers(1, 9))
+    data[places] = rng.integers(0, 256, len(places))
+    try:
+        found = unpack(data, ends)
+    except ValueError as error:
+        assert "is damaged" in str(error)  # noqa: PT017 - either outcome is right
+    else:
+        assert found.shape == rows.shape
+
+
+@few
+@given(st.binary(max_size=3 * MOST_ROW_BYTES), st.lists(st.integers(-(2**62), 2**62), max_size=4))
+def test_any_bytes_and_ends_are_rows_or_told(data: bytes, ends: list[int]) -> None:
+    blob = np.frombuffer(data, np.uint8)
+    near = np.array([end % (len(data) + 3) for end in ends], np.int64)
+    for some in (np.array(ends, np.int64), near, np.sort(near)):
+        try:
+            found = unpack(blob, some)
+        except ValueError as error:
+            assert "is damaged" in str(error)  # noqa: PT017 - either outcome is right
+        else:
+            assert found.shape == (len(ends), 1000)
+
+
+@pytest.mark.parametrize("change", ["shorter", "longer", "bits left over"])
+def test_a_row_of_another_length_is_told(change: str) -> None:
+    data, ends = pack(np.full((1, 1000), lattice.BEYOND, np.uint8))
+    if change == "shorter":
+        data, ends = data[:-1], ends - 1
+    elif change == "longer":
+        data, ends = np.append(data, np.uint8(0)), ends + 1
+    else:
+        data[-1] |= 128
+    with pytest.raises(ValueError, match="row 0 of 1"):
+        unpack(data, ends)

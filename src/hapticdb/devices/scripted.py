@@ -12,6 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import (
     Device,
     Reading,
@@ -95,6 +96,7 @@ class _Scripted:
     """A device that needs no hardware and ignores the wrench."""
 
     is_over = False
+    profile = SCRIPTED
 
     def __init__(self, clock: Clock) -> None:
         self.clock = clock

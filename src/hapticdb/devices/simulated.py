@@ -7,6 +7,7 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.devices.profiles import HAND_CAP, HAND_STIFFNESS, STIFFEST, DeviceProfile
 from hapticdb.devices.protocol import Reader, check_device
 from hapticdb.devices.scripted import Clock, Device, Reading, SupportsEnd, SupportsRewind, capped
 from hapticdb.errors import UsageError
@@ -17,6 +18,8 @@ from hapticdb.poses import quaternion_of
 STEP = 1e-4
 """Seconds of one step of the integration. Larger: less work a read, but only softer grips."""
 
+LEAST_CAP = 1e-6
+"""Cap (N, N m) that the profile of a device without motors has. Smaller: contacts become softer."""
 LONGEST = 0.05
 """Greatest time (s) that one read integrates; after a longer pause the time before is skipped."""
 
@@ -58,7 +61,7 @@ class SimulatedDevice:
         inertia: float = 1e-4,
         grip: float = 300.0,
         turn_grip: float = 0.3,
-        max_force: float = 7.0,
+        max_force: float = HAND_CAP,
         max_torque: float = 0.2,
         latency: float = 1e-3,
         clock: Clock = time.perf_counter,
@@ -82,6 +85,22 @@ class SimulatedDevice:
         self._time: float | None = None
         self._body = np.zeros(13)
         self._pose, self._velocity = np.eye(4), np.zeros(6)
+
+    @property
+    def profile(self) -> DeviceProfile:
+        """Caps, mass and delay of the device; its hand's damping is that of the grip."""
+        mass, grip = self._inertias[0], self._grips[0]
+        return DeviceProfile(
+            "simulated",
+            max(self.max_force, LEAST_CAP),
+            STIFFEST,
+            STIFFEST,
+            mass=mass,
+            hand_damping=2.0 * math.sqrt(grip * mass),
+            usual_stiffness=HAND_STIFFNESS,
+            torque_cap=max(self.max_torque, LEAST_CAP),
+            delay=self.latency,
+        )
 
     @property
     def is_over(self) -> bool:

@@ -5,17 +5,23 @@ Dimension SDK 3.16 or later. The functions of `forcedimension_core.dhd` write in
 and return 0 or more on success, -1 on failure. The SDK itself comes from the vendor.
 """
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.devices.profiles import DeviceProfile
 from hapticdb.devices.scripted import Reading, capped
 from hapticdb.devices.vendors import load
 from hapticdb.errors import DeviceError
 
 TIMEOUT = 7
 """ErrorNum.TIMEOUT: the velocity estimator does not have two positions yet."""
+
+
+PROFILE = DeviceProfile("force-dimension", cap=7.0, stiffness=3000.0, damping=20.0)
+"""Profile of a device whose model is not told: no more than every model renders."""
 
 
 class ForceDimensionDevice:
@@ -28,15 +34,26 @@ class ForceDimensionDevice:
     ----------
     serial : int, optional
         Serial number; without one, the first free device is taken.
-    max_force, max_torque : float
-        Caps, N and N m.
+    profile : DeviceProfile
+        The model's profile, as of `hapticdb.devices.profiles.PROFILES`.
+    max_force : float, optional
+        Cap, N; the profile's unless given.
+    max_torque : float
+        Cap, N m.
     """
 
     def __init__(
-        self, serial: int | None = None, *, max_force: float = 7.0, max_torque: float = 0.2
+        self,
+        serial: int | None = None,
+        *,
+        profile: DeviceProfile = PROFILE,
+        max_force: float | None = None,
+        max_torque: float = 0.2,
     ) -> None:
         self.serial = serial
-        self.max_force, self.max_torque = max_force, max_torque
+        self.max_force = profile.cap if max_force is None else max_force
+        self.max_torque = max_torque
+        self.profile = replace(profile, cap=self.max_force, torque_cap=max_torque or None)
         self._dhd: Any = None
         self._id = -1
         self._has_wrist = self._has_active_wrist = False

@@ -12,12 +12,14 @@ import contextlib
 import json
 import math
 import time
+from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.devices.profiles import DeviceProfile
 from hapticdb.devices.scripted import Clock, Reading, capped
 from hapticdb.devices.vendors import VelocityWindow, load
 from hapticdb.errors import DeviceError, UsageError
@@ -35,6 +37,10 @@ HANDSHAKE = {"configure": {"profile": {"name": "hapticdb"}}}
 AXES = ("x", "y", "z")
 
 
+PROFILE = DeviceProfile("inverse3", cap=7.0, stiffness=1000.0, damping=5.0)
+"""Profile of an Inverse3. Its maker gives no stiffness: what most desktop devices render."""
+
+
 class HaplyDevice:
     """A device of Haply.
 
@@ -44,8 +50,10 @@ class HaplyDevice:
         The service's name of the device ("049D"); without one, the first device is taken.
     url : str
         The service's address, on this machine.
-    max_force : float
-        Cap, N.
+    profile : DeviceProfile
+        What the device renders; an Inverse3's unless given.
+    max_force : float, optional
+        Cap, N; the profile's unless given.
     clock : callable
         Returns seconds; it must be picklable.
 
@@ -60,7 +68,8 @@ class HaplyDevice:
         device_id: str | None = None,
         *,
         url: str = URL,
-        max_force: float = 7.0,
+        profile: DeviceProfile = PROFILE,
+        max_force: float | None = None,
         clock: Clock = time.perf_counter,
     ) -> None:
         parts = urlsplit(url)
@@ -68,7 +77,8 @@ class HaplyDevice:
             raise UsageError(f"the Haply service runs on this machine, as at {URL}, not at {url}")
         self.device_id = device_id
         self.url = url
-        self.max_force = max_force
+        self.max_force = profile.cap if max_force is None else max_force
+        self.profile = replace(profile, cap=self.max_force)
         self.clock = clock
         self._socket: Any = None
         self._held = contextlib.ExitStack()

@@ -10,11 +10,13 @@ that `apply` stored. The package gives neither velocity nor torque: velocities a
 import contextlib
 import io
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.devices.profiles import PROFILES, DeviceProfile
 from hapticdb.devices.scripted import Clock, Reading, capped
 from hapticdb.devices.vendors import VelocityWindow, load
 from hapticdb.errors import DeviceError
@@ -37,8 +39,10 @@ class OpenHapticsDevice:
     ----------
     name : str
         Name of the device in the vendor's setup.
-    max_force : float
-        Cap, N; a Touch can do 3.3.
+    profile : DeviceProfile
+        The model's profile, as of `hapticdb.devices.profiles.PROFILES`; a Touch unless given.
+    max_force : float, optional
+        Cap, N; the profile's unless given.
     clock : callable
         Returns seconds; it must be picklable.
     """
@@ -47,11 +51,13 @@ class OpenHapticsDevice:
         self,
         name: str = "Default Device",
         *,
-        max_force: float = 3.3,
+        profile: DeviceProfile = PROFILES["touch"],
+        max_force: float | None = None,
         clock: Clock = time.perf_counter,
     ) -> None:
         self.name = name
-        self.max_force = max_force
+        self.max_force = profile.cap if max_force is None else max_force
+        self.profile = replace(profile, cap=self.max_force)
         self.clock = clock
         self._hd: Any = None
         self._id = 0

@@ -1,0 +1,133 @@
+"""How stiff a spring a device holds without trembling.
+
+A sampled spring gives back more energy than was put in: the force of a place comes late, by half a
+period on average and by the delay of device and transfer. Only damping of the device and of the
+hand that holds it takes this energy away (Gil, Sanchez, Hulin, Preusche and Hirzinger 2009).
+"""
+
+import math
+from dataclasses import dataclass
+
+from hapticdb.devices.profiles import LIGHTEST, DeviceProfile
+from hapticdb.errors import UsageError
+
+SHARE = 0.4
+"""Share of the bound of Gil and others that is used. Measured limits were 0.42 to 0.60 of the bound
+for a light grip and 0.88 to 1.02 for a firm one. Larger: stiffer surfaces, which tremble in a light
+grip."""
+GRIP_STIFFNESS = 100.0
+"""Stiffness of a hand that holds a device lightly, N/m. Larger: more damping is expected of it."""
+GRIP_DAMPING = 0.6
+"""Damping of that hand, in sqrt(stiffness times mass): 0.3 of critical. Larger: likewise."""
+SMALLEST = 1.0
+"""Smallest stiffness that a session may have, N/m: a softer one cannot be felt."""
+
+
+@dataclass(frozen=True)
+class Allowance:
+    """Stiffness that a session gets, and why it is not the one that was asked for.
+
+    Attributes
+    ----------
+    asked, stiffness : float
+        What was asked for, and what is given, N/m.
+    delay : float
+        Seconds that the rule counted.
+    lowered : str or None
+        One line: by what the stiffness was lowered; None if it was not.
+    """
+
+    asked: float
+    stiffness: float
+    delay: float
+    lowered: str | None
+
+
+def hand_damping(profile: DeviceProfile) -> float:
+    """Damping of the hand that holds the device, N s/m.
+
+    That of a light grip, b = 0.6 sqrt(100 m), unless the profile states it. Where the mass m is not
+    known, the lightest device's is taken.
+    """
+    if profile.hand_damping is not None:
+        return profile.hand_damping
+    mass = LIGHTEST if profile.mass is None else profile.mass
+    return GRIP_DAMPING * math.sqrt(GRIP_STIFFNESS * mass)
+
+
+def delay_of(profile: DeviceProfile, rate: float, delay: float | None = None) -> float:
+    """Delay in seconds: the given one, else the device's, else one period of the loop.
+
+    Raises
+    ------
+    UsageError
+        If the given delay is negative or not finite.
+    """
+    if delay is not None:
+        if not (math.isfinite(delay) and delay >= 0.0):
+            raise UsageError(f"a delay of {delay} s: give 0 or more")
+        return delay
+    return 1.0 / rate if profile.delay is None else profile.delay
+
+
+def stable_stiffness(profile: DeviceProfile, rate: float, delay: float) -> float:
+    """Stiffest spring, N/m, that stays stable in a light grip; infinite for a hand without motors.
+
+    K = 0.4 (b + b_hand) / (T / 2 + t_d), with the period T = 1 / rate and the delay t_d, seconds.
+    """
+    return SHARE * (profile.own_damping + hand_damping(profile)) / (0.5 / rate + delay)
+
+
+def allow(
+    profile: DeviceProfile, rate: float, asked: float | None = None, delay: float | None = None
+) -> Allowance:
+    """Lower a stiffness to what the device renders and what stays stable.
+
+    Parameters
+    ----------
+    profile : DeviceProfile
+        The device.
+    rate : float
+        Frames a second.
+    asked : float or None
+        Stiffness at the device, N/m. None: the profile's.
+    delay : float or None
+        Seconds; None: see `delay_of`.
+
+    Raises
+    ------
+    UsageError
+        If the stiffness is not a number above `SMALLEST`, or the delay is negative.
+    """
+    wanted = profile.first_stiffness if asked is None else asked
+    if not (math.isfinite(wanted) and wanted >= SMALLEST):
+        raise UsageError(f"a stiffness of {wanted} N/m: give {SMALLEST:g} or more")
+    late = delay_of(profile, rate, delay)
+    stable = stable_stiffness(profile, rate, late)
+    given = max(min(wanted, profile.stiffness, stable), SMALLEST)
+    lowered = None
+    if given < wanted:
+        what = f"stiffness {wanted:.4g} N/m lowered to {given:.4g} N/m: "
+        lowered = what + (
+            f"the most that the profile {profile.name} allows"
+            if profile.stiffness <= stable
+            else _stable_text(profile, rate, late)
+        )
+    return Allowance(wanted, given, late, lowered)
+
+
+def _stable_text(profile: DeviceProfile, rate: float, delay: float) -> str:
+    """Clause for people: at what conditions the stable stiffness is that small."""
+    grip, mass = "", ""
+    if profile.hand_damping is None:
+        grip = " in a light grip"
+        if profile.mass is None:
+            mass = f" (mass not known: {LIGHTEST:g} kg assumed)"
+    return (
+        f"at {_hertz(rate)} and {1e3 * delay:.3g} ms of delay the device {profile.name}{mass} "
+        f"stays stable up to that{grip}; a higher rate or a shorter delay allows more"
+    )
+
+
+def _hertz(rate: float) -> str:
+    return f"{rate / 1e3:.4g} kHz" if rate >= 1e3 else f"{rate:.4g} Hz"

@@ -1,0 +1,202 @@
+"""Device profiles, and the rule that says how stiff a session may be."""
+
+import math
+import pickle
+from dataclasses import replace
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticdb import UsageError
+from hapticdb.devices import stability
+from hapticdb.devices.profiles import (
+    PROFILES,
+    SCRIPTED,
+    UNKNOWN,
+    DeviceProfile,
+    profile_named,
+    profile_of,
+)
+from hapticdb.devices.scripted import Line, RandomHand
+from hapticdb.devices.simulated import SimulatedDevice
+from hapticdb.devices.vendors.force_dimension import ForceDimensionDevice
+from hapticdb.devices.vendors.haply import HaplyDevice
+from hapticdb.devices.vendors.openhaptics import OpenHapticsDevice
+
+# cap N, stiffness N/m, damping N s/m, as CHAI3D's sources give them
+TABLE = {
+    "touch": (3.3, 400, 4),
+    "omni": (3.3, 700, 5),
+    "desktop": (7.9, 1000, 5),
+    "premium-1.5": (8.5, 800, 5),
+    "falcon": (8, 3000, 20),
+    "omega": (12, 5000, 30),
+    "delta": (20, 5000, 30),
+    "sigma.7": (12, 4000, 30),
+}
+RATES = st.floats(10.0, 20_000.0)
+DELAYS = st.floats(0.0, 0.1)
+profiles = st.builds(
+    DeviceProfile,
+    st.just("any"),
+    st.floats(0.1, 50.0),
+    st.floats(10.0, 10_000.0),
+    st.floats(0.0, 50.0),
+    mass=st.none() | st.floats(0.01, 2.0),
+    own_damping=st.floats(0.0, 10.0),
+)
+
+
+def test_the_profiles_are_those_of_the_table() -> None:
+    found = {name: (p.cap, p.stiffness, p.damping) for name, p in PROFILES.items()}
+    assert found == TABLE
+
+
+def test_a_profile_is_found_by_its_name_however_it_is_written() -> None:
+    assert profile_named("Premium 1.5") is PROFILES["premium-1.5"]
+    assert profile_named("OMEGA") is PROFILES["omega"]
+    with pytest.raises(UsageError, match=r"no device profile 'omeag': give touch, omni, .*sigma"):
+        profile_named("omeag")
+
+
+def test_every_device_of_ours_has_a_profile_before_it_is_opened() -> None:
+    assert profile_of(Line((0, 0, 0), (1, 0, 0))) is SCRIPTED
+    assert profile_of(OpenHapticsDevice()) == PROFILES["touch"]
+    assert profile_of(OpenHapticsDevice(profile=PROFILES["desktop"])).cap == 7.9
+    assert profile_of(OpenHapticsDevice(max_force=2.0)).cap == 2.0
+    omega = ForceDimensionDevice(profile=PROFILES["omega"])
+    assert (omega.max_force, profile_of(omega).stiffness) == (12.0, 5000.0)
+    assert (ForceDimensionDevice().max_force, HaplyDevice().max_force) == (7.0, 7.0)
+    assert profile_of(pickle.loads(pickle.dumps(HaplyDevice()))).cap == 7.0  # noqa: S301 - its own
+    assert profile_of(object()) is UNKNOWN
+
+
+def test_a_profile_of_another_kind_is_refused_with_its_device() -> None:
+    class Mine:
+        profile = "omega"
+
+    with pytest.raises(UsageError, match=r"Mine\.profile is of the type str; give a hapticdb"):
+        profile_of(Mine())
+
+
+def test_a_simulated_device_states_its_caps_its_delay_and_its_hand() -> None:
+    hand = RandomHand((0, 0, 0))
+    device = SimulatedDevice(hand, mass=0.2, grip=450.0, max_force=5.0, latency=0.002)
+    profile = profile_of(device)
+    assert (profile.cap, profile.torque_cap, profile.delay) == (5.0, 0.2, 0.002)
+    assert profile.first_stiffness == 1000.0
+    assert stability.hand_damping(profile) == pytest.approx(2.0 * math.sqrt(450.0 * 0.2))
+    assert profile_of(SimulatedDevice(hand, max_force=0.0, max_torque=0.0)).cap > 0.0
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("cap", 0.0),
+        ("cap", math.nan),
+        ("stiffness", -1.0),
+        ("stiffness", math.inf),
+        ("damping", -1.0),
+        ("damping", math.inf),
+        ("mass", 0.0),
+        ("own_damping", math.nan),
+        ("hand_damping", -1.0),
+        ("usual_stiffness", 0.0),
+        ("torque_cap", 0.0),
+        ("turn_stiffness", math.nan),
+        ("delay", -1e-3),
+        ("delay", math.inf),
+    ],
+)
+def test_a_number_that_no_device_has_is_refused(field: str, value: float) -> None:
+    with pytest.raises(UsageError, match=f"profile desktop: {field} "):
+        replace(PROFILES["desktop"], **{field: value})  # type: ignore[arg-type]
+
+
+# -- the rule -------------------------------------------------------------------------------------
+
+
+def test_the_rule_is_that_of_its_source() -> None:
+    """0.4 (b + 0.6 sqrt(100 m)) / (T/2 + t_d), by hand."""
+    profile = DeviceProfile("mine", 10.0, 1e5, 5.0, mass=0.09, own_damping=0.2)
+    # 0.6 sqrt(9) = 1.8; (0.2 + 1.8) * 0.4 = 0.8; at 1 kHz and 1 ms: 0.8 / 1.5 ms
+    assert stability.stable_stiffness(profile, 1000.0, 1e-3) == pytest.approx(1600.0 / 3.0)
+    assert stability.stable_stiffness(profile, 5000.0, 0.0) == pytest.approx(8000.0)
+    assert stability.hand_damping(profile) == pytest.approx(1.8)
+
+
+def test_the_delay_is_the_given_one_or_the_device_s_or_one_period() -> None:
+    desktop = PROFILES["desktop"]
+    assert stability.delay_of(desktop, 500.0) == 0.002
+    assert stability.delay_of(replace(desktop, delay=5e-4), 500.0) == 5e-4
+    assert stability.delay_of(replace(desktop, delay=5e-4), 500.0, 0.0) == 0.0
+    for delay in (-1.0, math.nan, math.inf):
+        with pytest.raises(UsageError, match=r"a delay of .* s: give 0 or more"):
+            stability.delay_of(desktop, 500.0, delay)
+
+
+def test_a_stiffness_that_is_too_great_is_lowered_with_one_line_that_says_by_what() -> None:
+    desktop = PROFILES["desktop"]
+    found = stability.allow(desktop, 1000.0, 3000.0, 1e-3)
+    assert found.stiffness == pytest.approx(0.4 * 0.6 * math.sqrt(4.5) / 1.5e-3)
+    assert found.lowered == (
+        "stiffness 3000 N/m lowered to 339.4 N/m: at 1 kHz and 1 ms of delay the device desktop "
+        "stays stable up to that in a light grip; a higher rate or a shorter delay allows more"
+    )
+    found = stability.allow(desktop, 10_000.0, 3000.0, 0.0)
+    assert found.stiffness == 1000.0
+    assert found.lowered == (
+        "stiffness 3000 N/m lowered to 1000 N/m: the most that the profile desktop allows"
+    )
+    assert "(mass not known: 0.045 kg assumed)" in str(
+        stability.allow(PROFILES["omega"], 500.0).lowered
+    )
+
+
+def test_a_stiffness_that_holds_stays_as_it_was_asked_for() -> None:
+    assert stability.allow(PROFILES["omni"], 5000.0, 500.0).stiffness == 500.0
+    assert stability.allow(PROFILES["omni"], 5000.0, 500.0).lowered is None
+    assert stability.allow(PROFILES["omni"], 10_000.0).stiffness == 700.0
+    hand = SimulatedDevice(RandomHand((0, 0, 0)))
+    assert stability.allow(profile_of(hand), 1000.0).stiffness == 1000.0
+    assert stability.allow(profile_of(hand), 1000.0, 5000.0).stiffness == pytest.approx(
+        0.4 * 2.0 * math.sqrt(30.0) / 1.5e-3
+    )
+
+
+def test_a_hand_that_no_force_moves_takes_any_stiffness() -> None:
+    assert stability.allow(SCRIPTED, 10.0).stiffness == 1000.0
+    assert stability.allow(SCRIPTED, 10.0, 1e5).stiffness == 1e5
+
+
+@pytest.mark.parametrize("asked", [0.0, -1.0, math.nan, math.inf])
+def test_a_stiffness_that_cannot_be_felt_is_refused(asked: float) -> None:
+    with pytest.raises(UsageError, match=r"a stiffness of .* N/m: give 1 or more"):
+        stability.allow(PROFILES["omni"], 1000.0, asked)
+
+
+@given(profiles, RATES, RATES, DELAYS, DELAYS, st.floats(0.0, 10.0))
+def test_a_higher_rate_less_delay_and_more_damping_never_allow_less(
+    profile: DeviceProfile, rate: float, other_rate: float, delay: float, other: float, more: float
+) -> None:
+    slow, fast = sorted((rate, other_rate))
+    early, late = sorted((delay, other))
+    damped = replace(profile, own_damping=profile.own_damping + more)
+
+    def given_at(profile: DeviceProfile, rate: float, delay: float) -> float:
+        return stability.allow(profile, rate, 1e6, delay).stiffness
+
+    assert given_at(profile, fast, delay) >= given_at(profile, slow, delay)
+    assert given_at(profile, rate, early) >= given_at(profile, rate, late)
+    assert given_at(damped, rate, delay) >= given_at(profile, rate, delay)
+
+
+@given(profiles, RATES, DELAYS, st.floats(1.0, 1e5))
+def test_what_is_given_is_never_more_than_asked_rendered_or_stable(
+    profile: DeviceProfile, rate: float, delay: float, asked: float
+) -> None:
+    found = stability.allow(profile, rate, asked, delay)
+    stable = 0.4 * (profile.own_damping + stability.hand_damping(profile)) / (0.5 / rate + delay)
+    assert found.stiffness == max(min(asked, profile.stiffness, stable), stability.SMALLEST)
+    assert (found.lowered is None) == (found.stiffness == asked)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hapticdb import Grid
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.kernels.field.lattice import BEYOND, CELL_VALUES, HALF_WIDTH, VOXELS_A_STEP
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import CELL_WORDS, Place, cell_key, spread_key
 from hapticdb.store.base import Layout, row_shift
@@ -18,6 +19,7 @@ from naive import Voxel
 from realtime.worlds import HIERARCHICAL, cells_of, poses_in
 
 CAPACITY = 16
+Steps = NDArray[np.uint8]
 
 
 def colliding(count: int) -> list[int]:
@@ -123,6 +125,69 @@ def test_cells_hold_the_voxels_of_their_rows(
         inside = {v for v in wanted if cell_key(*v) == key}
         assert found == inside
         assert bricks[key] == {(i & ~7, j & ~7, k & ~7) for i, j, k in inside}
+
+
+def steps_to(points: NDArray[np.float64], low: NDArray[np.int64], side: int) -> Steps:
+    """Stored distances (side^3,) to the nearest of points, by brute force; `low`: first centre."""
+    centres = low + np.argwhere(np.ones((side, side, side))) + 0.5
+    least = np.full(len(centres), np.inf)
+    for point in points:
+        least = np.minimum(least, np.linalg.norm(centres - point, axis=1))
+    steps = np.minimum(least, HALF_WIDTH) / VOXELS_A_STEP + 0.5
+    return np.where(least > HALF_WIDTH, BEYOND, steps).astype(np.uint8)
+
+
+@given(
+    bits=st.sampled_from([3, 4, 5, 6]),
+    curve=st.sampled_from(["z", "hilbert"]),
+    seed=st.integers(0, 999),
+    n_left_out=st.integers(0, 3),
+)
+@settings(deadline=None, max_examples=12)
+def test_cells_hold_the_least_distances_of_their_rows(
+    bits: int, curve: CurveName, seed: int, n_left_out: int
+) -> None:
+    """At all 34^3 centres, though each cell reads only rows of its own bricks."""
+    grid = Grid(0.01, (0.0, 0.0, 0.0), bits, curve)
+    rng = np.random.default_rng(seed)
+    # the second object lies at a border of bricks and of cells
+    objects = [rng.uniform(0.0, grid.side, (3, 3)), grid.side / 2 + rng.normal(0.0, 1.0, (3, 3))]
+    objects.append(rng.choice([0.0, float(grid.side)], (1, 3)))
+    n_bricks = grid.side >> 3
+    bricks = 8 * np.argwhere(np.ones((n_bricks, n_bricks, n_bricks)))
+    keys = grid.encode(bricks) >> 9
+    rows = [
+        (key, number, steps)
+        for key, brick in zip(keys.tolist(), bricks, strict=True)
+        for number, points in enumerate(objects, 1)
+        if ((steps := steps_to(points, brick - 1, 10)) != BEYOND).any()
+    ]
+    rows.sort(key=lambda row: row[:2])
+    exclude = sorted(rng.choice([1, 2, 3], n_left_out, replace=False).tolist())
+    cells = cells_of(grid)
+    on_curve = np.empty(len(cells), dtype=np.int64)
+    kernels.curve_keys_of_cells(cells, grid.bits, grid.curve_code, on_curve)
+    ascending = np.argsort(on_curve)
+    payload = rng.integers(0, 256, (len(cells) + 1, CELL_VALUES), dtype=np.uint8)
+    untouched = payload[0].copy()
+    masks = np.zeros(len(cells) + 1, dtype=np.uint64)
+    kernels.fill_distances(
+        np.array([row[0] for row in rows]), np.array([row[1] for row in rows]),
+        np.array([row[2] for row in rows]), np.array(exclude, dtype=np.int64),
+        on_curve[ascending], ascending + 1, grid.bits, grid.curve_code, payload, masks,
+    )  # fmt: skip
+    assert np.array_equal(payload[0], untouched)
+    kept = [points for number, points in enumerate(objects, 1) if number not in exclude]
+    for n, key in enumerate(cells.tolist(), 1):
+        low = np.array([key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF]) << 5
+        wanted = steps_to(np.concatenate([np.empty((0, 3)), *kept]), low - 1, 34)
+        # in a grid smaller than a cell, no point needs the centres farther out
+        inside = wanted.reshape(34, 34, 34)[tuple([slice(min(grid.side, 32) + 2)] * 3)]
+        found = payload[n].reshape(34, 34, 34)[tuple([slice(min(grid.side, 32) + 2)] * 3)]
+        assert np.array_equal(found, inside) if masks[n] else (inside == BEYOND).all()
+        for bit, brick in enumerate(product(range(4), repeat=3) if bits >= 5 else ()):
+            around = wanted.reshape(34, 34, 34)[tuple(slice(8 * b, 8 * b + 10) for b in brick)]
+            assert bool(int(masks[n]) >> bit & 1) == (around != BEYOND).any()
 
 
 @given(st.integers(0, 1000), st.integers(1, 30))

@@ -35,9 +35,9 @@ ENTRIES = {
         "locate_kernel spans_of_keys refine_kernel pairs_of_hits wrench_of_addresses depths_of_hits"
     ),
     "resident.cell_table": (
-        "insert_cells remove_cells slots_of_cells fill_cells curve_keys_of_cells "
-        "cells_of_curve_keys slots_to_free publish oldest_version_read cells_ahead "
-        "cells_met"
+        "insert_cells remove_cells slots_of_cells fill_cells fill_distances "
+        "curve_keys_of_cells cells_of_curve_keys slots_to_free publish oldest_version_read "
+        "cells_ahead cells_met"
     ),
     "surfaces.sides": "side_votes_kernel nesting_kernel",
     "motion": "play sway survey pull",

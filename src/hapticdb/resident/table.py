@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.field.lattice import BEYOND, CELL_VALUES
 from hapticdb.kernels.records import FIGURES, SESSION
 from hapticdb.kernels.resident import cells as kernels
 
@@ -56,9 +57,10 @@ class _Field(NamedTuple):
     shape: tuple[int, ...]
 
 
-def _fields(n_slots: int, capacity: int) -> list[_Field]:
+def _fields(n_slots: int, *, has_distances: bool) -> list[_Field]:
     """All arrays of a table, in their order in memory."""
-    rows = MOST_READERS
+    rows, capacity = MOST_READERS, _capacity(n_slots)
+    payload = [_Field("payload", np.uint8, (n_slots, CELL_VALUES))] if has_distances else []
     return [
         _Field("control", np.int64, (CONTROL_WORDS,)),
         _Field("readers", np.int64, (rows * kernels.READER_STRIDE,)),
@@ -70,14 +72,15 @@ def _fields(n_slots: int, capacity: int) -> list[_Field]:
         _Field("words", np.uint32, (n_slots, kernels.CELL_WORDS)),
         _Field("masks", np.uint64, (n_slots,)),
         _Field("used", np.uint8, (n_slots,)),
+        *payload,
     ]
 
 
-def _bytes_of(n_slots: int) -> int:
+def _bytes_of(n_slots: int, *, has_distances: bool) -> int:
     """Bytes of a table with `n_slots` slots, each array on a page of its own."""
     sizes = [
         int(np.prod(f.shape)) * np.dtype(f.dtype).itemsize
-        for f in _fields(n_slots, _capacity(n_slots))
+        for f in _fields(n_slots, has_distances=has_distances)
     ]
     return sum(-(-size // _PAGE) * _PAGE for size in sizes)
 
@@ -87,8 +90,10 @@ def _capacity(n_slots: int) -> int:
     return 1 << (4 * n_slots - 1).bit_length()
 
 
-def slots_within(budget_bytes: int) -> int:
+def slots_within(budget_bytes: int, *, has_distances: bool = False) -> int:
     """Number of slots that fit into a budget, with the slot for empty cells.
+
+    A slot with distances takes 43 KiB, one without them 4 KiB.
 
     Raises
     ------
@@ -102,12 +107,20 @@ def slots_within(budget_bytes: int) -> int:
     low, high = 1, budget_bytes // (4 * kernels.CELL_WORDS)
     while low < high:
         middle = (low + high + 1) // 2
-        low, high = (middle, high) if _bytes_of(middle) <= budget_bytes else (low, middle - 1)
+        needed = _bytes_of(middle, has_distances=has_distances)
+        low, high = (middle, high) if needed <= budget_bytes else (low, middle - 1)
     return low
 
 
 class CellTable:
     """A table of cells in memory that processes share.
+
+    Parameters
+    ----------
+    descriptor : int
+        File descriptor of the memory of a table that `create` has made, in any process.
+    n_slots : int
+        Number of its slots.
 
     Attributes
     ----------
@@ -117,6 +130,8 @@ class CellTable:
         Messages between sessions and the fetching process.
     descriptor : int
         File descriptor of the memory, for a process to inherit.
+    has_distances : bool
+        Whether the cells have distances to surfaces.
     size_bytes : int
         Size of the memory: never more than the budget.
     """
@@ -124,29 +139,38 @@ class CellTable:
     def __init__(self, descriptor: int, n_slots: int) -> None:
         self.descriptor = descriptor
         self.n_slots = n_slots
-        self.size_bytes = _bytes_of(n_slots)
+        self.size_bytes = os.fstat(descriptor).st_size
+        # the size tells the two kinds apart, so no process can take one for the other
+        self.has_distances = self.size_bytes == _bytes_of(n_slots, has_distances=True)
         self._memory = mmap.mmap(descriptor, self.size_bytes)
         views: dict[str, NDArray[np.generic]] = {}
         at = 0
-        for name, dtype, shape in _fields(n_slots, _capacity(n_slots)):
+        for name, dtype, shape in _fields(n_slots, has_distances=self.has_distances):
             views[name] = np.ndarray(shape, dtype, self._memory, at)
             at += -(-views[name].nbytes // _PAGE) * _PAGE
         self.cells = kernels.Cells(**{n: views[n] for n in kernels.Cells._fields if n in views})  # type: ignore[arg-type]
         self.desk = Desk(**{n: views[n] for n in Desk._fields})  # type: ignore[arg-type]
 
     @classmethod
-    def create(cls, budget_bytes: int = DEFAULT_BUDGET) -> "CellTable":
-        """Make a table of at most `budget_bytes`, in which every cell is unknown."""
+    def create(cls, budget_bytes: int = DEFAULT_BUDGET, *, distances: bool = False) -> "CellTable":
+        """Make a table of at most `budget_bytes`, in which every cell is unknown.
+
+        With `distances` its cells have the distances to surfaces, which the smooth law reads; then
+        a tenth as many cells fit.
+        """
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
         if budget_bytes > memory:
             raise UsageError(
                 f"a budget of {budget_bytes} bytes for resident cells: this machine has {memory}"
             )
-        n_slots = slots_within(budget_bytes)
-        descriptor = anonymous_memory("hapticdb-cells", _bytes_of(n_slots))
+        n_slots = slots_within(budget_bytes, has_distances=distances)
+        size = _bytes_of(n_slots, has_distances=distances)
+        descriptor = anonymous_memory("hapticdb-cells", size)
         table = cls(descriptor, n_slots)
         table.cells.keys[:] = kernels.UNKNOWN
         table.cells.control[kernels.VERSION] = FIRST_VERSION
+        if table.cells.payload is not None:
+            table.cells.payload[kernels.EMPTY_SLOT] = BEYOND
         return table
 
     def __enter__(self) -> Self:

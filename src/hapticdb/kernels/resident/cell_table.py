@@ -4,6 +4,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import (
     BYTES,
+    BYTES2,
     FLOAT,
     FLOATS,
     FLOATS2,
@@ -19,6 +20,12 @@ from hapticdb.kernels._jit import (
     leaf,
 )
 from hapticdb.kernels.curves import compact, key_of, voxel_of
+from hapticdb.kernels.field.lattice import (
+    BEYOND,
+    CELL_VALUES,
+    cell_place,
+    row_place,
+)
 from hapticdb.kernels.query.grouping import first_bound
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
@@ -148,6 +155,67 @@ def fill_cells(
             i, j, k = voxel_of(row_key, bits, curve)
             words[slot, column_of(i, j)] |= np.uint32(1) << np.uint32(k & 31)
             mark_brick(masks, slot, i, j, k)
+
+
+@leaf
+def merge_row(payload, slot, i, j, k, last, values, row):
+    """Lower a slot's distances to those of the brick at (i, j, k), in `row` of values (R, 1000).
+
+    Of the row's outer layer only what lies outside the cell is written. A centre in the cell
+    belongs to a brick of the cell, whose own row has it; without such a row it is BEYOND. last:
+    where the cell's last brick begins on each axis: 24, or less in a grid smaller than a cell.
+    """
+    i, j, k = i & 31, j & 31, k & 31
+    low_i, low_j = -1 if i == 0 else 0, -1 if j == 0 else 0
+    high_i, high_j = 9 if i == last else 8, 9 if j == last else 8
+    for x in range(low_i, high_i):
+        for y in range(low_j, high_j):
+            at = cell_place(i + x, j + y, k)
+            start = row_place(x, y, 0)
+            for z in range(8):
+                payload[slot, at + z] = min(payload[slot, at + z], values[row, start + z])
+            if k == 0:
+                payload[slot, at - 1] = min(payload[slot, at - 1], values[row, start - 1])
+            if k == last:
+                payload[slot, at + 8] = min(payload[slot, at + 8], values[row, start + 8])
+
+
+@entry(INTS, INTS, BYTES2, INTS, INTS, INTS, INT, INT, BYTES2, WORDS)
+def fill_distances(
+    row_keys, row_ids, values, exclude, cell_keys, places, bits, curve, payload, masks
+):
+    """Fill the distances of cells from rows of the band; `fill_cells` has filled their voxels.
+
+    row_keys (R,) of bricks, ascending; values (R, 1000) uint8, unpacked; payload (S, 34^3) uint8;
+    the other arguments are those of `fill_cells`. What a slot held before is forgotten when its
+    first row comes; a slot without a row stays as it was, and its mask without a bit says so.
+    """
+    n_cells = cell_keys.shape[0]
+    n_excluded = exclude.shape[0]
+    at = 0
+    last_slot = np.int64(-1)
+    last_brick = min(1 << bits, 32) - 8
+    for row in range(row_keys.shape[0]):
+        cell = row_keys[row] >> 6
+        while at < n_cells and cell_keys[at] < cell:
+            at += 1
+        if at == n_cells:
+            break
+        if cell_keys[at] != cell:
+            continue
+        if n_excluded > 0:
+            found = first_bound(row_ids[row], exclude, np.int64(0))
+            if found < n_excluded and exclude[found] == row_ids[row]:
+                continue
+        slot = places[at]
+        if slot != last_slot:
+            last_slot = slot
+            for n in range(CELL_VALUES):
+                payload[slot, n] = BEYOND
+        i, j, k = voxel_of(row_keys[row], max(bits - 3, 0), curve)
+        i, j, k = i << 3, j << 3, k << 3
+        merge_row(payload, slot, i, j, k, last_brick, values, row)
+        mark_brick(masks, slot, i, j, k)
 
 
 @entry(INTS, INT, INT, INTS)

@@ -6,6 +6,10 @@ of every cell that is known to be empty; a cell without an entry is *unknown*. B
 each slot has a mask of 64 bits, one for each of its 4^3 bricks; a bit is set if the brick holds a
 voxel.
 
+A table with distances also has, for each slot, the least distance of all objects at 34^3 voxel
+centres: the cell's own and one more on each side (`hapticdb.kernels.field.lattice`). There a
+brick's bit is also set if the brick has a row of the band, and a cell without a voxel takes a slot.
+
 Directories are published in versions, three buffers in turn. A frame announces which version it
 reads and uses only that one, so it never reads a half-changed directory. The writing process reuses
 a buffer or a slot only when no frame can still read it (`hapticdb.resident.table`).
@@ -18,6 +22,7 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import (
     BYTES,
+    BYTES2,
     FLOAT,
     FLOATS,
     FLOATS2,
@@ -77,9 +82,8 @@ class Cells(NamedTuple):
 
     control (16,) int64; readers (16 x 8,) int64, the version that each reader reads, 0 for none;
     keys (3, capacity) int64 and slots (3, capacity) int32, the directories; words (slots, 1024)
-    uint32; masks (slots,) uint64; used (slots,) uint8, set by a frame that reads the slot; payload:
-    what laws read beside the occupancy, an array (slots, ...), or None. A slot's mask has the
-    bricks that hold a voxel, or a payload that is not empty.
+    uint32; masks (slots,) uint64; used (slots,) uint8, set by a frame that reads the slot; payload
+    (slots, 34^3) uint8: stored distances, all BEYOND in slot 0; None in a table without them.
     """
 
     control: Ints
@@ -93,6 +97,9 @@ class Cells(NamedTuple):
 
 
 CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, NONE)
+CELLS_WITH_DISTANCES = fields_of(
+    Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, BYTES2
+)
 
 
 class Place(NamedTuple):

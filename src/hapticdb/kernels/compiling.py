@@ -28,6 +28,7 @@ from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 ENTRIES = {
     "hand.coupling": "advance",
+    "hand.quasistatic": "advance",
     "surfaces.voxelize": "voxelize_kernel",
     "resident.clearance": "find_clearance cells_near",
     "resident.cells": "feel_kernel bounding_spheres",
@@ -98,6 +99,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         *_SHELL,
         *_RESIDENT,
         "hand.coupling.*",
+        "hand.quasistatic.*",
         "hand.servo.*",
         "hand.handle.*",
         "motion.*",

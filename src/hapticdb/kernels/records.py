@@ -126,6 +126,45 @@ SENT: Layout = _record(
 SERVO: Layout = _record([("tool", TOOL), ("hand", HAND), ("sent", SENT)])
 """All that a loop keeps from one period to the next."""
 
+MOST_TRAIL = 64
+"""Places of the hand that the quasi-static coupling remembers for its damping. Larger: the same
+time is remembered at higher loop rates."""
+FOLLOWER: Layout = _record(
+    [
+        ("looked_at", "<f8", 7),  # pose of the tool that the near points belong to
+        ("travelled", "<f8"),  # voxels that the farthest point may have moved so far
+        ("astray", "<f8"),  # voxels from the tool's pose to the one looked at last
+        ("clearance", "<f8"),  # voxels: no point is nearer to a surface, at the tool's pose
+        ("tried_clearance", "<f8"),  # the same at the pose looked at last
+        ("least_clearance", "<f8"),  # least of a period
+        ("side", "<i8"),  # 0 or 1: which half of the rows has the near points at the tool's pose
+        ("n_near", "<i8"),  # near points at the tool's pose
+        ("n_tried", "<i8"),  # near points at the pose looked at last, in the other half
+        ("n_unknown", "<i8"),  # points in unknown cells there
+        ("n_looks", "<i8"),  # poses looked at in this period
+        ("n_active", "<i8"),  # points in the contact set of the last step
+        ("is_walking", "?"),  # whether the pose that is looked at may be forbidden
+        ("is_loose", "?"),  # the tool lies in something and feels nothing yet
+        ("is_braked", "?"),  # the last step was cut short: the next one is held back
+        ("matrix", "<f8", (6, 6)),  # of the step's equations: N/m, N, N m
+        ("right", "<f8", 6),  # their right-hand side: N, N m
+        ("step", "<f8", 6),  # of the tool's centre: m, rad
+        ("pull", "<f8", 6),  # from tool to hand: m, rad
+        ("spring", "<f8"),  # stiffness along the pull, N/m of the scene
+        ("turn_spring", "<f8"),  # N m/rad of the scene
+        ("last_hand", "<f8", 3),  # the handle's place in the last period, m
+        ("trail", "<f8", (MOST_TRAIL, 4)),  # time s and place m of the handle, in turns
+        ("n_trail", "<i8"),  # places written since the handle was last lost
+        ("clock", "<f8"),  # s
+        ("share", "<f8"),  # of the stiffness that is used, 0 to 1
+        ("wanted_share", "<f8"),  # the share that the guard moves it to
+        ("reversals", "<f8"),  # of the force, forgotten as time passes
+        ("extreme", "<f8"),  # N, greatest or least force since the last reversal
+        ("is_rising", "?"),  # the force, since then
+    ]
+)
+"""What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""
+
 FRAME: Layout = np.dtype(
     [
         ("time", "<f8"),  # s since the session's start, when the frame began

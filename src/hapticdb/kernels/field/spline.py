@@ -1,0 +1,121 @@
+"""A resident cell's distances at a point: smooth value and gradient, and a proved lower bound.
+
+The value is a quadratic B-spline over the 27 centres around the point. It is exact where the
+distance is linear, and its gradient is continuous, so forces that follow the gradient are those of
+a potential. The lower bound needs no smoothness: a distance changes by at most the way between two
+places, so the distance at a point is at least u_i - |p - c_i| for each centre c_i, less half a step
+of storing.
+"""
+
+import math
+
+import numpy as np
+
+from hapticdb.kernels._jit import inlined, leaf
+from hapticdb.kernels.field.lattice import (
+    CELL_SIDE,
+    HALF_WIDTH,
+    STEPS,
+    VOXELS_A_STEP,
+    cell_place,
+)
+
+FREE_BEYOND = math.sqrt(HALF_WIDTH * HALF_WIDTH - 0.5)
+"""Voxels. Where all centres of a block of voxels and one more on each side are BEYOND, no surface
+is nearer to the block, grown by half a voxel, than this: the balls of radius h about the centres
+cover that space. It follows from `HALF_WIDTH`."""
+ALONG_I, ALONG_J = CELL_SIDE * CELL_SIDE, CELL_SIDE
+"""Steps in a cell's distances from a centre to the next one along i and j."""
+
+
+@leaf
+def spline_weights(t):
+    """Weights of the centres before, at and after a point at t from the middle one, |t| <= 1/2."""
+    return 0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)
+
+
+@leaf
+def from_center(x):
+    """Way from the centre of the voxel that holds a coordinate to it, voxels, -1/2 to 1/2."""
+    return x - np.floor(x) - 0.5
+
+
+@inlined
+def line_of_three(payload, slot, at, before, here, after, t):
+    """Value and slope along k at three centres from index `at` on, in steps."""
+    first = float(min(payload[slot, at], STEPS))
+    second = float(min(payload[slot, at + 1], STEPS))
+    third = float(min(payload[slot, at + 2], STEPS))
+    value = before * first + here * second + after * third
+    slope = (t - 0.5) * first - 2.0 * t * second + (t + 0.5) * third
+    return value, slope
+
+
+@inlined
+def plane_of_nine(payload, slot, at, by, hy, ay, ty, bz, hz, az, tz):
+    """Value and slopes along j and k at nine centres of one i, in steps."""
+    v0, z0 = line_of_three(payload, slot, at, bz, hz, az, tz)
+    v1, z1 = line_of_three(payload, slot, at + ALONG_J, bz, hz, az, tz)
+    v2, z2 = line_of_three(payload, slot, at + 2 * ALONG_J, bz, hz, az, tz)
+    value = by * v0 + hy * v1 + ay * v2
+    along_j = (ty - 0.5) * v0 - 2.0 * ty * v1 + (ty + 0.5) * v2
+    return value, along_j, by * z0 + hy * z1 + ay * z2
+
+
+@inlined
+def spline(payload, slot, x, y, z):
+    """Distance at a point of the slot's cell and its gradient: u, gx, gy, gz, in voxels.
+
+    (x, y, z): the point in voxels from the grid's origin. What is beyond the band counts as h.
+    """
+    tx, ty, tz = from_center(x), from_center(y), from_center(z)
+    bx, hx, ax = spline_weights(tx)
+    by, hy, ay = spline_weights(ty)
+    bz, hz, az = spline_weights(tz)
+    at = cell_place((np.int64(x) & 31) - 1, (np.int64(y) & 31) - 1, (np.int64(z) & 31) - 1)
+    v0, y0, z0 = plane_of_nine(payload, slot, at, by, hy, ay, ty, bz, hz, az, tz)
+    v1, y1, z1 = plane_of_nine(payload, slot, at + ALONG_I, by, hy, ay, ty, bz, hz, az, tz)
+    v2, y2, z2 = plane_of_nine(payload, slot, at + 2 * ALONG_I, by, hy, ay, ty, bz, hz, az, tz)
+    u = VOXELS_A_STEP * (bx * v0 + hx * v1 + ax * v2)
+    gx = VOXELS_A_STEP * ((tx - 0.5) * v0 - 2.0 * tx * v1 + (tx + 0.5) * v2)
+    gy = VOXELS_A_STEP * (bx * y0 + hx * y1 + ax * y2)
+    gz = VOXELS_A_STEP * (bx * z0 + hx * z1 + ax * z2)
+    return u, gx, gy, gz
+
+
+@inlined
+def lower_bound(payload, slot, x, y, z):
+    """Voxels: no surface is nearer to a point of the slot's cell, by the 8 centres around it."""
+    tx, ty, tz = from_center(x), from_center(y), from_center(z)
+    at = cell_place(
+        (np.int64(x) & 31) - np.int64(tx < 0.0),
+        (np.int64(y) & 31) - np.int64(ty < 0.0),
+        (np.int64(z) & 31) - np.int64(tz < 0.0),
+    )
+    # squares of the ways to the lower and the upper centres
+    lx, ly, lz = tx + np.int64(tx < 0.0), ty + np.int64(ty < 0.0), tz + np.int64(tz < 0.0)
+    ux, uy, uz = (1.0 - lx) * (1.0 - lx), (1.0 - ly) * (1.0 - ly), (1.0 - lz) * (1.0 - lz)
+    lx, ly, lz = lx * lx, ly * ly, lz * lz
+    best = 0.0
+    for corner in range(8):
+        square = ux if corner & 4 else lx
+        square += uy if corner & 2 else ly
+        square += uz if corner & 1 else lz
+        index = at + (corner >> 2) * ALONG_I + ((corner >> 1) & 1) * ALONG_J + (corner & 1)
+        u = float(min(payload[slot, index], STEPS)) * VOXELS_A_STEP
+        best = max(best, u - math.sqrt(square))
+    return max(best - 0.5 * VOXELS_A_STEP, 0.0)
+
+
+@leaf
+def depth_in_block(x, y, z, bits):
+    """Way from a point to the border of its block of (1 << bits)^3 voxels, voxels."""
+    side = float(1 << bits)
+    x, y, z = x % side, y % side, z % side
+    return min(x, side - x, y, side - y, z, side - z)
+
+
+@leaf
+def bound_in_free_block(x, y, z, bits):
+    """Lower bound of the distance in a block whose centres, and those around it, are BEYOND."""
+    return depth_in_block(x, y, z, bits) + 0.5 + FREE_BEYOND

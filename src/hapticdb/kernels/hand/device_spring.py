@@ -1,0 +1,124 @@
+"""The spring between hand and tool, in the device's units, and what it pulls in the scene.
+
+One metre of the device is S metres of the scene. Forces are the same in both, so that stiffness in
+the scene is K / S, turning stiffness S K_R, and a torque at the device is the scene's over S.
+"""
+
+import math
+from typing import NamedTuple
+
+from hapticdb.kernels._jit import FLOAT, fields_of, leaf
+from hapticdb.kernels.rigid import moment, product, turn, turn_of
+
+BEYOND_CAP = 1.2
+"""Most force of the spring, in caps of the device. Larger: the tool is pressed harder than the hand
+feels, and contacts must be stiffer."""
+CONTACT_SHARE = 50.0
+"""Least stiffness of a contact, in stiffnesses of the spring. Larger: contacts give way less."""
+STOPPING = 4.0
+"""Least stiffness of a contact, in greatest forces of the spring a voxel: one point then stops that
+force within a quarter of a voxel, where distances are exact. Larger: firmer and less smooth."""
+
+
+class DeviceSpring(NamedTuple):
+    """The spring between hand and tool; all but `radius` is measured at the device.
+
+    stiffness and turn_stiffness, N/m and N m/rad, above 0; cap and turn_cap: the most force and
+    torque that the spring sends, N and N m; damping, N s/m, of the hand's motion along the force;
+    scale: S, metres of the scene for a metre of the device; radius, m of the scene: distance of the
+    farthest point from the tool's centre; hold and fade, s: how long the wrench is kept when cells
+    are unknown, and how long it then falls to zero.
+    """
+
+    stiffness: float
+    turn_stiffness: float
+    cap: float
+    turn_cap: float
+    damping: float
+    scale: float
+    radius: float
+    hold: float
+    fade: float
+
+
+DEVICE_SPRING = fields_of(DeviceSpring, *(FLOAT,) * 9)
+
+
+@leaf
+def contact_stiffness(spring, size):
+    """Stiffness of a contact, N/m of the scene."""
+    most = BEYOND_CAP * spring.cap
+    return max(CONTACT_SHARE * spring.stiffness / spring.scale, STOPPING * most / size)
+
+
+@leaf
+def measure_pull(spring, tool, hand, pose, center, follower):
+    """Stretch and turn from tool to hand into follower.pull (6,), and their stiffnesses.
+
+    m and rad in the scene, at the tool's centre (3,), given in the tool's frame. A stiffness is
+    lower where the spring reaches its cap.
+    """
+    hw, hx, hy, hz = hand.quaternion[0], hand.quaternion[1], hand.quaternion[2], hand.quaternion[3]
+    rx, ry, rz = lever_in_hand(hand, center)
+    x, y, z = center[0], center[1], center[2]
+    pull, position = follower.pull, hand.position
+    for axis in range(3):
+        at = turn(pose[axis, 0], pose[axis, 1], pose[axis, 2], x, y, z) + pose[axis, 3]
+        pull[axis] = position[axis] + (rx if axis == 0 else (ry if axis == 1 else rz)) - at
+    turn_w, turn_x, turn_y, turn_z = (
+        tool.quaternion[0], tool.quaternion[1], tool.quaternion[2], tool.quaternion[3],
+    )  # fmt: skip
+    pull[3], pull[4], pull[5] = turn_of(*product(hw, hx, hy, hz, turn_w, -turn_x, -turn_y, -turn_z))
+    way = math.sqrt(pull[0] * pull[0] + pull[1] * pull[1] + pull[2] * pull[2])
+    angle = math.sqrt(pull[3] * pull[3] + pull[4] * pull[4] + pull[5] * pull[5])
+    stiffness = follower.share * spring.stiffness / spring.scale
+    turn_stiffness = follower.share * spring.turn_stiffness * spring.scale
+    most, most_turn = BEYOND_CAP * spring.cap, BEYOND_CAP * spring.turn_cap * spring.scale
+    follower.spring = most / way if stiffness * way > most else stiffness
+    follower.turn_spring = (
+        most_turn / angle if turn_stiffness * angle > most_turn else turn_stiffness
+    )
+
+
+@leaf
+def lever_in_hand(hand, center):
+    """Lever from the handle's origin to the centre (3,) of a tool at the handle, m, world frame."""
+    w, x, y, z = hand.quaternion[0], hand.quaternion[1], hand.quaternion[2], hand.quaternion[3]
+    cx, cy, cz = center[0], center[1], center[2]
+    # by the quaternion: c + 2 q_v x (q_v x c + w c)
+    ux, uy, uz = y * cz - z * cy + w * cx, z * cx - x * cz + w * cy, x * cy - y * cx + w * cz
+    return (
+        cx + 2.0 * (y * uz - z * uy),
+        cy + 2.0 * (z * ux - x * uz),
+        cz + 2.0 * (x * uy - y * ux),
+    )
+
+
+@leaf
+def push_of(spring, hand, center, follower):
+    """Wrench of the spring on the hand, at the device: force and torque about the handle's origin.
+
+    The force is at most `cap`, and the torque about the tool's centre at most `turn_cap`.
+    """
+    pull = follower.pull
+    fx, fy, fz = shortened(
+        -follower.spring * pull[0], -follower.spring * pull[1], -follower.spring * pull[2],
+        spring.cap,
+    )  # fmt: skip
+    tx, ty, tz = shortened(
+        -follower.turn_spring * pull[3], -follower.turn_spring * pull[4],
+        -follower.turn_spring * pull[5], spring.turn_cap * spring.scale,
+    )  # fmt: skip
+    rx, ry, rz = lever_in_hand(hand, center)
+    mx, my, mz = moment(rx, ry, rz, fx, fy, fz)
+    return (
+        fx, fy, fz, (tx + mx) / spring.scale, (ty + my) / spring.scale, (tz + mz) / spring.scale,
+    )  # fmt: skip
+
+
+@leaf
+def shortened(x, y, z, longest):
+    """Vector (x, y, z), shortened to the length `longest` where it is longer."""
+    length = math.sqrt(x * x + y * y + z * z)
+    scale = longest / length if length > longest else 1.0
+    return scale * x, scale * y, scale * z

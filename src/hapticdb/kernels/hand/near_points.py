@@ -1,0 +1,240 @@
+"""Which points of the tool are near a surface, and how near: one look at one pose.
+
+A look computes distance and gradient at each point that may be near. A point whose lower bound says
+that it is far is not looked at again until the tool has moved that far: `DUE` is the way of the
+farthest point at which the point is looked at next. The same holds for runs of points.
+"""
+
+import math
+
+import numpy as np
+
+from hapticdb.kernels._jit import inlined, leaf
+from hapticdb.kernels.field.lattice import HALF_WIDTH
+from hapticdb.kernels.field.spline import bound_in_free_block, lower_bound, spline
+from hapticdb.kernels.resident.cells import (
+    EMPTY_SLOT,
+    LISTED,
+    UNKNOWN,
+    brick_bit,
+    cell_key,
+    enter_cell,
+)
+from hapticdb.kernels.rigid import moment, moved, transform_of
+
+ONSET = 1.5
+"""delta, voxels: distance at which contact begins. Larger: smoother, and more clearance is lost."""
+MARGIN = 0.5
+"""Voxels beyond the onset at which a point enters the equations of a step. Larger: longer steps are
+foreseen, and more points are in the equations."""
+FAR = ONSET + MARGIN + 0.1
+"""Voxels: a point with a greater lower bound is not looked at. The tenth is room for the spline,
+which smooths. Larger: points are looked at more often."""
+FLOOR = 1.0
+"""Voxels: no step takes a point nearer to a surface. Smaller: firmer contacts, less smooth ones;
+below about 0.7 the gradients are wrong."""
+LEAST_BOUND = 0.1
+"""Voxels: least lower bound that a step may take a point to. Smaller: points get nearer to sheets;
+the rule is a proof while it is above 0."""
+NEVER = 1e30
+"""A way that no tool travels."""
+
+DUE, LAST_U, LAST_BOUND, ONSETS, RUN_DUE, ACTIVE = 0, 1, 2, 3, 4, 5
+"""Rows of a field (FIELD_ROWS, N) with a number for each point: way at which the point is looked at
+next; distance and bound at the tool's pose, h where it is not near; onset, voxels. RUN_DUE has the
+least DUE of each run of points; ACTIVE has, for each near point in its order, whether it is in
+the contact set."""
+NEAR = 6
+"""First row with the near points of two poses, in the order of the points: NEAR_ROWS for each."""
+U, BOUND, ALONG, ABOUT = 0, 1, 2, 5
+"""Rows from there on: distance and bound, voxels; gradient (3) and its moment about the centre (3),
+m."""
+NEAR_ROWS = 8
+FIELD_ROWS = NEAR + 2 * NEAR_ROWS
+NEAR_POINTS = 1
+"""First of two rows of `met` with the indices of the near points, as `field` has their numbers. The
+row before takes the indices of the points that are felt."""
+OPEN, SHUT, NOT_KNOWN = 0, 1, 2
+"""What a look finds: the tool may be there; a point may not; points are in unknown cells."""
+
+
+@leaf
+def clamped_into(x, side):
+    """A coordinate in voxels, moved into the grid, and by how much."""
+    inside = min(max(x, 0.0), side - 1e-6)
+    return inside, x - inside
+
+
+@leaf
+def outside_grid(u, gx, gy, gz, bound, dx, dy, dz):
+    """Distance, gradient and bound at a point outside the grid, from those where it was clamped to.
+
+    (dx, dy, dz): the way out, voxels. All surfaces are in the grid, so the way out adds to u.
+    """
+    way = math.sqrt(dx * dx + dy * dy + dz * dz)
+    gx = gx if dx == 0.0 else dx / way
+    gy = gy if dy == 0.0 else dy / way
+    gz = gz if dz == 0.0 else dz / way
+    return u + way, gx, gy, gz, max(bound, way)
+
+
+@inlined
+def distance_at(payload, slot, mask, x, y, z, dx, dy, dz):
+    """Distance, gradient and bound at (x, y, z) in the grid plus the way (dx, dy, dz) out of it."""
+    i, j, k = np.int64(x), np.int64(y), np.int64(z)
+    u, gx, gy, gz = HALF_WIDTH, 0.0, 0.0, 0.0
+    if (mask >> brick_bit(i, j, k)) & np.uint64(1):
+        u, gx, gy, gz = spline(payload, slot, x, y, z)
+        bound = lower_bound(payload, slot, x, y, z)
+    else:
+        bound = bound_in_free_block(x, y, z, 5 if slot == EMPTY_SLOT else 3)
+    if dx != 0.0 or dy != 0.0 or dz != 0.0:
+        u, gx, gy, gz, bound = outside_grid(u, gx, gy, gz, bound, dx, dy, dz)
+    return u, gx, gy, gz, bound
+
+
+@leaf
+def look_at_run(
+    cells, which, points, start, end, run, transform, place, center, follower, field, met, missed
+):
+    """Look at points start .. end, which are run number `run` -> SHUT, or OPEN; see `look`."""
+    keys, slots, masks, used = cells.keys, cells.slots, cells.masks, cells.used
+    payload = cells.payload
+    size, side = place.size, place.side
+    cx, cy, cz = center[0], center[1], center[2]
+    half = 1 - follower.side
+    base, near = NEAR + half * NEAR_ROWS, NEAR_POINTS + half
+    travelled, n_near, n_missed = follower.travelled, follower.n_tried, missed[LISTED]
+    is_walking, run_due = follower.is_walking, NEVER
+    last_key, slot, mask = np.int64(-1), np.int64(UNKNOWN), np.uint64(0)
+    for n in range(start, end):
+        if travelled < field[DUE, n]:
+            run_due = min(run_due, field[DUE, n])
+            continue
+        px, py, pz = moved(transform, points[n, 0], points[n, 1], points[n, 2])
+        x, dx = clamped_into((px - place.x) / size, side)
+        y, dy = clamped_into((py - place.y) / size, side)
+        z, dz = clamped_into((pz - place.z) / size, side)
+        key = cell_key(np.int64(x), np.int64(y), np.int64(z))
+        if key != last_key:
+            last_key = key
+            slot, mask, n_missed = enter_cell(
+                keys, slots, masks, used, which, key, missed, n_missed
+            )
+        if slot < 0:
+            follower.n_unknown += 1
+            field[DUE, n] = run_due = -NEVER
+            continue
+        u, gx, gy, gz, bound = distance_at(payload, slot, mask, x, y, z, dx, dy, dz)
+        field[DUE, n] = travelled + bound - FAR
+        run_due = min(run_due, field[DUE, n])
+        if u >= ONSET + MARGIN and bound >= LEAST_BOUND:
+            continue
+        if is_walking and (
+            (u < FLOOR and u <= field[LAST_U, n])
+            or (bound < LEAST_BOUND and bound <= field[LAST_BOUND, n])
+        ):
+            return SHUT
+        met[near, n_near] = n
+        field[base + U, n_near], field[base + BOUND, n_near] = u, bound
+        rx, ry, rz = moment(px - cx, py - cy, pz - cz, gx, gy, gz)
+        field[base + ALONG, n_near] = gx
+        field[base + ALONG + 1, n_near] = gy
+        field[base + ALONG + 2, n_near] = gz
+        field[base + ABOUT, n_near] = rx
+        field[base + ABOUT + 1, n_near] = ry
+        field[base + ABOUT + 2, n_near] = rz
+        n_near += 1
+    field[RUN_DUE, run] = run_due
+    follower.n_tried, missed[LISTED] = n_near, n_missed
+    return OPEN
+
+
+@leaf
+def look(cells, which, shell, pose, place, way, is_walking, follower, field, met, missed):
+    """Look at the tool at a pose (4, 4) -> OPEN, SHUT or NOT_KNOWN.
+
+    way: voxels that the farthest point has moved since the last look. is_walking: SHUT if a point
+    is nearer than FLOOR or LEAST_BOUND allow, and no farther than at the tool's pose. The near
+    points go into the half of `field` and `met` that the tool's pose does not use; SHUT leaves it
+    unfinished.
+    """
+    points, run = shell.points, shell.run
+    transform = transform_of(pose)
+    center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
+    follower.travelled += way
+    follower.is_walking = is_walking
+    follower.n_looks += 1
+    follower.n_tried = follower.n_unknown = 0
+    missed[LISTED] = 0
+    travelled, least = follower.travelled, NEVER
+    for start in range(0, points.shape[0], run):
+        if not travelled < field[RUN_DUE, start // run]:
+            end = min(start + run, points.shape[0])
+            if look_at_run(
+                cells, which, points, start, end, start // run, transform, place, center, follower,
+                field, met, missed,
+            ) == SHUT:  # fmt: skip
+                return SHUT
+        least = min(least, field[RUN_DUE, start // run])
+    follower.tried_clearance = least - travelled + FAR
+    return OPEN if follower.n_unknown == 0 else NOT_KNOWN
+
+
+@leaf
+def settle(follower, field, met):
+    """Make the pose that was tried the tool's pose: its near points, their onsets."""
+    before, after = follower.side, 1 - follower.side
+    rows = NEAR + after * NEAR_ROWS
+    for m in range(follower.n_near):
+        field[LAST_U, met[NEAR_POINTS + before, m]] = HALF_WIDTH
+        field[LAST_BOUND, met[NEAR_POINTS + before, m]] = HALF_WIDTH
+    for m in range(follower.n_tried):
+        n, u = met[NEAR_POINTS + after, m], field[rows + U, m]
+        field[LAST_U, n], field[LAST_BOUND, n] = u, field[rows + BOUND, m]
+        field[ONSETS, n] = max(field[ONSETS, n], min(u, ONSET))
+    for m in range(follower.n_near):
+        n = met[NEAR_POINTS + before, m]
+        if field[LAST_U, n] == HALF_WIDTH:  # no longer near
+            field[ONSETS, n] = ONSET
+    follower.side, follower.n_near = after, follower.n_tried
+    follower.clearance, follower.astray = follower.tried_clearance, 0.0
+    follower.least_clearance = min(follower.least_clearance, follower.clearance)
+
+
+@leaf
+def look_anew(follower, field):
+    """Forget all ways, so that the next look looks at every point; near points stay as they are."""
+    follower.travelled = follower.astray = 0.0
+    for n in range(field.shape[1]):
+        field[DUE, n] = field[RUN_DUE, n] = -NEVER
+
+
+@leaf
+def forget(follower, field):
+    """Forget everything about the points, as at the start: each has the full onset."""
+    look_anew(follower, field)
+    follower.n_near = follower.n_tried = 0
+    for n in range(field.shape[1]):
+        field[LAST_U, n] = field[LAST_BOUND, n] = HALF_WIDTH
+        field[ONSETS, n] = ONSET
+
+
+@leaf
+def least_distance(follower, field):
+    """Least distance of the near points at the tool's pose, voxels; h without any."""
+    rows = NEAR + follower.side * NEAR_ROWS
+    least = HALF_WIDTH
+    for m in range(follower.n_near):
+        least = min(least, field[rows + U, m])
+    return least
+
+
+@leaf
+def fix_onsets(follower, field, met):
+    """Let each point's contact begin where it is now, at most at the full onset."""
+    rows = NEAR + follower.side * NEAR_ROWS
+    for n in range(field.shape[1]):
+        field[ONSETS, n] = ONSET
+    for m in range(follower.n_near):
+        field[ONSETS, met[NEAR_POINTS + follower.side, m]] = min(field[rows + U, m], ONSET)

@@ -1,0 +1,101 @@
+"""The way of a step: in strides so short that no point can pass a surface unseen.
+
+Every stride is shorter than the lower bound of the distance of every point to every surface
+(`near_points`), along the exact screw motion of the step. So a point never gets from one side of a
+sheet to the other, however thin the sheet is and however fast the hand moves.
+"""
+
+import math
+
+import numpy as np
+
+from hapticdb.kernels._jit import leaf
+from hapticdb.kernels.hand.coupling import place_next
+from hapticdb.kernels.hand.near_points import NOT_KNOWN, OPEN, SHUT, look, settle
+from hapticdb.kernels.rigid import pose_of_quaternion
+
+STRIDE = 0.98
+"""Length of a stride, in lower bounds of the least distance. Larger: fewer looks; below 1, or the
+proof is lost."""
+LEAST_STRIDE = 0.02
+"""Voxels: the clearance that a stride counts with at least. Only points that lie in a surface have
+less."""
+SHORTEST = 0.02
+"""Share of a stride below which it is not halved any more. Smaller: more looks at an obstacle."""
+MOST_LOOKS = 96
+"""Most poses that a period looks at. Larger: a faster hand is followed in one period, and the worst
+period takes longer."""
+
+
+@leaf
+def place_on_way(tool, center, follower, done):
+    """Tool's pose at a share of the step, into tool.tried_pose -> position and quaternion."""
+    step = follower.step
+    return place_next(
+        tool.quaternion, center, tool.pose, tool.tried_pose, done,
+        step[0], step[1], step[2], step[3], step[4], step[5],
+    )  # fmt: skip
+
+
+@leaf
+def way_of_step(follower, radius, size):
+    """Way that no point exceeds in the whole step, voxels."""
+    step = follower.step
+    way = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
+    angle = math.sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
+    return (way + radius * angle) / size
+
+
+@leaf
+def stride_on(cells, which, shell, place, way, done, tool, follower, field, met, missed):
+    """Make one stride from share `done` of the step -> where the tool is then, and what was found.
+
+    SHUT: not even a short stride is allowed, or the period has no looks left.
+    """
+    stride = min(1.0 - done, STRIDE * max(follower.clearance, LEAST_STRIDE) / max(way, 1e-300))
+    part = stride
+    while part >= SHORTEST * stride and follower.n_looks < MOST_LOOKS:
+        end = 1.0 if part >= 1.0 - done else done + part
+        place_on_way(tool, shell.center, follower, end)
+        moved = way * (end - done)
+        found = look(
+            cells, which, shell, tool.tried_pose, place, follower.astray + moved, np.bool_(True),
+            follower, field, met, missed,
+        )  # fmt: skip
+        follower.astray = moved
+        if found == OPEN:
+            settle(follower, field, met)
+            return end, found
+        if found == NOT_KNOWN:
+            return done, found
+        part *= 0.5
+    return done, SHUT
+
+
+@leaf
+def keep_pose(tool, follower, px, py, pz, w, x, y, z):
+    """Make a pose the tool's, which the near points belong to."""
+    pose_of_quaternion(px, py, pz, w, x, y, z, tool.pose)
+    position, turned, looked_at = tool.position, tool.quaternion, follower.looked_at
+    position[0], position[1], position[2] = px, py, pz
+    turned[0], turned[1], turned[2], turned[3] = w, x, y, z
+    looked_at[0], looked_at[1], looked_at[2] = px, py, pz
+    looked_at[3], looked_at[4], looked_at[5], looked_at[6] = w, x, y, z
+
+
+@leaf
+def walk(cells, which, shell, place, radius, tool, follower, field, met, missed):
+    """Walk the step as far as the tool may go -> share of the step, and what the last look found.
+
+    radius, m: distance of the farthest point from the tool's centre.
+    """
+    way = way_of_step(follower, radius, place.size)
+    done, found = 0.0, OPEN
+    while done < 1.0 and found == OPEN:
+        done, found = stride_on(
+            cells, which, shell, place, way, done, tool, follower, field, met, missed
+        )
+    if done > 0.0:
+        px, py, pz, w, x, y, z = place_on_way(tool, shell.center, follower, done)
+        keep_pose(tool, follower, px, py, pz, w, x, y, z)
+    return done, found

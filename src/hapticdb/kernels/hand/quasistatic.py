@@ -1,0 +1,386 @@
+"""The quasi-static coupling: the tool is where spring and contacts balance, a period at a time.
+
+The tool has a pose and no velocity. Each period moves it to the pose that minimises the energy of
+the spring to the hand and of the contacts with the distance field (`step`), by Gauss-Newton steps
+that are walked in strides (`path`). The hand feels the spring. So it never feels more than the
+spring's stiffness, whatever the voxel size, the number of points and the contacts' stiffness.
+
+It needs resident cells with distances. Without distances `coupling.advance` takes its place.
+"""
+
+import math
+
+import numpy as np
+
+from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS, INTS2, entry, leaf, record_of
+from hapticdb.kernels.hand.body import begin_anew, is_finite, is_somewhere
+from hapticdb.kernels.hand.coupling import (
+    IS_CUT,
+    IS_DROPPED,
+    IS_FADING,
+    IS_HELD,
+    RISE_FRAMES,
+)
+from hapticdb.kernels.hand.device_spring import (
+    BEYOND_CAP,
+    DEVICE_SPRING,
+    STOPPING,
+    contact_stiffness,
+    lever_in_hand,
+    measure_pull,
+    push_of,
+)
+from hapticdb.kernels.hand.near_points import (
+    ABOUT,
+    ACTIVE,
+    ALONG,
+    FLOOR,
+    LAST_U,
+    NEAR,
+    NEAR_POINTS,
+    NEAR_ROWS,
+    NEVER,
+    NOT_KNOWN,
+    ONSETS,
+    OPEN,
+    SHUT,
+    U,
+    fix_onsets,
+    forget,
+    least_distance,
+    look,
+    look_anew,
+    settle,
+)
+from hapticdb.kernels.hand.path import MOST_LOOKS, keep_pose, place_on_way, walk, way_of_step
+from hapticdb.kernels.hand.steadying import (
+    MOST_FALL,
+    WINDOW,
+    begin_steady,
+    guard_stiffness,
+    hand_speed,
+    remember_hand,
+    soften_fall,
+)
+from hapticdb.kernels.hand.step import solve_step
+from hapticdb.kernels.records import FOLLOWER, SERVO
+from hapticdb.kernels.resident.cells import (
+    CELLS_WITH_DISTANCES,
+    CLUSTERS,
+    CONTACTS,
+    DEEPEST,
+    HITS,
+    PLACE,
+    READER_STRIDE,
+    REVISION,
+    WRENCH,
+    begin_frame,
+    end_frame,
+)
+from hapticdb.kernels.rigid import pose_of_quaternion
+
+IS_LOOSE, IS_SOFTER, IS_SNAPPING = 64, 128, 256
+"""Flags of a period, beside those of `coupling`: the tool lies in something and feels nothing; the
+guard has lowered the stiffness; the fall of the force is softened."""
+
+STEPS = 3
+"""Most Gauss-Newton steps of a period. Larger: sharper corners are followed in one period, and the
+worst period takes longer."""
+SETTLED = 5e-4
+"""Voxels: a step in which no point moves farther is not walked. Larger: fewer looks, and the force
+is wrong by the spring's stiffness times so much."""
+SHORT_CUT = 0.1
+"""Share of a step: if less of it was walked, the next step is braked. Larger: braked more often."""
+SUNK = 0.02
+"""Voxels by which a point must be nearer in a new version of the cells, and nearer than FLOOR, so
+that something was put upon the tool."""
+
+
+@leaf
+def has_moved(tool, follower):
+    """Whether the tool is not at the pose that the near points belong to."""
+    count = 0
+    for n in range(3):
+        count += tool.position[n] != follower.looked_at[n]
+    for n in range(4):
+        count += tool.quaternion[n] != follower.looked_at[3 + n]
+    return count > 0
+
+
+@leaf
+def meet_change(follower, field, met):
+    """Compare the last look with the one before, at the same pose in an older version of the cells.
+
+    Where a surface has come nearer, contact begins at the present distance, so that no force jumps.
+    Returns whether a point now lies in something.
+    """
+    near = NEAR_POINTS + 1 - follower.side
+    rows = NEAR + (1 - follower.side) * NEAR_ROWS
+    is_sunk = False
+    for m in range(follower.n_tried):
+        n, u = met[near, m], field[rows + U, m]
+        if u < field[LAST_U, n] - SUNK:
+            field[ONSETS, n] = min(field[ONSETS, n], u)
+            is_sunk = is_sunk or u < FLOOR - SUNK
+    return is_sunk
+
+
+@leaf
+def look_here(cells, which, shell, place, tool, follower, field, met, missed):
+    """Look at the tool where it is, at the start or in a new version -> whether all is known."""
+    is_first = tool.version == 0
+    if is_first:
+        forget(follower, field)
+        begin_steady(follower)
+        follower.is_loose = follower.is_braked = False
+    else:
+        look_anew(follower, field)
+    position, turned = tool.position, tool.quaternion
+    px, py, pz = position[0], position[1], position[2]
+    w, x, y, z = turned[0], turned[1], turned[2], turned[3]
+    pose_of_quaternion(px, py, pz, w, x, y, z, tool.tried_pose)
+    found = look(
+        cells, which, shell, tool.tried_pose, place, 0.0, np.bool_(False), follower, field, met,
+        missed,
+    )  # fmt: skip
+    if found == NOT_KNOWN:
+        return False
+    is_sunk = not has_moved(tool, follower) and meet_change(follower, field, met)
+    settle(follower, field, met)
+    keep_pose(tool, follower, px, py, pz, w, x, y, z)
+    if is_first:
+        fix_onsets(follower, field, met)
+        is_sunk = least_distance(follower, field) < FLOOR
+    follower.is_loose = follower.is_loose or is_sunk
+    return True
+
+
+@leaf
+def follow_loosely(cells, which, shell, place, spring, tool, hand, follower, field, met, missed):
+    """Put a tool that lies in something at the hand -> OPEN or NOT_KNOWN."""
+    measure_pull(spring, tool, hand, tool.pose, shell.center, follower)
+    for axis in range(6):
+        follower.step[axis] = follower.pull[axis]
+    way = way_of_step(follower, spring.radius, place.size)
+    px, py, pz, w, x, y, z = place_on_way(tool, shell.center, follower, 1.0)
+    found = look(
+        cells, which, shell, tool.tried_pose, place, follower.astray + way, np.bool_(False),
+        follower, field, met, missed,
+    )  # fmt: skip
+    follower.astray = way
+    if found == OPEN:
+        settle(follower, field, met)
+        keep_pose(tool, follower, px, py, pz, w, x, y, z)
+        follower.n_active = 0
+        if least_distance(follower, field) >= FLOOR:
+            follower.is_loose = False
+            fix_onsets(follower, field, met)
+    return found
+
+
+@leaf
+def follow(cells, which, shell, place, spring, tool, hand, follower, field, met, missed):
+    """Move the tool to where spring and contacts balance -> what the last look found.
+
+    SHUT: the tool is held back, by a surface or because the period has no looks left.
+    """
+    size, most = place.size, BEYOND_CAP * spring.cap
+    stiffness = contact_stiffness(spring, size)
+    at, turned = hand.position, hand.quaternion
+    found = OPEN
+    for n in range(STEPS + 1):
+        measure_pull(spring, tool, hand, tool.pose, shell.center, follower)
+        brake = STOPPING * most / size if follower.is_braked else 0.0
+        turn_brake = brake * spring.radius * spring.radius
+        solve_step(follower, field, met, size, stiffness, brake, turn_brake)
+        way = way_of_step(follower, spring.radius, size)
+        if n == STEPS or follower.n_looks >= MOST_LOOKS or way == 0.0:
+            break
+        if way < SETTLED and follower.n_active > 0:
+            break
+        done, found = walk(
+            cells, which, shell, place, spring.radius, tool, follower, field, met, missed
+        )
+        if found == NOT_KNOWN:
+            break
+        if done == 1.0 and follower.n_active == 0 and not follower.is_braked:
+            keep_pose(
+                tool, follower, at[0], at[1], at[2], turned[0], turned[1], turned[2], turned[3]
+            )
+        follower.is_braked = done < SHORT_CUT
+    return found
+
+
+@leaf
+def record_felt(follower, field, met, size, stiffness, felt):
+    """Contacts at the tool's pose: indices into met[0], wrench on the tool and counts into felt.
+
+    Hits are the near points that push or are about to; contacts are those that push.
+    """
+    rows, near = NEAR + follower.side * NEAR_ROWS, NEAR_POINTS + follower.side
+    deepest = 0.0
+    n_hits = n_contacts = 0
+    for n in range(felt.shape[0]):
+        felt[n] = 0.0
+    if not follower.is_loose:
+        for m in range(follower.n_near):
+            depth = size * (field[ONSETS, met[near, m]] - field[rows + U, m])
+            if depth <= 0.0 and field[ACTIVE, m] == 0.0:
+                continue
+            met[0, n_hits] = met[near, m]
+            n_hits += 1
+            if depth > 0.0:
+                n_contacts += 1
+                deepest = max(deepest, depth)
+                for axis in range(3):
+                    force = stiffness * depth
+                    felt[WRENCH + axis] += force * field[rows + ALONG + axis, m]
+                    felt[WRENCH + 3 + axis] += force * field[rows + ABOUT + axis, m]
+    felt[HITS], felt[CONTACTS], felt[DEEPEST] = n_hits, n_contacts, deepest
+
+
+@leaf
+def push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
+    """Wrench on the hand at the device, about the handle's origin, into wrench (6,) -> flags."""
+    for axis in range(6):
+        wrench[axis] = 0.0
+    force = 0.0
+    if is_felt:
+        wrench[0], wrench[1], wrench[2], wrench[3], wrench[4], wrench[5] = push_of(
+            spring, hand, center, follower
+        )
+        x, y, z = wrench[0], wrench[1], wrench[2]
+        force = math.sqrt(x * x + y * y + z * z)
+    flags = IS_SOFTER if guard_stiffness(follower, force, dt) else 0
+    if force > 0.0:
+        speed = hand_speed(follower, hand, x / force, y / force, z / force) / spring.scale
+        damped = force + min(max(-spring.damping * speed, -force), force)
+        damped = min(damped, spring.cap)
+        for axis in range(3):
+            wrench[axis] *= damped / force
+    rx, ry, rz = lever_in_hand(hand, center)
+    last, at = follower.last_hand, hand.position
+    x, y, z = at[0] + rx - last[0], at[1] + ry - last[1], at[2] + rz - last[2]
+    last[0], last[1], last[2] = at[0] + rx, at[1] + ry, at[2] + rz
+    way = math.sqrt(x * x + y * y + z * z) / spring.scale
+    allowed = MOST_FALL * dt + (spring.stiffness + spring.damping / WINDOW) * way
+    if soften_fall(tool.kept, wrench, allowed):
+        flags |= IS_SNAPPING
+    return flags
+
+
+@leaf
+def share_of_wrench(spring, tool, hand, is_held, dt):
+    """Share of the wrench that is sent: it fades while cells are unknown, and rises again."""
+    passed = dt / spring.fade
+    faded = 0.0
+    if is_held:
+        tool.held_for += dt
+        faded = faded_share(spring, tool.held_for)
+    else:
+        tool.risen *= 1.0 - faded_share(spring, tool.held_for)
+        tool.held_for = 0.0
+        if not hand.is_open:
+            tool.risen = min(tool.risen + min(passed, 1.0 / RISE_FRAMES), 1.0)
+    if hand.is_open:
+        tool.risen = max(tool.risen - passed, 0.0)
+    return (1.0 - faded) * tool.risen, faded > 0.0
+
+
+@leaf
+def faded_share(spring, seconds):
+    """Share, 0 to 1, by which a wrench has faded that was kept for so many seconds."""
+    return min(max((seconds - spring.hold) / spring.fade, 0.0), 1.0)
+
+
+@leaf
+def finish(spring, shell, place, tool, hand, follower, field, met, is_held, found, dt, wrench):
+    """Wrench for the device into wrench (6,), contacts into tool.felt -> flags of the period."""
+    flags, kept = 0, tool.kept
+    if is_held:
+        flags |= IS_HELD
+        follower.n_trail = 0  # a speed over a gap says nothing
+    else:
+        remember_hand(follower, hand, dt)
+        is_over = follower.n_looks >= MOST_LOOKS
+        is_felt = follower.n_active > 0 or (found == SHUT and not is_over)
+        is_felt = is_felt and not follower.is_loose
+        flags |= push_hand(spring, tool, hand, shell.center, follower, is_felt, dt, wrench)
+        for n in range(6):
+            kept[n] = wrench[n] if is_finite(wrench) else 0.0
+        record_felt(
+            follower, field, met, place.size, contact_stiffness(spring, place.size), tool.felt
+        )
+        flags |= IS_DROPPED if is_over else (IS_CUT if found == SHUT else 0)
+        flags |= IS_LOOSE if follower.is_loose else 0
+    share, is_fading = share_of_wrench(spring, tool, hand, is_held, dt)
+    flags |= IS_FADING if is_fading else 0
+    for n in range(6):
+        wrench[n] = share * kept[n]
+    return flags
+
+
+@entry(
+    CELLS_WITH_DISTANCES, INT, CLUSTERS, PLACE, DEVICE_SPRING, record_of(SERVO),
+    record_of(FOLLOWER), FLOAT, FLOATS2, INTS2, INTS,
+)  # fmt: skip
+def advance(
+    cells, reader, shell, place, spring, servo_record, follower_record, dt, field, met, missed
+):
+    """Move the tool for one period of dt seconds.
+
+    As `coupling.advance`, with these differences. The spring is a `DeviceSpring`. follower_record
+    () of FOLLOWER, field (FIELD_ROWS, N) float64 and met (MET_ROWS, N) int64 are the coupling's own
+    from period to period; it starts anew, whatever they hold, while `tool.version` is 0. The
+    caller may put the tool back to an earlier pose, but must not put back these three.
+
+    `sent.wrench` is the wrench for the device, in the device's units, about the handle's origin: a
+    force of min(k |x|, cap) against the way x from tool to hand, changed by the damper along it;
+    the torque is that of this force at the tool's centre, and of the turning spring. It is exactly
+    zero while no point touches or is held back. `tool.felt` has the contacts' wrench on the tool,
+    N and N m of the scene, and their counts. `sent.hits` points are in met[BEFORE]: those that
+    push, which `sent.contacts` counts, and those about to. `sent.deepest`: onset less distance, m.
+    """
+    dt = max(dt, 0.0)
+    which = begin_frame(cells, reader)
+    version = cells.readers[reader * READER_STRIDE]
+    servo, follower = servo_record[()], follower_record[()]
+    tool, hand, sent = servo.tool, servo.hand, servo.sent
+    is_hand = is_somewhere(hand)
+    is_held = hand.is_stale or not is_hand
+    if not (is_somewhere(tool) and is_finite(tool.kept) and math.isfinite(tool.held_for)):
+        begin_anew(tool)
+        if is_hand:
+            for n in range(3):
+                tool.position[n] = hand.position[n]
+            for n in range(4):
+                tool.quaternion[n] = hand.quaternion[n]
+    found = OPEN
+    follower.n_looks, follower.least_clearance = 0, NEVER
+    if not is_held:
+        if tool.version != version or has_moved(tool, follower):
+            if look_here(cells, which, shell, place, tool, follower, field, met, missed):
+                tool.version = version
+            else:
+                found = NOT_KNOWN
+        if found == OPEN:
+            if follower.is_loose:
+                found = follow_loosely(
+                    cells, which, shell, place, spring, tool, hand, follower, field, met, missed
+                )
+            else:
+                found = follow(
+                    cells, which, shell, place, spring, tool, hand, follower, field, met, missed
+                )
+    revision = cells.control[REVISION + which]  # before end_frame: then the buffer may be reused
+    end_frame(cells, reader)
+    is_held = is_held or found == NOT_KNOWN
+    sent.flags = finish(
+        spring, shell, place, tool, hand, follower, field, met, is_held, found, dt, sent.wrench
+    )
+    sent.hits = np.int64(tool.felt[HITS])
+    sent.contacts = np.int64(tool.felt[CONTACTS])
+    sent.unknown = follower.n_unknown if found == NOT_KNOWN else 0
+    sent.deepest = tool.felt[DEEPEST]
+    sent.n_steps = follower.n_looks
+    sent.revision = revision

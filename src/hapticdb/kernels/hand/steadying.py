@@ -1,0 +1,110 @@
+"""What keeps the force stable: damping along it, a guard against shaking, and soft snap-off."""
+
+import math
+
+from hapticdb.kernels._jit import leaf
+from hapticdb.kernels.records import MOST_TRAIL
+
+WINDOW = 4e-3
+"""Seconds over which the hand's speed is measured. Larger: later damping; at one sample of a
+device's steps the damper chatters."""
+TRAIL_STEP = WINDOW / (MOST_TRAIL - 8)
+"""Least seconds between two remembered places of the hand. It follows from `WINDOW`."""
+REVERSAL = 0.3
+"""Newtons by which a force must turn back to count as a reversal. Larger: smaller shaking is not
+seen."""
+FORGOTTEN = 0.1
+"""Seconds in which reversals are forgotten (the time constant). Larger: slower shaking is seen, and
+quick taps count, too."""
+MOST_REVERSALS = 3.0
+"""Reversals above which the guard acts. Larger: shaking lasts longer before it does."""
+SOFTER = 0.8
+"""Factor of the stiffness each time that the guard acts."""
+LEAST_SHARE = 0.1
+"""Least share of the stiffness that the guard leaves."""
+SHARE_RATE = 10.0
+"""Change of that share a second. Larger: the guard acts sooner, and the force changes faster."""
+MOST_FALL = 1000.0
+"""Newtons a second by which a force may fall beyond what the hand's own motion takes from it, when
+the tool snaps off an edge. Larger: sharper edges, harder snaps."""
+
+
+@leaf
+def begin_steady(follower):
+    """Start without memory of the hand, at the full stiffness."""
+    follower.n_trail = 0
+    follower.clock = follower.reversals = follower.extreme = 0.0
+    follower.share = follower.wanted_share = 1.0
+    follower.is_rising = True
+
+
+@leaf
+def remember_hand(follower, hand, dt):
+    """Add the handle's place to the trail."""
+    trail, position = follower.trail, hand.position
+    follower.clock += dt
+    newest = (follower.n_trail - 1) % MOST_TRAIL
+    if follower.n_trail > 0 and follower.clock - trail[newest, 0] < TRAIL_STEP:
+        return
+    at = follower.n_trail % MOST_TRAIL
+    trail[at, 0] = follower.clock
+    for axis in range(3):
+        trail[at, 1 + axis] = position[axis]
+    follower.n_trail += 1
+
+
+@leaf
+def hand_speed(follower, hand, x, y, z):
+    """Speed of the handle along the unit vector (x, y, z), m/s of the scene, over `WINDOW`."""
+    trail, position = follower.trail, hand.position
+    oldest = max(follower.n_trail - MOST_TRAIL, 0)
+    n = follower.n_trail - 1
+    while n > oldest and follower.clock - trail[n % MOST_TRAIL, 0] < WINDOW * (1.0 - 1e-6):
+        n -= 1
+    if n < 0:
+        return 0.0
+    at = n % MOST_TRAIL
+    passed = follower.clock - trail[at, 0]
+    if passed <= 0.0:
+        return 0.0
+    way = (position[0] - trail[at, 1]) * x
+    way += (position[1] - trail[at, 2]) * y
+    way += (position[2] - trail[at, 3]) * z
+    return way / passed
+
+
+@leaf
+def guard_stiffness(follower, force, dt):
+    """Count the force's reversals and lower the stiffness when there are many -> whether it did.
+
+    force: N, of the spring alone.
+    """
+    follower.reversals *= math.exp(-dt / FORGOTTEN)
+    ahead = force - follower.extreme
+    if (ahead >= 0.0) == follower.is_rising:
+        follower.extreme = force
+    elif abs(ahead) > REVERSAL:
+        follower.extreme, follower.is_rising = force, not follower.is_rising
+        follower.reversals += 1.0
+    has_acted = follower.reversals > MOST_REVERSALS and follower.wanted_share > LEAST_SHARE
+    if has_acted:
+        follower.reversals = 0.0
+        follower.wanted_share = max(SOFTER * follower.wanted_share, LEAST_SHARE)
+    follower.share = max(follower.share - SHARE_RATE * dt, follower.wanted_share)
+    return has_acted
+
+
+@leaf
+def soften_fall(kept, wrench, allowed):
+    """Limit the fall of force from kept (6,) to wrench (6,), in place -> whether it was limited.
+
+    allowed: the greatest fall, N. The torque falls by the same share of its way.
+    """
+    before = math.sqrt(kept[0] * kept[0] + kept[1] * kept[1] + kept[2] * kept[2])
+    after = math.sqrt(wrench[0] * wrench[0] + wrench[1] * wrench[1] + wrench[2] * wrench[2])
+    if before - after <= allowed:
+        return False
+    share = (before - after - allowed) / (before - after)
+    for axis in range(6):
+        wrench[axis] += share * (kept[axis] - wrench[axis])
+    return True

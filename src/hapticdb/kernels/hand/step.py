@@ -1,0 +1,152 @@
+"""One Gauss-Newton step of the quasi-static coupling over a predicted contact set.
+
+The tool's pose minimises E = psi(|e|; k, F) + psi(|theta|; k_R, T) + K/2 sum d_i^2 (physics: Wan
+and McNeely 2003, Barbic and James 2008), with the stretch e and the turn theta from tool to hand,
+and the depths d_i = s (onset_i - u_i). psi is quadratic up to its cap and linear beyond.
+"""
+
+import math
+
+from hapticdb.kernels._jit import leaf
+from hapticdb.kernels.hand.near_points import (
+    ABOUT,
+    ACTIVE,
+    ALONG,
+    NEAR,
+    NEAR_POINTS,
+    NEAR_ROWS,
+    ONSETS,
+    U,
+)
+
+ROUNDS = 6
+"""Most times that the equations of a step are solved until the contact set stays the same. Larger:
+the set is right more often in corners, and the worst period takes longer."""
+
+
+@leaf
+def add_row(follower, weight, depth, jx, jy, jz, ax, ay, az):
+    """Add a contact to the step's equations: weight J J^T to the lower triangle, weight d J."""
+    matrix, right = follower.matrix, follower.right
+    wx, wy, wz = weight * jx, weight * jy, weight * jz
+    bx, by, bz = weight * ax, weight * ay, weight * az
+    matrix[0, 0] += wx * jx
+    matrix[1, 0] += wy * jx
+    matrix[1, 1] += wy * jy
+    matrix[2, 0] += wz * jx
+    matrix[2, 1] += wz * jy
+    matrix[2, 2] += wz * jz
+    matrix[3, 0] += bx * jx
+    matrix[3, 1] += bx * jy
+    matrix[3, 2] += bx * jz
+    matrix[3, 3] += bx * ax
+    matrix[4, 0] += by * jx
+    matrix[4, 1] += by * jy
+    matrix[4, 2] += by * jz
+    matrix[4, 3] += by * ax
+    matrix[4, 4] += by * ay
+    matrix[5, 0] += bz * jx
+    matrix[5, 1] += bz * jy
+    matrix[5, 2] += bz * jz
+    matrix[5, 3] += bz * ax
+    matrix[5, 4] += bz * ay
+    matrix[5, 5] += bz * az
+    right[0] += wx * depth
+    right[1] += wy * depth
+    right[2] += wz * depth
+    right[3] += bx * depth
+    right[4] += by * depth
+    right[5] += bz * depth
+
+
+@leaf
+def factor(follower):
+    """Cholesky factor L of the step's matrix, in its lower triangle; step = L^-T L^-1 right."""
+    matrix, right, step = follower.matrix, follower.right, follower.step
+    for row in range(6):
+        for column in range(row + 1):
+            total = matrix[row, column]
+            for n in range(column):
+                total -= matrix[row, n] * matrix[column, n]
+            if row == column:
+                matrix[row, row] = math.sqrt(max(total, 1e-300))
+            else:
+                matrix[row, column] = total / matrix[column, column]
+    for row in range(6):
+        total = right[row]
+        for n in range(row):
+            total -= matrix[row, n] * step[n]
+        step[row] = total / matrix[row, row]
+    for back in range(6):
+        row = 5 - back
+        total = step[row]
+        for n in range(row + 1, 6):
+            total -= matrix[n, row] * step[n]
+        step[row] = total / matrix[row, row]
+
+
+@leaf
+def begin_equations(follower, extra, turn_extra):
+    """Set the step's equations to the springs alone, and `extra` stiffness that only brakes."""
+    matrix, right, pull = follower.matrix, follower.right, follower.pull
+    for row in range(6):
+        for column in range(row):
+            matrix[row, column] = 0.0
+    for axis in range(3):
+        matrix[axis, axis] = follower.spring + extra
+        matrix[3 + axis, 3 + axis] = follower.turn_spring + turn_extra
+        right[axis] = follower.spring * pull[axis]
+        right[3 + axis] = follower.turn_spring * pull[3 + axis]
+
+
+@leaf
+def predict_contacts(follower, field, met, size):
+    """Put the near points that the step leaves in depth into the contact set -> whether it changed.
+
+    The depth after the step is d_i - J_i . step, metres.
+    """
+    step = follower.step
+    sx, sy, sz, tx, ty, tz = step[0], step[1], step[2], step[3], step[4], step[5]
+    base = NEAR + follower.side * NEAR_ROWS
+    near = NEAR_POINTS + follower.side
+    n_changed = n_active = 0
+    for m in range(follower.n_near):
+        depth = size * (field[ONSETS, met[near, m]] - field[base + U, m])
+        depth -= field[base + ALONG, m] * sx + field[base + ALONG + 1, m] * sy
+        depth -= field[base + ALONG + 2, m] * sz + field[base + ABOUT, m] * tx
+        depth -= field[base + ABOUT + 1, m] * ty + field[base + ABOUT + 2, m] * tz
+        active = 1.0 if depth > 0.0 else 0.0
+        if active != field[ACTIVE, m]:
+            n_changed += 1
+            field[ACTIVE, m] = active
+        n_active += depth > 0.0
+    follower.n_active = n_active
+    return n_changed > 0
+
+
+@leaf
+def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
+    """Solve for the step (6,), m and rad about the centre, and its contact set.
+
+    stiffness: of a contact, N/m. follower.pull has e and theta, follower.spring and turn_spring
+    their stiffnesses, lowered where a cap is reached.
+    """
+    step = follower.step
+    base = NEAR + follower.side * NEAR_ROWS
+    near = NEAR_POINTS + follower.side
+    for axis in range(6):
+        step[axis] = 0.0
+    predict_contacts(follower, field, met, size)
+    for _ in range(ROUNDS):
+        begin_equations(follower, extra, turn_extra)
+        for m in range(follower.n_near):
+            if field[ACTIVE, m] == 0.0:
+                continue
+            add_row(
+                follower, stiffness, size * (field[ONSETS, met[near, m]] - field[base + U, m]),
+                field[base + ALONG, m], field[base + ALONG + 1, m], field[base + ALONG + 2, m],
+                field[base + ABOUT, m], field[base + ABOUT + 1, m], field[base + ABOUT + 2, m],
+            )  # fmt: skip
+        factor(follower)
+        if not predict_contacts(follower, field, met, size):
+            return

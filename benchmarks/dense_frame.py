@@ -1,7 +1,7 @@
 """The limit of a real-time frame: the same flat loop over one dense bitmap in memory.
 
 Voxel (i, j, k) is bit ``k & 31`` of word ``(i * side + j) * side / 32 + k / 32``. Arithmetic and
-order of sums equal those of `hapticdb.kernels.resident.cells.felt`; only the lookup differs.
+order of sums equal those of `hapticdb.kernels.resident.feeling.felt`; only the lookup differs.
 """
 
 import numpy as np

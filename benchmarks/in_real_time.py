@@ -29,7 +29,8 @@ from dense_frame import dense_bitmap, dense_feel
 from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.bench import records
-from hapticdb.kernels.resident.cells import BUFFERS, RESULTS, feel_kernel
+from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.mesh import read_file
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.resident.frames import ResidentFrames

@@ -6,7 +6,7 @@ The hits come from a plain set.
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 Triple = tuple[float, float, float]
 Voxel = tuple[int, int, int]
@@ -21,14 +21,25 @@ class NaiveTouch:
     hits: list[int]
     depths: list[float]
     pairs: list[tuple[int, int]]
+    apart: list[int] = field(default_factory=list)
+    """Felt points that are no hits."""
+    apart_depths: list[float] = field(default_factory=list)
+    near: list[tuple[int, int]] = field(default_factory=list)
+    """Felt points, each with every object that it touches, under the distance law."""
 
     @property
     def contacts(self) -> list[int]:
-        return [h for h, d in zip(self.hits, self.depths, strict=True) if d > 0]
+        return sorted(self.contact_depths)
+
+    @property
+    def contact_depths(self) -> dict[int, float]:
+        both = [*zip(self.hits, self.depths, strict=True)]
+        both += zip(self.apart, self.apart_depths, strict=True)
+        return {n: d for n, d in both if d > 0}
 
     @property
     def ids(self) -> list[int]:
-        return sorted({i for _, i in self.pairs})
+        return sorted({i for _, i in self.pairs} | {i for _, i in self.near})
 
 
 def transform(pose: list[list[float]], v: Triple, *, shift: bool) -> Triple:
@@ -68,7 +79,7 @@ def touch(
 ) -> NaiveTouch:
     """Look every point up in a dictionary of voxels and sum a law, the tangent plane by default."""
     found = NaiveTouch((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), [], [], [])
-    total = [0.0] * 6
+    total = Total()
     cm = transform(pose, center, shift=True)
     for n, (point, normal) in enumerate(zip(points, normals, strict=True)):
         p = transform(pose, point, shift=True)
@@ -86,16 +97,104 @@ def touch(
         found.pairs += [(n, i) for i in ids]
         if depth <= 0:
             continue
-        f = [stiffness * depth * x for x in nrm]
-        r = [a - b for a, b in zip(p, cm, strict=True)]
-        total[0] += f[0]
-        total[1] += f[1]
-        total[2] += f[2]
-        total[3] += r[1] * f[2] - r[2] * f[1]
-        total[4] += r[2] * f[0] - r[0] * f[2]
-        total[5] += r[0] * f[1] - r[1] * f[0]
-    if len(found.hits) >= 10:
-        total = [x / (len(found.hits) / 10.0) for x in total]
-    found.force = (total[0], total[1], total[2])
-    found.torque = (total[3], total[4], total[5])
+        total.add(p, nrm, cm, stiffness, depth)
+    found.force, found.torque = total.averaged(float(len(found.hits)))
+    return found
+
+
+class Total:
+    """Force and torque, point after point."""
+
+    def __init__(self) -> None:
+        self.sums = [0.0] * 6
+
+    def add(
+        self, p: Triple, normal: Triple, center: Triple, stiffness: float, depth: float
+    ) -> None:
+        f = [stiffness * depth * x for x in normal]
+        r = [a - b for a, b in zip(p, center, strict=True)]
+        self.sums[0] += f[0]
+        self.sums[1] += f[1]
+        self.sums[2] += f[2]
+        self.sums[3] += r[1] * f[2] - r[2] * f[1]
+        self.sums[4] += r[2] * f[0] - r[0] * f[2]
+        self.sums[5] += r[0] * f[1] - r[1] * f[0]
+
+    def averaged(self, weight: float) -> tuple[Triple, Triple]:
+        if weight >= 10:
+            self.sums = [x / (weight / 10.0) for x in self.sums]
+        fx, fy, fz, tx, ty, tz = self.sums
+        return (fx, fy, fz), (tx, ty, tz)
+
+
+# --- the distance law ----------------------------------------------------------------------------
+
+HALF_WIDTH, STEPS, ONSET, BLENDING = 2.75, 254, 1.5, 1.0
+Steps = Mapping[Voxel, int]
+"""Stored distances of one object at voxel centres; 254 and more, or nothing: far away."""
+
+
+def distance_at(where: Triple, fields: Collection[Steps]) -> float:
+    """u, voxels: the least step of all objects at each of 8 centres, interpolated.
+
+    where : the point in voxels from the grid's origin.
+    """
+    low = [math.floor(x - 0.5) for x in where]
+    part = [x - 0.5 - a for x, a in zip(where, low, strict=True)]
+
+    def corner(i: int, j: int, k: int) -> int:
+        at = (low[0] + i, low[1] + j, low[2] + k)
+        return min([STEPS, *(steps.get(at, STEPS) for steps in fields)])
+
+    def between(a: float, b: float, share: float) -> float:
+        return a + share * (b - a)
+
+    rows = [[between(corner(i, j, 0), corner(i, j, 1), part[2]) for j in (0, 1)] for i in (0, 1)]
+    plates = [between(row[0], row[1], part[1]) for row in rows]
+    return HALF_WIDTH / STEPS * between(plates[0], plates[1], part[0])
+
+
+def touch_distances(
+    ids_in: Mapping[Voxel, Collection[int]],
+    fields: Mapping[int, Steps],
+    points: list[Triple],
+    normals: list[Triple],
+    center: Triple,
+    pose: list[list[float]],
+    origin: Triple,
+    size: float,
+    side: int,
+    stiffness: float = 1000.0,
+    exclude: Collection[int] = (),
+) -> NaiveTouch:
+    """Sum the distance law; fields has the stored distances of each object."""
+    found = NaiveTouch((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), [], [], [])
+    total, weight = Total(), 0.0
+    cm = transform(pose, center, shift=True)
+    felt = {i: steps for i, steps in fields.items() if i not in exclude}
+    for n, (point, normal) in enumerate(zip(points, normals, strict=True)):
+        p = transform(pose, point, shift=True)
+        nrm = transform(pose, normal, shift=False)
+        voxel = voxel_of(p, origin, size)
+        if not all(0 <= v < side for v in voxel):
+            continue
+        x, y, z = ((a - o) / size for a, o in zip(p, origin, strict=True))
+        u = distance_at((x, y, z), felt.values())
+        depth = size * (ONSET - u)
+        weight += min(max((ONSET + BLENDING - u) / BLENDING, 0.0), 1.0)
+        ids = sorted(i for i in ids_in.get(voxel, ()) if i not in exclude)
+        if ids:
+            found.hits.append(n)
+            found.depths.append(max(depth, 0.0))
+            found.pairs += [(n, i) for i in ids]
+        if depth > 0:
+            if not ids:
+                found.apart.append(n)
+                found.apart_depths.append(depth)
+            own = {i: distance_at((x, y, z), [steps]) for i, steps in felt.items()}
+            near = {i for i, u in own.items() if size * (ONSET - u) > 0}
+            near = near or {min(i for i in own if own[i] == min(own.values()))}
+            found.near += [(n, i) for i in sorted(near | set(ids))]
+            total.add(p, nrm, cm, stiffness, depth)
+    found.force, found.torque = total.averaged(weight)
     return found

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from hapticdb import PointShell
 from hapticdb.grid import Grid
-from hapticdb.kernels.query import contact
+from hapticdb.kernels.query import contact, refining
 from hapticdb.query.law import TangentPlane
 from hapticdb.store.base import NO_KEYS, NO_OCCUPANCY, Keys, Layout, row_shift
 from peers import SAME, PeerWork, Pose
@@ -66,7 +66,7 @@ class RowPeer(ABC):
         found, occupancy = self.look_up(keys) if len(keys) else (NO_KEYS, NO_OCCUPANCY)
         ids = self._ids[: len(found)]
         law = TangentPlane().for_kernels
-        wrench, hits, *_ = contact.refine(
+        wrench, hits, *_ = refining.refine(
             placed, asked, keys, found, ids, occupancy, None, NO_KEYS, self._origin, size, law
         )
         return len(hits), wrench

@@ -19,7 +19,7 @@ LONG_FUNCTIONS = {
     "src/hapticdb/kernels/hand/coupling.py:advance": "one step of the coupling: smooth forces "
     "replace it",
     "src/hapticdb/kernels/hand/coupling.py:cut_back": "likewise",
-    "src/hapticdb/kernels/resident/cells.py:felt": "one pass over the points",
+    "src/hapticdb/kernels/resident/feeling.py:felt": "one pass over the points",
 }
 """Functions that may be longer than `MOST_LINES`, each with the reason."""
 

@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell, UsageError
 from hapticdb.kernels import law as kernels
-from hapticdb.kernels.query import contact
+from hapticdb.kernels.query import contact, refining
 from hapticdb.kernels.records import RESULTS
-from hapticdb.kernels.resident.cells import CONTACTS, HITS, feel_kernel
+from hapticdb.kernels.resident.cells import CONTACTS, HITS
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
@@ -51,9 +52,18 @@ class NearNumbers(NamedTuple):
     stiffness: float
 
 
-def sample(law, payload, at, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
-    """Distance that the payload has for a whole row or slot, voxels."""
-    return float(payload[at])
+def sample_rows(law, payload, counts, first, end, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
+    """Least distance that the payload has for a whole row, voxels."""
+    least = np.inf
+    for row in range(first, end):
+        if counts[row]:
+            least = min(least, float(payload[row, 0]))
+    return least
+
+
+def sample_slot(law, payload, slot, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
+    """Distance that the payload has for a whole slot, voxels."""
+    return float(payload[slot, 0])
 
 
 def reach(law):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
@@ -61,8 +71,20 @@ def reach(law):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
     return 1.0
 
 
+def felt_within(law):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
+    """Anywhere in a brick that holds a voxel: as far as its corners are from one another."""
+    return 8.0 * 3.0**0.5
+
+
 kernels.define(
-    NearNumbers, kernels.Leaves(penalty, reach=reach, sample_row=sample, sample_slot=sample)
+    NearNumbers,
+    kernels.Leaves(
+        penalty,
+        reach=reach,
+        felt_within=felt_within,
+        sample_rows=sample_rows,
+        sample_slot=sample_slot,
+    ),
 )
 
 
@@ -151,10 +173,10 @@ def test_a_payload_lets_a_law_feel_points_that_are_no_hits(env: Environment) -> 
     nothing = np.empty(0, dtype=np.int64)
     origin = np.array(grid.origin)
 
-    def refined(payload: NDArray[np.uint8]) -> contact.Refined:
-        return contact.refine(*located, *rows[:3], payload, nothing, origin, SIZE, law)
+    def refined(payload: NDArray[np.uint8]) -> refining.Refined:
+        return refining.refine(*located, *rows[:3], payload, nothing, origin, SIZE, law)
 
-    wrench, hits, _, _, apart, depths = refined(np.zeros(len(rows), dtype=np.uint8))
+    wrench, hits, _, _, apart, depths = refined(np.zeros((len(rows), 1), dtype=np.uint8))
     wanted = expected(shell, pose)
     is_near = np.isin(located.keys[located.asked[1]], rows.keys) & (located.asked[1] >= 0)
     assert hits.tolist() == wanted.hits
@@ -164,7 +186,7 @@ def test_a_payload_lets_a_law_feel_points_that_are_no_hits(env: Environment) -> 
     with CellTable.create(LEAST_BUDGET) as table:
         frames = ResidentFrames(Residency(env.store, table), shell, Penalty())
         frames.feel(pose[None])
-        cells = table.cells._replace(payload=np.zeros(table.n_slots, dtype=np.uint8))
+        cells = table.cells._replace(payload=np.zeros((table.n_slots, 1), dtype=np.uint8))
         out = np.zeros((1, RESULTS))
         place, met = frames.residency.place, np.empty(300, dtype=np.int64)
         with table.reading() as reader:
@@ -175,7 +197,7 @@ def test_a_payload_lets_a_law_feel_points_that_are_no_hits(env: Environment) -> 
     assert out[0, :6].tolist() == wrench.tolist()
     assert met[: int(out[0, HITS])].tolist() == wanted.hits
     assert out[0, CONTACTS] == is_near.sum()
-    far = refined(np.full(len(rows), 2, dtype=np.uint8))
+    far = refined(np.full((len(rows), 1), 2, dtype=np.uint8))
     assert far[1].tolist() == wanted.hits
     assert far[4].size == 0
     assert far[0].tolist() == [*wanted.force, *wanted.torque]

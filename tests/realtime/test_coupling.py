@@ -19,8 +19,8 @@ from hapticdb.kernels.resident.cells import (
     WRENCH,
     Cells,
     end_frame,
-    feel_kernel,
 )
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.testing import write_voxels
 from realtime.coupled import SIDE, SIZE, Tool, World, box, punch

@@ -13,15 +13,8 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.law import TangentPlaneLaw
-from hapticdb.kernels.resident.cells import (
-    HITS,
-    RESULTS,
-    UNKNOWNS,
-    WRENCH,
-    Cells,
-    Place,
-    feel_kernel,
-)
+from hapticdb.kernels.resident.cells import HITS, RESULTS, UNKNOWNS, WRENCH, Cells, Place
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.resident.frames import clusters_of
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Layout, Store

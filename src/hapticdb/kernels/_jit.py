@@ -8,7 +8,8 @@ configured.
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any
 
 import numba
@@ -36,8 +37,11 @@ A read-only array has another type than a writable one.
 
 ENTRIES: list[Any] = []
 """Every compiled entry, in order of definition."""
-SIGNATURES: dict[str, tuple[Any, ...]] = {}
-"""Types of the arguments of every entry, by its module and name: ``query.grouping.gap_rows``."""
+SIGNATURES: dict[str, tuple[tuple[Any, ...], ...]] = {}
+"""Types of the arguments of every entry, by its module and name: ``query.grouping.gap_rows``.
+
+An entry has one such tuple, or several when it is compiled for several laws.
+"""
 
 
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped
@@ -66,12 +70,18 @@ class _Cache(FunctionCache):  # type: ignore[misc]
             super().save_overload(sig, data)
 
 
-def entry(*signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:  # noqa: ANN401
+def entry(
+    *signature: Any,  # noqa: ANN401
+    also: Mapping[Any, Any] = MappingProxyType({}),
+) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Compile a kernel that Python calls with arguments of those types, when it is first called.
 
-    The kernel is cached on disk and runs without the interpreter lock. A call with other types is
-    correct, but slow the first time, because the kernel is compiled for them then.
+    `also` declares a second signature: the first one with some types exchanged. The kernel is
+    cached on disk and runs without the interpreter lock. A call with other types is correct, but
+    slow the first time, because the kernel is compiled for them then.
     """
+    second = tuple(also.get(kind, kind) for kind in signature)
+    signatures = (signature, second) if also else (signature,)
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         before = config.CACHE_DIR
@@ -84,7 +94,7 @@ def entry(*signature: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]
             config.CACHE_DIR = before
         ENTRIES.append(compiled)
         module = function.__module__.removeprefix("hapticdb.kernels.")
-        SIGNATURES[f"{module}.{function.__name__}"] = signature
+        SIGNATURES[f"{module}.{function.__name__}"] = signatures
         return compiled  # type: ignore[no-any-return]
 
     return decorate

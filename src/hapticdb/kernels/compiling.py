@@ -31,10 +31,11 @@ ENTRIES = {
     "hand.quasistatic": "advance",
     "surfaces.voxelize": "voxelize_kernel",
     "resident.clearance": "find_clearance cells_near",
-    "resident.cells": "feel_kernel bounding_spheres",
-    "query.contact": (
-        "locate_kernel spans_of_keys refine_kernel pairs_of_hits wrench_of_addresses depths_of_hits"
+    "resident.feeling": "feel_kernel bounding_spheres",
+    "query.refining": (
+        "refine_kernel pairs_of_hits pairs_of_contacts is_asked wrench_of_addresses depths_of_hits"
     ),
+    "query.contact": "locate_kernel spans_of_keys",
     "resident.cell_table": (
         "insert_cells remove_cells slots_of_cells fill_cells fill_distances "
         "curve_keys_of_cells cells_of_curve_keys slots_to_free publish oldest_version_read "
@@ -55,7 +56,7 @@ ENTRIES = {
 """Entries of each module; modules that take longest to compile come first. The names are listed
 here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
-TOGETHER = {"resident.cells": "hand.coupling"}
+TOGETHER = {"resident.feeling": "hand.coupling"}
 """Modules that are compiled after another module in the same process: they share its leaves."""
 LONGEST_S = 600.0
 """Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
@@ -75,7 +76,7 @@ _RANGES = ("query.grouping.ranges_of_box", "surfaces.bricks.brick_voxels_kernel"
 _COST = (
     "query.contact.locate_kernel",
     "query.contact.spans_of_keys",
-    "query.contact.wrench_of_addresses",
+    "query.refining.wrench_of_addresses",
     "query.grouping.gap_rows",
     "query.grouping.group_by_gap",
     "query.grouping.group_by_cost",
@@ -83,7 +84,7 @@ _COST = (
 )
 _RESIDENT = (
     "resident.cell_table.*",
-    "resident.cells.bounding_spheres",
+    "resident.feeling.bounding_spheres",
     "query.grouping.group_spans_by_cost",
     *_COST,
 )
@@ -93,7 +94,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "copy": ("surfaces.bricks.*", "curves.*", "query.grouping.gap_rows", *_RANGES),
     "shell": _SHELL,
     "calibrate": _COST,
-    "touch": (*_SHELL, *_COST, "query.contact.*"),
+    "touch": (*_SHELL, *_COST, "query.contact.*", "query.refining.*"),
     "resident": _RESIDENT,
     "feel": (
         *_SHELL,
@@ -105,11 +106,11 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "motion.*",
         "rigid.*",
     ),
-    "replay": (*_RESIDENT, "resident.cells.*", "rigid.poses_of"),
+    "replay": (*_RESIDENT, "resident.feeling.*", "rigid.poses_of"),
     "sweep": (
         *_SHELL,
         *_RESIDENT,
-        "resident.cells.*",
+        "resident.feeling.*",
         "resident.sweep.*",
         "resident.clearance.*",
         *_RANGES,
@@ -284,7 +285,8 @@ def _compile_here(name: str) -> None:
     compiled = getattr(_module_of(name), name.rpartition(".")[2])
     if not hasattr(compiled, "compile"):
         return  # the JIT is off
-    compiled.compile(importlib.import_module("hapticdb.kernels._jit").SIGNATURES[name])
+    for signature in importlib.import_module("hapticdb.kernels._jit").SIGNATURES[name]:
+        compiled.compile(signature)
     mark = _mark_of(name)
     if not mark.exists():
         with contextlib.suppress(OSError):

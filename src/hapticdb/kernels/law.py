@@ -10,8 +10,8 @@ functions in `Leaves` that `define` enters for its type. Kernels are compiled on
 law. One compiled kernel with a branch on a number in the law would be worse: every frame would pass
 the payload of every law, at 0.3 us an array, and a law could not be added from outside.
 
-A *payload* is what a law reads beside the occupancy: an array next to the rows of a frame, or next
-to the cells in memory. None stands for no payload and costs a frame nothing.
+A *payload* is what a law reads beside the occupancy: the distances of a frame's rows, or of the
+cells in memory (`hapticdb.kernels.field`). None stands for no payload and costs a frame nothing.
 """
 
 import math
@@ -30,8 +30,13 @@ NOTHING_NEAR = math.inf
 """Sample of a point when the payload holds nothing near the point."""
 
 
-def no_sample(law, payload, at, x, y, z):  # noqa: ARG001 - the arguments of every such leaf
-    """Sample of a law that reads no payload."""
+def no_sample_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001 - as every such leaf
+    """Sample, in rows, of a law that reads no payload."""
+    return NOTHING_NEAR
+
+
+def no_sample_of_slot(law, payload, slot, x, y, z):  # noqa: ARG001 - likewise
+    """Sample, in a resident cell, of a law that reads no payload."""
     return NOTHING_NEAR
 
 
@@ -49,15 +54,21 @@ class Leaves(NamedTuple):
         point that counts fully in the average, and 0 for a point that does not count.
     reach : (law) -> largest sample, in voxels, at which a point that is no hit may be felt. A point
         that is no hit is left out when its sample is above the reach.
-    sample_row, sample_slot : (law, payload, at, x, y, z) -> sample. The payload's value at the
-        point (x, y, z), in voxels from the grid's origin, in row `at` of the index table or in
-        slot `at` of the resident cells. Of several rows the least sample counts.
+    felt_within : (law) -> distance in voxels. A point that is at least so far from every occupied
+        voxel is no hit, and its sample is above the reach. Resident frames skip such points.
+    sample_rows : (law, payload, counts, first, end, x, y, z) -> sample of the point (x, y, z), in
+        voxels from the grid's origin. payload (R, 1000) uint8 are the distances of a frame's rows;
+        rows first .. end - 1 are those of the point's brick, one for each object near it; counts
+        (R,) bool is False for the rows of excluded objects.
+    sample_slot : (law, payload, slot, x, y, z) -> sample of the point in a slot of the resident
+        cells; payload (S, 34^3) uint8. It must be the same number as `sample_rows` gives.
     """
 
     respond: Callable[..., Any]
     reach: Callable[..., Any] = no_reach
-    sample_row: Callable[..., Any] = no_sample
-    sample_slot: Callable[..., Any] = no_sample
+    felt_within: Callable[..., Any] = no_reach
+    sample_rows: Callable[..., Any] = no_sample_of_rows
+    sample_slot: Callable[..., Any] = no_sample_of_slot
 
 
 LEAVES: dict[type, Leaves] = {}
@@ -69,9 +80,15 @@ def define(law_type: type, leaves: Leaves) -> None:
     LEAVES[law_type] = leaves
 
 
+def reads_distances(law: Any) -> bool:  # noqa: ANN401 - a NamedTuple of a type of its own
+    """Whether frames of that law need the distances of rows as its payload."""
+    return LEAVES[type(law)].sample_rows is not no_sample_of_rows
+
+
 respond = chosen_by_type(lambda law_type: LEAVES[law_type].respond)
 reach = chosen_by_type(lambda law_type: LEAVES[law_type].reach)
-sample_row = chosen_by_type(lambda law_type: LEAVES[law_type].sample_row)
+felt_within = chosen_by_type(lambda law_type: LEAVES[law_type].felt_within)
+sample_rows = chosen_by_type(lambda law_type: LEAVES[law_type].sample_rows)
 sample_slot = chosen_by_type(lambda law_type: LEAVES[law_type].sample_slot)
 
 

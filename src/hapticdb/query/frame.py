@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
-from hapticdb.kernels.query import contact
+from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
@@ -147,7 +147,7 @@ class HapticQuery:
         """Answer of a frame from its rows; rows of other poses may lie among them."""
         placed, asked, keys = located
         row_keys, row_ids, occupancy, _ = rows
-        wrench, hits, depths, ids, apart, apart_depths = contact.refine(
+        wrench, hits, depths, ids, apart, apart_depths = refining.refine(
             placed,
             asked,
             keys,
@@ -161,7 +161,7 @@ class HapticQuery:
             law.for_kernels,
         )
         pairs = partial(
-            contact.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
+            refining.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
         )
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         return Answer(
@@ -293,7 +293,7 @@ class HapticQuery:
             ordinals, ids = store.statement_hits(frame)
         pairs = np.stack([ordinals, ids], axis=1)
         hits = np.unique(ordinals)
-        depths = contact.depths_of_hits(placed, hits, self._origin, self._size)
+        depths = refining.depths_of_hits(placed, hits, self._origin, self._size)
         touched = np.unique(ids).tolist()
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)

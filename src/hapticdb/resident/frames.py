@@ -18,9 +18,8 @@ from hapticdb.kernels.resident.cells import (
     UNKNOWNS,
     WRENCH,
     Clusters,
-    bounding_spheres,
-    feel_kernel,
 )
+from hapticdb.kernels.resident.feeling import bounding_spheres, feel_kernel
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
 from hapticdb.query.law import ForceLaw, TangentPlane

@@ -50,8 +50,8 @@ from hapticdb.kernels.resident.cells import (
     WRENCH,
     begin_frame,
     end_frame,
-    felt,
 )
+from hapticdb.kernels.resident.feeling import felt
 from hapticdb.kernels.rigid import pose_of_quaternion, product, quaternion_by, turn, turn_of
 
 IS_HELD, IS_FADING, IS_DROPPED, IS_CUT, IS_STOPPED = 1, 2, 8, 16, 32

@@ -33,10 +33,10 @@ from hapticdb.kernels.resident.cells import (
     cell_key,
     column_of,
     end_frame,
-    free_runs,
     place_in_set,
     slot_of,
 )
+from hapticdb.kernels.resident.feeling import free_runs
 from hapticdb.kernels.rigid import (
     moved,
     pose_of_quaternion,

@@ -98,7 +98,7 @@ END $$""",
 # The paper's force(point, z_val). A hit carries what the tangent-plane law needs, so that one
 # statement serves any shell, pose and stiffness; the aggregate collects hits and computes at the
 # end, in one query over the array: at 220 hits half the time of a step function in plpgsql.
-# Sums start at 0 and run in the order of the hits, with the products of kernels/query/contact.py:
+# Sums start at 0 and run in the order of the hits, with the products of kernels/query/refining.py:
 # the wrench is the same bit for bit.
 FORCE = (
     """

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
 from hapticdb.kernels import law as laws
-from hapticdb.kernels.query import contact
+from hapticdb.kernels.query import refining
 from hapticdb.store import believed
 from hapticdb.store.base import BRICK_BYTES, Layout, LocatedShell, row_shift
 
@@ -93,7 +93,7 @@ class _Force:
         if self._frame is None:
             return bytes(48)
         hits = np.array(sorted(self._hits), dtype=np.int64)
-        wrench: NDArray[np.float64] = contact.wrench_of_addresses(
+        wrench: NDArray[np.float64] = refining.wrench_of_addresses(
             self._frame.placed,
             hits[:, 0].copy(),
             hits[:, 1].copy(),

@@ -1,0 +1,152 @@
+"""The distance law: a point is felt by its distance to the nearest surface.
+
+With u the distance at a point, d = s max(0, `ONSET` - u) and F = K sum d n, where s is the voxel
+size and n the point's inward normal. Each point counts clamp((ONSET + BLENDING - u) / BLENDING, 0,
+1) in the frame's average, so that force does not jump where a point comes near. The stored
+distances are interpolated by `trilinear` between the 8 voxel centres around the point. At each
+centre the least distance of all objects counts, and the interpolation comes after that. A frame on
+rows and a frame on resident cells do the same arithmetic with the same 8 numbers, so they agree bit
+for bit.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticdb.kernels._jit import FLOAT, fields_of, leaf
+from hapticdb.kernels.field.lattice import (
+    CELL_SIDE,
+    HALF_WIDTH,
+    ROW_SIDE,
+    STEPS,
+    VOXELS_A_STEP,
+    cell_place,
+    row_place,
+    trilinear,
+)
+from hapticdb.kernels.law import Leaves, define
+
+ONSET = 1.5
+"""delta, voxels: the distance at which a point begins to be felt.
+
+Trilinear distances are exact to 0.016 voxels down to 0.7 (physics.md), so the force is smooth for
+the first 0.8 voxels of depth. Larger: smoother deep forces, and contact earlier before the surface.
+"""
+BLENDING = 1.0
+"""r, voxels: beyond the onset, the width in which a point's weight in the average falls to 0.
+
+Larger: smoother forces at the edges of a tool, and more points that lower the average before they
+push. `ONSET` + `BLENDING` must stay below `HALF_WIDTH`, where nothing is known any more.
+"""
+REACH = ONSET + BLENDING
+"""Largest distance of a point that counts in the average, voxels."""
+LARGEST_ERROR = 0.5 * VOXELS_A_STEP
+"""Largest rounding error of a stored distance, voxels."""
+FELT_WITHIN = min(
+    HALF_WIDTH + math.sqrt(3.0),
+    HALF_WIDTH + 3.0 / (16.0 * (HALF_WIDTH - LARGEST_ERROR - REACH)),
+)
+"""A point that is this far from every surface, in voxels, has u > `REACH`: it feels nothing.
+
+Proof. Let D be the true distance at the point, t_i the squared distance of centre i from the point,
+w_i its trilinear weight, h = `HALF_WIDTH` and e = `LARGEST_ERROR`. A distance is 1-Lipschitz, so
+the stored value at centre i is at least min(D - sqrt(t_i), h) - e. For D > h and g = D - h this is
+at least h - t_i / (4 g) - e, because g + t / (4 g) >= sqrt(t). On each axis the squares of the
+distances, weighted, add up to f (1 - f) <= 1/4, so sum w_i t_i <= 3/4. Hence u >= h - 3 / (16 g) -
+e, which is above the reach for g > 3 / (16 (h - e - reach)). For D > h + sqrt(3) all 8 centres are
+beyond h, and u = h.
+"""
+
+
+class DistanceFieldLaw(NamedTuple):
+    """Distance law. stiffness: K, N/m."""
+
+    stiffness: float
+
+
+DISTANCE_FIELD = fields_of(DistanceFieldLaw, FLOAT)
+
+
+@leaf
+def distance_between(q000, q001, q010, q011, q100, q101, q110, q111, x, y, z):
+    """Distance u, voxels, between 8 stored values, at most `STEPS`; x, y, z from centre 000."""
+    return VOXELS_A_STEP * trilinear(q000, q001, q010, q011, q100, q101, q110, q111, x, y, z)
+
+
+def least_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001
+    """U at a point, in voxels from the grid's origin, from rows first .. end - 1 of its brick.
+
+    payload (R, 1000) uint8; rows that do not count are left out; h without a row.
+    """
+    x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
+    at = row_place(
+        np.int64(x0) - (np.int64(x) & -8),
+        np.int64(y0) - (np.int64(y) & -8),
+        np.int64(z0) - (np.int64(z) & -8),
+    )
+    q000 = q001 = q010 = q011 = q100 = q101 = q110 = q111 = np.int64(STEPS)
+    for row in range(first, end):
+        if counts[row]:
+            q000 = min(q000, np.int64(payload[row, at]))
+            q001 = min(q001, np.int64(payload[row, at + 1]))
+            q010 = min(q010, np.int64(payload[row, at + ROW_SIDE]))
+            q011 = min(q011, np.int64(payload[row, at + ROW_SIDE + 1]))
+            q100 = min(q100, np.int64(payload[row, at + ROW_SIDE * ROW_SIDE]))
+            q101 = min(q101, np.int64(payload[row, at + ROW_SIDE * ROW_SIDE + 1]))
+            q110 = min(q110, np.int64(payload[row, at + ROW_SIDE * (ROW_SIDE + 1)]))
+            q111 = min(q111, np.int64(payload[row, at + ROW_SIDE * (ROW_SIDE + 1) + 1]))
+    return distance_between(
+        q000, q001, q010, q011, q100, q101, q110, q111, x - 0.5 - x0, y - 0.5 - y0, z - 0.5 - z0
+    )
+
+
+def at_slot(law, payload, slot, x, y, z):  # noqa: ARG001
+    """U at a point, in voxels from the grid's origin, from its cell; payload (S, 34^3) uint8."""
+    x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
+    at = cell_place(
+        np.int64(x0) - (np.int64(x) & -32),
+        np.int64(y0) - (np.int64(y) & -32),
+        np.int64(z0) - (np.int64(z) & -32),
+    )
+    most = np.int64(STEPS)
+    return distance_between(
+        min(most, np.int64(payload[slot, at])),
+        min(most, np.int64(payload[slot, at + 1])),
+        min(most, np.int64(payload[slot, at + CELL_SIDE])),
+        min(most, np.int64(payload[slot, at + CELL_SIDE + 1])),
+        min(most, np.int64(payload[slot, at + CELL_SIDE * CELL_SIDE])),
+        min(most, np.int64(payload[slot, at + CELL_SIDE * CELL_SIDE + 1])),
+        min(most, np.int64(payload[slot, at + CELL_SIDE * (CELL_SIDE + 1)])),
+        min(most, np.int64(payload[slot, at + CELL_SIDE * (CELL_SIDE + 1) + 1])),
+        x - 0.5 - x0,
+        y - 0.5 - y0,
+        z - 0.5 - z0,
+    )
+
+
+def below_onset(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # noqa: ARG001
+    """Depth below the onset in metres, negative above it, and the weight in the average."""
+    return size * (ONSET - sample), min(max((REACH - sample) / BLENDING, 0.0), 1.0)
+
+
+def reach_of(law):  # noqa: ARG001
+    """Distance up to which a point counts, voxels."""
+    return REACH
+
+
+def felt_within_of(law):  # noqa: ARG001
+    """Distance from all voxels from which on nothing is felt: no surface lies nearer than these."""
+    return FELT_WITHIN
+
+
+define(
+    DistanceFieldLaw,
+    Leaves(
+        respond=below_onset,
+        reach=reach_of,
+        felt_within=felt_within_of,
+        sample_rows=least_of_rows,
+        sample_slot=at_slot,
+    ),
+)

@@ -1,0 +1,374 @@
+"""From rows to a wrench: drop the false hits of a frame, and sum what its points feel.
+
+Every sum runs in the order of the shell's points and every product is written out, so that each
+strategy, layout, curve and engine gives the same wrench bit for bit (numba contracts no
+multiplication and addition without fastmath, which this package never sets).
+"""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import (
+    BYTES2,
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    INT,
+    INTS,
+    INTS2,
+    NONE,
+    READ_BYTES,
+    entry,
+    inlined,
+    leaf,
+)
+from hapticdb.kernels.field.law import DISTANCE_FIELD
+from hapticdb.kernels.law import (
+    NOTHING_NEAR,
+    TANGENT_PLANE,
+    accumulate,
+    average_into,
+    depth_below_plane,
+    reach,
+    respond,
+    sample_rows,
+)
+from hapticdb.kernels.query.contact import center_of, voxel_at
+from hapticdb.kernels.query.sorting import insert_distinct
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+Refined = tuple[Floats, Ints, Floats, Ints, Ints, Floats]
+"""What `refine` returns.
+
+wrench (6,): N and N m about the centre, world frame; hits (H,): indices of the shell's points
+inside a voxel, ascending; depths (H,): depth of each hit in metres, 0 where the law feels nothing;
+ids (I,): objects that the hits are in, and those that felt points touch, ascending; apart (A,):
+points that the law feels although they are no hits, ascending; apart_depths (A,): their depths in
+metres, above 0.
+"""
+NO_POINTS = np.empty(0, dtype=np.int64)
+NO_DEPTHS = np.empty(0)
+
+
+@leaf
+def rows_of_keys(keys, row_keys):
+    """Where the rows of each asked key begin and end, (U,) int64 each.
+
+    One merge of two ascending lists; rows of keys that were not asked for are the false hits.
+    """
+    total = keys.shape[0]
+    starts = np.empty(total, dtype=np.int64)
+    ends = np.empty(total, dtype=np.int64)
+    n_rows = row_keys.shape[0]
+    row = 0
+    for n in range(total):
+        key = keys[n]
+        while row < n_rows and row_keys[row] < key:
+            row += 1
+        starts[n] = row
+        while row < n_rows and row_keys[row] == key:
+            row += 1
+        ends[n] = row
+    return starts, ends
+
+
+@leaf
+def counting_rows(row_ids, exclude):
+    """Mask (R,) bool of the rows whose objects are not excluded."""
+    counts = np.empty(row_ids.shape[0], dtype=np.bool_)
+    for row in range(row_ids.shape[0]):
+        counts[row] = True
+    if exclude.shape[0] > 0:
+        for row in range(row_ids.shape[0]):
+            for n in range(exclude.shape[0]):
+                if exclude[n] == row_ids[row]:
+                    counts[row] = False
+    return counts
+
+
+@inlined
+def has_voxel(occupancy, row, address):
+    """Whether a row has the voxel of an address; always true for a voxel row (no occupancy)."""
+    if occupancy.shape[0] == 0:
+        return True
+    return (occupancy[64 * row + ((address & 511) >> 3)] >> (address & 7)) & 1 != 0
+
+
+@inlined
+def distinct_ids(touched, row_ids, met, start):
+    """Write the distinct ids of touched rows into met[start:], ascending -> number of ids."""
+    count = np.int64(0)
+    for row in range(row_ids.shape[0]):
+        if touched[row]:
+            count = insert_distinct(met, start, count, row_ids[row])
+    return count
+
+
+@inlined
+def touch_near_rows(
+    law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
+    px, py, pz, nx, ny, nz, cx, cy, cz, size,
+):  # fmt: skip
+    """Mark the rows of the objects that a felt point touches, by each object's own sample.
+
+    These are the objects that the point would feel alone. Between two objects the least distances,
+    interpolated, may be below the onset although each object's own distance is not: then it is the
+    nearest object. Nothing is marked under a law without samples, which feels hits alone.
+    """
+    if sample <= reach(law):
+        n_touched = np.int64(0)
+        nearest = np.int64(-1)
+        least = NOTHING_NEAR
+        for row in range(first, end):
+            if counts[row]:
+                own = sample_rows(law, payload, counts, row, row + 1, x, y, z)
+                if own < least:
+                    least = own
+                    nearest = np.int64(row)
+                if own <= reach(law):
+                    depth, _ = respond(
+                        law, is_hit, own, px, py, pz, nx, ny, nz, cx, cy, cz, size
+                    )  # fmt: skip
+                    if depth > 0.0:
+                        touched[row] = True
+                        n_touched += 1
+        if n_touched == 0:
+            touched[nearest] = True
+
+
+@entry(
+    FLOATS2,
+    INTS2,
+    INTS,
+    INTS,
+    INTS,
+    READ_BYTES,
+    NONE,
+    INTS,
+    FLOATS,
+    FLOAT,
+    TANGENT_PLANE,
+    FLOATS,
+    INTS,
+    also={NONE: BYTES2, TANGENT_PLANE: DISTANCE_FIELD},
+)
+def refine_kernel(
+    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law,
+    felt, met,
+):  # fmt: skip
+    """`refine` into felt (6 + N,) and met (N + R,) -> P, A and I.
+
+    P points are hits, or felt, or both; A of them are felt only. felt takes the wrench and the P
+    depths; met takes the P indices (~n for a point n that is no hit), then the I ids.
+    """
+    total = asked.shape[1]
+    touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
+    starts, ends = rows_of_keys(keys, row_keys)
+    counts = counting_rows(row_ids, exclude)
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    mx, my, mz = placed[total, 0], placed[total, 1], placed[total, 2]
+    fx = fy = fz = tx = ty = tz = weight = 0.0
+    count = n_apart = np.int64(0)
+    for n in range(total):
+        at = asked[1, n]
+        if at < 0:
+            continue
+        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
+        first, end = starts[at], ends[at]
+        if first == end:
+            continue
+        x, y, z = (px - ox) / size, (py - oy) / size, (pz - oz) / size
+        sample = sample_rows(law, payload, counts, first, end, x, y, z)
+        is_hit = False
+        for row in range(first, end):
+            if counts[row] and has_voxel(occupancy, row, asked[0, n]):
+                is_hit = True
+                touched[row] = True
+        if not is_hit and not sample <= reach(law):
+            continue
+        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
+        cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
+        depth, share = respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+        weight += share
+        if is_hit or depth > 0.0:
+            met[count] = n if is_hit else ~n
+            felt[6 + count] = max(depth, 0.0)
+            count += 1
+            n_apart += not is_hit
+        if depth > 0.0:
+            touch_near_rows(
+                law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
+                px, py, pz, nx, ny, nz, cx, cy, cz, size,
+            )  # fmt: skip
+            fx, fy, fz, tx, ty, tz = accumulate(
+                fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
+            )
+    average_into(felt, weight, fx, fy, fz, tx, ty, tz)
+    return count, n_apart, distinct_ids(touched, row_ids, met, count)
+
+
+def refine(
+    placed: Floats,
+    asked: Ints,
+    keys: Ints,
+    row_keys: Ints,
+    row_ids: Ints,
+    occupancy: NDArray[np.uint8],
+    payload: NDArray[np.uint8] | None,
+    exclude: Ints,
+    origin: Floats,
+    size: float,
+    law: Any,  # noqa: ANN401 - a NamedTuple that `kernels.law` knows
+) -> Refined:
+    """Drop the false hits of a frame's rows and sum the wrench of the points that are felt.
+
+    placed, asked, keys as `locate` returns them; row_keys (R,) int64 ascending, row_ids (R,) int64,
+    occupancy (64 R,) uint8, or empty for voxel rows; payload (R, 1000) uint8, the rows' distances,
+    or None for a law that reads none; exclude (E,) int64; origin (3,) and size of a voxel, metres.
+    """
+    total = asked.shape[1]
+    felt = np.empty(6 + total)
+    met = np.empty(total + row_ids.shape[0], dtype=np.int64)
+    n_points, n_apart, n_ids = refine_kernel(
+        placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law,
+        felt, met,
+    )  # fmt: skip
+    ids = met[n_points : n_points + n_ids]
+    if n_apart == 0:
+        return felt[:6], met[:n_points], felt[6 : 6 + n_points], ids, NO_POINTS, NO_DEPTHS
+    points, depths = met[:n_points], felt[6 : 6 + n_points]
+    is_hit = points >= 0
+    return felt[:6], points[is_hit], depths[is_hit], ids, ~points[~is_hit], depths[~is_hit]
+
+
+@entry(INTS2, INTS, INTS, INTS, READ_BYTES, INTS, INTS)
+def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
+    """Every (shell point, object) pair of a frame's hits, (P, 2) int64, ordered by both."""
+    starts, ends = rows_of_keys(keys, row_keys)
+    counts = counting_rows(row_ids, exclude)
+    most = 0
+    for h in range(hits.shape[0]):
+        at = asked[1, hits[h]]
+        most += ends[at] - starts[at]
+    pairs = np.empty((most, 2), dtype=np.int64)
+    count = 0
+    for h in range(hits.shape[0]):
+        n = hits[h]
+        at = asked[1, n]
+        for row in range(starts[at], ends[at]):
+            if counts[row] and has_voxel(occupancy, row, asked[0, n]):
+                pairs[count, 0] = n
+                pairs[count, 1] = row_ids[row]
+                count += 1
+    return pairs[:count]
+
+
+@entry(
+    FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, BYTES2, INTS, FLOATS, FLOAT, DISTANCE_FIELD, INTS
+)  # fmt: skip
+def pairs_of_contacts(
+    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law, contacts
+):
+    """Every (felt point, object) pair of a frame, (P, 2) int64, ordered by both.
+
+    A felt point touches the objects in whose voxel it is, and those of `touch_near_rows`. contacts
+    (C,) are the felt points; the other arguments are those of `refine`.
+    """
+    starts, ends = rows_of_keys(keys, row_keys)
+    counts = counting_rows(row_ids, exclude)
+    touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    most = 0
+    for c in range(contacts.shape[0]):
+        at = asked[1, contacts[c]]
+        most += ends[at] - starts[at]
+    pairs = np.empty((most, 2), dtype=np.int64)
+    count = 0
+    for c in range(contacts.shape[0]):
+        n = contacts[c]
+        at = asked[1, n]
+        first, end = starts[at], ends[at]
+        is_hit = False
+        for row in range(first, end):
+            touched[row] = counts[row] and has_voxel(occupancy, row, asked[0, n])
+            is_hit |= touched[row]
+        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
+        x, y, z = (px - ox) / size, (py - oy) / size, (pz - oz) / size
+        sample = sample_rows(law, payload, counts, first, end, x, y, z)
+        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
+        cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
+        touch_near_rows(
+            law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
+            px, py, pz, nx, ny, nz, cx, cy, cz, size,
+        )  # fmt: skip
+        for row in range(first, end):
+            if touched[row]:
+                pairs[count, 0] = n
+                pairs[count, 1] = row_ids[row]
+                count += 1
+    return pairs[:count]
+
+
+@entry(INTS, INTS)
+def is_asked(keys, row_keys):
+    """Mask (R,) bool of the rows whose key is among those that a shell asks for: no false hits.
+
+    keys (U,) and row_keys (R,) int64, both ascending.
+    """
+    found = np.empty(row_keys.shape[0], dtype=np.bool_)
+    at = 0
+    for row in range(row_keys.shape[0]):
+        while at < keys.shape[0] and keys[at] < row_keys[row]:
+            at += 1
+        found[row] = at < keys.shape[0] and keys[at] == row_keys[row]
+    return found
+
+
+@entry(FLOATS2, INTS, INTS, FLOATS, FLOAT, INT, INT, INT, TANGENT_PLANE)
+def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, shift, law):
+    """Wrench (6,) of hits given as ordinals (H,), ascending, and addresses (H,) int64.
+
+    The paper's ``force(point, z_val)``: the voxel's centre comes from the address alone. For laws
+    that read no payload.
+    """
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    last = placed.shape[0] - 1
+    mx, my, mz = placed[last, 0], placed[last, 1], placed[last, 2]
+    fx = fy = fz = tx = ty = tz = weight = 0.0
+    for h in range(ordinals.shape[0]):
+        i, j, k = voxel_at(addresses[h], bits, curve, shift)
+        n = ordinals[h]
+        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
+        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
+        cx = ox + size * (i + 0.5)
+        cy = oy + size * (j + 0.5)
+        cz = oz + size * (k + 0.5)
+        depth, share = respond(law, True, NOTHING_NEAR, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+        weight += share
+        if depth > 0.0:
+            fx, fy, fz, tx, ty, tz = accumulate(
+                fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
+            )
+    wrench = np.empty(6)
+    average_into(wrench, weight, fx, fy, fz, tx, ty, tz)
+    return wrench
+
+
+@entry(FLOATS2, INTS, FLOATS, FLOAT)
+def depths_of_hits(placed, hits, origin, size):
+    """Depths (H,) in metres of hits (H,) int64, 0 where the point is above its tangent plane."""
+    depths = np.empty(hits.shape[0])
+    ox, oy, oz = origin[0], origin[1], origin[2]
+    for h in range(hits.shape[0]):
+        n = hits[h]
+        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
+        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
+        cx = center_of(px, ox, size)
+        cy = center_of(py, oy, size)
+        cz = center_of(pz, oz, size)
+        depths[h] = max(depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz), 0.0)
+    return depths

@@ -43,7 +43,7 @@ class Source:
             raise UsageError(f"{env.url} is in {env.grid.curve} order: copies need z order")
         parts = []
         for obj in env.objects():
-            ranges = object_ranges(env.grid, env.layout, obj.bounds)
+            ranges = object_ranges(env.grid, env.layout, obj)
             parts.append((obj, env.store.rows_of(obj.id, *ranges)))
         return cls(env.grid, env.layout, tuple(parts))
 

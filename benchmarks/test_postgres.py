@@ -230,7 +230,7 @@ def test_forms_of_a_lookup(
 ) -> None:
     """Keys as one array for an index scan, or as rows of a join with one descent for each."""
     session = served.session(layout)
-    text = {"any": statements.LOOKUP, "join": JOINED}[form][layout]
+    text = statements.LOOKUP[layout] if form == "any" else JOINED[layout]
     shift = row_shift(layout)
     asked = [
         wire.int8s(np.unique(frame.addresses[frame.addresses >= 0] >> shift))

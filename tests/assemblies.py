@@ -109,7 +109,7 @@ def voxel_set(ijk: NDArray[np.int64]) -> set[Voxel]:
     return found
 
 
-TABLES = ("environment", "object", "voxel", "brick", "change", "quantile")
+TABLES = ("environment", "object", "voxel", "brick", "band", "change", "quantile")
 
 
 def rows_of(database: Path, *tables: str) -> Rows:

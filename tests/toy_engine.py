@@ -25,7 +25,6 @@ from hapticdb.errors import (
 )
 from hapticdb.grid import Grid
 from hapticdb.store.base import (
-    NO_OCCUPANCY,
     NO_ROWS,
     Change,
     Covering,
@@ -37,13 +36,12 @@ from hapticdb.store.base import (
     Rows,
     Size,
     Store,
-    check_unwritten,
-    no_object,
-    present_already,
     touched_ranges,
 )
-from hapticdb.store.believed import rows_crc
+from hapticdb.store.batches import joined
+from hapticdb.store.believed import distances_crc, rows_crc
 from hapticdb.store.engines import Capability
+from hapticdb.store.refusals import check_distances, check_unwritten, no_object, present_already
 from hapticdb.store.threads import check_thread, this_thread
 
 
@@ -66,34 +64,30 @@ class State:
 
     @cached_property
     def rows(self) -> Rows:
-        """Rows of all objects, in order of key and id."""
-        parts = [rows for _, rows in self.objects.values() if len(rows)]
-        if not parts:
-            return NO_ROWS
-        keys = np.concatenate([part.keys for part in parts])
-        ids = np.concatenate([part.ids for part in parts])
-        order = np.lexsort((ids, keys))
-        bits = np.concatenate([part.occupancy for part in parts])
-        return picked(Rows(keys, ids, bits), order)
+        """Rows of the index table, in order of key and id."""
+        return in_order([rows.occupied() for _, rows in self.objects.values()])
+
+    @cached_property
+    def distances(self) -> Rows:
+        """Rows of the objects that have distances, in order of key and id."""
+        held = [rows for obj, rows in self.objects.values() if obj.has_distances]
+        return in_order(held, distances=True)
 
 
-def picked(rows: Rows, which: Keys) -> Rows:
-    """The rows at the given places of a batch."""
-    if not len(which):
-        return NO_ROWS
-    bits = NO_OCCUPANCY
-    if rows.occupancy.size:
-        bits = np.frombuffer(rows.occupancy.reshape(-1, 64)[which].tobytes(), np.uint8)
-    return Rows(rows.keys[which], rows.ids[which], bits)
+def in_order(parts: list[Rows], *, distances: bool = False) -> Rows:
+    """Rows of several objects, in order of key and id."""
+    rows = joined(parts, distances=distances)
+    return rows.picked(np.lexsort((rows.ids, rows.keys)))
 
 
 class Contents:
     """One environment: its grid, its newest state, its histograms and costs."""
 
-    def __init__(self, name: str, grid: Grid, layout: Layout) -> None:
+    def __init__(self, name: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
         self.name = name
         self.grid = grid
         self.layout = layout
+        self.wants_distances = distances
         self.state = State({})
         self.n_ids = 0
         self.histograms: dict[int, tuple[int, Histogram]] = {}
@@ -163,31 +157,35 @@ class MemoryStore:
 
     # -- rows --------------------------------------------------------------------------------
 
-    def lookup(self, keys: Keys) -> Rows:
-        rows = self._state().rows
-        return picked(rows, np.flatnonzero(np.isin(rows.keys, keys)))
+    def _rows(self, *, distances: bool) -> Rows:
+        state = self._state()
+        return state.distances if distances else state.rows
 
-    def lookup_each(self, keys: Keys) -> Rows:
-        return self.lookup(keys)
+    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
+        rows = self._rows(distances=distances)
+        return rows.picked(np.flatnonzero(np.isin(rows.keys, keys)))
 
-    def scan(self, lows: Keys, highs: Keys) -> Rows:
-        rows = self._state().rows
+    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
+        return self.lookup(keys, distances=distances)
+
+    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        rows = self._rows(distances=distances)
         starts = np.searchsorted(rows.keys, lows)
         ends = np.searchsorted(rows.keys, highs, side="right")
         pairs = zip(starts.tolist(), ends.tolist(), strict=True)
-        return picked(rows, np.concatenate([[], *(np.arange(*pair) for pair in pairs)]).astype(int))
+        return rows.picked(np.concatenate([[], *(np.arange(*pair) for pair in pairs)]).astype(int))
 
     def count(self, lows: Keys, highs: Keys) -> int:
         return len(self.scan(lows, highs))
 
-    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
-        rows = self.scan(lows, highs)
-        return picked(rows, np.flatnonzero(rows.ids == object_id))
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        rows = self.scan(lows, highs, distances=distances)
+        return rows.picked(np.flatnonzero(rows.ids == object_id))
 
-    def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
-        rows = self._state().rows
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        rows = self._rows(distances=distances)
         later = (rows.keys > key) | ((rows.keys == key) & (rows.ids > object_id))
-        return picked(rows, np.flatnonzero(later)[:limit])
+        return rows.picked(np.flatnonzero(later)[:limit])
 
     # -- objects -----------------------------------------------------------------------------
 
@@ -234,6 +232,15 @@ class MemoryStore:
             _, old = self._known(object_id)
             self._commit("remove", object_id, old.keys, None, NO_ROWS)
 
+    def want_distances(self) -> None:
+        self._check_writable()
+        check_distances(self.layout, distances=True)
+        self._contents.wants_distances = True
+
+    @property
+    def wants_distances(self) -> bool:
+        return self._contents.wants_distances
+
     def _newest(self) -> State:
         """The state that a write starts from."""
         self._check_writable()
@@ -266,9 +273,14 @@ class MemoryStore:
             gone = objects.pop(object_id)[0]
             removed.add((gone.link, gone.name))
         else:
-            written = replace(record, revision=revision, rows_crc=rows_crc(rows))
+            written = replace(
+                record,
+                revision=revision,
+                rows_crc=rows_crc(rows.occupied()),
+                distances_crc=distances_crc(rows),
+            )
             ids = np.full(len(rows), object_id, np.int64)
-            objects[object_id] = (written, Rows(rows.keys, ids, rows.occupancy))
+            objects[object_id] = (written, Rows(rows.keys, ids, rows.occupancy, rows.distances))
             removed.discard((record.link, record.name))
         ranges = touched_ranges(self.grid, self.layout, touched)
         change = Change(revision, action, object_id, ranges)
@@ -277,8 +289,10 @@ class MemoryStore:
     # -- statistics --------------------------------------------------------------------------
 
     def size(self) -> Size:
-        rows = self._state().rows
+        rows, band = self._state().rows, self._state().distances
         n_bytes = rows.keys.nbytes + rows.ids.nbytes + rows.occupancy.nbytes
+        if band.distances is not None:
+            n_bytes += band.keys.nbytes + band.ids.nbytes + band.distances.data.nbytes
         return Size(len(rows), n_bytes, 1 + n_bytes // 8192)
 
     def quantiles(self, resolution: int) -> Histogram:
@@ -345,9 +359,9 @@ class MemoryEngine:
             raise EnvironmentNotFoundError(f"no environment at {url} in this process")
         return MemoryStore(contents, url, read_only=read_only)
 
-    def create(self, url: str, grid: Grid, layout: Layout) -> Store:
+    def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
         name = self.name_of(url)
-        contents = Contents(name, grid, layout)
+        contents = Contents(name, grid, layout, distances=distances)
         if ENVIRONMENTS.setdefault(name, contents) is not contents:
             raise EnvironmentExistsError(f"{url} exists already; open it, or give another name")
         return MemoryStore(contents, url, read_only=False)

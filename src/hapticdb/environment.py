@@ -94,6 +94,19 @@ class Environment:
         """The store of the engine: for tools that query it directly, such as benchmarks."""
         return self._store
 
+    @property
+    def has_distances(self) -> bool:
+        """Whether there is an object, and distances to the surface of every object are stored.
+
+        As of the revision that the last frame has read; before the first frame, of the newest. It
+        costs a statement only before the first frame and after an edit of this environment.
+        """
+        if self._known.version is None:
+            with self._store.snapshot():
+                self._store.revision()  # `version` then tells of this snapshot
+                self._known.learn()
+        return self._known.have_distances
+
     def size(self) -> Size:
         """Rows, bytes and leaf blocks of the database."""
         return self._store.size()
@@ -429,7 +442,7 @@ class Environment:
         return zip(lows.tolist(), highs.tolist(), strict=True)
 
     def _ranges_of(self, obj: Object) -> Ranges:
-        return object_ranges(self.grid, self.layout, obj.bounds)
+        return object_ranges(self.grid, self.layout, obj)
 
 
 _DEFAULT_LAW = TangentPlane()
@@ -453,14 +466,29 @@ def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment
     return Environment(open_store(url, read_only=read_only))
 
 
-def create(url: str | os.PathLike[str], grid: Grid, *, layout: Layout = "brick") -> Environment:
+def create(
+    url: str | os.PathLike[str],
+    grid: Grid,
+    *,
+    layout: Layout = "brick",
+    distances: bool | None = None,
+) -> Environment:
     """Make an environment with a given grid and open it.
+
+    Parameters
+    ----------
+    layout : {"brick", "voxel"}
+        Rows of its index table.
+    distances : bool or None
+        Whether parts that are imported get distances to their surfaces beside their voxels. By
+        default they do on the layout brick; the layout voxel has none.
 
     Raises
     ------
     EnvironmentExistsError
         If something exists there already.
     UsageError
-        If the layout is bricks and the order is lexicographic.
+        If the layout is bricks and the order is lexicographic, or if the layout is voxel and
+        distances are asked for.
     """
-    return Environment(create_store(url, grid, layout))
+    return Environment(create_store(url, grid, layout, distances=distances))

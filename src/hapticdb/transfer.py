@@ -226,7 +226,7 @@ def part_of(obj: Object) -> tuple[str, str]:
 
 def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVector) -> Rows:
     """All rows of an object of the source, in the layout and curve of the target."""
-    ranges = object_ranges(source.grid, source.layout, obj.bounds)
+    ranges = object_ranges(source.grid, source.layout, obj)
     batches = _batches(source, obj, ranges, quantiles)
     if is_same_kind(source, target):
         keys, ids, occupancy = zip(*(batch[:3] for batch in batches), strict=True)

@@ -34,7 +34,8 @@ from hapticdb.ingest.files import ImportProgress
 from hapticdb.kernels.surfaces.voxelize import brick_voxels, voxelize
 from hapticdb.mesh import MeshFile, Part, parse_in_process, read_file
 from hapticdb.store import base
-from hapticdb.store.base import Layout, Object, present_already
+from hapticdb.store.base import Layout, Object
+from hapticdb.store.refusals import present_already
 from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 from hapticdb.testing import KINDS
 from mesh_files import gltf

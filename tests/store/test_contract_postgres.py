@@ -18,7 +18,14 @@ from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.tables import statistics as store_statistics
 from hapticdb.store.postgres.tables.histogram import exact_histogram
-from hapticdb.testing import EngineContract, StoreContract, blob, floor_voxels, write_voxels
+from hapticdb.testing import (
+    EngineContract,
+    StoreContract,
+    blob,
+    floor_voxels,
+    with_distances,
+    write_voxels,
+)
 from servers import Place
 
 GRID = Grid(0.005, (0, 0, 0), 6)
@@ -98,13 +105,21 @@ def test_an_environment_of_format_2_is_read_as_it_is_and_brought_up_to_date_by_i
     name = parse(url).environment
     for what in ("TABLE {0}.removed", "FUNCTION {0}.note_removed", "FUNCTION {0}.removed_parts"):
         admin.execute(f"DROP {what.format(name)} CASCADE")
+    admin.execute(f"DROP TABLE {name}.band")
+    admin.execute(f"ALTER TABLE {name}.environment DROP wants_distances")
     admin.execute(f"UPDATE {name}.environment SET format = 2")
+    everywhere = np.array([0]), np.array([2**62])
     with hapticdb.open(url, read_only=True) as env:
         (obj,) = env.objects()
         assert env.store.removed(obj.link) == set()
-    with hapticdb.open(url) as env:
-        env.remove(obj.id)
-        assert env.store.removed(obj.link) == {obj.name}
+        assert not env.store.wants_distances
+        assert not len(env.store.scan(*everywhere, distances=True))
+        with hapticdb.open(url) as writer:
+            writer.remove(obj.id)
+            assert writer.store.removed(obj.link) == {obj.name}
+            rows = with_distances(blob(1, (20, 20, 20)), GRID, "brick")
+            writer.store.add(obj, rows)
+        assert len(env.store.scan(*everywhere, distances=True)) == len(rows)
 
 
 def test_a_dropped_table_is_damage(url: str, admin: psycopg.Connection) -> None:

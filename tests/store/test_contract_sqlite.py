@@ -6,6 +6,7 @@ import sqlite3
 import sys
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import apsw
@@ -21,7 +22,15 @@ from hapticdb.store.schema import FORMAT_VERSION
 from hapticdb.store.sqlite.migrations import CHECKED_VERSION
 from hapticdb.store.sqlite.pages import LAYER
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import EngineContract, StoreContract, blob, floor_voxels, write_voxels
+from hapticdb.testing import (
+    EngineContract,
+    StoreContract,
+    blob,
+    floor_voxels,
+    with_distances,
+    write_voxels,
+)
+from old_formats import make_old
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 
@@ -67,6 +76,21 @@ def test_the_file_is_marked_as_ours(path: Path) -> None:
             CHECKED_VERSION + FORMAT_VERSION,
         )
         assert plain.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+
+
+def test_a_file_of_format_1_has_no_distances_until_somebody_writes_some(path: Path) -> None:
+    make_old(path)
+    everywhere = np.array([0]), np.array([2**62])
+    with closing(SQLiteStore.open(path, read_only=True)) as reader:
+        (obj,) = reader.objects()
+        assert not reader.wants_distances
+        assert not obj.has_distances
+        assert not len(reader.scan(*everywhere, distances=True))
+        rows = with_distances(blob(1, (20, 20, 20)), GRID, "brick")
+        with closing(SQLiteStore.open(path)) as writer:
+            assert not writer.wants_distances
+            writer.add(replace(obj, name="blob"), rows)
+        assert len(reader.scan(*everywhere, distances=True)) == len(rows)
 
 
 def test_creating_never_replaces_a_file(path: Path) -> None:

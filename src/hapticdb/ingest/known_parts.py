@@ -117,7 +117,7 @@ def drop_others(store: Store, mesh_file: MeshFile) -> int:
 
 def _covering(store: Store) -> Covering:
     def ranges(obj: Object) -> Iterable[tuple[int, int]]:
-        lows, highs = object_ranges(store.grid, store.layout, obj.bounds)
+        lows, highs = object_ranges(store.grid, store.layout, obj)
         return zip(lows.tolist(), highs.tolist(), strict=True)
 
     return ranges

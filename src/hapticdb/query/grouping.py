@@ -10,13 +10,18 @@ from hapticdb.grid import Grid
 from hapticdb.kernels.query import grouping as kernels
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import Keys, Layout, row_shift
+from hapticdb.store.base import Keys, Layout, Object, row_shift
 
 DEFAULT_MAXGAP = 500
 """The paper's MAXGAP, in voxel keys. A larger value gives fewer ranges, which hold more rows."""
 BOX_CUBES = 16
 """Cubes along a box's longest edge when it is covered by key ranges. A larger value gives more
 ranges, which hold fewer keys outside the box."""
+
+
+BAND_MARGIN = 5
+"""Voxels around an object's bounds in which its rows of distances lie: the half width of the band,
+a voxel more since a row also has the centres beside its brick, and rounding."""
 
 
 class Ranges(NamedTuple):
@@ -86,10 +91,14 @@ def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostM
     return Ranges(lows[:count].copy(), highs[:count].copy())
 
 
-def object_ranges(grid: Grid, layout: Layout, bounds: NDArray[np.float64]) -> Ranges:
-    """Ranges of row keys that cover an object's bounds (2, 3), enlarged by a voxel on each side."""
-    low, high = grid.voxels_of(bounds)
-    return box_ranges(grid, layout, low - 1, high + 1)
+def object_ranges(grid: Grid, layout: Layout, obj: Object) -> Ranges:
+    """Ranges of row keys that cover an object's bounds, enlarged by a voxel on each side.
+
+    If the object has distances, the ranges also cover the bricks around it that hold distances.
+    """
+    low, high = grid.voxels_of(obj.bounds)
+    margin = BAND_MARGIN if obj.has_distances else 1
+    return box_ranges(grid, layout, low - margin, high + margin)
 
 
 def box_ranges(

@@ -8,15 +8,11 @@ from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import (
-    ConflictError,
-    EnvironmentExistsError,
-    ObjectNotFoundError,
-    UsageError,
-)
 from hapticdb.grid import BRICK_BITS, Grid
 
 Layout = Literal["voxel", "brick"]
+Table = Literal["voxel", "brick", "band"]
+"""Tables that hold rows: the index table of a layout, and the distances beside `brick`."""
 LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 BRICK_SHIFT = 3 * BRICK_BITS
 """Bits of a voxel's key below its brick's."""
@@ -24,6 +20,9 @@ CELL_SHIFT = 15
 """Bits of a voxel's key below its cell's."""
 BRICK_BYTES = 64
 """Bytes of a brick's occupancy: a bit for each of its 512 voxels."""
+LONGEST_BAND = 2048
+"""Most bytes of a row's packed distances, more than `kernels.field.packing` ever makes. A larger
+value believes longer rows of a database that means harm."""
 
 Keys = NDArray[np.int64]
 
@@ -37,6 +36,19 @@ class Band(NamedTuple):
 
     data: NDArray[np.uint8]
     ends: NDArray[np.int64]
+
+    @property
+    def lengths(self) -> NDArray[np.int64]:
+        """Bytes of each row (R,)."""
+        return np.diff(self.ends, prepend=0)
+
+    def picked(self, which: NDArray[np.int64]) -> "Band":
+        """Copies of the rows at the given places, in their order."""
+        lengths, bytes_of = self.lengths[which], self.data.tobytes()
+        ends = self.ends[which].tolist()
+        pairs = zip(ends, lengths.tolist(), strict=True)
+        joined = b"".join([bytes_of[end - length : end] for end, length in pairs])
+        return Band(np.frombuffer(joined, np.uint8), np.cumsum(lengths))
 
     def part(self, low: int, high: int) -> "Band":
         """Rows low .. high; their bytes are a view."""
@@ -71,6 +83,26 @@ class Rows(NamedTuple):
         distances = None if self.distances is None else self.distances.part(low, high)
         bits = self.occupancy[BRICK_BYTES * low : BRICK_BYTES * high]
         return Rows(self.keys[low:high], self.ids[low:high], bits, distances)
+
+    def having(self, distances: Band | None) -> "Rows":
+        """These rows with other distances; `_replace` fails, since it asks for the length."""
+        return Rows(self.keys, self.ids, self.occupancy, distances)
+
+    def picked(self, which: NDArray[np.int64]) -> "Rows":
+        """Copies of the rows at the given places, in their order."""
+        bits = NO_OCCUPANCY
+        if self.occupancy.size:
+            some = self.occupancy.reshape(-1, BRICK_BYTES)[which]
+            bits = np.frombuffer(some.tobytes(), np.uint8)
+        distances = None if self.distances is None else self.distances.picked(which)
+        return Rows(self.keys[which], self.ids[which], bits, distances)
+
+    def occupied(self) -> "Rows":
+        """The rows of the index table: those whose brick holds a voxel, without distances."""
+        rows = self.having(None)
+        if self.distances is None:
+            return rows
+        return rows.picked(np.flatnonzero(self.occupancy.reshape(-1, BRICK_BYTES).any(axis=1)))
 
 
 NO_KEYS = np.empty(0, dtype=np.int64)
@@ -125,6 +157,8 @@ class Object:
     rows_crc : int or None
         Checksum of its rows as they were written. None for an object that a version without
         checksums has written.
+    distances_crc : int or None
+        Checksum of its rows of distances as they were written. None for an object without any.
     """
 
     name: str
@@ -137,48 +171,18 @@ class Object:
     id: int = 0
     revision: int = 0
     rows_crc: int | None = None
+    distances_crc: int | None = None
+
+    @property
+    def has_distances(self) -> bool:
+        """Whether distances to its surface are stored beside its voxels."""
+        return self.distances_crc is not None
 
 
 def scene_bounds(objects: Iterable[Object]) -> NDArray[np.float64] | None:
     """Lower and upper corner (2, 3) of all objects, metres, world frame; None without any."""
     boxes = np.array([obj.bounds for obj in objects])
     return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]) if len(boxes) else None
-
-
-def no_object(object_id: int, url: str) -> ObjectNotFoundError:
-    """Build the error for an id that no object has."""
-    return ObjectNotFoundError(
-        f"no object {object_id} in {url}; 'hapticdb objects {url}' lists them"
-    )
-
-
-def unknown_exclusion(object_id: int, url: str) -> ObjectNotFoundError:
-    """Build the error for an id to exclude that no object has."""
-    return ObjectNotFoundError(
-        f"no object {object_id} in {url} to exclude; 'hapticdb objects {url}' lists them"
-    )
-
-
-def present_already(record: Object, url: str) -> EnvironmentExistsError:
-    """Build the error for a part that the environment holds already."""
-    return EnvironmentExistsError(
-        f"{record.name} of {record.link} is in {url} already; remove it first"
-    )
-
-
-def check_outside(depth: int, url: str) -> None:
-    """Refuse to look for the commits of others inside a snapshot, which hides them."""
-    if depth:
-        raise UsageError(f"{url}: inside a snapshot nothing changes: ask before or after it")
-
-
-def check_unwritten(record: Object, known: Object, url: str) -> None:
-    """Refuse to replace an object that was written after `record` was derived from it."""
-    if record.revision and record.revision != known.revision:
-        raise ConflictError(
-            f"object {known.id} ({known.name}) of {url} was written by another meanwhile "
-            f"(revision {known.revision}, not {record.revision}): read it again, then decide"
-        )
 
 
 @dataclass(frozen=True)
@@ -234,22 +238,23 @@ class ReadsRows(Protocol):
     """Reads rows of the index table, in ascending order of key and id.
 
     Each call is one statement, but for `lookup_each`. Arrays of keys and of bounds are ascending,
-    distinct and contiguous.
+    distinct and contiguous. With `distances`, the rows come from the table of distances, with
+    their occupancy, zero where a brick holds no voxel; objects without distances have no rows then.
     """
 
-    def lookup(self, keys: Keys) -> Rows:
+    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in the form that this engine answers fastest."""
 
-    def lookup_each(self, keys: Keys) -> Rows:
+    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
         """The rows that `lookup` returns, by one statement a key: the paper's point queries."""
 
-    def scan(self, lows: Keys, highs: Keys) -> Rows:
+    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows with a key in any closed range, ascending and disjoint, in one statement."""
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """Number of rows that `scan` would return, counted inside the engine."""
 
-    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any closed range, ascending and disjoint."""
 
 
@@ -278,6 +283,8 @@ class ReadsObjects(Protocol):
 class WritesObjects(Protocol):
     """Writes objects, each in one transaction: its rows, its record and its `Change`.
 
+    Rows with distances are written into both tables, and the object has distances from then on.
+    Rows without are written into the index table alone, and the object has none.
     Raises ReadOnlyError when the store was opened to read, or the user may not write.
     """
 
@@ -303,6 +310,9 @@ class WritesObjects(Protocol):
 
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""
+
+    def want_distances(self) -> None:
+        """Make `Store.wants_distances` true from now on, for all who open the environment."""
 
 
 class KeepsStatistics(Protocol):
@@ -353,6 +363,10 @@ class Store(ReadsRows, ReadsObjects, WritesObjects, KeepsStatistics, Protocol):
     @property
     def layout(self) -> Layout:
         """Which index table it has, fixed when it was made."""
+
+    @property
+    def wants_distances(self) -> bool:
+        """Whether parts get distances to their surfaces when they are imported; bricks only."""
 
     @property
     def is_read_only(self) -> bool:
@@ -454,8 +468,11 @@ class Checker(Protocol):
     def findings(self) -> Iterator[str]:
         """What is wrong with pages, indexes and kept statistics, a line each."""
 
-    def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
-        """At most `limit` rows after (key, id), ascending by both; (-1, 0) starts at the first."""
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        """At most `limit` rows after (key, id), ascending by both; (-1, 0) starts at the first.
+
+        With `distances`, rows of the table of distances, as `ReadsRows` says.
+        """
 
 
 @runtime_checkable

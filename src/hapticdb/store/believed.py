@@ -17,16 +17,31 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import DamagedError, GridError
 from hapticdb.grid import CurveName, Grid
-from hapticdb.store.base import LAYOUTS, Change, Histogram, Keys, Layout, Object, Rows
+from hapticdb.store.base import (
+    LAYOUTS,
+    LONGEST_BAND,
+    Band,
+    Change,
+    Histogram,
+    Keys,
+    Layout,
+    Object,
+    Rows,
+)
 
 KEY_END = 1 << 63
 """One above the largest count or key that an int64 holds."""
 ROWS_CRC = "rows_crc"
 """Name under which the checksum of an object's rows is stored among its attributes."""
+DISTANCES_CRC = "distances_crc"
+"""Name under which the checksum of an object's distances is stored among its attributes."""
+CHECKSUMS = (ROWS_CRC, DISTANCES_CRC)
 ACTIONS = ("add", "move", "remove")
 """Actions that a row of `change` may have."""
 TABLES = ("brick", "change", "cost", "environment", "object", "quantile", "voxel")
 """Tables that every environment has, in every format."""
+BAND = "band"
+"""Table of distances, which an environment has since format 4."""
 Floats = NDArray[np.float64]
 
 
@@ -61,10 +76,62 @@ def rows_crc(rows: Rows) -> int:
     return checksum.value()
 
 
+class BandChecksum:
+    """CRC-32 of keys and lengths, and of packed distances, over an object's rows in order of keys.
+
+    Keys and lengths are taken as pairs of int64, so that no byte can pass to the next row unseen.
+    """
+
+    __slots__ = ("_bytes", "_places")
+
+    def __init__(self) -> None:
+        self._places = self._bytes = 0
+
+    def update(self, keys: Keys, distances: Band) -> None:
+        """Add the next rows."""
+        places = np.stack([keys, distances.lengths], axis=1)
+        self._places = zlib.crc32(np.ascontiguousarray(places, "<i8").data, self._places)
+        self._bytes = zlib.crc32(np.ascontiguousarray(distances.data).data, self._bytes)
+
+    def value(self) -> int:
+        """The checksum of all rows so far."""
+        return self._places << 32 | self._bytes
+
+
+def distances_crc(rows: Rows) -> int | None:
+    """Checksum of all distances of an object; None if it has none."""
+    if rows.distances is None:
+        return None
+    checksum = BandChecksum()
+    checksum.update(rows.keys, rows.distances)
+    return checksum.value()
+
+
 def attributes_text(record: Object, rows: Rows) -> str:
-    """An object's attributes as JSON, with the checksum of its rows among them."""
-    kept = {**record.attributes, ROWS_CRC: f"{rows_crc(rows):016x}"}
+    """An object's attributes as JSON, with the checksums of its rows among them."""
+    kept = {**record.attributes, ROWS_CRC: f"{rows_crc(rows.occupied()):016x}"}
+    kept.pop(DISTANCES_CRC, None)
+    crc = distances_crc(rows)
+    if crc is not None:
+        kept[DISTANCES_CRC] = f"{crc:016x}"
     return json.dumps(kept, sort_keys=True)
+
+
+def band_of(url: str, packed: bytes, lengths: NDArray[np.int64]) -> Band:
+    """Packed distances that were read, and the bytes of each row."""
+    if len(lengths) and (lengths.min() < 1 or lengths.max() > LONGEST_BAND):
+        raise damaged(url, "distances of the wrong length")
+    ends = np.cumsum(lengths)
+    if len(packed) != (int(ends[-1]) if len(ends) else 0):
+        raise damaged(url, "distances of the wrong length")
+    return Band(np.frombuffer(packed, np.uint8), ends)
+
+
+def wish_of(url: str, stored: object) -> bool:
+    """Whether an environment wants distances, from a number 0 or 1, or a boolean."""
+    if stored not in {0, 1}:
+        raise damaged(url, "whether it wants distances is neither yes nor no")
+    return bool(stored)
 
 
 def grid_of(url: str, rows: Sequence[Sequence[Any]]) -> tuple[Grid, Layout]:
@@ -95,6 +162,8 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
             raise damaged(url, f"no such table: {name}")
         if kind != "table":
             raise damaged(url, f"{name} is a {kind} and no table")
+    if kinds.get(BAND, "table") != "table":
+        raise damaged(url, f"{BAND} is a {kinds[BAND]} and no table")
 
 
 def object_of(url: str, row: Sequence[Any]) -> Object:
@@ -130,9 +199,10 @@ def object_of(url: str, row: Sequence[Any]) -> Object:
         transform=placed.reshape(4, 4),
         voxels=voxels,
         bounds=corners.reshape(2, 3),
-        attributes={key: value for key, value in known.items() if key != ROWS_CRC},
+        attributes={key: value for key, value in known.items() if key not in CHECKSUMS},
         revision=revision,
         rows_crc=_crc_of(known.get(ROWS_CRC)),
+        distances_crc=_crc_of(known.get(DISTANCES_CRC)),
     )
 
 

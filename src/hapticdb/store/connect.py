@@ -20,6 +20,7 @@ from hapticdb.store.engines import (
     Url,
     engine_of,
 )
+from hapticdb.store.refusals import check_distances
 from hapticdb.store.urls import redact
 
 __all__ = [
@@ -42,12 +43,19 @@ def open_store(url: Url, *, read_only: bool = False) -> Store:
     return engine_of(url).open(os.fspath(url), read_only=read_only)
 
 
-def create_store(url: Url, grid: Grid, layout: Layout = "brick") -> Store:
-    """Make a new environment; bricks need a hierarchical curve."""
+def create_store(
+    url: Url, grid: Grid, layout: Layout = "brick", *, distances: bool | None = None
+) -> Store:
+    """Make a new environment; bricks need a hierarchical curve.
+
+    Its parts get distances to their surfaces unless `distances` is false or the layout is voxel.
+    """
     if layout not in LAYOUTS:
         raise UsageError(f"layout {layout!r}: choose one of {', '.join(LAYOUTS)}")
     check_curve(grid.curve, layout)
-    return engine_of(url).create(os.fspath(url), grid, layout)
+    check_distances(layout, distances=distances)
+    wanted = layout == "brick" if distances is None else distances
+    return engine_of(url).create(os.fspath(url), grid, layout, distances=wanted)
 
 
 def exists(url: Url) -> bool:

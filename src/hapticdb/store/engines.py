@@ -76,8 +76,11 @@ class Engine(Protocol):
         Raises EnvironmentNotFoundError, NotAnEnvironmentError, NewerVersionError or DamagedError.
         """
 
-    def create(self, url: str, grid: Grid, layout: Layout) -> Store:
-        """Make a new environment; raises EnvironmentExistsError when something is there."""
+    def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
+        """Make a new environment; raises EnvironmentExistsError when something is there.
+
+        distances : its `Store.wants_distances`; false on the layout voxel.
+        """
 
     def exists(self, url: str) -> bool:
         """Whether something is there already, an environment or not. May connect."""

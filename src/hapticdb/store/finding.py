@@ -7,7 +7,8 @@ from fnmatch import translate
 from operator import index
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
-from hapticdb.store.base import Object, Store, no_object
+from hapticdb.store.base import Object, Store
+from hapticdb.store.refusals import no_object
 
 MOST_IDS = 1 << 63
 """All ids lie below this value: they are signed 64-bit integers in the databases."""

@@ -25,6 +25,8 @@ STEPS = (
     # a mark of each commit, and of the commit before: store/sqlite/log.py
     Step("lineage", readers_need_it=False),
     Step("removed parts", readers_need_it=False),
+    # without it no object has distances
+    Step("distances", readers_need_it=False),
 )
 FORMAT_VERSION = len(STEPS)
 Dialect = Mapping[str, tuple[str, ...]]

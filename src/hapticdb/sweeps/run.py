@@ -23,7 +23,8 @@ from hapticdb.query.frame import as_ids
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
-from hapticdb.store.base import Keys, Object, unknown_exclusion
+from hapticdb.store.base import Keys, Object
+from hapticdb.store.refusals import unknown_exclusion
 from hapticdb.sweeps.clearance import ClearanceSearch
 from hapticdb.sweeps.inside import enclosed_ids
 from hapticdb.sweeps.objects import Met, Runs, pairs_in_voxels, pairs_of_hits, tally

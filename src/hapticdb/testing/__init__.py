@@ -19,11 +19,19 @@ Needs pytest.
 """
 
 from hapticdb.testing.capabilities import STORE_CAPABILITIES, CapabilitiesContract
+from hapticdb.testing.distances import DistancesContract
 from hapticdb.testing.engines import ENGINE_CAPABILITIES, EngineContract
 from hapticdb.testing.lifecycle import LifecycleContract
 from hapticdb.testing.objects import ObjectsContract
 from hapticdb.testing.rows import RowsContract
-from hapticdb.testing.scenes import KINDS, blob, floor_voxels, voxel_object, write_voxels
+from hapticdb.testing.scenes import (
+    KINDS,
+    blob,
+    floor_voxels,
+    voxel_object,
+    with_distances,
+    write_voxels,
+)
 from hapticdb.testing.statistics import StatisticsContract
 from hapticdb.testing.watching import WatchContract, is_noticed
 
@@ -37,6 +45,7 @@ __all__ = [
     "floor_voxels",
     "is_noticed",
     "voxel_object",
+    "with_distances",
     "write_voxels",
 ]
 
@@ -44,6 +53,7 @@ __all__ = [
 class StoreContract(
     RowsContract,
     ObjectsContract,
+    DistancesContract,
     LifecycleContract,
     StatisticsContract,
     WatchContract,

@@ -75,6 +75,17 @@ class EngineContract:
             assert store.is_read_only == read_only
             store.close()
 
+    def test_what_wants_distances_says_so_when_it_is_opened(self) -> None:
+        """An environment wants none unless it is made so."""
+        for wanted in (True, False):
+            url = self.url()
+            made = self.engine().create(url, self.grid, "brick", distances=wanted)
+            assert made.wants_distances == wanted
+            made.close()
+            store = open_store(url, read_only=True)
+            assert store.wants_distances == wanted
+            store.close()
+
     def test_what_is_not_there_is_not_opened(self) -> None:
         """Opening a missing environment does not make it."""
         url = self.url()

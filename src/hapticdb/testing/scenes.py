@@ -6,7 +6,7 @@ from numpy.typing import NDArray
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.query.grouping import object_ranges
-from hapticdb.store.base import Covering, Layout, Object, Rows, Store
+from hapticdb.store.base import BRICK_BYTES, Band, Covering, Layout, Object, Rows, Store
 
 KINDS: list[tuple[Layout, CurveName]] = [
     ("voxel", "z"),
@@ -59,6 +59,25 @@ def blob(seed: int, center: tuple[int, int, int], radius: int = 8) -> NDArray[np
     return found
 
 
+def with_distances(ijk: NDArray[np.int64], grid: Grid, layout: Layout, seed: int = 0) -> Rows:
+    """Rows of voxels (n, 3) and of the bricks around them, with made-up packed distances.
+
+    A store never unpacks distances: any bytes will do.
+    """
+    rows = rows_of_voxels(ijk, grid, layout)
+    steps = np.stack(np.meshgrid(*[[-4, 0, 4]] * 3, indexing="ij"), axis=-1).reshape(-1, 1, 3)
+    near = np.clip(ijk + steps, 0, grid.side - 1).reshape(-1, 3)
+    keys = rows_of_voxels(np.unique(near, axis=0), grid, layout).keys
+    occupancy = np.zeros((len(keys), BRICK_BYTES), np.uint8)
+    occupancy[np.searchsorted(keys, rows.keys)] = rows.occupancy.reshape(-1, BRICK_BYTES)
+    rng = np.random.default_rng(seed)
+    lengths = rng.integers(1, 120, len(keys))
+    lengths[:2] = 1, 1000
+    data = rng.integers(0, 256, int(lengths.sum()), dtype=np.uint8)
+    ids = np.zeros(len(keys), np.int64)
+    return Rows(keys, ids, occupancy.reshape(-1), Band(data, np.cumsum(lengths)))
+
+
 def kind(store: Store) -> tuple[Grid, Layout]:
     """Grid and layout of a store, the arguments that make rows."""
     return store.grid, store.layout
@@ -68,7 +87,7 @@ def covering(store: Store) -> Covering:
     """Argument `covering` of a write: says where the rows of an object are."""
 
     def ranges(obj: Object) -> list[tuple[int, int]]:
-        found = object_ranges(store.grid, store.layout, obj.bounds)
+        found = object_ranges(store.grid, store.layout, obj)
         return list(zip(found.lows.tolist(), found.highs.tolist(), strict=True))
 
     return ranges

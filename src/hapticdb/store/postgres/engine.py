@@ -26,9 +26,9 @@ class PostgresEngine:
         """Connect to an existing environment; ``?data=FOLDER`` starts its private server."""
         return PostgresStore.open(url, read_only=read_only)
 
-    def create(self, url: str, grid: Grid, layout: Layout) -> Store:
+    def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
         """Make a schema, which appears whole or not at all; ``?data=FOLDER`` makes the server."""
-        return PostgresStore.create(url, grid, layout)
+        return PostgresStore.create(url, grid, layout, distances=distances)
 
     def exists(self, url: str) -> bool:
         """Whether a schema of that name is there. Connects."""

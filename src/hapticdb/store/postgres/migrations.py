@@ -178,6 +178,38 @@ LANGUAGE sql STABLE SECURITY DEFINER SET search_path = {schema}, pg_temp AS $$
 $$""",
 )
 
+# a row has 30 to 1,000 bytes, packed already: EXTERNAL compresses nothing, and spares the three
+# bytes of padding and length that PLAIN takes. Roles keep on `band` what they may do with `brick`,
+# so that nobody's right has to be granted anew
+DISTANCES = (
+    f"""
+CREATE TABLE band (
+  z_val     bigint NOT NULL,
+  id        bigint NOT NULL,
+  distances bytea NOT NULL
+) WITH ({AUTOVACUUM})""",
+    "ALTER TABLE band ALTER distances SET STORAGE EXTERNAL",
+    "ALTER TABLE band ALTER id SET STATISTICS 0, ALTER distances SET STATISTICS 0",
+    "CREATE UNIQUE INDEX band_key ON band (z_val, id)",
+    "ALTER TABLE environment ADD COLUMN wants_distances boolean NOT NULL DEFAULT false",
+    """
+DO $$
+DECLARE given record;
+BEGIN
+  FOR given IN
+    SELECT CASE grantee WHEN 0 THEN 'PUBLIC' ELSE grantee::regrole::text END AS role,
+           privilege_type AS privilege
+      FROM pg_class, aclexplode(relacl)
+     WHERE pg_class.oid = 'brick'::regclass AND grantee <> relowner
+  LOOP
+    EXECUTE format('GRANT %s ON band TO %s', given.privilege, given.role);
+    IF given.privilege = 'INSERT' THEN
+      EXECUTE format('GRANT UPDATE (wants_distances) ON environment TO %s', given.role);
+    END IF;
+  END LOOP;
+END $$""",
+)
+
 MIGRATIONS: Dialect = {
     "tables": (
         ENVIRONMENT,
@@ -193,4 +225,5 @@ MIGRATIONS: Dialect = {
     ),
     "lineage": (),  # only SQLite needs it: its log lies beside the file, a server keeps its own log
     "removed parts": REMOVED,
+    "distances": DISTANCES,
 }

@@ -3,6 +3,7 @@
 import atexit
 import re
 from pathlib import Path
+from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
 from psycopg import errors, sql
@@ -167,19 +168,34 @@ SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'v' THEN 'view'
  WHERE nspname = %s AND relkind <> 'i'"""
 
 
-def read_environment(connection: ServerConnection) -> tuple[Grid, Layout, int]:
-    """Grid and layout of an environment, and an oid that differs if the environment is remade."""
+class Made(NamedTuple):
+    """What is fixed when an environment is made.
+
+    identity : an oid that differs if the environment is remade; wants_distances : may become true
+    later.
+    """
+
+    grid: Grid
+    layout: Layout
+    wants_distances: bool
+    identity: int
+
+
+def read_environment(connection: ServerConnection) -> Made:
+    """Read the one row of the table `environment`."""
+    kinds = dict(connection.rows(TABLE_KINDS, (connection.address.environment,)))
+    # a reader may have opened an environment of an older format
+    wish = "wants_distances" if believed.BAND in kinds else "false"
     rows = connection.rows(
-        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, tableoid::bigint"
-        " FROM environment"
+        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout,"
+        f" tableoid::bigint, {wish} FROM environment"
     )
     grid, layout = believed.grid_of(connection.shown, rows)
-    kinds = connection.rows(TABLE_KINDS, (connection.address.environment,))
-    believed.check_tables(connection.shown, dict(kinds))
-    return grid, layout, rows[0][7]
+    believed.check_tables(connection.shown, kinds)
+    return Made(grid, layout, believed.wish_of(connection.shown, rows[0][8]), rows[0][7])
 
 
-def created(url: str, grid: Grid, layout: Layout) -> None:
+def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
     """Make the schema with all tables and the grid, in one transaction."""
     with connected(url, making=True) as connection:
         name = connection.address.environment
@@ -200,8 +216,16 @@ def created(url: str, grid: Grid, layout: Layout) -> None:
                 ) from error
             _migrate(connection, 0)
             connection.execute(
-                "INSERT INTO environment VALUES (1, %s, %s, %s, %s, %s, %s, %s, %s, 0)",
-                (FORMAT_VERSION, grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout),
+                "INSERT INTO environment VALUES (1, %s, %s, %s, %s, %s, %s, %s, %s, 0, %s)",
+                (
+                    FORMAT_VERSION,
+                    grid.voxel_size,
+                    *grid.origin,
+                    grid.bits,
+                    grid.curve,
+                    layout,
+                    distances,
+                ),
             )
 
         connection.write(work, lambda: _has_schema(connection))

@@ -14,6 +14,7 @@ from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.tables.statistics import PostgresStatistics
 from hapticdb.store.postgres.tables.writing import PostgresWriter
 from hapticdb.store.postgres.watching import Watch
+from hapticdb.store.refusals import check_distances
 
 GROUPS_KEYS_ITSELF = 170_000
 """Server version, as libpq numbers it, from which `= ANY` reads each leaf page once."""
@@ -37,12 +38,12 @@ class PostgresStore:
         self.grouping_threshold = None if groups_keys_itself else GROUPING_THRESHOLD
         self.is_read_only = connection.is_read_only
         try:
-            self.grid, self.layout, self.identity = schema_of.read_environment(connection)
+            made = schema_of.read_environment(connection)
         except BaseException:
             connection.close()
             raise
-        reader = PostgresReader(connection, self.layout)
-        self._unpacked = reader.unpacked
+        self.grid, self.layout, self.wants_distances, self.identity = made
+        reader = self._reader = PostgresReader(connection, self.layout)
         self.version, self.revision = reader.version, reader.revision
         self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
         self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
@@ -52,6 +53,7 @@ class PostgresStore:
         self._loading = Loading(connection, self.layout)
         writer = PostgresWriter(connection, self.grid, self.layout, reader, self._loading)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
+        self._write_wish = writer.want_distances
         known = PostgresStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
@@ -66,9 +68,11 @@ class PostgresStore:
         return cls(schema_of.opened(url, read_only=read_only))
 
     @classmethod
-    def create(cls, url: str, grid: Grid, layout: Layout = "brick") -> "PostgresStore":
+    def create(
+        cls, url: str, grid: Grid, layout: Layout = "brick", *, distances: bool = False
+    ) -> "PostgresStore":
         """Make a new environment with its grid: a schema that appears whole or not at all."""
-        schema_of.created(url, grid, layout)
+        schema_of.created(url, grid, layout, distances=distances)
         return cls.open(url)
 
     @property
@@ -102,6 +106,12 @@ class PostgresStore:
         """Inside, an empty table may have no index; the index is made at the end."""
         return self._loading
 
+    def want_distances(self) -> None:
+        """Note that parts get distances when they are imported."""
+        check_distances(self.layout, distances=True)
+        self._write_wish()
+        self.wants_distances = True
+
     def looping(self) -> Store:
         """The same store, but its `scan` loops over the ranges inside the server, one at a time."""
         return cast("Store", LoopInServer(self, self._connection))
@@ -113,4 +123,4 @@ class PostgresStore:
 
     def checker(self) -> PostgresChecker:
         """Answers of this engine for `hapticdb check`."""
-        return PostgresChecker(self._connection, self.layout, self._unpacked)
+        return PostgresChecker(self._connection, self.layout, self._reader)

@@ -9,7 +9,8 @@ import apsw
 import numpy as np
 
 from hapticdb.store import believed
-from hapticdb.store.base import Layout, Rows
+from hapticdb.store.base import Layout, Rows, Table
+from hapticdb.store.batches import NO_DISTANCES
 from hapticdb.store.sqlite import pages as sqlite_pages
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.pages import (
@@ -23,6 +24,8 @@ from hapticdb.store.sqlite.pages import (
     words_checksum,
 )
 from hapticdb.store.sqlite.raw import read_from
+from hapticdb.store.sqlite.tables.ranges import BAND_AND_BRICK, COLUMNS
+from hapticdb.store.sqlite.tables.reading import SQLiteReader
 
 Fetch = Callable[[str, Sequence[Any]], list[Any]]
 PAGES_AT_ONCE = 512
@@ -30,26 +33,27 @@ MOST = 100
 """Findings of one kind that are listed. A larger value makes the report of a ruined file longer."""
 LOOKS = 5
 """Times that a page with a wrong checksum is read again: another process may be writing it."""
-AFTER: dict[Layout, str] = {
+AFTER: dict[Table, str] = {
     "voxel": """
 SELECT z_val, id FROM voxel
  WHERE (z_val, id) > (?1, ?2) ORDER BY z_val, id LIMIT ?3""",
     "brick": """
 SELECT z_val, id, occupancy FROM brick
  WHERE (z_val, id) > (?1, ?2) ORDER BY z_val, id LIMIT ?3""",
+    "band": f"""
+SELECT {COLUMNS} FROM {BAND_AND_BRICK}
+ WHERE (band.z_val, band.id) > (?1, ?2) ORDER BY band.z_val, band.id LIMIT ?3""",
 }
 
 
 class SQLiteChecker:
     """What `hapticdb check` asks a file: SQLite's own check, statistics, all rows in order."""
 
-    def __init__(
-        self, path: Path, layout: Layout, fetch: Fetch, rows: Callable[[list[Any]], Rows]
-    ) -> None:
+    def __init__(self, path: Path, layout: Layout, fetch: Fetch, reader: SQLiteReader) -> None:
         self._path = path
         self._layout = layout
         self._fetch = fetch
-        self._rows = rows
+        self._reader = reader
 
     def has_page_checksums(self) -> bool:
         """Whether the file's pages carry checksums."""
@@ -64,9 +68,13 @@ class SQLiteChecker:
         costs = self._fetch("SELECT figures FROM cost", ())
         yield from believed.findings_of_kept(str(self._path), kept, costs)
 
-    def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
         """At most that many rows after (key, id), ascending by both."""
-        return self._rows(self._fetch(AFTER[self._layout], (key, object_id, limit)))
+        if distances and not self._reader.has_band():
+            return NO_DISTANCES
+        table: Table = "band" if distances else self._layout
+        found = self._fetch(AFTER[table], (key, object_id, limit))
+        return self._reader.unpacked(found, distances=distances)
 
 
 def page_findings(path: Path) -> Iterator[str]:

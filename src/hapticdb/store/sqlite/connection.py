@@ -7,7 +7,7 @@ from typing import Any
 
 import apsw
 
-from hapticdb.store.base import check_outside
+from hapticdb.store.refusals import check_outside
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.threads import check_thread, this_thread

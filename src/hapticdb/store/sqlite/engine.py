@@ -29,9 +29,9 @@ class SQLiteEngine:
         """Open an existing file."""
         return SQLiteStore.open(path_of(url), read_only=read_only)
 
-    def create(self, url: str, grid: Grid, layout: Layout) -> Store:
+    def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
         """Make a new file, which appears whole or not at all."""
-        return SQLiteStore.create(path_of(url), grid, layout)
+        return SQLiteStore.create(path_of(url), grid, layout, distances=distances)
 
     def exists(self, url: str) -> bool:
         """Whether a file of that name is there."""

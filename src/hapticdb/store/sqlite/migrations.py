@@ -97,8 +97,22 @@ CREATE TRIGGER part_added AFTER INSERT ON object BEGIN
 END""",
 )
 
+DISTANCES = (
+    """
+CREATE TABLE band (
+  z_val     INTEGER NOT NULL,
+  id        INTEGER NOT NULL,
+  distances BLOB NOT NULL,
+  PRIMARY KEY (z_val, id)
+) STRICT, WITHOUT ROWID""",
+    """
+ALTER TABLE environment
+  ADD COLUMN wants_distances INTEGER NOT NULL DEFAULT 0 CHECK (wants_distances IN (0, 1))""",
+)
+
 MIGRATIONS: Dialect = {
     "tables": (ENVIRONMENT, OBJECT, VOXEL, BRICK, CHANGE, QUANTILE, COST),
     "lineage": LINEAGE,
     "removed parts": REMOVED,
+    "distances": DISTANCES,
 }

@@ -7,6 +7,7 @@ import apsw
 
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout
+from hapticdb.store.refusals import check_distances
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
@@ -33,10 +34,10 @@ class SQLiteStore:
         self.engine = f"SQLite {apsw.sqlite_lib_version()}"
         self.is_read_only = connection.is_read_only
         self.identity = connection.file.identity
-        self.grid, self.layout = read_environment(connection)
+        self.grid, self.layout, self.wants_distances = read_environment(connection)
         self.snapshot, self.version = connection.snapshot, connection.version
         reader = SQLiteReader(connection, self.grid, self.layout)
-        self._unpacked = reader.unpacked
+        self._reader = reader
         self.revision = reader.revision
         self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
         self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
@@ -45,6 +46,7 @@ class SQLiteStore:
         self.removed, self.changes = reader.removed, reader.changes
         writer = SQLiteWriter(connection, self.grid, self.layout, reader)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
+        self._write_wish = writer.want_distances
         known = SQLiteStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
@@ -63,13 +65,16 @@ class SQLiteStore:
             raise
 
     @classmethod
-    def create(cls, path: str | Path, grid: Grid, layout: Layout = "brick") -> "SQLiteStore":
+    def create(
+        cls, path: str | Path, grid: Grid, layout: Layout = "brick", *, distances: bool = False
+    ) -> "SQLiteStore":
         """Make a new environment with its grid; its file appears whole or not at all."""
         lineage = sqlite_log.first_lineage()
-        row = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout, lineage)
+        told = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout, lineage)
+        row = (*told, int(distances))
 
         def fill(connection: apsw.Connection) -> None:
-            connection.execute("INSERT INTO environment VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+            connection.execute("INSERT INTO environment VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
 
         sqlite_file.create_file(Path(path), fill)
         return cls.open(path)
@@ -97,9 +102,15 @@ class SQLiteStore:
         """Postpones nothing: rows go at once into the tree where they stay."""
         return contextlib.nullcontext()
 
+    def want_distances(self) -> None:
+        """Note that parts get distances when they are imported."""
+        check_distances(self.layout, distances=True)
+        self._write_wish()
+        self.wants_distances = True
+
     def checker(self) -> SQLiteChecker:
         """Answers of this engine for `hapticdb check`."""
-        return SQLiteChecker(self.path, self.layout, self._connection.fetch, self._unpacked)
+        return SQLiteChecker(self.path, self.layout, self._connection.fetch, self._reader)
 
     # -- caches ------------------------------------------------------------------------------
 

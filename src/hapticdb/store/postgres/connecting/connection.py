@@ -9,11 +9,11 @@ import psycopg
 from psycopg import sql
 
 from hapticdb.errors import ConnectionLostError, DatabaseError
-from hapticdb.store.base import check_outside
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.link import Link
 from hapticdb.store.postgres.connecting.wire import Parameter
+from hapticdb.store.refusals import check_outside
 from hapticdb.store.threads import check_thread, this_thread
 
 Result = TypeVar("Result")

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.store.base import BRICK_BYTES, LocatedShell, Rows
+from hapticdb.store.base import BRICK_BYTES, Band, LocatedShell, Rows
 
 BYTEA, INT8, INT4, TEXT, FLOAT8 = 17, 20, 23, 25, 701
 INT8_ARRAY, FLOAT8_ARRAY = 1016, 1022
@@ -32,6 +32,7 @@ _FIELDS = [
     ("id", ">i8"),
 ]
 _VOXEL = np.dtype(_FIELDS)
+_BAND = np.dtype([*_FIELDS, ("distances_length", ">i4")])
 _BRICK = np.dtype([*_FIELDS, ("bits_length", ">i4"), ("bits", f"V{BRICK_BYTES}")])
 
 
@@ -107,7 +108,12 @@ def read_float8s(value: bytes) -> NDArray[np.float64]:
 
 
 def copy_rows(rows: Rows, object_id: int) -> bytes:
-    """Rows of an object in the form of COPY, without header and trailer."""
+    """Rows of an object in the form of COPY, without header and trailer.
+
+    Rows with distances are rows of the table `band`, others of the index table.
+    """
+    if rows.distances is not None:
+        return _copy_band(rows.keys, rows.distances, object_id)
     count = len(rows)
     has_bits = rows.occupancy.size > 0
     packed = np.empty(count, _BRICK if has_bits else _VOXEL)
@@ -119,4 +125,23 @@ def copy_rows(rows: Rows, object_id: int) -> bytes:
         packed["bits_length"] = BRICK_BYTES
         bits = np.ascontiguousarray(rows.occupancy).view(f"V{BRICK_BYTES}")
         packed["bits"] = bits.reshape(-1)
+    return packed.tobytes()
+
+
+def _copy_band(keys: NDArray[np.int64], distances: Band, object_id: int) -> bytes:
+    """Rows of the table `band`: what stands before each row's bytes, then these bytes."""
+    lengths = distances.lengths
+    heads = np.empty(len(keys), _BAND)
+    heads["fields"] = 3
+    heads["z_length"] = heads["id_length"] = 8
+    heads["z_val"] = keys
+    heads["id"] = object_id
+    heads["distances_length"] = lengths
+    size = _BAND.itemsize
+    starts = distances.ends - lengths + size * np.arange(len(keys))
+    is_data = np.ones(len(distances.data) + size * len(keys), dtype=np.bool_)
+    is_data[starts[:, None] + np.arange(size)] = False
+    packed = np.empty(len(is_data), np.uint8)
+    packed[is_data] = distances.data
+    packed[~is_data] = heads.view(np.uint8)
     return packed.tobytes()

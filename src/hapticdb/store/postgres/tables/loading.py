@@ -13,12 +13,13 @@ from types import TracebackType
 import psycopg
 
 from hapticdb.errors import ConnectionLostError
-from hapticdb.store.base import LAYOUTS, Layout
+from hapticdb.store.base import Layout, Table
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 
-IS_EMPTY = {layout: f"SELECT NOT EXISTS (SELECT 1 FROM {layout})" for layout in LAYOUTS}
+TABLES: dict[Layout, tuple[Table, ...]] = {"voxel": ("voxel",), "brick": ("brick", "band")}
+"""Tables of a layout whose index is made after the rows."""
 # Advisory locks of an environment: one for its loaders, one for the maker of the index.
 # The key is the oid of a table of the environment. An oid has 32 bits without a sign, a key 32 bits
 # with a sign.
@@ -31,7 +32,7 @@ class Loading:
 
     def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
-        self._layout = layout
+        self._tables = TABLES[layout]
         self._depth = 0
         self._is_owner = False
         self._has_written = False
@@ -78,7 +79,7 @@ class Loading:
                 if self._is_owner:
                     self._make_index()
                     if self._has_written:  # so that frames read the index only
-                        connection.command(f"VACUUM {self._layout}")
+                        connection.command(f"VACUUM {', '.join(self._tables)}")
             finally:
                 self._unlock("_shared", LOADERS)
 
@@ -131,21 +132,24 @@ class Loading:
 
     def _has_index(self) -> bool:
         found = self._connection.rows(
-            "SELECT to_regclass(%s) IS NOT NULL", (f"{self._layout}_key",)
+            "SELECT bool_and(to_regclass(name) IS NOT NULL) FROM unnest(%s::text[]) AS name",
+            ([f"{table}_key" for table in self._tables],),
         )
         return bool(found[0][0])
 
     def _is_empty(self) -> bool:
-        return bool(self._connection.rows(IS_EMPTY[self._layout])[0][0])
+        held = " UNION ALL ".join(f"(SELECT 1 FROM {table} LIMIT 1)" for table in self._tables)
+        return not self._connection.rows(f"{held} LIMIT 1")
 
     def _drop_index(self) -> None:
-        """Drop the index. If somebody is reading, the index stays, and nobody waits."""
+        """Drop the indexes. If somebody is reading, they stay, and nobody waits."""
         connection = self._connection
         with contextlib.suppress(psycopg.errors.LockNotAvailable):
             connection.command("BEGIN")
             try:
                 connection.command("SET LOCAL lock_timeout = '50ms'")
-                connection.command(f"DROP INDEX IF EXISTS {self._layout}_key")
+                keys = ", ".join(f"{table}_key" for table in self._tables)
+                connection.command(f"DROP INDEX IF EXISTS {keys}")
                 connection.command("COMMIT")
             except BaseException:
                 if not connection.driver.closed:
@@ -153,17 +157,18 @@ class Loading:
                 raise
 
     def _make_index(self) -> None:
-        """Make the index, while readers go on and writers wait.
+        """Make the indexes, while readers go on and writers wait.
 
         A lock lets one connection at a time do so: IF NOT EXISTS alone would let two begin.
         """
-        connection, layout = self._connection, self._layout
+        connection = self._connection
         connection.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
         try:
             connection.command("SET maintenance_work_mem = '256MB'")
-            connection.command(
-                f"CREATE UNIQUE INDEX IF NOT EXISTS {layout}_key ON {layout} (z_val, id)"
-            )
+            for table in self._tables:
+                connection.command(
+                    f"CREATE UNIQUE INDEX IF NOT EXISTS {table}_key ON {table} (z_val, id)"
+                )
             connection.command("RESET maintenance_work_mem")
         finally:
             self._unlock("", MAKERS)

@@ -8,19 +8,22 @@ from numpy.typing import NDArray
 from hapticdb.store import believed
 from hapticdb.store.base import (
     NO_OCCUPANCY,
-    NO_ROWS,
     Change,
     Keys,
     Layout,
     LocatedShell,
     Object,
     Rows,
-    no_object,
+    Table,
     row_shift,
 )
+from hapticdb.store.batches import joined, no_rows
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import records, statements
+from hapticdb.store.refusals import no_object
+
+HAS_BAND = "SELECT to_regclass('band') IS NOT NULL"
 
 
 class PostgresReader:
@@ -32,6 +35,7 @@ class PostgresReader:
         self._layout = layout
         self._shift = row_shift(layout)
         self._seen = -1
+        self._has_band = False
 
     def version(self) -> int:
         """The revision that the last read has seen."""
@@ -45,56 +49,66 @@ class PostgresReader:
 
     # -- rows -----------------------------------------------------------------------------------
 
-    def unpacked(self, found: list[bytes | None]) -> Rows:
+    def unpacked(self, found: list[bytes | None], *, distances: bool = False) -> Rows:
         """Rows from a statement's one packed row; its last value is the revision that was read."""
         seen = found[-1]
         self._seen = wire.read_int8(seen) if seen is not None else -1
         if found[0] is None:
-            return NO_ROWS
+            return no_rows(distances=distances)
         keys, ids = wire.read_int8s(found[0]), wire.read_int8s(found[1])
         occupancy = np.frombuffer(found[2] or b"", np.uint8) if self._shift else NO_OCCUPANCY
         rows = Rows(keys, ids, occupancy)
-        return rows if _is_in_order(rows) else _in_order(rows)
+        if distances:
+            lengths = wire.read_int8s(found[4])
+            rows = rows.having(believed.band_of(self._url, found[3] or b"", lengths))
+        return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
 
-    def lookup(self, keys: Keys) -> Rows:
+    def has_band(self) -> bool:
+        """Whether there is a table of distances; another may make it while a reader has it open."""
+        if not self._has_band:
+            self._has_band = self._connection.rows(HAS_BAND) == [(True,)]
+        return self._has_band
+
+    def _table(self, *, distances: bool) -> Table | None:
+        """Table that answers a read; None if it is not there."""
+        if not distances:
+            return self._layout
+        return "band" if self._has_band or self.has_band() else None
+
+    def _fetched(self, text: str, *parameters: wire.Parameter, distances: bool) -> Rows:
+        return self.unpacked(self._connection.fetch(text, *parameters), distances=distances)
+
+    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in one statement."""
-        if not keys.size:
-            return NO_ROWS
-        return self.unpacked(
-            self._connection.fetch(statements.LOOKUP[self._layout], wire.int8s(keys))
-        )
+        table = self._table(distances=distances)
+        if not keys.size or table is None:
+            return no_rows(distances=distances)
+        return self._fetched(statements.LOOKUP[table], wire.int8s(keys), distances=distances)
 
-    def lookup_each(self, keys: Keys) -> Rows:
+    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), one statement a key."""
-        text = statements.LOOKUP_ONE[self._layout]
-        parts = [
-            rows
-            for key in keys.tolist()
-            if len(rows := self.unpacked(self._connection.fetch(text, wire.int8(key))))
-        ]
-        if not parts:
-            return NO_ROWS
-        bits = b"".join(part.occupancy.tobytes() for part in parts)
-        return Rows(
-            np.concatenate([part.keys for part in parts]),
-            np.concatenate([part.ids for part in parts]),
-            np.frombuffer(bits, np.uint8),
-        )
+        table = self._table(distances=distances)
+        if table is None:
+            return no_rows(distances=distances)
+        text = statements.LOOKUP_ONE[table]
+        parts = [self._fetched(text, wire.int8(key), distances=distances) for key in keys.tolist()]
+        return joined([part for part in parts if len(part)], distances=distances)
 
-    def scan(self, lows: Keys, highs: Keys) -> Rows:
+    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows with a key in any of the closed ranges, ascending and disjoint."""
-        if not lows.size:
-            return NO_ROWS
-        text = statements.SCAN[self._layout]
-        return self.unpacked(self._connection.fetch(text, wire.int8s(lows), wire.int8s(highs)))
-
-    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
-        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
-        if not lows.size:
-            return NO_ROWS
+        table = self._table(distances=distances)
+        if not lows.size or table is None:
+            return no_rows(distances=distances)
         ends = wire.int8s(lows), wire.int8s(highs)
-        text = statements.ROWS_OF[self._layout]
-        return self.unpacked(self._connection.fetch(text, *ends, wire.int8(object_id)))
+        return self._fetched(statements.SCAN[table], *ends, distances=distances)
+
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
+        table = self._table(distances=distances)
+        if not lows.size or table is None:
+            return no_rows(distances=distances)
+        chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(object_id)
+        return self._fetched(statements.ROWS_OF[table], *chosen, distances=distances)
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""
@@ -158,16 +172,8 @@ class PostgresReader:
 
 
 def _is_in_order(rows: Rows) -> bool:
+    """Whether rows are ordered by key and id. They are not while a first import has no index."""
     keys, ids = rows.keys, rows.ids
     if len(keys) < 2:
         return True
     return bool(((keys[1:] > keys[:-1]) | ((keys[1:] == keys[:-1]) & (ids[1:] > ids[:-1]))).all())
-
-
-def _in_order(rows: Rows) -> Rows:
-    """Rows in order of key and id. They come unsorted while a first import has no index yet."""
-    order = np.lexsort((rows.ids, rows.keys))
-    bits = rows.occupancy
-    if bits.size:
-        bits = np.frombuffer(bits.reshape(-1, 64)[order].tobytes(), np.uint8)
-    return Rows(rows.keys[order], rows.ids[order], bits)

@@ -5,72 +5,83 @@ trip whether the environment has changed. Rows come in the order of the index; `
 checks that.
 """
 
-from hapticdb.store.base import LAYOUTS, Layout
+from typing import get_args
 
-PACKED: dict[Layout, str] = {
+from hapticdb.store.base import BRICK_BYTES, LAYOUTS, Layout, Table
+
+TABLES: tuple[Table, ...] = get_args(Table)
+# the LEFT JOIN of `band` and `brick` as a subquery in the list of columns: so the planner can only
+# look up each brick by its key, and the rows keep the order of `band`
+OCCUPANCY = f"""
+       string_agg(coalesce((SELECT occupancy FROM brick
+                             WHERE brick.z_val = band.z_val AND brick.id = band.id),
+                           decode(repeat('00', {BRICK_BYTES}), 'hex')), '')"""
+PACKED: dict[Table, str] = {
     "voxel": "array_agg(z_val), array_agg(id)",
     "brick": "array_agg(z_val), array_agg(id), string_agg(occupancy, '')",
+    "band": f"array_agg(z_val), array_agg(id), {OCCUPANCY}, string_agg(distances, ''),"
+    " array_agg(octet_length(distances)::bigint)",
 }
 SEEN = "(SELECT revision FROM environment WHERE environment.id = 1)"
 
 # PostgreSQL 17 and later read each leaf page once for all of the sorted keys on it
-LOOKUP = {
-    layout: f"""
-SELECT {PACKED[layout]}, {SEEN}
-  FROM {layout}
+LOOKUP: dict[Table, str] = {
+    table: f"""
+SELECT {PACKED[table]}, {SEEN}
+  FROM {table}
  WHERE z_val = ANY ($1)"""
-    for layout in LAYOUTS
+    for table in TABLES
 }
-LOOKUP_ONE = {
-    layout: f"""
-SELECT {PACKED[layout]}, {SEEN}
-  FROM {layout}
+LOOKUP_ONE: dict[Table, str] = {
+    table: f"""
+SELECT {PACKED[table]}, {SEEN}
+  FROM {table}
  WHERE z_val = $1"""
-    for layout in LAYOUTS
+    for table in TABLES
 }
-SCAN = {
-    layout: f"""
-SELECT {PACKED[layout]}, {SEEN}
-  FROM unnest($1, $2) AS range(low, high) JOIN {layout}
+SCAN: dict[Table, str] = {
+    table: f"""
+SELECT {PACKED[table]}, {SEEN}
+  FROM unnest($1, $2) AS range(low, high) JOIN {table}
     ON z_val BETWEEN range.low AND range.high"""
-    for layout in LAYOUTS
+    for table in TABLES
 }
-AFTER = {
-    layout: f"""
-SELECT {PACKED[layout]}, {SEEN}
-  FROM (SELECT * FROM {layout}
+AFTER: dict[Table, str] = {
+    table: f"""
+SELECT {PACKED[table]}, {SEEN}
+  FROM (SELECT * FROM {table}
          WHERE (z_val, id) > ($1, $2)
-         ORDER BY z_val, id LIMIT $3) AS found"""
-    for layout in LAYOUTS
+         ORDER BY z_val, id LIMIT $3) AS {table}"""
+    for table in TABLES
 }
 # LATERAL and OFFSET 0 force a scan of each range: the planner expects wide ranges, and would read
 # the whole index to find the id
-ROWS_OF = {
-    layout: f"""
-SELECT {PACKED[layout]}, {SEEN}
+ROWS_OF: dict[Table, str] = {
+    table: f"""
+SELECT {PACKED[table]}, {SEEN}
   FROM unnest($1, $2) AS range(low, high),
        LATERAL (SELECT *
-                  FROM {layout}
+                  FROM {table}
                  WHERE z_val BETWEEN range.low AND range.high AND id = $3
-                 ORDER BY z_val OFFSET 0) AS found"""
-    for layout in LAYOUTS
+                 ORDER BY z_val OFFSET 0) AS {table}"""
+    for table in TABLES
 }
-DELETE_ROWS = {
-    layout: f"""
+DELETE_ROWS: dict[Table, str] = {
+    table: f"""
 WITH gone AS (
-  DELETE FROM {layout}
+  DELETE FROM {table}
    WHERE ctid = ANY (ARRAY(
            SELECT place
              FROM unnest($1, $2) AS range(low, high),
                   LATERAL (SELECT ctid AS place
-                             FROM {layout}
+                             FROM {table}
                             WHERE z_val BETWEEN range.low AND range.high AND id = $3
                            OFFSET 0) AS found))
   RETURNING z_val)
 SELECT array_agg(z_val) FROM gone"""
-    for layout in LAYOUTS
+    for table in TABLES
 }
-COUNT = {
+COUNT: dict[Layout, str] = {
     layout: f"""
 SELECT count(*)
   FROM unnest($1, $2) AS range(low, high) JOIN {layout}

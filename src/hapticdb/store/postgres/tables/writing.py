@@ -8,14 +8,12 @@ from psycopg import errors
 
 from hapticdb.grid import Grid
 from hapticdb.store.base import (
-    BRICK_BYTES,
     Covering,
     Keys,
     Layout,
     Object,
     Rows,
-    check_unwritten,
-    present_already,
+    Table,
     touched_ranges,
 )
 from hapticdb.store.postgres.connecting import wire
@@ -24,11 +22,17 @@ from hapticdb.store.postgres.tables import records, statements
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.watching import channel_of
+from hapticdb.store.refusals import check_unwritten, present_already
 
 Result = TypeVar("Result")
 
 COPY_CHUNK = 1 << 17
 """Rows that are packed for COPY at a time. A larger value takes more memory, not less time."""
+COLUMNS: dict[Table, str] = {
+    "voxel": "z_val, id",
+    "brick": "z_val, id, occupancy",
+    "band": "z_val, id, distances",
+}
 # not from a sequence, which also counts rolled-back writes: an import that is run again would
 # give other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
@@ -96,6 +100,12 @@ class PostgresWriter:
 
         self._commit(work)
 
+    def want_distances(self) -> None:
+        """Note in the environment that its parts get distances."""
+        self._connection.write(
+            lambda: self._connection.execute("UPDATE environment SET wants_distances = true")
+        )
+
     def _next_revision(self) -> int:
         """Take the write lock; returns the number of the new revision."""
         return int(self._execute(NEXT_REVISION)[0][0])
@@ -118,27 +128,30 @@ class PostgresWriter:
         return cursor.fetchall() if cursor.description else []
 
     def _copy(self, rows: Rows, object_id: int) -> None:
-        columns = "z_val, id, occupancy" if self._layout == "brick" else "z_val, id"
-        text = f"COPY {self._layout} ({columns}) FROM STDIN (FORMAT binary)"
+        self._copy_into(self._layout, rows.occupied(), object_id)
+        if rows.distances is not None:
+            self._copy_into("band", rows, object_id)
+
+    def _copy_into(self, table: Table, rows: Rows, object_id: int) -> None:
         cursor = self._connection.driver.cursor()
-        with cursor.copy(text) as copy:
+        with cursor.copy(f"COPY {table} ({COLUMNS[table]}) FROM STDIN (FORMAT binary)") as copy:
             copy.write(wire.COPY_HEADER)
             for at in range(0, len(rows), COPY_CHUNK):
-                part = slice(at, at + COPY_CHUNK)
-                bits = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + COPY_CHUNK)]
-                copy.write(wire.copy_rows(Rows(rows.keys[part], rows.ids[part], bits), object_id))
+                copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id))
             copy.write(wire.COPY_TRAILER)
 
     def _delete(self, known: Object, covering: Covering) -> Keys:
-        """Delete the rows of an object as it is now; returns their keys."""
+        """Delete the rows of an object as it is now, from both tables; returns their keys."""
         ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
-        (found,) = self._connection.fetch(
-            statements.DELETE_ROWS[self._layout],
-            wire.int8s(ends[:, 0]),
-            wire.int8s(ends[:, 1]),
-            wire.int8(known.id),
-        )
-        return wire.read_int8s(found)
+        chosen = wire.int8s(ends[:, 0]), wire.int8s(ends[:, 1]), wire.int8(known.id)
+        tables: list[Table] = [self._layout]
+        if known.has_distances:
+            tables.append("band")
+        gone = []
+        for table in tables:
+            (found,) = self._connection.fetch(statements.DELETE_ROWS[table], *chosen)
+            gone.append(wire.read_int8s(found))
+        return np.concatenate(gone)
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
         """Record which keys a write touched, and notify those who watch when it is committed."""

@@ -10,12 +10,17 @@ from typing import Any, cast
 import apsw
 import numpy as np
 
-from hapticdb.store.base import Keys, Layout, row_shift
+from hapticdb.store.base import BRICK_BYTES, Keys, Layout, Table, row_shift
 
 KEY_BITS = 63
 """Value bits of a non-negative int64."""
 
-NARROW: dict[Layout, str] = {
+# a row of distances, and the occupancy of its brick, zero if the brick holds no voxel. SQLite never
+# reorders a CROSS JOIN nor a LEFT JOIN, so the rows keep the order of the keys asked for
+COLUMNS = f"band.z_val, band.id, coalesce(occupancy, zeroblob({BRICK_BYTES})), distances"
+BAND_AND_BRICK = """band LEFT JOIN brick
+    ON brick.z_val = band.z_val AND brick.id = band.id"""
+NARROW: dict[Table, str] = {
     "voxel": """
 SELECT z_val, id
   FROM carray(?1) AS range CROSS JOIN voxel
@@ -24,8 +29,12 @@ SELECT z_val, id
 SELECT z_val, id, occupancy
   FROM carray(?1) AS range CROSS JOIN brick
  WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
+    "band": f"""
+SELECT {COLUMNS}
+  FROM carray(?1) AS range CROSS JOIN {BAND_AND_BRICK}
+ WHERE band.z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
 }
-WIDE: dict[Layout, str] = {
+WIDE: dict[Table, str] = {
     "voxel": """
 SELECT z_val, id
   FROM carray(?1) AS low CROSS JOIN voxel
@@ -34,6 +43,10 @@ SELECT z_val, id
 SELECT z_val, id, occupancy
   FROM carray(?1) AS low CROSS JOIN brick
  WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
+    "band": f"""
+SELECT {COLUMNS}
+  FROM carray(?1) AS low CROSS JOIN {BAND_AND_BRICK}
+ WHERE band.z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
 }
 
 
@@ -45,23 +58,23 @@ class RangeStatements:
         self._width_bits = KEY_BITS - max(3 * bits - row_shift(layout), 1)
         self._mask = (1 << self._width_bits) - 1
         self._key_end = 1 << (KEY_BITS - self._width_bits)
-        self._narrow, self._wide = NARROW[layout], WIDE[layout]
+        self._layout = layout
         connection.create_scalar_function("nth", cast("Any", _nth), 3, deterministic=True)
 
-    def scan(self, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
-        """Rows with a key in closed ranges, ascending and disjoint, at least one."""
+    def scan(self, table: Table, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
+        """Rows of a table with a key in closed ranges, ascending and disjoint, at least one."""
         widths = highs - lows
         is_narrow = (
             int(widths.max()) <= self._mask and int(lows[-1]) < self._key_end and int(lows[0]) >= 0
         )
         if is_narrow:
             packed = apsw.carray((lows << self._width_bits) | widths)
-            return self._narrow, (packed, self._width_bits, self._mask)
-        return self._wide, (apsw.carray(np.ascontiguousarray(lows)), _ends(highs), 0)
+            return NARROW[table], (packed, self._width_bits, self._mask)
+        return WIDE[table], (apsw.carray(np.ascontiguousarray(lows)), _ends(highs), 0)
 
     def count(self, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
-        """Count the rows that `scan` would return."""
-        sql, bindings = self.scan(lows, highs)
+        """Count the rows of the index table in the ranges."""
+        sql, bindings = self.scan(self._layout, lows, highs)
         return f"SELECT count(*) FROM ({sql})", bindings
 
 

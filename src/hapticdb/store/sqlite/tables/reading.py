@@ -15,40 +15,42 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
 from hapticdb.store import believed
-from hapticdb.store.base import (
-    NO_ROWS,
-    Change,
-    Keys,
-    Layout,
-    LocatedShell,
-    Object,
-    Rows,
-    no_object,
-    row_shift,
-)
+from hapticdb.store.base import Change, Keys, Layout, LocatedShell, Object, Rows, Table, row_shift
+from hapticdb.store.batches import no_rows
+from hapticdb.store.refusals import no_object
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
-from hapticdb.store.sqlite.tables.ranges import RangeStatements
+from hapticdb.store.sqlite.tables.ranges import BAND_AND_BRICK, COLUMNS, RangeStatements
 
-LOOKUP = {
+HAS_BAND = "SELECT count(*) FROM sqlite_master WHERE name = 'band' AND type = 'table'"
+LOOKUP: dict[Table, str] = {
     "voxel": "SELECT z_val, id FROM carray(?1) AS asked CROSS JOIN voxel ON z_val = asked.value",
     "brick": """SELECT z_val, id, occupancy
                   FROM carray(?1) AS asked CROSS JOIN brick ON z_val = asked.value""",
+    "band": f"""SELECT {COLUMNS}
+                  FROM carray(?1) AS asked CROSS JOIN {BAND_AND_BRICK}
+                 WHERE band.z_val = asked.value""",
 }
-LOOKUP_ONE = {
+LOOKUP_ONE: dict[Table, str] = {
     "voxel": "SELECT z_val, id FROM voxel WHERE z_val = ?1",
     "brick": "SELECT z_val, id, occupancy FROM brick WHERE z_val = ?1",
+    "band": f"SELECT {COLUMNS} FROM {BAND_AND_BRICK} WHERE band.z_val = ?1",
 }
 
 
-def read_environment(connection: FileConnection) -> tuple[Grid, Layout]:
-    """Grid and layout of an environment, both checked."""
-    believed.check_tables(connection.url, dict(connection.fetch(sqlite_rows.KINDS)))
+def read_environment(connection: FileConnection) -> tuple[Grid, Layout, bool]:
+    """Grid and layout of an environment, and whether it wants distances, all checked."""
+    kinds = dict(connection.fetch(sqlite_rows.KINDS))
+    believed.check_tables(connection.url, kinds)
+    # a reader may have opened a file of an older format
+    wish = "wants_distances" if believed.BAND in kinds else "0"
     rows = connection.fetch(
-        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout FROM environment"
+        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, "
+        f"{wish} FROM environment"
     )
-    return believed.grid_of(connection.url, rows)
+    grid, layout = believed.grid_of(connection.url, rows)
+    return grid, layout, believed.wish_of(connection.url, rows[0][7])
 
 
 class SQLiteReader:
@@ -58,6 +60,7 @@ class SQLiteReader:
         self._connection = connection
         self._layout = layout
         self._has_bricks = row_shift(layout) > 0
+        self._has_band = False
         self._ranges = RangeStatements(connection.driver, layout, grid.bits)
         sqlite_force.register(connection.driver, grid, layout)
 
@@ -69,36 +72,61 @@ class SQLiteReader:
 
     # -- rows -----------------------------------------------------------------------------------
 
-    def unpacked(self, found: list[Any]) -> Rows:
+    def unpacked(self, found: list[Any], *, distances: bool = False) -> Rows:
         """Rows as arrays, from the tuples of a statement."""
-        return sqlite_rows.rows_of(self._connection.url, found, has_bricks=self._has_bricks)
+        url = self._connection.url
+        if distances:
+            return sqlite_rows.rows_with_distances(url, found)
+        return sqlite_rows.rows_of(url, found, has_bricks=self._has_bricks)
 
-    def lookup(self, keys: Keys) -> Rows:
+    def has_band(self) -> bool:
+        """Whether there is a table of distances; another may make it while a reader has it open."""
+        if not self._has_band:
+            found = self._connection.fetch(HAS_BAND)
+            self._has_band = bool(found[0][0])
+        return self._has_band
+
+    def _table(self, *, distances: bool) -> Table | None:
+        """Table that answers a read; None if it is not there."""
+        if not distances:
+            return self._layout
+        return "band" if self._has_band or self.has_band() else None
+
+    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in one statement."""
-        if not keys.size:
-            return NO_ROWS
-        return self.unpacked(self._connection.fetch(LOOKUP[self._layout], (apsw.carray(keys),)))
+        table = self._table(distances=distances)
+        if not keys.size or table is None:
+            return no_rows(distances=distances)
+        found = self._connection.fetch(LOOKUP[table], (apsw.carray(keys),))
+        return self.unpacked(found, distances=distances)
 
-    def lookup_each(self, keys: Keys) -> Rows:
+    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), one statement a key."""
-        sql = LOOKUP_ONE[self._layout]
+        table = self._table(distances=distances)
+        if table is None:
+            return no_rows(distances=distances)
+        sql = LOOKUP_ONE[table]
         found: list[Any] = []
         for key in keys.tolist():
             found += self._connection.fetch(sql, (key,))
-        return self.unpacked(found)
+        return self.unpacked(found, distances=distances)
 
-    def scan(self, lows: Keys, highs: Keys) -> Rows:
+    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows with a key in any of the closed ranges, ascending and disjoint."""
-        if not lows.size:
-            return NO_ROWS
-        return self.unpacked(self._connection.fetch(*self._ranges.scan(lows, highs)))
+        table = self._table(distances=distances)
+        if not lows.size or table is None:
+            return no_rows(distances=distances)
+        found = self._connection.fetch(*self._ranges.scan(table, lows, highs))
+        return self.unpacked(found, distances=distances)
 
-    def rows_of(self, object_id: int, lows: Keys, highs: Keys) -> Rows:
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
-        if not lows.size:
-            return NO_ROWS
-        sql, bindings = self._ranges.scan(lows, highs)
-        return self.unpacked(self._connection.fetch(f"{sql} AND id = ?4", (*bindings, object_id)))
+        table = self._table(distances=distances)
+        if not lows.size or table is None:
+            return no_rows(distances=distances)
+        sql, bindings = self._ranges.scan(table, lows, highs)
+        found = self._connection.fetch(f"{sql} AND {table}.id = ?4", (*bindings, object_id))
+        return self.unpacked(found, distances=distances)
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""

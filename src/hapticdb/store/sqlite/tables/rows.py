@@ -1,5 +1,6 @@
 """Rows and objects converted from and to the values that apsw returns and takes."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -7,6 +8,7 @@ from numpy.typing import NDArray
 
 from hapticdb.store import believed
 from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, NO_ROWS, Object, Rows
+from hapticdb.store.batches import NO_DISTANCES
 
 KINDS = """
 SELECT name, CASE WHEN sql LIKE 'CREATE VIRTUAL%' THEN 'virtual table' ELSE type END
@@ -20,7 +22,11 @@ def rows_of(url: str, found: list[Any], *, has_bricks: bool) -> Rows:
     if not has_bricks:
         pairs = pairs_of(url, found)
         return Rows(pairs[:, 0].copy(), pairs[:, 1].copy(), NO_OCCUPANCY)
-    keys, ids, bricks = zip(*found, strict=True)
+    return _bricks(url, *zip(*found, strict=True))
+
+
+def _bricks(url: str, keys: Sequence[Any], ids: Sequence[Any], bricks: Sequence[Any]) -> Rows:
+    """Rows from their columns."""
     count = len(keys)
     try:
         joined = b"".join(bricks)
@@ -34,6 +40,20 @@ def rows_of(url: str, found: list[Any], *, has_bricks: bool) -> Rows:
     if len(joined) != BRICK_BYTES * count:
         raise believed.damaged(url, "a brick of the wrong length")
     return rows
+
+
+def rows_with_distances(url: str, found: list[Any]) -> Rows:
+    """Rows from the tuples (key, id, occupancy, distances) of a statement."""
+    if not found:
+        return NO_DISTANCES
+    *columns, packed = zip(*found, strict=True)
+    rows = _bricks(url, *columns)
+    try:
+        joined = b"".join(packed)
+        lengths = np.fromiter(map(len, packed), np.int64, len(packed))
+    except TypeError as error:
+        raise believed.damaged(url, f"distances of another kind: {error}") from error
+    return rows.having(believed.band_of(url, joined, lengths))
 
 
 def pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:

@@ -1,5 +1,7 @@
 """Writes into a file: each object in one transaction, with its rows and its change."""
 
+from typing import get_args
+
 import apsw
 import numpy as np
 
@@ -11,10 +13,10 @@ from hapticdb.store.base import (
     Layout,
     Object,
     Rows,
-    check_unwritten,
-    present_already,
+    Table,
     touched_ranges,
 )
+from hapticdb.store.refusals import check_unwritten, present_already
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
@@ -26,12 +28,23 @@ INSERT = {
                         substr(?3, {BRICK_BYTES} * rowid - {BRICK_BYTES - 1}, {BRICK_BYTES})
                    FROM carray(?1)""",
 }
+INSERT_BAND = """
+INSERT INTO band SELECT value, ?2, substr(?3, nth(?4, rowid, 0), nth(?5, rowid, 0))
+  FROM carray(?1)"""
 CHUNK = 1 << 22
 """Rows that one statement inserts. A larger value takes more memory, up to 80 bytes a row."""
+BAND_CHUNK = 1 << 17
+"""Rows of distances that one statement inserts, a value of at most 256 MiB."""
 INSERT_OBJECT = """
 INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
 SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN ?9 END,
        ?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8"""
+
+
+DELETE: dict[Table, str] = {
+    table: f"DELETE FROM {table} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
+    for table in get_args(Table)
+}
 
 
 class SQLiteWriter:
@@ -89,8 +102,14 @@ class SQLiteWriter:
             self._connection.execute("DELETE FROM object WHERE id = ?", (object_id,))
             self._log(revision, "remove", object_id, gone)
 
-    def _insert(self, rows: Rows, object_id: int) -> None:
-        """Insert a batch of rows, ascending by key: one statement for up to CHUNK of them."""
+    def want_distances(self) -> None:
+        """Note in the environment that its parts get distances."""
+        with self._connection.writing():
+            self._connection.execute("UPDATE environment SET wants_distances = 1")
+
+    def _insert(self, union: Rows, object_id: int) -> None:
+        """Insert rows, ascending by key: one statement for up to CHUNK of them."""
+        rows = union.occupied()
         for at in range(0, len(rows), CHUNK):
             keys = apsw.carray(rows.keys[at : at + CHUNK])
             if self._layout == "voxel":
@@ -98,14 +117,29 @@ class SQLiteWriter:
             else:
                 part = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + CHUNK)]
                 self._connection.execute(INSERT["brick"], (keys, object_id, part.tobytes()))
+        for at in range(0, len(union), BAND_CHUNK) if union.distances is not None else ():
+            self._insert_band(union.part(at, at + BAND_CHUNK), object_id)
+
+    def _insert_band(self, rows: Rows, object_id: int) -> None:
+        """Insert the distances of rows, by one statement."""
+        assert rows.distances is not None  # noqa: S101 - the caller has looked
+        data, ends = rows.distances
+        lengths = rows.distances.lengths
+        places = (apsw.pyobject((ends - lengths + 1).tolist()), apsw.pyobject(lengths.tolist()))
+        keys = apsw.carray(np.ascontiguousarray(rows.keys))
+        self._connection.execute(INSERT_BAND, (keys, object_id, data.tobytes(), *places))
 
     def _delete(self, object_id: int, covering: Covering) -> Keys:
-        """Delete the rows of an object as it is now; returns their keys."""
+        """Delete the rows of an object as it is now, from both tables; returns their keys."""
         known = self._reader.object(object_id)
-        sql = f"DELETE FROM {self._layout} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
+        tables: list[Table] = [self._layout]
+        if known.has_distances:
+            tables.append("band")
         gone: list[int] = []
         for low, high in covering(known):
-            gone += [row[0] for row in self._connection.execute(sql, (low, high, object_id))]
+            for table in tables:
+                deleted = self._connection.execute(DELETE[table], (low, high, object_id))
+                gone += [row[0] for row in deleted]
         return np.array(gone, dtype=np.int64)
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:

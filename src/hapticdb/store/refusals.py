@@ -1,0 +1,51 @@
+"""Errors that the stores of all engines raise in the same words."""
+
+from hapticdb.errors import (
+    ConflictError,
+    EnvironmentExistsError,
+    ObjectNotFoundError,
+    UsageError,
+)
+from hapticdb.store.base import Layout, Object
+
+
+def no_object(object_id: int, url: str) -> ObjectNotFoundError:
+    """Build the error for an id that no object has."""
+    return ObjectNotFoundError(
+        f"no object {object_id} in {url}; 'hapticdb objects {url}' lists them"
+    )
+
+
+def unknown_exclusion(object_id: int, url: str) -> ObjectNotFoundError:
+    """Build the error for an id to exclude that no object has."""
+    return ObjectNotFoundError(
+        f"no object {object_id} in {url} to exclude; 'hapticdb objects {url}' lists them"
+    )
+
+
+def present_already(record: Object, url: str) -> EnvironmentExistsError:
+    """Build the error for a part that the environment holds already."""
+    return EnvironmentExistsError(
+        f"{record.name} of {record.link} is in {url} already; remove it first"
+    )
+
+
+def check_outside(depth: int, url: str) -> None:
+    """Refuse to look for the commits of others inside a snapshot, which hides them."""
+    if depth:
+        raise UsageError(f"{url}: inside a snapshot nothing changes: ask before or after it")
+
+
+def check_unwritten(record: Object, known: Object, url: str) -> None:
+    """Refuse to replace an object that was written after `record` was derived from it."""
+    if record.revision and record.revision != known.revision:
+        raise ConflictError(
+            f"object {known.id} ({known.name}) of {url} was written by another meanwhile "
+            f"(revision {known.revision}, not {record.revision}): read it again, then decide"
+        )
+
+
+def check_distances(layout: Layout, *, distances: bool | None) -> None:
+    """Refuse distances on the layout voxel: a row of distances belongs to a brick."""
+    if distances and layout == "voxel":
+        raise UsageError("the layout voxel has no distances: leave them out, or choose bricks")

@@ -1,0 +1,220 @@
+"""Tests of distances beside the voxels: written, read and removed with their objects."""
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hapticdb.errors import EnvironmentExistsError, UsageError
+from hapticdb.grid import CurveName, Grid
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.store import believed
+from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Change, Keys, Rows, Store, row_shift
+from hapticdb.testing.case import StoreCase
+from hapticdb.testing.scenes import EVERYWHERE, blob, covering, voxel_object, with_distances
+
+GRID = Grid(0.01, (-0.3, 0.1, 0.2), 6)
+CURVES: list[CurveName] = ["z", "hilbert"]
+PLACES = {1: (20, 20, 20), 2: (24, 20, 20), 3: (28, 24, 20)}
+"""Centres of three overlapping blobs, by id."""
+Content = dict[tuple[int, int], tuple[bytes, bytes]]
+
+
+def content_of(rows: Rows, object_id: int | None = None) -> Content:
+    """Occupancy and packed distances of rows by key and id, which must ascend and be distinct."""
+    assert rows.distances is not None
+    ids = rows.ids.tolist() if object_id is None else [object_id] * len(rows)
+    places = list(zip(rows.keys.tolist(), ids, strict=True))
+    assert places == sorted(set(places))
+    bricks = rows.occupancy.reshape(-1, BRICK_BYTES)
+    data, ends = rows.distances.data.tobytes(), rows.distances.ends.tolist()
+    starts = (rows.distances.ends - rows.distances.lengths).tolist()
+    return {
+        place: (brick.tobytes(), data[start:end])
+        for place, brick, start, end in zip(places, bricks, starts, ends, strict=True)
+    }
+
+
+def is_touched(change: Change, row_keys: Keys) -> bool:
+    """Whether all voxels of these bricks lie in ranges of a change."""
+    lows, shift = change.ranges[:, 0], row_shift("brick")
+    at = np.searchsorted(lows, row_keys << shift, side="right") - 1
+    highs = change.ranges[np.maximum(at, 0), 1]
+    return bool(((at >= 0) & (((row_keys + 1) << shift) - 1 <= highs)).all())
+
+
+class DistancesContract(StoreCase):
+    """Objects 1 and 3 have distances, object 2 has none."""
+
+    @pytest.fixture(params=CURVES)
+    def band(self, request: pytest.FixtureRequest) -> Store:
+        """Three overlapping blobs of voxels, two of them with distances."""
+        store = self.make(replace(GRID, curve=request.param), "brick")
+        for object_id in PLACES:
+            self.write(store, object_id)
+        return store
+
+    def rows(self, store: Store, object_id: int) -> Rows:
+        """Rows of one of the blobs, as they are written."""
+        ijk = blob(object_id, PLACES[object_id])
+        if object_id == 2:
+            return rows_of_voxels(ijk, store.grid, "brick")
+        return with_distances(ijk, store.grid, "brick", seed=object_id)
+
+    def write(self, store: Store, object_id: int, name: str = "") -> int:
+        """Write one of the blobs; returns the id that it got."""
+        ijk = blob(object_id, PLACES[object_id])
+        record = voxel_object(store.grid, ijk, name or f"{object_id}")
+        return store.add(record, self.rows(store, object_id))
+
+    def expected(self, store: Store, *object_ids: int) -> Content:
+        """Content of the table of distances, in the order of its rows."""
+        found: Content = {}
+        for object_id in object_ids:
+            found |= content_of(self.rows(store, object_id), object_id)
+        return dict(sorted(found.items()))
+
+    def test_scans_return_distances_and_occupancy_as_written(self, band: Store) -> None:
+        """A brick without a voxel has zeros. Objects without distances have no rows."""
+        everything = self.expected(band, 1, 3)
+        assert content_of(band.scan(*EVERYWHERE, distances=True)) == everything
+        assert any(not any(brick) for brick, _ in everything.values())
+        keys = np.array(sorted({key for key, _ in everything}), dtype=np.int64)
+        lows, highs = keys[::5].copy(), keys[2::5].copy()
+        lows = lows[: len(highs)].copy()
+        inside = [range(lo, hi + 1) for lo, hi in zip(lows.tolist(), highs.tolist(), strict=True)]
+        assert content_of(band.scan(lows, highs, distances=True)) == {
+            place: row for place, row in everything.items() if any(place[0] in r for r in inside)
+        }
+
+    def test_lookups_return_distances_of_the_keys_alone(self, band: Store) -> None:
+        """Tests `lookup` and `lookup_each`, with keys that no row has among the others."""
+        everything = self.expected(band, 1, 3)
+        keys = np.arange(0, max(key for key, _ in everything) + 3, dtype=np.int64)[::3].copy()
+        wanted = {place: row for place, row in everything.items() if place[0] % 3 == 0}
+        assert content_of(band.lookup(keys, distances=True)) == wanted
+        assert content_of(band.lookup_each(keys, distances=True)) == wanted
+
+    def test_rows_of_one_object_have_its_distances(self, band: Store) -> None:
+        """The objects overlap."""
+        for object_id in (1, 3):
+            rows = band.rows_of(object_id, *EVERYWHERE, distances=True)
+            assert content_of(rows) == self.expected(band, object_id)
+        assert content_of(band.rows_of(2, *EVERYWHERE, distances=True)) == {}
+
+    def test_without_distances_reads_are_those_of_the_index_table(self, band: Store) -> None:
+        """So are counts and statistics: a brick without a voxel has no row there."""
+        parts = [self.rows(band, object_id).occupied() for object_id in PLACES]
+        keys = np.sort(np.concatenate([part.keys for part in parts]))
+        rows = band.scan(*EVERYWHERE)
+        assert rows.distances is None
+        np.testing.assert_array_equal(rows.keys, keys)
+        assert rows.occupancy.reshape(-1, BRICK_BYTES).any(axis=1).all()
+        own = band.rows_of(1, *EVERYWHERE)
+        np.testing.assert_array_equal(own.occupancy, parts[0].occupancy)
+        assert band.lookup(np.unique(keys)).distances is None
+        assert band.count(*EVERYWHERE) == band.size().rows == band.quantiles(7).n_rows == len(keys)
+
+    def test_nothing_asked_is_nothing_found(self, band: Store) -> None:
+        """The answer still has distances, of no row."""
+        for empty in (
+            band.lookup(NO_KEYS, distances=True),
+            band.lookup_each(NO_KEYS, distances=True),
+            band.scan(NO_KEYS, NO_KEYS, distances=True),
+            band.rows_of(1, NO_KEYS, NO_KEYS, distances=True),
+        ):
+            assert content_of(empty) == {}
+
+    def test_objects_say_whether_they_have_distances(self, band: Store) -> None:
+        """Their checksums are those of the rows; an empty brick does not count as a row."""
+        assert [obj.has_distances for obj in band.objects()] == [True, False, True]
+        for obj in band.objects():
+            rows = self.rows(band, obj.id)
+            assert obj.distances_crc == believed.distances_crc(rows)
+            assert obj.rows_crc == believed.rows_crc(rows.occupied())
+            assert obj.attributes == {"made": True}
+
+    def test_a_refused_write_leaves_no_distances(self, band: Store) -> None:
+        """Both tables are written in one transaction."""
+        before = content_of(band.scan(*EVERYWHERE, distances=True))
+        with pytest.raises(EnvironmentExistsError):
+            self.write(band, 3, name="1")
+        assert content_of(band.scan(*EVERYWHERE, distances=True)) == before
+        assert band.revision() == 3
+
+    def test_distances_go_with_their_object(self, band: Store) -> None:
+        """The others stay. The change tells of all bricks that had distances."""
+        band.remove(1, covering(band))
+        assert content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
+        band.remove(2, covering(band))
+        assert content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
+        for change in band.changes():
+            if change.id != 2:
+                assert is_touched(change, self.rows(band, change.id).keys)
+
+    def test_replacing_gives_distances_and_takes_them(self, band: Store) -> None:
+        """Rows without distances leave none of the former rows. The voxels stay the same."""
+        known, rows = band.object(1), self.rows(band, 1)
+        voxels = band.rows_of(1, *EVERYWHERE)
+        for new in (rows.occupied(), rows):
+            band.replace(replace(known, revision=0), new, covering(band))
+            has_distances = new.distances is not None
+            assert band.object(1).has_distances == has_distances
+            wanted = self.expected(band, *([1, 3] if has_distances else [3]))
+            assert content_of(band.scan(*EVERYWHERE, distances=True)) == wanted
+            for found, column in zip(band.rows_of(1, *EVERYWHERE), voxels, strict=True):
+                np.testing.assert_array_equal(found, column)
+            assert is_touched(list(band.changes())[-1], rows.keys)
+
+    def test_a_snapshot_sees_the_distances_of_one_revision(self, band: Store) -> None:
+        """A removal and an addition by another connection come after it."""
+        reader = self.reopen(band)
+        reads: list[Callable[[], Rows]] = [
+            lambda: reader.scan(*EVERYWHERE, distances=True),
+            lambda: reader.lookup(self.rows(band, 1).keys, distances=True),
+        ]
+        with reader.snapshot():
+            before = [content_of(read()) for read in reads]
+            band.remove(1, covering(band))
+            self.write(band, 1)
+            assert [content_of(read()) for read in reads] == before
+        assert {object_id for _, object_id in content_of(reads[0]())} == {3, 4}
+        reader.close()
+
+    def test_loading_ends_as_single_writes_do(self, band: Store) -> None:
+        """Also if an error ends the loading."""
+        fresh = self.make(band.grid, "brick", "loaded")
+        with contextlib.suppress(ZeroDivisionError), fresh.loading():
+            for object_id in PLACES:
+                self.write(fresh, object_id)
+            loaded = content_of(fresh.scan(*EVERYWHERE, distances=True))
+            raise ZeroDivisionError
+        assert loaded == content_of(fresh.scan(*EVERYWHERE, distances=True))
+        assert loaded == content_of(band.scan(*EVERYWHERE, distances=True))
+
+    def test_all_rows_are_read_in_pieces_for_check(self, band: Store) -> None:
+        """The pieces together are what a scan returns."""
+        checker, found = band.checker(), {}
+        key, object_id = -1, 0
+        while len(rows := checker.rows_after(key, object_id, 7, distances=True)):
+            assert len(rows) <= 7
+            key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
+            found.update(content_of(rows))
+        assert found == self.expected(band, 1, 3)
+
+    def test_a_wish_for_distances_stays(self, store: Store) -> None:
+        """The layout voxel has none, and refuses the wish."""
+        assert not store.wants_distances
+        assert content_of(store.scan(*EVERYWHERE, distances=True)) == {}
+        if store.layout == "voxel":
+            with pytest.raises(UsageError, match="the layout voxel has no distances"):
+                store.want_distances()
+            return
+        store.want_distances()
+        assert store.wants_distances
+        assert store.revision() == 2
+        again = self.reopen(store)
+        assert again.wants_distances
+        again.close()

@@ -141,6 +141,7 @@ class Environment:
         points: int | None = None,
         spacing: float | None = None,
         seed: int = 0,
+        inset: float = 0.0,
     ) -> PointShell:
         """Make one rigid tool from objects at their places; reads their files again.
 
@@ -152,7 +153,7 @@ class Environment:
         ----------
         words : int or str
             As for `find`.
-        points, spacing, seed
+        points, spacing, seed, inset
             As for `PointShell.from_file`, for all surfaces together.
 
         Raises
@@ -164,7 +165,7 @@ class Environment:
         UsageError
             If no word is given, or an object is a point cloud, which has no surface.
         """
-        return shell_of_objects(self.find(*words), points, spacing, seed)
+        return shell_of_objects(self.find(*words), points, spacing, seed, inset)
 
     def add(
         self,

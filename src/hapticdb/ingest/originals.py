@@ -47,7 +47,11 @@ def parts_of(objects: Sequence[Object], to_be: str, instead: str) -> Iterator[tu
 
 
 def shell_of_objects(
-    objects: Sequence[Object], points: int | None, spacing: float | None, seed: int
+    objects: Sequence[Object],
+    points: int | None,
+    spacing: float | None,
+    seed: int,
+    inset: float = 0.0,
 ) -> PointShell:
     """Make one shell of several objects at their places; see `Environment.shell`."""
     if not objects:
@@ -61,4 +65,4 @@ def shell_of_objects(
         triangles.append(part.triangles(obj.transform))
     corners = np.concatenate(triangles).reshape(-1, 3)
     faces = np.arange(len(corners)).reshape(-1, 3)
-    return PointShell.from_mesh(corners, faces, points, spacing=spacing, seed=seed)
+    return PointShell.from_mesh(corners, faces, points, spacing=spacing, seed=seed, inset=inset)

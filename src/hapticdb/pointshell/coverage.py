@@ -66,11 +66,11 @@ def covering_radius(triangles: Floats, points: Floats) -> float:
         is_done = (corners <= (1.0 + CLOSE) * found) | (longest <= fine)
         bound = max(bound, float(corners[is_done].max(initial=0.0)))
         if not is_done.all():
-            waiting.append(_halves(cut[~is_done]))
+            waiting.append(halves(cut[~is_done]))
     return (1.0 + 1e-6) * bound
 
 
-def _halves(triangles: Floats) -> Floats:
+def halves(triangles: Floats) -> Floats:
     """Cut triangles (F, 3, 3) across their longest sides, (2 F, 3, 3)."""
     lengths = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
     turned = (np.argmax(lengths, axis=1)[:, None] + np.arange(3)) % 3

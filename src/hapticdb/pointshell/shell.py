@@ -21,6 +21,7 @@ from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels import curves
 from hapticdb.kernels.surfaces import sampling
 from hapticdb.pointshell.coverage import Ball, covering_radius, points_for
+from hapticdb.pointshell.inset import draw_inward
 from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.poses import as_floats
 
@@ -78,7 +79,9 @@ class PointShell:
         Covering radius, metres: no position on the tool's surface is farther from the nearest
         point. None if it is not known; `with_cover` computes it for shells made of a mesh.
     surface : Surface or Ball, optional
-        Surface on which the points lie; not saved.
+        Surface on which the points lie, or from which they were drawn inward; not saved.
+    inset : (N,), optional
+        How far each point was drawn inward from the surface, metres; zeros unless given.
 
     Raises
     ------
@@ -95,6 +98,7 @@ class PointShell:
     defects: str = ""
     cover: float | None = None
     surface: Surface | Ball | None = field(default=None, repr=False)
+    inset: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
 
     def __post_init__(self) -> None:
         if self.cover is not None and not (np.isfinite(self.cover) and self.cover >= 0.0):
@@ -114,6 +118,12 @@ class PointShell:
             )
         if np.any(np.abs(np.einsum("nk,nk->n", self.normals, self.normals) - 1.0) > 1e-6):
             raise UsageError("a shell's normals are not of unit length: divide them by their norms")
+        inset = _as_floats(self.inset, "inset")
+        inset = inset if inset.size else np.zeros(len(self.points))
+        if inset.shape != (len(self.points),) or np.any(inset < 0.0):
+            raise UsageError("a shell's inset: give 0 m or more for each point, or leave it out")
+        inset.flags.writeable = False
+        object.__setattr__(self, "inset", inset)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -132,6 +142,7 @@ class PointShell:
         spacing: float | None = None,
         unit: str | None = None,
         seed: int = 0,
+        inset: float = 0.0,
     ) -> "PointShell":
         """Make the shell of all parts of a mesh file together, or load one that was saved.
 
@@ -139,7 +150,7 @@ class PointShell:
         ----------
         path : path
             A mesh file, or a shell saved as `.npz`; a saved shell is loaded unchanged, whatever
-            `points`, `spacing` and `seed` say.
+            `points`, `spacing`, `seed` and `inset` say.
         points : int, optional
             Number of points, 1 to 10^7; 300 unless given. With a spacing, the greatest number;
             200,000 unless given.
@@ -149,6 +160,11 @@ class PointShell:
             Unit of a file that names none; metres unless given.
         seed : int
             Random seed of the points: equal seeds give equal points.
+        inset : float
+            How far the points are drawn inward, metres. Give the smooth law's onset, 1.5 voxels,
+            for contact that begins at the surface; 0 for points on it, so that clearance is kept.
+            Thin walls, sharp edges and tips are drawn in as far as they can be:
+            `hapticdb.pointshell.inset`.
 
         Raises
         ------
@@ -162,14 +178,14 @@ class PointShell:
             if unit is not None:
                 raise UsageError(f"{path} is a saved shell, in metres: leave out the unit")
             return cls.load(path)
-        _check_request(DEFAULT_POINTS if points is None else points, spacing, seed)
+        _check_request(DEFAULT_POINTS if points is None else points, spacing, seed, inset)
         file = mesh.read_file(path, unit=unit)
         parts = [part for part in file.parts if not part.is_cloud]
         if not parts:
             raise FileError(f"{path}: no triangles, only points or nothing; a tool needs a surface")
         triangles = np.concatenate([part.triangles() for part in parts])
         try:
-            shell = cls._from_triangles(triangles, points, spacing, seed, file.link)
+            shell = cls._from_triangles(triangles, points, spacing, seed, inset, file.link)
         except UsageError as error:
             raise FileError(f"{path}: {error}") from None
         return replace(shell, defects=file.defects.describe())
@@ -183,6 +199,7 @@ class PointShell:
         *,
         spacing: float | None = None,
         seed: int = 0,
+        inset: float = 0.0,
     ) -> "PointShell":
         """Make the shell of a triangle mesh.
 
@@ -192,7 +209,7 @@ class PointShell:
             Metres; they define the shell's frame.
         faces : (F, 3)
             Vertices of each triangle, in any order and winding.
-        points, spacing, seed
+        points, spacing, seed, inset
             As for `from_file`.
 
         Raises
@@ -200,7 +217,7 @@ class PointShell:
         UsageError
             Numbers out of range, vertices not finite, faces that name no vertex, no area.
         """
-        _check_request(DEFAULT_POINTS if points is None else points, spacing, seed)
+        _check_request(DEFAULT_POINTS if points is None else points, spacing, seed, inset)
         corners = _as_floats(vertices, "vertices", finite=False)
         indices = np.asarray(faces)
         if corners.ndim != 2 or corners.shape[1] != 3:
@@ -209,7 +226,7 @@ class PointShell:
             raise UsageError(f"faces are {indices.dtype} {indices.shape}, not integers (F, 3)")
         if indices.size and (indices.min() < 0 or indices.max() >= len(corners)):
             raise UsageError(f"faces name vertices outside 0 .. {len(corners) - 1}")
-        return cls._from_triangles(corners[indices], points, spacing, seed, "")
+        return cls._from_triangles(corners[indices], points, spacing, seed, inset, "")
 
     @classmethod
     def sphere(cls, radius: float, points: int = 300) -> "PointShell":
@@ -236,7 +253,13 @@ class PointShell:
 
     @classmethod
     def _from_triangles(
-        cls, triangles: Floats, points: int | None, spacing: float | None, seed: int, link: str
+        cls,
+        triangles: Floats,
+        points: int | None,
+        spacing: float | None,
+        seed: int,
+        inset: float,
+        link: str,
     ) -> "PointShell":
         surface = orient(triangles)
         n_points = DEFAULT_POINTS if points is None else points
@@ -244,14 +267,19 @@ class PointShell:
             most = DENSE_POINTS if points is None else points
             wanted = points_for(float(surface.areas.sum()), spacing)
             n_points = min(max(wanted, DEFAULT_POINTS), most)
-        sampled, face_of = sampling.sample_surface(
-            surface.triangles, surface.areas, surface.normals, n_points, np.random.default_rng(seed)
-        )
+        rng = np.random.default_rng(seed)
+        if inset > 0.0:
+            sampled, face_of, insets = draw_inward(surface, n_points, inset, rng)
+        else:
+            sampled, face_of = sampling.sample_surface(
+                surface.triangles, surface.areas, surface.normals, n_points, rng
+            )
+            insets = np.zeros(n_points)
         order = _curve_order(sampled)
-        normals = surface.normals[face_of[order]]
         return cls(
-            sampled[order], normals, surface.center, surface.is_closed, link, seed, surface=surface
-        )
+            sampled[order], surface.normals[face_of[order]], surface.center, surface.is_closed,
+            link, seed, surface=surface, inset=insets[order],
+        )  # fmt: skip
 
     def with_cover(self) -> "PointShell":
         """Return the shell with its covering radius, if it was made of a mesh or is a sphere.
@@ -284,6 +312,7 @@ class PointShell:
                     link=np.array(self.link),
                     seed=np.array(self.seed),
                     cover=np.array(np.nan if self.cover is None else self.cover),
+                    inset=self.inset,
                 )
         except OSError as error:
             raise FileError(f"{path}: cannot write the shell: {error.strerror}") from None
@@ -311,6 +340,7 @@ class PointShell:
                     str(saved["link"]),
                     int(saved["seed"]),
                     cover=_saved_cover(saved),
+                    inset=saved["inset"] if "inset" in saved else np.zeros(0),
                 )
         except FileNotFoundError:
             raise FileError(f"{path}: no such file") from None
@@ -321,7 +351,7 @@ class PointShell:
             raise FileError(f"{path}: not a saved shell, or damaged: {cause}") from None
 
 
-def _check_request(points: int, spacing: float | None, seed: int) -> None:
+def _check_request(points: int, spacing: float | None, seed: int, inset: float = 0.0) -> None:
     for number, what in ((points, "points"), (seed, "a seed")):
         if isinstance(number, bool) or not isinstance(number, (int, np.integer)):
             raise UsageError(f"{what} {number!r}: give a whole number")
@@ -331,6 +361,8 @@ def _check_request(points: int, spacing: float | None, seed: int) -> None:
         raise UsageError(f"seed {seed}: give 0 or more")
     if spacing is not None and not (np.isfinite(spacing) and spacing > 0.0):
         raise UsageError(f"a spacing of {spacing} m: give metres above 0")
+    if not (np.isfinite(inset) and inset >= 0.0):
+        raise UsageError(f"an inset of {inset} m: give 0 or more")
 
 
 def _check_members(file: BinaryIO, path: str | PathLike[str]) -> None:

@@ -1,0 +1,109 @@
+"""Points drawn inward from a tool's surface, for the smooth law.
+
+Under the smooth law contact begins a fixed distance before the surface. Points that lie as far
+inside the tool make it begin at the surface. The points are images of samples, moved along their
+inward normals, and an image is kept only if no part of the surface is nearer to it than its own
+sample. So points vanish along convex edges, which touch late, by d (1 / sin(a / 2) - 1) for an
+inset d and an edge of angle a. Walls thinner than two insets, and wedges below 60 degrees, keep all
+their points: as far in as these can go, which is half the thickness. So do details that would
+touch late by more than one inset.
+"""
+
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels.surfaces import sampling
+from hapticdb.pointshell.coverage import spacing_of
+from hapticdb.pointshell.inscribed import SLACK, InscribedBalls
+
+if TYPE_CHECKING:
+    from hapticdb.pointshell.orientation import Surface
+
+SAMPLES = 5
+"""Samples for each wanted point, at first. A larger value spreads the points more evenly and takes
+longer."""
+ENOUGH = 3
+"""Images for each wanted point, below which more samples are drawn. A larger value spreads the
+points of small tools more evenly."""
+MOST_SAMPLES = 10
+"""Most samples for each wanted point. A larger value helps tools that keep few of their images, and
+takes longer."""
+SHARP = -0.5
+"""Cosine between the inward normals of two faces below which they form a thin wall or a sharp
+wedge: minus the cosine of a wedge's angle of 60 degrees. A larger value keeps the points of wider
+wedges, which then touch early."""
+LATEST = 2.0
+"""Distance from a sample to the nearest image, in insets, above which the sample's own image is
+kept: so no position touches late by more than one inset. A wedge of 60 degrees has this distance. A
+larger value leaves more corners without points."""
+
+Floats = NDArray[np.float64]
+
+
+class Drawn(NamedTuple):
+    """Points drawn inward."""
+
+    points: Floats  # (N, 3)
+    faces: NDArray[np.int32]  # (N,) face on which the sample of each lies
+    inset: Floats  # (N,) metres from the sample to its image
+
+
+def draw_inward(surface: "Surface", n_points: int, inset: float, rng: np.random.Generator) -> Drawn:
+    """Spread points evenly over the surface drawn inward by `inset` metres; see the module.
+
+    Points of open surfaces without matter behind them stay where they are.
+    """
+    balls = InscribedBalls(surface, inset)
+    per_point = SAMPLES
+    while True:
+        samples, faces = sampling.sample_surface(
+            surface.triangles, surface.areas, surface.normals, per_point * n_points, rng
+        )
+        radius, facing = balls.touching(samples, faces, inset)
+        images = samples + radius[:, None] * surface.normals[faces]
+        is_kept = (radius >= (1.0 - SLACK) * inset) | (facing < SHARP) | (radius == 0.0)
+        if not is_kept.any():
+            is_kept = radius >= (1.0 - SLACK) * radius.max()
+        spacing = spacing_of(float(surface.areas.sum()), len(samples))
+        is_kept |= _is_late(samples, images[is_kept], LATEST * inset + 2.0 * spacing)
+        n_kept = int(is_kept.sum())
+        if n_kept >= ENOUGH * n_points or per_point >= MOST_SAMPLES:
+            break
+        per_point = min(MOST_SAMPLES, 1 + per_point * ENOUGH * n_points // n_kept)
+    if n_kept < n_points:  # the deepest of the others
+        others = np.flatnonzero(~is_kept)
+        deepest = np.argsort(-radius[others], kind="stable")
+        is_kept[others[deepest[: n_points - n_kept]]] = True
+    kept = np.flatnonzero(is_kept)
+    share = len(kept) / len(samples)
+    chosen = kept[_spread(samples[kept], images[kept], faces[kept], surface, n_points, share)]
+    return Drawn(images[chosen], faces[chosen], radius[chosen])
+
+
+def _is_late(samples: Floats, images: Floats, latest: float) -> NDArray[np.bool_]:
+    """Whether each sample (Q, 3) has no image within `latest` metres."""
+    from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for insets alone
+
+    distance, _ = cKDTree(images).query(samples, distance_upper_bound=latest, workers=-1)
+    return np.asarray(~np.isfinite(distance))
+
+
+def _spread(
+    samples: Floats,
+    images: Floats,
+    faces: NDArray[np.int32],
+    surface: "Surface",
+    n_points: int,
+    share: float,
+) -> NDArray[np.intp]:
+    """Choose `n_points` images (M, 3), as far from one another as elimination makes them.
+
+    share : of all samples that the images are; it estimates the area that they lie on. Images of a
+    small ball or rod coincide, and elimination needs distinct places, so each place is moved back
+    a little towards its sample.
+    """
+    places = images + 1e-3 * (samples - images)
+    spacing = spacing_of(share * float(surface.areas.sum()), n_points)
+    return sampling.spread_points(places, faces, surface.normals, n_points, spacing)

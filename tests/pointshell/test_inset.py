@@ -1,0 +1,313 @@
+"""Points drawn inward: as far in as was asked for, nowhere nearer to the surface, none missing."""
+
+import pickle
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, cKDTree
+
+from hapticdb.errors import UsageError
+from hapticdb.pointshell.shell import PointShell
+
+Floats = NDArray[np.float64]
+Mesh = tuple[Floats, NDArray[np.int64]]
+
+INSET = 0.1
+NEAR = 0.98 * INSET
+"""Least distance of an image from the surface: two hundredths of the inset are the tolerance."""
+
+
+def hull_of(corners: Floats) -> Mesh:
+    return corners, ConvexHull(corners).simplices.astype(np.int64)
+
+
+def box(sides: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
+    unit = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=float)
+    return hull_of(unit * sides + at)
+
+
+def together(*meshes: Mesh) -> Mesh:
+    starts = np.cumsum([0] + [len(corners) for corners, _ in meshes])
+    return (
+        np.concatenate([corners for corners, _ in meshes]),
+        np.concatenate([faces + n for (_, faces), n in zip(meshes, starts, strict=False)]),
+    )
+
+
+def ball(n: int = 3000) -> Mesh:
+    k = np.arange(n) + 0.5
+    z, angle = 1.0 - 2.0 * k / n, np.pi * (1.0 + 5.0**0.5) * k
+    ring = np.sqrt(1.0 - z * z)
+    return hull_of(np.stack((ring * np.cos(angle), ring * np.sin(angle), z), axis=1))
+
+
+def cylinder(radius: float, length: float, n: int = 96) -> Mesh:
+    angle = 2.0 * np.pi * np.arange(n) / n
+    ring = np.stack((radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle), axis=1)
+    return hull_of(np.concatenate((ring, ring + np.array([0.0, 0.0, length]))))
+
+
+def wedge(degrees: float, length: float = 1.5) -> Mesh:
+    """A prism along y whose sharp edge is the y axis; it opens towards +x."""
+    half = np.radians(degrees / 2.0)
+    side = np.array(
+        [[0.0, 0, 0], [np.cos(half), 0, np.sin(half)], [np.cos(half), 0, -np.sin(half)]]
+    )
+    return hull_of(np.concatenate((side, side + np.array([0.0, length, 0.0]))))
+
+
+def plane_distances(points: Floats, corners: Floats) -> Floats:
+    """Distance of points inside a convex body from its surface: the least over all its planes."""
+    planes = ConvexHull(corners).equations
+    inside: Floats = -(points @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+    return inside
+
+
+def nearest_to(points: Floats, positions: Floats) -> Floats:
+    return np.asarray(cKDTree(points).query(positions)[0])
+
+
+def test_faces_of_a_box_are_drawn_in_exactly_and_its_edges_touch_late() -> None:
+    shell = PointShell.from_mesh(*box((1, 1, 1)), 3000, inset=INSET)
+    depth = np.minimum(shell.points, 1.0 - shell.points)
+    assert depth.min() >= NEAR
+    # The image lies on the inward normal: along it, as deep as the shell says.
+    axis = np.abs(shell.normals).argmax(axis=1)
+    along = depth[np.arange(len(shell)), axis]
+    assert np.allclose(along, shell.inset, atol=1e-12)
+    assert shell.inset.min() >= NEAR
+    assert np.median(shell.inset) == INSET
+    # An edge of 90 degrees: 1 / sin(45) = 1.414 insets to the nearest point; a corner: 1.732.
+    edge = np.stack([np.linspace(0.2, 0.8, 50), np.zeros(50), np.zeros(50)], axis=1)
+    spacing = np.sqrt(6.0 * 0.8**2 / 3000)
+    late = nearest_to(shell.points, edge)
+    assert late.min() >= 2.0**0.5 * NEAR
+    assert late.max() <= np.hypot(2.0**0.5 * INSET, spacing) + 0.1 * INSET
+    corner = nearest_to(shell.points, np.zeros((1, 3)))[0]
+    assert 3.0**0.5 * NEAR <= corner <= 3.0**0.5 * INSET + 1.5 * spacing
+
+
+def test_images_of_a_sphere_lie_on_a_smaller_one() -> None:
+    shell = PointShell.from_mesh(*ball(), 500, inset=INSET)
+    radii = np.linalg.norm(shell.points, axis=1)
+    assert np.allclose(radii, 1.0 - INSET, atol=0.003)
+    outward = shell.points / radii[:, None]
+    assert np.einsum("nk,nk->n", outward, shell.normals).max() < -0.99
+
+
+def test_images_of_a_cylinder_lie_on_its_axes_side_and_caps() -> None:
+    corners, faces = cylinder(0.5, 1.5)
+    shell = PointShell.from_mesh(corners, faces, 500, inset=INSET)
+    assert plane_distances(shell.points, corners).min() >= NEAR
+    radial = np.hypot(shell.points[:, 0], shell.points[:, 1])
+    is_side = np.abs(shell.normals[:, 2]) < 0.5
+    assert np.allclose(radial[is_side], 0.5 - INSET, atol=0.002)
+    height = np.minimum(shell.points[~is_side, 2], 1.5 - shell.points[~is_side, 2])
+    assert np.allclose(height, INSET, atol=0.002)
+
+
+@pytest.mark.parametrize("degrees", [64.0, 75.0, 90.0, 120.0])
+def test_a_wide_wedge_touches_late_by_the_formula(degrees: float) -> None:
+    shell = PointShell.from_mesh(*wedge(degrees), 2000, inset=INSET)
+    edge = np.stack([np.zeros(40), np.linspace(0.3, 1.2, 40), np.zeros(40)], axis=1)
+    late = nearest_to(shell.points, edge)
+    wanted = INSET / np.sin(np.radians(degrees / 2.0))
+    assert late.min() >= 0.97 * wanted
+    assert late.max() <= np.hypot(wanted + 0.01, 0.08)
+
+
+@pytest.mark.parametrize("degrees", [15.0, 30.0, 55.0])
+def test_a_sharp_wedge_keeps_its_points_as_far_in_as_they_can_go(degrees: float) -> None:
+    corners, faces = wedge(degrees)
+    shell = PointShell.from_mesh(corners, faces, 2000, inset=INSET)
+    edge = np.stack([np.zeros(40), np.linspace(0.3, 1.2, 40), np.zeros(40)], axis=1)
+    assert nearest_to(shell.points, edge).max() < INSET
+    # In the wedge's middle plane, at l from the edge, a point is l sin(a / 2) from both faces.
+    middle = (shell.points[:, 1] > 0.3) & (shell.points[:, 1] < 1.2) & (shell.inset < 0.9 * INSET)
+    middle &= shell.points[:, 0] < 0.5
+    assert middle.sum() > 20
+    assert np.abs(shell.points[middle, 2]).max() < 0.03 * INSET
+    deep = np.hypot(shell.points[middle, 0], 0.0) * np.sin(np.radians(degrees / 2.0))
+    assert np.allclose(shell.inset[middle], deep, atol=0.03 * INSET)
+
+
+def test_a_thin_plate_is_drawn_in_by_half_its_thickness_up_to_its_rim() -> None:
+    shell = PointShell.from_mesh(*box((1, 1, 0.08)), 500, inset=INSET)
+    assert np.allclose(shell.points[:, 2], 0.04, atol=0.002)
+    assert np.allclose(shell.inset, 0.04, atol=0.002)
+    low, high = shell.points[:, :2].min(axis=0), shell.points[:, :2].max(axis=0)
+    assert np.allclose(low, 0.04, atol=0.02)
+    assert np.allclose(high, 0.96, atol=0.02)
+
+
+def test_a_sharp_cone_has_points_near_its_tip() -> None:
+    angle = 2.0 * np.pi * np.arange(48) / 48
+    ring = np.stack((0.3 * np.cos(angle), 0.3 * np.sin(angle), 0.0 * angle - 1.2), axis=1)
+    corners, faces = hull_of(np.concatenate((np.zeros((1, 3)), ring)))  # a full angle of 28 degrees
+    shell = PointShell.from_mesh(corners, faces, 1000, inset=INSET)
+    assert nearest_to(shell.points, np.zeros((1, 3)))[0] < INSET
+    inside = plane_distances(shell.points, corners)
+    assert np.allclose(inside, shell.inset, atol=0.03 * INSET)
+
+
+def test_an_open_sheet_stays_where_it_is() -> None:
+    x, y = (a.ravel() for a in np.meshgrid(np.arange(12.0) / 11, np.arange(12.0) / 11))
+    bowed = np.stack((x, y, 0.05 * ((x - 0.5) ** 2 + (y - 0.5) ** 2)), axis=1)
+    at = (np.arange(11)[:, None] * 12 + np.arange(11)).ravel()
+    quads = np.stack((at, at + 1, at + 13, at, at + 13, at + 12), axis=1).reshape(-1, 3)
+    there = PointShell.from_mesh(bowed, quads, 200)
+    shell = PointShell.from_mesh(bowed, quads, 200, inset=INSET)
+    assert not shell.is_closed
+    assert (shell.inset == 0.0).all()
+    assert nearest_to(shell.points, there.points).max() < 0.15
+
+
+def test_a_solid_with_a_hole_in_its_surface_is_drawn_in_like_a_whole_one() -> None:
+    corners, faces = ball(800)
+    torn = faces[3:]
+    shell = PointShell.from_mesh(corners, torn, 300, inset=INSET)
+    assert not shell.is_closed
+    radii = np.linalg.norm(shell.points, axis=1)
+    assert np.mean(np.abs(radii - (1.0 - INSET)) < 0.01) > 0.98
+
+
+def test_bodies_close_to_one_another_are_drawn_in_like_single_ones() -> None:
+    pair = together(box((1, 1, 1)), box((1, 1, 1), at=(1.03, 0, 0)))
+    shell = PointShell.from_mesh(*pair, 2000, inset=INSET)
+    local = np.where(shell.points[:, :1] > 1.015, shell.points - (1.03, 0, 0), shell.points)
+    depth = np.minimum(local, 1.0 - local)
+    assert depth.min() >= NEAR
+    facing = np.abs(shell.normals[:, 0]) == 1.0
+    assert np.isclose(shell.points[facing, 0], 1.0 - INSET, atol=0.002).any()
+    assert np.isclose(shell.points[facing, 0], 1.03 + INSET, atol=0.002).any()
+
+
+@pytest.mark.parametrize(("wall", "inset"), [(0.3, 0.1), (0.1, 0.1)])
+def test_points_stay_in_the_wall_around_a_void(wall: float, inset: float) -> None:
+    hollow = 1.0 - 2.0 * wall
+    tool = together(box((1, 1, 1)), box((hollow, hollow, hollow), at=(wall, wall, wall)))
+    shell = PointShell.from_mesh(*tool, 1500, inset=inset)
+    outer = np.minimum(shell.points, 1.0 - shell.points).min(axis=1)
+    beyond = np.maximum(np.abs(shell.points - 0.5) - hollow / 2.0, 0.0)
+    inner = np.linalg.norm(beyond, axis=1)
+    least = min(inset, wall / 2.0)
+    assert outer.min() >= 0.97 * least
+    assert inner.min() >= 0.97 * least
+    # At the box's corners the void's are farther away than its walls.
+    assert shell.inset.min() >= 0.97 * least
+    assert np.median(shell.inset) == pytest.approx(least, rel=0.05)
+
+
+@given(seed=st.integers(0, 2**32), n=st.integers(4, 30), share=st.floats(0.05, 0.9))
+@settings(max_examples=12, deadline=None)
+def test_random_convex_bodies_keep_the_inset_and_leave_no_part_without_points(
+    seed: int, n: int, share: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    corners, faces = hull_of(rng.normal(size=(n, 3)) * rng.uniform(0.2, 1.0, 3))
+    size = float(np.ptp(corners, axis=0).min())
+    inset = share * size / 2.0
+    shell = PointShell.from_mesh(corners, faces, 200, inset=inset, seed=seed)
+    inside = plane_distances(shell.points, corners)
+    # Nothing nearer to the surface than it says; what says less than the inset was kept.
+    assert np.all(inside >= shell.inset * 0.97 - 1e-9)
+    assert np.all(inside <= shell.inset * (1.0 + 1e-9) + 1e-12)
+    assert shell.inset.max() <= inset * (1.0 + 1e-12)
+    on_surface = PointShell.from_mesh(corners, faces, 2000, seed=seed)
+    area = ConvexHull(corners).area
+    covering = np.sqrt(2.0 * area / (np.sqrt(3.0) * 200))
+    assert nearest_to(shell.points, on_surface.points).max() <= 2.0 * inset + 2.5 * covering
+
+
+def test_points_are_spread_evenly_after_they_were_drawn_in() -> None:
+    shell = PointShell.from_mesh(*box((1, 1, 1)), 1000, inset=INSET)
+    nearest = np.asarray(cKDTree(shell.points).query(shell.points, k=2)[0])[:, 1]
+    hexagonal = np.sqrt(2.0 * 6.0 * 0.8**2 / (np.sqrt(3.0) * 1000))
+    assert np.median(nearest) > 0.65 * hexagonal
+    assert np.percentile(nearest, 5) > 0.5 * hexagonal
+    axis = np.abs(shell.normals).argmax(axis=1)
+    counts = np.bincount(axis * 2 + (shell.normals[np.arange(1000), axis] > 0.0), minlength=6)
+    assert np.allclose(counts, 1000 / 6, rtol=0.1)
+
+
+@pytest.mark.parametrize("sides", [(1, 1, 1), (20, 1, 1), (20, 20, 1)])
+def test_tools_smaller_than_the_inset_keep_their_number_of_points(
+    sides: tuple[float, float, float],
+) -> None:
+    scaled = tuple(0.01 * side for side in sides)
+    shell = PointShell.from_mesh(*box((scaled[0], scaled[1], scaled[2])), 50, inset=INSET)
+    assert len(shell) == 50
+    assert (np.minimum(shell.points, np.array(scaled) - shell.points) >= 0.003).all()
+
+
+def test_equal_seeds_give_equal_insets_anywhere() -> None:
+    tool = wedge(40.0)
+    first, again = (PointShell.from_mesh(*tool, 200, inset=INSET, seed=3) for _ in range(2))
+    other = PointShell.from_mesh(*tool, 200, inset=INSET, seed=4)
+    assert np.array_equal(first.points, again.points)
+    assert np.array_equal(first.inset, again.inset)
+    assert not np.array_equal(first.points, other.points)
+    far = PointShell.from_mesh(tool[0] + (1e3, -2e3, 5e2), tool[1], 200, inset=INSET, seed=3)
+    assert far.inset.mean() == pytest.approx(first.inset.mean(), rel=0.02)
+
+
+def test_a_shell_keeps_how_far_it_was_drawn_in(tmp_path: Path) -> None:
+    shell = PointShell.from_mesh(*wedge(40.0), 100, inset=INSET)
+    shell.save(tmp_path / "tool.npz")
+    saved = PointShell.from_file(tmp_path / "tool.npz")
+    assert np.array_equal(saved.inset, shell.inset)
+    assert np.array_equal(pickle.loads(pickle.dumps(shell)).inset, shell.inset)  # noqa: S301
+    assert not shell.inset.flags.writeable
+    plain = PointShell(shell.points, shell.normals, shell.center)
+    assert np.array_equal(plain.inset, np.zeros(100))
+    assert shell.with_cover().inset is not None
+
+
+@pytest.mark.parametrize("inset", [-1.0, np.nan, np.inf])
+def test_an_inset_that_is_no_length_is_refused(inset: float) -> None:
+    with pytest.raises(UsageError, match="an inset of"):
+        PointShell.from_mesh(*box((1, 1, 1)), 10, inset=inset)
+    shell = PointShell.from_mesh(*box((1, 1, 1)), 10)
+    for wrong in (np.full(10, inset), np.zeros(9)):
+        with pytest.raises(UsageError, match="inset"):
+            PointShell(shell.points, shell.normals, shell.center, inset=wrong)
+
+
+def field_in_hole(points: Floats, radius: float) -> Floats:
+    """Distance to a hole's wall, voxels, trilinear between exact ones at voxel centres.
+
+    The hole runs along z, so that the field is the same at all heights.
+    """
+    low = np.floor(points[:, :2] - 0.5) + 0.5
+    share = points[:, :2] - low
+    found = np.zeros(len(points))
+    for i in (0, 1):
+        for j in (0, 1):
+            corner = np.hypot(low[:, 0] + i, low[:, 1] + j)
+            weight = np.abs(1 - i - share[:, 0]) * np.abs(1 - j - share[:, 1])
+            found += weight * np.abs(radius - corner)
+    return found
+
+
+def free_clearance(shell: PointShell, radius: float, offset: Floats) -> float:
+    """Least radial clearance, voxels, with which no point is nearer to the wall than the onset."""
+    points = shell.points + offset
+    for clearance in np.arange(0.0, 3.0, 0.01):
+        if field_in_hole(points, radius + clearance).min() >= 1.5:
+            return float(clearance)
+    return 3.0
+
+
+@pytest.mark.parametrize("radius", [6.0, 20.0])
+def test_a_peg_drawn_in_by_the_onset_moves_freely_in_a_close_hole(radius: float) -> None:
+    # Lengths in voxels. The axis of peg and hole is that of the lattice: corners at its centre.
+    corners, faces = cylinder(radius, 30.0, n=128)
+    drawn = PointShell.from_mesh(corners, faces, 400, inset=1.5)
+    plain = PointShell.from_mesh(corners, faces, 400)
+    middle = np.zeros(3)
+    assert free_clearance(drawn, radius, middle) <= 0.08
+    assert free_clearance(plain, radius, middle) >= 1.45

@@ -8,10 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from banded import steps_to
 from hapticdb import Grid
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.kernels.field.lattice import BEYOND, CELL_VALUES, HALF_WIDTH, VOXELS_A_STEP
+from hapticdb.kernels.field.lattice import BEYOND, CELL_VALUES
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import CELL_WORDS, Place, cell_key, spread_key
 from hapticdb.store.base import Layout, row_shift
@@ -19,7 +20,6 @@ from naive import Voxel
 from realtime.worlds import HIERARCHICAL, cells_of, poses_in
 
 CAPACITY = 16
-Steps = NDArray[np.uint8]
 
 
 def colliding(count: int) -> list[int]:
@@ -127,16 +127,6 @@ def test_cells_hold_the_voxels_of_their_rows(
         assert bricks[key] == {(i & ~7, j & ~7, k & ~7) for i, j, k in inside}
 
 
-def steps_to(points: NDArray[np.float64], low: NDArray[np.int64], side: int) -> Steps:
-    """Stored distances (side^3,) to the nearest of points, by brute force; `low`: first centre."""
-    centres = low + np.argwhere(np.ones((side, side, side))) + 0.5
-    least = np.full(len(centres), np.inf)
-    for point in points:
-        least = np.minimum(least, np.linalg.norm(centres - point, axis=1))
-    steps = np.minimum(least, HALF_WIDTH) / VOXELS_A_STEP + 0.5
-    return np.where(least > HALF_WIDTH, BEYOND, steps).astype(np.uint8)
-
-
 @given(
     bits=st.sampled_from([3, 4, 5, 6]),
     curve=st.sampled_from(["z", "hilbert"]),
@@ -171,11 +161,16 @@ def test_cells_hold_the_least_distances_of_their_rows(
     payload = rng.integers(0, 256, (len(cells) + 1, CELL_VALUES), dtype=np.uint8)
     untouched = payload[0].copy()
     masks = np.zeros(len(cells) + 1, dtype=np.uint64)
-    kernels.fill_distances(
-        np.array([row[0] for row in rows]), np.array([row[1] for row in rows]),
-        np.array([row[2] for row in rows]), np.array(exclude, dtype=np.int64),
-        on_curve[ascending], ascending + 1, grid.bits, grid.curve_code, payload, masks,
-    )  # fmt: skip
+    slot = -1
+    for part in np.array_split(np.arange(len(rows)), int(rng.integers(1, 4))):  # as a cell is split
+        some = [rows[n] for n in part]
+        slot = kernels.fill_distances(
+            np.array([row[0] for row in some], dtype=np.int64),
+            np.array([row[1] for row in some], dtype=np.int64),
+            np.array([row[2] for row in some], dtype=np.uint8).reshape(-1, 1000),
+            np.array(exclude, dtype=np.int64), on_curve[ascending], ascending + 1, grid.bits,
+            grid.curve_code, slot, payload, masks,
+        )  # fmt: skip
     assert np.array_equal(payload[0], untouched)
     kept = [points for number, points in enumerate(objects, 1) if number not in exclude]
     for n, key in enumerate(cells.tolist(), 1):

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticdb.errors import GridError, HapticDBError
+from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.realtime.object_names import ObjectAnswers
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
@@ -28,7 +28,6 @@ from hapticdb.resident.table import (
 )
 from hapticdb.store.base import NO_KEYS, Store, SupportsWatch
 from hapticdb.store.connect import open_store
-from hapticdb.store.objects_at import ids_of_voxels
 
 LOOKAHEAD = 0.05
 """Least time (s) that cells are fetched ahead of the hand. Larger: fewer unknown cells, more cells
@@ -145,7 +144,7 @@ class Fetcher:
         assert wish is not None  # noqa: S101 - the origin is finite
         self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
         self.residency.warm_up()
-        ids_of_voxels(self.store, np.zeros(1, dtype=np.int64), self.residency.exclude)
+        self._answers.ids_of(self.store, np.zeros(1, dtype=np.int64))
 
     @property
     def lookahead(self) -> float:
@@ -250,6 +249,8 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
     ------
     GridError
         If the environment was replaced by one with another grid.
+    UsageError
+        If the table has distances and an object was written that has none.
     """
     table = CellTable(request.descriptor, request.n_slots)
     is_first = table.version == FIRST_VERSION
@@ -270,7 +271,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
             if not is_busy:
                 time.sleep(IDLE)
             is_lost, is_ready, patience = False, True, RETRY[0]
-        except GridError:
+        except (GridError, UsageError):
             raise
         except (HapticDBError, OSError):
             if is_first and fetcher is None:

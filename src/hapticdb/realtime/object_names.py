@@ -7,11 +7,18 @@ import numpy as np
 from hapticdb.kernels.records import MOST_ASKED
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Keys, Store
-from hapticdb.store.objects_at import ids_of_voxels
+from hapticdb.store.objects_at import ids_near_voxels, ids_of_voxels
+
+NEAR = 1.5 + 0.87
+"""Voxels within which an object is felt, where cells have distances: the onset of the smooth law,
+and half a voxel's diagonal, since the distance counts at the centre of the voxel that holds the
+point. Larger: objects are named that are not felt."""
 
 
 class ObjectAnswers:
-    """Answers on the desk of a table: ids of the objects in the voxels that loops ask for.
+    """Answers on the desk of a table: ids of the objects that are felt in the voxels asked for.
+
+    These are the objects in the voxels; in a table with distances, those near the voxels, too.
 
     Parameters
     ----------
@@ -24,6 +31,7 @@ class ObjectAnswers:
     def __init__(self, table: CellTable, exclude: Keys) -> None:
         self._desk = table.desk.sessions
         self._exclude = exclude
+        self._has_distances = table.has_distances
         self._answered: dict[int, bytes] = {}
 
     def forget(self) -> None:
@@ -41,7 +49,13 @@ class ObjectAnswers:
             keys = np.unique(self._desk["asked"][row, :n_asked])
             question = keys.tobytes()
             if before.get(row) != question:
-                ids = ids_of_voxels(store, keys, self._exclude)[:MOST_ASKED]
+                ids = self.ids_of(store, keys)[:MOST_ASKED]
                 self._desk["objects"][row, : len(ids)] = ids
                 self._desk["n_objects"][row] = len(ids)
             self._answered[row] = question
+
+    def ids_of(self, store: Store, keys: Keys) -> Keys:
+        """Ids of the objects that are felt in voxels (n,), distinct and ascending."""
+        if self._has_distances:
+            return ids_near_voxels(store, keys, self._exclude, NEAR)
+        return ids_of_voxels(store, keys, self._exclude)

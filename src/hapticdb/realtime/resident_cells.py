@@ -7,13 +7,13 @@ from collections.abc import Iterable
 from contextlib import suppress
 from typing import NamedTuple, Self
 
-from hapticdb.errors import GridError, HapticDBError
+from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.query.frame import as_ids
 from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.processes import Process
-from hapticdb.resident.residency import check_cells
+from hapticdb.resident.residency import check_cells, check_distances
 from hapticdb.resident.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellTable
 from hapticdb.store.connect import open_store
 
@@ -76,13 +76,17 @@ class ResidentCells:
         Memory for cells, never exceeded; 1 MiB at least.
     exclude : iterable of int
         Ids of objects that are left out of the force.
+    distances : bool
+        Whether the cells have distances to surfaces, for the smooth law: a tenth as many cells fit
+        then. Every object must have distances.
     wrap : callable or None
         Takes the fetching process's store and returns the store to use; importable. For tests.
 
     Raises
     ------
     UsageError
-        If the environment's curve has no cells, or the budget is too small.
+        If the environment's curve has no cells, or the budget is too small; if cells with distances
+        are asked for, and an object has none.
     DatabaseError
         If the environment cannot be opened.
     """
@@ -96,13 +100,14 @@ class ResidentCells:
         *,
         budget_bytes: int = DEFAULT_BUDGET,
         exclude: Iterable[int] = (),
+        distances: bool = False,
         wrap: Wrap | None = None,
     ) -> None:
         self.url = url
         self.exclude: tuple[int, ...] = tuple(as_ids(exclude).tolist())
-        self.grid = self._read_environment()
+        self.grid = self._read_environment(distances=distances)
         compile_missing(entries_for("resident"))  # now: two processes would each compile them
-        self.table = CellTable.create(budget_bytes)
+        self.table = CellTable.create(budget_bytes, distances=distances)
         self.restarts = 0
         self._request = FetchRequest(
             url, self.table.descriptor, self.table.n_slots, self.grid, self.exclude, wrap
@@ -113,18 +118,20 @@ class ResidentCells:
             self.table.close()
             raise
         self._restarted_at = 0.0
-        self._failure: GridError | None = None
+        self._failure: GridError | UsageError | None = None
         self._supervising = threading.Lock()
         self._pid = os.getpid()
 
-    def _read_environment(self) -> Grid:
-        """Grid of the environment, after a check of its curve and of the excluded objects."""
+    def _read_environment(self, *, distances: bool) -> Grid:
+        """Grid of the environment, after a check of its curve and of its objects."""
         store = open_store(self.url, read_only=True)
         try:
             check_cells(store)
             self.first_objects = tuple(store.objects())
             for object_id in self.exclude:
                 store.object(object_id)
+            if distances:
+                check_distances(store, as_ids(self.exclude))
             return store.grid
         finally:
             store.close()
@@ -175,6 +182,8 @@ class ResidentCells:
         ------
         GridError
             If the environment was replaced by one with another grid.
+        UsageError
+            If the cells have distances and an object was written that has none.
         """
         with self._supervising:
             if self._process.is_alive or self.table.cells.control[STOP]:
@@ -197,7 +206,7 @@ class ResidentCells:
         try:
             while self._failure is None and self._process.receive(0.0):
                 pass
-        except GridError as error:
+        except (GridError, UsageError) as error:
             self._failure = error
         except HapticDBError:
             return

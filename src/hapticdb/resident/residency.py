@@ -5,12 +5,13 @@ directory.
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import NamedTuple
 
 import numpy as np
 
-from hapticdb.errors import GridError, UsageError
+from hapticdb.errors import GridError, ObjectNotFoundError, UsageError
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, Place
 from hapticdb.query.frame import as_ids
@@ -18,7 +19,7 @@ from hapticdb.resident.changes import known_cells_touched, writes_since
 from hapticdb.resident.source import CellSource
 from hapticdb.resident.table import FIRST_VERSION, LOADING, CellTable
 from hapticdb.resident.writer import CellWriter, UnpublishedCells
-from hapticdb.store.base import NO_KEYS, Keys, Store
+from hapticdb.store.base import NO_KEYS, Change, Keys, Store
 
 BATCH = 256
 """Greatest number of cells in one statement. A larger value fetches more cells a second; a smaller
@@ -37,6 +38,27 @@ def check_cells(store: Store) -> None:
             f"{store.url} is in lexicographic order, which has no cells: "
             "'hapticdb copy' it to one with --curve z"
         )
+
+
+def check_distances(store: Store, exclude: Keys, changes: Sequence[Change] | None = None) -> None:
+    """Refuse objects without distances: a law by distances would not feel them.
+
+    exclude (E,) : ids of objects that may have none; changes : the writes since the last check, or
+    None to check every object.
+    """
+    if changes is None:
+        objects = store.objects()
+    else:
+        objects = []
+        for object_id in {change.id for change in changes if change.action != "remove"}:
+            with suppress(ObjectNotFoundError):  # removed by a later write
+                objects.append(store.object(object_id))
+    for obj in objects:
+        if not obj.has_distances and obj.id not in exclude:
+            raise UsageError(
+                f"object {obj.id} ({obj.name}) of {store.url} has no distances to its surface: "
+                "import it again with distances, or use the law 'plane'"
+            )
 
 
 class Loaded(NamedTuple):
@@ -80,7 +102,8 @@ class Residency:
     Raises
     ------
     UsageError
-        If the environment's curve has no cells.
+        If the environment's curve has no cells. If the table has distances and an object that is
+        not excluded has none; also later, after a write of others.
     """
 
     def __init__(
@@ -255,8 +278,10 @@ class Residency:
             writes = writes_since(self.store, self._revision, revision)
             if writes is None:
                 writes, touched = [], self.writer.known()
+                self._check_distances(None)
             else:
                 touched = known_cells_touched(writes, self.grid, self.slots_of, self.writer.known)
+                self._check_distances(writes)
             again = self._urgent[np.isin(self._urgent, touched)][:MOST_RENEWED]
             read = self._read_all(np.concatenate([asked, again]))
             commit_count = self.store.version()
@@ -265,6 +290,11 @@ class Residency:
         if len(touched) or len(read.cells) or revision != before:
             self._publish(touched, read)
         return len(writes), read
+
+    def _check_distances(self, changes: Sequence[Change] | None) -> None:
+        """Refuse objects without distances, as `check_distances`, if the table has distances."""
+        if self.table.has_distances:
+            check_distances(self.store, self.exclude, changes)
 
     def _read_all(self, cells: Keys) -> UnpublishedCells:
         """Read cells (n,), batch by batch, while there is room."""

@@ -6,18 +6,25 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.errors import DatabaseError
+from hapticdb.kernels.field.packing import unpack
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.query.grouping import group_spans
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.resident.costs import costs_at_start
 from hapticdb.resident.table import CellTable
-from hapticdb.store.base import CELL_SHIFT, Keys, Store, row_shift
+from hapticdb.store.base import BRICK_SHIFT, CELL_SHIFT, Keys, Rows, Store, row_shift
+
+ROWS_AT_ONCE = 1024
+"""Rows whose distances are unpacked together, into a megabyte. A larger value makes fewer calls; a
+smaller one merges the values while they are still in the processor's cache."""
 
 
 class CellsRead(NamedTuple):
     """Result of one statement.
 
-    is_empty (n,) : whether each cell has no voxel; n_rows : rows read; n_ranges : ranges queried.
+    is_empty (n,) : whether each cell has no voxel and no distances; n_rows : rows read; n_ranges :
+    ranges queried.
     """
 
     is_empty: NDArray[np.bool_]
@@ -62,12 +69,51 @@ class CellSource:
         lows = on_curve << (CELL_SHIFT - shift)
         highs = ((on_curve + 1) << (CELL_SHIFT - shift)) - 1
         ranges = group_spans(lows, highs, self._quantiles, self._costs)
-        rows = self.store.scan(*ranges)
-        words, masks = table.cells.words, table.cells.masks
+        words, masks, payload = table.cells.words, table.cells.masks, table.cells.payload
+        if payload is None:
+            rows = self.store.scan(*ranges)
+        else:
+            rows = self.store.scan(*ranges, distances=True)
         words[slots] = 0
         masks[slots] = 0
         kernels.fill_cells(
             rows.keys, rows.ids, rows.occupancy, self.exclude, on_curve, slots[order], grid.bits,
             grid.curve_code, shift, words, masks,
         )  # fmt: skip
+        if payload is not None:
+            self._fill_distances(rows, on_curve, slots[order], payload, masks)
         return CellsRead(masks[slots] == 0, len(rows), len(ranges.lows))
+
+    def _fill_distances(
+        self,
+        rows: Rows,
+        on_curve: Keys,
+        slots: Keys,
+        payload: NDArray[np.uint8],
+        masks: NDArray[np.uint64],
+    ) -> None:
+        """Write the distances of rows into the slots (n,) of cells (n,), ascending on the curve.
+
+        Raises
+        ------
+        DatabaseError
+            If packed distances are damaged.
+        """
+        grid, slot = self.store.grid, -1
+        for at in range(0, len(rows), ROWS_AT_ONCE):
+            part = rows.part(at, at + ROWS_AT_ONCE)
+            if part.distances is None:
+                raise DatabaseError(f"{self.store.url} has given no distances: import it again")
+            cells = part.keys >> (CELL_SHIFT - BRICK_SHIFT)
+            place = np.minimum(np.searchsorted(on_curve, cells), len(on_curve) - 1)
+            wanted = (on_curve[place] == cells) & ~np.isin(part.ids, self.exclude)
+            try:
+                values = unpack(part.distances.data, part.distances.ends, wanted)
+            except ValueError as error:
+                raise DatabaseError(
+                    f"{self.store.url} is damaged ({error}): run 'hapticdb check {self.store.url}'"
+                ) from None
+            slot = kernels.fill_distances(
+                part.keys, part.ids, values, self.exclude, on_curve, slots, grid.bits,
+                grid.curve_code, slot, payload, masks,
+            )  # fmt: skip

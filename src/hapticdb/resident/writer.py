@@ -19,7 +19,7 @@ from hapticdb.store.base import NO_KEYS, Keys
 class UnpublishedCells(NamedTuple):
     """Cells (n,) in slots (n,) that are in no directory yet, and the cost of reading them.
 
-    The slot of a cell without a voxel is EMPTY_SLOT.
+    The slot of a cell that is empty is EMPTY_SLOT.
     """
 
     cells: Keys = NO_KEYS
@@ -39,9 +39,9 @@ class CellWriter:
     Attributes
     ----------
     slots : CellSlots
-        Cells with voxels.
+        Cells with voxels or distances.
     empty : EmptyCells
-        Cells without voxels.
+        Cells without any.
     directory : CellDirectory
         Published map of both, for frames.
     n_evicted : int
@@ -56,7 +56,7 @@ class CellWriter:
 
     @property
     def n_resident(self) -> int:
-        """Number of cells with voxels, each in a slot."""
+        """Number of cells with voxels or distances, each in a slot."""
         return self.slots.n_filled
 
     @property

@@ -4,7 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.curves import Z_ORDER, encode
-from hapticdb.store.base import BRICK_BYTES, BRICK_SHIFT, Keys, Store
+from hapticdb.kernels.field.lattice import HALF_WIDTH, ROW_SIDE, VOXELS_A_STEP
+from hapticdb.kernels.field.packing import unpack
+from hapticdb.store.base import BRICK_BYTES, BRICK_SHIFT, NO_KEYS, Keys, Rows, Store
 
 
 def ids_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
@@ -14,6 +16,29 @@ def ids_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
     that are left out.
     """
     return np.unique(pairs_of_voxels(store, keys, exclude)[:, 1])
+
+
+def ids_near_voxels(store: Store, keys: Keys, exclude: Keys, within: float) -> NDArray[np.int64]:
+    """Ids of the objects whose surface is near the centres of voxels (n,), distinct and ascending.
+
+    Near is at most `within` voxels, and no more than the half width of the band; an object in a
+    voxel counts, too. The other arguments are those of `ids_of_voxels`. Every object must have
+    distances, which the layout brick alone has.
+    """
+    bricks, inverse = np.unique(keys >> BRICK_SHIFT, return_inverse=True)
+    rows = store.lookup(bricks, distances=True)
+    band = rows.distances
+    if band is None:
+        return NO_KEYS
+    values = unpack(band.data, band.ends)
+    i, j, k = (store.grid.decode(keys) & 7).T
+    place = ((i + 1) * ROW_SIDE + j + 1) * ROW_SIDE + k + 1
+    step = int(min(within, HALF_WIDTH) / VOXELS_A_STEP + 0.5)
+    voxel, row = _rows_of_bricks(rows, bricks[inverse])
+    is_near = values[row, place[voxel]] <= step
+    is_near |= _is_in_voxel(store, rows, row, keys[voxel])
+    ids = np.unique(rows.ids[row[is_near]])
+    return ids[~np.isin(ids, exclude)]
 
 
 def pairs_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
@@ -33,14 +58,25 @@ def pairs_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64
 def _pairs_in_bricks(store: Store, keys: Keys) -> NDArray[np.int64]:
     bricks, inverse = np.unique(keys >> BRICK_SHIFT, return_inverse=True)
     rows = store.lookup(bricks)
-    if store.grid.curve == "z":
-        bits = keys & ((1 << BRICK_SHIFT) - 1)
-    else:
-        bits = encode(store.grid.decode(keys) & 7, 3, Z_ORDER)
-    first = np.searchsorted(rows.keys, bricks[inverse])
-    last = np.searchsorted(rows.keys, bricks[inverse], side="right")
-    voxel = np.repeat(np.arange(len(keys)), last - first)
-    row = np.arange(len(voxel)) - np.repeat(np.cumsum(last - first) - last, last - first)
-    bit = bits[voxel]
-    is_set = (rows.occupancy[BRICK_BYTES * row + (bit >> 3)] >> (bit & 7).astype(np.uint8)) & 1 > 0
+    voxel, row = _rows_of_bricks(rows, bricks[inverse])
+    is_set = _is_in_voxel(store, rows, row, keys[voxel])
     return np.stack([voxel[is_set], rows.ids[row[is_set]]], axis=1)
+
+
+def _rows_of_bricks(rows: Rows, bricks: Keys) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Every brick (n,) with every row of it, (P,): index in `bricks`, and index of the row."""
+    first = np.searchsorted(rows.keys, bricks)
+    last = np.searchsorted(rows.keys, bricks, side="right")
+    brick = np.repeat(np.arange(len(bricks)), last - first)
+    row = np.arange(len(brick)) - np.repeat(np.cumsum(last - first) - last, last - first)
+    return brick, row
+
+
+def _is_in_voxel(store: Store, rows: Rows, row: NDArray[np.int64], keys: Keys) -> NDArray[np.bool_]:
+    """Whether the brick of rows (P,), given by their indices, holds the voxel of each key (P,)."""
+    if store.grid.curve == "z":
+        bit = keys & ((1 << BRICK_SHIFT) - 1)
+    else:
+        bit = encode(store.grid.decode(keys) & 7, 3, Z_ORDER)
+    bytes_of = rows.occupancy[BRICK_BYTES * row + (bit >> 3)]
+    return ((bytes_of >> (bit & 7).astype(np.uint8)) & 1).astype(np.bool_)

@@ -180,20 +180,20 @@ def merge_row(payload, slot, i, j, k, last, values, row):
                 payload[slot, at + 8] = min(payload[slot, at + 8], values[row, start + 8])
 
 
-@entry(INTS, INTS, BYTES2, INTS, INTS, INTS, INT, INT, BYTES2, WORDS)
+@entry(INTS, INTS, BYTES2, INTS, INTS, INTS, INT, INT, INT, BYTES2, WORDS)
 def fill_distances(
-    row_keys, row_ids, values, exclude, cell_keys, places, bits, curve, payload, masks
+    row_keys, row_ids, values, exclude, cell_keys, places, bits, curve, before, payload, masks
 ):
     """Fill the distances of cells from rows of the band; `fill_cells` has filled their voxels.
 
     row_keys (R,) of bricks, ascending; values (R, 1000) uint8, unpacked; payload (S, 34^3) uint8;
-    the other arguments are those of `fill_cells`. What a slot held before is forgotten when its
-    first row comes; a slot without a row stays as it was, and its mask without a bit says so.
+    before: the slot that the rows of an earlier call have filled last, or -1; the other arguments
+    are those of `fill_cells`. What a slot held is forgotten when its first row comes; a slot
+    without a row stays as it was, and its mask has no bit. Returns the slot that was filled last.
     """
     n_cells = cell_keys.shape[0]
     n_excluded = exclude.shape[0]
     at = 0
-    last_slot = np.int64(-1)
     last_brick = min(1 << bits, 32) - 8
     for row in range(row_keys.shape[0]):
         cell = row_keys[row] >> 6
@@ -208,14 +208,15 @@ def fill_distances(
             if found < n_excluded and exclude[found] == row_ids[row]:
                 continue
         slot = places[at]
-        if slot != last_slot:
-            last_slot = slot
+        if slot != before:
+            before = slot
             for n in range(CELL_VALUES):
                 payload[slot, n] = BEYOND
         i, j, k = voxel_of(row_keys[row], max(bits - 3, 0), curve)
         i, j, k = i << 3, j << 3, k << 3
         merge_row(payload, slot, i, j, k, last_brick, values, row)
         mark_brick(masks, slot, i, j, k)
+    return before
 
 
 @entry(INTS, INT, INT, INTS)

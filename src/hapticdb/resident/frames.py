@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.law import felt_within, reads_distances
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import (
@@ -102,8 +103,12 @@ class Surroundings(NamedTuple):
         return min(first + within, end - 1)
 
 
-def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
-    """Places of the runs: one place for a run with a radius of `SMALL` voxels or less."""
+def surroundings_of(clusters: Clusters, voxel_size: float, beyond: float) -> Surroundings:
+    """Places of the runs: one place for a run with a radius of `SMALL` voxels or less.
+
+    The reach has room for `beyond` voxels around the runs, in which frames look for voxels before
+    they skip a run. It is `SMALL` at most: a cell that is missing there costs time, not exactness.
+    """
     n_points = len(clusters.points)
     starts = np.arange(0, n_points, clusters.run)
     radii = clusters.spheres[:, 3] / voxel_size
@@ -117,7 +122,8 @@ def surroundings_of(clusters: Clusters, voxel_size: float) -> Surroundings:
     is_point = np.ones(len(places), dtype=bool)
     is_point[first[is_small]] = False
     places[is_point] = clusters.points[np.repeat(~is_small, clusters.run)[:n_points], :3]
-    return Surroundings(places, float(radii[is_small].max()), clusters.run, first)
+    reach = min(float(radii[is_small].max()) + beyond, SMALL)
+    return Surroundings(places, reach, clusters.run, first)
 
 
 class ResidentFrames:
@@ -130,9 +136,14 @@ class ResidentFrames:
     shell : PointShell
         The tool.
     law : ForceLaw or None
-        Force law; 1000 N/m unless given.
+        Force law; the tangent plane with 1000 N/m unless given.
     run : int or None
         As for `clusters_of`.
+
+    Raises
+    ------
+    UsageError
+        If the law reads distances, and the cells have none.
     """
 
     def __init__(
@@ -146,11 +157,22 @@ class ResidentFrames:
         self.residency = residency
         self.shell = shell
         self.law = (law or TangentPlane()).for_kernels
+        table = residency.table
+        if reads_distances(self.law) and not table.has_distances:
+            raise UsageError(
+                "this force law reads distances, which the resident cells do not have: make their "
+                "table by CellTable.create(distances=True)"
+            )
+        self.cells = table.cells
+        if not reads_distances(self.law):  # kernels are compiled for the plane without a payload
+            self.cells = table.cells._replace(payload=None)
         self.clusters = clusters_of(shell, residency.grid.voxel_size, run)
         self.met = np.empty(len(shell), dtype=np.int64)
-        self.surroundings = surroundings_of(self.clusters, residency.grid.voxel_size)
+        self.surroundings = surroundings_of(
+            self.clusters, residency.grid.voxel_size, felt_within(self.law)
+        )
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-        self._row = residency.table.join()
+        self._row = table.join()
 
     def close(self) -> None:
         """Free the table's reader row."""
@@ -204,7 +226,7 @@ class ResidentFrames:
         """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
         part = slice(start, start + n_poses)
         done = feel_kernel(
-            self.residency.table.cells, self._row, self.clusters, poses[part],
+            self.cells, self._row, self.clusters, poses[part],
             self.residency.place, self.law, self.met, self.missed, out[part],
         )  # fmt: skip
         if done < n_poses:

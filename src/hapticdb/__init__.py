@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from hapticdb.proportions import Proportions, compare_proportions
     from hapticdb.query.cost_model import CostModel
     from hapticdb.query.frame import Query
-    from hapticdb.query.law import TangentPlane
+    from hapticdb.query.law import DistanceField, TangentPlane
     from hapticdb.query.quantiles import QuantileVector
     from hapticdb.query.touches import Touch, Touches
     from hapticdb.realtime.coupling import Coupling
@@ -74,6 +74,7 @@ __all__ = [
     "DatabaseError",
     "DeviceError",
     "Difference",
+    "DistanceField",
     "Environment",
     "EnvironmentExistsError",
     "EnvironmentNotFoundError",
@@ -137,7 +138,7 @@ _HOMES = {
         "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutsideGridError "
         "ReadOnlyError StuckError UsageError"
     ),
-    "query.law": "TangentPlane",
+    "query.law": "DistanceField TangentPlane",
     "grid": "Grid GridOptions",
     "ingest.files": "FileReport ImportOptions import_files",
     "pointshell.shell": "PointShell",

@@ -66,6 +66,7 @@ PUBLIC = [
     "DatabaseError",
     "DeviceError",
     "Difference",
+    "DistanceField",
     "Environment",
     "EnvironmentExistsError",
     "EnvironmentNotFoundError",

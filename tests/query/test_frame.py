@@ -260,6 +260,24 @@ def test_an_empty_environment_is_free(tmp_path: Path) -> None:
         assert not touch.torque.any()
 
 
+def test_contacts_have_places_normals_and_depths(env: Environment) -> None:
+    shell, pose = random_shell(5, 300), random_pose(5)
+    touch = env.touch(shell, pose)
+    assert len(touch.contacts) > 10
+    at = shell.points[touch.contacts] @ pose[:3, :3].T + pose[:3, 3]
+    np.testing.assert_allclose(touch.contact_points, at, atol=1e-12)
+    turned = shell.normals[touch.contacts] @ pose[:3, :3].T
+    np.testing.assert_allclose(touch.contact_normals, turned, atol=1e-12)
+    assert (touch.contact_depths > 0).all()
+    is_felt = np.isin(touch.hits, touch.contacts)
+    assert touch.contact_depths.tolist() == touch.depths[is_felt].tolist()
+
+
+def test_a_law_that_reads_distances_is_refused_where_there_are_none(env: Environment) -> None:
+    with pytest.raises(hapticdb.UsageError, match="no distances to surfaces"):
+        env.touch(random_shell(5, 300), random_pose(5), law=hapticdb.DistanceField())
+
+
 def test_stiffness_scales_the_wrench(env: Environment) -> None:
     shell, pose = random_shell(5, 300), random_pose(5)
     soft = env.touch(shell, pose)
@@ -268,3 +286,5 @@ def test_stiffness_scales_the_wrench(env: Environment) -> None:
     for bad in (-1.0, float("nan"), float("inf")):
         with pytest.raises(hapticdb.UsageError, match="stiffness"):
             TangentPlane(stiffness=bad)
+        with pytest.raises(hapticdb.UsageError, match="stiffness"):
+            hapticdb.DistanceField(stiffness=bad)

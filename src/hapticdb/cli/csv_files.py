@@ -141,7 +141,7 @@ def row_of_pose(index: int, touched: "Touch") -> list[object]:
         *touched.torque.tolist(),
         len(touched.hits),
         len(touched.contacts),
-        float(touched.depths.max(initial=0.0)),
+        float(touched.contact_depths.max(initial=0.0)),
         " ".join(str(obj.id) for obj in objects),
         text_cell("; ".join(obj.name for obj in objects)),
     ]

@@ -10,12 +10,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
+from hapticdb.kernels import law as laws
+from hapticdb.kernels.field import lattice, packing
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
 from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
+from hapticdb.store.believed import damaged
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
@@ -59,6 +62,7 @@ class Answer(NamedTuple):
 
     wrench (6,) N and N m; hits (H,) indices, ascending; depths (H,) metres; ids : objects of all
     hits, ascending; pairs : () -> (P, 2) int64, every (hit, object id), computed when asked for;
+    placed (N + 1, 6) : the shell's points in metres and normals, world frame, last its centre;
     apart (A,) : indices of felt points that are no hits, ascending; apart_depths (A,) metres.
     """
 
@@ -68,6 +72,7 @@ class Answer(NamedTuple):
     ids: list[int]
     pairs: Callable[[], NDArray[np.int64]]
     query: Query
+    placed: NDArray[np.float64]
     apart: NDArray[np.int64] = NO_POINTS
     apart_depths: NDArray[np.float64] = NO_DEPTHS
 
@@ -133,12 +138,41 @@ class HapticQuery:
         if strategy == "statement":
             return self._by_statement(located, exclude, law, started)
         asked, rows = self._fetch(strategy, located, gap)
-        return self._refined(located, rows, exclude, law, asked, started)
+        payload = self._distances_of(rows, law, located.keys)
+        return self._refined(located, rows, payload, exclude, law, asked, started)
+
+    def _distances_of(
+        self, rows: Rows, law: ForceLaw, keys: Keys | None = None
+    ) -> NDArray[np.uint8] | None:
+        """Distances (R, 1000) of rows for a law that reads them; None for every other law.
+
+        Rows whose keys are not among `keys`, where these are given, are left unset.
+
+        Raises
+        ------
+        UsageError
+            If the rows have no distances.
+        """
+        if not laws.reads_distances(law.for_kernels):
+            return None
+        if not len(rows):
+            return np.empty((0, lattice.ROW_VALUES), dtype=np.uint8)
+        if rows.distances is None:
+            raise UsageError(
+                f"{self._store.url} has no distances to surfaces, which this law reads: give "
+                "the law TangentPlane"
+            )
+        wanted = None if keys is None else refining.is_asked(keys, rows.keys)
+        try:
+            return packing.unpack(*rows.distances, wanted)
+        except ValueError as error:
+            raise damaged(self._store.url, str(error)) from error
 
     def _refined(
         self,
         located: "contact.Located",
         rows: Rows,
+        payload: NDArray[np.uint8] | None,
         exclude: Keys,
         law: ForceLaw,
         query: _Asked,
@@ -154,7 +188,7 @@ class HapticQuery:
             row_keys,
             row_ids,
             occupancy,
-            None,
+            payload,
             exclude,
             self._origin,
             self._size,
@@ -171,6 +205,7 @@ class HapticQuery:
             ids.tolist(),
             pairs,
             Query(*query, elapsed_us),
+            placed,
             apart,
             apart_depths,
         )
@@ -215,6 +250,7 @@ class HapticQuery:
         fetched = self._store.lookup(keys)
         query: _Asked = ("array", 1, len(keys), len(fetched))
         row_keys = fetched.keys
+        distances = self._distances_of(fetched, law)
         for located in batch:
             low = high = 0
             if located.keys.size:
@@ -222,7 +258,8 @@ class HapticQuery:
                 low = int(row_keys.searchsorted(located.keys[0], "left"))
                 high = int(row_keys.searchsorted(located.keys[-1], "right"))
             rows = fetched.part(low, high)
-            yield self._refined(located, rows, exclude, law, query, started)
+            payload = None if distances is None else distances[low:high]
+            yield self._refined(located, rows, payload, exclude, law, query, started)
             query, started = ("array", 0, 0, 0), time.perf_counter_ns()
 
     def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> "contact.Located":
@@ -282,7 +319,8 @@ class HapticQuery:
         store = self._store
         if not isinstance(law, TangentPlane):
             raise UsageError(
-                "the strategy 'statement' computes the tangent-plane law alone: choose another one"
+                "the strategy 'statement' computes the tangent-plane law alone: give that law, or "
+                "choose another strategy"
             )
         if not isinstance(store, SupportsStatement):
             raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
@@ -298,7 +336,7 @@ class HapticQuery:
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
         order = np.lexsort((ids, ordinals))
-        return Answer(wrench, hits, depths, touched, lambda: pairs[order], query)
+        return Answer(wrench, hits, depths, touched, lambda: pairs[order], query, placed)
 
 
 def _check_options(strategy: Strategy, gap: int) -> None:

@@ -5,10 +5,11 @@ A law of this module is checked and immutable, and makes the NamedTuple that ker
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, ClassVar, Protocol
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels import law as kernels
+from hapticdb.kernels.field import law as field
 
 MOST_STIFFNESS = 1e9
 """Largest stiffness of a law, N/m: stiffer than any hand, device or part."""
@@ -43,14 +44,48 @@ class TangentPlane:
 
     stiffness: float = 1000.0
 
+    name: ClassVar[str] = "plane"
+
     def __post_init__(self) -> None:
-        if not 0.0 <= self.stiffness <= MOST_STIFFNESS:
-            raise UsageError(
-                f"stiffness {self.stiffness} N/m: give a number from 0 to {MOST_STIFFNESS:g}"
-            )
-        object.__setattr__(self, "stiffness", float(self.stiffness))
+        object.__setattr__(self, "stiffness", _checked(self.stiffness))
 
     @cached_property
     def for_kernels(self) -> Any:  # noqa: ANN401 - kernels are loaded when they are first used
         """The law's NamedTuple for kernels."""
         return kernels.TangentPlaneLaw(self.stiffness)
+
+
+@dataclass(frozen=True)
+class DistanceField:
+    """Smooth law: a point is felt by its distance u to the nearest surface (Barbic and James 2008).
+
+    u is in voxels, interpolated between the stored distances at the 8 voxel centres around the
+    point; at each centre the least distance of all objects counts. With the voxel size s and the
+    point's inward normal n: d = s max(0, 1.5 - u), F = K sum d n / max(1, W / 10), torque alike. W
+    is the sum of the points' weights clamp(2.5 - u, 0, 1). So contact begins 1.5 voxels before the
+    surface, and the force is continuous in the pose. Only an environment in which every object has
+    distances can be felt by this law.
+
+    Attributes
+    ----------
+    stiffness : float
+        K, N/m, `MOST_STIFFNESS` at most.
+    """
+
+    stiffness: float = 1000.0
+
+    name: ClassVar[str] = "smooth"
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "stiffness", _checked(self.stiffness))
+
+    @cached_property
+    def for_kernels(self) -> Any:  # noqa: ANN401 - likewise
+        """The law's NamedTuple for kernels."""
+        return field.DistanceFieldLaw(self.stiffness)
+
+
+def _checked(stiffness: float) -> float:
+    if not 0.0 <= stiffness <= MOST_STIFFNESS:
+        raise UsageError(f"stiffness {stiffness} N/m: give a number from 0 to {MOST_STIFFNESS:g}")
+    return float(stiffness)

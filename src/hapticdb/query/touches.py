@@ -25,7 +25,8 @@ class Touch:
     hits : (H,) int64
         Indices of the shell's points inside a voxel, ascending.
     depths : (H,) float64
-        Metres below each hit's tangent plane; 0 above it.
+        Depth of each hit in metres, 0 where the law does not feel it: below its tangent plane, or,
+        under `DistanceField`, below the onset of 1.5 voxels before the surface.
     query : Query
         How the database was asked.
     """
@@ -45,6 +46,21 @@ class Touch:
     def contacts(self) -> NDArray[np.int64]:
         """Indices (C,) of the shell's points that the law feels, ascending."""
         return self._answer.contacts()[0]
+
+    @property
+    def contact_depths(self) -> NDArray[np.float64]:
+        """Depths (C,) of the contacts in metres, all above 0."""
+        return self._answer.contacts()[1]
+
+    @property
+    def contact_points(self) -> NDArray[np.float64]:
+        """Places (C, 3) of the contacts, metres, world frame."""
+        return self._answer.placed[self.contacts, :3]
+
+    @property
+    def contact_normals(self) -> NDArray[np.float64]:
+        """Unit normals (C, 3) of the contacts, which point into the tool, world frame."""
+        return self._answer.placed[self.contacts, 3:]
 
     @property
     def objects(self) -> list[Object]:

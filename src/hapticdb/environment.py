@@ -29,7 +29,7 @@ from hapticdb.query.frame import (
 )
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
 from hapticdb.query.known_objects import KnownObjects
-from hapticdb.query.law import ForceLaw, TangentPlane
+from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.query.touches import Touch, Touches
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
@@ -283,7 +283,7 @@ class Environment:
         *,
         exclude: Iterable[int] = _NOBODY,
         maxgap: int = DEFAULT_MAXGAP,
-        law: ForceLaw | None = None,
+        law: ForceLaw | LawName | None = None,
     ) -> Touch:
         """Force and torque that the environment exerts on the tool at one pose.
 
@@ -302,13 +302,14 @@ class Environment:
         maxgap : int
             For the strategy ``maxgap``: greatest distance, in voxel keys, of neighbours that share
             a range.
-        law : TangentPlane or None
-            The force law; 1000 N/m unless given.
+        law : TangentPlane, DistanceField, "plane", "smooth" or None
+            By default ``smooth`` (`DistanceField`) where `has_distances`, else ``plane``, with 1000
+            N/m. The strategy ``statement`` computes ``plane`` alone.
 
         Raises
         ------
         UsageError
-            If the pose is not rigid or the strategy is unknown.
+            If the pose is not rigid, the strategy unknown, or objects lack what the law reads.
         ObjectNotFoundError
             If an excluded object does not exist.
 
@@ -317,7 +318,7 @@ class Environment:
         Points outside the grid miss. All statements of a touch read one committed revision.
         """
         ids = NOTHING_EXCLUDED if exclude is _NOBODY else as_ids(exclude)
-        force_law = law or _DEFAULT_LAW
+        force_law = as_law(law)
         try:
             answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
         except ConnectionLostError:  # a lost snapshot: repeat all of it once
@@ -334,15 +335,23 @@ class Environment:
         strategy: Strategy,
         maxgap: int,
         ids: Keys,
-        law: ForceLaw,
+        law: ForceLaw | None,
     ) -> Answer:
         """Answer of a frame; also loads the objects of the revision that the frame read."""
-        answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
-        if self._store.version() != self._known.version:
+        fitting = self._known.fits(law)
+        chosen = self._known.law_of(law) if fitting else PLANE
+        answer = self._query.run(shell, pose, strategy, maxgap, ids, chosen)
+        if not fitting or self._store.version() != self._known.version:
             with self._store.snapshot():
-                answer = self._query.run(shell, pose, strategy, maxgap, ids, law)
-                self._learn_objects()
+                chosen = self._law_of_snapshot(law)
+                answer = self._query.run(shell, pose, strategy, maxgap, ids, chosen)
         return answer
+
+    def _law_of_snapshot(self, law: ForceLaw | None) -> ForceLaw:
+        """The law of a frame in this snapshot; also loads the snapshot's objects."""
+        self._store.revision()  # `version` then tells of this snapshot
+        self._learn_objects()
+        return self._known.law_of(law)
 
     def _learn_objects(self) -> None:
         """Load the objects of the revision that this snapshot reads."""
@@ -357,7 +366,7 @@ class Environment:
         *,
         exclude: Iterable[int] = _NOBODY,
         maxgap: int = DEFAULT_MAXGAP,
-        law: ForceLaw | None = None,
+        law: ForceLaw | LawName | None = None,
         contacts: bool = False,
     ) -> Touches:
         """Force and torque at many poses; the same as `touch` for each pose, bit for bit.
@@ -383,11 +392,10 @@ class Environment:
         where, started = as_poses(poses), perf_counter_ns()
 
         def felt() -> Touches:
-            answers = self._query.run_many(shell, where, strategy, maxgap, ids, law or _DEFAULT_LAW)
             with self._store.snapshot():
-                touches = Touches(len(where), has_contacts=contacts).gather(answers)
-                self._learn_objects()
-            return touches
+                chosen = self._law_of_snapshot(as_law(law))
+                answers = self._query.run_many(shell, where, strategy, maxgap, ids, chosen)
+                return Touches(len(where), has_contacts=contacts).gather(answers)
 
         if strategy == "cbgroup":
             self._figures.both()  # measured outside the snapshot
@@ -444,9 +452,6 @@ class Environment:
 
     def _ranges_of(self, obj: Object) -> Ranges:
         return object_ranges(self.grid, self.layout, obj)
-
-
-_DEFAULT_LAW = TangentPlane()
 
 
 def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment:  # noqa: A001 - the word users expect, as in tarfile.open

@@ -33,7 +33,7 @@ WRENCH = tuple(
 TOUCHED = ("pose", *WRENCH, "hits", "contacts", "deepest_m", "object_ids", "object_names")
 """Columns of `touch --csv`: a row for each pose."""
 CONTACTS = ("pose", "point", "x_m", "y_m", "z_m", "depth_m", "object_id", "object_name")
-"""Columns of `touch --contacts-csv`: a row for each contact with each object in its voxel."""
+"""Columns of `touch --contacts-csv`: a row for each contact with each object that it touches."""
 _PLACE = (*(f"{axis}_m" for axis in AXES), "qw", "qx", "qy", "qz")
 _SPEED = (*(f"v{axis}_m_per_s" for axis in AXES), *(f"w{axis}_rad_per_s" for axis in AXES))
 FRAME_COLUMNS: dict[str, tuple[str, ...]] = {
@@ -151,12 +151,11 @@ def rows_of_contacts(
     index: int, touched: "Touch", shell: "PointShell", pose: "NDArray[np.float64]"
 ) -> Iterator[list[object]]:
     """Rows of `CONTACTS`, ordered by point and id; points at their places in the world."""
-    depths = dict(zip(touched.hits.tolist(), touched.depths.tolist(), strict=True))
+    depths = dict(zip(touched.contacts.tolist(), touched.contact_depths.tolist(), strict=True))
     names = {obj.id: text_cell(obj.name) for obj in touched.objects}
-    for point, i in touched.pairs.tolist():
-        if depths[point] > 0.0:
-            place = pose[:3, :3] @ shell.points[point] + pose[:3, 3]
-            yield [index, point, *place.tolist(), depths[point], i, names[i]]
+    for point, i in touched.contact_pairs.tolist():
+        place = pose[:3, :3] @ shell.points[point] + pose[:3, 3]
+        yield [index, point, *place.tolist(), depths[point], i, names[i]]
 
 
 def rows_of_frames(frames: "Frames") -> Iterator[list[object]]:

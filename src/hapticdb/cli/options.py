@@ -7,6 +7,7 @@ import typer
 StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 CurveName = Literal["z", "hilbert", "lexicographic"]
 LayoutName = Literal["brick", "voxel"]
+LawName = Literal["plane", "smooth"]
 UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
 
 _TOOL = typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
@@ -66,6 +67,14 @@ SeedOption = Annotated[
     int | None, typer.Option(metavar="N", help="Seed of the points' places.", show_default="0")
 ]
 StiffnessOption = Annotated[float, typer.Option(metavar="N/M", help="Stiffness of the force law.")]
+LawOption = Annotated[
+    LawName | None,
+    typer.Option(
+        "--law",
+        help="Force law: the tangent plane of a voxel, or smooth by distances to surfaces; smooth "
+        "unless given where every object has distances.",
+    ),
+]
 BudgetOption = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
 
 # -- results --------------------------------------------------------------------------------------

@@ -63,6 +63,8 @@ class Answer(NamedTuple):
     wrench (6,) N and N m; hits (H,) indices, ascending; depths (H,) metres; ids : objects of all
     hits, ascending; pairs : () -> (P, 2) int64, every (hit, object id), computed when asked for;
     placed (N + 1, 6) : the shell's points in metres and normals, world frame, last its centre;
+    touched : contacts (C,) -> (P, 2) int64, every (contact, object id), under a law that reads
+    distances; None where contacts are hits;
     apart (A,) : indices of felt points that are no hits, ascending; apart_depths (A,) metres.
     """
 
@@ -73,6 +75,8 @@ class Answer(NamedTuple):
     pairs: Callable[[], NDArray[np.int64]]
     query: Query
     placed: NDArray[np.float64]
+    law: ForceLaw
+    touched: Callable[[NDArray[np.int64]], NDArray[np.int64]] | None = None
     apart: NDArray[np.int64] = NO_POINTS
     apart_depths: NDArray[np.float64] = NO_DEPTHS
 
@@ -137,7 +141,8 @@ class HapticQuery:
         located = self.locate(shell, as_floats(world_from_tool, "a pose"))
         if strategy == "statement":
             return self._by_statement(located, exclude, law, started)
-        asked, rows = self._fetch(strategy, located, gap)
+        distances = laws.reads_distances(law.for_kernels)
+        asked, rows = self._fetch(strategy, located, gap, distances=distances)
         payload = self._distances_of(rows, law, located.keys)
         return self._refined(located, rows, payload, exclude, law, asked, started)
 
@@ -206,9 +211,27 @@ class HapticQuery:
             pairs,
             Query(*query, elapsed_us),
             placed,
+            law,
+            None if payload is None else partial(self._touched, located, rows, exclude, law),
             apart,
             apart_depths,
         )
+
+    def _touched(
+        self,
+        located: "contact.Located",
+        rows: Rows,
+        exclude: Keys,
+        law: ForceLaw,
+        contacts: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        """Every (contact, object) pair (P, 2) of a frame whose law reads distances."""
+        payload = self._distances_of(rows, law, located.keys)
+        keys, ids, occupancy, _ = rows
+        return refining.pairs_of_contacts(  # type: ignore[no-any-return]
+            *located, keys, ids, occupancy, payload, exclude, self._origin, self._size,
+            law.for_kernels, contacts,
+        )  # fmt: skip
 
     def run_many(
         self,
@@ -247,7 +270,8 @@ class HapticQuery:
         """Answers of poses, in their order; one statement fetches the rows of all poses."""
         started = time.perf_counter_ns()
         keys = np.unique(np.concatenate([located.keys for located in batch]))
-        fetched = self._store.lookup(keys)
+        reads = laws.reads_distances(law.for_kernels)
+        fetched = self._store.lookup(keys, distances=reads)
         query: _Asked = ("array", 1, len(keys), len(fetched))
         row_keys = fetched.keys
         distances = self._distances_of(fetched, law)
@@ -283,13 +307,13 @@ class HapticQuery:
             raise UsageError(f"{error}: give finite numbers and a rotation") from error
 
     def _fetch(
-        self, strategy: Strategy, located: "contact.Located", gap: int
+        self, strategy: Strategy, located: "contact.Located", gap: int, *, distances: bool
     ) -> tuple[_Asked, Rows]:
         """Rows of a frame, and the fields of `Query` that say how they were asked for."""
         _, asked, keys = located
         if strategy == "points":
             with self._store.snapshot():
-                rows = self._store.lookup_each(keys)
+                rows = self._store.lookup_each(keys, distances=distances)
             return ("points", len(keys), len(keys), len(rows)), rows
         ranges: Ranges | None = None
         if strategy == "maxgap":
@@ -303,9 +327,9 @@ class HapticQuery:
             )
             strategy = "array" if ranges is None else "cbgroup"
         if ranges is None:
-            rows = self._store.lookup(keys)
+            rows = self._store.lookup(keys, distances=distances)
             return ("array", 1, len(keys), len(rows)), rows
-        rows = self._store.scan(*ranges)
+        rows = self._store.scan(*ranges, distances=distances)
         return (strategy, 1, len(ranges.lows), len(rows)), rows
 
     def _by_statement(
@@ -319,8 +343,8 @@ class HapticQuery:
         store = self._store
         if not isinstance(law, TangentPlane):
             raise UsageError(
-                "the strategy 'statement' computes the tangent-plane law alone: give that law, or "
-                "choose another strategy"
+                "the strategy 'statement' computes the tangent-plane law alone: give the law "
+                "'plane', or choose another strategy"
             )
         if not isinstance(store, SupportsStatement):
             raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
@@ -336,7 +360,7 @@ class HapticQuery:
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
         order = np.lexsort((ids, ordinals))
-        return Answer(wrench, hits, depths, touched, lambda: pairs[order], query, placed)
+        return Answer(wrench, hits, depths, touched, lambda: pairs[order], query, placed, law)
 
 
 def _check_options(strategy: Strategy, gap: int) -> None:

@@ -2,7 +2,10 @@
 
 from collections.abc import Iterable
 
-from hapticdb.store.base import Keys, Object, Store
+from hapticdb.errors import UsageError
+from hapticdb.kernels import law as laws
+from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
+from hapticdb.store.base import Keys, Layout, Object, Store
 from hapticdb.store.believed import damaged
 from hapticdb.store.refusals import unknown_exclusion
 
@@ -70,3 +73,43 @@ class KnownObjects:
         for object_id in wanted:
             if object_id not in self.by_id:
                 raise unknown_exclusion(object_id, self._store.url)
+
+    def fits(self, law: ForceLaw | None) -> bool:
+        """Whether the objects have what the law reads."""
+        return law is None or self.have_distances or not laws.reads_distances(law.for_kernels)
+
+    def law_of(self, law: ForceLaw | None) -> ForceLaw:
+        """The law of a frame; where None is given, the one for these objects.
+
+        Raises
+        ------
+        UsageError
+            If the law reads distances, and an object has none.
+        """
+        if law is None:
+            return SMOOTH if self.have_distances else PLANE
+        if not self.fits(law):
+            check_distances(self._store.url, self._store.layout, self.by_id.values())
+        return law
+
+
+def check_distances(url: str, layout: Layout, objects: Iterable[Object]) -> None:
+    """Refuse a law that reads distances where an object has none.
+
+    Raises
+    ------
+    UsageError
+        It says what to do.
+    """
+    known = list(objects)
+    if layout != "brick":
+        raise UsageError(
+            f"{url} has the layout {layout}, which stores no distances to surfaces: give the law "
+            "'plane', or import into the layout brick"
+        )
+    lacking = [obj.name for obj in known if not obj.has_distances]
+    if lacking:
+        raise UsageError(
+            f"{len(lacking)} of {len(known)} objects of {url} have no distances to their surfaces "
+            f"({lacking[0]}): run 'hapticdb upgrade {url}', or give the law 'plane'"
+        )

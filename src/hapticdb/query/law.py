@@ -5,12 +5,14 @@ A law of this module is checked and immutable, and makes the NamedTuple that ker
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol, get_args
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels import law as kernels
 from hapticdb.kernels.field import law as field
 
+LawName = Literal["plane", "smooth"]
+LAW_NAMES: tuple[LawName, ...] = get_args(LawName)
 MOST_STIFFNESS = 1e9
 """Largest stiffness of a law, N/m: stiffer than any hand, device or part."""
 
@@ -89,3 +91,16 @@ def _checked(stiffness: float) -> float:
     if not 0.0 <= stiffness <= MOST_STIFFNESS:
         raise UsageError(f"stiffness {stiffness} N/m: give a number from 0 to {MOST_STIFFNESS:g}")
     return float(stiffness)
+
+
+PLANE, SMOOTH = TangentPlane(), DistanceField()
+"""The laws with their default stiffness."""
+
+
+def as_law(law: "ForceLaw | LawName | None") -> ForceLaw | None:
+    """A law, or the one of that name; None stays None."""
+    if not isinstance(law, str):
+        return law
+    if law not in LAW_NAMES:
+        raise UsageError(f"law {law!r}: choose one of {', '.join(LAW_NAMES)}, or give a law")
+    return PLANE if law == PLANE.name else SMOOTH

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.query.frame import Answer, Query
+from hapticdb.query.law import ForceLaw
 from hapticdb.store.base import Object
 
 CONTACT: np.dtype[np.void] = np.dtype([("pose", "<i8"), ("point", "<i8"), ("depth", "<f8")])
@@ -63,8 +64,25 @@ class Touch:
         return self._answer.placed[self.contacts, 3:]
 
     @property
+    def law(self) -> ForceLaw:
+        """The force law that was felt."""
+        return self._answer.law
+
+    @property
+    def contact_pairs(self) -> NDArray[np.int64]:
+        """Every contact with every object that it touches, (P, 2): index of the point, id."""
+        contacts = self.contacts
+        if self._answer.touched is not None:
+            return self._answer.touched(contacts)
+        pairs = self.pairs
+        return pairs[np.isin(pairs[:, 0], contacts)]
+
+    @property
     def objects(self) -> list[Object]:
-        """Objects of all hits, ordered by id."""
+        """Objects of all hits and, under `DistanceField`, those that contacts touch, by id.
+
+        A contact touches the objects that it would feel alone, or the nearest one.
+        """
         return [self._known[i] for i in self._answer.ids]
 
     @property

@@ -24,6 +24,7 @@ from hapticdb.cli.options import (
     CsvOption,
     ExcludeOption,
     JsonOption,
+    LawOption,
     PathUnitOption,
     PointsOption,
     PosesOption,
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.proportions import Misfit
     from hapticdb.query.frame import Strategy
+    from hapticdb.query.law import ForceLaw
     from hapticdb.query.touches import Touch
     from hapticdb.store.base import Object
 
@@ -83,6 +85,7 @@ def touch(
     strategy: StrategyOption = "auto",
     maxgap: MaxgapOption = 500,
     exclude: ExcludeOption = None,
+    law: LawOption = None,
     stiffness: StiffnessOption = 1000.0,
     csv: CsvOption = None,
     contacts_csv: ContactsCsvOption = None,
@@ -98,12 +101,14 @@ def touch(
     import hapticdb
     from hapticdb.poses import read_poses
 
-    law = hapticdb.TangentPlane(stiffness)
+    plane, smooth = hapticdb.TangentPlane(stiffness), hapticdb.DistanceField(stiffness)
     path = read_poses(poses, unit=path_unit or "m")
     with (
         _output(csv, contacts_csv, json=json) as output,
         hapticdb.open(url, read_only=True) as env,
     ):
+        name = law or ("smooth" if env.has_distances else "plane")
+        chosen: ForceLaw = smooth if name == "smooth" else plane
         excluded = ids_of(env, exclude, "--exclude")
         render.compile_kernels("touch", files=[tool])
         shell = shell_of(tool, tool_unit, points, seed)
@@ -113,7 +118,7 @@ def touch(
         )  # fmt: skip
         asked = _strategy_of(strategy, env, len(path))
         touch_at = partial(
-            env.touch, shell, strategy=asked, exclude=excluded, maxgap=maxgap, law=law
+            env.touch, shell, strategy=asked, exclude=excluded, maxgap=maxgap, law=chosen
         )
         touch_at(path[0])  # compiles kernels and reads statistics, which belong to no frame's time
         for index, pose in enumerate(path):
@@ -181,6 +186,7 @@ def _record(index: int, touched: "Touch") -> dict[str, object]:
     query = touched.query
     return {
         "pose": index,
+        "law": getattr(touched.law, "name", ""),
         "force": touched.force.tolist(),
         "torque": touched.torque.tolist(),
         "hits": len(touched.hits),
@@ -206,6 +212,7 @@ class _Summary:
     contacts: list[int] = field(default_factory=list)
     queries: list[tuple[int, int, int, float]] = field(default_factory=list)
     strategies: Counter[str] = field(default_factory=Counter)
+    laws: Counter[str] = field(default_factory=Counter)
     frames_of: Counter[int] = field(default_factory=Counter)
     objects: dict[int, "Object"] = field(default_factory=dict)
 
@@ -220,6 +227,7 @@ class _Summary:
         self.contacts.append(len(touched.contacts))
         self.queries.append((query.statements, query.ranges, query.rows, query.elapsed_us))
         self.strategies[query.strategy] += 1
+        self.laws[getattr(touched.law, "name", "")] += 1
         for obj in touched.objects:
             self.frames_of[obj.id] += 1
             self.objects[obj.id] = obj
@@ -248,6 +256,7 @@ class _Summary:
                     ("peak torque", f"{self.torques[twist]:.4g} N m at pose {twist}"),
                     ("frame time", f"median {median:.0f} µs, p99 {p99:.0f} µs"),
                     ("a frame asks", asked),
+                    ("law", render.shares(self.laws)),
                     ("strategy", render.shares(self.strategies)),
                     ("objects", f"{len(self.objects)} touched"),
                 ]

@@ -1,0 +1,75 @@
+"""The distance law through `Environment.touch`: strategies, and its default."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from hapticdb import DistanceField, Environment, UsageError
+from hapticdb.kernels.field.packing import pack
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.store.base import Band, Rows
+from hapticdb.testing import blob, voxel_object, write_voxels
+from kernels.test_distance_law import (
+    expected,
+    grid_of,
+    merged,
+    objects,
+    random_pose,
+    random_shell,
+)
+from naive_frame import NaiveTouch
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> Environment:
+    env = hapticdb.create(tmp_path / "e.db", grid_of(), distances=True)
+    for n, part in enumerate(objects()):
+        ids = np.zeros(len(part.keys), dtype=np.int64)
+        rows = Rows(part.keys, ids, part.occupancy, Band(*pack(part.values)))
+        env.store.add(voxel_object(env.grid, part.voxels, f"part {n}"), rows)
+    return env
+
+
+def assert_same(touch: hapticdb.Touch, wanted: NaiveTouch) -> None:
+    assert touch.law == DistanceField()
+    assert touch.hits.tolist() == wanted.hits
+    assert touch.contacts.tolist() == wanted.contacts
+    assert touch.contact_depths.tolist() == [wanted.contact_depths[n] for n in wanted.contacts]
+    assert [o.id for o in touch.objects] == wanted.ids
+    assert [tuple(pair) for pair in touch.pairs.tolist()] == wanted.pairs
+    assert [tuple(pair) for pair in touch.contact_pairs.tolist()] == wanted.near
+    assert [*touch.force, *touch.torque] == [*wanted.force, *wanted.torque]
+
+
+def test_every_strategy_feels_what_plain_python_feels(env: Environment) -> None:
+    n_contacts = 0
+    for seed in range(6):
+        shell, pose, exclude = random_shell(seed, 200), random_pose(seed), [seed % 3 + 1]
+        wanted = expected(merged(), shell, pose, exclude)
+        n_contacts += len(wanted.contacts)
+        for strategy in STRATEGIES:
+            if strategy != "statement":
+                assert_same(env.touch(shell, pose, strategy, exclude=exclude), wanted)
+        many = env.touch_many(shell, [pose, random_pose(seed + 1)], exclude=exclude)
+        assert [*many.forces[0], *many.torques[0]] == [*wanted.force, *wanted.torque]
+        assert many.ids[0] == wanted.ids
+    assert n_contacts > 0
+
+
+def test_the_default_law_follows_the_objects(env: Environment) -> None:
+    shell, pose = random_shell(1, 40), random_pose(1)
+    assert env.touch(shell, pose).law.name == "smooth"  # type: ignore[attr-defined]
+    assert env.touch(shell, pose, law="plane").law.name == "plane"  # type: ignore[attr-defined]
+    with pytest.raises(UsageError, match="tangent-plane law alone"):
+        env.touch(shell, pose, "statement")
+    with hapticdb.open(env.store.url) as other:
+        write_voxels(other.store, blob(1, (20, 20, 20)), "without")
+    assert env.touch(shell, pose).law.name == "plane"  # type: ignore[attr-defined]
+    with pytest.raises(UsageError, match=r"1 of 6 objects .* 'hapticdb upgrade"):
+        env.touch(shell, pose, law="smooth")
+    with pytest.raises(UsageError, match=r"1 of 6 objects .* 'hapticdb upgrade"):
+        env.touch_many(shell, [pose], law="smooth")
+    with pytest.raises(UsageError, match="choose one of plane, smooth"):
+        env.touch(shell, pose, law="soft")  # type: ignore[arg-type]

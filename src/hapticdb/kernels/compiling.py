@@ -29,6 +29,7 @@ from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 ENTRIES = {
     "hand.coupling": "advance",
     "hand.quasistatic": "advance",
+    "surfaces.distances": "find_blocks rows_of_blocks",
     "surfaces.voxelize": "voxelize_kernel",
     "resident.clearance": "find_clearance cells_near",
     "resident.feeling": "feel_kernel bounding_spheres",
@@ -67,6 +68,7 @@ SERVE = "from hapticdb.kernels.compiling import serve; serve()"
 _SHELL = ("surfaces.sampling.*", "surfaces.sides.*", "curves.encode_kernel")
 _VOXELIZE = (
     "surfaces.voxelize.*",
+    "surfaces.distances.*",
     "surfaces.bricks.z_keys_kernel",
     "surfaces.bricks.mark_points_kernel",
     "surfaces.bricks.count_kernel",

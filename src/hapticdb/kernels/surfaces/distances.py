@@ -1,0 +1,484 @@
+"""Triangles, or points, -> the band of distances around them, as packed rows.
+
+Space is cut into blocks of 8^3 bricks. A block holds the least squared distance of its 66^3
+centres: its 64^3 voxels, and one centre more on each side, which the rows of its outer bricks need.
+Each triangle is entered into the blocks that it comes near to, one line of centres along k after
+the other. Then the block is quantised, and each brick that has a distance becomes a row.
+
+Which centres a triangle comes near to follows from directions: no centre within h of a triangle
+lies farther than h outside the triangle's extent in any direction. The directions are the normal,
+the normals of the edges in the plane, those of the edges' shadows on the plane (i, j), and the
+axes. For a triangle that is a line, two directions square to it and its own replace the first ones.
+
+A distance depends on the triangle and on the centre's place in the grid alone, not on the block or
+on other triangles, and the least is taken before it is quantised. So neither the order of the
+triangles nor a split of them changes a bit, and rows that share a centre have the same value there.
+
+Where the distance to the plane, or to the bounding box, already exceeds what the centre has, the
+exact one is not computed. To make this exact to the last bit, the exact distance is never taken
+below those two.
+"""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import BYTES2, FLOATS3, INT, INTS, INTS2, entry, inlined, leaf
+from hapticdb.kernels.curves import compact, z_encode
+from hapticdb.kernels.field.lattice import BEYOND, HALF_WIDTH, ROW_SIDE, ROW_VALUES, step_of
+from hapticdb.kernels.field.packing import pack
+from hapticdb.kernels.surfaces.voxelize import normal_of
+
+BRICK = 8
+"""Voxels of a brick on each axis."""
+BLOCK_BITS = 3
+"""Bits of a brick's place in its block, on each axis."""
+BLOCK_BRICKS = 1 << (3 * BLOCK_BITS)
+"""Bricks of a block, and most rows that it makes."""
+BLOCK = BRICK << BLOCK_BITS
+"""Voxels of a block on each axis. Larger: fewer triangles enter several blocks; a block of 64 takes
+2.3 MB for each thread."""
+SIDE = BLOCK + 2
+"""Centres of a block on each axis."""
+REACH = 0.5 * (SIDE - 1)
+"""From the middle of a block to its outermost centres along an axis, voxels."""
+SLACK = 1e-6
+"""Voxels by which directions reach farther than h, because of rounding."""
+NEAR_ZERO = 1e-12
+"""Slopes below it count as it: what a line along k changes then is below `SLACK`."""
+FAR = 2.0**40
+"""Coordinates beyond it, in voxels, are set to it, so that no product overflows. Triangles with
+such corners, far outside any grid, are less exact."""
+NOTHING = HALF_WIDTH * HALF_WIDTH * (1.0 + 1e-9)
+"""Squared distance of a centre to which no triangle comes near: just above h^2."""
+POINT, LINE, FACE = 0, 1, 2
+"""Shape of a triangle: all corners coincide, all lie on a line, or neither."""
+N_SIDES = 7
+"""Directions of a triangle: 0 to 3 bound k, 4 to 6 bound j. The first is the normal of a face."""
+AT_X, AT_Y, AT_Z, INVERSE, LOW, HIGH, NEAR_LOW, NEAR_HIGH = 0, 1, 2, 3, 4, 5, 6, 7
+"""Fields of a direction: unit vector, 1 / slope, least and greatest value in the triangle, and
+where it is near."""
+EDGE_X, EDGE_Y, EDGE_Z, INVERSE_SQUARE = 3, 4, 5, 6
+"""Fields of an edge behind its first corner: its vector, 1 / its squared length or 0."""
+ROWS_OF_PIECE = 8 * BLOCK_BRICKS
+"""Rows that one call makes at most: 4 MB. A larger value takes more memory and reports progress
+less often."""
+
+
+class Shape(NamedTuple):
+    """One triangle, prepared. All relative to its first corner where a direction is meant.
+
+    sides (7, 8), edges (3, 7), box (2, 3) float64: its directions, edges and bounding box; corners
+    (3, 3) float64.
+    """
+
+    sides: NDArray[np.float64]
+    edges: NDArray[np.float64]
+    box: NDArray[np.float64]
+    corners: NDArray[np.float64]
+
+
+class Block(NamedTuple):
+    """A block under construction.
+
+    squares (66^3,) float64: least squared distances; unset outside the spans. spans (66^2, 2)
+    int64: first centre set on each line along k, and one past the last. steps (66^3,) uint8:
+    quantised.
+    """
+
+    squares: NDArray[np.float64]
+    spans: NDArray[np.int64]
+    steps: NDArray[np.uint8]
+
+
+@leaf
+def set_side(shape, n, x, y, z, slope, reach):
+    """Set direction n to the unit vector along (x, y, z), or to no bound where that is null.
+
+    slope : AT_Y or AT_Z, the axis that the direction is solved for; reach : half the edge of the
+    boxes that are to come near, 0 for points.
+    """
+    sides, corners = shape.sides, shape.corners
+    length = np.sqrt(x * x + y * y + z * z)
+    if length == 0.0:
+        for field in range(INVERSE):
+            sides[n, field] = 0.0
+        sides[n, LOW] = sides[n, NEAR_LOW] = -1.0
+        sides[n, HIGH] = sides[n, NEAR_HIGH] = 1.0
+        sides[n, INVERSE] = 1.0 / NEAR_ZERO
+        return
+    sign = -1.0 if (y if slope == AT_Y else z) < 0.0 else 1.0
+    x, y, z = sign * x / length, sign * y / length, sign * z / length
+    low, high = 0.0, 0.0
+    for m in range(1, 3):
+        value = x * (corners[m, 0] - corners[0, 0]) + y * (corners[m, 1] - corners[0, 1])
+        value += z * (corners[m, 2] - corners[0, 2])
+        low, high = min(low, value), max(high, value)
+    more = reach * (abs(x) + abs(y) + abs(z)) + HALF_WIDTH + SLACK
+    sides[n, AT_X], sides[n, AT_Y], sides[n, AT_Z] = x, y, z
+    sides[n, INVERSE] = 1.0 / max(y if slope == AT_Y else z, NEAR_ZERO)
+    sides[n, LOW], sides[n, HIGH] = low, high
+    sides[n, NEAR_LOW], sides[n, NEAR_HIGH] = low - more, high + more
+
+
+@leaf
+def set_edges(triangles, t, shape):
+    """Set corners, bounding box and edges of triangle t; return the number of its longest edge.
+
+    Returns -1 when all its corners coincide.
+    """
+    corners, edges, box = shape.corners, shape.edges, shape.box
+    for axis in range(3):
+        box[0, axis], box[1, axis] = FAR, -FAR
+        for m in range(3):
+            value = triangles[t, min(m, triangles.shape[1] - 1), axis]
+            corners[m, axis] = min(max(value, -FAR), FAR)
+            box[0, axis] = min(box[0, axis], corners[m, axis])
+            box[1, axis] = max(box[1, axis], corners[m, axis])
+    longest, longest_square = -1, 0.0
+    for m in range(3):
+        square = 0.0
+        for axis in range(3):
+            edges[m, axis] = corners[m, axis]
+            along = corners[(m + 1) % 3, axis] - corners[m, axis]
+            edges[m, EDGE_X + axis] = along
+            square += along * along
+        edges[m, INVERSE_SQUARE] = 1.0 / square if square > 0.0 else 0.0
+        if square > longest_square:
+            longest, longest_square = m, square
+    return longest
+
+
+@leaf
+def set_shape(triangles, t, shape, reach):
+    """Prepare triangle t of triangles (T, 3, 3), or point t of (T, 1, 3); return its kind."""
+    longest = set_edges(triangles, t, shape)
+    edges = shape.edges
+    for m in range(3):  # square to each edge's shadow
+        set_side(shape, 4 + m, -edges[m, EDGE_Y], edges[m, EDGE_X], 0.0, AT_Y, reach)
+    if longest < 0:
+        for n in range(4):
+            set_side(shape, n, 0.0, 0.0, 0.0, AT_Z, reach)
+        return POINT
+    x, y, z = normal_of(shape.corners)
+    if x != 0.0 or y != 0.0 or z != 0.0:
+        length = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / length, y / length, z / length
+        set_side(shape, 0, x, y, z, AT_Z, reach)
+        for m in range(3):
+            u, v, w = edges[m, EDGE_X], edges[m, EDGE_Y], edges[m, EDGE_Z]
+            set_side(shape, 1 + m, y * w - z * v, z * u - x * w, x * v - y * u, AT_Z, reach)
+        return FACE
+    u, v, w = edges[longest, EDGE_X], edges[longest, EDGE_Y], edges[longest, EDGE_Z]
+    if abs(u) <= min(abs(v), abs(w)):  # square to the edge and to the axis that it is farthest from
+        x, y, z = 0.0, w, -v
+    elif abs(v) <= abs(w):
+        x, y, z = -w, 0.0, u
+    else:
+        x, y, z = v, -u, 0.0
+    set_side(shape, 0, x, y, z, AT_Z, reach)
+    set_side(shape, 1, v * z - w * y, w * x - u * z, u * y - v * x, AT_Z, reach)
+    set_side(shape, 2, u, v, w, AT_Z, reach)
+    set_side(shape, 3, 0.0, 0.0, 0.0, AT_Z, reach)
+    return LINE
+
+
+@inlined
+def y_interval(sides, x, least, greatest):
+    """Narrow an interval of y to where the line at x comes near the shadow."""
+    for n in range(4, N_SIDES):
+        value = sides[n, AT_X] * x
+        least = max(least, (sides[n, NEAR_LOW] - value) * sides[n, INVERSE])
+        greatest = min(greatest, (sides[n, NEAR_HIGH] - value) * sides[n, INVERSE])
+    return least, greatest
+
+
+@inlined
+def z_interval(sides, x, y, least, greatest):
+    """Narrow an interval of z to where the line at (x, y) comes near."""
+    for n in range(4):
+        value = sides[n, AT_X] * x + sides[n, AT_Y] * y
+        least = max(least, (sides[n, NEAR_LOW] - value) * sides[n, INVERSE])
+        greatest = min(greatest, (sides[n, NEAR_HIGH] - value) * sides[n, INVERSE])
+    return least, greatest
+
+
+@leaf
+def whole(low, high, first, last):
+    """Numbers from low to high that lie in first..last: the least, and one past the greatest."""
+    low, high = max(np.ceil(low), float(first)), min(np.floor(high), float(last))
+    if low > high:
+        return first, first
+    return int(low), int(high) + 1
+
+
+@entry(FLOATS3, INT, INTS2)
+def find_blocks(triangles, bits, pairs):
+    """Blocks near each triangle; returns how many pairs of a block and a triangle there are.
+
+    triangles (T, 3, 3), or (T, 1, 3) for points. pairs (P, 2) int64: the block's Z-order key and
+    the triangle; those beyond P are counted only.
+    """
+    shape = Shape(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
+    last, half = (np.int64(1) << max(bits - BLOCK_BITS - 3, 0)) - 1, 0.5 * BLOCK
+    n_pairs = 0
+    for t in range(triangles.shape[0]):
+        set_shape(triangles, t, shape, REACH)
+        sides, box = shape.sides, shape.box
+        at_x, at_y, at_z = shape.corners[0, 0], shape.corners[0, 1], shape.corners[0, 2]
+        more = REACH + HALF_WIDTH + SLACK
+        low, high = box[0, 0] - more, box[1, 0] + more
+        first_i, end_i = whole((low - half) / BLOCK, (high - half) / BLOCK, 0, last)
+        for i in range(first_i, end_i):
+            x = i * BLOCK + half - at_x
+            low, high = box[0, 1] - more - at_y, box[1, 1] + more - at_y
+            low, high = y_interval(sides, x, low, high)
+            low, high = (low + at_y - half) / BLOCK, (high + at_y - half) / BLOCK
+            first_j, end_j = whole(low, high, 0, last)
+            for j in range(first_j, end_j):
+                y = j * BLOCK + half - at_y
+                low, high = box[0, 2] - more - at_z, box[1, 2] + more - at_z
+                low, high = z_interval(sides, x, y, low, high)
+                low, high = (low + at_z - half) / BLOCK, (high + at_z - half) / BLOCK
+                first_k, end_k = whole(low, high, 0, last)
+                for k in range(first_k, end_k):
+                    if n_pairs < pairs.shape[0]:
+                        pairs[n_pairs, 0] = z_encode(i, j, k)
+                        pairs[n_pairs, 1] = t
+                    n_pairs += 1
+    return n_pairs
+
+
+@leaf
+def segment_square(x, y, z, u, v, w, inverse):
+    """Squared distance of (x, y, z) to the segment from 0 to (u, v, w); 1 / its squared length."""
+    t = min(max((x * u + y * v + z * w) * inverse, 0.0), 1.0)
+    x, y, z = x - t * u, y - t * v, z - t * w
+    return x * x + y * y + z * z
+
+
+@leaf
+def gap(x, low, high):
+    """Distance of x from an interval."""
+    return max(low - x, x - high, 0.0)
+
+
+@inlined
+def cover(squares, spans, line, first, end):
+    """Let a line's span hold the centres first..end, new ones at `NOTHING`."""
+    low, high = spans[line, 0], spans[line, 1]
+    if low >= high:
+        low = high = first
+    for k in range(first, low):
+        squares[line * SIDE + k] = NOTHING
+    for k in range(high, end):
+        squares[line * SIDE + k] = NOTHING
+    spans[line, 0] = min(low, first)
+    spans[line, 1] = max(high, end)
+
+
+@inlined
+def edge_square(sides, edges, is_line, x, y, z, u, v, w):
+    """Least squared distance of the centre (x, y, z) to the edges that it lies outside of, or 0.
+
+    (u, v, w) is the same centre from the first corner. For a line, to all edges.
+    """
+    near = np.inf
+    for m in range(3):
+        s = sides[m + 1, AT_X] * u + sides[m + 1, AT_Y] * v + sides[m + 1, AT_Z] * w
+        if is_line or s < sides[m + 1, LOW] or s > sides[m + 1, HIGH]:
+            found = segment_square(
+                x - edges[m, 0], y - edges[m, 1], z - edges[m, 2],
+                edges[m, EDGE_X], edges[m, EDGE_Y], edges[m, EDGE_Z], edges[m, INVERSE_SQUARE],
+            )  # fmt: skip
+            near = min(near, found)
+    return near if near < np.inf else 0.0
+
+
+@inlined
+def enter_line(shape, kind, squares, at, x, y, base_z, first, end):
+    """Enter a triangle into the centres first..end of a line along k.
+
+    at : the place of the line's first centre in squares; x, y : the line's place in the grid;
+    base_z : that of its first centre.
+    """
+    sides, edges, box, corners = shape
+    u, v = x - corners[0, 0], y - corners[0, 1]
+    across_x, across_y = gap(x, box[0, 0], box[1, 0]), gap(y, box[0, 1], box[1, 1])
+    across = across_x * across_x + across_y * across_y
+    height_here = sides[0, AT_X] * u + sides[0, AT_Y] * v
+    low_z, high_z, corner_z, slope_z = box[0, 2], box[1, 2], corners[0, 2], sides[0, AT_Z]
+    for k in range(first, end):
+        z = base_z + k
+        w = z - corner_z
+        along = gap(z, low_z, high_z)
+        square = across + along * along
+        if kind == FACE:
+            height = height_here + slope_z * w
+            square = max(square, height * height)
+        if square < squares[at + k]:
+            if kind != POINT:
+                near = edge_square(sides, edges, kind == LINE, x, y, z, u, v, w)
+                square = max(square, near)
+            squares[at + k] = min(squares[at + k], square)
+
+
+@leaf
+def enter(shape, kind, block, i, j, k):
+    """Enter a triangle into the block whose first centre is that of voxel (i, j, k)."""
+    sides, _, box, corners = shape
+    squares, spans, _ = block
+    x0, y0, z0 = i + 0.5, j + 0.5, k + 0.5
+    corner_x, corner_y, corner_z = corners[0, 0], corners[0, 1], corners[0, 2]
+    more = HALF_WIDTH + SLACK
+    low_y, high_y = box[0, 1] - more - corner_y, box[1, 1] + more - corner_y
+    low_z, high_z = box[0, 2] - more - corner_z, box[1, 2] + more - corner_z
+    first, end = whole(box[0, 0] - more - x0, box[1, 0] + more - x0, 0, SIDE - 1)
+    for at_x in range(first, end):
+        x = x0 + at_x
+        low, high = y_interval(sides, x - corner_x, low_y, high_y)
+        first_y, end_y = whole(low + corner_y - y0, high + corner_y - y0, 0, SIDE - 1)
+        for at_y in range(first_y, end_y):
+            y = y0 + at_y
+            low, high = z_interval(sides, x - corner_x, y - corner_y, low_z, high_z)
+            first_z, end_z = whole(low + corner_z - z0, high + corner_z - z0, 0, SIDE - 1)
+            if first_z < end_z:
+                line = at_x * SIDE + at_y
+                cover(squares, spans, line, first_z, end_z)
+                enter_line(shape, kind, squares, line * SIDE, x, y, z0, first_z, end_z)
+
+
+@leaf
+def quantise(block):
+    """Set the steps of a block from its squared distances."""
+    squares, spans, steps = block
+    for n in range(steps.shape[0]):
+        steps[n] = BEYOND
+    for line in range(SIDE * SIDE):
+        for here in range(line * SIDE + spans[line, 0], line * SIDE + spans[line, 1]):
+            if squares[here] < NOTHING:
+                steps[here] = step_of(np.sqrt(squares[here]))
+
+
+@leaf
+def has_span(spans, i, j, k):
+    """Whether a row that begins at centre (i, j, k) of a block meets a line's span."""
+    for x in range(i, i + ROW_SIDE):
+        for y in range(j, j + ROW_SIDE):
+            line = x * SIDE + y
+            if spans[line, 0] < k + ROW_SIDE and spans[line, 1] > k:
+                return True
+    return False
+
+
+@leaf
+def copy_row(steps, i, j, k, out, n):
+    """Copy the row that begins at centre (i, j, k) of a block to row n of out (R, 1000).
+
+    Returns whether it has a distance.
+    """
+    least = np.int64(BEYOND)
+    for x in range(ROW_SIDE):
+        for y in range(ROW_SIDE):
+            here = ((i + x) * SIDE + j + y) * SIDE + k
+            to = (x * ROW_SIDE + y) * ROW_SIDE
+            for z in range(ROW_SIDE):
+                step = steps[here + z]
+                out[n, to + z] = step
+                least = min(least, np.int64(step))
+    return least < BEYOND
+
+
+@entry(FLOATS3, INTS2, INTS, INT, INTS, BYTES2)
+def rows_of_blocks(triangles, pairs, at, bits, keys, out):
+    """Rows of the blocks from pair at[0] on; returns how many rows were made.
+
+    pairs (P, 2) int64, as `find_blocks` gives them, ascending; at (1,) int64, where the next call
+    goes on. Stops before a block for which keys (R,) and out (R, 1000) may have no room.
+    """
+    shape = Shape(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
+    block = Block(
+        np.empty(SIDE**3), np.empty((SIDE * SIDE, 2), np.int64), np.empty(SIDE**3, np.uint8)
+    )
+    bricks = np.int64(1) << max(bits - 3, 0)
+    n_rows = 0
+    while at[0] < pairs.shape[0] and n_rows + BLOCK_BRICKS <= out.shape[0]:
+        key = pairs[at[0], 0]
+        i, j, k = compact(key >> 2), compact(key >> 1), compact(key)
+        for line in range(SIDE * SIDE):
+            block.spans[line, 0] = block.spans[line, 1] = 0
+        while at[0] < pairs.shape[0] and pairs[at[0], 0] == key:
+            kind = set_shape(triangles, pairs[at[0], 1], shape, 0.0)
+            enter(shape, kind, block, i * BLOCK - 1, j * BLOCK - 1, k * BLOCK - 1)
+            at[0] += 1
+        quantise(block)
+        for brick in range(BLOCK_BRICKS):
+            place = np.int64(brick)
+            x, y, z = compact(place >> 2), compact(place >> 1), compact(place)
+            if max((i << BLOCK_BITS) + x, (j << BLOCK_BITS) + y, (k << BLOCK_BITS) + z) >= bricks:
+                continue
+            x, y, z = x * BRICK, y * BRICK, z * BRICK
+            if has_span(block.spans, x, y, z) and copy_row(block.steps, x, y, z, out, n_rows):
+                keys[n_rows] = (key << (3 * BLOCK_BITS)) | brick
+                n_rows += 1
+    return n_rows
+
+
+def band_pieces(
+    triangles: NDArray[np.float64], bits: int, rows: int = ROWS_OF_PIECE
+) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]]:
+    """Band of triangles or points, a bounded number of rows at a time.
+
+    Parameters
+    ----------
+    triangles : NDArray[np.float64]
+        (T, 3, 3) corners of triangles, or (P, 1, 3) points, in voxels from the grid's origin,
+        finite. A triangle may be a line or a point. What lies outside the grid counts where it is
+        near.
+    bits : int
+        Bits an axis of the grid, 1 to 21.
+    rows : int
+        Rows of a piece; at least `BLOCK_BRICKS`.
+
+    Yields
+    ------
+    share : float
+        How much is done, 0 to 1.
+    bricks_z : NDArray[np.int64]
+        (R,) Z-order keys of bricks, ascending through all pieces, each once: all bricks of the
+        grid whose row has a distance of up to h.
+    data, ends : arrays
+        Their packed rows, as `hapticdb.kernels.field.packing.pack` gives them.
+    """
+    corners = np.ascontiguousarray(triangles, dtype=np.float64)
+    pairs = np.empty((4 * len(corners) + 64, 2), dtype=np.int64)
+    n_pairs = find_blocks(corners, bits, pairs)
+    if n_pairs > len(pairs):
+        pairs = np.empty((n_pairs, 2), dtype=np.int64)
+        find_blocks(corners, bits, pairs)
+    pairs = pairs[:n_pairs]
+    pairs = np.ascontiguousarray(pairs[np.argsort(pairs[:, 0], kind="stable")])
+    at = np.zeros(1, dtype=np.int64)
+    keys = np.empty(rows, dtype=np.int64)
+    out = np.empty((rows, ROW_VALUES), dtype=np.uint8)
+    while at[0] < n_pairs:
+        n_rows = rows_of_blocks(corners, pairs, at, bits, keys, out)
+        yield float(at[0]) / n_pairs, keys[:n_rows].copy(), *pack(out[:n_rows])
+
+
+def band_of(
+    triangles: NDArray[np.float64], bits: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
+    """Band of triangles or points: keys (R,), packed rows and their ends; see `band_pieces`."""
+    pieces = list(band_pieces(triangles, bits))
+    starts = np.cumsum([0] + [len(data) for _, _, data, _ in pieces])
+    keys = [np.empty(0, dtype=np.int64), *(keys for _, keys, _, _ in pieces)]
+    packed = [np.empty(0, dtype=np.uint8), *(data for _, _, data, _ in pieces)]
+    ends = [ends + start for (_, _, _, ends), start in zip(pieces, starts, strict=False)]
+    return (
+        np.concatenate(keys),
+        np.concatenate(packed),
+        np.concatenate([np.empty(0, dtype=np.int64), *ends]),
+    )

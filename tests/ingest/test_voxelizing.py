@@ -62,7 +62,7 @@ def test_a_part_that_does_not_fit_into_memory_is_refused_in_one_line(
 ) -> None:
     monkeypatch.setattr("hapticdb.ingest.voxelizing._MERGE_FROM", 100)
     monkeypatch.setattr("hapticdb.ingest.voxelizing.bytes_available", lambda: 50_000)
-    with pytest.raises(FileError, match=r"a part: its voxels take .*fewer --bits"):
+    with pytest.raises(FileError, match=r"a part: its rows take .*fewer --bits"):
         bricks_of_triangles(HUGE, BITS, "a part", most=100)
     path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     options = ImportOptions(grid=GridOptions(bits=BITS), layout="voxel")

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.kernels import curves
 from hapticdb.kernels.surfaces import voxelize
-from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, Keys, Layout, Rows
+from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, Band, Keys, Layout, Rows
 
 BRICKS_AT_ONCE = 1 << 15
 """Bricks whose voxels are unpacked together. A larger value takes more memory: 24 bytes a voxel."""
@@ -23,16 +23,17 @@ class Bricks(NamedTuple):
     """Voxels as bricks in Z-order, for any curve of the environment.
 
     keys (B,) int64, ascending, distinct; occupancy (B, 64) uint8: bit n, least significant first,
-    is the voxel whose (i, j, k) modulo 8 has Z-order n.
+    is the voxel whose (i, j, k) modulo 8 has Z-order n; distances: as `Rows` has them.
     """
 
     keys: Keys
     occupancy: NDArray[np.uint8]
+    distances: Band | None = None
 
 
 def rows_of_bricks(bricks: Bricks, grid: Grid, layout: Layout) -> tuple[Rows, int]:
     """Rows of bricks in a layout and the grid's order, and the number of their voxels."""
-    keys, occupancy = bricks
+    keys, occupancy, distances = bricks
     n_voxels = voxelize.count_voxels(occupancy)
     if layout == "voxel":
         keys = _voxel_keys(bricks, n_voxels, grid)
@@ -41,7 +42,9 @@ def rows_of_bricks(bricks: Bricks, grid: Grid, layout: Layout) -> tuple[Rows, in
         keys = _reordered(keys, grid.bits, curves.Z_ORDER, grid.curve_code)
         order = np.argsort(keys)
         keys, occupancy = keys[order], occupancy[order]
-    return Rows(keys, np.zeros(len(keys), dtype=np.int64), occupancy.reshape(-1)), n_voxels
+        distances = None if distances is None else picked(distances, order)
+    ids = np.zeros(len(keys), dtype=np.int64)
+    return Rows(keys, ids, occupancy.reshape(-1), distances), n_voxels
 
 
 def _voxel_keys(bricks: Bricks, n_voxels: int, grid: Grid) -> Keys:
@@ -65,7 +68,16 @@ def bricks_of_rows(rows: Rows, grid: Grid, layout: Layout) -> Bricks:
     if grid.curve != "z":
         keys = _reordered(keys, grid.bits, grid.curve_code, curves.Z_ORDER)
     order = np.argsort(keys)
-    return Bricks(keys[order], rows.occupancy.reshape(-1, BRICK_BYTES)[order])
+    distances = None if rows.distances is None else picked(rows.distances, order)
+    return Bricks(keys[order], rows.occupancy.reshape(-1, BRICK_BYTES)[order], distances)
+
+
+def picked(band: Band, which: NDArray[np.int64]) -> Band:
+    """Distances of the rows at the given places, in their order."""
+    lengths = np.diff(band.ends, prepend=0)[which]
+    ends = np.cumsum(lengths)
+    shifts = np.repeat(band.ends[which] - ends, lengths)
+    return Band(band.data[shifts + np.arange(len(shifts))], ends)
 
 
 def bricks_of_voxels(ijk: NDArray[np.int64], grid: Grid) -> Bricks:
@@ -82,12 +94,15 @@ def voxels_of_rows(rows: Rows, grid: Grid, layout: Layout) -> NDArray[np.int64]:
     """Voxels (n, 3) of one object's rows, in the order of their keys."""
     if layout == "voxel":
         return grid.decode(rows.keys)
-    ijk = voxelize.brick_voxels(*bricks_of_rows(rows, grid, layout))
+    ijk = voxelize.brick_voxels(*bricks_of_rows(rows, grid, layout)[:2])
     return ijk[np.argsort(grid.encode(ijk))]
 
 
 def merged(parts: Sequence[Bricks]) -> Bricks:
-    """Bricks of one or more parts together; a brick in several parts gets the bits of all."""
+    """Bricks of one or more parts together; a brick in several parts gets the bits of all.
+
+    Parts with distances have no brick in common.
+    """
     if len(parts) == 1:
         return parts[0]
     keys = np.concatenate([part.keys for part in parts])
@@ -97,7 +112,17 @@ def merged(parts: Sequence[Bricks]) -> Bricks:
     if not len(starts):
         return parts[0]
     occupancy = np.concatenate([part.occupancy for part in parts])[order]
-    return Bricks(keys[starts], np.bitwise_or.reduceat(occupancy, starts, axis=0))
+    occupancy = np.bitwise_or.reduceat(occupancy, starts, axis=0)
+    bands = [part.distances for part in parts if part.distances is not None]
+    distances = picked(joined(bands), order) if len(bands) == len(parts) else None
+    return Bricks(keys[starts], occupancy, distances)
+
+
+def joined(bands: Sequence[Band]) -> Band:
+    """Distances of all rows of some batches, one batch after the other."""
+    starts = np.cumsum([0] + [len(band.data) for band in bands])
+    ends = [band.ends + start for band, start in zip(bands, starts, strict=False)]
+    return Band(np.concatenate([band.data for band in bands]), np.concatenate(ends))
 
 
 def _reordered(keys: Keys, bits: int, curve: int, onto: int) -> Keys:

@@ -3,12 +3,14 @@
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError
 from hapticdb.grid import Grid
+from hapticdb.ingest.distances import with_distances
 from hapticdb.ingest.layout import Bricks, rows_of_bricks
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.mesh import MeshFile, Part
@@ -21,6 +23,8 @@ SHARE_EVERY_S = 0.2
 """Seconds between two calls with the share of a long part. Larger: fewer calls."""
 BYTES_A_BRICK = 8 + BRICK_BYTES
 """Memory of a brick, bytes: its key and its occupancy."""
+_VOXELS_SHARE = 0.1
+"""Share of a part's time that its voxels take where distances are computed, too."""
 _MERGE_FROM = 8 * voxelize.MOST_BRICKS
 """Number of bricks in all pieces at which the pieces are merged for the first time. A larger value
 merges less often and takes more memory."""
@@ -32,6 +36,8 @@ def rows_of_part(
     layout: Layout,
     world_from_part: NDArray[np.float64] | None = None,
     progress: ShareCallback | None = None,
+    *,
+    distances: bool = False,
 ) -> tuple[Rows, int]:
     """Voxelize a part; returns its rows, ascending by key, and the number of its voxels.
 
@@ -43,21 +49,38 @@ def rows_of_part(
         Placement in metres; the file's unless given.
     progress : callable or None
         Called with the share of a large part that is done.
+    distances : bool
+        Whether the rows get distances to the part's surface, or to the points of a cloud. Then
+        there are rows for all bricks near it. Bricks only.
 
     Raises
     ------
     FileError
-        If its voxels would take more memory than the machine has left.
+        If its voxels or distances would take more memory than the machine has left.
     """
+    what = f"part {part.name!r}"
+    voxels_alone = _VOXELS_SHARE if distances else 1.0
     if part.is_cloud:
-        points = _on_grid(part.world_points(world_from_part), grid)
-        bricks = Bricks(*voxelize.mark_points(points, grid.bits))
+        corners = _on_grid(part.world_points(world_from_part), grid)[:, None]
+        bricks = Bricks(*voxelize.mark_points(corners, grid.bits))
     else:
-        triangles = _on_grid(part.triangles(world_from_part), grid)
-        bricks = bricks_of_triangles(triangles, grid.bits, f"part {part.name!r}", progress)
+        corners = _on_grid(part.triangles(world_from_part), grid)
+        marking = _portion(progress, 0.0, voxels_alone)
+        bricks = bricks_of_triangles(corners, grid.bits, what, marking)
         if layout == "voxel":
-            check_room(8 * voxelize.count_voxels(bricks.occupancy), f"part {part.name!r}")
+            check_room(8 * voxelize.count_voxels(bricks.occupancy), what)
+    if distances:
+        measuring = _portion(progress, voxels_alone, 1.0)
+        room = partial(check_room, what=what)
+        bricks = with_distances(bricks, corners, grid.bits, room, measuring)
     return rows_of_bricks(bricks, grid, layout)
+
+
+def _portion(progress: ShareCallback | None, low: float, high: float) -> ShareCallback | None:
+    """Tell `progress` that a share of the portion low to high of the work is done."""
+    if progress is None:
+        return None
+    return lambda share: progress(low + share * (high - low))
 
 
 def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
@@ -114,7 +137,7 @@ def check_room(n_bytes: int, what: str) -> None:
     left = bytes_available()
     if n_bytes > left:
         raise FileError(
-            f"{what}: its voxels take more than {n_bytes / 2**30:.1f} GiB of memory, and "
+            f"{what}: its rows take more than {n_bytes / 2**30:.1f} GiB of memory, and "
             f"{left / 2**30:.1f} are left; import it into a grid of fewer --bits"
         )
 

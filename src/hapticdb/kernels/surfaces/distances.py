@@ -54,7 +54,7 @@ such corners, far outside any grid, are less exact."""
 NOTHING = HALF_WIDTH * HALF_WIDTH * (1.0 + 1e-9)
 """Squared distance of a centre to which no triangle comes near: just above h^2."""
 POINT, LINE, FACE = 0, 1, 2
-"""Shape of a triangle: all corners coincide, all lie on a line, or neither."""
+"""Prepared of a triangle: all corners coincide, all lie on a line, or neither."""
 N_SIDES = 7
 """Directions of a triangle: 0 to 3 bound k, 4 to 6 bound j. The first is the normal of a face."""
 AT_X, AT_Y, AT_Z, INVERSE, LOW, HIGH, NEAR_LOW, NEAR_HIGH = 0, 1, 2, 3, 4, 5, 6, 7
@@ -67,7 +67,7 @@ ROWS_OF_PIECE = 8 * BLOCK_BRICKS
 less often."""
 
 
-class Shape(NamedTuple):
+class Prepared(NamedTuple):
     """One triangle, prepared. All relative to its first corner where a direction is meant.
 
     sides (7, 8), edges (3, 7), box (2, 3) float64: its directions, edges and bounding box; corners
@@ -221,7 +221,7 @@ def find_blocks(triangles, bits, pairs):
     triangles (T, 3, 3), or (T, 1, 3) for points. pairs (P, 2) int64: the block's Z-order key and
     the triangle; those beyond P are counted only.
     """
-    shape = Shape(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
+    shape = Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
     last, half = (np.int64(1) << max(bits - BLOCK_BITS - 3, 0)) - 1, 0.5 * BLOCK
     n_pairs = 0
     for t in range(triangles.shape[0]):
@@ -398,7 +398,7 @@ def rows_of_blocks(triangles, pairs, at, bits, keys, out):
     pairs (P, 2) int64, as `find_blocks` gives them, ascending; at (1,) int64, where the next call
     goes on. Stops before a block for which keys (R,) and out (R, 1000) may have no room.
     """
-    shape = Shape(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
+    shape = Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
     block = Block(
         np.empty(SIDE**3), np.empty((SIDE * SIDE, 2), np.int64), np.empty(SIDE**3, np.uint8)
     )

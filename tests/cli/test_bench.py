@@ -3,12 +3,14 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 import hapticdb
 from command_line import PLACES, Run, made, refused, run, scene, tool  # noqa: F401 - fixtures
+from hapticdb.bench.feel.measures import MEASURES
 from hapticdb.poses import write_poses
 
 EXPERIMENTS = {
@@ -87,3 +89,27 @@ def path_over(folder: Path) -> Path:
     path = folder / "over.csv"
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+def test_bench_feel_refuses_what_it_does_not_take_in_one_line(run: Run, tmp_path: Path) -> None:
+    refused(run("bench"), "no environment", "--feel")
+    refused(run("bench", "none.db", "--feel"), "no environment at none.db", "hapticdb import")
+    tool = ("--tool", "t.stl", "--poses", "p.csv")
+    refused(run("bench", "--feel", *tool), "--feel has tools of its own")
+    assert not (tmp_path / "feel-bench").exists()
+
+
+@pytest.mark.long
+def test_bench_feel_prints_its_table(run: Run, tmp_path: Path) -> None:
+    code, out, err = run("bench", "--feel", "--quick")
+    assert code == 0, err
+    lines = out.splitlines()
+    assert lines[0] == "| measure | plane | smooth | wanted |"
+    assert lines[-1] == "feel-bench/feel.md"
+    result = json.loads((tmp_path / "feel-bench" / "feel.json").read_text())
+    assert {cell["measure"] for cell in result["cells"]} == {m.key for m in MEASURES}
+    page = (tmp_path / "feel-bench" / "feel.md").read_text()
+    for target in re.findall(r"\]\((feel/\w+\.\w+)\)", page):
+        assert (tmp_path / "feel-bench" / target).stat().st_size > 1000
+    for measure in MEASURES:
+        assert measure.how in page

@@ -143,8 +143,10 @@ FOLLOWER: Layout = _record(
         ("n_unknown", "<i8"),  # points in unknown cells there
         ("n_looks", "<i8"),  # poses looked at in this period
         ("n_active", "<i8"),  # points in the contact set of the last step
+        ("n_bends", "<i8"),  # rows of curvature in its equations
         ("is_walking", "?"),  # whether the pose that is looked at may be forbidden
         ("is_loose", "?"),  # the tool lies in something and feels nothing yet
+        ("is_bent", "?"),  # the surface is hollow: looks compute its curvature
         ("is_braked", "?"),  # the last step was cut short: the next one is held back
         ("matrix", "<f8", (6, 6)),  # of the step's equations: N/m, N, N m
         ("right", "<f8", 6),  # their right-hand side: N, N m

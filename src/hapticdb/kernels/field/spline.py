@@ -84,6 +84,41 @@ def spline(payload, slot, x, y, z):
 
 
 @inlined
+def weighted(payload, slot, at, bx, hx, ax, by, hy, ay, bz, hz, az):
+    """Sum of the 27 centres from index `at` on, in voxels, with weights along each axis."""
+    total = 0.0
+    for plane in range(3):
+        along = bx if plane == 0 else (hx if plane == 1 else ax)
+        for line in range(3):
+            across = along * (by if line == 0 else (hy if line == 1 else ay))
+            here = at + plane * ALONG_I + line * ALONG_J
+            total += across * (
+                bz * min(payload[slot, here], STEPS)
+                + hz * min(payload[slot, here + 1], STEPS)
+                + az * min(payload[slot, here + 2], STEPS)
+            )
+    return VOXELS_A_STEP * total
+
+
+@inlined
+def second_derivatives(payload, slot, x, y, z):
+    """Second derivatives of the spline at a point, as in `spline`: xx, yy, zz, xy, xz, yz."""
+    tx, ty, tz = from_center(x), from_center(y), from_center(z)
+    bx, hx, ax = spline_weights(tx)
+    by, hy, ay = spline_weights(ty)
+    bz, hz, az = spline_weights(tz)
+    sx, sy, sz = tx - 0.5, ty - 0.5, tz - 0.5  # slopes: t - 1/2, -2 t, t + 1/2
+    at = cell_place((np.int64(x) & 31) - 1, (np.int64(y) & 31) - 1, (np.int64(z) & 31) - 1)
+    xx = weighted(payload, slot, at, 1.0, -2.0, 1.0, by, hy, ay, bz, hz, az)
+    yy = weighted(payload, slot, at, bx, hx, ax, 1.0, -2.0, 1.0, bz, hz, az)
+    zz = weighted(payload, slot, at, bx, hx, ax, by, hy, ay, 1.0, -2.0, 1.0)
+    xy = weighted(payload, slot, at, sx, -2.0 * tx, tx + 0.5, sy, -2.0 * ty, ty + 0.5, bz, hz, az)
+    xz = weighted(payload, slot, at, sx, -2.0 * tx, tx + 0.5, by, hy, ay, sz, -2.0 * tz, tz + 0.5)
+    yz = weighted(payload, slot, at, bx, hx, ax, sy, -2.0 * ty, ty + 0.5, sz, -2.0 * tz, tz + 0.5)
+    return xx, yy, zz, xy, xz, yz
+
+
+@inlined
 def lower_bound(payload, slot, x, y, z):
     """Voxels: no surface is nearer to a point of the slot's cell, by the 8 centres around it."""
     tx, ty, tz = from_center(x), from_center(y), from_center(z)
@@ -105,6 +140,15 @@ def lower_bound(payload, slot, x, y, z):
         u = float(min(payload[slot, index], STEPS)) * VOXELS_A_STEP
         best = max(best, u - math.sqrt(square))
     return max(best - 0.5 * VOXELS_A_STEP, 0.0)
+
+
+@inlined
+def nearest_bound(payload, slot, x, y, z):
+    """As `lower_bound`, by the nearest centre alone: lower, and a third of the time."""
+    tx, ty, tz = from_center(x), from_center(y), from_center(z)
+    at = cell_place(np.int64(x) & 31, np.int64(y) & 31, np.int64(z) & 31)
+    u = min(payload[slot, at], STEPS) * VOXELS_A_STEP
+    return max(u - math.sqrt(tx * tx + ty * ty + tz * tz) - 0.5 * VOXELS_A_STEP, 0.0)
 
 
 @leaf

@@ -11,7 +11,13 @@ import numpy as np
 
 from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.field.lattice import HALF_WIDTH
-from hapticdb.kernels.field.spline import bound_in_free_block, lower_bound, spline
+from hapticdb.kernels.field.spline import (
+    bound_in_free_block,
+    lower_bound,
+    nearest_bound,
+    second_derivatives,
+    spline,
+)
 from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     LISTED,
@@ -36,6 +42,9 @@ below about 0.7 the gradients are wrong."""
 LEAST_BOUND = 0.1
 """Voxels: least lower bound that a step may take a point to. Smaller: points get nearer to sheets;
 the rule is a proof while it is above 0."""
+ENOUGH = 0.3
+"""Voxels: a bound of a near point that is not improved any more. Larger: fewer and longer strides
+in contact, and more computing for each point."""
 NEVER = 1e30
 """A way that no tool travels."""
 
@@ -49,7 +58,13 @@ NEAR = 6
 U, BOUND, ALONG, ABOUT = 0, 1, 2, 5
 """Rows from there on: distance and bound, voxels; gradient (3) and its moment about the centre (3),
 m."""
-NEAR_ROWS = 8
+BENDS, BEND_ROWS = 8, 7
+"""First row of the two ways in which the surface bends towards a near point, and rows of each:
+curvature, 1/voxel, its direction (3), and that direction's moment about the centre (3), m."""
+NEAR_ROWS = BENDS + 2 * BEND_ROWS
+BENT = 0.05
+"""Curvature, 1/voxel, that is not counted: the noise of stored distances. Larger: less resistance
+along rough surfaces, and steps that overshoot in gentle hollows."""
 FIELD_ROWS = NEAR + 2 * NEAR_ROWS
 NEAR_POINTS = 1
 """First of two rows of `met` with the indices of the near points, as `field` has their numbers. The
@@ -85,12 +100,84 @@ def distance_at(payload, slot, mask, x, y, z, dx, dy, dz):
     u, gx, gy, gz = HALF_WIDTH, 0.0, 0.0, 0.0
     if (mask >> brick_bit(i, j, k)) & np.uint64(1):
         u, gx, gy, gz = spline(payload, slot, x, y, z)
-        bound = lower_bound(payload, slot, x, y, z)
+        bound = nearest_bound(payload, slot, x, y, z) if u < ONSET + MARGIN else 0.0
+        if bound < ENOUGH:
+            bound = lower_bound(payload, slot, x, y, z)
     else:
         bound = bound_in_free_block(x, y, z, 5 if slot == EMPTY_SLOT else 3)
     if dx != 0.0 or dy != 0.0 or dz != 0.0:
         u, gx, gy, gz, bound = outside_grid(u, gx, gy, gz, bound, dx, dy, dz)
     return u, gx, gy, gz, bound
+
+
+@leaf
+def write_row(field, rows, m, gx, gy, gz, rx, ry, rz):
+    """Write the gradient of near point m, with lever r, and its moment into its rows."""
+    field[rows + ALONG, m], field[rows + ALONG + 1, m], field[rows + ALONG + 2, m] = gx, gy, gz
+    ax, ay, az = moment(rx, ry, rz, gx, gy, gz)
+    field[rows + ABOUT, m], field[rows + ABOUT + 1, m], field[rows + ABOUT + 2, m] = ax, ay, az
+
+
+@leaf
+def bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
+    """Curvatures of a hollow surface across a gradient and their unit directions: c, v, d, w.
+
+    The second derivatives are those of the distance. A curvature is 0 where the surface is flat or
+    bulges. Eigenvalues of the 2 x 2 matrix in the plane across the gradient, in closed form.
+    """
+    ux, uy, uz = (gz, 0.0, -gx) if abs(gy) > 0.7 * (abs(gx) + abs(gz)) else (-gz, 0.0, gx)
+    if abs(ux) + abs(uz) < 1e-9:
+        ux, uy, uz = 1.0, 0.0, 0.0
+    length = math.sqrt(ux * ux + uy * uy + uz * uz)
+    ux, uy, uz = ux / length, uy / length, uz / length
+    wx, wy, wz = moment(gx, gy, gz, ux, uy, uz)
+    length = max(math.sqrt(wx * wx + wy * wy + wz * wz), 1e-12)
+    wx, wy, wz = wx / length, wy / length, wz / length
+    px, py, pz = (
+        xx * ux + xy * uy + xz * uz,
+        xy * ux + yy * uy + yz * uz,
+        xz * ux + yz * uy + zz * uz,
+    )
+    qx, qy, qz = (
+        xx * wx + xy * wy + xz * wz,
+        xy * wx + yy * wy + yz * wz,
+        xz * wx + yz * wy + zz * wz,
+    )
+    a = -(px * ux + py * uy + pz * uz)
+    b = -(px * wx + py * wy + pz * wz)
+    c = -(qx * wx + qy * wy + qz * wz)
+    middle, half = 0.5 * (a + c), math.sqrt(0.25 * (a - c) * (a - c) + b * b)
+    angle = 0.5 * math.atan2(2.0 * b, a - c)
+    cosine, sine = math.cos(angle), math.sin(angle)
+    return (
+        max(middle + half - BENT, 0.0),
+        cosine * ux + sine * wx, cosine * uy + sine * wy, cosine * uz + sine * wz,
+        max(middle - half - BENT, 0.0),
+        cosine * wx - sine * ux, cosine * wy - sine * uy, cosine * wz - sine * uz,
+    )  # fmt: skip
+
+
+@leaf
+def write_bend(field, row, m, curvature, vx, vy, vz, rx, ry, rz):
+    """Write one bend of near point m into rows from `row` on; r: the point's lever."""
+    field[row, m] = curvature
+    field[row + 1, m], field[row + 2, m], field[row + 3, m] = vx, vy, vz
+    ax, ay, az = moment(rx, ry, rz, vx, vy, vz)
+    field[row + 4, m], field[row + 5, m], field[row + 6, m] = ax, ay, az
+
+
+@leaf
+def bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m):
+    """Write both bends of near point m, at (x, y, z) voxels with lever r, into its rows."""
+    row = rows + BENDS
+    field[row, m] = field[row + BEND_ROWS, m] = 0.0
+    if not (mask >> brick_bit(np.int64(x), np.int64(y), np.int64(z))) & np.uint64(1):
+        return
+    gx, gy, gz = field[rows + ALONG, m], field[rows + ALONG + 1, m], field[rows + ALONG + 2, m]
+    xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, x, y, z)
+    c, vx, vy, vz, d, wx, wy, wz = bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz)
+    write_bend(field, row, m, c, vx, vy, vz, rx, ry, rz)
+    write_bend(field, row + BEND_ROWS, m, d, wx, wy, wz, rx, ry, rz)
 
 
 @leaf
@@ -137,13 +224,12 @@ def look_at_run(
             return SHUT
         met[near, n_near] = n
         field[base + U, n_near], field[base + BOUND, n_near] = u, bound
-        rx, ry, rz = moment(px - cx, py - cy, pz - cz, gx, gy, gz)
-        field[base + ALONG, n_near] = gx
-        field[base + ALONG + 1, n_near] = gy
-        field[base + ALONG + 2, n_near] = gz
-        field[base + ABOUT, n_near] = rx
-        field[base + ABOUT + 1, n_near] = ry
-        field[base + ABOUT + 2, n_near] = rz
+        rx, ry, rz = px - cx, py - cy, pz - cz
+        write_row(field, base, n_near, gx, gy, gz, rx, ry, rz)
+        if follower.is_bent and u < ONSET:
+            bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, base, n_near)
+        else:
+            field[base + BENDS, n_near] = field[base + BENDS + BEND_ROWS, n_near] = 0.0
         n_near += 1
     field[RUN_DUE, run] = run_due
     follower.n_tried, missed[LISTED] = n_near, n_missed

@@ -86,9 +86,12 @@ guard has lowered the stiffness; the fall of the force is softened."""
 STEPS = 3
 """Most Gauss-Newton steps of a period. Larger: sharper corners are followed in one period, and the
 worst period takes longer."""
-SETTLED = 5e-4
-"""Voxels: a step in which no point moves farther is not walked. Larger: fewer looks, and the force
-is wrong by the spring's stiffness times so much."""
+SETTLED = 5e-3
+"""Voxels: a step in which no point moves farther is not walked, and the force is that at its end.
+Larger: fewer looks, and the tool's pose and the force's direction are less exact."""
+BENT_FROM = 2
+"""Steps of a period after which the surface's curvature is computed, too, until it is flat. Larger:
+less computing, and more steps in corners."""
 SHORT_CUT = 0.1
 """Share of a step: if less of it was walked, the next step is braked. Larger: braked more often."""
 SUNK = 0.02
@@ -132,7 +135,7 @@ def look_here(cells, which, shell, place, tool, follower, field, met, missed):
     if is_first:
         forget(follower, field)
         begin_steady(follower)
-        follower.is_loose = follower.is_braked = False
+        follower.is_loose = follower.is_braked = follower.is_bent = False
     else:
         look_anew(follower, field)
     position, turned = tool.position, tool.quaternion
@@ -194,9 +197,12 @@ def follow(cells, which, shell, place, spring, tool, hand, follower, field, met,
         turn_brake = brake * spring.radius * spring.radius
         solve_step(follower, field, met, size, stiffness, brake, turn_brake)
         way = way_of_step(follower, spring.radius, size)
+        follower.is_bent = n >= BENT_FROM or follower.n_bends > 0
         if n == STEPS or follower.n_looks >= MOST_LOOKS or way == 0.0:
             break
         if way < SETTLED and follower.n_active > 0:
+            for axis in range(6):
+                follower.pull[axis] -= follower.step[axis]
             break
         done, found = walk(
             cells, which, shell, place, spring.radius, tool, follower, field, met, missed

@@ -20,7 +20,7 @@ MOST_REVERSALS = 3.0
 """Reversals above which the guard acts. Larger: shaking lasts longer before it does."""
 SOFTER = 0.8
 """Factor of the stiffness each time that the guard acts."""
-LEAST_SHARE = 0.1
+LEAST_SHARE = 0.2
 """Least share of the stiffness that the guard leaves."""
 SHARE_RATE = 10.0
 """Change of that share a second. Larger: the guard acts sooner, and the force changes faster."""

@@ -12,6 +12,8 @@ from hapticdb.kernels.hand.near_points import (
     ABOUT,
     ACTIVE,
     ALONG,
+    BEND_ROWS,
+    BENDS,
     NEAR,
     NEAR_POINTS,
     NEAR_ROWS,
@@ -26,7 +28,7 @@ the set is right more often in corners, and the worst period takes longer."""
 
 @leaf
 def add_row(follower, weight, depth, jx, jy, jz, ax, ay, az):
-    """Add a contact to the step's equations: weight J J^T to the lower triangle, weight d J."""
+    """Add a row to the step's equations: weight J J^T to the lower triangle, weight d J."""
     matrix, right = follower.matrix, follower.right
     wx, wy, wz = weight * jx, weight * jy, weight * jz
     bx, by, bz = weight * ax, weight * ay, weight * az
@@ -125,6 +127,25 @@ def predict_contacts(follower, field, met, size):
 
 
 @leaf
+def add_bends(follower, weight, field, rows, m):
+    """Add the resistance of a hollow surface across the gradient of near point m.
+
+    It is the part of the energy's second derivative that Gauss-Newton leaves out, -K d u'', where
+    it is positive. Without it steps in corners overshoot as soon as the force over the voxel size
+    exceeds the spring's stiffness.
+    """
+    for bend in range(2):
+        row = rows + BENDS + bend * BEND_ROWS
+        if field[row, m] > 0.0:
+            add_row(
+                follower, weight * field[row, m], 0.0,
+                field[row + 1, m], field[row + 2, m], field[row + 3, m],
+                field[row + 4, m], field[row + 5, m], field[row + 6, m],
+            )  # fmt: skip
+            follower.n_bends += 1
+
+
+@leaf
 def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
     """Solve for the step (6,), m and rad about the centre, and its contact set.
 
@@ -134,6 +155,7 @@ def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
     step = follower.step
     base = NEAR + follower.side * NEAR_ROWS
     near = NEAR_POINTS + follower.side
+    follower.n_bends = 0
     for axis in range(6):
         step[axis] = 0.0
     predict_contacts(follower, field, met, size)
@@ -142,11 +164,14 @@ def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
         for m in range(follower.n_near):
             if field[ACTIVE, m] == 0.0:
                 continue
+            depth = size * (field[ONSETS, met[near, m]] - field[base + U, m])
             add_row(
-                follower, stiffness, size * (field[ONSETS, met[near, m]] - field[base + U, m]),
+                follower, stiffness, depth,
                 field[base + ALONG, m], field[base + ALONG + 1, m], field[base + ALONG + 2, m],
                 field[base + ABOUT, m], field[base + ABOUT + 1, m], field[base + ABOUT + 2, m],
             )  # fmt: skip
+            if follower.is_bent and depth > 0.0:
+                add_bends(follower, stiffness * depth / size, field, base, m)
         factor(follower)
         if not predict_contacts(follower, field, met, size):
             return

@@ -20,7 +20,7 @@ from hapticdb.kernels.hand.near_points import FIELD_ROWS
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, SERVO, views_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import rotation_of
-from hapticdb.query.law import ForceLaw, TangentPlane
+from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.handle import Handle
 from hapticdb.resident.frames import clusters_of
@@ -196,11 +196,12 @@ class Side:
 
     def law_of(self, stiffness: float) -> ForceLaw:
         """The law of this side for `touch`, with a stiffness in N/m."""
-        return TangentPlane(stiffness)
+        return DistanceField(stiffness) if self.distances else TangentPlane(stiffness)
 
 
 PLANE = Side("plane", 0.0, PlaneHand, distances=False)
-SIDES = (PLANE,)
+SMOOTH = Side("smooth", 1.5, SmoothHand, distances=True)
+SIDES = (PLANE, SMOOTH)
 """Both laws: the columns of the table."""
 
 

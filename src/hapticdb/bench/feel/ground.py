@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.bench.feel.scenes import SEED, Scene
-from hapticdb.environment import Environment
+from hapticdb.environment import Environment, create
 from hapticdb.environment import open as open_environment
-from hapticdb.grid import GridOptions
-from hapticdb.ingest.files import ImportOptions, import_files
+from hapticdb.errors import UsageError
+from hapticdb.grid import Grid
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
 from hapticdb.resident.residency import Residency
@@ -82,10 +82,11 @@ class Ground:
         triangles = [scene.triangles + place for scene, place in zip(scenes, places, strict=True)]
         write_mesh(mesh, np.concatenate(triangles) * voxel_size)
         bits = max(math.ceil(math.log2(n_a_side * pitch)), 5)
-        grid = GridOptions(bits=bits, voxel_size=voxel_size, origin=(0.0, 0.0, 0.0))
-        (report,) = import_files(url, [mesh], ImportOptions(grid=grid))
-        if report.error is not None:
-            raise report.error
+        grid = Grid(voxel_size, (0.0, 0.0, 0.0), bits)
+        with create(url, grid, distances=distances) as environment:
+            environment.add(mesh)
+            if distances and not environment.has_distances:
+                raise UsageError("imported parts have no distances to their surfaces")
         origins = {s.name: p * voxel_size for s, p in zip(scenes, places, strict=True)}
         ground = cls(url, origins, distances=distances)
         for scene in scenes:

@@ -195,7 +195,8 @@ def clearance_of_peg(side: Side, folder: Path) -> dict[str, Any]:
         poses = np.stack([posed(middle + size * height * axes[:, 2]) for height in heights])
         law = side.law_of(STIFFNESS)
         for clearance in CLEARANCES:
-            shell = peg(HOLE - 2.0 * clearance, PEG_LENGTH, size, axes, PEG_POINTS)
+            width = HOLE - 2.0 * clearance
+            shell = peg(width, PEG_LENGTH, size, axes, PEG_POINTS, side.onset)
             felt = ground.environment.touch_many(shell, poses, law=law).forces
             forces[clearance] = float(np.linalg.norm(felt, axis=1).max())
     free = [clearance for clearance, force in forces.items() if force <= FREE_TOUCH]

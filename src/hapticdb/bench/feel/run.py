@@ -9,11 +9,13 @@ from typing import Any
 from hapticdb.bench import records
 from hapticdb.bench.feel import passing, sliding, stability, touching
 from hapticdb.bench.feel.couplings import SIDES, Side
+from hapticdb.bench.feel.ground import Ground
 from hapticdb.bench.feel.page import write_feel_page
 from hapticdb.bench.feel.person import DEVICE_DAMPING, DEVICE_KG, FIRM, LIGHT
 from hapticdb.bench.feel.plots import draw_feel, draw_walk
-from hapticdb.bench.feel.scenes import N_RANDOM
+from hapticdb.bench.feel.scenes import N_RANDOM, plate, slope_axes
 from hapticdb.bench.feel.walking import PLACES, walk_over
+from hapticdb.errors import UsageError
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import ImportOptions, import_files
 from hapticdb.sample import write_sample
@@ -82,6 +84,7 @@ def feel(
     curves: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory(prefix="hapticdb-feel-") as temporary:
         place = Path(temporary)
+        sides = [side for side in sides if can_measure(side, place, say)]
         for side in sides:
             found, drawn = measured(side, place, effort, say)
             cells += [{"measure": key, "law": side.law} | cell for key, cell in found.items()]
@@ -102,6 +105,17 @@ def feel(
     page = folder / f"{NAME}.md"
     write_feel_page(result, page, NAME)
     return page, result
+
+
+def can_measure(side: Side, place: Path, say: Say) -> bool:
+    """Whether imported scenes have the distances that a law needs; says so where they have none."""
+    scene = plate("plate", 1.0, slope_axes(20.0), 4.0)
+    try:
+        Ground.of_scenes(place, [scene], sliding.SIZE, distances=side.distances).close()
+    except UsageError as error:
+        say(f"{side.law}: left out: {error}")
+        return False
+    return True
 
 
 def measured(

@@ -26,12 +26,16 @@ def ball(radius_voxels: float, voxel_size: float, points: int = 300) -> PointShe
     return PointShell.sphere(radius_voxels * voxel_size, points)
 
 
-def peg(width: float, length: float, voxel_size: float, axes: Floats, points: int) -> PointShell:
-    """A square bar about the origin, along a scene's z; width and length in voxels."""
+def peg(
+    width: float, length: float, voxel_size: float, axes: Floats, points: int, inset: float
+) -> PointShell:
+    """A square bar about the origin, along a scene's z, drawn inward by an inset; all in voxels."""
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     faces = [
         [0, 1, 3], [0, 3, 2], [4, 6, 7], [4, 7, 5], [0, 4, 5], [0, 5, 1],
         [2, 3, 7], [2, 7, 6], [0, 2, 6], [0, 6, 4], [1, 5, 7], [1, 7, 3],
     ]  # fmt: skip
     halves = 0.5 * voxel_size * np.array([width, width, length])
-    return PointShell.from_mesh((corners * halves) @ axes.T, faces, points)
+    return PointShell.from_mesh(
+        (corners * halves) @ axes.T, faces, points, inset=inset * voxel_size
+    )

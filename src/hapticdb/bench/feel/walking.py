@@ -14,6 +14,7 @@ from hapticdb.bench.feel.ground import Ground
 from hapticdb.bench.feel.tools import ball
 from hapticdb.demo import slide_along
 from hapticdb.environment import Environment
+from hapticdb.environment import open as open_environment
 
 Floats = NDArray[np.float64]
 
@@ -79,7 +80,10 @@ def walk_over(sides: tuple[Side, ...], url: str | Path, places: int = PLACES) ->
         ``walk``: the `Walk`.
     """
     found: dict[str, Any] = {"cells": {}, "curves": []}
-    with Ground(url) as ground:
+    with open_environment(url, read_only=True) as environment:
+        distances = environment.has_distances
+    sides = tuple(side for side in sides if distances or not side.distances)
+    with Ground(url, distances=distances) as ground:
         walk = plan_walk(ground.environment, places)
         apart = max(round(16.0 * ground.size / (walk.speed / RATE)), 1)
         for place in walk.hand[::apart]:

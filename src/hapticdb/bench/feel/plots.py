@@ -20,8 +20,10 @@ from hapticdb.bench.drawing.canvas import (
     SKY,
     Framing,
     entry,
+    fix_ticks,
     head,
     lay_out,
+    log_ticks,
     not_measured,
     styled,
     write,
@@ -165,10 +167,14 @@ def _line(axes: Axes, plot: FeelPlot, curve: Mapping[str, Any], color: str) -> N
 
 def _share_heights(panels: Sequence[Axes], plot: FeelPlot) -> None:
     limits = np.array([axes.get_ylim() for axes in panels if axes.lines])
+    low, high = float(limits[:, 0].min()), float(limits[:, 1].max())
     for axes in panels:
-        if plot.is_log:
-            axes.set(yscale="log")
-        axes.set_ylim(limits[:, 0].min(), limits[:, 1].max())
+        axes.set_ylim(low, high)
+        if plot.is_log and axes.lines:
+            # plain numbers: the style draws no mathematics, in which powers are written otherwise
+            for axis, ends in ((axes.xaxis, axes.get_xlim()), (axes.yaxis, (low, high))):
+                ticks = log_ticks(*ends)
+                fix_ticks(axis, ticks, [f"{tick:g}" for tick in ticks])
 
 
 # --- the picture of the walk ----------------------------------------------------------------------

@@ -75,6 +75,15 @@ LawOption = Annotated[
         "unless given where every object has distances.",
     ),
 ]
+ConservativeOption = Annotated[
+    bool,
+    typer.Option(
+        "--conservative",
+        help="Leave the tool's points on its surface, so that clearance is kept: under the smooth "
+        "law contact begins 1.5 voxels before the surface. Otherwise points are drawn inward by "
+        "1.5 voxels, and it begins at the surface.",
+    ),
+]
 BudgetOption = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
 
 # -- results --------------------------------------------------------------------------------------

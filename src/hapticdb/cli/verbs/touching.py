@@ -21,6 +21,7 @@ from hapticdb.cli.csv_files import (
     rows_of_contacts,
 )
 from hapticdb.cli.options import (
+    ConservativeOption,
     CsvOption,
     ExcludeOption,
     JsonOption,
@@ -35,7 +36,7 @@ from hapticdb.cli.options import (
     ToolUnitOption,
     UrlArgument,
 )
-from hapticdb.cli.tools import shell_of
+from hapticdb.cli.tools import inset_for, shell_of, shell_record, shell_text
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -86,6 +87,7 @@ def touch(
     maxgap: MaxgapOption = 500,
     exclude: ExcludeOption = None,
     law: LawOption = None,
+    conservative: ConservativeOption = False,
     stiffness: StiffnessOption = 1000.0,
     csv: CsvOption = None,
     contacts_csv: ContactsCsvOption = None,
@@ -111,7 +113,8 @@ def touch(
         chosen: ForceLaw = smooth if name == "smooth" else plane
         excluded = ids_of(env, exclude, "--exclude")
         render.compile_kernels("touch", files=[tool])
-        shell = shell_of(tool, tool_unit, points, seed)
+        inset = inset_for(env.grid.voxel_size, name, is_conservative=conservative)
+        shell = shell_of(tool, tool_unit, points, seed, inset=inset)
         fit = fitting.compare(
             env, shell, path, exclude=excluded, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=False,
@@ -123,7 +126,7 @@ def touch(
         touch_at(path[0])  # compiles kernels and reads statistics, which belong to no frame's time
         for index, pose in enumerate(path):
             output.add(index, touch_at(pose), shell, pose, fit.misfits)
-    output.finish()
+    output.finish(shell)
 
 
 @contextmanager
@@ -172,14 +175,15 @@ class _Output:
             self.contacts.write(rows_of_contacts(index, touched, shell, pose))
         if self.is_json:
             found = [misfit._asdict() for misfit in misfits]
-            render.say_json(_record(index, touched) | {"misfits": found})
+            record = {"misfits": found, "shell": shell_record(shell)}
+            render.say_json(_record(index, touched) | record)
         if self.summary is not None:
             self.summary.add(touched)
 
-    def finish(self) -> None:
+    def finish(self, shell: "PointShell") -> None:
         """Print the summary, unless standard output has been taken for something else."""
         if self.summary is not None:
-            self.summary.show()
+            self.summary.show(shell)
 
 
 def _record(index: int, touched: "Touch") -> dict[str, object]:
@@ -232,7 +236,7 @@ class _Summary:
             self.frames_of[obj.id] += 1
             self.objects[obj.id] = obj
 
-    def show(self) -> None:
+    def show(self, shell: "PointShell") -> None:
         """Print it."""
         import numpy as np
 
@@ -247,6 +251,7 @@ class _Summary:
         render.show(
             render.facts(
                 [
+                    ("shell", shell_text(shell)),
                     ("frames", f"{len(self.hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
                     (
                         "hits a frame",

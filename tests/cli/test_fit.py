@@ -1,0 +1,93 @@
+"""Tools drawn inward under the smooth law, so that contact begins at the surface."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from bands import band_rows
+from command_line import Run, poses, run, tool  # noqa: F401 - fixtures
+from hapticdb.kernels.field.packing import pack
+from hapticdb.store.base import Band, Rows
+from hapticdb.testing import voxel_object
+
+VOXEL = 0.001
+FLOOR = 0.0325
+"""Height of the floor, metres."""
+ABOVE, BELOW = 0.0004, -0.0004
+"""Where the underside of the tool is, from the floor, metres."""
+
+
+@pytest.fixture
+def floor(run: Run, tmp_path: Path) -> Path:
+    """A floor that has distances, a cube of 2 cm, and poses of it above and below the floor."""
+    del run  # has changed to the folder in which the environment is to be
+    grid = hapticdb.Grid(VOXEL, (0.0, 0.0, 0.0), 6)
+    low, high = 0.002, 0.062
+    corners = np.array([[i, j, FLOOR] for i in (low, high) for j in (low, high)])
+    made = band_rows(corners[[[0, 1, 2], [1, 2, 3]]], grid)
+    rows = Rows(made.keys, np.zeros_like(made.keys), made.occupancy, Band(*pack(made.values)))
+    with hapticdb.create(tmp_path / "floor.db", grid) as env:
+        env.store.add(voxel_object(grid, made.voxels, "floor"), rows)
+    tool(tmp_path / "tool.stl")
+    places = [(0.032, 0.032, FLOOR + 0.01 + height) for height in (ABOVE, BELOW)]
+    poses(tmp_path / "path.csv", *places)
+    return tmp_path / "floor.db"
+
+
+def touched(run: Run, floor: Path, *more: object) -> list[dict[str, object]]:
+    args = ("touch", floor, "--tool", "tool.stl", "--poses", "path.csv", "--json", *more)
+    code, out, err = run(*args)
+    assert (code, err) == (0, "")
+    return [json.loads(line) for line in out.splitlines()]
+
+
+def lifts(frames: list[dict[str, object]]) -> list[float]:
+    """Force of each frame along z, newtons."""
+    return [frame["force"][2] for frame in frames]  # type: ignore[index]
+
+
+def test_contact_of_a_touched_tool_begins_at_the_surface(run: Run, floor: Path) -> None:
+    frames = touched(run, floor)
+    assert {frame["law"] for frame in frames} == {"smooth"}
+    above, below = lifts(frames)
+    assert above == 0.0
+    assert below > 0.0
+    for frame in frames:
+        shell = frame["shell"]
+        assert shell == {"points": 300, "inset": {"least": 1.5 * VOXEL, "greatest": 1.5 * VOXEL}}
+
+
+def test_a_conservative_tool_is_felt_before_it_is_at_the_surface(run: Run, floor: Path) -> None:
+    frames = touched(run, floor, "--conservative")
+    assert min(lifts(frames)) > 0.0
+    assert frames[0]["shell"] == {"points": 300, "inset": {"least": 0.0, "greatest": 0.0}}
+
+
+def test_under_the_plane_no_tool_is_drawn_in(run: Run, floor: Path) -> None:
+    frames = touched(run, floor, "--law", "plane")
+    assert {frame["law"] for frame in frames} == {"plane"}
+    assert frames[0]["shell"] == {"points": 300, "inset": {"least": 0.0, "greatest": 0.0}}
+
+
+def test_a_summary_says_how_far_the_tool_was_drawn_in(run: Run, floor: Path) -> None:
+    args = ("touch", floor, "--tool", "tool.stl", "--poses", "path.csv")
+    assert re.search(r"^shell +300 points, drawn in by 1.5 mm$", run(*args)[1], re.MULTILINE)
+    out = run(*args, "--conservative")[1]
+    assert re.search(r"^shell +300 points, on the surface$", out, re.MULTILINE)
+
+
+def test_a_saved_shell_that_was_drawn_in_is_told_where_clearance_counts(
+    run: Run, floor: Path
+) -> None:
+    hapticdb.PointShell.from_file("tool.stl", 100, inset=0.002).save("drawn.npz")
+    args = ("touch", floor, "--tool", "drawn.npz", "--poses", "path.csv", "--json")
+    for more, late in (((), "0.5 mm"), (("--conservative",), "2 mm"), (("--law", "plane"), "2 mm")):
+        code, _, err = run(*args, *more)
+        assert code == 0
+        assert f"drawn in by 2 mm: contact begins up to {late} late" in err

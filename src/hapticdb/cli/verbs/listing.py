@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
 
 import typer
 
-from hapticdb.cli import render
+from hapticdb.cli import fitting, render
 from hapticdb.cli.columns import Columns
 from hapticdb.cli.options import JsonOption, UrlArgument
 from hapticdb.cli.pages import PAGE, Corners, ListingPage, Order, page_of, selected
@@ -97,6 +97,7 @@ class _Overview(NamedTuple):
     layout: "Layout"
     size: "Size"
     n_objects: int
+    has_distances: bool
     voxels: int
     scene: "NDArray[np.float64] | None"
     freshness: "Freshness"
@@ -118,12 +119,18 @@ class _Overview(NamedTuple):
             layout=store.layout,
             size=size,
             n_objects=len(objects),
+            has_distances=bool(objects) and all(obj.has_distances for obj in objects),
             voxels=sum(obj.voxels for obj in objects),
             scene=scene_bounds(objects),
             freshness=store.freshness(DEFAULT_RESOLUTION),
             source=QuantileVector.of(store, DEFAULT_RESOLUTION).source,
             has_checksums=store.checker().has_page_checksums(),
         )
+
+    @property
+    def fit(self) -> fitting.Accuracy | None:
+        """Accuracy of fit under the smooth law; None where that law cannot be felt."""
+        return fitting.accuracy_at(self.grid.voxel_size) if self.has_distances else None
 
     def record(self) -> dict[str, object]:
         """Put it in JSON."""
@@ -141,6 +148,7 @@ class _Overview(NamedTuple):
             "rows": self.size.rows,
             "bytes": self.size.bytes,
             "page_checksums": self.has_checksums,
+            "fit": None if self.fit is None else self.fit._asdict(),
             "statistics": {"source": self.source, **self.freshness._asdict()},
         }
 
@@ -164,6 +172,7 @@ class _Overview(NamedTuple):
             ("voxels", f"{self.voxels:,}"),
             ("rows", f"{size.rows:,}"),
             ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
+            *(self.fit.facts if self.fit is not None else ()),
             ("checksums", "of pages" if self.has_checksums else NO_CHECKSUMS),
             ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),
         ]

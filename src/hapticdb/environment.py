@@ -477,7 +477,7 @@ def create(
     grid: Grid,
     *,
     layout: Layout = "brick",
-    distances: bool | None = None,
+    distances: bool = False,
 ) -> Environment:
     """Make an environment with a given grid and open it.
 
@@ -485,9 +485,9 @@ def create(
     ----------
     layout : {"brick", "voxel"}
         Rows of its index table.
-    distances : bool or None
-        Whether parts that are imported get distances to their surfaces beside their voxels. By
-        default they do on the layout brick; the layout voxel has none.
+    distances : bool
+        Whether parts that are imported get distances to their surfaces beside their voxels, which
+        the smooth force law needs.
 
     Raises
     ------

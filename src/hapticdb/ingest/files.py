@@ -29,6 +29,7 @@ from hapticdb.mesh import Defects, MeshFile, Part, read_file
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
+from hapticdb.store.refusals import check_distances
 
 
 class ImportProgress(NamedTuple):
@@ -111,6 +112,9 @@ class ImportOptions:
     replace : bool
         Make the environment agree with the file: replace objects, under their ids, whose parts have
         another geometry, placement or unit now, and remove objects whose parts the file lacks.
+    distances : bool or None
+        Whether parts of a new environment get distances to their surfaces, which the smooth force
+        law needs (they do not unless given); must agree with an existing one.
     """
 
     unit: str | None = None
@@ -121,6 +125,7 @@ class ImportOptions:
     time_limit: float | None = None
     memory_limit: int | None = None
     replace: bool = False
+    distances: bool | None = None
 
     def __post_init__(self) -> None:
         for name, limit in (("seconds", self.time_limit), ("bytes", self.memory_limit)):
@@ -223,11 +228,14 @@ class _Target:
         self.is_first_file, self.has_written = True, False
         self.store: Store | None = None
         if not exists(url):
-            check_curve(options.grid.curve or "z", options.layout or "brick")
+            layout = options.layout or "brick"
+            check_curve(options.grid.curve or "z", layout)
+            check_distances(layout, distances=bool(options.distances))
             return
         self.store = open_store(url)
         with _closing_on_error(self.store):
             _check_layout(self.store, options.layout)
+            _check_wish(self.store, options.distances)
             options.grid.check_matches(self.store.grid)
 
     def __enter__(self) -> Self:
@@ -261,11 +269,14 @@ class _Target:
         """Make the environment, or open the one that another process has made meanwhile."""
         layout = self._options.layout or "brick"
         try:
-            self.store, self._is_new = create_store(self._url, grid, layout), True
+            wanted = bool(self._options.distances)
+            self.store = create_store(self._url, grid, layout, distances=wanted)
+            self._is_new = True
         except EnvironmentExistsError:
             store = open_store(self._url)
             with _closing_on_error(store):
                 _check_layout(store, layout)
+                _check_wish(store, self._options.distances)
                 GridOptions(
                     bits=grid.bits, voxel_size=grid.voxel_size, origin=grid.origin, curve=grid.curve
                 ).check_matches(store.grid)
@@ -383,6 +394,15 @@ def _check_layout(store: Store, layout: Layout | None) -> None:
         raise UsageError(
             f"{store.url} has the layout {store.layout}, not {layout}; leave --layout out"
         )
+
+
+def _check_wish(store: Store, distances: bool | None) -> None:  # noqa: FBT001 - an option as given
+    """Refuse a wish about distances that is not the environment's."""
+    if distances is None or distances == store.wants_distances:
+        return
+    if distances:
+        raise UsageError(f"{store.url} was made without distances: leave --distances out")
+    raise UsageError(f"{store.url} was made with distances: leave --no-distances out")
 
 
 def _first_bounds(store: Store, mesh_file: MeshFile) -> NDArray[np.float64] | None:

@@ -57,9 +57,17 @@ def _write_moved(
 ) -> None:
     """Replace an object's rows by those of its part at the placement `placed` (4, 4)."""
     bounds = bounds_inside(part, old.link, store.grid, placed)
-    rows, n_voxels = rows_of_part(part, store.grid, store.layout, placed)
+    rows, n_voxels = rows_of_part(
+        part, store.grid, store.layout, placed, distances=old.has_distances
+    )
     new = replace(
-        old, transform=placed, voxels=n_voxels, bounds=bounds, revision=revision, rows_crc=None
+        old,
+        transform=placed,
+        voxels=n_voxels,
+        bounds=bounds,
+        revision=revision,
+        rows_crc=None,
+        distances_crc=None,
     )
     store.replace(new, rows, covering)
 

@@ -202,7 +202,9 @@ def _object_of(
 ) -> tuple[Object, Rows]:
     """Object and rows of a part at its placement in the file."""
     try:
-        rows, n_voxels = rows_of_part(part, store.grid, store.layout, progress=progress)
+        rows, n_voxels = rows_of_part(
+            part, store.grid, store.layout, progress=progress, distances=store.wants_distances
+        )
     except FileError as error:
         raise FileError(f"{file.link}: {error}") from None
     return (

@@ -44,18 +44,17 @@ def open_store(url: Url, *, read_only: bool = False) -> Store:
 
 
 def create_store(
-    url: Url, grid: Grid, layout: Layout = "brick", *, distances: bool | None = None
+    url: Url, grid: Grid, layout: Layout = "brick", *, distances: bool = False
 ) -> Store:
     """Make a new environment; bricks need a hierarchical curve.
 
-    Its parts get distances to their surfaces unless `distances` is false or the layout is voxel.
+    distances : whether imported parts get distances to their surfaces; the layout voxel has none.
     """
     if layout not in LAYOUTS:
         raise UsageError(f"layout {layout!r}: choose one of {', '.join(LAYOUTS)}")
     check_curve(grid.curve, layout)
     check_distances(layout, distances=distances)
-    wanted = layout == "brick" if distances is None else distances
-    return engine_of(url).create(os.fspath(url), grid, layout, distances=wanted)
+    return engine_of(url).create(os.fspath(url), grid, layout, distances=distances)
 
 
 def exists(url: Url) -> bool:

@@ -45,7 +45,7 @@ def check_unwritten(record: Object, known: Object, url: str) -> None:
         )
 
 
-def check_distances(layout: Layout, *, distances: bool | None) -> None:
+def check_distances(layout: Layout, *, distances: bool) -> None:
     """Refuse distances on the layout voxel: a row of distances belongs to a brick."""
     if distances and layout == "voxel":
         raise UsageError("the layout voxel has no distances: leave them out, or choose bricks")

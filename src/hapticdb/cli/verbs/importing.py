@@ -73,6 +73,14 @@ ReplaceOption = Annotated[
     bool,
     typer.Option("--replace", help="Replace objects of these files by what the files hold now."),
 ]
+DistancesOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--distances/--no-distances",
+        help="Store distances to surfaces, for smooth forces, in a new environment.",
+        show_default="no",
+    ),
+]
 
 
 def import_(
@@ -91,6 +99,7 @@ def import_(
     time_limit: TimeLimitOption = None,
     memory_limit: MemoryLimitOption = None,
     replace: ReplaceOption = False,
+    distances: DistancesOption = None,
     json: JsonOption = False,
 ) -> None:
     """Import files into an environment, which is made when it does not exist.
@@ -117,7 +126,7 @@ def import_(
     options = ImportOptions(
         unit=unit, grid=grid, layout=layout, jobs=jobs, keep_removed=keep_removed,
         time_limit=time_limit, memory_limit=None if memory_limit is None else memory_limit << 20,
-        replace=replace,
+        replace=replace, distances=distances,
     )  # fmt: skip
     reports, elapsed = _imported(url, files, options)
     if json:

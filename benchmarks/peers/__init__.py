@@ -102,7 +102,7 @@ class PeerWork:
     @cached_property
     def voxels(self) -> Keys:
         """Keys of all voxels, each once, ascending."""
-        keys, occupancy = self.bricks
+        keys, occupancy, _ = self.bricks
         bits = np.flatnonzero(np.unpackbits(occupancy, bitorder="little"))
         voxels: Keys = keys[bits >> BRICK_SHIFT] << BRICK_SHIFT | bits & (1 << BRICK_SHIFT) - 1
         return voxels

@@ -31,7 +31,7 @@ class DuckdbBricks(RowPeer):
         self._connection = duckdb.connect(str(self._file))
         self._connection.execute("SET threads = 1")
         self._connection.execute("SET force_compression = 'uncompressed'")
-        keys, occupancy = work.bricks
+        keys, occupancy, _ = work.bricks
         bits = np.array([row.tobytes() for row in occupancy], dtype=object)
         self._connection.register("given", {"key": keys, "bits": bits})
         self._connection.execute(LOAD)

@@ -28,7 +28,7 @@ class LmdbBricks(RowPeer):
 
     def load(self, work: PeerWork) -> None:
         self._file = work.folder / "bricks.mdb"
-        keys, occupancy = work.bricks
+        keys, occupancy, _ = work.bricks
         size = (1 << 20) + ROOM * len(keys)
         self._env: Any = lmdb.open(str(self._file), subdir=False, map_size=size, lock=False)
         ordered, bits = _split(keys), occupancy.tobytes()

@@ -31,9 +31,9 @@ ALIGNED = 0.96
 """Cosine between a plane's normal and the direction to its nearest point above which the ball
 touches the plane and not its border: 16 degrees. A larger value finds fewer opposite walls of round
 tools."""
-MOST_PIECES = 200_000
+MOST_PIECES = 20_000
 """Pieces into which long triangles are cut, about. A larger value makes searches more selective,
-and takes more memory."""
+and cutting slower."""
 MOST_PAIRS = 2_000_000
 """Pairs of a ball and a triangle that are measured at a time, about. Larger: more memory, up to
 0.5 kB a pair."""
@@ -108,16 +108,13 @@ class InscribedBalls:
         from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for insets alone
 
         longest = max(self._greatest, 3.0 * float(np.sqrt(area / MOST_PIECES)))
-        pieces, solids = self._triangles, self._solids
-        while True:
-            sides_of = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
-            is_long = sides_of.max(axis=1) > longest
-            if not is_long.any() or len(pieces) > 2 * MOST_PIECES:
-                break
-            pieces = np.concatenate([pieces[~is_long], halves(pieces[is_long])])
-            solids = np.concatenate([solids[~is_long], np.tile(solids[is_long], 2)])
-        middles = 0.5 * (pieces.min(axis=1) + pieces.max(axis=1))
-        reach = np.linalg.norm(pieces - middles[:, None], axis=2).max(axis=1)
+        pieces, solids = self._cut_to(longest)
+        # Corner by corner: numpy is slow over axes of three.
+        a, b, c = pieces[:, 0], pieces[:, 1], pieces[:, 2]
+        low = np.minimum(np.minimum(a, b), c)
+        high = np.maximum(np.maximum(a, b), c)
+        middles = 0.5 * (low + high)
+        reach = longest_of(pieces - middles[:, None])
         octave = np.floor(np.log2(np.maximum(reach, 1e-3 * self._greatest))).astype(np.int64)
         places = np.column_stack([middles, self._apart * solids])
         self._pieces, self._tree = pieces, cKDTree(places)
@@ -126,6 +123,28 @@ class InscribedBalls:
             for number in np.unique(octave)
             for some in [np.flatnonzero(octave == number)]
         ]
+
+    def _cut_to(self, longest: float) -> tuple[Floats, Ints]:
+        """Pieces (P, 3, 3) of the triangles with sides up to `longest` metres, and their solids.
+
+        A piece that is short enough is looked at once.
+        """
+        pieces, solids = self._triangles, self._solids
+        done: list[tuple[Floats, Ints]] = []
+        n_done = 0
+        while True:
+            is_long = longest_of(pieces - pieces[:, [1, 2, 0]]) > longest
+            n_pieces = n_done + len(pieces)
+            if not is_long.any() or n_pieces > 2 * MOST_PIECES + len(self._triangles):
+                break
+            done.append((pieces[~is_long], solids[~is_long]))
+            n_done += len(done[-1][1])
+            pieces, solids = halves(pieces[is_long]), np.tile(solids[is_long], 2)
+        done.append((pieces, solids))
+        return (
+            np.concatenate([pieces for pieces, _ in done]),
+            np.concatenate([solids for _, solids in done]),
+        )
 
     def touching(self, positions: Floats, face_of: NDArray[np.int32], radius: float) -> Balls:
         """Find the largest balls, `radius` at most, that touch the surface at positions (Q, 3).
@@ -316,6 +335,13 @@ def _facings(
     is_aligned = np.abs(along) > ALIGNED
     cosines = np.einsum("pk,pk->p", np.where(is_aligned[:, None], planes, inward), normals)
     return np.where(is_aligned | (distance < (1.0 + 0.1 * SLACK) * radii), cosines, 1.0)
+
+
+def longest_of(vectors: Floats) -> Floats:
+    """Greatest of the lengths of three vectors each, (P, 3, 3): (P,)."""
+    squares = np.einsum("pck,pck->pc", vectors, vectors)
+    a, b, c = squares[:, 0], squares[:, 1], squares[:, 2]
+    return np.asarray(np.sqrt(np.maximum(np.maximum(a, b), c)))
 
 
 def nearest_on(triangles: Floats, positions: Floats) -> Floats:

@@ -154,6 +154,16 @@ def distance_at(where: Triple, fields: Collection[Steps]) -> float:
     return HALF_WIDTH / STEPS * between(plates[0], plates[1], part[0])
 
 
+AHEAD, FULL_SLOPE = 0.4, 0.25
+
+
+def share_at(where: Triple, normal: Triple, fields: Collection[Steps]) -> float:
+    """g: how far the inward normal agrees with the distances, 0 to 1."""
+    x, y, z = (a + AHEAD * n for a, n in zip(where, normal, strict=True))
+    slope = distance_at((x, y, z), fields) - distance_at(where, fields)
+    return min(max(slope / (AHEAD * FULL_SLOPE), 0.0), 1.0)
+
+
 def touch_distances(
     ids_in: Mapping[Voxel, Collection[int]],
     fields: Mapping[int, Steps],
@@ -180,8 +190,9 @@ def touch_distances(
             continue
         x, y, z = ((a - o) / size for a, o in zip(p, origin, strict=True))
         u = distance_at((x, y, z), felt.values())
-        depth = size * (ONSET - u)
-        weight += min(max((ONSET + BLENDING - u) / BLENDING, 0.0), 1.0)
+        share = share_at((x, y, z), nrm, felt.values())
+        depth = size * (ONSET - u) * share
+        weight += min(max((ONSET + BLENDING - u) / BLENDING, 0.0), 1.0) * share
         ids = sorted(i for i in ids_in.get(voxel, ()) if i not in exclude)
         if ids:
             found.hits.append(n)
@@ -192,7 +203,11 @@ def touch_distances(
                 found.apart.append(n)
                 found.apart_depths.append(depth)
             own = {i: distance_at((x, y, z), [steps]) for i, steps in felt.items()}
-            near = {i for i, u in own.items() if size * (ONSET - u) > 0}
+            near = {
+                i
+                for i, u in own.items()
+                if size * (ONSET - u) * share_at((x, y, z), nrm, [felt[i]]) > 0
+            }
             near = near or {min(i for i in own if own[i] == min(own.values()))}
             found.near += [(n, i) for i in sorted(near | set(ids))]
             total.add(p, nrm, cm, stiffness, depth)

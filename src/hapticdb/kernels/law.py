@@ -40,6 +40,16 @@ def no_sample_of_slot(law, payload, slot, x, y, z):  # noqa: ARG001 - likewise
     return NOTHING_NEAR
 
 
+def full_share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
+    """Share, in rows, under a law for which the normal's direction does not matter."""
+    return 1.0
+
+
+def full_share_of_slot(law, payload, slot, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
+    """Share, in a resident cell, under such a law."""
+    return 1.0
+
+
 def no_reach(law):  # noqa: ARG001 - the arguments of every such leaf
     """Reach of a law that feels only hits."""
     return 0.0
@@ -62,6 +72,9 @@ class Leaves(NamedTuple):
         (R,) bool is False for the rows of excluded objects.
     sample_slot : (law, payload, slot, x, y, z) -> sample of the point in a slot of the resident
         cells; payload (S, 34^3) uint8. It must be the same number as `sample_rows` gives.
+    share_rows : as `sample_rows`, and then nx, ny, nz, sample -> share, 0 to 1, of a point with the
+        inward normal n and that sample. Depth and weight of the point are multiplied by it.
+    share_slot : as `sample_slot`, and then nx, ny, nz, sample -> the same share as `share_rows`.
     """
 
     respond: Callable[..., Any]
@@ -69,6 +82,8 @@ class Leaves(NamedTuple):
     felt_within: Callable[..., Any] = no_reach
     sample_rows: Callable[..., Any] = no_sample_of_rows
     sample_slot: Callable[..., Any] = no_sample_of_slot
+    share_rows: Callable[..., Any] = full_share_of_rows
+    share_slot: Callable[..., Any] = full_share_of_slot
 
 
 LEAVES: dict[type, Leaves] = {}
@@ -90,6 +105,8 @@ reach = chosen_by_type(lambda law_type: LEAVES[law_type].reach)
 felt_within = chosen_by_type(lambda law_type: LEAVES[law_type].felt_within)
 sample_rows = chosen_by_type(lambda law_type: LEAVES[law_type].sample_rows)
 sample_slot = chosen_by_type(lambda law_type: LEAVES[law_type].sample_slot)
+share_rows = chosen_by_type(lambda law_type: LEAVES[law_type].share_rows)
+share_slot = chosen_by_type(lambda law_type: LEAVES[law_type].share_slot)
 
 
 @leaf

@@ -63,10 +63,15 @@ class DistanceField:
 
     u is in voxels, interpolated between the stored distances at the 8 voxel centres around the
     point; at each centre the least distance of all objects counts. With the voxel size s and the
-    point's inward normal n: d = s max(0, 1.5 - u), F = K sum d n / max(1, W / 10), torque alike. W
-    is the sum of the points' weights clamp(2.5 - u, 0, 1). So contact begins 1.5 voxels before the
-    surface, and the force is continuous in the pose. Only an environment in which every object has
-    distances can be felt by this law.
+    point's inward normal n: d = g s max(0, 1.5 - u), F = K sum d n / max(1, W / 10), torque alike.
+    W is the sum of the points' weights g clamp(2.5 - u, 0, 1). So contact begins 1.5 voxels before
+    the surface, and the force is continuous in the pose.
+
+    The share g = clamp((u(p + 0.4 n) - u(p)) / 0.1, 0, 1) lets a point push only as far as u grows
+    into the tool. Without it the two sides of a thin wall would cancel: their normals are opposite
+    and their distances almost equal.
+
+    Only an environment in which every object has distances can be felt by this law.
 
     Attributes
     ----------

@@ -26,8 +26,8 @@ class Touch:
     hits : (H,) int64
         Indices of the shell's points inside a voxel, ascending.
     depths : (H,) float64
-        Depth of each hit in metres, 0 where the law does not feel it: below its tangent plane, or,
-        under `DistanceField`, below the onset of 1.5 voxels before the surface.
+        Depth of each hit in metres, 0 where the law does not feel it: above its tangent plane or,
+        under `DistanceField`, where the distance does not grow along the point's normal.
     query : Query
         How the database was asked.
     """
@@ -108,12 +108,13 @@ class Touches:
     torques : (n, 3) float64
         N m about the tool's centre of mass, world frame.
     hits, n_contacts : (n,) int64
-        Number of the shell's points inside a voxel, and number of those that are below their
-        tangent plane.
+        Number of the shell's points inside a voxel, and number of the points that the law feels.
+        Under `DistanceField` a contact need not be a hit.
     deepest : (n,) float64
         Depth of the deepest contact in metres, 0 without contacts.
     ids : list of lists of int
-        Ids of the objects that each pose's hits are in, ascending.
+        Ids of the objects that each pose's hits are in and, under `DistanceField`, of those that
+        its contacts touch, ascending.
     contacts : (C,) array of `CONTACT`, or None
         Every contact: ``pose``, ``point``, ``depth``, ordered by the first two; None when contacts
         were not asked for.
@@ -143,7 +144,7 @@ class Touches:
 
     @property
     def objects(self) -> list[Object]:
-        """Objects of all hits at all poses, ordered by id."""
+        """Objects of all hits and, under `DistanceField`, of all contacts, at all poses, by id."""
         return [self._known[i] for i in sorted({i for ids in self.ids for i in ids})]
 
     def gather(self, answers: Iterable[Answer]) -> Self:

@@ -1,12 +1,21 @@
 """The distance law: a point is felt by its distance to the nearest surface.
 
-With u the distance at a point, d = s max(0, `ONSET` - u) and F = K sum d n, where s is the voxel
-size and n the point's inward normal. Each point counts clamp((ONSET + BLENDING - u) / BLENDING, 0,
-1) in the frame's average, so that force does not jump where a point comes near. The stored
-distances are interpolated by `trilinear` between the 8 voxel centres around the point. At each
-centre the least distance of all objects counts, and the interpolation comes after that. A frame on
-rows and a frame on resident cells do the same arithmetic with the same 8 numbers, so they agree bit
-for bit.
+With u the distance at a point, d = g s max(0, `ONSET` - u) and F = K sum d n, where s is the voxel
+size and n the point's inward normal. Each point counts g clamp((ONSET + BLENDING - u) / BLENDING,
+0, 1) in the frame's average, so that force does not jump where a point comes near.
+
+The share g = clamp((u(p + `AHEAD` n) - u(p)) / (AHEAD `FULL_SLOPE`), 0, 1) says how far the normal
+agrees with the field: u must grow into the tool. Without it the two sides of a thin wall, with
+opposite normals and almost the same u, would cancel. g is 1 wherever a face of the tool lies on a
+face of the environment. The slope is a difference of two values of u and not the interpolant's
+gradient, because that gradient jumps between lattice cells: where two surfaces are equally near, a
+point's whole force would jump. It is taken ahead of the point, where u is exact, so that a point on
+the surface keeps its force.
+
+The stored distances are interpolated by `trilinear` between the 8 voxel centres around the point.
+At each centre the least distance of all objects counts, and the interpolation comes after that. A
+frame on rows and a frame on resident cells do the same arithmetic with the same 8 numbers, so they
+agree bit for bit.
 """
 
 import math
@@ -14,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticdb.kernels._jit import FLOAT, fields_of, leaf
+from hapticdb.kernels._jit import FLOAT, fields_of, inlined, leaf
 from hapticdb.kernels.field.lattice import (
     CELL_SIDE,
     HALF_WIDTH,
@@ -41,6 +50,17 @@ push. `ONSET` + `BLENDING` must stay below `HALF_WIDTH`, where nothing is known 
 """
 REACH = ONSET + BLENDING
 """Largest distance of a point that counts in the average, voxels."""
+AHEAD = 0.4
+"""Way along the normal over which the share's slope is taken, voxels; below 1/2, so that a row has
+all centres that it needs.
+
+Larger: errors of u matter less. Smaller: points close to the surface keep their force longer.
+"""
+FULL_SLOPE = 0.25
+"""Slope of u along the normal from which on a point counts fully; 1 where a face meets a face.
+
+Larger: points whose normals are askew push less. Smaller: the share changes faster with the pose.
+"""
 LARGEST_ERROR = 0.5 * VOXELS_A_STEP
 """Largest rounding error of a stored distance, voxels."""
 FELT_WITHIN = min(
@@ -79,12 +99,16 @@ def least_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001
 
     payload (R, 1000) uint8; rows that do not count are left out; h without a row.
     """
-    x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
-    at = row_place(
-        np.int64(x0) - (np.int64(x) & -8),
-        np.int64(y0) - (np.int64(y) & -8),
-        np.int64(z0) - (np.int64(z) & -8),
+    return least_of_brick(
+        payload, counts, first, end, x, y, z, np.int64(x) & -8, np.int64(y) & -8, np.int64(z) & -8
     )
+
+
+@inlined
+def least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
+    """U at a point in, or under 1/2 voxel beside, the brick whose first voxel is (i, j, k)."""
+    x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
+    at = row_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k)
     q000 = q001 = q010 = q011 = q100 = q101 = q110 = q111 = np.int64(STEPS)
     for row in range(first, end):
         if counts[row]:
@@ -103,12 +127,14 @@ def least_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001
 
 def at_slot(law, payload, slot, x, y, z):  # noqa: ARG001
     """U at a point, in voxels from the grid's origin, from its cell; payload (S, 34^3) uint8."""
+    return of_cell(payload, slot, x, y, z, np.int64(x) & -32, np.int64(y) & -32, np.int64(z) & -32)
+
+
+@inlined
+def of_cell(payload, slot, x, y, z, i, j, k):
+    """U at a point in, or under 1/2 voxel beside, the cell whose first voxel is (i, j, k)."""
     x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
-    at = cell_place(
-        np.int64(x0) - (np.int64(x) & -32),
-        np.int64(y0) - (np.int64(y) & -32),
-        np.int64(z0) - (np.int64(z) & -32),
-    )
+    at = cell_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k)
     most = np.int64(STEPS)
     return distance_between(
         min(most, np.int64(payload[slot, at])),
@@ -130,6 +156,30 @@ def below_onset(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size): 
     return size * (ONSET - sample), min(max((REACH - sample) / BLENDING, 0.0), 1.0)
 
 
+@leaf
+def agreement(sample, ahead):
+    """Share of a point with distance `sample` at the point and `ahead` a bit into the tool."""
+    return min(max((ahead - sample) / (AHEAD * FULL_SLOPE), 0.0), 1.0)
+
+
+def share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
+    """How far the normal agrees with the distances of rows first .. end - 1, 0 to 1."""
+    ahead = least_of_brick(
+        payload, counts, first, end, x + AHEAD * nx, y + AHEAD * ny, z + AHEAD * nz,
+        np.int64(x) & -8, np.int64(y) & -8, np.int64(z) & -8,
+    )  # fmt: skip
+    return agreement(sample, ahead)
+
+
+def share_at_slot(law, payload, slot, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
+    """How far the normal agrees with the distances of a cell, 0 to 1."""
+    ahead = of_cell(
+        payload, slot, x + AHEAD * nx, y + AHEAD * ny, z + AHEAD * nz,
+        np.int64(x) & -32, np.int64(y) & -32, np.int64(z) & -32,
+    )  # fmt: skip
+    return agreement(sample, ahead)
+
+
 def reach_of(law):  # noqa: ARG001
     """Distance up to which a point counts, voxels."""
     return REACH
@@ -148,5 +198,7 @@ define(
         felt_within=felt_within_of,
         sample_rows=least_of_rows,
         sample_slot=at_slot,
+        share_rows=share_of_rows,
+        share_slot=share_at_slot,
     ),
 )

@@ -34,6 +34,7 @@ from hapticdb.kernels.law import (
     reach,
     respond,
     sample_rows,
+    share_rows,
 )
 from hapticdb.kernels.query.contact import center_of, voxel_at
 from hapticdb.kernels.query.sorting import insert_distinct
@@ -134,6 +135,10 @@ def touch_near_rows(
                         law, is_hit, own, px, py, pz, nx, ny, nz, cx, cy, cz, size
                     )  # fmt: skip
                     if depth > 0.0:
+                        depth *= share_rows(
+                            law, payload, counts, row, row + 1, x, y, z, nx, ny, nz, own
+                        )
+                    if depth > 0.0:
                         touched[row] = True
                         n_touched += 1
         if n_touched == 0:
@@ -192,8 +197,10 @@ def refine_kernel(
             continue
         nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
         cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
-        depth, share = respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size)
-        weight += share
+        depth, counted = respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+        share = share_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample)
+        depth *= share
+        weight += counted * share
         if is_hit or depth > 0.0:
             met[count] = n if is_hit else ~n
             felt[6 + count] = max(depth, 0.0)

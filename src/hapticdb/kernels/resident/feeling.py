@@ -13,6 +13,7 @@ from hapticdb.kernels.law import (
     reach,
     respond,
     sample_slot,
+    share_slot,
 )
 from hapticdb.kernels.query.contact import center_of
 from hapticdb.kernels.resident.cells import (
@@ -234,11 +235,13 @@ def felt(cells, which, shell, pose, place, law, met, missed, out):
                 continue
             n = start + at
             px, py, pz = scratch[0, at], scratch[1, at], scratch[2, at]
-            depth, share, nx, ny, nz = respond_at(
+            depth, counted, nx, ny, nz = respond_at(
                 law, is_hit, sample, transform, px, py, pz, points[n, 3], points[n, 4],
                 points[n, 5], ox, oy, oz, size,
             )  # fmt: skip
-            weight += share
+            share = share_slot(law, payload, slot, x, y, z, nx, ny, nz, sample)
+            depth *= share
+            weight += counted * share
             if is_hit:
                 met[n_hits] = n
                 n_hits += 1

@@ -20,14 +20,16 @@ import hapticdb
 from assemblies import index_rows, left_behind, placement, rows_of, voxel_set
 from children import child
 from hapticdb import Environment, Grid, PointShell, copy_environment, diff_environments, transfer
+from hapticdb.check import check_environment
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.kernels.field import packing
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
-from hapticdb.store.base import Layout
+from hapticdb.store.base import Band, Layout, Rows
 from hapticdb.store.sqlite.pages import LAYER
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
 from hapticdb.store.sqlite.tables.writing import SQLiteWriter
-from hapticdb.testing import KINDS, blob, voxel_object, write_voxels
+from hapticdb.testing import KINDS, blob, voxel_object, with_distances, write_voxels
 from hapticdb.transfer import CopyProgress, CopyReport
 
 Kind = tuple[Layout, CurveName]
@@ -431,3 +433,62 @@ def test_an_error_before_the_first_object_leaves_nothing(
         with pytest.raises(KeyboardInterrupt):
             copy_environment(source, tmp_path / "b.db")
     assert not (tmp_path / "b.db").exists()
+
+
+# --- distances ----------------------------------------------------------------------------------
+
+
+def with_packed(ijk: NDArray[np.int64], grid: Grid, seed: int) -> Rows:
+    """Rows of voxels with made-up distances that can be unpacked."""
+    rows = with_distances(ijk, grid, "brick")
+    values = np.full((len(rows), 1000), 255, np.uint8)
+    values[:, ::50] = np.random.default_rng(seed).integers(0, 255, (len(rows), 20))
+    return rows.having(Band(*packing.pack(values)))
+
+
+@pytest.mark.parametrize("curves", [("z", "z"), ("z", "hilbert"), ("hilbert", "z")])
+def test_distances_are_copied_as_they_are_where_they_are_wanted(
+    tmp_path: Path, curves: tuple[CurveName, CurveName]
+) -> None:
+    """Of objects that have them. A target that does not want them gets the voxels alone."""
+    everywhere = np.array([0]), np.array([2**62])
+    first, second = curves
+    grid = Grid(0.01, (-0.1, 0.2, -0.3), 5, first)
+    with hapticdb.create(tmp_path / "a.db", grid, distances=True) as env:
+        for n, place in enumerate(PLACES[:2]):
+            ijk = blob(n, place)
+            rows = with_packed(ijk, grid, n) if n else rows_of_voxels(ijk, grid, "brick")
+            env.store.add(voxel_object(grid, ijk, f"{n}"), rows)
+        was = env.store.scan(*everywhere, distances=True)
+    copy_environment(tmp_path / "a.db", tmp_path / "b.db", curve=second)
+    hapticdb.create(tmp_path / "c.db", grid, distances=False).close()
+    for target in ("b.db", "c.db"):
+        copy_environment(tmp_path / "a.db", tmp_path / target)
+        assert check_environment(tmp_path / target).findings == []
+    with hapticdb.open(tmp_path / "b.db") as env:
+        assert env.store.wants_distances
+        assert [obj.has_distances for obj in env.objects()] == [False, True]
+    copy_environment(tmp_path / "b.db", tmp_path / "d.db", curve=first)
+    with hapticdb.open(tmp_path / "d.db") as env:
+        found = env.store.scan(*everywhere, distances=True)
+    assert found.distances is not None
+    assert was.distances is not None
+    columns = (*found[:3], *found.distances), (*was[:3], *was.distances)
+    for column, other in zip(*columns, strict=True):
+        np.testing.assert_array_equal(column, other)
+    with hapticdb.open(tmp_path / "c.db") as env:
+        assert not any(obj.has_distances for obj in env.objects())
+    copy_environment(tmp_path / "a.db", tmp_path / "e.db", layout="voxel")
+    assert check_environment(tmp_path / "e.db").findings == []
+
+
+def test_damaged_distances_are_not_copied(tmp_path: Path) -> None:
+    grid = Grid(0.01, (-0.1, 0.2, -0.3), 5)
+    with hapticdb.create(tmp_path / "a.db", grid, distances=True) as env:
+        ijk = blob(1, PLACES[0])
+        env.store.add(voxel_object(grid, ijk), with_packed(ijk, grid, 1))
+    change(tmp_path / "a.db", "DELETE FROM band WHERE z_val = (SELECT min(z_val) FROM band)")
+    with pytest.raises(hapticdb.DamagedError, match="distances other than those"):
+        copy_environment(tmp_path / "a.db", tmp_path / "b.db")
+    findings = check_environment(tmp_path / "a.db").findings
+    assert findings[-1].endswith("its distances are not those that were written")

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import DamagedError
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.kernels import curves
+from hapticdb.kernels.field import packing
 from hapticdb.store.base import (
     BRICK_BYTES,
     Change,
@@ -21,11 +22,13 @@ from hapticdb.store.base import (
     Store,
     row_shift,
 )
-from hapticdb.store.believed import RowsChecksum
+from hapticdb.store.believed import BandChecksum, RowsChecksum
 from hapticdb.store.connect import findings_before_opening, open_store
 
 ROWS_AT_ONCE = 1 << 17
 """Rows that are read at a time. A larger value takes more memory and hardly less time."""
+BAND_ROWS_AT_ONCE = 1 << 14
+"""Rows of distances that are read at a time; 1,000 bytes each when they are unpacked."""
 MOST_FINDINGS = 1000
 """Most findings that a report keeps. The report counts all findings."""
 BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
@@ -93,8 +96,9 @@ def check_environment(
     The check compares the checksums of all pages (SQLite) and runs the engine's own check. Every
     row must belong to an object, be in order, and lie in the grid and in its object's bounds. A
     brick must hold a voxel, and none outside the grid. Every object must have its number of voxels,
-    and its rows the checksum that was written with them. The log of changes must have no gaps and
-    agree with the objects. Rows are read in batches, so memory does not grow with their number.
+    and its rows the checksum that was written with them; so must its distances, if it has any, and
+    every brick that holds a voxel of it must have distances. The log of changes must have no gaps
+    and agree with the objects. Rows are read in batches, so memory does not grow with their number.
 
     Parameters
     ----------
@@ -136,6 +140,8 @@ def _check(store: Store, report: CheckReport, progress: CheckCallback | None) ->
         for finding in _log_findings(store, objects):
             report.add(finding)
         for finding in _row_findings(store, objects, report, progress):
+            report.add(finding)
+        for finding in _band_findings(store, objects):
             report.add(finding)
 
 
@@ -234,6 +240,59 @@ def _row_findings(
         checksum = sums.checksums.get(obj.id, RowsChecksum()).value()
         if obj.rows_crc is not None and checksum != obj.rows_crc:
             yield f"object {obj.id} ({obj.name}): its rows are not those that were written"
+
+
+# -- distances ------------------------------------------------------------------------------------
+
+
+class _BandSums:
+    """Voxels in bricks with distances, and checksums of distances, of each object."""
+
+    def __init__(self) -> None:
+        self.voxels: dict[int, int] = {}
+        self.checksums: dict[int, BandChecksum] = {}
+
+    def add(self, rows: Rows) -> None:
+        """Add a batch to the counts and the checksums of its objects."""
+        counts = BITS[rows.occupancy].reshape(-1, BRICK_BYTES).sum(axis=1, dtype=np.int64)
+        for object_id in np.unique(rows.ids).tolist():
+            at = np.flatnonzero(rows.ids == object_id)
+            own = rows.picked(at)
+            self.voxels[object_id] = self.voxels.get(object_id, 0) + int(counts[at].sum())
+            assert own.distances is not None  # noqa: S101 - read with distances
+            self.checksums.setdefault(object_id, BandChecksum()).update(own.keys, own.distances)
+
+
+def _band_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
+    """Distances that are damaged, missing, or of no object."""
+    checker, sums = store.checker(), _BandSums()
+    key, object_id = -1, 0
+    key_end = 1 << max(3 * store.grid.bits - row_shift(store.layout), 0)
+    while len(rows := checker.rows_after(key, object_id, BAND_ROWS_AT_ONCE, distances=True)):
+        if not _is_ascending(rows, key, object_id):
+            yield f"distances after key {key} are not in order"
+            return
+        key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
+        if int(rows.keys[0]) < 0 or key >= key_end:
+            yield "distances of bricks outside the grid"
+        assert rows.distances is not None  # noqa: S101 - read with distances
+        try:
+            packing.unpack(*rows.distances)
+        except ValueError as error:
+            yield f"distances between keys {int(rows.keys[0])} and {key}: {error}"
+        sums.add(rows)
+    for found in sorted(sums.checksums):
+        if found not in objects:
+            yield f"distances of object {found}, which is not there"
+        elif not objects[found].has_distances:
+            yield f"object {found} ({objects[found].name}) has distances, and its record has none"
+    for obj in objects.values():
+        if not obj.has_distances:
+            continue
+        if sums.voxels.get(obj.id, 0) != obj.voxels:
+            yield f"object {obj.id} ({obj.name}) has voxels in bricks without distances"
+        if sums.checksums.get(obj.id, BandChecksum()).value() != obj.distances_crc:
+            yield f"object {obj.id} ({obj.name}): its distances are not those that were written"
 
 
 def _is_ascending(rows: Rows, key: int, object_id: int) -> bool:

@@ -16,12 +16,15 @@ from hapticdb.errors import (
     GridError,
     UsageError,
 )
-from hapticdb.grid import CurveName, Grid
+from hapticdb.grid import BRICK_BITS, CurveName, Grid
 from hapticdb.ingest.layout import bricks_of_rows, merged, rows_of_bricks
+from hapticdb.kernels import curves
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.query.grouping import Ranges, object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Rows, Store
+from hapticdb.store.batches import joined
+from hapticdb.store.believed import distances_crc
 from hapticdb.store.connect import create_store, exists, open_store
 
 MOST_ROWS = 1 << 19
@@ -82,7 +85,8 @@ def copy_environment(
     Each object is copied in one transaction, with its id if that is free. Objects that are in the
     target already are left alone: an interrupted copy goes on when it is started again. Everything
     is read at one revision of the source, so later edits are not copied. The memory needed is
-    proportional to the largest object.
+    proportional to the largest object. Distances to surfaces are copied as they are, if the target
+    wants them; a new target of bricks wants them if the source does.
 
     Parameters
     ----------
@@ -129,7 +133,9 @@ def _target(
     if not exists(url):
         grid = source.grid if curve is None else replace(source.grid, curve=curve)
         with suppress(EnvironmentExistsError):  # another process may be faster
-            return create_store(url, grid, layout or source.layout), True
+            kept = layout or source.layout
+            distances = kept == "brick" and source.wants_distances
+            return create_store(url, grid, kept, distances=distances), True
     store = open_store(url)
     with ExitStack() as on_error:
         on_error.callback(store.close)
@@ -225,22 +231,43 @@ def part_of(obj: Object) -> tuple[str, str]:
 
 
 def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVector) -> Rows:
-    """All rows of an object of the source, in the layout and curve of the target."""
+    """All rows of an object of the source, in the layout and curve of the target.
+
+    With distances if the object has them and the target wants them.
+    """
     ranges = object_ranges(source.grid, source.layout, obj)
-    batches = _batches(source, obj, ranges, quantiles)
-    if is_same_kind(source, target):
-        keys, ids, occupancy = zip(*(batch[:3] for batch in batches), strict=True)
-        rows = Rows(np.concatenate(keys), np.concatenate(ids), np.concatenate(occupancy))
+    distances = obj.has_distances and target.wants_distances
+    batches = _batches(source, obj, ranges, quantiles, distances=distances)
+    if distances or is_same_kind(source, target):
+        rows = joined(list(batches), distances=distances)
         n_voxels = len(rows) if source.layout == "voxel" else voxelize.count_voxels(rows.occupancy)
+        if distances and distances_crc(rows) != obj.distances_crc:
+            raise _damaged(source, obj, "distances other than those that were written")
+        rows = _on_curve(rows, source.grid, target.grid)
     else:
         parts = [bricks_of_rows(batch, source.grid, source.layout) for batch in batches]
         rows, n_voxels = rows_of_bricks(merged(parts), target.grid, target.layout)
     if n_voxels != obj.voxels:
-        raise DamagedError(
-            f"{source.url} is damaged (object {obj.id}, {obj.name}, has {n_voxels} voxels instead "
-            f"of {obj.voxels}): remove that object and import its file again, or restore a copy"
-        )
+        raise _damaged(source, obj, f"{n_voxels} voxels instead of {obj.voxels}")
     return rows
+
+
+def _damaged(source: Store, obj: Object, what: str) -> DamagedError:
+    return DamagedError(
+        f"{source.url} is damaged (object {obj.id}, {obj.name}, has {what}): remove that object "
+        "and import its file again, or restore a copy"
+    )
+
+
+def _on_curve(rows: Rows, grid: Grid, onto: Grid) -> Rows:
+    """Rows of bricks with the keys of another curve, ascending; the same rows on the same curve."""
+    if grid.curve == onto.curve:
+        return rows
+    level = max(grid.bits - BRICK_BITS, 0)
+    places = curves.decode(rows.keys, level, grid.curve_code)
+    keys = curves.encode(places, level, onto.curve_code)
+    anew = Rows(keys, rows.ids, rows.occupancy, rows.distances)
+    return anew.picked(np.argsort(keys))
 
 
 def are_few_rows(ranges: Ranges, quantiles: QuantileVector) -> bool:
@@ -250,13 +277,13 @@ def are_few_rows(ranges: Ranges, quantiles: QuantileVector) -> bool:
 
 
 def _batches(
-    store: Store, obj: Object, ranges: Ranges, quantiles: QuantileVector
+    store: Store, obj: Object, ranges: Ranges, quantiles: QuantileVector, *, distances: bool
 ) -> Iterator[Rows]:
     """Rows of an object in batches, ascending by key; one statement reads one batch."""
     lows, highs = ranges
     is_one_key = len(lows) == 1 and lows[0] == highs[0]
     if is_one_key or are_few_rows(ranges, quantiles):
-        yield store.rows_of(obj.id, lows, highs)
+        yield store.rows_of(obj.id, lows, highs, distances=distances)
         return
     half = len(lows) // 2
     if half:
@@ -265,4 +292,4 @@ def _batches(
         middle = (lows + highs) // 2
         halves = (lows, middle), (middle + 1, highs)
     for part in halves:
-        yield from _batches(store, obj, Ranges(*part), quantiles)
+        yield from _batches(store, obj, Ranges(*part), quantiles, distances=distances)

@@ -94,7 +94,7 @@ def test_both_laws_feel_the_same_in_memory_as_in_the_database(
                         wrench, count = on_database(env, shell, pose, exclude)
                         assert (felt[n] + 0.0).tobytes() == (wrench + 0.0).tobytes()
                         assert hits[n] == flat_hits[n] == count
-                        touch = env.touch(shell, pose, exclude=exclude)
+                        touch = env.touch(shell, pose, exclude=exclude, law="plane")
                         same = np.concatenate([touch.force, touch.torque])
                         assert (flat[n] + 0.0).tobytes() == (same + 0.0).tobytes()
                     objects[1] = objects[1] + np.array([1.0, -2.0, 3.5])

@@ -153,6 +153,22 @@ class InscribedBalls:
         open surface that has no matter behind it.
         """
         local = positions - self._center
+        radii, facing = self._shrunk(local, face_of, radius)
+        # A wall thinner than the slack of a ball is not seen by the ball, but by a smaller one.
+        small = 2.0 * SLACK * radius
+        near, near_facing = self._shrunk(local, face_of, small)
+        is_thin = (near < (1.0 - SLACK) * small) & (near < radii)
+        radii[is_thin], facing[is_thin] = near[is_thin], near_facing[is_thin]
+        is_open = np.flatnonzero(self._bodies[face_of] == 0)
+        if len(is_open):
+            middles = local[is_open] + 0.5 * radii[is_open, None] * self._normals[face_of[is_open]]
+            radii[is_open[~self._has_matter(middles)]] = 0.0
+        return Balls(radii, facing)
+
+    def _shrunk(
+        self, local: Floats, face_of: NDArray[np.int32], radius: float
+    ) -> tuple[Floats, Floats]:
+        """Radii and facings (Q,) of the largest balls, up to the slack of a ball of `radius`."""
         radii = self._preshrunk(local, face_of, radius)
         facing = np.ones(len(local))
         order, at, step = np.argsort(radii, kind="stable"), 0, len(local)
@@ -169,11 +185,7 @@ class InscribedBalls:
             normals = self._normals[face_of[part]]
             radii[part], facing[part] = _shrink(local[part], normals, radii[part], balls, pieces)
             at += len(part)
-        is_open = np.flatnonzero(self._bodies[face_of] == 0)
-        if len(is_open):
-            middles = local[is_open] + 0.5 * radii[is_open, None] * self._normals[face_of[is_open]]
-            radii[is_open[~self._has_matter(middles)]] = 0.0
-        return Balls(radii, facing)
+        return radii, facing
 
     def _preshrunk(self, local: Floats, face_of: NDArray[np.int32], radius: float) -> Floats:
         """Radii (Q,) at which balls no longer hold the pieces whose middles are nearest to theirs.

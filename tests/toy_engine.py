@@ -41,7 +41,13 @@ from hapticdb.store.base import (
 from hapticdb.store.batches import joined
 from hapticdb.store.believed import distances_crc, rows_crc
 from hapticdb.store.engines import Capability
-from hapticdb.store.refusals import check_distances, check_unwritten, no_object, present_already
+from hapticdb.store.refusals import (
+    check_distances,
+    check_unwritten,
+    check_without_distances,
+    no_object,
+    present_already,
+)
 from hapticdb.store.threads import check_thread, this_thread
 
 
@@ -227,6 +233,11 @@ class MemoryStore:
             touched = np.concatenate([old.keys, rows.keys])
             self._commit("move", record.id, touched, record, rows)
 
+    def add_distances(self, record: Object, rows: Rows) -> None:
+        with self._contents.write_lock:
+            check_without_distances(record, self._known(record.id)[0], self.url)
+            self._commit("move", record.id, rows.keys, record, rows)
+
     def remove(self, object_id: int, covering: Covering) -> None:
         with self._contents.write_lock:
             _, old = self._known(object_id)
@@ -290,10 +301,11 @@ class MemoryStore:
 
     def size(self) -> Size:
         rows, band = self._state().rows, self._state().distances
-        n_bytes = rows.keys.nbytes + rows.ids.nbytes + rows.occupancy.nbytes
+        n_bytes, of_band = rows.keys.nbytes + rows.ids.nbytes + rows.occupancy.nbytes, 0
         if band.distances is not None:
-            n_bytes += band.keys.nbytes + band.ids.nbytes + band.distances.data.nbytes
-        return Size(len(rows), n_bytes, 1 + n_bytes // 8192)
+            of_band = band.keys.nbytes + band.ids.nbytes + band.distances.data.nbytes
+        n_bytes += of_band
+        return Size(len(rows), n_bytes, 1 + n_bytes // 8192, len(band), of_band)
 
     def quantiles(self, resolution: int) -> Histogram:
         state = self._state()

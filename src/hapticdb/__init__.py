@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     )
     from hapticdb.grid import Grid, GridOptions
     from hapticdb.ingest.files import FileReport, ImportOptions, import_files
+    from hapticdb.ingest.upgrading import UpgradeReport, upgrade_environment
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.pool import Pool
     from hapticdb.poses import read_poses, write_poses
@@ -109,6 +110,7 @@ __all__ = [
     "TangentPlane",
     "Touch",
     "Touches",
+    "UpgradeReport",
     "UsageError",
     "backup_environment",
     "check_environment",
@@ -122,6 +124,7 @@ __all__ = [
     "replay",
     "restore_environment",
     "sweep",
+    "upgrade_environment",
     "warm_up",
     "write_poses",
 ]
@@ -141,6 +144,7 @@ _HOMES = {
     "query.law": "DistanceField TangentPlane",
     "grid": "Grid GridOptions",
     "ingest.files": "FileReport ImportOptions import_files",
+    "ingest.upgrading": "UpgradeReport upgrade_environment",
     "pointshell.shell": "PointShell",
     "pool": "Pool",
     "poses": "read_poses write_poses",

@@ -45,6 +45,7 @@ VERBS = (
     "analyze",
     "copy",
     "diff",
+    "upgrade",
     "sample",
     "demo",
     "warm",

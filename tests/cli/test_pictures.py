@@ -35,6 +35,7 @@ LINES = {
     "check": "scene.db",
     "backup": "scene.db whole.db",
     "restore": "scene.db put.db",
+    "upgrade": "scene.db",
     "calibrate": "scene.db",
     "analyze": "scene.db",
     "grant": "scene.db anna --as viewer",

@@ -101,6 +101,7 @@ PUBLIC = [
     "TangentPlane",
     "Touch",
     "Touches",
+    "UpgradeReport",
     "UsageError",
     "backup_environment",
     "check_environment",
@@ -114,6 +115,7 @@ PUBLIC = [
     "replay",
     "restore_environment",
     "sweep",
+    "upgrade_environment",
     "warm_up",
     "write_poses",
 ]

@@ -385,7 +385,7 @@ def lines(url: str) -> dict[str, list[str]]:
     """Arguments for each verb that takes a URL, in an order in which all succeed."""
     by = ("--tool", "tool.stl")
     return {"import": [url, "boxes.glb", "--bits", "6"]} | {
-        **{verb: [url] for verb in ("info", "objects", "check", "calibrate", "analyze")},
+        **{verb: [url] for verb in ("info", "objects", "check", "calibrate", "analyze", "upgrade")},
         "touch": [url, *by, "--poses", "path.csv"],
         "feel": [url, *by, "--device", "path.csv", "--seconds", "0.2", "--record", "felt.hdbrec"],
         "replay": ["felt.hdbrec", url],

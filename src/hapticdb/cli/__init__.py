@@ -27,6 +27,7 @@ from hapticdb.cli.verbs.sampling import demo, sample, warm
 from hapticdb.cli.verbs.sweeping import HELP as SWEEP_HELP
 from hapticdb.cli.verbs.sweeping import sweep
 from hapticdb.cli.verbs.touching import touch
+from hapticdb.cli.verbs.upgrading import upgrade
 from hapticdb.errors import HapticDBError
 
 __all__ = ["app", "main"]
@@ -51,6 +52,7 @@ VERBS: dict[Callable[..., None], str] = {
     check: "Say whether an environment is sound.",
     backup: "Copy an SQLite environment into a file, whole.",
     restore: "Put such a copy in an environment's place.",
+    upgrade: "Give distances to objects imported without.",
     calibrate: "Measure what queries cost on this machine.",
     analyze: "Renew the statistics of the keys.",
     bench: "Measure the paper's experiments, with a report.",

@@ -4,7 +4,13 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from hapticdb.errors import FileError, GeometryChangedError, UsageError
+from hapticdb.errors import (
+    FileError,
+    GeometryChangedError,
+    HapticDBError,
+    MissingExtraError,
+    UsageError,
+)
 from hapticdb.mesh import Part, read_file
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
@@ -25,25 +31,46 @@ def parts_of(objects: Sequence[Object], to_be: str, instead: str) -> Iterator[tu
     GeometryChangedError
         If an object's file is missing or has another geometry now.
     """
+    for some, part in found_parts(objects, to_be, instead):
+        if not isinstance(part, Part):
+            raise part
+        yield some[0], part
+
+
+def found_parts(
+    objects: Sequence[Object], to_be: str, instead: str
+) -> Iterator[tuple[tuple[Object, ...], Part | HapticDBError]]:
+    """Yield objects with their geometry, as `parts_of`, or with the error that there is none.
+
+    A geometry comes with one object, an error with all objects that it means.
+    """
     of_file: dict[tuple[str, str | None], list[Object]] = {}
     for obj in objects:
         unit = obj.attributes.get("unit")
         of_file.setdefault((obj.link, unit if isinstance(unit, str) else None), []).append(obj)
     for (link, unit), some in of_file.items():
         first = f"object {some[0].id} ({some[0].name})"
+        if len(some) > 1:
+            first += f" and {len(some) - 1} of the same file"
         try:
             parts = {(part.name, part.digest): part for part in read_file(link, unit=unit).parts}
+        except MissingExtraError as error:
+            yield tuple(some), error
+            continue
         except FileError as error:
-            raise GeometryChangedError(
-                f"{first} cannot be {to_be}, its file cannot be read: {error}"
-            ) from error
+            unread = f"{first} cannot be {to_be}, its file cannot be read: {error}"
+            yield tuple(some), GeometryChangedError(unread)
+            continue
         for obj in some:
-            if (obj.name, obj.digest) not in parts:
-                raise GeometryChangedError(
+            part = parts.get((obj.name, obj.digest))
+            yield (
+                (obj,),
+                part
+                or GeometryChangedError(
                     f"object {obj.id} ({obj.name}) cannot be {to_be}: {link} no longer holds the "
                     f"geometry that was imported; {instead}"
-                )
-            yield obj, parts[obj.name, obj.digest]
+                ),
+            )
 
 
 def shell_of_objects(

@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import partial
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,8 @@ from hapticdb.mesh import MeshFile, Part
 from hapticdb.mesh.child import bytes_available
 from hapticdb.store.base import BRICK_BYTES, Layout, Object, Rows, Store
 
+Item = TypeVar("Item")
+Done = TypeVar("Done")
 ShareCallback = Callable[[float], None]
 """Called with the share of a part that is done, 0 to 1; from any thread."""
 SHARE_EVERY_S = 0.2
@@ -163,28 +166,50 @@ def voxelize_parts(
     progress : callable
         Called in the caller's thread with the share of the part that it waits for.
     """
-    shares: dict[str, float] = {}
     given = {"unit": unit, "up": file.up}
     attributes = {name: value for name, value in given.items() if value}
 
-    def voxelize_part(part: Part) -> tuple[Object, Rows]:
-        def note_share(share: float) -> None:
-            shares[part.name] = share
+    def voxelize_part(part: Part, share: ShareCallback) -> tuple[Object, Rows]:
+        return _object_of(part, file, store, attributes, share)
 
-        return _object_of(part, file, store, attributes, note_share)
+    yield from in_threads(parts, voxelize_part, jobs, progress)
 
-    waiting: deque[tuple[str, Future[tuple[Object, Rows]]]] = deque()
 
-    def next_result() -> tuple[Object, Rows]:
-        name, future = waiting.popleft()
+def in_threads(
+    items: Iterable[Item],
+    work: Callable[[Item, ShareCallback], Done],
+    jobs: int,
+    progress: ShareCallback = lambda _share: None,
+) -> Iterator[Done]:
+    """Yield the results of `work` on items, in order; threads compute a few in advance.
+
+    Parameters
+    ----------
+    work : callable
+        Called in a thread with an item, and with what it calls with the share that is done.
+    jobs : int
+        Number of threads.
+    progress : callable
+        Called in the caller's thread with the share of the item that it waits for.
+    """
+    shares: dict[int, float] = {}
+
+    def worked(number: int, item: Item) -> Done:
+        return work(item, partial(shares.__setitem__, number))
+
+    waiting: deque[tuple[int, Future[Done]]] = deque()
+
+    def next_result() -> Done:
+        number, future = waiting.popleft()
         while not wait([future], SHARE_EVERY_S).done:
-            progress(shares.get(name, 0.0))
+            progress(shares.get(number, 0.0))
+        shares.pop(number, None)
         return future.result()
 
     pool = ThreadPoolExecutor(jobs, thread_name_prefix="voxelize")
     try:
-        for part in parts:
-            waiting.append((part.name, pool.submit(voxelize_part, part)))
+        for number, item in enumerate(items):
+            waiting.append((number, pool.submit(worked, number, item)))
             if len(waiting) > 2 * jobs:
                 yield next_result()
         while waiting:

@@ -227,11 +227,13 @@ class Freshness(NamedTuple):
 
 
 class Size(NamedTuple):
-    """How large an index table is; bytes of the whole database, its write-ahead log included."""
+    """How large the tables are; bytes of the whole database, its write-ahead log included."""
 
     rows: int
     bytes: int
     leaf_blocks: int
+    band_rows: int = 0
+    band_bytes: int = 0
 
 
 class ReadsRows(Protocol):
@@ -307,6 +309,9 @@ class WritesObjects(Protocol):
         A record with a revision above 0 was derived from the object of that revision. Raises
         ConflictError when the object has been written since.
         """
+
+    def add_distances(self, record: Object, rows: Rows) -> None:
+        """Give distances to an object without any, whose bricks are among these rows: a move."""
 
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hapticdb.errors import EnvironmentExistsError, UsageError
+from hapticdb.errors import ConflictError, EnvironmentExistsError, UsageError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store import believed
@@ -117,6 +117,15 @@ class DistancesContract(StoreCase):
         assert band.lookup(np.unique(keys)).distances is None
         assert band.count(*EVERYWHERE) == band.size().rows == band.quantiles(7).n_rows == len(keys)
 
+    def test_the_size_tells_of_distances_apart(self, band: Store) -> None:
+        """`rows` counts the index table; the rows of distances are more, and take bytes."""
+        n_rows = len(self.expected(band, 1, 3))
+        assert band.size().band_rows == n_rows > 0
+        assert 0 < band.size().band_bytes <= band.size().bytes
+        band.remove(1, covering(band))
+        band.remove(3, covering(band))
+        assert band.size().band_rows == 0
+
     def test_nothing_asked_is_nothing_found(self, band: Store) -> None:
         """The answer still has distances, of no row."""
         for empty in (
@@ -167,6 +176,30 @@ class DistancesContract(StoreCase):
             for found, column in zip(band.rows_of(1, *EVERYWHERE), voxels, strict=True):
                 np.testing.assert_array_equal(found, column)
             assert is_touched(list(band.changes())[-1], rows.keys)
+
+    def test_distances_are_added_to_an_object_without_any(self, band: Store) -> None:
+        """Its voxels stay, and it can be removed. Other writes of it in between are conflicts."""
+        union = self.rows(band, 1)
+        band.replace(replace(band.object(1), revision=0), union.occupied(), covering(band))
+        known, voxels = band.object(1), band.scan(*EVERYWHERE)
+        with pytest.raises(ConflictError, match="was written by another"):
+            band.add_distances(replace(known, revision=1), union)
+        band.add_distances(known, union)
+        assert list(band.changes())[-1].action == "move"
+        assert is_touched(list(band.changes())[-1], union.keys)
+        found = band.object(1)
+        assert found.revision == band.revision() == known.revision + 1
+        assert (found.rows_crc, found.distances_crc) == (
+            known.rows_crc,
+            believed.distances_crc(union),
+        )
+        assert content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 1, 3)
+        for column, was in zip(band.scan(*EVERYWHERE), voxels, strict=True):
+            np.testing.assert_array_equal(column, was)
+        with pytest.raises(ConflictError, match="has distances already"):
+            band.add_distances(found, union)
+        band.remove(1, covering(band))
+        assert content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
 
     def test_a_snapshot_sees_the_distances_of_one_revision(self, band: Store) -> None:
         """A removal and an addition by another connection come after it."""

@@ -17,6 +17,8 @@ from hapticdb.store.postgres.tables.histogram import (
 )
 from hapticdb.store.postgres.tables.reading import PostgresReader
 
+SIZE_OF_BAND = "SELECT count(*), pg_total_relation_size('band') FROM band"
+
 
 class PostgresStatistics:
     """Sizes and statistics of one environment's tables, and the figures kept beside them."""
@@ -29,7 +31,8 @@ class PostgresStatistics:
         self._reader = reader
 
     def size(self) -> Size:
-        """Rows, bytes of all tables and indexes, leaf blocks of the index."""
+        """Rows, bytes of all tables and indexes, leaf blocks of the index; rows of distances."""
+        band = (0, 0)
         with self._connection.snapshot(), self._connection.without_limit():
             self._reader.revision()
             counted = (
@@ -45,7 +48,9 @@ class PostgresStatistics:
                 "         / current_setting('block_size')::int",
                 (_quoted(self._connection), f"{_quoted(self._connection)}.{self._layout}_key"),
             ).fetchall()
-        return Size(int(rows), int(total), max(int(index), 1))
+            if self._reader.has_band():
+                (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
+        return Size(int(rows), int(total), max(int(index), 1), *map(int, band))
 
     def quantiles(self, resolution: int) -> Histogram:
         """Equi-count histogram of all row keys, of R buckets.

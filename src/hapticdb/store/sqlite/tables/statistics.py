@@ -11,6 +11,9 @@ from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables.quantiles import exact_quantiles
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
 
+SIZE_OF_BAND = "SELECT ncell, pgsize FROM dbstat WHERE name = 'band' AND aggregate = TRUE"
+"""Rows and bytes by one pass: in a table WITHOUT ROWID each cell is a row."""
+
 
 class SQLiteStatistics:
     """Sizes and statistics of one environment's tables, and the figures kept beside them."""
@@ -21,15 +24,18 @@ class SQLiteStatistics:
         self._reader = reader
 
     def size(self) -> Size:
-        """Rows, bytes of the file and its write-ahead log, leaf blocks of the index table."""
+        """Rows, bytes of the file and its write-ahead log, leaf blocks; rows of distances."""
+        band = (0, 0)
         with self._connection.snapshot():
             rows = self._connection.fetch(f"SELECT count(*) FROM {self._layout}")[0][0]
             blocks = self._connection.fetch(
                 "SELECT pageno FROM dbstat WHERE name = ?1 AND aggregate = TRUE", (self._layout,)
             )
+            if self._reader.has_band():
+                (band,) = self._connection.fetch(SIZE_OF_BAND)  # a row for an empty table, too
         wal = Path(f"{self._connection.path}-wal")
         total = self._connection.path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
-        return Size(int(rows), total, int(blocks[0][0]) if blocks else 1)
+        return Size(int(rows), total, int(blocks[0][0]) if blocks else 1, *map(int, band))
 
     def quantiles(self, resolution: int) -> Histogram:
         """Equi-count histogram of all row keys, of R buckets.

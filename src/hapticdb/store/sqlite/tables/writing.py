@@ -16,7 +16,7 @@ from hapticdb.store.base import (
     Table,
     touched_ranges,
 )
-from hapticdb.store.refusals import check_unwritten, present_already
+from hapticdb.store.refusals import check_unwritten, check_without_distances, present_already
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
@@ -39,7 +39,9 @@ INSERT_OBJECT = """
 INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
 SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN ?9 END,
        ?1, ?2, ?3, ?4, ?5, ?6, ?7, ?8"""
-
+UPDATE_OBJECT = """
+UPDATE object SET digest = ?, transform = ?, voxels = ?, bounds = ?, attributes = ?, revision = ?
+ WHERE id = ?"""
 
 DELETE: dict[Table, str] = {
     table: f"DELETE FROM {table} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
@@ -86,13 +88,20 @@ class SQLiteWriter:
             revision = self._reader.revision() + 1
             check_unwritten(record, self._reader.object(record.id), self._connection.url)
             gone = self._delete(record.id, covering)
-            self._connection.execute(
-                "UPDATE object SET digest = ?, transform = ?, voxels = ?, bounds = ?,"
-                " attributes = ?, revision = ? WHERE id = ?",
-                (*sqlite_rows.contents(record, rows), revision, record.id),
-            )
+            contents = sqlite_rows.contents(record, rows)
+            self._connection.execute(UPDATE_OBJECT, (*contents, revision, record.id))
             self._insert(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
+
+    def add_distances(self, record: Object, rows: Rows) -> None:
+        """Give distances to an object without any, in one transaction."""
+        with self._connection.writing():
+            revision = self._reader.revision() + 1
+            check_without_distances(record, self._reader.object(record.id), self._connection.url)
+            contents = sqlite_rows.contents(record, rows)
+            self._connection.execute(UPDATE_OBJECT, (*contents, revision, record.id))
+            self._insert_distances(rows, record.id)
+            self._log(revision, "move", record.id, rows.keys)
 
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""
@@ -117,7 +126,12 @@ class SQLiteWriter:
             else:
                 part = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + CHUNK)]
                 self._connection.execute(INSERT["brick"], (keys, object_id, part.tobytes()))
-        for at in range(0, len(union), BAND_CHUNK) if union.distances is not None else ():
+        if union.distances is not None:
+            self._insert_distances(union, object_id)
+
+    def _insert_distances(self, union: Rows, object_id: int) -> None:
+        """Insert distances, ascending by key: one statement for up to BAND_CHUNK rows."""
+        for at in range(0, len(union), BAND_CHUNK):
             self._insert_band(union.part(at, at + BAND_CHUNK), object_id)
 
     def _insert_band(self, rows: Rows, object_id: int) -> None:

@@ -1,0 +1,227 @@
+"""Distances for objects that were imported without: resumable, and equal to those of an import.
+
+An upgrade that is interrupted is a process of its own that says how many objects it has written.
+"""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hapticdb
+from assemblies import assembly, index_rows, small_options, write_obj
+from children import child
+from hapticdb import Environment, ImportOptions, upgrade_environment
+from hapticdb.check import check_environment
+from hapticdb.ingest.files import ImportProgress
+from hapticdb.ingest.upgrading import is_as_stored
+from hapticdb.ingest.voxelizing import rows_of_part
+from hapticdb.mesh import parse_in_process
+from hapticdb.store.base import Rows
+from servers import Place
+
+EVERYWHERE = np.array([0]), np.array([2**62])
+N_PARTS = 7
+SHELL = hapticdb.PointShell(
+    points=np.zeros((1, 3)), normals=np.array([[1.0, 0, 0]]), center=np.zeros(3)
+)
+UPGRADE = """
+import sys, time
+import hapticdb
+
+def say(progress):
+    if not progress.share:
+        print(progress.parts_done, flush=True)
+    if progress.parts_done == progress.parts_total - 1:
+        time.sleep(600)
+
+print(0, flush=True)
+hapticdb.upgrade_environment(sys.argv[1], jobs=2, progress=say)
+"""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return write_obj(tmp_path / "assembly.obj", assembly(N_PARTS))
+
+
+@pytest.fixture
+def plain(file: Path, tmp_path: Path) -> Path:
+    """An environment without distances; its first object has been moved."""
+    hapticdb.import_files(tmp_path / "plain.db", [file], small_options())
+    with hapticdb.open(tmp_path / "plain.db") as env:
+        placed = env.object(1).transform.copy()
+        placed[:3, 3] += 0.013
+        env.move(1, placed)
+    return tmp_path / "plain.db"
+
+
+def band_of(env: Environment) -> list[tuple[Any, ...]]:
+    """All rows with distances."""
+    rows = env.store.scan(*EVERYWHERE, distances=True)
+    assert rows.distances is not None
+    ends = rows.distances.ends.tolist()
+    starts = [0, *ends[:-1]]
+    data = rows.distances.data.tobytes()
+    packed = [data[start:end] for start, end in zip(starts, ends, strict=True)]
+    return list(zip(rows.keys.tolist(), rows.ids.tolist(), packed, strict=True))
+
+
+def wanted_band(env: Environment, file: Path, ids: set[int]) -> list[tuple[Any, ...]]:
+    """What an import of these objects at their places gives."""
+    parts = {part.name: part for part in parse_in_process(file).parts}
+    found: list[tuple[Any, ...]] = []
+    for obj in env.objects():
+        if obj.id in ids:
+            rows, _ = rows_of_part(
+                parts[obj.name], env.grid, "brick", obj.transform, distances=True
+            )
+            assert rows.distances is not None
+            for n, key in enumerate(rows.keys.tolist()):
+                found.append((key, obj.id, rows.distances.part(n, n + 1).data.tobytes()))
+    return sorted(found)
+
+
+def test_every_object_gets_the_distances_of_an_import(
+    file: Path, plain: Path, place: Place
+) -> None:
+    """On both engines, at the object's place now. Voxels stay; open readers learn of it."""
+    on_a_server = place()
+    hapticdb.copy_environment(plain, on_a_server)
+    for url in (str(plain), on_a_server):
+        shares: list[ImportProgress] = []
+        with hapticdb.open(url, read_only=True) as reader:
+            before, revision = index_rows(reader), reader.store.revision()
+            assert reader.touch(SHELL, np.eye(4)).law == hapticdb.TangentPlane()
+            report = upgrade_environment(url, jobs=2, progress=shares.append)
+            assert (report.upgraded, report.present, report.left_out) == (N_PARTS, 0, ())
+            assert report.voxels == sum(obj.voxels for obj in reader.objects())
+            assert [now.parts_done for now in shares if not now.share][-1] == N_PARTS
+            assert reader.touch(SHELL, np.eye(4)).law == hapticdb.DistanceField()
+            assert reader.has_distances
+            changes = list(reader.store.changes(revision))
+            assert [(c.action, c.id) for c in changes] == [("move", i + 1) for i in range(N_PARTS)]
+            assert index_rows(reader) == before
+            assert band_of(reader) == wanted_band(reader, file, set(range(1, N_PARTS + 1)))
+        again = upgrade_environment(url)
+        assert (again.upgraded, again.present, again.is_complete) == (0, N_PARTS, True)
+        assert check_environment(url).findings == []
+
+
+def test_parts_imported_later_get_distances_too(plain: Path, tmp_path: Path) -> None:
+    upgrade_environment(plain)
+    more = write_obj(tmp_path / "more.obj", assembly(2))
+    hapticdb.import_files(plain, [more], ImportOptions())
+    with hapticdb.open(plain) as env:
+        assert env.store.wants_distances
+        assert env.has_distances
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=str)
+@pytest.mark.parametrize("is_file", [True, False])
+def test_an_interrupted_upgrade_goes_on(
+    file: Path,
+    plain: Path,
+    place: Place,
+    how: signal.Signals,
+    is_file: bool,
+) -> None:
+    """Each object has all of its distances or none; in the end all have them."""
+    url = str(plain) if is_file else place()
+    if not is_file:
+        hapticdb.copy_environment(plain, url)
+    command = [sys.executable, "-c", UPGRADE, url]
+    with child(command, stderr=subprocess.DEVNULL) as upgrading:
+        assert upgrading.stdout is not None
+        assert any(int(line) >= 3 for line in upgrading.stdout)
+        upgrading.send_signal(how)
+    assert upgrading.returncode == -how
+    assert check_environment(url).findings == []
+    with hapticdb.open(url, read_only=True) as env:
+        done = {obj.id for obj in env.objects() if obj.has_distances}
+        assert 3 <= len(done) < N_PARTS
+        assert band_of(env) == wanted_band(env, file, done)
+    report = upgrade_environment(url)
+    assert (report.upgraded, report.present) == (N_PARTS - len(done), len(done))
+    with hapticdb.open(url, read_only=True) as env:
+        assert env.has_distances
+        assert band_of(env) == wanted_band(env, file, set(range(1, N_PARTS + 1)))
+
+
+def test_objects_whose_file_is_gone_are_left_out_once(plain: Path, file: Path) -> None:
+    """One reason for all of them. When the file is back, the same call goes on."""
+    hidden = file.rename(file.with_name("hidden.obj"))
+    report = upgrade_environment(plain)
+    ((objects, error),) = report.left_out
+    assert (len(objects), report.upgraded) == (N_PARTS, 0)
+    assert "object 1 (ball 0) and 6 of the same file cannot be upgraded" in str(error)
+    hidden.rename(file)
+    assert upgrade_environment(plain).upgraded == N_PARTS
+
+
+def test_an_object_whose_geometry_changed_is_left_out(plain: Path, file: Path) -> None:
+    """The others get distances."""
+    changed = assembly(N_PARTS)
+    vertices, faces = changed["ball 3"]
+    write_obj(file, {**changed, "ball 3": (vertices * 1.01, faces)})
+    report = upgrade_environment(plain)
+    ((objects, error),) = report.left_out
+    assert [obj.name for obj in objects] == ["ball 3"]
+    assert "no longer holds the geometry that was imported" in str(error)
+    assert report.upgraded == N_PARTS - 1
+    with hapticdb.open(plain) as env:
+        assert [obj.name for obj in env.objects() if not obj.has_distances] == ["ball 3"]
+        assert not env.has_distances
+
+
+def test_an_object_with_other_voxels_than_its_file_gives_is_left_out(plain: Path) -> None:
+    """Such as one that another version has voxelized otherwise."""
+    with hapticdb.open(plain) as env:
+        obj = env.object(2)
+        env.store.remove(2, lambda _: [(0, 2**62)])
+        rows = env.store.rows_of(3, *EVERYWHERE)
+        env.store.add(obj, rows)
+    report = upgrade_environment(plain)
+    ((objects, error),) = report.left_out
+    assert [obj.id for obj in objects] == [2]
+    assert "its voxels are not those that its file gives now" in str(error)
+    assert report.upgraded == N_PARTS - 1
+
+
+def test_voxels_are_compared_bit_by_bit_in_pieces(
+    plain: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A row more, a row less or another bit is found, wherever a piece ends."""
+    with hapticdb.open(plain) as env:
+        obj = env.object(1)
+        rows = env.store.rows_of(1, *EVERYWHERE)
+        n = len(rows)
+        for at_once in (1, 3, n - 1, n, n + 1):
+            monkeypatch.setattr("hapticdb.ingest.upgrading.ROWS_AT_ONCE", at_once)
+            assert is_as_stored(env.store, obj, rows)
+            for row in (0, n // 2, n - 1):
+                rest = rows.picked(np.delete(np.arange(n), row))
+                assert not is_as_stored(env.store, obj, rest)
+                bits = rows.occupancy.copy()
+                bits[64 * row + 5] ^= 16
+                other = Rows(rows.keys, rows.ids, bits)
+                assert not is_as_stored(env.store, obj, other)
+            for key in (rows.keys[0] - 1, rows.keys[-1] + 1):
+                keys = np.sort(np.append(rows.keys, key))
+                more = Rows(
+                    keys, np.append(rows.ids, 1), np.append(rows.occupancy, rows.occupancy[:64])
+                )
+                assert not is_as_stored(env.store, obj, more)
+
+
+def test_the_layout_voxel_is_refused(file: Path, tmp_path: Path) -> None:
+    hapticdb.import_files(tmp_path / "v.db", [file], small_options(layout="voxel"))
+    with pytest.raises(hapticdb.UsageError, match="has the layout voxel, which has no distances"):
+        upgrade_environment(tmp_path / "v.db")
+    with pytest.raises(hapticdb.UsageError, match="0 jobs"):
+        upgrade_environment(tmp_path / "v.db", jobs=0)

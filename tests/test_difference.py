@@ -16,9 +16,9 @@ from hapticdb import Environment, Grid, diff_environments, transfer
 from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.store.base import Layout
+from hapticdb.store.base import Band, Layout
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
-from hapticdb.testing import KINDS, blob, voxel_object
+from hapticdb.testing import KINDS, blob, voxel_object, with_distances
 
 Kind = tuple[Layout, CurveName]
 PLACE = (12, 12, 12)
@@ -175,3 +175,38 @@ def test_other_grids_have_no_totals(tmp_path: Path) -> None:
     found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
     assert (found.totals, found.elsewhere) == (None, ())
     assert len(found.changed) == 1
+
+
+@pytest.mark.parametrize("most_rows", [1, 1 << 19])
+@pytest.mark.parametrize("curve", ["z", "hilbert"])
+def test_distances_are_compared_where_both_have_them(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, curve: CurveName, most_rows: int
+) -> None:
+    """On any curve. Objects that have them on one side alone do not differ."""
+    monkeypatch.setattr(transfer, "MOST_ROWS", most_rows)
+    ijk = blob(3, PLACE)
+    rows = with_distances(ijk, Grid(0.01, (-0.1, 0.2, -0.3), 5), "brick", seed=1)
+    assert rows.distances is not None
+    data = rows.distances.data.copy()
+    data[0] ^= 1
+    data[-1] ^= 1
+    other = rows.having(Band(data, rows.distances.ends))
+    fewer = rows.picked(np.flatnonzero(rows.occupied().keys[0] <= rows.keys))
+    found = {}
+    for name, some in {"a": rows, "b": other, "c": rows.occupied(), "d": fewer}.items():
+        with make(tmp_path / f"{name}.db") as env:
+            env.store.add(voxel_object(env.grid, ijk), some)
+        target = tmp_path / f"{name}-{curve}.db"
+        grid = Grid(0.01, (-0.1, 0.2, -0.3), 5, curve)
+        hapticdb.create(target, grid, distances=True).close()
+        hapticdb.copy_environment(tmp_path / f"{name}.db", target)
+        found[name] = diff_environments(tmp_path / "a.db", target)
+        assert found[name].voxels == ()
+    assert found["a"].is_equal
+    assert (found["a"].with_distances, found["a"].distances) == ((1, 1), ())
+    assert [one.n_rows for one in found["b"].distances] == [2]
+    assert not found["b"].is_equal
+    assert (found["c"].with_distances, found["c"].distances) == ((1, 0), ())
+    assert found["c"].is_equal
+    assert len(fewer) < len(rows)
+    assert [one.n_rows for one in found["d"].distances] == [len(rows) - len(fewer)]

@@ -12,7 +12,7 @@ from hapticdb.grid import BRICK_BITS, CELL_BITS, Grid
 from hapticdb.ingest.layout import Bricks, bricks_of_rows
 from hapticdb.kernels import curves
 from hapticdb.kernels.surfaces import voxelize
-from hapticdb.query.grouping import box_ranges
+from hapticdb.query.grouping import BAND_MARGIN, box_ranges
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import BRICK_BYTES, Object, Store
 from hapticdb.store.connect import open_store
@@ -45,6 +45,17 @@ class VoxelDifference(NamedTuple):
         """Share of the voxels of either that both have, 0 .. 1; 1 if neither has a voxel."""
         total = self.only_in_a + self.only_in_b + self.shared
         return self.shared / total if total else 1.0
+
+
+class DistanceDifference(NamedTuple):
+    """One part in both environments, with other distances to its surface in each.
+
+    n_rows : number of bricks whose distances differ, or that only one environment has.
+    """
+
+    a: Object
+    b: Object
+    n_rows: int
 
 
 class Totals(NamedTuple):
@@ -98,6 +109,11 @@ class Difference:
         and number of these voxels.
     n_shared : int
         Number of voxels of all compared objects that both environments have.
+    distances : tuple of DistanceDifference
+        The same geometry in the same place, with distances in both environments that differ.
+    with_distances : tuple of two int
+        Number of compared objects that have distances in a, and in b. An object that has them in
+        one environment alone is no difference: its voxels are the same.
     """
 
     a: str
@@ -114,6 +130,8 @@ class Difference:
     compared: int
     n_voxels: int
     n_shared: int
+    distances: tuple[DistanceDifference, ...]
+    with_distances: tuple[int, int]
 
     @property
     def is_same_grid(self) -> bool:
@@ -136,9 +154,9 @@ class Difference:
 
     @property
     def is_equal(self) -> bool:
-        """Whether both hold the same objects and voxels; ids and attributes may differ."""
+        """Whether both hold the same objects, voxels and distances; ids, attributes may differ."""
         parts = (self.only_in_a, self.only_in_b, self.changed, self.moved, self.voxels)
-        return self.is_same_grid and not any(parts)
+        return self.is_same_grid and not any(parts) and not self.distances
 
 
 def diff_environments(
@@ -146,7 +164,8 @@ def diff_environments(
 ) -> Difference:
     """Compare two environments: their grids, their objects, and every voxel of each object.
 
-    Engines, layouts and curves may differ. Each environment is read at one revision, and
+    Distances to surfaces are compared where both environments have them for an object in the same
+    place. Engines, layouts and curves may differ. Each environment is read at one revision, and
     voxels in batches, whatever the size of an object.
 
     Parameters
@@ -192,6 +211,11 @@ def diff_environments(
             compared=len(compared),
             n_voxels=sum(obj.voxels for obj, _ in compared),
             n_shared=sum(one.shared for one in found),
+            distances=tuple(_distances_apart(a, b, compared)),
+            with_distances=(
+                sum(obj.has_distances for obj, _ in compared),
+                sum(obj.has_distances for _, obj in compared),
+            ),
         )
 
 
@@ -219,9 +243,7 @@ def _compare_voxels(
 ) -> VoxelDifference:
     """Compare two objects voxel by voxel, box by box."""
     grid = stores[0].grid
-    corners = np.concatenate([grid.voxels_of(obj.bounds) for obj in pair])
-    low = np.clip(corners.min(axis=0) - 1, 0, grid.side - 1) & -BRICK_EDGE
-    high = np.clip(corners.max(axis=0) + 1, 0, grid.side - 1) | (BRICK_EDGE - 1)
+    low, high = _box_of(grid, pair, 1)
     counts = np.zeros(3, dtype=np.int64)
     for box in _boxes(stores, vectors, low, high):
         rows_a, rows_b = (
@@ -243,6 +265,42 @@ def _compare_voxels(
             )
         )
     return VoxelDifference(*pair, *counts.tolist())
+
+
+def _distances_apart(a: Store, b: Store, pairs: Sequence[Pair]) -> Iterator[DistanceDifference]:
+    """Objects whose distances differ, of those that have some in both environments."""
+    stores = (a, b)
+    both = [pair for pair in pairs if pair[0].has_distances and pair[1].has_distances]
+    vectors = [QuantileVector.of(store) for store in stores] if both else []
+    for pair in both:
+        n_rows = sum(
+            _count_rows_apart(stores, pair, box)
+            for box in _boxes(stores, vectors, *_box_of(a.grid, pair, BAND_MARGIN))
+        )
+        if n_rows:
+            yield DistanceDifference(*pair, n_rows)
+
+
+def _count_rows_apart(stores: tuple[Store, Store], pair: Pair, box: tuple[Corner, Corner]) -> int:
+    """Bricks of a box whose packed distances differ, or that only one of the two objects has."""
+    packed = []
+    for store, obj in zip(stores, pair, strict=True):
+        ranges = box_ranges(store.grid, store.layout, *box)
+        rows = store.rows_of(obj.id, *ranges, distances=True)
+        bricks = _inside(bricks_of_rows(rows, store.grid, store.layout), store.grid, *box)
+        assert bricks.distances is not None  # noqa: S101 - read with distances
+        data, ends = bricks.distances.data.tobytes(), bricks.distances.ends.tolist()
+        pieces = zip(bricks.keys.tolist(), [0, *ends[:-1]], ends, strict=True)
+        packed.append({(key, data[start:end]) for key, start, end in pieces})
+    return len({key for key, _ in packed[0] ^ packed[1]})
+
+
+def _box_of(grid: Grid, pair: Pair, margin: int) -> tuple[Corner, Corner]:
+    """Whole bricks around the bounds of both objects and a margin, voxels, cut to the grid."""
+    corners = np.concatenate([grid.voxels_of(obj.bounds) for obj in pair])
+    low = np.clip(corners.min(axis=0) - margin, 0, grid.side - 1) & -BRICK_EDGE
+    high = np.clip(corners.max(axis=0) + margin, 0, grid.side - 1) | (BRICK_EDGE - 1)
+    return low, high
 
 
 def _boxes(
@@ -272,7 +330,10 @@ def _inside(bricks: Bricks, grid: Grid, low: Corner, high: Corner) -> Bricks:
         curves.decode(bricks.keys, max(grid.bits - BRICK_BITS, 0), curves.Z_ORDER) << BRICK_BITS
     )
     mine = ((corners >= low) & (corners <= high)).all(axis=1)
-    return Bricks(bricks.keys[mine], bricks.occupancy[mine])
+    distances = bricks.distances
+    if distances is not None:
+        distances = distances.picked(np.flatnonzero(mine))
+    return Bricks(bricks.keys[mine], bricks.occupancy[mine], distances)
 
 
 def _count_apart(a: Bricks, b: Bricks) -> tuple[int, int, int]:

@@ -17,6 +17,7 @@ from assemblies import voxel_set
 from children import PATIENCE, child
 from command_line import (  # noqa: F401 - fixtures among them
     Run,
+    boxes,
     command,
     command_that_halts,
     made,
@@ -249,3 +250,33 @@ def read_terminal(ours: int) -> bytes:
         return os.read(ours, 4096)
     except OSError:
         return b""
+
+
+# -- upgrade --------------------------------------------------------------------------------------
+
+
+def test_an_upgrade_says_what_it_did_and_what_it_left_out(run: Run, tmp_path: Path) -> None:
+    """Exit code 1 where an object stays without distances; running again goes on."""
+    hapticdb.import_files(tmp_path / "e.db", [boxes(tmp_path / "boxes.glb")])
+    (tmp_path / "boxes.glb").rename(tmp_path / "hidden.glb")
+    code, out, err = run("upgrade", "e.db")
+    assert code == 1
+    assert len(err.splitlines()) == 1
+    assert "and 2 of the same file cannot be upgraded, its file cannot be read" in err
+    assert out.startswith("e.db: distances for 0 objects; 3 objects without; the same command")
+    code, out, err = run("upgrade", "e.db", "--json")
+    record = json.loads(out)
+    assert (code, record["upgraded"], len(record["left_out"])) == (1, 0, 3)
+    assert "\ndistances     none\n" in run("info", "e.db")[1]
+    (tmp_path / "hidden.glb").rename(tmp_path / "boxes.glb")
+    code, out, err = run("upgrade", "e.db")
+    assert (code, out, err) == (0, "e.db: distances for 3 objects\n", "")
+    found = json.loads(run("info", "e.db", "--json")[1])["distances"]
+    assert found["objects"] == 3
+    assert 0 < found["rows"] < found["bytes"]
+    assert run("upgrade", "e.db")[1] == "e.db: complete already (3 objects), nothing to do\n"
+
+
+def test_the_layout_voxel_cannot_be_upgraded(run: Run, scene: Path) -> None:
+    run("copy", scene, "v.db", "--layout", "voxel")
+    refused(run("upgrade", "v.db"), "has the layout voxel, which has no distances")

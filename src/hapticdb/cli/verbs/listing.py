@@ -97,7 +97,7 @@ class _Overview(NamedTuple):
     layout: "Layout"
     size: "Size"
     n_objects: int
-    has_distances: bool
+    n_with_distances: int
     voxels: int
     scene: "NDArray[np.float64] | None"
     freshness: "Freshness"
@@ -119,13 +119,29 @@ class _Overview(NamedTuple):
             layout=store.layout,
             size=size,
             n_objects=len(objects),
-            has_distances=bool(objects) and all(obj.has_distances for obj in objects),
+            n_with_distances=sum(obj.has_distances for obj in objects),
             voxels=sum(obj.voxels for obj in objects),
             scene=scene_bounds(objects),
             freshness=store.freshness(DEFAULT_RESOLUTION),
             source=QuantileVector.of(store, DEFAULT_RESOLUTION).source,
             has_checksums=store.checker().has_page_checksums(),
         )
+
+    @property
+    def has_distances(self) -> bool:
+        """Whether every object has distances, and there is one."""
+        return 0 < self.n_with_distances == self.n_objects
+
+    @property
+    def _distances(self) -> str:
+        """Put in words which objects have distances, and what these take."""
+        if not self.n_with_distances:
+            return "none"
+        size = self.size
+        whose = "all objects"
+        if not self.has_distances:
+            whose = f"{self.n_with_distances:,} of {render.counted(self.n_objects, 'object')}"
+        return f"of {whose}: {size.band_rows:,} rows, {render.bytes_text(size.band_bytes)}"
 
     @property
     def fit(self) -> fitting.Accuracy | None:
@@ -147,6 +163,11 @@ class _Overview(NamedTuple):
             "voxels": self.voxels,
             "rows": self.size.rows,
             "bytes": self.size.bytes,
+            "distances": {
+                "objects": self.n_with_distances,
+                "rows": self.size.band_rows,
+                "bytes": self.size.band_bytes,
+            },
             "page_checksums": self.has_checksums,
             "fit": None if self.fit is None else self.fit._asdict(),
             "statistics": {"source": self.source, **self.freshness._asdict()},
@@ -172,6 +193,7 @@ class _Overview(NamedTuple):
             ("voxels", f"{self.voxels:,}"),
             ("rows", f"{size.rows:,}"),
             ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
+            ("distances", self._distances),
             *(self.fit.facts if self.fit is not None else ()),
             ("checksums", "of pages" if self.has_checksums else NO_CHECKSUMS),
             ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),

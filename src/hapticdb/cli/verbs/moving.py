@@ -76,7 +76,8 @@ def diff(
     """Say whether two environments hold the same objects and voxels, and by how much they differ.
 
     For each object that differs: voxels that only A has, only B, the share that
-    both have, and how far a corner of its bounding box has moved at most. The
+    both have, and how far a corner of its bounding box has moved at most.
+    Distances to surfaces are compared where both have them. The
     exit code is 0 when they hold the same, 1 when they differ. Engine, layout
     and curve make no difference.
 
@@ -125,6 +126,8 @@ def _record(difference: "Difference") -> dict[str, object]:
         "changed": [amount(*pair) for pair in difference.changed],
         "moved": [amount(*pair) for pair in difference.moved],
         "voxels": [amount(one.a, one.b) for one in difference.voxels],
+        "distances": [named(one.a) | {"rows": one.n_rows} for one in difference.distances],
+        "with_distances": list(difference.with_distances),
         "renumbered": [named(obj) | {"id_in_b": other.id} for obj, other in difference.renumbered],
         "described": [named(obj) for obj, _ in difference.described],
         "objects_compared": difference.compared,
@@ -140,6 +143,11 @@ def _equal(difference: "Difference") -> str:
         f"{render.counted(difference.n_voxels, 'voxel')}, {difference.grids[0].side}^3 cells of "
         f"{render.metres(difference.grids[0].voxel_size)}"
     )
+    in_a, in_b = difference.with_distances
+    if in_a == in_b:
+        line += f", {render.counted(in_a, 'object')} with distances" if in_a else ""
+    else:
+        line += f"; distances of {render.counted(in_a, 'object')} in A, of {in_b:,} in B"
     if difference.renumbered:
         line += f"; {render.counted(len(difference.renumbered), 'object')} with other ids"
     if difference.described:
@@ -204,6 +212,9 @@ def _rows(difference: "Difference") -> Iterator[tuple[str, ...]]:
                     f"{one.only_in_a:,}", f"{one.only_in_b:,}", render.percent(one.share)
                 )  # fmt: skip
             yield str(obj.id), obj.name, what, *counts, _moved_text(obj, other, size), obj.link
+    for found in difference.distances:
+        what = f"other distances in {render.counted(found.n_rows, 'row')}"
+        yield str(found.a.id), found.a.name, what, "", "", "", "", found.a.link
 
 
 def _moved_text(a: "Object", b: "Object", voxel_size: float) -> str:

@@ -164,8 +164,8 @@ def test_no_statement_brings_more_than_a_batch(
     brought: list[int] = []
     rows_of_object = SQLiteReader.rows_of
 
-    def counting(reader: SQLiteReader, *asked: Any) -> Any:  # noqa: ANN401
-        rows = rows_of_object(reader, *asked)
+    def counting(reader: SQLiteReader, *asked: Any, distances: bool = False) -> Any:  # noqa: ANN401
+        rows = rows_of_object(reader, *asked, distances=distances)
         brought.append(len(rows))
         return rows
 

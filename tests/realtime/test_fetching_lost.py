@@ -214,8 +214,8 @@ def test_a_table_goes_when_its_process_does_not_start(
     made: list[CellTable] = []
     create = CellTable.create
 
-    def noted(budget_bytes: int) -> CellTable:
-        made.append(create(budget_bytes))
+    def noted(budget_bytes: int, *, distances: bool) -> CellTable:
+        made.append(create(budget_bytes, distances=distances))
         return made[-1]
 
     def refuse(_: ResidentCells) -> Process:

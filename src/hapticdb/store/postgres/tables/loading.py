@@ -138,8 +138,8 @@ class Loading:
         return bool(found[0][0])
 
     def _is_empty(self) -> bool:
-        held = " UNION ALL ".join(f"(SELECT 1 FROM {table} LIMIT 1)" for table in self._tables)
-        return not self._connection.rows(f"{held} LIMIT 1")
+        held = " OR ".join(f"EXISTS (SELECT 1 FROM {table})" for table in self._tables)
+        return self._connection.rows(f"SELECT {held}") == [(False,)]
 
     def _drop_index(self) -> None:
         """Drop the indexes. If somebody is reading, they stay, and nobody waits."""

@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from hapticdb.query.law import DistanceField, TangentPlane
     from hapticdb.query.quantiles import QuantileVector
     from hapticdb.query.touches import Touch, Touches
-    from hapticdb.realtime.coupling import Coupling
+    from hapticdb.realtime.coupling import Coupling, DeviceCoupling
     from hapticdb.realtime.handle import Handle
     from hapticdb.realtime.report import Report
     from hapticdb.realtime.resident_cells import ResidentCells
@@ -73,6 +73,7 @@ __all__ = [
     "Coupling",
     "DamagedError",
     "DatabaseError",
+    "DeviceCoupling",
     "DeviceError",
     "Difference",
     "DistanceField",
@@ -150,7 +151,7 @@ _HOMES = {
     "poses": "read_poses write_poses",
     "proportions": "Proportions compare_proportions",
     "query.frame": "Query",
-    "realtime.coupling": "Coupling",
+    "realtime.coupling": "Coupling DeviceCoupling",
     "realtime.handle": "Handle",
     "recording.file": "Recording",
     "recording.replay": "Replayed replay",

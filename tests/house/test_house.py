@@ -64,6 +64,7 @@ PUBLIC = [
     "Coupling",
     "DamagedError",
     "DatabaseError",
+    "DeviceCoupling",
     "DeviceError",
     "Difference",
     "DistanceField",

@@ -7,10 +7,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 import hapticdb
+from closed_forms import field_of, plane
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.hand.anchors import MET_ROWS
 from hapticdb.kernels.records import MOST_MISSED, SERVO, pose_numbers, views_of
+from hapticdb.kernels.resident.cells import spread_key
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.resident.frames import clusters_of
@@ -53,6 +55,30 @@ class World:
         self.environment.close()
         self.table.close()
         self._folder.cleanup()
+
+
+class SmoothWorld:
+    """Cells of a `World`'s size with distances: full below z = 0."""
+
+    def __init__(self) -> None:
+        field = field_of(plane((0.0, 0.0, 1.0)), SIZE)
+        self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
+        self.table = CellTable.create(4 << 20, distances=True)
+        cells = self.table.cells
+        is_cell = field.cells.keys[0] >= 0
+        for key, slot in zip(
+            field.cells.keys[0, is_cell], field.cells.slots[0, is_cell], strict=True
+        ):
+            at = int(spread_key(key, np.int64(self.table.capacity)))
+            while cells.keys[0, at] >= 0:
+                at = (at + 1) % self.table.capacity
+            cells.keys[:, at], cells.slots[:, at] = key, slot
+        for name in ("words", "masks", "payload"):
+            filled = getattr(field.cells, name)
+            getattr(cells, name)[: len(filled)] = filled
+
+    def close(self) -> None:
+        self.table.close()
 
 
 class Tool:

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from devices.readings import FAULTS, FORMS, MOMENTS, Change
-from hapticdb import PointShell
+from hapticdb import PointShell, TangentPlane
 from hapticdb.devices.scripted import Device
 from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.kernels.hand import servo
@@ -70,7 +70,7 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
                 grid=cells.grid,
                 shell=sphere,
                 device=device,
-                stiffness=1000.0,
+                law=TangentPlane(),
                 coupling=Coupling(),
                 handle=Handle(),
                 timing=Timing(rate),
@@ -269,7 +269,9 @@ def test_a_frame_that_waits_lets_go_and_ends_with_the_session(
 
 
 def test_frames_in_which_the_tool_was_held_back_are_counted(run: Run) -> None:
-    assert run(stroking(-0.010, 0.5), seconds=0.6, stiffness=0.0).answer.counts.cut_frames > 0
+    assert (
+        run(stroking(-0.010, 0.5), seconds=0.6, law=TangentPlane(0.0)).answer.counts.cut_frames > 0
+    )
     assert run(still(0.03)).answer.counts.cut_frames == 0
 
 

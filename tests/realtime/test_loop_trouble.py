@@ -10,17 +10,21 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from hapticdb import TangentPlane
+from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.scripted import Reading
 from hapticdb.errors import DeviceError
 from hapticdb.kernels.hand import coupling as kernels
+from hapticdb.kernels.resident.cells import BUFFERS, VERSION, Cells
+from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime import loop as subject
-from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.coupling import Coupling, DeviceCoupling, SettledCoupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import WITHDRAWN_NS, Loop, LoopRequest, ring_bytes, work
 from hapticdb.realtime.processes import MessageSender
 from hapticdb.resident.table import HEARTBEAT, anonymous_memory
-from realtime.coupled import SIDE, World, punch
+from realtime.coupled import SIDE, SmoothWorld, World, punch
 from realtime.hands import at
 from realtime.worlds import block
 
@@ -47,19 +51,29 @@ class Pressing:
         self.sent.append(wrench.copy())
 
 
-@pytest.fixture
-def world(monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+@pytest.fixture(params=["plane", "smooth"])
+def world(
+    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[World | SmoothWorld]:
+    """A floor, felt by one coupling or the other."""
     monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
     monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no fetching process exists
     before = signal.getsignal(signal.SIGTERM)
-    made = World(FLOOR)
+    made = World(FLOOR) if request.param == "plane" else SmoothWorld()
     yield made
     made.close()
     signal.signal(signal.SIGTERM, before)
 
 
-def requested(world: World, hand: Pressing, **options: object) -> LoopRequest:
-    given: dict[str, object] = {"coupling": Coupling(), "is_waiting": True, "seconds": 1.0}
+def requested(world: World | SmoothWorld, hand: Pressing, **options: object) -> LoopRequest:
+    hold = float(str(options.pop("hold", 0.02)))
+    law: ForceLaw = TangentPlane()
+    coupling: Coupling | SettledCoupling = Coupling(hold=hold)
+    if isinstance(world, SmoothWorld):
+        law = DistanceField()
+        spring = DeviceCoupling(hold=hold, profile=SCRIPTED)
+        coupling = spring.settled(SCRIPTED, 200.0, 1.0, 0.01)
+    given: dict[str, object] = {"is_waiting": True, "seconds": 1.0}
     return LoopRequest(
         descriptor=world.table.descriptor,
         n_slots=world.table.n_slots,
@@ -69,7 +83,8 @@ def requested(world: World, hand: Pressing, **options: object) -> LoopRequest:
         grid=world.grid,
         shell=punch(6),
         device=hand,
-        stiffness=1000.0,
+        law=law,
+        coupling=coupling,
         handle=Handle(),
         timing=Timing(200.0),
         staleness=1e9,
@@ -86,7 +101,7 @@ def frame(loop: Loop, hand: Pressing, dt: float = 1e-3) -> Reading:
     return used
 
 
-def pressed(world: World, hand: Pressing, **options: object) -> Loop:
+def pressed(world: World | SmoothWorld, hand: Pressing, **options: object) -> Loop:
     """A loop whose tool was placed in the air and then pressed on the floor."""
     loop = Loop(requested(world, hand, **options))
     loop.warm_up()
@@ -107,10 +122,11 @@ class Summoning(Pressing):
         self.known: NDArray[np.int64] | None = None
         self.reads_left = 1 << 30
 
-    def take(self, keys: NDArray[np.int64]) -> None:
-        """Make all cells unknown."""
-        self.keys, self.known = keys, keys.copy()
-        keys[:] = -1
+    def take(self, cells: Cells) -> None:
+        """Make all cells unknown, in a new version of the same directory."""
+        self.keys, self.known = cells.keys, cells.keys.copy()
+        cells.keys[:] = -1
+        cells.control[VERSION] += BUFFERS
 
     def apply(self, wrench: Floats) -> None:
         super().apply(wrench)
@@ -125,12 +141,12 @@ class Summoning(Pressing):
         return super().read()
 
 
-def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World) -> None:
+def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World | SmoothWorld) -> None:
     """No frame raises the force by more than one share, even a frame as long as the wait."""
     hand = Summoning(0.02)
-    loop = pressed(world, hand, coupling=Coupling(hold=1e-3))
+    loop = pressed(world, hand, hold=1e-3)
     full, n_before = loop.sent.wrench[2], len(hand.sent)
-    hand.take(world.table.cells.keys)
+    hand.take(world.table.cells)
     frame(loop, hand)
     for dt in [0.3] + [1e-3] * 20:
         frame(loop, hand, dt)
@@ -141,11 +157,13 @@ def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World) -> 
     assert sent[-1] == pytest.approx(full, rel=0.01)
 
 
-def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(world: World) -> None:
+def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(
+    world: World | SmoothWorld,
+) -> None:
     """The frame returns the reading it used, and that reading is the one that is recorded."""
     hand = Summoning(0.02)
-    loop = pressed(world, hand, coupling=Coupling(hold=1e-3))
-    hand.take(world.table.cells.keys)
+    loop = pressed(world, hand, hold=1e-3)
+    hand.take(world.table.cells)
     used = frame(loop, hand)
     assert not loop.sent.unknown
     assert used.buttons == 2
@@ -153,7 +171,7 @@ def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(world: Wor
 
 
 def test_objects_are_no_longer_asked_for_once_the_tool_has_left_and_was_answered(
-    world: World,
+    world: World | SmoothWorld,
 ) -> None:
     hand = Pressing(0.02)
     loop = pressed(world, hand)
@@ -171,7 +189,7 @@ def test_objects_are_no_longer_asked_for_once_the_tool_has_left_and_was_answered
     assert asked == 0
 
 
-def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
+def test_a_loop_takes_back_what_it_asked_for(world: World | SmoothWorld) -> None:
     """A whole run: a hand leaves the floor while the database keeps answering."""
 
     class Leaving(Pressing):
@@ -180,20 +198,20 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
             world.table.cells.control[HEARTBEAT] = time.monotonic_ns() + 2 * WITHDRAWN_NS
             if wrench.any():
                 self.n_asked = int(world.table.desk.sessions["n_asked"].max())
-                self.z = 0.02 if len(self.sent) > 30 else self.z
+            self.z = -0.004 if 5 < len(self.sent) <= 30 else 0.02
 
         @property
         def is_over(self) -> bool:
             return len(self.sent) > 120
 
-    hand = Leaving(-0.004)
+    hand = Leaving(0.02)
     work(requested(world, hand, is_waiting=False, seconds=60.0), MessageSender(io.BytesIO()))
     assert hand.n_asked > 0
     assert not hand.sent[-1].any()
     assert not world.table.desk.sessions["n_asked"].any()
 
 
-def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:
+def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World | SmoothWorld) -> None:
     hand = Pressing(-0.004)
     loop = Loop(requested(world, hand))
     loop.warm_up()
@@ -209,7 +227,7 @@ def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> 
 
 @pytest.mark.parametrize("when", ["apply", "close"])
 def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
-    world: World, when: str
+    world: World | SmoothWorld, when: str
 ) -> None:
     class Ended(SystemExit):
         pass

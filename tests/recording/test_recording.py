@@ -3,6 +3,7 @@
 import json
 import struct
 import zlib
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +13,13 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hapticdb import FileError, PointShell, UsageError
+from hapticdb import DeviceCoupling, FileError, PointShell, TangentPlane, UsageError
+from hapticdb.devices.profiles import PROFILES
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.poses import rotation_of
+from hapticdb.query.law import DistanceField
 from hapticdb.recording.file import CHUNK, FRAME, Frames, Recorder, Recording, State
+from hapticdb.recording.header import FORMAT_VERSION, PREAMBLE
 from recordings import HEADER, header, motion, read, write
 
 repeatedly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
@@ -55,6 +59,29 @@ def test_the_header_returns(tmp_path: Path, sphere: PointShell) -> None:
     assert found.exclude == (2, 5)
     for name in ("points", "normals", "center"):
         assert getattr(found.shell, name).tobytes() == getattr(sphere, name).tobytes()
+
+
+def test_the_header_names_law_and_coupling(tmp_path: Path) -> None:
+    coupling = asdict(DeviceCoupling().settled(PROFILES["omni"], 1000.0, 2.0, 0.1))
+    given = header(law=DistanceField(800.0), coupling=coupling)
+    Recorder(tmp_path / "smooth.hdbrec", given).close()
+    found = Recording(tmp_path / "smooth.hdbrec").header
+    assert found.law == DistanceField(800.0)
+    assert found.coupling == coupling
+    assert found.differing(HEADER) == ["law", "coupling"]
+
+
+def test_only_recordings_under_the_smooth_law_need_the_second_version() -> None:
+    """Earlier releases read a recording under the plane, and refuse the other one."""
+
+    def version_of(content: bytes) -> int:
+        number: int = PREAMBLE.unpack(content[: PREAMBLE.size])[1]
+        return number
+
+    plane, smooth = (header(law=law(800.0)).packed() for law in (TangentPlane, DistanceField))
+    assert version_of(plane) == 1
+    assert b'"law"' not in plane  # as before there were two laws
+    assert version_of(smooth) == FORMAT_VERSION == 2
 
 
 def test_a_session_without_frames_is_a_recording(tmp_path: Path) -> None:

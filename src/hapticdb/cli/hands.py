@@ -7,6 +7,7 @@ from hapticdb.cli.values import numbers_of
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
+    from hapticdb.devices.profiles import DeviceProfile
     from hapticdb.devices.scripted import Device
 
 VENDORS = {
@@ -41,6 +42,8 @@ class HandOptions:
         --loop: a path begins again at its end.
     is_simulated : bool
         --simulate: the force moves the hand.
+    profile : DeviceProfile or None
+        --device-profile: what the device renders.
     """
 
     word: str
@@ -49,6 +52,7 @@ class HandOptions:
     seed: int
     loops: bool
     is_simulated: bool
+    profile: "DeviceProfile | None" = None
 
     def path_speed(self) -> float | None:
         """Speed, m/s, that is assumed for a path without times; None where none is assumed."""
@@ -71,10 +75,8 @@ class HandOptions:
         self._check()
         if self.word in VENDORS:
             return self._vendor_device()
-        from hapticdb.devices.simulated import SimulatedDevice
-
         hand = self._scripted(path_speed)
-        return SimulatedDevice(hand) if self.is_simulated else hand
+        return self._simulated(hand) if self.is_simulated else hand
 
     def _ends_with(self, suffix: str) -> bool:
         return self.word.lower().endswith(suffix)
@@ -106,8 +108,19 @@ class HandOptions:
         from importlib import import_module
 
         module, name = VENDORS[self.word]
-        device: Device = getattr(import_module(module), name)()
+        given = {} if self.profile is None else {"profile": self.profile}
+        device: Device = getattr(import_module(module), name)(**given)
         return device
+
+    def _simulated(self, hand: "Device") -> "Device":
+        """Device that a hand holds, with cap and mass of the profile."""
+        from hapticdb.devices.simulated import SimulatedDevice
+
+        if self.profile is None:
+            return SimulatedDevice(hand)
+        if self.profile.mass is None:
+            return SimulatedDevice(hand, max_force=self.profile.cap)
+        return SimulatedDevice(hand, max_force=self.profile.cap, mass=self.profile.mass)
 
     def _scripted(self, path_speed: float | None) -> "Device":
         """The hand that a motion moves."""

@@ -8,6 +8,7 @@ from hapticdb.cli import render
 
 if TYPE_CHECKING:
     from hapticdb.cli.columns import Columns
+    from hapticdb.realtime.coupling import SettledCoupling
     from hapticdb.realtime.report import Report, Spread
     from hapticdb.realtime.resident_cells import ResidentCells
 
@@ -32,9 +33,8 @@ def show(
         Speed assumed for a path without times, m/s.
     """
     render.show(_loop_table(report))
-    facts = [*_frame_facts(report), *_cell_facts(report)]
+    facts = [*_frame_facts(report), *force_facts(report), *_cell_facts(report)]
     facts.append(("warm start", f"{1e3 * report.warm_up:.3g} ms" + _cold_clause(report)))
-    facts.append(("peak", _peak_text(report)))
     facts.append(("objects", _object_names(report, cells)))
     facts += _exceptional_facts(report)
     if path_speed is not None:
@@ -84,6 +84,39 @@ def _frame_facts(report: "Report") -> Facts:
     return [("touching", touching), ("not known", unknown), ("force held", held)]
 
 
+def force_facts(report: "Report") -> Facts:
+    """Law and coupling, the greatest force, and what was done to keep it stable."""
+    from hapticdb.realtime.coupling import SettledCoupling
+
+    spring = report.coupling
+    if not isinstance(spring, SettledCoupling):
+        return [("force law", "plane: tangent planes of voxels"), ("peak", _peak_text(report))]
+    facts: Facts = [
+        ("force law", "smooth: distances to surfaces"),
+        ("stiffness", f"{spring.stiffness:.4g} N/m at the device{_lowered_clause(spring)}"),
+        (
+            "at most",
+            (
+                f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m; damping {spring.damping:.3g} "
+                f"N s/m (profile {spring.profile}, {1e3 * spring.delay:.3g} ms of delay)"
+            ),
+        ),
+        ("peak", _peak_text(report)),
+    ]
+    if report.guard_actions:
+        times = render.counted(report.guard_actions, "time")
+        left = f"to {100.0 * report.least_share:.0f} %"
+        facts.append(("guard", f"the force went back and forth: stiffness lowered {times}, {left}"))
+    if report.loose_frames:
+        held = render.counted(report.loose_frames, "frame")
+        facts.append(("in something", f"{held} in which the tool lay in an object: no force"))
+    return facts
+
+
+def _lowered_clause(spring: "SettledCoupling") -> str:
+    return "" if spring.lowered is None else f"; {spring.lowered}"
+
+
 def _cell_facts(report: "Report") -> Facts:
     """Cells in memory, and what it cost to fetch them."""
     cache = report.cache
@@ -121,8 +154,8 @@ def _cold_clause(report: "Report") -> str:
 
 def _peak_text(report: "Report") -> str:
     return (
-        f"{report.peak_force:.4g} N, {report.peak_torque:.4g} N m, "
-        f"{render.metres(report.deepest)} deep"
+        f"{report.peak_force:.4g} N, {report.peak_torque:.4g} N m at the device; "
+        f"deepest contact {render.metres(report.deepest)}"
     )
 
 

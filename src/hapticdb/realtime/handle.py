@@ -32,7 +32,8 @@ class Handle:
     Parameters
     ----------
     scale : float
-        Metres of the scene for one metre of the device; turns are not scaled, nor are wrenches.
+        S, metres of the scene for one metre of the device. Turns and forces are not scaled; a
+        torque at the device is the scene's over S, and stiffness is the device's at every scale.
     start : array_like or None
         Pose (4, 4) or point (3,) of the handle at the start, scene metres. None: the hand's pose,
         its position scaled.

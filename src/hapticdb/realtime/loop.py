@@ -26,15 +26,16 @@ from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.kernels._jit import ENTRIES
 from hapticdb.kernels.hand import coupling as kernels
-from hapticdb.kernels.hand import servo
-from hapticdb.kernels.hand.anchors import BEFORE, MET_ROWS
+from hapticdb.kernels.hand import quasistatic, servo
 from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.records import FRAME, MOST_MISSED, SERVO, TOLD, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import Place
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.realtime.coupling import Coupling
+from hapticdb.query.law import ForceLaw
+from hapticdb.realtime.coupling import Coupling, SettledCoupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
+from hapticdb.realtime.drive import PlaneDrive, SmoothDrive
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
@@ -56,6 +57,8 @@ LOOK_EVERY = 0.25
 WITHDRAWN_NS = 250_000_000
 """Nanoseconds. The loop withdraws its request for ids once the database has answered this much
 later: by then the objects are named, and the process that began the session has read them."""
+SMOOTH_FLAGS = quasistatic.IS_LOOSE | quasistatic.IS_SOFTER | quasistatic.IS_SNAPPING
+"""Flags that only the quasi-static coupling has."""
 WARM_PATIENCE = 30.0
 """Greatest time (s) that the loop waits for its first cells and for a device's first valid pose."""
 
@@ -72,14 +75,15 @@ class LoopRequest:
     grid: Grid
     shell: PointShell
     device: Device
-    stiffness: float
-    coupling: Coupling
+    law: ForceLaw
+    coupling: Coupling | SettledCoupling
     handle: Handle
     timing: Timing
     seconds: float
     staleness: float
     is_waiting: bool
     has_baseline: bool = True
+    is_recorded: bool = True
 
 
 class Loop:
@@ -96,21 +100,20 @@ class Loop:
         self.device = request.device
         self.reader = Reader(request.device)
         self.table = CellTable(request.descriptor, request.n_slots)
-        self.cells = self.table.cells
+        self.cells, self.row = self.table.cells, request.row
         grid = request.grid
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
         self.clusters = clusters_of(request.shell, grid.voxel_size)
-        self.body = request.coupling.body(request.shell, self.place, request.stiffness)
         self.servo = np.zeros((), SERVO)
         self.tool, self.hand = self.servo["tool"], self.servo["hand"]
         self.sent = views_of(self.servo["sent"])
         self._hand_position = self.hand["position"]
         self._tool_pose = pose_numbers(self.tool)[None]
-        self.met = np.empty((MET_ROWS, len(request.shell)), dtype=np.int64)
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self.told = np.zeros((), TOLD)
         self.pose = np.eye(4)
         self._pose = self.pose[None]
+        self.drive = self._make_drive()
         self.ring = ring_of(request.ring, request.n_ring)
         self.session = self.table.desk.sessions[request.row, ...]
         self._n_frames, self._is_asked_to_end = (
@@ -121,6 +124,14 @@ class Loop:
         self.is_warm = False
         self._asked_at = 0  # ns; 0 without a request
         self.lateness, self.elapsed = Times(), Times()
+
+    def _make_drive(self) -> PlaneDrive | SmoothDrive:
+        request, coupling = self.request, self.request.coupling
+        if isinstance(coupling, SettledCoupling):
+            return SmoothDrive(self, coupling.spring(), request.law)
+        scale = request.handle.scale
+        body = coupling.body(request.shell, self.place, request.law.stiffness, scale)
+        return PlaneDrive(self, body, scale)
 
     # -- before the first frame --------------------------------------------------------------
 
@@ -178,6 +189,7 @@ class Loop:
                 self.request.handle.follow(reading._replace(buttons=buttons), self.hand)
             self._step(1e-3, is_stale=False)
             self._ask(0)
+            self.drive.feel()  # `_note` leaves it out while cells are unknown
             self._note(at, 0.0, 0.0, 0.0, 0.0, 0, 0)
             self._tell()
         self.session["told"]["is_active"] = False
@@ -188,10 +200,7 @@ class Loop:
     def _step(self, dt: float, *, is_stale: bool) -> None:
         """Advance the tool by a period `dt` (s); `sent` then has the wrench for the device."""
         self.hand["is_stale"] = is_stale
-        kernels.advance(
-            self.cells, self.request.row, self.clusters, self.place, self.body, self.servo, dt,
-            self.met, self.missed,
-        )  # fmt: skip
+        self.drive.step(dt)
 
     def _step_exactly(self, reading: Reading, dt: float, ends: int) -> Reading:
         """Advance by a period `dt` (s) once all cells that it needs are resident.
@@ -203,15 +212,14 @@ class Loop:
         clock = time.perf_counter_ns
         holds = clock() + round(min(self.request.coupling.hold, 1e9) * 1e9)
         is_let_go = False
-        before, met, sent = self.tool.copy(), self.met.copy(), self.sent
+        sent = self.sent
+        self.drive.remember()
         self._step(dt, is_stale=False)
         while sent.unknown and clock() < ends and not self._is_left():
             if not is_let_go and clock() > holds:
                 self.device.apply(np.zeros(6))
                 is_let_go = True
-                before["risen"] = 0.0  # the force rises again from zero
-            self.tool[()] = before
-            self.met[:] = met
+            self.drive.step_back(from_zero=is_let_go)
             self._tell()
             time.sleep(2e-4)
             if is_let_go:
@@ -230,17 +238,14 @@ class Loop:
         told["tool"] = self.pose[:3, :3] @ center + self.pose[:3, 3]
         told["handle"] = self._hand_position + self.pose[:3, :3] @ center
         told["velocity"] = self.hand["velocity"][:3]
-        told["radius"] = self.body.radius
+        told["radius"] = self.drive.radius
         servo.tell(self.session, told, self.missed)
 
     def _ask(self, n_hits: int) -> None:
         """Request the ids of the objects at the last frame's hits."""
         grid = self.request.grid
         poses_of(self._tool_pose, self._pose)
-        servo.name_voxels(
-            self.session, self.clusters, self.pose, self.place, grid.bits, grid.curve_code,
-            self.met[BEFORE], n_hits,
-        )  # fmt: skip
+        self.drive.ask(self.session, grid.bits, grid.curve_code, n_hits)
 
     def _ask_or_withdraw(self, now: int) -> None:
         """Request the ids at the last frame's hits; without hits, withdraw the last request.
@@ -265,6 +270,9 @@ class Loop:
         buttons: int,
         state: int,
     ) -> None:
+        if self.request.is_recorded and not self.sent.flags.item() & kernels.IS_HELD:
+            poses_of(self._tool_pose, self._pose)
+            self.drive.feel()
         servo.note(self.ring, at, begun, dt, lateness, elapsed, self.servo, buttons, state)
 
     def _is_stopped(self) -> bool:
@@ -322,6 +330,7 @@ class Loop:
                 break
         device.apply(np.zeros(6))
         self.counts.frames = deadlines.frames
+        self.counts.least_share = self.drive.least_share
         return deadlines.figures()
 
     def _count(self, is_clutch_open: bool, is_stale: bool) -> int:  # noqa: FBT001 - of a frame
@@ -330,11 +339,12 @@ class Loop:
         flags = sent.flags.item()
         state = State(0)
         counts.substeps += sent.n_steps.item()
-        if sent.hits:
-            counts.hit_frames += 1
+        if sent.hits or flags:
             wrench = sent.wrench.tolist()  # plain floats: a tenth of the time
             counts.peak_force = max(counts.peak_force, math.hypot(*wrench[:3]))
             counts.peak_torque = max(counts.peak_torque, math.hypot(*wrench[3:]))
+        if sent.hits:
+            counts.hit_frames += 1
             if sent.contacts:
                 counts.contact_frames += 1
                 counts.deepest = max(counts.deepest, sent.deepest.item())
@@ -351,6 +361,10 @@ class Loop:
                 counts.dropped_frames += 1
         if flags & (kernels.IS_CUT | kernels.IS_STOPPED):
             counts.cut_frames += 1
+        if flags & SMOOTH_FLAGS:
+            counts.loose_frames += bool(flags & quasistatic.IS_LOOSE)
+            counts.snapping_frames += bool(flags & quasistatic.IS_SNAPPING)
+            counts.guard_actions += bool(flags & quasistatic.IS_SOFTER)
         if is_stale:
             counts.stale_frames += 1
         if math.isnan(self._hand_position[0]):

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.proportions import Proportions
+from hapticdb.realtime.coupling import Coupling, SettledCoupling
 from hapticdb.realtime.resident_cells import CacheFigures
 
 BINS = 200_000
@@ -91,6 +92,10 @@ class Counts:
     peak_force: float = 0.0
     peak_torque: float = 0.0
     deepest: float = 0.0
+    loose_frames: int = 0
+    snapping_frames: int = 0
+    guard_actions: int = 0
+    least_share: float = 1.0
     conditions: dict[str, str] = field(default_factory=dict)
 
 
@@ -131,8 +136,22 @@ class Report:
         Frames with an invalid reading: numbers not finite or too large, or no rotation.
     bad_reading : str or None
         One line on the first invalid reading: the device, what it returned, what was expected.
-    peak_force, peak_torque, deepest : float
-        Greatest norms sent to the device, N and N m; deepest contact, metres.
+    peak_force, peak_torque : float
+        Greatest norms sent to the device, N and N m.
+    deepest : float
+        Deepest contact, metres: below the tangent plane, or, with distances, within the distance at
+        which contact begins.
+    law : str
+        The force law: "plane" or "smooth".
+    coupling : Coupling or SettledCoupling or None
+        The coupling between hand and tool, with what lowered its stiffness.
+    loose_frames, snapping_frames : int
+        With distances. Frames in which the tool lay in something and felt nothing; frames in which
+        the fall of the force was softened, as when the tool snaps off an edge.
+    guard_actions : int
+        How often the guard lowered the stiffness because the force went back and forth.
+    least_share : float
+        Share of the stiffness that the guard left.
     warm_up : float
         Seconds until all wanted cells were resident, before the first frame; after
         `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
@@ -178,6 +197,12 @@ class Report:
     proportions: Proportions | None = None
     nowhere_frames: int = 0
     bad_reading: str | None = None
+    law: str = "plane"
+    coupling: Coupling | SettledCoupling | None = None
+    loose_frames: int = 0
+    snapping_frames: int = 0
+    guard_actions: int = 0
+    least_share: float = 1.0
     conditions: dict[str, str] = field(default_factory=dict)
 
     @property

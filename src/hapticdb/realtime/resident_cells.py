@@ -76,9 +76,9 @@ class ResidentCells:
         Memory for cells, never exceeded; 1 MiB at least.
     exclude : iterable of int
         Ids of objects that are left out of the force.
-    distances : bool
+    distances : bool or None
         Whether the cells have distances to surfaces, for the smooth law: a tenth as many cells fit
-        then. Every object must have distances.
+        then. Every object that is not excluded must have distances. None: where they have them.
     wrap : callable or None
         Takes the fetching process's store and returns the store to use; importable. For tests.
 
@@ -100,14 +100,14 @@ class ResidentCells:
         *,
         budget_bytes: int = DEFAULT_BUDGET,
         exclude: Iterable[int] = (),
-        distances: bool = False,
+        distances: bool | None = None,
         wrap: Wrap | None = None,
     ) -> None:
         self.url = url
         self.exclude: tuple[int, ...] = tuple(as_ids(exclude).tolist())
-        self.grid = self._read_environment(distances=distances)
+        self.grid, has_distances = self._read_environment(distances)
         compile_missing(entries_for("resident"))  # now: two processes would each compile them
-        self.table = CellTable.create(budget_bytes, distances=distances)
+        self.table = CellTable.create(budget_bytes, distances=has_distances)
         self.restarts = 0
         self._request = FetchRequest(
             url, self.table.descriptor, self.table.n_slots, self.grid, self.exclude, wrap
@@ -122,8 +122,16 @@ class ResidentCells:
         self._supervising = threading.Lock()
         self._pid = os.getpid()
 
-    def _read_environment(self, *, distances: bool) -> Grid:
-        """Grid of the environment, after a check of its curve and of its objects."""
+    @property
+    def has_distances(self) -> bool:
+        """Whether the cells have distances to surfaces."""
+        return self.table.has_distances
+
+    def _read_environment(
+        self,
+        distances: bool | None,  # noqa: FBT001 - as it was asked for
+    ) -> tuple[Grid, bool]:
+        """Check curve and objects; returns the grid and whether the cells have distances."""
         store = open_store(self.url, read_only=True)
         try:
             check_cells(store)
@@ -132,7 +140,9 @@ class ResidentCells:
                 store.object(object_id)
             if distances:
                 check_distances(store, as_ids(self.exclude))
-            return store.grid
+            felt = [obj for obj in self.first_objects if obj.id not in self.exclude]
+            has_all = bool(felt) and all(obj.has_distances for obj in felt)
+            return store.grid, has_all if distances is None else distances
         finally:
             store.close()
 

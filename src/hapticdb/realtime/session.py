@@ -7,13 +7,21 @@ from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from typing import Literal, Self, get_args
 
+from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
-from hapticdb.query.law import TangentPlane
-from hapticdb.realtime.coupling import Coupling
+from hapticdb.query.choosing import chosen_law, is_smooth
+from hapticdb.query.law import ForceLaw, LawName
+from hapticdb.realtime.coupling import (
+    Coupling,
+    DeviceCoupling,
+    SettledCoupling,
+    coupling_for,
+    radius_of,
+)
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.hand_path import path_of_hand
 from hapticdb.realtime.handle import Handle
@@ -62,10 +70,12 @@ class Session:
         Frames a second, 10 to 20,000.
     seconds : float or None
         Duration; None: until the device's script ends or `stop` is called.
-    law : TangentPlane or None
-        Force law of the contacts; 1000 N/m unless given.
-    coupling : Coupling or None
-        Coupling between hand and tool.
+    law : {"plane", "smooth"}, ForceLaw or None
+        Force law of the contacts. None: the smooth law where the environment has distances to
+        surfaces and `coupling` is no `Coupling`, else the tangent plane.
+    coupling : DeviceCoupling, Coupling or None
+        Coupling between hand and tool: a `DeviceCoupling` for the smooth law, a `Coupling` for the
+        tangent plane. Its stiffness is lowered to what the device holds: see `coupling.lowered`.
     handle : Handle or None
         Mapping of the hand to the scene: scale and clutch.
     policy : {"hold", "wait"}
@@ -114,8 +124,8 @@ class Session:
         *,
         rate: float = 1000.0,
         seconds: float | None = None,
-        law: TangentPlane | None = None,
-        coupling: Coupling | None = None,
+        law: ForceLaw | LawName | None = None,
+        coupling: DeviceCoupling | Coupling | None = None,
         handle: Handle | None = None,
         policy: Policy = "hold",
         staleness: float = DEFAULT_STALENESS,
@@ -131,14 +141,18 @@ class Session:
     ) -> None:
         check_device(device)
         _check_choices(rate, seconds, staleness, policy)
-        self.shell, self.law = shell, law or TangentPlane()
-        self.coupling = coupling or Coupling()
-        self.handle = handle or Handle()
+        self.shell, self.handle = shell, handle or Handle()
         self.timing = Timing(rate, is_fifo, processor)
         self.timing.check_granted()
         self._has_baseline = has_baseline
         self._owns_cells = isinstance(cells, str)
-        self.cells = _cells_of(cells, budget_bytes, exclude)
+        if law is None and isinstance(coupling, Coupling):
+            law = "plane"
+        needs_distances = None if law is None else is_smooth(law)
+        self.cells = _cells_of(cells, budget_bytes, exclude, needs_distances)
+        self.law = chosen_law(law, has_distances=self.cells.has_distances)
+        self._check_distances()
+        self.coupling = self._settled(coupling, device)
         self.proportions = self._compared(device)
         self._pid = os.getpid()
         self._row = self._memory = -1
@@ -161,6 +175,25 @@ class Session:
                     self._recording.remove_new_file()
             raise
 
+    def _check_distances(self) -> None:
+        if is_smooth(self.law) and not self.cells.has_distances:
+            raise UsageError(
+                "the smooth law needs cells with distances to surfaces, and these have none: make "
+                "ResidentCells(..., distances=True), or give law='plane'"
+            )
+
+    def _settled(
+        self, coupling: DeviceCoupling | Coupling | None, device: Device
+    ) -> Coupling | SettledCoupling:
+        """Coupling for the session's law, with all its numbers."""
+        chosen = coupling_for(coupling, smooth=is_smooth(self.law))
+        if isinstance(chosen, Coupling):
+            return chosen
+        return chosen.settled(
+            profile_of(device), self.timing.rate, self.handle.scale,
+            radius_of(self.shell, self.cells.grid.voxel_size),
+        )  # fmt: skip
+
     def _compared(self, device: Device) -> Proportions:
         poses, sway = path_of_hand(device, self.handle)
         cells = self.cells
@@ -176,7 +209,8 @@ class Session:
         staleness: float,
         seconds: float | None,
     ) -> None:
-        compile_missing(entries_for("feel"))  # here, so that the loop does not compile
+        # here, so that the loop does not compile; a recording has the law's frames, as a replay
+        compile_missing([*entries_for("feel"), "resident.feeling.feel_kernel"])
         table = self.cells.table
         if self._recording is not None:
             self._recording.begin(self._header())
@@ -193,7 +227,7 @@ class Session:
             grid=self.cells.grid,
             shell=replace(self.shell, surface=None),
             device=device,
-            stiffness=self.law.stiffness,
+            law=self.law,
             coupling=self.coupling,
             handle=self.handle,
             timing=self.timing,
@@ -201,6 +235,7 @@ class Session:
             staleness=staleness,
             is_waiting=policy == "wait",
             has_baseline=self._has_baseline,
+            is_recorded=self._recording is not None,
         )
         self._process = Process(
             "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory]
@@ -326,6 +361,8 @@ class Session:
             recording_ended=self.recording_ended,
             lost_records=0 if recording is None else recording.n_lost,
             proportions=self.proportions,
+            law="smooth" if is_smooth(self.law) else "plane",
+            coupling=self.coupling,
             conditions={"points": str(len(self.shell)), **conditions},
             **counts,
         )
@@ -361,12 +398,15 @@ class Session:
 
 
 def _cells_of(
-    cells: ResidentCells | str, budget_bytes: int | None, exclude: Iterable[int]
+    cells: ResidentCells | str,
+    budget_bytes: int | None,
+    exclude: Iterable[int],
+    distances: bool | None,  # noqa: FBT001 - as of ResidentCells
 ) -> ResidentCells:
     """Return the given resident cells, or make new ones for the environment at a URL."""
     if isinstance(cells, str):
         budget_bytes = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
-        return ResidentCells(cells, budget_bytes=budget_bytes, exclude=exclude)
+        return ResidentCells(cells, budget_bytes=budget_bytes, exclude=exclude, distances=distances)
     if budget_bytes is not None or tuple(exclude):
         raise UsageError("these cells have a budget and exclusions already: give a URL instead")
     if cells.is_closed:

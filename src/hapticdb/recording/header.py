@@ -18,14 +18,18 @@ import numpy as np
 from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell
+from hapticdb.query.choosing import law_named
 from hapticdb.query.frame import as_ids
-from hapticdb.query.law import TangentPlane
+from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.store.connect import redact
 
 MAGIC = b"HDBREC\r\n"
 """First bytes of each recording."""
-FORMAT_VERSION = 1
-"""Version of the format that is written; files of later versions are refused."""
+FORMAT_VERSION = 2
+"""Newest version of the format; files of later versions are refused. A recording under the tangent
+plane is written as version 1, which earlier releases read; under another law as version 2."""
+PLANE_VERSION = 1
+"""Version of recordings under the tangent plane: their header names no law."""
 PREAMBLE = struct.Struct("<8sIIII")
 """First fields of a header: magic, format version, bytes of JSON, points, CRC-32 of the header."""
 MOST_TEXT = 1 << 24
@@ -52,8 +56,8 @@ class Header:
         Revision of the environment when the session began.
     shell : PointShell
         The tool.
-    law : TangentPlane
-        The force law.
+    law : ForceLaw
+        The force law of the recorded wrenches.
     rate : float
         Frames a second that the session was set to.
     exclude : iterable of int
@@ -76,7 +80,7 @@ class Header:
     revision: int
     shell: PointShell
     rate: float
-    law: TangentPlane = field(default_factory=TangentPlane)
+    law: ForceLaw = field(default_factory=TangentPlane)
     exclude: Iterable[int] = ()
     coupling: Mapping[str, Value] = field(default_factory=dict)
     version: str = field(default_factory=lambda: version("hapticdb"))
@@ -114,9 +118,10 @@ class Header:
         UsageError
             If the JSON text is longer than `MOST_TEXT`.
         """
-        shell = self.shell
+        shell, is_plane = self.shell, isinstance(self.law, TangentPlane)
         text = json.dumps(
-            {
+            ({} if is_plane else {"law": "smooth"})
+            | {
                 "environment": self.environment,
                 "grid": asdict(self.grid),
                 "revision": self.revision,
@@ -132,7 +137,8 @@ class Header:
         if len(text) > MOST_TEXT:
             raise UsageError(f"a recording's header of {len(text)} bytes: exclude fewer objects")
         body = text + _arrays(self.shell)
-        counts = PREAMBLE.pack(MAGIC, FORMAT_VERSION, len(text), len(shell), 0)[:-4]
+        number = PLANE_VERSION if is_plane else FORMAT_VERSION
+        counts = PREAMBLE.pack(MAGIC, number, len(text), len(shell), 0)[:-4]
         return counts + struct.pack("<I", zlib.crc32(body, zlib.crc32(counts))) + body
 
     @classmethod
@@ -185,7 +191,7 @@ class Header:
                     index(made["seed"]),
                 ),
                 rate=told["rate"],
-                law=TangentPlane(told["stiffness"]),
+                law=law_named(told.get("law", "plane"), told["stiffness"]),
                 exclude=told["exclude"],
                 coupling=told["coupling"],
                 version=str(told["version"]),

@@ -12,7 +12,8 @@ from hapticdb.environment import Environment
 from hapticdb.errors import GridError
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import TangentPlane
+from hapticdb.query.choosing import is_smooth
+from hapticdb.query.law import ForceLaw
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.frames import ResidentFrames
@@ -98,7 +99,7 @@ class Replayed:
 
 
 def touching(
-    environment: Environment, shell: PointShell, law: TangentPlane, exclude: Iterable[int] = ()
+    environment: Environment, shell: PointShell, law: ForceLaw, exclude: Iterable[int] = ()
 ) -> Feel:
     """Return a function that queries the database for each pose: no resident cells, slow."""
     excluded = _present(environment, exclude)
@@ -118,7 +119,7 @@ def touching(
 
 @contextmanager
 def resident(
-    environment: Environment, shell: PointShell, law: TangentPlane, exclude: Iterable[int] = ()
+    environment: Environment, shell: PointShell, law: ForceLaw, exclude: Iterable[int] = ()
 ) -> Iterator[Feel]:
     """Provide a function that uses resident cells, fetched before their use: as fast as a session.
 
@@ -127,9 +128,10 @@ def resident(
     Raises
     ------
     UsageError
-        If the environment is in lexicographic order, which has no cells.
+        If the environment is in lexicographic order, which has no cells, or if the law is by
+        distances and an object has none.
     """
-    with CellTable.create() as table:
+    with CellTable.create(distances=is_smooth(law)) as table:
         residency = Residency(environment.store, table, _present(environment, exclude))
         frames = ResidentFrames(residency, shell, law)
         try:

@@ -9,13 +9,14 @@ import typer
 
 from hapticdb.cli import fitting, render, session_page
 from hapticdb.cli.choosing import ids_of
+from hapticdb.cli.forces import ForceOptions
 from hapticdb.cli.hands import VENDORS, HandOptions
 from hapticdb.cli.options import (
     BudgetOption,
     ExcludeOption,
     JsonOption,
+    LawOption,
     PointsOption,
-    StiffnessOption,
     ToolOption,
     ToolUnitOption,
     UrlArgument,
@@ -27,7 +28,9 @@ from hapticdb.errors import UsageError
 from hapticdb.interrupting import interrupt
 
 if TYPE_CHECKING:
+    from hapticdb.pointshell.shell import PointShell
     from hapticdb.realtime.report import Report
+    from hapticdb.realtime.resident_cells import ResidentCells
     from hapticdb.realtime.session import Session
 
 PolicyName = Literal["hold", "wait"]
@@ -101,6 +104,36 @@ StalenessOption = Annotated[
         metavar="S", help="Seconds without an answer of the database, after which the force falls."
     ),
 ]
+DeviceStiffnessOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="N/M",
+        help="Stiffness that the hand feels; lowered to what the device holds without trembling. "
+        "Under the law plane: of a contact.",
+        show_default="the device's, or 1000",
+    ),
+]
+ProfileOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="What the device renders: touch, omni, desktop, premium-1.5, falcon, omega, delta or "
+        "sigma.7.",
+        show_default="the device's own",
+    ),
+]
+CapOption = Annotated[
+    float | None,
+    typer.Option(metavar="N", help="Greatest force.", show_default="the device's"),
+]
+DelayOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MS",
+        help="Milliseconds from reading the hand's place until its force acts.",
+        show_default="the device's, or one period",
+    ),
+]
 HandSeedOption = Annotated[
     int | None,
     typer.Option(
@@ -140,7 +173,11 @@ def feel(
     budget: BudgetOption = 256.0,
     policy: PolicyOption = "hold",
     staleness: StalenessOption = 1.0,
-    stiffness: StiffnessOption = 1000.0,
+    law: LawOption = None,
+    stiffness: DeviceStiffnessOption = None,
+    device_profile: ProfileOption = None,
+    cap: CapOption = None,
+    delay: DelayOption = None,
     tool_unit: ToolUnitOption = None,
     points: PointsOption = None,
     seed: HandSeedOption = None,
@@ -153,32 +190,51 @@ def feel(
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
-    from hapticdb import Handle, ResidentCells, Session, TangentPlane
+    from hapticdb import Handle, Session
 
-    law, n_bytes = TangentPlane(stiffness), budget_bytes(budget)
+    n_bytes, force = budget_bytes(budget), ForceOptions(law, stiffness, device_profile, cap, delay)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
     _check_loop(processor, policy, device)
-    hand_options = HandOptions(device, speed, at, seed or 0, loops=loop, is_simulated=simulate)
-    path_speed = hand_options.path_speed()
-    hand, handle = hand_options.open(path_speed), Handle(scale=scale, clutch=clutch)
+    motion = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
+    path_speed = motion.path_speed()
+    hand, handle = motion.open(path_speed), Handle(scale=scale, clutch=clutch)
     excluded = _excluded_ids(url, exclude)
+    shell = _compiled_shell(tool, tool_unit, points, seed, device)
+    with force.cells(url, n_bytes, excluded) as cells:
+        session = Session(
+            cells, shell, hand, rate=rate, seconds=seconds, **force.law_and_coupling(cells),
+            handle=handle, policy=policy, staleness=staleness, record=record,
+            append_recording=append, replace_recording=replace, record_limit_bytes=limit_bytes,
+            is_fifo=fifo, processor=processor, has_baseline=not no_baseline,
+        )  # fmt: skip
+        force.tell_lowered(session)
+        report, signals = _run(session, tool)
+        _show(report, cells, record, path_speed, json=json)
+    _exit_after(signals, report)
+
+
+def _compiled_shell(
+    tool: str, unit: str | None, points: int | None, seed: int | None, device: str
+) -> "PointShell":
+    """Compile the kernels and make the tool's shell."""
     render.compile_kernels("feel", files=[tool])
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
-    shell = shell_of(tool, tool_unit, points, None if is_for_hand_alone else seed)
-    with ResidentCells(url, budget_bytes=n_bytes, exclude=excluded) as cells:
-        session = Session(
-            cells, shell, hand, rate=rate, seconds=seconds, law=law, handle=handle, policy=policy,
-            staleness=staleness, record=record, append_recording=append,
-            replace_recording=replace, record_limit_bytes=limit_bytes, is_fifo=fifo,
-            processor=processor, has_baseline=not no_baseline,
-        )  # fmt: skip
-        report, signals = _run(session, tool)
-        if json:
-            render.say_json(report.figures() | {"path_speed": path_speed})
-        else:
-            session_page.show(report, cells, record, path_speed)
-    _exit_after(signals, report)
+    return shell_of(tool, unit, points, None if is_for_hand_alone else seed)
+
+
+def _show(
+    report: "Report",
+    cells: "ResidentCells",
+    record: str | None,
+    path_speed: float | None,
+    *,
+    json: bool,
+) -> None:
+    if json:
+        render.say_json(report.figures() | {"path_speed": path_speed})
+    else:
+        session_page.show(report, cells, record, path_speed)
 
 
 def _recording_limit(record: str | None, limit: str | None, *, is_continued: bool) -> int:

@@ -1,0 +1,116 @@
+"""The numbers of a device's coupling, and that they are the device's at every scale."""
+
+import math
+from dataclasses import asdict, replace
+
+import numpy as np
+import pytest
+
+from hapticdb import PointShell, UsageError
+from hapticdb.devices.profiles import PROFILES, SCRIPTED, DeviceProfile
+from hapticdb.devices.stability import allow
+from hapticdb.kernels.resident.cells import Place
+from hapticdb.realtime.coupling import (
+    Coupling,
+    DeviceCoupling,
+    coupling_for,
+    radius_of,
+)
+
+OMNI = PROFILES["omni"]
+
+
+def test_the_numbers_are_the_device_s_unless_they_are_given() -> None:
+    found = DeviceCoupling().settled(OMNI, 10_000.0, 1.0, 0.1)
+    assert (found.profile, found.stiffness, found.cap) == ("omni", 700.0, 3.3)
+    # K (T / 2 + t_d), with a delay of one period
+    assert found.damping == pytest.approx(700.0 * 1.5e-4)
+    assert found.turn_stiffness == pytest.approx(700.0 * 0.1**2)
+    assert found.torque_cap == pytest.approx(0.33)
+    assert found.lowered is None
+    given = DeviceCoupling(
+        stiffness=500.0, cap=2.0, turn_stiffness=0.3, torque_cap=0.1, damping=1.0, delay=1e-4
+    ).settled(OMNI, 10_000.0, 1.0, 0.1)
+    assert (given.stiffness, given.cap, given.turn_stiffness) == (500.0, 2.0, 0.3)
+    assert (given.torque_cap, given.damping, given.delay) == (0.1, 1.0, 1e-4)
+
+
+def test_a_profile_that_is_given_takes_the_place_of_the_device_s() -> None:
+    found = DeviceCoupling(profile=PROFILES["delta"]).settled(OMNI, 20_000.0, 1.0, 0.1)
+    assert (found.profile, found.cap) == ("delta", 20.0)
+    known = DeviceProfile("mine", 5.0, 600.0, 2.0, torque_cap=0.3, turn_stiffness=4.0)
+    found = DeviceCoupling(profile=known).settled(OMNI, 20_000.0, 1.0, 0.1)
+    assert (found.torque_cap, found.turn_stiffness) == (0.3, 4.0)
+
+
+def test_the_stiffness_is_lowered_to_what_stays_stable_and_the_line_says_so() -> None:
+    found = DeviceCoupling(stiffness=650.0).settled(OMNI, 1000.0, 1.0, 0.1)
+    allowed = allow(OMNI, 1000.0, 650.0)
+    assert found.stiffness == allowed.stiffness < 650.0
+    assert found.lowered == allowed.lowered is not None
+    assert found.asked_stiffness == 650.0
+    assert found.turn_stiffness == pytest.approx(found.stiffness * 0.1**2)
+
+
+def test_a_damper_is_no_stronger_than_the_device_renders() -> None:
+    slow = DeviceCoupling(stiffness=1000.0).settled(
+        replace(SCRIPTED, damping=5.0, delay=0.1), 100.0, 1.0, 0.1
+    )
+    assert slow.damping == 5.0
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.1, 1.0, 10.0, 100.0])
+def test_stiffness_caps_and_damping_are_the_device_s_at_every_scale(scale: float) -> None:
+    """The tool is S times as large in the scene, so its lever at the device is the same."""
+    at_one = asdict(DeviceCoupling().settled(OMNI, 5000.0, 1.0, 0.1))
+    found = asdict(DeviceCoupling().settled(OMNI, 5000.0, scale, 0.1 * scale))
+    for name in ("stiffness", "cap", "turn_stiffness", "torque_cap", "damping"):
+        assert found[name] == pytest.approx(at_one[name], rel=1e-12)
+
+
+@pytest.mark.parametrize("scale", [0.1, 1.0, 10.0])
+def test_the_body_of_the_plane_law_has_the_device_s_spring_too(scale: float) -> None:
+    shell, place = PointShell.sphere(0.01, 50), Place(0.0, 0.0, 0.0, 0.002, 64.0)
+    body = Coupling(stiffness=800.0).body(shell, place, 1000.0, scale)
+    assert body.spring == pytest.approx(800.0 / scale)
+    assert body.damping == pytest.approx(2.0 * math.sqrt(800.0 / scale * 0.012))
+    assert body.turn_spring == pytest.approx(800.0 / scale * body.radius**2)
+
+
+def test_the_radius_of_a_single_point_is_a_voxel() -> None:
+    point = PointShell(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros(3))
+    assert radius_of(point, 0.002) == 0.002
+    assert radius_of(PointShell.sphere(0.01, 50), 0.002) == pytest.approx(0.01, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("stiffness", 0.0, "stiffness of 0.0 N/m: give a number above 0"),
+        ("stiffness", math.nan, "stiffness of nan N/m"),
+        ("cap", -1.0, "cap of -1.0 N: give a number above 0"),
+        ("turn_stiffness", math.inf, "turn_stiffness of inf N m/rad"),
+        ("torque_cap", 0.0, "torque_cap of 0.0 N m"),
+        ("damping", -1.0, "damping of -1.0 N s/m: give 0 or more"),
+        ("delay", math.inf, "delay of inf s: give 0 or more"),
+        ("hold", 0.0, "hold of 0.0 s"),
+        ("fade", math.nan, "fade of nan s"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(name: str, value: float, message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        DeviceCoupling(**{name: value})  # type: ignore[arg-type]
+
+
+def test_each_law_has_its_own_coupling() -> None:
+    assert coupling_for(None, smooth=True) == DeviceCoupling()
+    assert coupling_for(None, smooth=False) == Coupling()
+    assert coupling_for(DeviceCoupling(cap=1.0), smooth=True) == DeviceCoupling(cap=1.0)
+    with pytest.raises(
+        UsageError, match="a Coupling does not go with the smooth law: give a DeviceCoupling"
+    ):
+        coupling_for(Coupling(), smooth=True)
+    with pytest.raises(
+        UsageError, match="a DeviceCoupling does not go with the tangent plane: give a Coupling"
+    ):
+        coupling_for(DeviceCoupling(), smooth=False)

@@ -1,0 +1,169 @@
+"""Sessions in an environment with distances: the smooth law, the device's coupling, recordings."""
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from banded import write_points
+from children import PATIENCE
+from hapticdb import DeviceCoupling, Environment, Handle, PointShell, TangentPlane, UsageError
+from hapticdb.devices.scripted import Device, Player
+from hapticdb.devices.simulated import SimulatedDevice
+from hapticdb.query.law import DistanceField
+from hapticdb.realtime.coupling import Coupling, SettledCoupling
+from hapticdb.realtime.report import Report
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.realtime.session import Session
+from hapticdb.recording.file import Recording
+from hapticdb.recording.replay import replay
+from realtime.hands import at, still
+from realtime.sessions import NEVER_STALE, RATE, floored, recorded
+from realtime.worlds import SIZE, make
+
+HEIGHT = 31.5
+"""Height of the floor in voxels from the grid's origin: 1 mm below the world's origin."""
+ONSET = 1.5 * SIZE
+"""Distance at which contact begins, metres."""
+RADIUS = 0.012
+"""Radius of the tool, metres."""
+
+
+def floor_points() -> NDArray[np.float64]:
+    """Points on a floor (n, 3), in voxels, so dense that the floor is flat to 0.01 voxels."""
+    across = np.arange(24.0, 40.0, 0.25) + 0.125
+    x, y = np.meshgrid(across, across, indexing="ij")
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, HEIGHT)], axis=1)
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    with make(tmp_path_factory.mktemp("smooth"), bits=6) as made:
+        write_points(made.store, floor_points(), "floor")
+        yield made
+
+
+@pytest.fixture(scope="module")
+def cells(env: Environment) -> Iterator[ResidentCells]:
+    with ResidentCells(env.url, budget_bytes=4 << 20) as made:
+        yield made
+
+
+def pressing(depth: float, seconds: float = 1.0) -> Player:
+    """A hand that comes down until the sphere's lowest point would be so deep below the floor."""
+    low = SIZE * (HEIGHT - 32.0) + ONSET + RADIUS - depth
+    times = np.array([0.0, 0.3, 0.8, 0.9]) * seconds
+    return Player(times, [at(0.0, 0.0, z) for z in (0.03, low, low, 0.03)])
+
+
+def felt(
+    cells: ResidentCells | str,
+    shell: PointShell,
+    hand: Device,
+    path: Path | None = None,
+    **options: object,
+) -> Report:
+    with Session(
+        cells,
+        shell,
+        hand,
+        rate=RATE,
+        record=path,
+        staleness=NEVER_STALE,
+        **options,  # type: ignore[arg-type]
+    ) as session:
+        report = session.wait(PATIENCE)
+    assert report is not None
+    return report
+
+
+@pytest.fixture(scope="module")
+def ball() -> PointShell:
+    return PointShell.sphere(RADIUS, 300)
+
+
+def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
+    cells: ResidentCells, ball: PointShell, env: Environment, tmp_path: Path
+) -> None:
+    assert cells.has_distances
+    report = felt(cells, ball, pressing(0.004), tmp_path / "s.hdbrec")
+    assert report.law == "smooth"
+    assert isinstance(report.coupling, SettledCoupling)
+    assert report.coupling.stiffness == 1000.0
+    # a sphere of 300 points touches with a point that lies up to a fifth of a millimetre higher
+    assert report.peak_force == pytest.approx(4.0, abs=0.4)
+    assert report.objects == (1,)
+    assert report.loose_frames == report.unknown_frames == 0
+    frames = recorded(tmp_path / "s.hdbrec")
+    assert not frames["applied"][0].any()
+    assert not frames["applied"][-1].any()
+    assert (frames["applied"][:, 2] >= 0.0).all()
+    header = Recording(tmp_path / "s.hdbrec").header
+    assert header.law == DistanceField()
+    assert header.coupling["stiffness"] == 1000.0
+    assert json.loads(json.dumps(report.figures(), allow_nan=False))["law"] == "smooth"
+    replayed = replay(Recording(tmp_path / "s.hdbrec"), env)
+    assert replayed.is_equal, replayed.describe()
+    assert frames["wrench"].any()
+
+
+def test_the_plane_law_is_felt_there_too_and_replays_as_what_it_is(
+    cells: ResidentCells, ball: PointShell, env: Environment, tmp_path: Path
+) -> None:
+    report = felt(cells, ball, pressing(0.004), tmp_path / "p.hdbrec", law="plane")
+    assert (report.law, report.coupling) == ("plane", Coupling())
+    assert 0.0 < report.peak_force < 1000.0 * SIZE
+    assert Recording(tmp_path / "p.hdbrec").header.law == TangentPlane()
+    replayed = replay(Recording(tmp_path / "p.hdbrec"), env)
+    assert replayed.is_equal, replayed.describe()
+
+
+def test_a_stiffness_too_great_for_the_device_is_lowered_and_reported(
+    cells: ResidentCells, ball: PointShell
+) -> None:
+    hand = SimulatedDevice(still(0.03))
+    report = felt(cells, ball, hand, seconds=0.1, coupling=DeviceCoupling(stiffness=50_000.0))
+    assert isinstance(report.coupling, SettledCoupling)
+    assert report.coupling.stiffness < 50_000.0
+    assert str(report.coupling.lowered).startswith("stiffness 5e+04 N/m lowered to")
+
+
+@pytest.mark.parametrize("scale", [0.5, 4.0])
+def test_the_device_feels_the_same_stiffness_at_another_scale(
+    cells: ResidentCells, ball: PointShell, scale: float
+) -> None:
+    """The same path at the device presses S times as deep in the scene, with the same force."""
+    hand = pressing(0.004 * scale)
+    hand._knots[:, 1:4] /= scale
+    report = felt(cells, ball, hand, handle=Handle(scale=scale))
+    assert report.peak_force == pytest.approx(4.0, abs=0.4 / min(scale, 1.0))
+
+
+def test_a_tool_that_starts_in_something_feels_nothing_until_it_is_free(
+    cells: ResidentCells, ball: PointShell
+) -> None:
+    report = felt(cells, ball, still(SIZE * (HEIGHT - 32.0)), seconds=0.3)
+    assert report.peak_force == 0.0
+    assert report.loose_frames == report.loop.frames
+
+
+def test_a_law_and_a_coupling_that_do_not_fit_are_refused(
+    cells: ResidentCells, ball: PointShell, tmp_path: Path
+) -> None:
+    with pytest.raises(UsageError, match="does not go with the smooth law"):
+        Session(cells, ball, still(0.03), law="smooth", coupling=Coupling())
+    with pytest.raises(UsageError, match="does not go with the tangent plane"):
+        Session(cells, ball, still(0.03), law="plane", coupling=DeviceCoupling())
+    with pytest.raises(UsageError, match="law 'hard': choose one of plane, smooth"):
+        Session(cells, ball, still(0.03), law="hard")  # type: ignore[arg-type]
+    with floored(make(tmp_path, bits=5)) as without:
+        with pytest.raises(UsageError, match="has no distances to its surface"):
+            Session(without.url, ball, still(0.03), law="smooth")
+        with (
+            ResidentCells(without.url, budget_bytes=1 << 20) as plain,
+            pytest.raises(UsageError, match="the smooth law needs cells with distances"),
+        ):
+            Session(plain, ball, still(0.03), law=DistanceField())

@@ -97,7 +97,7 @@ def _bench_paper(
     shell = PointShell.from_file(tool) if tool else None
     path = read_poses(poses) if poses else None
     render.compile_kernels("everything")
-    page, results = run(url, folder, quick=quick, shell=shell, poses=path)
+    page, results = run(url, folder, quick=quick, shell=shell, poses=path, say=render.note)
     if not json:
         render.say(str(page))
         return

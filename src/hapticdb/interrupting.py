@@ -49,7 +49,7 @@ def leave() -> None:
         )  # without a handler the alarm would end the process
 
 
-def interrupt(number: int, frame: FrameType | None) -> None:
+def interrupt(_number: int, frame: FrameType | None) -> None:
     """Signal handler: raise KeyboardInterrupt or end the process, depending on the phase."""
     global _phase  # noqa: PLW0603
     if _phase == "starting":
@@ -60,7 +60,7 @@ def interrupt(number: int, frame: FrameType | None) -> None:
     elif _is_importing(frame) and _try_again():
         pass
     else:
-        raise KeyboardInterrupt(number)
+        raise KeyboardInterrupt  # without the number: SIGALRM's would be read as a message
 
 
 def _is_importing(frame: FrameType | None) -> bool:

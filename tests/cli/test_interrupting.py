@@ -99,11 +99,11 @@ interrupting.work()
 try:
     Slow()
     time.sleep(30)
-except KeyboardInterrupt:
-    print("raised")
+except KeyboardInterrupt as error:
+    print(f"raised {error}")
 """
 
 
 def test_ctrl_c_within_a_finalizer_is_not_lost() -> None:
     done = finished([sys.executable, "-c", FINALIZED])
-    assert (done.stdout, done.stderr) == ("raised\n", "")
+    assert (done.stdout, done.stderr) == ("raised \n", "")

@@ -101,6 +101,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "feel": (
         *_SHELL,
         *_RESIDENT,
+        "resident.feeling.feel_kernel",
         "hand.coupling.*",
         "hand.quasistatic.*",
         "hand.servo.*",

@@ -209,8 +209,7 @@ class Session:
         staleness: float,
         seconds: float | None,
     ) -> None:
-        # here, so that the loop does not compile; a recording has the law's frames, as a replay
-        compile_missing([*entries_for("feel"), "resident.feeling.feel_kernel"])
+        compile_missing(entries_for("feel"))  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
             self._recording.begin(self._header())

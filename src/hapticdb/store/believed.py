@@ -117,10 +117,16 @@ def attributes_text(record: Object, rows: Rows) -> str:
     return json.dumps(kept, sort_keys=True)
 
 
+def check_lengths(url: str, least: int, most: int) -> None:
+    """Refuse rows of distances if the least or the most bytes of a row cannot be."""
+    if least < 1 or most > LONGEST_BAND:
+        raise damaged(url, "distances of the wrong length")
+
+
 def band_of(url: str, packed: bytes, lengths: NDArray[np.int64]) -> Band:
     """Packed distances that were read, and the bytes of each row."""
-    if len(lengths) and (lengths.min() < 1 or lengths.max() > LONGEST_BAND):
-        raise damaged(url, "distances of the wrong length")
+    if len(lengths):
+        check_lengths(url, lengths.min(), lengths.max())
     ends = np.cumsum(lengths)
     if len(packed) != (int(ends[-1]) if len(ends) else 0):
         raise damaged(url, "distances of the wrong length")

@@ -45,7 +45,13 @@ LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
 """The seven low bits of each of eight bytes."""
 ALL_BEYOND = np.uint64(BEYOND * 0x0101010101010101)
 """Eight values outside the row."""
-NONE = np.uint64(0)
+EACH_BYTE = np.uint64(0x0101010101010101)
+"""Factor that copies a byte into each of eight bytes."""
+NONE, ONE = np.uint64(0), np.uint64(1)
+FULL_MASK = np.uint64((1 << ROW_SIDE) - 1)
+"""Mask of a line in which no residual is 0."""
+LOWEST_BIT = np.array([max((m & -m).bit_length() - 1, 0) for m in range(1 << ROW_SIDE)], np.uint8)
+"""(1024,) number of the lowest bit of each mask; numba has no function for it."""
 
 
 @leaf
@@ -178,10 +184,11 @@ def pack_kernel(values, first, ends, out):
 @leaf
 def bits_at(row, at):
     """Return 25 bits or more of a row's bytes from bit `at` on. Reads 4 bytes."""
-    byte = at >> 3
-    word = np.int64(row[byte]) | (np.int64(row[byte + 1]) << 8)
-    word |= (np.int64(row[byte + 2]) << 16) | (np.int64(row[byte + 3]) << 24)
-    return word >> (at & 7)
+    byte = at >> np.uint64(3)
+    word = np.uint64(row[byte]) | (np.uint64(row[byte + ONE]) << np.uint64(8))
+    word |= np.uint64(row[byte + np.uint64(2)]) << np.uint64(16)
+    word |= np.uint64(row[byte + np.uint64(3)]) << np.uint64(24)
+    return word >> (at & np.uint64(7))
 
 
 @leaf
@@ -194,13 +201,19 @@ def added(a, b):
 def take_mask(row, at, back, up):
     """Return a line's mask and the bit behind its code."""
     word = bits_at(row, at)
-    if not word & 1:
-        return back, at + 1
+    if not word & ONE:
+        return back, at + ONE
     if back == up:
-        return (word >> 1) & ((1 << ROW_SIDE) - 1), at + 11
-    if not word & 2:
-        return up, at + 2
-    return (word >> 2) & ((1 << ROW_SIDE) - 1), at + 12
+        return (word >> ONE) & FULL_MASK, at + np.uint64(11)
+    if not word & np.uint64(2):
+        return up, at + np.uint64(2)
+    return (word >> np.uint64(2)) & FULL_MASK, at + np.uint64(12)
+
+
+@leaf
+def below(word, n):
+    """The n lowest bits of a word."""
+    return word & ((ONE << n) - ONE)
 
 
 @leaf
@@ -209,60 +222,67 @@ def take_line(row, at, mask):
 
     Returns the sums in bytes, 8 in the first word and 2 in the second, and the bit behind.
     """
-    low, high = NONE, NONE
-    total, z = np.int64(0), np.int64(0)
-    while z < ROW_SIDE:
-        if (mask >> z) & 1:
-            word = bits_at(row, at)
-            n = word & 7
-            number = (1 << n) | ((word >> 3) & ((1 << n) - 1))
-            at += n + 3
-            total += (number + 1) >> 1 if number & 1 else -(number >> 1)
-        byte = np.uint64(total & 255)
-        if z < 8:
-            low |= byte << np.uint64(8 * z)
+    low, high, total = NONE, NONE, NONE
+    while mask:
+        z = np.uint64(LOWEST_BIT[mask])
+        mask &= mask - ONE
+        word = bits_at(row, at)
+        n = word & np.uint64(7)
+        number = (ONE << n) | below(word >> np.uint64(3), n)
+        at += n + np.uint64(3)
+        half = (number + ONE) >> ONE
+        total += half if number & ONE else np.uint64(256) - half  # modulo 256
+        from_here = (total & np.uint64(255)) * EACH_BYTE
+        if z < np.uint64(8):
+            place = z << np.uint64(3)
+            low = below(low, place) | (from_here << place)
+            high = from_here
         else:
-            high |= byte << np.uint64(8 * (z - 8))
-        z += 1
+            place = (z - np.uint64(8)) << np.uint64(3)
+            high = below(high, place) | (from_here << place)
     return low, high, at
 
 
 @leaf
 def put_line(out, n, at, low, high):
     """Write a line's values to row n of out."""
-    for z in range(8):
-        out[n, at + z] = low >> np.uint64(8 * z) & np.uint64(255)
-    out[n, at + 8] = high & np.uint64(255)
-    out[n, at + 9] = high >> np.uint64(8) & np.uint64(255)
+    for z in range(np.uint64(8)):
+        out[n, at + z] = low >> (z << np.uint64(3)) & np.uint64(255)
+    out[n, at + np.uint64(8)] = high & np.uint64(255)
+    out[n, at + np.uint64(9)] = high >> np.uint64(8) & np.uint64(255)
 
 
 @leaf
 def unpack_row(row, masks, lines, out, n):
     """Unpack the bytes in `row` into row n of out (R, 1000); return how many bits they were.
 
-    masks (10,) int64 and lines (20,) uint64 are the last plane's masks and values.
+    masks (10,) and lines (20,) uint64 are the last plane's masks and values. All numbers are
+    unsigned: an index that cannot be negative lets LLVM join loads and stores of single bytes.
     """
     for y in range(ROW_SIDE):
-        masks[y] = 0
+        masks[y] = NONE
         lines[2 * y], lines[2 * y + 1] = ALL_BEYOND, ALL_BEYOND
-    at = np.int64(0)
-    for plane in range(ROW_SIDE):
-        is_same = bits_at(row, at) & 1
-        at += 1
-        up = np.int64(0)
+    at = place = some = NONE
+    for _ in range(ROW_SIDE):
+        is_same = bits_at(row, at) & ONE
+        at += ONE
+        has_residuals = some or not is_same  # else the plane is the one before
+        up = some = NONE
         low, high = NONE, NONE  # change of the line's values from plane to plane
         for y in range(ROW_SIDE):
-            if not is_same:
-                up, at = take_mask(row, at, masks[y], up)
-                masks[y] = up
-            if masks[y]:
-                low_more, high_more, at = take_line(row, at, masks[y])
-                low, high = added(low, low_more), added(high, high_more)
-            lines[2 * y] = added(lines[2 * y], low)
-            lines[2 * y + 1] = added(lines[2 * y + 1], high)
-            place = (plane * ROW_SIDE + y) * ROW_SIDE
+            if has_residuals:
+                if not is_same:
+                    up, at = take_mask(row, at, masks[y], up)
+                    masks[y] = up
+                if masks[y]:
+                    some |= masks[y]
+                    low_more, high_more, at = take_line(row, at, masks[y])
+                    low, high = added(low, low_more), added(high, high_more)
+                lines[2 * y] = added(lines[2 * y], low)
+                lines[2 * y + 1] = added(lines[2 * y + 1], high)
             put_line(out, n, place, lines[2 * y], lines[2 * y + 1])
-    return at
+            place += np.uint64(ROW_SIDE)
+    return np.int64(at)
 
 
 @entry(READ_BYTES, INTS, BOOLS, BYTES2)
@@ -273,7 +293,7 @@ def unpack_kernel(data, ends, wanted, out):
     rows that are not wanted.
     """
     row = np.zeros(MOST_ROW_BYTES + 4, np.uint8)
-    masks = np.empty(ROW_SIDE, np.int64)
+    masks = np.empty(ROW_SIDE, np.uint64)
     lines = np.empty(2 * ROW_SIDE, np.uint64)
     for n in range(ends.shape[0]):
         start = ends[n - 1] if n else np.int64(0)
@@ -284,7 +304,7 @@ def unpack_kernel(data, ends, wanted, out):
             continue
         for byte in range(size):
             row[byte] = data[start + byte]
-        n_bits = unpack_row(row, masks, lines, out, n)
+        n_bits = unpack_row(row, masks, lines, out, np.uint64(n))
         if (n_bits + 7) >> 3 != size or np.int64(row[size - 1]) >> (((n_bits - 1) & 7) + 1):
             return n
     return -1

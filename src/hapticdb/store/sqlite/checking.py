@@ -24,7 +24,7 @@ from hapticdb.store.sqlite.pages import (
     words_checksum,
 )
 from hapticdb.store.sqlite.raw import read_from
-from hapticdb.store.sqlite.tables.ranges import BAND_AND_BRICK, COLUMNS
+from hapticdb.store.sqlite.tables.ranges import BAND_COLUMNS
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
 
 Fetch = Callable[[str, Sequence[Any]], list[Any]]
@@ -41,8 +41,8 @@ SELECT z_val, id FROM voxel
 SELECT z_val, id, occupancy FROM brick
  WHERE (z_val, id) > (?1, ?2) ORDER BY z_val, id LIMIT ?3""",
     "band": f"""
-SELECT {COLUMNS} FROM {BAND_AND_BRICK}
- WHERE (band.z_val, band.id) > (?1, ?2) ORDER BY band.z_val, band.id LIMIT ?3""",
+SELECT {BAND_COLUMNS} FROM band
+ WHERE (z_val, id) > (?1, ?2) ORDER BY z_val, id LIMIT ?3""",
 }
 
 

@@ -16,10 +16,11 @@ KEY_BITS = 63
 """Value bits of a non-negative int64."""
 
 # a row of distances, and the occupancy of its brick, zero if the brick holds no voxel. SQLite never
-# reorders a CROSS JOIN nor a LEFT JOIN, so the rows keep the order of the keys asked for
-COLUMNS = f"band.z_val, band.id, coalesce(occupancy, zeroblob({BRICK_BYTES})), distances"
-BAND_AND_BRICK = """band LEFT JOIN brick
-    ON brick.z_val = band.z_val AND brick.id = band.id"""
+# reorders a CROSS JOIN, so the rows keep the order of the keys asked for. With a LEFT JOIN a
+# statement of one key takes 10 us instead of 2, even if it finds nothing
+BAND_COLUMNS = f"""z_val, id, coalesce((SELECT occupancy FROM brick
+                          WHERE brick.z_val = band.z_val AND brick.id = band.id),
+                        zeroblob({BRICK_BYTES})), distances"""
 NARROW: dict[Table, str] = {
     "voxel": """
 SELECT z_val, id
@@ -30,9 +31,9 @@ SELECT z_val, id, occupancy
   FROM carray(?1) AS range CROSS JOIN brick
  WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
     "band": f"""
-SELECT {COLUMNS}
-  FROM carray(?1) AS range CROSS JOIN {BAND_AND_BRICK}
- WHERE band.z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
+SELECT {BAND_COLUMNS}
+  FROM carray(?1) AS range CROSS JOIN band
+ WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
 }
 WIDE: dict[Table, str] = {
     "voxel": """
@@ -44,9 +45,9 @@ SELECT z_val, id, occupancy
   FROM carray(?1) AS low CROSS JOIN brick
  WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
     "band": f"""
-SELECT {COLUMNS}
-  FROM carray(?1) AS low CROSS JOIN {BAND_AND_BRICK}
- WHERE band.z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
+SELECT {BAND_COLUMNS}
+  FROM carray(?1) AS low CROSS JOIN band
+ WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
 }
 
 

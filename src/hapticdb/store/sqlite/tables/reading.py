@@ -21,21 +21,20 @@ from hapticdb.store.refusals import no_object
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
-from hapticdb.store.sqlite.tables.ranges import BAND_AND_BRICK, COLUMNS, RangeStatements
+from hapticdb.store.sqlite.tables.ranges import BAND_COLUMNS, RangeStatements
 
 HAS_BAND = "SELECT count(*) FROM sqlite_master WHERE name = 'band' AND type = 'table'"
 LOOKUP: dict[Table, str] = {
     "voxel": "SELECT z_val, id FROM carray(?1) AS asked CROSS JOIN voxel ON z_val = asked.value",
     "brick": """SELECT z_val, id, occupancy
                   FROM carray(?1) AS asked CROSS JOIN brick ON z_val = asked.value""",
-    "band": f"""SELECT {COLUMNS}
-                  FROM carray(?1) AS asked CROSS JOIN {BAND_AND_BRICK}
-                 WHERE band.z_val = asked.value""",
+    "band": f"""SELECT {BAND_COLUMNS}
+                  FROM carray(?1) AS asked CROSS JOIN band ON z_val = asked.value""",
 }
 LOOKUP_ONE: dict[Table, str] = {
     "voxel": "SELECT z_val, id FROM voxel WHERE z_val = ?1",
     "brick": "SELECT z_val, id, occupancy FROM brick WHERE z_val = ?1",
-    "band": f"SELECT {COLUMNS} FROM {BAND_AND_BRICK} WHERE band.z_val = ?1",
+    "band": f"SELECT {BAND_COLUMNS} FROM band WHERE z_val = ?1",
 }
 
 

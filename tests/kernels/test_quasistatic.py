@@ -15,6 +15,7 @@ from closed_forms import (
     Field,
     Hand,
     corner,
+    cylinder,
     field_of,
     hole,
     moved,
@@ -375,3 +376,68 @@ def test_a_peg_moves_freely_in_a_hole_with_a_clearance(clearance: float) -> None
     assert -forces[-1, 0] == pytest.approx(1000.0 * (99 * 2e-5 - clearance * size), abs=0.05)
     assert np.abs(forces[:, 1]).max() < 1e-9
     assert steps_of(forces) <= 0.021
+
+
+def test_a_cylinder_is_felt_all_round_with_little_ripple() -> None:
+    """The force over a cylinder of 20 voxels is k times the depth, along its radius."""
+    radius, depth = 20.0 * SIZE, 0.002
+    angles = np.arange(-1.2, 1.2, 5e-5 / radius)
+    outward = np.stack([np.sin(angles), np.zeros(len(angles)), np.cos(angles)], axis=1)
+    path = (radius + ONSET * SIZE - depth) * outward
+    field = field_of(cylinder(radius), SIZE)
+    hand = pressed(field, np.zeros((1, 3)), path[0], -3.0 * SIZE * outward[0])
+    forces = np.array([hand.move(at) for at in path])
+    along = (forces * outward).sum(axis=1)
+    # one point alone gives way by a 51st of the depth: its contact is 50 times as stiff as the
+    # spring; and the B-spline adds an eighth of the distance's curvature, 1 / 21.5 voxels: 0.03 N
+    assert along == pytest.approx(1000.0 * depth * 50.0 / 51.0 - 0.03, abs=0.03)
+    assert np.std(along) / np.mean(along) <= 0.02
+    assert np.linalg.norm(forces - along[:, None] * outward, axis=1).max() <= 0.05
+    assert steps_of(forces) <= 0.05
+
+
+@pytest.mark.parametrize("size", [0.005, 0.0005])
+def test_the_force_changes_softly_when_the_tool_snaps_off_an_edge(size: float) -> None:
+    """The hand goes out through the side of a right angle, deep below its top."""
+    slope, down = unit([1.0, 0.0, 1.0]), unit([1.0, 0.0, -1.0])  # of the face on the left
+    start = -6.0 * size * slope + (2.5 - ONSET) * size * down
+    field = field_of(wedge(np.pi / 2.0), size)
+    hand = pressed(field, np.zeros((1, 3)), start, 6.0 * size * down)
+    step = min(5e-5, 0.05 * size)
+    forces, stretches, flags = [hand.advance()], [], 0
+    for way in np.arange(0.0, 12.0 * size, step):
+        forces.append(hand.move(start + way * slope))
+        flags |= int(hand.sent.flags)
+        stretches.append(float(np.linalg.norm(hand.hand.position - hand.tool.position)))
+    snap = -1000.0 * np.diff(stretches).min()
+    assert (snap > 2.0) == bool(flags & quasistatic.IS_SNAPPING) == (size == 0.005)
+    assert steps_of(np.array(forces)) <= 1.0 + 1000.0 * step + 1e-9
+    assert (hand.rest(50) == 0.0).all()
+
+
+@pytest.mark.parametrize("ground", ["plane", "corner"])
+def test_a_hand_that_rests_on_a_surface_never_gains_energy(ground: str) -> None:
+    """A mass of a light grip, pressed on with 3 N; the maximum of energy of each window falls."""
+    mass, grip, stiffness, dt, pieces = 0.1, 1.0, 1000.0, 1e-3, 10
+    up = np.array([0.0, 0.0, 1.0]) if ground == "plane" else unit([1.0, 0.0, 1.0])
+    field = field_of(plane(up) if ground == "plane" else corner(), SIZE)
+    hand = Hand(
+        field, punch(1, SIZE), 3.0 * SIZE * up / up.max(),
+        damping=stiffness * dt / 2.0, turn_stiffness=2.0,
+    )  # fmt: skip
+    hand.advance()
+    position, velocity = hand.hand.position.copy(), np.zeros(3)
+    energies = []
+    for _ in range(1500):
+        force = hand.move(position)
+        stretch = float(np.linalg.norm(hand.hand.position - hand.tool.position))
+        spring = stiffness * float(hand.follower["share"])  # the guard may have lowered it
+        energy = 0.5 * mass * float(velocity @ velocity) + 0.5 * spring * stretch**2
+        energies.append(energy + 3.0 * float(position @ up))
+        for _ in range(pieces):
+            velocity = velocity + dt / pieces / mass * (force - 3.0 * up - grip * velocity)
+            position = position + dt / pieces * velocity
+    windows = np.array(energies).reshape(-1, 100).max(axis=1)
+    assert (np.diff(windows) <= 1e-9).all()
+    assert windows[0] - windows[-1] > 1e-3
+    assert np.linalg.norm(velocity) < 1e-3

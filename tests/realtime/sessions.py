@@ -37,5 +37,12 @@ def floored(env: Environment) -> Environment:
     return env
 
 
+def floor_points(height: float) -> NDArray[np.float64]:
+    """Points on a floor (n, 3), in voxels, so dense that the floor is flat to 0.01 voxels."""
+    across = np.arange(24.0, 40.0, 0.25) + 0.125
+    x, y = np.meshgrid(across, across, indexing="ij")
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+
+
 def recorded(path: Path) -> Recorded:
     return np.concatenate(list(Recording(path).frames()))

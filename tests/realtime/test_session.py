@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+import hapticdb
+from banded import write_points
 from children import PATIENCE, child, finished
 from hapticdb import Environment, PointShell
 from hapticdb.devices.scripted import Player
@@ -28,7 +30,7 @@ from hapticdb.recording.replay import replay
 from hapticdb.resident.table import is_alive
 from hapticdb.testing import write_voxels
 from realtime.hands import Beckoned, Talking, Unplugged, at, still, stroking
-from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until
+from realtime.sessions import NEVER_STALE, RATE, Recorded, floor_points, floored, recorded, until
 from realtime.worlds import block, make
 from recordings import motion, write
 
@@ -60,9 +62,28 @@ def played(
     cells: ResidentCells, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
 ) -> Played:
     """A session that moves 2 mm deep over the floor until the device's end."""
-    path = tmp_path_factory.mktemp("played") / "session.hdbrec"
+    return play(cells, sphere, tmp_path_factory.mktemp("played") / "session.hdbrec")
+
+
+@pytest.fixture(scope="module", params=["plane", "smooth"])
+def by_law(
+    request: pytest.FixtureRequest, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Played]:
+    """The same session under either coupling: over voxels, and over distances to a floor."""
+    if request.param == "plane":
+        yield request.getfixturevalue("played")
+        return
+    folder = tmp_path_factory.mktemp("smooth")
+    with make(folder, bits=6) as made:
+        write_points(made.store, floor_points(31.5), "floor")
+        with ResidentCells(made.url, budget_bytes=4 << 20) as cells:
+            yield play(cells, sphere, folder / "session.hdbrec")
+
+
+def play(cells: ResidentCells, shell: PointShell, path: Path) -> Played:
+    """Move over the floor until the device's end."""
     with Session(
-        cells, sphere, stroking(0.010), rate=RATE, record=path, staleness=NEVER_STALE
+        cells, shell, stroking(0.010), rate=RATE, record=path, staleness=NEVER_STALE
     ) as session:
         pid = session.pid
         report = session.wait(PATIENCE)
@@ -74,19 +95,19 @@ def played(
 # -- sessions without disturbance --------------------------------------------------------------
 
 
-def test_a_session_ends_with_its_device(played: Played) -> None:
-    assert played.report.loop.seconds == pytest.approx(1.0, abs=0.1)
-    assert not is_alive(played.loop_pid)
+def test_a_session_ends_with_its_device(by_law: Played) -> None:
+    assert by_law.report.loop.seconds == pytest.approx(1.0, abs=0.1)
+    assert not is_alive(by_law.loop_pid)
 
 
-def test_every_deadline_was_kept_or_missed(played: Played) -> None:
-    loop = played.report.loop
+def test_every_deadline_was_kept_or_missed(by_law: Played) -> None:
+    loop = by_law.report.loop
     assert loop.frames + loop.missed == pytest.approx(RATE * loop.seconds, abs=2.0)
     assert loop.rate <= RATE * 1.01
 
 
-def test_the_recording_has_every_frame(played: Played) -> None:
-    report, frames = played.report, played.frames
+def test_the_recording_has_every_frame(by_law: Played) -> None:
+    report, frames = by_law.report, by_law.frames
     assert len(frames) == report.loop.frames == report.recorded_frames
     assert report.lost_records == 0
     np.testing.assert_allclose(np.diff(frames["time"]), frames["dt"][1:], atol=1e-9)
@@ -117,23 +138,24 @@ def finite(value: object) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-def test_the_report_survives_json_and_is_finite(played: Played) -> None:
-    figures = played.report.figures()
+def test_the_report_survives_json_and_is_finite(by_law: Played) -> None:
+    figures = by_law.report.figures()
     assert finite(figures)
     again = json.loads(json.dumps(figures, allow_nan=False))
     assert again == json.loads(json.dumps(again))
-    assert again["loop"]["frames"] == played.report.loop.frames
-    assert again["loop"]["lateness"]["p99"] == played.report.loop.lateness.p99
-    assert played.report.empty is not None
-    assert again["empty"]["frames"] == played.report.empty.frames > 0
+    assert again["loop"]["frames"] == by_law.report.loop.frames
+    assert again["loop"]["lateness"]["p99"] == by_law.report.loop.lateness.p99
+    assert by_law.report.empty is not None
+    assert again["empty"]["frames"] == by_law.report.empty.frames > 0
     assert again["cache"]["budget_bytes"] <= 4 << 20
 
 
-def test_wrenches_are_those_of_a_touch_bit_for_bit(played: Played, env: Environment) -> None:
-    replayed = replay(played.recording, env)
+def test_wrenches_are_those_of_a_touch_bit_for_bit(by_law: Played) -> None:
+    with hapticdb.open(by_law.recording.header.environment, read_only=True) as env:
+        replayed = replay(by_law.recording, env)
     assert replayed.is_equal, replayed.describe()
-    assert replayed.n_compared == len(played.frames) - played.report.held_frames
-    assert played.frames["wrench"].any()
+    assert replayed.n_compared == len(by_law.frames) - by_law.report.held_frames
+    assert by_law.frames["wrench"].any()
 
 
 def test_nothing_is_sent_while_nothing_is_touched(played: Played) -> None:

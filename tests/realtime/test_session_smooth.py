@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from banded import write_points
 from children import PATIENCE
@@ -18,10 +17,10 @@ from hapticdb.realtime.coupling import Coupling, SettledCoupling
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
-from hapticdb.recording.file import Recording
+from hapticdb.recording.file import Recording, State
 from hapticdb.recording.replay import replay
 from realtime.hands import at, still
-from realtime.sessions import NEVER_STALE, RATE, floored, recorded
+from realtime.sessions import NEVER_STALE, RATE, floor_points, floored, recorded, until
 from realtime.worlds import SIZE, make
 
 HEIGHT = 31.5
@@ -32,17 +31,10 @@ RADIUS = 0.012
 """Radius of the tool, metres."""
 
 
-def floor_points() -> NDArray[np.float64]:
-    """Points on a floor (n, 3), in voxels, so dense that the floor is flat to 0.01 voxels."""
-    across = np.arange(24.0, 40.0, 0.25) + 0.125
-    x, y = np.meshgrid(across, across, indexing="ij")
-    return np.stack([x.ravel(), y.ravel(), np.full(x.size, HEIGHT)], axis=1)
-
-
 @pytest.fixture(scope="module")
 def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
     with make(tmp_path_factory.mktemp("smooth"), bits=6) as made:
-        write_points(made.store, floor_points(), "floor")
+        write_points(made.store, floor_points(HEIGHT), "floor")
         yield made
 
 
@@ -148,6 +140,34 @@ def test_a_tool_that_starts_in_something_feels_nothing_until_it_is_free(
     report = felt(cells, ball, still(SIZE * (HEIGHT - 32.0)), seconds=0.3)
     assert report.peak_force == 0.0
     assert report.loose_frames == report.loop.frames
+    assert (report.first_loose_frame, report.ended_loose) == (0, True)
+    assert (report.loose_objects, report.objects) == ((1,), ())
+
+
+def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_when(
+    cells: ResidentCells, ball: PointShell, tmp_path: Path
+) -> None:
+    inside = SIZE * (HEIGHT - 32.0)
+    low = inside + ONSET + RADIUS - 0.004
+    hand = Player(
+        np.array([0.0, 0.5, 0.7, 0.9, 1.9, 2.1]),
+        [at(0.0, 0.0, z) for z in (inside, inside, 0.03, low, low, 0.03)],
+    )
+    with Session(
+        cells, ball, hand, rate=RATE, staleness=NEVER_STALE, record=tmp_path / "s.hdbrec"
+    ) as session:
+        until(lambda: session.is_loose and session.loose_objects == (1,), session)
+        until(lambda: not session.is_loose, session)
+        report = session.wait(PATIENCE)
+    assert report is not None
+    frames = recorded(tmp_path / "s.hdbrec")
+    is_loose = frames["state"] & State.IN_OBJECT > 0
+    assert report.loose_frames == np.count_nonzero(is_loose) > 0
+    assert is_loose[: report.loose_frames].all()
+    assert not frames["applied"][is_loose].any()
+    assert (report.first_loose_frame, report.ended_loose) == (0, False)
+    assert (report.loose_objects, report.objects) == ((1,), (1,))
+    assert report.peak_force == pytest.approx(4.0, abs=0.4)
 
 
 def test_a_law_and_a_coupling_that_do_not_fit_are_refused(

@@ -294,4 +294,4 @@ def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
 
 
 def test_bits_of_the_state_are_as_the_format_says() -> None:
-    assert (State.HELD, State.FADING, State.CLUTCH_OPEN) == (1, 2, 4)
+    assert list(State) == [1, 2, 4, 8]

@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from hapticdb.realtime.coupling import SettledCoupling
     from hapticdb.realtime.report import Report, Spread
     from hapticdb.realtime.resident_cells import ResidentCells
+    from hapticdb.realtime.session import Session
 
 MOST_NAMED = 8
 """Objects that were touched whose names are printed; more are counted."""
@@ -35,7 +36,9 @@ def show(
     render.show(_loop_table(report))
     facts = [*_frame_facts(report), *force_facts(report), *_cell_facts(report)]
     facts.append(("warm start", f"{1e3 * report.warm_up:.3g} ms" + _cold_clause(report)))
-    facts.append(("objects", _object_names(report, cells)))
+    if report.loose_frames:
+        facts.append(("in something", loose_text(report, cells)))
+    facts.append(("objects", f"{len(report.objects)} touched{_names_after(cells, report.objects)}"))
     facts += _exceptional_facts(report)
     if path_speed is not None:
         facts.append(("played at", f"{path_speed} m/s: the path has no times (column t); --speed"))
@@ -107,10 +110,50 @@ def force_facts(report: "Report") -> Facts:
         times = render.counted(report.guard_actions, "time")
         left = f"to {100.0 * report.least_share:.0f} %"
         facts.append(("guard", f"the force went back and forth: stiffness lowered {times}, {left}"))
-    if report.loose_frames:
-        held = render.counted(report.loose_frames, "frame")
-        facts.append(("in something", f"{held} in which the tool lay in an object: no force"))
+    if report.snapping_frames:
+        slowed = render.counted(report.snapping_frames, "frame")
+        facts.append(
+            ("snap-off", f"{slowed} in which the tool snapped over: the force changed by 1 N a ms")
+        )
     return facts
+
+
+def loose_text(report: "Report", cells: "ResidentCells") -> str:
+    """How long the tool lay in what, and that nothing was felt."""
+    frames = report.loose_frames
+    start = (
+        "it began inside"
+        if report.first_loose_frame == 0
+        else f"from second {report.first_loose_frame / report.rate:.3g} on it was inside"
+    )
+    inside = in_objects(cells, report.loose_objects)
+    end = "it never came free" if report.ended_loose else "then it was free"
+    return (
+        f"{start} {inside}: no force for {render.counted(frames, 'frame')} "
+        f"({frames / report.rate:.3g} s), since nothing is felt until the tool is free; {end}"
+    )
+
+
+class LooseNotes:
+    """Tells on the command line when the tool lies in an object, and when it is free again."""
+
+    def __init__(self) -> None:
+        self._looks = 0
+
+    def look(self, session: "Session") -> None:
+        """Tell what has changed since the last look; names may come a look later than the fact."""
+        if session.is_loose:
+            self._looks += 1
+            if self._looks <= 2 and (self._looks == 2 or session.loose_objects):
+                inside = in_objects(session.cells, session.loose_objects)
+                render.note(
+                    f"the tool is inside {inside}: nothing is felt until it is free; draw it out"
+                )
+                self._looks = 2
+        elif self._looks:
+            if self._looks > 1:
+                render.note("the tool is free: from now on surfaces are felt")
+            self._looks = 0
 
 
 def _lowered_clause(spring: "SettledCoupling") -> str:
@@ -165,17 +208,22 @@ def _recording_text(report: "Report", recording: str) -> str:
     return f"{report.recorded_frames:,} frames in {recording}{lost}{ended}"
 
 
-def _object_names(report: "Report", cells: "ResidentCells") -> str:
-    """Names of the objects that were touched; their ids where the database does not answer."""
+def in_objects(cells: "ResidentCells", ids: Sequence[int]) -> str:
+    """The names of the objects that a tool lies in, for a sentence."""
+    return _names_after(cells, ids).removeprefix(": ") or "an object"
+
+
+def _names_after(cells: "ResidentCells", ids: Sequence[int]) -> str:
+    """A colon and names of objects; their ids where the database does not answer; '' for none."""
     import hapticdb
     from hapticdb.errors import DatabaseError
 
     names: dict[int, str] = {}
     with suppress(DatabaseError):
-        if not cells.is_away:
+        if ids and not cells.is_away:
             with hapticdb.open(cells.url, read_only=True) as env:
                 names = {obj.id: obj.name for obj in env.objects()}
-    touched = [names.get(i, f"object {i}") for i in report.objects]
-    shown = ", ".join(touched[:MOST_NAMED])
-    more = f" and {len(touched) - MOST_NAMED} more" if len(touched) > MOST_NAMED else ""
-    return f"{len(touched)} touched" + (f": {shown}{more}" if shown else "")
+    listed = [names.get(i, f"object {i}") for i in ids]
+    shown = ", ".join(listed[:MOST_NAMED])
+    more = f" and {len(listed) - MOST_NAMED} more" if len(listed) > MOST_NAMED else ""
+    return f": {shown}{more}" if shown else ""

@@ -10,17 +10,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.hand import coupling as plane_kernels
-from hapticdb.kernels.hand import quasistatic, servo
+from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.anchors import BEFORE, MET_ROWS
 from hapticdb.kernels.hand.body import Body
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.near_points import FIELD_ROWS
+from hapticdb.kernels.hand.near_points import (
+    FIELD_ROWS,
+    FLOOR,
+    NEAR,
+    NEAR_POINTS,
+    NEAR_ROWS,
+    U,
+)
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS
 from hapticdb.kernels.resident import feeling
 from hapticdb.kernels.resident.cells import UNKNOWNS, Cells, Clusters, Place
 from hapticdb.query.law import ForceLaw
 
 Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
 Record = NDArray[np.void]
 
 
@@ -82,12 +90,9 @@ class PlaneDrive:
         if from_zero:
             self._tool["risen"] = 0.0
 
-    def ask(self, session: Record, bits: int, curve: int, n_hits: int) -> None:
-        """Request the ids of the objects at the last frame's hits; the tool is at `scene.pose`."""
-        scene = self._scene
-        servo.name_voxels(
-            session, scene.clusters, scene.pose, scene.place, bits, curve, self._met[BEFORE], n_hits
-        )
+    def touching(self, n_hits: int) -> Indices:
+        """Indices of the last frame's hits, as many as it had."""
+        return self._met[BEFORE, :n_hits]
 
     def feel(self) -> None:
         """Nothing to do: the frame at the tool's pose is computed in each step."""
@@ -144,15 +149,16 @@ class SmoothDrive:
         if from_zero:
             self._tool["risen"] = 0.0
 
-    def ask(self, session: Record, bits: int, curve: int, n_hits: int) -> None:
-        """Request the ids of the objects near the points that touch, with the tool at `scene.pose`.
+    def touching(self, n_hits: int) -> Indices:
+        """Indices of the points that touch, `n_hits`; where it lies in something, those that do.
 
         The voxels of these points may be free: the fetching process looks around them.
         """
-        scene = self._scene
-        servo.name_voxels(
-            session, scene.clusters, scene.pose, scene.place, bits, curve, self._met[BEFORE], n_hits
-        )
+        if not self._follower["is_loose"]:
+            return self._met[BEFORE, :n_hits]
+        side, n_near = int(self._follower["side"]), int(self._follower["n_near"])
+        distances = self._field[NEAR + side * NEAR_ROWS + U, :n_near]
+        return self._met[NEAR_POINTS + side, :n_near][distances < FLOOR]
 
     def feel(self) -> None:
         """Compute the law's frame at the tool's pose for the recording, after `step`.

@@ -12,6 +12,7 @@ import time
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticdb.devices.protocol import (
     Device,
@@ -59,6 +60,8 @@ WITHDRAWN_NS = 250_000_000
 later: by then the objects are named, and the process that began the session has read them."""
 SMOOTH_FLAGS = quasistatic.IS_LOOSE | quasistatic.IS_SOFTER | quasistatic.IS_SNAPPING
 """Flags that only the quasi-static coupling has."""
+NO_POINTS = np.empty(0, dtype=np.int64)
+"""Nothing is asked about."""
 WARM_PATIENCE = 30.0
 """Greatest time (s) that the loop waits for its first cells and for a device's first valid pose."""
 
@@ -188,7 +191,7 @@ class Loop:
             for buttons in (-1, 0):  # a clutch that opens, and closes
                 self.request.handle.follow(reading._replace(buttons=buttons), self.hand)
             self._step(1e-3, is_stale=False)
-            self._ask(0)
+            self._ask(NO_POINTS)
             self.drive.feel()  # `_note` leaves it out while cells are unknown
             self._note(at, 0.0, 0.0, 0.0, 0.0, 0, 0)
             self._tell()
@@ -241,23 +244,28 @@ class Loop:
         told["radius"] = self.drive.radius
         servo.tell(self.session, told, self.missed)
 
-    def _ask(self, n_hits: int) -> None:
-        """Request the ids of the objects at the last frame's hits."""
+    def _ask(self, points: NDArray[np.int64]) -> None:
+        """Request the ids of the objects at some of the tool's points, by their indices (M,)."""
         grid = self.request.grid
         poses_of(self._tool_pose, self._pose)
-        self.drive.ask(self.session, grid.bits, grid.curve_code, n_hits)
+        servo.name_voxels(
+            self.session, self.clusters, self.pose, self.place, grid.bits, grid.curve_code, points,
+            len(points),
+        )  # fmt: skip
 
     def _ask_or_withdraw(self, now: int) -> None:
-        """Request the ids at the last frame's hits; without hits, withdraw the last request.
+        """Request the ids at the last frame's hits, or of what the tool lies in.
+
+        Without any, the last request is withdrawn.
 
         A request that stays would be answered again at each write, for voxels that are no longer
         touched. A request withdrawn at once would never be answered by a slow database.
         """
-        if self.sent.hits:
-            self._ask(self.sent.hits.item())
+        if self.sent.hits or self.sent.flags & quasistatic.IS_LOOSE:
+            self._ask(self.drive.touching(self.sent.hits.item()))
             self._asked_at = now
         elif self._asked_at and self.cells.control[HEARTBEAT] > self._asked_at + WITHDRAWN_NS:
-            self._ask(0)
+            self._ask(NO_POINTS)
             self._asked_at = 0
 
     def _note(
@@ -331,6 +339,7 @@ class Loop:
         device.apply(np.zeros(6))
         self.counts.frames = deadlines.frames
         self.counts.least_share = self.drive.least_share
+        self.counts.ended_loose = bool(self.sent.flags.item() & quasistatic.IS_LOOSE)
         return deadlines.figures()
 
     def _count(self, is_clutch_open: bool, is_stale: bool) -> int:  # noqa: FBT001 - of a frame
@@ -362,7 +371,11 @@ class Loop:
         if flags & (kernels.IS_CUT | kernels.IS_STOPPED):
             counts.cut_frames += 1
         if flags & SMOOTH_FLAGS:
-            counts.loose_frames += bool(flags & quasistatic.IS_LOOSE)
+            if flags & quasistatic.IS_LOOSE:
+                if not counts.loose_frames:
+                    counts.first_loose_frame = self._n_frames.item()
+                counts.loose_frames += 1
+                state |= State.IN_OBJECT
             counts.snapping_frames += bool(flags & quasistatic.IS_SNAPPING)
             counts.guard_actions += bool(flags & quasistatic.IS_SOFTER)
         if is_stale:

@@ -4,12 +4,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.records import MOST_ASKED
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Keys, Store
 from hapticdb.store.objects_at import ids_near_voxels, ids_of_voxels
 
-NEAR = 1.5 + 0.87
+NEAR = ONSET + 0.87
 """Voxels within which an object is felt, where cells have distances: the onset of the smooth law,
 and half a voxel's diagonal, since the distance counts at the centre of the voxel that holds the
 point. Larger: objects are named that are not felt."""

@@ -93,6 +93,8 @@ class Counts:
     peak_torque: float = 0.0
     deepest: float = 0.0
     loose_frames: int = 0
+    first_loose_frame: int = -1
+    ended_loose: bool = False
     snapping_frames: int = 0
     guard_actions: int = 0
     least_share: float = 1.0
@@ -121,7 +123,8 @@ class Report:
         Timing of the session's loop, and of an empty loop at the same rate on this machine just
         before. The empty loop shows the machine's own lateness; None if it was not run.
     hit_frames, contact_frames, unknown_frames, held_frames, stale_frames : int
-        Numbers of frames: with a point in a voxel; with a point below its tangent plane; with a
+        Numbers of frames: with a hit (a point in a voxel or, with distances, near a surface); with
+        a contact (a point below its tangent plane or, with distances, below the onset); with a
         point in a cell that was not resident; that kept an earlier wrench; in which the database
         had not answered for too long.
     points, unknown_points : int
@@ -145,9 +148,15 @@ class Report:
         The force law: "plane" or "smooth".
     coupling : Coupling or SettledCoupling or None
         The coupling between hand and tool, with what lowered its stiffness.
-    loose_frames, snapping_frames : int
-        With distances. Frames in which the tool lay in something and felt nothing; frames in which
-        the fall of the force was softened, as when the tool snaps off an edge.
+    loose_frames, first_loose_frame : int
+        With distances. Frames in which the tool lay in an object and felt nothing, since it began
+        there or a part was put upon it; number of the first of them from 0, or -1 without any.
+    ended_loose : bool
+        Whether the tool still lay in something at the end.
+    loose_objects : tuple of int
+        Ids of the objects that it lay in; sampled a hundred times a second.
+    snapping_frames : int
+        Frames in which the change of the force was softened, as when the tool snaps off an edge.
     guard_actions : int
         How often the guard lowered the stiffness because the force went back and forth.
     least_share : float
@@ -200,9 +209,12 @@ class Report:
     law: str = "plane"
     coupling: Coupling | SettledCoupling | None = None
     loose_frames: int = 0
+    first_loose_frame: int = -1
+    ended_loose: bool = False
     snapping_frames: int = 0
     guard_actions: int = 0
     least_share: float = 1.0
+    loose_objects: tuple[int, ...] = ()
     conditions: dict[str, str] = field(default_factory=dict)
 
     @property
@@ -222,6 +234,6 @@ class Report:
                 plain[name][times] = getattr(part, times)._asdict()
         plain["cache"] = self.cache._asdict()
         plain["hit_rate"] = self.hit_rate
-        plain["objects"] = list(self.objects)
+        plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
         plain["proportions"] = None if self.proportions is None else self.proportions.record()
         return plain

@@ -7,6 +7,8 @@ from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from typing import Literal, Self, get_args
 
+import numpy as np
+
 from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
@@ -31,7 +33,7 @@ from hapticdb.realtime.report import LoopAnswer, Report
 from hapticdb.realtime.resident_cells import ResidentCells, start_error
 from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
-from hapticdb.recording.frame import Frames
+from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.table import DEFAULT_BUDGET, anonymous_memory
 
 Policy = Literal["hold", "wait"]
@@ -158,6 +160,8 @@ class Session:
         self._row = self._memory = -1
         self._process: Process | None = None
         self._objects: set[int] = set()
+        self._loose_objects: set[int] = set()
+        self._n_drained, self._has_touched = 0, False  # touched since it last lay in something
         self._answer: LoopAnswer | None = None
         self._recording: SessionRecording | None = None
         if record is not None:
@@ -287,6 +291,17 @@ class Session:
         return tuple(sorted(self._objects))
 
     @property
+    def is_loose(self) -> bool:
+        """Whether the tool lies in an object now and feels nothing; only with distances."""
+        last = self.last()
+        return last is not None and bool(last["state"][0] & State.IN_OBJECT)
+
+    @property
+    def loose_objects(self) -> tuple[int, ...]:
+        """Ids of the objects in which the tool lay so far; sampled a hundred times a second."""
+        return tuple(sorted(self._loose_objects))
+
+    @property
     def recording_ended(self) -> str | None:
         """One line: why the recording has ended before the session; None while it continues."""
         return None if self._recording is None else self._recording.ended
@@ -335,7 +350,17 @@ class Session:
         """Add the touched objects to the list, and record the new frames."""
         sessions, done = self.cells.table.desk.sessions, self.n_frames
         n_objects = int(sessions["n_objects"][self._row])
-        self._objects.update(sessions["objects"][self._row, :n_objects].tolist())
+        named = set(sessions["objects"][self._row, :n_objects].tolist())
+        first = max(self._n_drained, done - len(self._ring))
+        frames = self._ring[np.arange(first, done) % len(self._ring)]
+        self._n_drained = done
+        if self.is_loose:
+            self._loose_objects |= named
+            self._has_touched = False
+        else:
+            self._has_touched = self._has_touched or bool(frames["hits"].any())
+            # before the first hit an answer about the place where the tool lay may be left
+            self._objects |= named if self._has_touched else named - self._loose_objects
         if self._recording is not None:
             self._recording.take(self._ring, done)
 
@@ -356,6 +381,7 @@ class Session:
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
             objects=self.objects,
+            loose_objects=self.loose_objects,
             recorded_frames=0 if recording is None else len(recording),
             recording_ended=self.recording_ended,
             lost_records=0 if recording is None else recording.n_lost,

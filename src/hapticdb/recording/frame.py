@@ -21,3 +21,6 @@ class State(enum.IntFlag):
     """The wrench was kept for so long that it fell towards zero."""
     CLUTCH_OPEN = 4
     """The handle did not follow the hand."""
+    IN_OBJECT = 8
+    """The tool lay in an object, from the start or since a part was put upon it, and felt nothing;
+    only with the smooth law."""

@@ -44,8 +44,9 @@ class FeltFrames(NamedTuple):
     """Wrenches and counts of a shell at M poses.
 
     wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
-    int64: numbers of points in a voxel, below their tangent plane, in a cell that is not resident;
-    deepest (M,): depth of the deepest contact, metres.
+    int64: numbers of points that hit (in a voxel or, with distances, near a surface), that touch
+    (below their tangent plane or the onset), in a cell that is not resident; deepest (M,): depth of
+    the deepest contact, metres.
     """
 
     wrenches: Floats

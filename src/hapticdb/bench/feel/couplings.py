@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hapticdb.bench.feel.ground import Ground
 from hapticdb.devices.protocol import Reading
+from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.hand import coupling as kernels
 from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.anchors import MET_ROWS
@@ -75,40 +76,37 @@ Grasp = Callable[[Ground, PointShell, Floats, Terms], Hand]
 """Puts a hand with a tool at a pose (4, 4) of the device: ground, tool, pose, terms -> hand."""
 
 
-class PlaneHand:
-    """The tangent plane with its coupling: a body between spring and contacts.
-
-    The tool is at rest at the pose, and has been there for `REST` periods.
-    """
+class _Held:
+    """A tool in a hand: what both couplings keep, and how they begin."""
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
-        self._cells = ground.table.cells._replace(payload=None)
-        self._place = ground.residency.place
+        self._cells, self._place = ground.table.cells, ground.residency.place
         self._row = 0
         self._clusters = clusters_of(shell, ground.size)
-        coupling = Coupling(stiffness=terms.stiffness)
-        self._body = coupling.body(shell, self._place, terms.stiffness)
         self._servo = np.zeros((), SERVO)
         views = views_of(self._servo)
         self._tool, self._hand, self._sent = views.tool, self._servo["hand"], views.sent
-        self._met = np.empty((MET_ROWS, len(shell)), dtype=np.int64)
+        self._met = np.zeros((MET_ROWS, len(shell)), dtype=np.int64)
         self._missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._handle = Handle(scale=terms.scale)
         self._period = 1.0 / terms.rate
-        at_rest = np.zeros(6)
-        self._handle.start(Reading(pose, at_rest, 0), self._hand)
+        self._handle.start(Reading(pose, np.zeros(6), 0), self._hand)
         self._tool.position[:] = self._hand["position"]
         self._tool.quaternion[:] = self._hand["quaternion"]
-        for _ in range(round(REST * terms.rate / RATE)):
-            self.step(pose, at_rest)
+
+    def _advance(self) -> None:
+        """Run one period of the coupling."""
+        raise NotImplementedError
+
+    def _rest(self, pose: Floats) -> None:
+        """Stay at the first pose for `REST` periods at 1 kHz."""
+        for _ in range(round(REST / (self._period * RATE))):
+            self.step(pose, np.zeros(6))
 
     def step(self, pose: Floats, velocity: Floats) -> Floats:
         """Force (3,) on the device after one period; see `Hand`."""
         self._handle.follow(Reading(pose, velocity, 0), self._hand)
-        kernels.advance(
-            self._cells, self._row, self._clusters, self._place, self._body, self._servo,
-            self._period, self._met, self._missed,
-        )  # fmt: skip
+        self._advance()
         return np.array(self._sent.wrench[:3])
 
     @property
@@ -122,7 +120,27 @@ class PlaneHand:
         return np.asarray(points @ rotation.T + self._tool.position)
 
 
-class SmoothHand:
+class PlaneHand(_Held):
+    """The tangent plane with its coupling: a body between spring and contacts.
+
+    The tool is at rest at the pose, and has been there for `REST` periods.
+    """
+
+    def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
+        super().__init__(ground, shell, pose, terms)
+        self._cells = self._cells._replace(payload=None)
+        coupling = Coupling(stiffness=terms.stiffness)
+        self._body = coupling.body(shell, self._place, terms.stiffness)
+        self._rest(pose)
+
+    def _advance(self) -> None:
+        kernels.advance(
+            self._cells, self._row, self._clusters, self._place, self._body, self._servo,
+            self._period, self._met, self._missed,
+        )  # fmt: skip
+
+
+class SmoothHand(_Held):
     """The distance law with the quasi-static coupling: a tool that rests where forces balance.
 
     Parameters and methods are those of `PlaneHand`. The damper cancels what delay gives, as in a
@@ -130,9 +148,7 @@ class SmoothHand:
     """
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
-        self._cells, self._place = ground.table.cells, ground.residency.place
-        self._row = 0
-        self._clusters = clusters_of(shell, ground.size)
+        super().__init__(ground, shell, pose, terms)
         reach = float(np.linalg.norm(shell.points - shell.center, axis=1).max())
         lever = max(reach, ground.size) / terms.scale
         self._spring = DeviceSpring(
@@ -146,39 +162,15 @@ class SmoothHand:
             hold=0.02,
             fade=0.02,
         )
-        self._servo, self._follower = np.zeros((), SERVO), np.zeros((), FOLLOWER)
-        views = views_of(self._servo)
-        self._tool, self._hand, self._sent = views.tool, self._servo["hand"], views.sent
+        self._follower = np.zeros((), FOLLOWER)
         self._field = np.zeros((FIELD_ROWS, len(shell)))
-        self._met = np.zeros((MET_ROWS, len(shell)), dtype=np.int64)
-        self._missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-        self._handle = Handle(scale=terms.scale)
-        self._period = 1.0 / terms.rate
-        at_rest = np.zeros(6)
-        self._handle.start(Reading(pose, at_rest, 0), self._hand)
-        self._tool.position[:] = self._hand["position"]
-        self._tool.quaternion[:] = self._hand["quaternion"]
-        for _ in range(round(REST * terms.rate / RATE)):
-            self.step(pose, at_rest)
+        self._rest(pose)
 
-    def step(self, pose: Floats, velocity: Floats) -> Floats:
-        """Force (3,) on the device after one period; see `Hand`."""
-        self._handle.follow(Reading(pose, velocity, 0), self._hand)
+    def _advance(self) -> None:
         quasistatic.advance(
             self._cells, self._row, self._clusters, self._place, self._spring, self._servo,
             self._follower, self._period, self._field, self._met, self._missed,
         )  # fmt: skip
-        return np.array(self._sent.wrench[:3])
-
-    @property
-    def tool(self) -> Floats:
-        """Position (3,) of the tool, metres of the scene."""
-        return np.array(self._tool.position)
-
-    def placed(self, points: Floats) -> Floats:
-        """Points (N, 3) of the tool's frame where the tool is, metres of the scene."""
-        rotation = rotation_of(self._tool.quaternion)[0]
-        return np.asarray(points @ rotation.T + self._tool.position)
 
 
 @dataclass(frozen=True)
@@ -200,7 +192,7 @@ class Side:
 
 
 PLANE = Side("plane", 0.0, PlaneHand, distances=False)
-SMOOTH = Side("smooth", 1.5, SmoothHand, distances=True)
+SMOOTH = Side("smooth", ONSET, SmoothHand, distances=True)
 SIDES = (PLANE, SMOOTH)
 """Both laws: the columns of the table."""
 

@@ -1,5 +1,7 @@
 """Does anything pass? Tools thrown at sheets and plates, or astride them; pegs in holes."""
 
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,8 +12,8 @@ from scipy.spatial.transform import Rotation
 
 from hapticdb.bench.feel.couplings import RATE, Hand, Side, Terms, posed
 from hapticdb.bench.feel.ground import Ground
-from hapticdb.bench.feel.scenes import Scene, hole, plate, random_axes
-from hapticdb.bench.feel.tools import ball, peg
+from hapticdb.bench.feel.scenes import Scene, hole, plate, random_axes, round_hole
+from hapticdb.bench.feel.tools import ball, peg, round_peg
 from hapticdb.pointshell.shell import PointShell
 
 Floats = NDArray[np.float64]
@@ -46,14 +48,14 @@ ASTRIDE = 24
 FREE_N = 1e-9
 """Largest force, N, of a free tool."""
 HOLE = 12.0
-"""Width of the square hole, voxels."""
+"""Width of the holes, voxels."""
 PEG_LENGTH = 16.0
 """Length of the peg, voxels; the hole is 40 voxels deep."""
 PEG_POINTS = 1000
 """Points of the peg."""
 PEG_WAY = 32.0
 """Way of the peg's middle on either side of the hole's, voxels: in at one end, out at the other."""
-CLEARANCES = (0.0, 0.025, 0.05, 0.1, 0.2, 0.4, 0.8, 1.1, 1.4, 1.6, 1.8, 2.2, 3.0)
+CLEARANCES = (0.0, 0.025, 0.05, 0.1, 0.2, 0.3, 0.4, 0.8, 1.1, 1.4, 1.6, 1.8, 2.2, 3.0)
 """Radial clearances that are tried, voxels."""
 FREE_TOUCH = 0.01
 """Largest force, N, that counts as none in a hole."""
@@ -185,19 +187,32 @@ def draw_out(side: Side, ground: Ground, scene: Scene, offset: Floats, shell: Po
 # --- a peg ----------------------------------------------------------------------------------------
 
 
-def clearance_of_peg(side: Side, folder: Path) -> dict[str, Any]:
-    """Least of `CLEARANCES` at which a peg is free on all of its way through a hole."""
-    size, axes = SIZES[0], random_axes(1)[0]
+def clearances_of_pegs(side: Side, folder: Path) -> dict[str, Any]:
+    """Least of `CLEARANCES` at which a round and a square peg are free on all their way through."""
+    axes = random_axes(1)[0]
+    values, cases = [], {}
+    for scene, shape in ((round_hole(HOLE, axes), round_peg), (hole(HOLE, axes), peg)):
+        forces = forces_in_hole(side, folder, scene, shape)
+        free = [clearance for clearance, force in forces.items() if force <= FREE_TOUCH]
+        values.append(min(free, default=math.inf))
+        cases[scene.name] = forces
+    return {"values": values, "cases": cases}
+
+
+def forces_in_hole(
+    side: Side, folder: Path, scene: Scene, shape: Callable[..., PointShell]
+) -> dict[float, float]:
+    """Largest force of `touch` on a peg's way through a hole, N, at each clearance."""
+    size, axes = SIZES[0], scene.axes
     heights = np.linspace(-PEG_WAY, PEG_WAY, 65)
     forces: dict[float, float] = {}
-    with Ground.of_scenes(folder, [hole(HOLE, axes)], size, distances=side.distances) as ground:
-        middle = ground.origins["hole"]
+    with Ground.of_scenes(folder, [scene], size, distances=side.distances) as ground:
+        middle = ground.origins[scene.name]
         poses = np.stack([posed(middle + size * height * axes[:, 2]) for height in heights])
         law = side.law_of(STIFFNESS)
         for clearance in CLEARANCES:
             width = HOLE - 2.0 * clearance
-            shell = peg(width, PEG_LENGTH, size, axes, PEG_POINTS, side.onset)
+            shell = shape(width, PEG_LENGTH, size, axes, PEG_POINTS, side.onset)
             felt = ground.environment.touch_many(shell, poses, law=law).forces
             forces[clearance] = float(np.linalg.norm(felt, axis=1).max())
-    free = [clearance for clearance, force in forces.items() if force <= FREE_TOUCH]
-    return {"values": [min(free)] if free else [], "cases": forces}
+    return forces

@@ -153,7 +153,7 @@ def measured(
     say(f"{side.law}: sheets, plates, pegs")
     found["sheets"] = passing.sheets_of_sessions(side, place, effort.n_throws)
     found["astride"] = passing.starts_astride(side, place)
-    found["peg"] = passing.clearance_of_peg(side, place)
+    found["peg"] = passing.clearances_of_pegs(side, place)
     return found, curves
 
 

@@ -155,6 +155,15 @@ def hole(width: float, axes: Floats, half: float = 20.0) -> Scene:
     return _scene("hole", found, axes, h + 10.0, None)
 
 
+def round_hole(width: float, axes: Floats, half: float = 20.0) -> Scene:
+    """A round hole along z, of that width; its middle is the origin."""
+    angles = np.linspace(0.0, 2.0 * np.pi, FACETS + 1)
+    ring = 0.5 * width * np.column_stack([np.cos(angles), np.sin(angles), np.zeros(len(angles))])
+    up = np.array([0.0, 0.0, half])
+    found = [quad([a - up, b - up, b + up, a + up]) for a, b in pairwise(ring)]
+    return _scene("round hole", found, axes, half + 10.0, None)
+
+
 def plate(name: str, thickness: float, axes: Floats, half: float) -> Scene:
     """A closed square plate about the origin, z across it; a thickness of 0 makes a sheet."""
     t = 0.5 * thickness

@@ -44,8 +44,10 @@ ABOVE = 0.002
 """Height above the onset from which a hand comes, metres."""
 ACROSS = (3, 10)
 """Points along an edge of the flat tools."""
-EDGE_DEPTH = 0.002
-"""Depth of the hand round the convex edge, metres."""
+EDGE_DEPTHS = (0.4, 0.8)
+"""Depths of the hand round the convex edge, voxels below the onset. At d the force k d turns with
+the hand, whose way has the radius 1.5 s - d: 0.1 mm of it change the force by k d 0.1 mm / (1.5 s -
+d), which passes 0.05 N at d = s / 2 for every voxel size s, and ends in a corner at 1.5 s."""
 SCALES = (0.1, 1.0, 10.0, 100.0)
 """Metres of the scene for one metre of the device; the scenes are as many times as large."""
 
@@ -196,33 +198,46 @@ def edge_of_sessions(
 ) -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
     """Largest step within 0.1 mm and greatest side force round a convex edge; their curves."""
     scene = convex_edge(slope_axes(20.0))
-    tools = {"a point": point_tool(scene.axes), "a ball": ball(4.0, SIZE, 300)}
     rows: list[dict[str, Any]] = []
     curves: list[dict[str, Any]] = []
     with Ground.of_scenes(folder, [scene], SIZE, distances=side.distances) as ground:
-        origin = ground.origins[scene.name]
-        for name, shell in tools.items():
-            radius = side.onset * SIZE - EDGE_DEPTH + (4.0 * SIZE if name == "a ball" else 0.0)
-            path, outward = way_round_edge(radius, 0.02)
-            path, outward = origin + path @ scene.axes.T, outward @ scene.axes.T
-            start = path[0] + (EDGE_DEPTH + ABOVE) * outward[0]
-            hand = side.grasp(ground, shell, posed(start), Terms())
-            drive(hand, straight(start, path[0], SPEED))
-            drive(hand, np.repeat(path[:1], 100, axis=0))
-            forces = drive(hand, path).forces
-            along = np.einsum("nk,nk->n", forces, outward)
-            sideways = np.linalg.norm(forces - along[:, None] * outward, axis=1)
-            step = largest_step(forces, apart=2)
-            share = float(sideways.max()) / (STIFFNESS * EDGE_DEPTH)
-            rows.append({"tool": name, "step": step, "side": share})
-            ways = (np.arange(len(path)) * SPEED / RATE).tolist()
-            curves.append({"label": f"{name}, outward", "x": ways, "y": along.tolist()})
-            curves.append({"label": f"{name}, sideways", "x": ways, "y": sideways.tolist()})
-    found = {
-        "session_edge_step": {"values": [max(row["step"] for row in rows)], "cases": rows},
-        "session_edge_side": {"values": [max(row["side"] for row in rows)]},
-    }
-    return found, curves
+        for depth in EDGE_DEPTHS:
+            for name, reach in (("a point", 0.0), ("a ball", 4.0)):
+                found, drawn = round_edge(side, ground, scene, depth, reach)
+                rows.append({"tool": name, "depth": depth} | found)
+                if depth == EDGE_DEPTHS[0]:
+                    curves += [each | {"label": f"{name}, {each['label']}"} for each in drawn]
+
+    def worst(figure: str) -> list[float]:
+        return [max(r[figure] for r in rows if r["depth"] == depth) for depth in EDGE_DEPTHS]
+
+    return {
+        "session_edge_step": {"values": worst("step"), "cases": rows},
+        "session_edge_side": {"values": worst("side")},
+    }, curves
+
+
+def round_edge(
+    side: Side, ground: Ground, scene: Scene, depth: float, reach: float
+) -> tuple[dict[str, float], list[dict[str, Any]]]:
+    """Lead a ball of radius `reach` voxels, or a point for 0, round an edge; depth in voxels."""
+    shell = ball(reach, SIZE, 300) if reach else point_tool(scene.axes)
+    path, outward = way_round_edge((side.onset - depth + reach) * SIZE, 0.02)
+    path = ground.origins[scene.name] + path @ scene.axes.T
+    outward = outward @ scene.axes.T
+    start = path[0] + (depth * SIZE + ABOVE) * outward[0]
+    hand = side.grasp(ground, shell, posed(start), Terms())
+    drive(hand, straight(start, path[0], SPEED))
+    drive(hand, np.repeat(path[:1], 100, axis=0))
+    forces = drive(hand, path).forces
+    along = np.einsum("nk,nk->n", forces, outward)
+    sideways = np.linalg.norm(forces - along[:, None] * outward, axis=1)
+    share = float(sideways.max()) / (STIFFNESS * depth * SIZE)
+    ways = (np.arange(len(path)) * SPEED / RATE).tolist()
+    return {"step": largest_step(forces, apart=2), "side": share}, [
+        {"label": "outward", "x": ways, "y": along.tolist()},
+        {"label": "sideways", "x": ways, "y": sideways.tolist()},
+    ]
 
 
 def point_tool(axes: Floats) -> PointShell:

@@ -33,6 +33,8 @@ DEPTHS = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8)
 """Depths below the onset of contact, voxels."""
 APART = 0.0001
 """Distance of neighbouring poses, metres."""
+SHALLOW = 0.5
+"""Depth, voxels, up to which steps are told on their own: deeper, distances have a kink."""
 SLIDE = 10.0
 """Way of a slide, voxels."""
 ACROSS = (3, 10, 17)
@@ -90,9 +92,14 @@ def slides_of_touch(side: Side, folder: Path, n_random: int) -> dict[str, dict[s
     ways = (np.arange(len(curve)) * APART * 1e3).tolist()
     return {
         "touch_ripple": {"values": ripples, "unfelt": unfelt, "slides": len(rows)},
-        "touch_step": {"values": [max(row["step"] for row in rows)]},
+        "touch_step": {"values": [step_to(rows, SHALLOW), step_to(rows, DEPTHS[-1])]},
         "curve": {"label": "20 degrees, 9 points, depth 0.5 voxels", "x": ways, "y": curve},
     }
+
+
+def step_to(rows: Iterable[dict[str, Any]], depth: float) -> float:
+    """Largest step of all slides down to a depth in voxels."""
+    return max(float(row["step"]) for row in rows if row["depth"] <= depth)
 
 
 def worst_ripple(ripples: Iterable[float]) -> float:

@@ -37,7 +37,8 @@ PolicyName = Literal["hold", "wait"]
 TERMINATED = 128 + signal.SIGTERM
 """Exit code after SIGTERM."""
 LOOK_EVERY = 0.25
-"""Seconds between two looks whether the recording goes on: how late its end may be told."""
+"""Seconds between two looks at the session: how late is told that its recording has ended, or that
+the tool lies in an object."""
 
 # -- options of this verb alone -------------------------------------------------------------------
 
@@ -287,10 +288,11 @@ def _exit_after(signals: Sequence[int], report: "Report") -> None:
 
 
 def _waited_for(session: "Session") -> "Report":
-    """Wait for a session's end; of a recording that ends before, tell at once."""
-    report, is_told = None, False
+    """Wait for a session's end; what a person should know at once is told at once."""
+    report, is_told, notes = None, False, session_page.LooseNotes()
     while report is None:
         report = session.wait(LOOK_EVERY)
+        notes.look(session)
         if session.recording_ended is not None and not is_told:
             render.note(f"{session.recording_ended}; the session goes on without it")
             is_told = True

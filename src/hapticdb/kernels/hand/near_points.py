@@ -11,6 +11,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.field.lattice import HALF_WIDTH
+from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.field.spline import (
     bound_in_free_block,
     lower_bound,
@@ -28,8 +29,6 @@ from hapticdb.kernels.resident.cells import (
 )
 from hapticdb.kernels.rigid import moment, moved, transform_of
 
-ONSET = 1.5
-"""delta, voxels: distance at which contact begins. Larger: smoother, and more clearance is lost."""
 MARGIN = 0.5
 """Voxels beyond the onset at which a point enters the equations of a step. Larger: longer steps are
 foreseen, and more points are in the equations."""

@@ -54,13 +54,13 @@ from hapticdb.kernels.hand.near_points import (
 )
 from hapticdb.kernels.hand.path import MOST_LOOKS, keep_pose, place_on_way, walk, way_of_step
 from hapticdb.kernels.hand.steadying import (
-    MOST_FALL,
+    MOST_CHANGE,
     WINDOW,
     begin_steady,
     guard_stiffness,
     hand_speed,
     remember_hand,
-    soften_fall,
+    soften_change,
 )
 from hapticdb.kernels.hand.step import solve_step
 from hapticdb.kernels.records import FOLLOWER, SERVO
@@ -81,7 +81,7 @@ from hapticdb.kernels.rigid import pose_of_quaternion
 
 IS_LOOSE, IS_SOFTER, IS_SNAPPING = 64, 128, 256
 """Flags of a period, beside those of `coupling`: the tool lies in something and feels nothing; the
-guard has lowered the stiffness; the fall of the force is softened."""
+guard has lowered the stiffness; the change of the force is softened."""
 
 STEPS = 3
 """Most Gauss-Newton steps of a period. Larger: sharper corners are followed in one period, and the
@@ -269,8 +269,8 @@ def push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
     x, y, z = at[0] + rx - last[0], at[1] + ry - last[1], at[2] + rz - last[2]
     last[0], last[1], last[2] = at[0] + rx, at[1] + ry, at[2] + rz
     way = math.sqrt(x * x + y * y + z * z) / spring.scale
-    allowed = MOST_FALL * dt + (spring.stiffness + spring.damping / WINDOW) * way
-    if soften_fall(tool.kept, wrench, allowed):
+    allowed = MOST_CHANGE * dt + (spring.stiffness + spring.damping / WINDOW) * way
+    if soften_change(tool.kept, wrench, allowed):
         flags |= IS_SNAPPING
     return flags
 

@@ -24,9 +24,9 @@ LEAST_SHARE = 0.2
 """Least share of the stiffness that the guard leaves."""
 SHARE_RATE = 10.0
 """Change of that share a second. Larger: the guard acts sooner, and the force changes faster."""
-MOST_FALL = 1000.0
-"""Newtons a second by which a force may fall beyond what the hand's own motion takes from it, when
-the tool snaps off an edge. Larger: sharper edges, harder snaps."""
+MOST_CHANGE = 1000.0
+"""Newtons a second by which a force may change beyond what the hand's own motion makes of it, when
+the tool snaps off an edge or from one face to another. Larger: sharper edges, harder snaps."""
 
 
 @leaf
@@ -95,16 +95,16 @@ def guard_stiffness(follower, force, dt):
 
 
 @leaf
-def soften_fall(kept, wrench, allowed):
-    """Limit the fall of force from kept (6,) to wrench (6,), in place -> whether it was limited.
+def soften_change(kept, wrench, allowed):
+    """Limit the change of force from kept (6,) to wrench (6,), in place -> whether it was limited.
 
-    allowed: the greatest fall, N. The torque falls by the same share of its way.
+    allowed: the greatest change, N. The torque makes the same share of its way.
     """
-    before = math.sqrt(kept[0] * kept[0] + kept[1] * kept[1] + kept[2] * kept[2])
-    after = math.sqrt(wrench[0] * wrench[0] + wrench[1] * wrench[1] + wrench[2] * wrench[2])
-    if before - after <= allowed:
+    x, y, z = wrench[0] - kept[0], wrench[1] - kept[1], wrench[2] - kept[2]
+    change = math.sqrt(x * x + y * y + z * z)
+    if change <= allowed:
         return False
-    share = (before - after - allowed) / (before - after)
+    share = allowed / change
     for axis in range(6):
-        wrench[axis] += share * (kept[axis] - wrench[axis])
+        wrench[axis] = kept[axis] + share * (wrench[axis] - kept[axis])
     return True

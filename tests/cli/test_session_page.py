@@ -1,0 +1,66 @@
+"""What `feel` says of a tool that lies in an object: live, and at the end."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from hapticdb.cli import session_page
+
+AWAY = SimpleNamespace(is_away=True, url="gone.db")
+"""Cells whose database does not answer: ids stand in place of names."""
+
+
+def session(*, is_loose: bool, ids: tuple[int, ...] = ()) -> Any:  # noqa: ANN401 - of a stand-in
+    return SimpleNamespace(is_loose=is_loose, loose_objects=ids, cells=AWAY)
+
+
+def report(**figures: Any) -> Any:  # noqa: ANN401 - of a stand-in
+    told = {"loose_frames": 250, "first_loose_frame": 0, "ended_loose": False, "rate": 500.0}
+    return SimpleNamespace(**(told | {"loose_objects": (3,)} | figures))
+
+
+def test_a_tool_in_an_object_is_told_once_and_so_is_its_freedom(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    notes = session_page.LooseNotes()
+    for _ in range(3):
+        notes.look(session(is_loose=True, ids=(3,)))
+    said = capsys.readouterr().err
+    assert said.count("nothing is felt until it is free") == 1
+    assert "the tool is inside object 3" in said
+    for _ in range(2):
+        notes.look(session(is_loose=False, ids=(3,)))
+    assert capsys.readouterr().err.count("the tool is free") == 1
+
+
+def test_a_name_may_come_a_look_later_and_none_may_come_at_all(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    notes = session_page.LooseNotes()
+    notes.look(session(is_loose=True))
+    assert capsys.readouterr().err == ""
+    notes.look(session(is_loose=True))
+    assert "the tool is inside an object: nothing is felt" in capsys.readouterr().err
+
+
+def test_a_session_without_such_a_tool_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    notes = session_page.LooseNotes()
+    notes.look(session(is_loose=False))
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("figures", "said"),
+    [
+        ({}, "it began inside object 3: no force for 250 frames (0.5 s), since nothing is felt"),
+        ({"first_loose_frame": 600}, "from second 1.2 on it was inside object 3: no force"),
+        ({"loose_objects": ()}, "it began inside an object: no force"),
+        ({"ended_loose": True}, "it never came free"),
+        ({"ended_loose": False}, "then it was free"),
+    ],
+)
+def test_the_report_says_in_what_for_how_long_and_whether_it_came_free(
+    figures: dict[str, Any], said: str
+) -> None:
+    assert said in session_page.loose_text(report(**figures), AWAY)  # type: ignore[arg-type]

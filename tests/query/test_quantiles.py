@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import UsageError
-from hapticdb.query.calibration import _cautious, _probes, calibrate
+from hapticdb.query.calibration import _cautious, _probes, _times_dearer, calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, MAX_RESOLUTION, QuantileVector
@@ -116,7 +116,7 @@ MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0, 7.0, 0.25, 11.0, 13.0, 0.125)
 
 
 @few
-@given(values=st.lists(figures, min_size=15, max_size=15), spread=figures)
+@given(values=st.lists(figures, min_size=16, max_size=16), spread=figures)
 def test_a_cost_model_returns_from_its_figures(values: list[float], spread: float) -> None:
     """Also when they were written as text, as a store keeps them."""
     names = [name for name in vars(MODEL) if name != "spread"]
@@ -126,9 +126,26 @@ def test_a_cost_model_returns_from_its_figures(values: list[float], spread: floa
     assert CostModel.from_figures(json.loads(json.dumps(model.figures()))) == model
 
 
-def test_figures_kept_before_crowding_was_measured_still_serve() -> None:
-    older = {k: v for k, v in MODEL.figures().items() if k not in {"crowding", "presence"}}
+def test_figures_kept_before_one_of_them_was_measured_still_serve() -> None:
+    older = {k: v for k, v in MODEL.figures().items() if k not in {"crowding", "distances"}}
     assert CostModel.from_figures(older) == MODEL
+
+
+@few
+@given(values=st.lists(st.floats(0.01, 1e6), min_size=3, max_size=3), factor=st.floats(1, 100))
+def test_rows_with_distances_cost_so_many_times_more(values: list[float], factor: float) -> None:
+    descent, block, row = values
+    plain = replace(MODEL, descent=descent, block=block, row=row, caution=2.0, distances=factor)
+    found = plain.with_distances
+    assert found.row_in_gap == pytest.approx(factor * plain.row_in_gap)
+    assert found.descent == descent
+    assert found.with_distances == found
+
+
+def test_the_factor_of_distances_comes_from_the_time_that_they_take() -> None:
+    assert _times_dearer(30.0, 10.0, 1.5) == 3.0
+    assert _times_dearer(-1.0, 10.0, 1.5) == 1.0, "no slower: noise"
+    assert _times_dearer(30.0, 0.0, 1.5) == 1.0, "nothing was measured"
 
 
 def test_cautious_grouping_closes_fewer_gaps() -> None:

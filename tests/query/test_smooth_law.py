@@ -1,15 +1,20 @@
 """The distance law through `Environment.touch`: strategies, and its default."""
 
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
 
 import hapticdb
 from hapticdb import DistanceField, Environment, UsageError
+from hapticdb.grid import CurveName
 from hapticdb.kernels.field.packing import pack
+from hapticdb.query.calibration import calibrate
+from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.frame import STRATEGIES
-from hapticdb.store.base import Band, Rows
+from hapticdb.query.law import LAW_NAMES
+from hapticdb.store.base import Band, Keys, Rows
 from hapticdb.testing import blob, voxel_object, write_voxels
 from kernels.test_distance_law import (
     expected,
@@ -20,16 +25,23 @@ from kernels.test_distance_law import (
     random_shell,
 )
 from naive_frame import NaiveTouch
+from servers import Place
+
+CURVES = [curve for curve in get_args(CurveName) if curve != "lexicographic"]
 
 
-@pytest.fixture
-def env(tmp_path: Path) -> Environment:
-    env = hapticdb.create(tmp_path / "e.db", grid_of(), distances=True)
-    for n, part in enumerate(objects()):
+def make(url: str, curve: CurveName = "z") -> Environment:
+    env = hapticdb.create(url, grid_of(curve), distances=True)
+    for n, part in enumerate(objects(curve)):
         ids = np.zeros(len(part.keys), dtype=np.int64)
         rows = Rows(part.keys, ids, part.occupancy, Band(*pack(part.values)))
         env.store.add(voxel_object(env.grid, part.voxels, f"part {n}"), rows)
     return env
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> Environment:
+    return make(str(tmp_path / "e.db"))
 
 
 def assert_same(touch: hapticdb.Touch, wanted: NaiveTouch) -> None:
@@ -43,11 +55,11 @@ def assert_same(touch: hapticdb.Touch, wanted: NaiveTouch) -> None:
     assert [*touch.force, *touch.torque] == [*wanted.force, *wanted.torque]
 
 
-def test_every_strategy_feels_what_plain_python_feels(env: Environment) -> None:
+def check_strategies(env: Environment, curve: CurveName) -> None:
     n_contacts = 0
     for seed in range(6):
         shell, pose, exclude = random_shell(seed, 200), random_pose(seed), [seed % 3 + 1]
-        wanted = expected(merged(), shell, pose, exclude)
+        wanted = expected(merged(curve), shell, pose, exclude)
         n_contacts += len(wanted.contacts)
         for strategy in STRATEGIES:
             if strategy != "statement":
@@ -56,6 +68,42 @@ def test_every_strategy_feels_what_plain_python_feels(env: Environment) -> None:
         assert [*many.forces[0], *many.torques[0]] == [*wanted.force, *wanted.torque]
         assert many.ids[0] == wanted.ids
     assert n_contacts > 0
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_every_strategy_feels_what_plain_python_feels(tmp_path: Path, curve: CurveName) -> None:
+    check_strategies(make(str(tmp_path / "e.db"), curve), curve)
+
+
+@pytest.mark.parametrize("curve", CURVES)
+def test_every_strategy_feels_the_same_on_a_server(place: Place, curve: CurveName) -> None:
+    with make(place(), curve) as env:
+        check_strategies(env, curve)
+
+
+def test_gaps_are_closed_by_what_rows_cost_with_their_distances(env: Environment) -> None:
+    """Rows cost nothing, but with their distances they are worth more than a descent."""
+    shell, pose = random_shell(1, 200), random_pose(1)
+    costs = CostModel(1.0, 1.0, 0.0, 1e-9, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, distances=1e15)
+    env.store.save_costs(machine_name(), costs.figures())
+    with hapticdb.open(env.url) as reader:
+        plane, smooth = (reader.touch(shell, pose, "cbgroup", law=law) for law in LAW_NAMES)
+    assert plane.query.ranges == 1
+    assert smooth.query.ranges > 1
+    assert_same(smooth, expected(merged(), shell, pose, []))
+
+
+def test_calibrating_measures_rows_with_their_distances(env: Environment) -> None:
+    asked: list[bool] = []
+    store, scan = env.store, env.store.scan
+
+    def noted(lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        asked.append(distances)
+        return scan(lows, highs, distances=distances)
+
+    store.scan = noted  # type: ignore[method-assign]
+    assert calibrate(store, repeats=1, budget=0.0).distances >= 1.0
+    assert set(asked) == {False, True}
 
 
 def test_the_default_law_follows_the_objects(env: Environment) -> None:

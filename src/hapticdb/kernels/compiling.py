@@ -34,7 +34,8 @@ ENTRIES = {
     "resident.clearance": "find_clearance cells_near",
     "resident.feeling": "feel_kernel bounding_spheres",
     "query.refining": (
-        "refine_kernel pairs_of_hits pairs_of_contacts is_asked wrench_of_addresses depths_of_hits"
+        "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
+        "depths_of_hits"
     ),
     "query.contact": "locate_kernel spans_of_keys",
     "resident.cell_table": (

@@ -83,7 +83,8 @@ def calibrate(
         before = store.drop_caches
     rows_per_block = size.rows / max(size.leaf_blocks, 1)
     quantiles = QuantileVector.of(store)
-    trials = _Trials(store, quantiles, 1 if cold else repeats, before)
+    has_distances = size.band_rows > 0
+    trials = _Trials(store, quantiles, 1 if cold else repeats, before, has_distances=has_distances)
     started = time.perf_counter()
     for n, probe in enumerate(_probes(store, quantiles, seed)):
         trials.measure(probe)
@@ -101,8 +102,11 @@ class _Trials:
         quantiles: QuantileVector,
         repeats: int,
         before: Callable[[], None] | None,
+        *,
+        has_distances: bool,
     ) -> None:
         self._store = store
+        self._has_distances = has_distances
         self._before = before
         self._quantiles = quantiles
         self._repeats = repeats
@@ -113,6 +117,7 @@ class _Trials:
         self._statements: list[tuple[float, ...]] = []
         self._keys: list[Keys] = []
         self._under_keys = np.zeros(2)
+        self._with_distances = np.zeros(2)
 
     def measure(self, probe: _Probe) -> None:
         """Time every form of query for one shell."""
@@ -126,6 +131,9 @@ class _Trials:
             count = self._time(lambda lo=lows, hi=highs: store.count(lo, hi))  # type: ignore[misc]
             self._scans.append((1, len(lows), rows, scan))
             self._counts.append((1, len(lows), rows, count))
+            if self._has_distances:
+                more = self._time(lambda lo=lows, hi=highs: store.scan(lo, hi, distances=True))  # type: ignore[misc]
+                self._with_distances += np.array([more - scan, rows])
         rows = len(store.lookup(probe.keys))
         asked = sum(self._quantiles.rows_between(key, key) for key in probe.keys.tolist())
         self._under_keys += np.array([rows, asked])
@@ -192,6 +200,7 @@ class _Trials:
             _least_squares(self._statements) if self._statements else ((np.inf, np.inf), (0.0, 0.0))
         )
         (group, group_key), s_group = _least_squares(self._groupings())
+        more_time, rows = self._with_distances.tolist()
         model = CostModel(
             statement=statement,
             descent=descent,
@@ -206,6 +215,7 @@ class _Trials:
             presence=_ratio(*self._under_keys.tolist()),
             group=group,
             group_key=group_key,
+            distances=_times_dearer(more_time, rows, counted + row),
             spread={
                 "statement": s_scan[0],
                 "descent": s_scan[1],
@@ -250,6 +260,13 @@ def _cautious(
         trials.append((cost, -caution, rows, expected))
     _, caution, rows, expected = min(trials)
     return replace(model, caution=-caution, crowding=_ratio(rows - under_keys, expected))
+
+
+def _times_dearer(more_time: float, rows: float, row_scanned: float) -> float:
+    """How many times dearer rows are that take `more_time` in all; 1 where none were measured."""
+    if more_time <= 0.0 or rows <= 0.0 or row_scanned <= 0.0:
+        return 1.0
+    return 1.0 + more_time / (rows * row_scanned)
 
 
 def _ratio(found: float, expected: float) -> float:

@@ -2,7 +2,7 @@
 
 import platform
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 
 
@@ -41,6 +41,10 @@ class CostModel:
         Factor on the expected rows of a gap when CBGroup decides whether to close it. It is the
         factor with the least cost at the places measured. Small gaps near a surface are empty or
         full and seldom hold the expected number of rows. A larger factor closes fewer gaps.
+    distances : float
+        Cost of the rows in a range when their distances are read, too, divided by their cost
+        without. It counts rows of the index, so it includes that there are more rows of distances.
+        1 where there are no distances, or the figures were kept before it was measured.
     group, group_key : float
         CBGroup itself: fixed cost for a frame, and each key in it.
     spread : mapping
@@ -62,6 +66,7 @@ class CostModel:
     caution: float = 1.0
     group: float = 0.0
     group_key: float = 0.0
+    distances: float = 1.0
     spread: Mapping[str, float] = field(default_factory=dict)
 
     @cached_property
@@ -73,6 +78,14 @@ class CostModel:
     def row_in_gap(self) -> float:
         """Cost of one row that the quantile vector expects in a gap, multiplied by `caution`."""
         return self.row_scanned * self.caution
+
+    @cached_property
+    def with_distances(self) -> "CostModel":
+        """The model of ranges whose rows are read with their distances."""
+        if self.distances == 1.0:
+            return self
+        in_blocks = self.block / self.rows_per_block
+        return replace(self, row=self.row_scanned * self.distances - in_blocks, distances=1.0)
 
     def of_ranges(self, n_ranges: int, rows: float) -> float:
         """Expected cost of one statement of ranges."""

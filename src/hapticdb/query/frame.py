@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
-from hapticdb.kernels.field import lattice, packing
+from hapticdb.kernels.field import lattice
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
@@ -143,33 +143,26 @@ class HapticQuery:
             return self._by_statement(located, exclude, law, started)
         distances = laws.reads_distances(law.for_kernels)
         asked, rows = self._fetch(strategy, located, gap, distances=distances)
-        payload = self._distances_of(rows, law, located.keys)
+        payload = self._distances_of(rows, located.keys) if distances else None
         return self._refined(located, rows, payload, exclude, law, asked, started)
 
-    def _distances_of(
-        self, rows: Rows, law: ForceLaw, keys: Keys | None = None
-    ) -> NDArray[np.uint8] | None:
-        """Distances (R, 1000) of rows for a law that reads them; None for every other law.
-
-        Rows whose keys are not among `keys`, where these are given, are left unset.
+    def _distances_of(self, rows: Rows, keys: Keys) -> NDArray[np.uint8]:
+        """Distances (R, 1000) of rows. Rows whose keys are not among `keys` are left unset.
 
         Raises
         ------
         UsageError
             If the rows have no distances.
         """
-        if not laws.reads_distances(law.for_kernels):
-            return None
-        if not len(rows):
+        if not rows.keys.size:
             return np.empty((0, lattice.ROW_VALUES), dtype=np.uint8)
         if rows.distances is None:
             raise UsageError(
                 f"{self._store.url} has no distances to surfaces, which this law reads: give "
                 "the law TangentPlane"
             )
-        wanted = None if keys is None else refining.is_asked(keys, rows.keys)
         try:
-            return packing.unpack(*rows.distances, wanted)
+            return refining.unpack_asked(keys, rows.keys, *rows.distances)
         except ValueError as error:
             raise damaged(self._store.url, str(error)) from error
 
@@ -226,7 +219,7 @@ class HapticQuery:
         contacts: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         """Every (contact, object) pair (P, 2) of a frame whose law reads distances."""
-        payload = self._distances_of(rows, law, located.keys)
+        payload = self._distances_of(rows, located.keys)
         keys, ids, occupancy, _ = rows
         return refining.pairs_of_contacts(  # type: ignore[no-any-return]
             *located, keys, ids, occupancy, payload, exclude, self._origin, self._size,
@@ -274,7 +267,7 @@ class HapticQuery:
         fetched = self._store.lookup(keys, distances=reads)
         query: _Asked = ("array", 1, len(keys), len(fetched))
         row_keys = fetched.keys
-        distances = self._distances_of(fetched, law)
+        distances = self._distances_of(fetched, keys) if reads else None
         for located in batch:
             low = high = 0
             if located.keys.size:
@@ -306,6 +299,11 @@ class HapticQuery:
         except ValueError as error:
             raise UsageError(f"{error}: give finite numbers and a rotation") from error
 
+    def _figures(self, *, distances: bool) -> "tuple[QuantileVector, CostModel]":
+        """Quantile vector, and the cost model of rows with their distances or without."""
+        quantiles, costs = self._quantiles_and_costs()
+        return quantiles, costs.with_distances if distances else costs
+
     def _fetch(
         self, strategy: Strategy, located: "contact.Located", gap: int, *, distances: bool
     ) -> tuple[_Asked, Rows]:
@@ -320,11 +318,10 @@ class HapticQuery:
             first, last = contact.spans_of_keys(asked, keys, *self._curve)
             ranges = maxgap(keys, first, last, gap)
         elif strategy == "cbgroup":
-            ranges = cbgroup(keys, *self._quantiles_and_costs()).ranges
+            ranges = cbgroup(keys, *self._figures(distances=distances)).ranges
         elif strategy == "auto":
-            ranges = ranges_worth_scanning(
-                keys, self._grouping_threshold, self._quantiles_and_costs
-            )
+            figures = partial(self._figures, distances=distances)
+            ranges = ranges_worth_scanning(keys, self._grouping_threshold, figures)
             strategy = "array" if ranges is None else "cbgroup"
         if ranges is None:
             rows = self._store.lookup(keys, distances=distances)

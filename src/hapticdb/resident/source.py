@@ -68,8 +68,9 @@ class CellSource:
         on_curve = on_curve[order]
         lows = on_curve << (CELL_SHIFT - shift)
         highs = ((on_curve + 1) << (CELL_SHIFT - shift)) - 1
-        ranges = group_spans(lows, highs, self._quantiles, self._costs)
         words, masks, payload = table.cells.words, table.cells.masks, table.cells.payload
+        costs = self._costs if payload is None else self._costs.with_distances
+        ranges = group_spans(lows, highs, self._quantiles, costs)
         if payload is None:
             rows = self.store.scan(*ranges)
         else:

@@ -32,7 +32,7 @@ MEANINGS = {
     "group_key": "grouping by cost: each key of a frame",
 }
 """Figures of a cost model that are times, microseconds, and what each is the time of."""
-RATIOS = ("rows_per_block", "crowding", "presence", "caution")
+RATIOS = ("rows_per_block", "crowding", "presence", "caution", "distances")
 """Figures of a cost model that are ratios, and not times."""
 SOURCES = {
     "server statistics": "the server's own statistics",

@@ -24,7 +24,9 @@ from hapticdb.kernels._jit import (
     inlined,
     leaf,
 )
+from hapticdb.kernels.field.lattice import ROW_VALUES
 from hapticdb.kernels.field.law import DISTANCE_FIELD
+from hapticdb.kernels.field.packing import unpack_rows
 from hapticdb.kernels.law import (
     NOTHING_NEAR,
     TANGENT_PLANE,
@@ -165,10 +167,11 @@ def refine_kernel(
     placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law,
     felt, met,
 ):  # fmt: skip
-    """`refine` into felt (6 + N,) and met (N + R,) -> P, A and I.
+    """`refine` into felt (6 + 2 N,) and met (2 N + R,) -> H, A and I.
 
-    P points are hits, or felt, or both; A of them are felt only. felt takes the wrench and the P
-    depths; met takes the P indices (~n for a point n that is no hit), then the I ids.
+    felt takes the wrench, from 6 on the depths of the H hits, and from 6 + N on those of the A
+    points that are felt only. met takes the H indices, from N on the A indices, and from 2 N on
+    the I ids.
     """
     total = asked.shape[1]
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
@@ -177,7 +180,7 @@ def refine_kernel(
     ox, oy, oz = origin[0], origin[1], origin[2]
     mx, my, mz = placed[total, 0], placed[total, 1], placed[total, 2]
     fx = fy = fz = tx = ty = tz = weight = 0.0
-    count = n_apart = np.int64(0)
+    n_hits = n_apart = np.int64(0)
     for n in range(total):
         at = asked[1, n]
         if at < 0:
@@ -201,11 +204,14 @@ def refine_kernel(
         share = share_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample)
         depth *= share
         weight += counted * share
-        if is_hit or depth > 0.0:
-            met[count] = n if is_hit else ~n
-            felt[6 + count] = max(depth, 0.0)
-            count += 1
-            n_apart += not is_hit
+        if is_hit:
+            met[n_hits] = n
+            felt[6 + n_hits] = max(depth, 0.0)
+            n_hits += 1
+        elif depth > 0.0:
+            met[total + n_apart] = n
+            felt[6 + total + n_apart] = depth
+            n_apart += 1
         if depth > 0.0:
             touch_near_rows(
                 law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
@@ -215,7 +221,7 @@ def refine_kernel(
                 fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
             )
     average_into(felt, weight, fx, fy, fz, tx, ty, tz)
-    return count, n_apart, distinct_ids(touched, row_ids, met, count)
+    return n_hits, n_apart, distinct_ids(touched, row_ids, met, 2 * total)
 
 
 def refine(
@@ -238,18 +244,18 @@ def refine(
     or None for a law that reads none; exclude (E,) int64; origin (3,) and size of a voxel, metres.
     """
     total = asked.shape[1]
-    felt = np.empty(6 + total)
-    met = np.empty(total + row_ids.shape[0], dtype=np.int64)
-    n_points, n_apart, n_ids = refine_kernel(
+    felt = np.empty(6 + 2 * total)
+    met = np.empty(2 * total + row_ids.shape[0], dtype=np.int64)
+    n_hits, n_apart, n_ids = refine_kernel(
         placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law,
         felt, met,
     )  # fmt: skip
-    ids = met[n_points : n_points + n_ids]
+    wrench, hits, depths = felt[:6], met[:n_hits], felt[6 : 6 + n_hits]
+    ids = met[2 * total : 2 * total + n_ids]
     if n_apart == 0:
-        return felt[:6], met[:n_points], felt[6 : 6 + n_points], ids, NO_POINTS, NO_DEPTHS
-    points, depths = met[:n_points], felt[6 : 6 + n_points]
-    is_hit = points >= 0
-    return felt[:6], points[is_hit], depths[is_hit], ids, ~points[~is_hit], depths[~is_hit]
+        return wrench, hits, depths, ids, NO_POINTS, NO_DEPTHS
+    apart, apart_depths = met[total : total + n_apart], felt[6 + total : 6 + total + n_apart]
+    return wrench, hits, depths, ids, apart, apart_depths
 
 
 @entry(INTS2, INTS, INTS, INTS, READ_BYTES, INTS, INTS)
@@ -320,7 +326,7 @@ def pairs_of_contacts(
     return pairs[:count]
 
 
-@entry(INTS, INTS)
+@leaf
 def is_asked(keys, row_keys):
     """Mask (R,) bool of the rows whose key is among those that a shell asks for: no false hits.
 
@@ -333,6 +339,35 @@ def is_asked(keys, row_keys):
             at += 1
         found[row] = at < keys.shape[0] and keys[at] == row_keys[row]
     return found
+
+
+@entry(INTS, INTS, READ_BYTES, INTS, BYTES2)
+def unpack_asked_kernel(keys, row_keys, data, ends, out):
+    """`unpack_asked` into out (R, 1000); return the first row that is damaged, or -1."""
+    return unpack_rows(data, ends, is_asked(keys, row_keys), out)
+
+
+def unpack_asked(
+    keys: Ints, row_keys: Ints, data: NDArray[np.uint8], ends: Ints
+) -> NDArray[np.uint8]:
+    """Unpack the distances of those rows whose keys a shell asks for: (R, 1000) uint8.
+
+    keys (U,) and row_keys (R,) int64, both ascending; data (n,) and ends (R,) as `packing.pack`
+    gives them. Rows of other keys, the false hits, are left unset.
+
+    Raises
+    ------
+    ValueError
+        If the bytes of a row that is asked for are no packed row.
+    """
+    if data.flags.writeable:
+        data = data.view()
+        data.flags.writeable = False
+    out = np.empty((row_keys.shape[0], ROW_VALUES), dtype=np.uint8)
+    damaged = unpack_asked_kernel(keys, row_keys, data, ends, out)
+    if damaged >= 0:
+        raise ValueError(f"row {damaged} of {len(ends)} packed rows of distances is damaged")
+    return out
 
 
 @entry(FLOATS2, INTS, INTS, FLOATS, FLOAT, INT, INT, INT, TANGENT_PLANE)

@@ -23,10 +23,17 @@ def rows_of(url: str, found: list[Any], *, has_bricks: bool) -> Rows:
     if not has_bricks:
         pairs = pairs_of(url, found)
         return Rows(pairs[:, 0].copy(), pairs[:, 1].copy(), NO_OCCUPANCY)
-    return _bricks(url, *zip(*found, strict=True))
+    keys, ids, bricks = zip(*found, strict=True)
+    return _bricks(url, keys, ids, bricks)
 
 
-def _bricks(url: str, keys: Sequence[Any], ids: Sequence[Any], bricks: Sequence[Any]) -> Rows:
+def _bricks(
+    url: str,
+    keys: Sequence[Any],
+    ids: Sequence[Any],
+    bricks: Sequence[Any],
+    distances: Band | None = None,
+) -> Rows:
     """Rows from their columns."""
     count = len(keys)
     try:
@@ -35,6 +42,7 @@ def _bricks(url: str, keys: Sequence[Any], ids: Sequence[Any], bricks: Sequence[
             np.fromiter(keys, np.int64, count),
             np.fromiter(ids, np.int64, count),
             np.frombuffer(joined, np.uint8),
+            distances,
         )
     except (TypeError, ValueError, OverflowError) as error:
         raise believed.damaged(url, f"a row of another kind: {error}") from error
@@ -47,8 +55,7 @@ def rows_with_distances(url: str, found: list[Any]) -> Rows:
     """Rows from the tuples (key, id, occupancy, distances) of a statement."""
     if not found:
         return NO_DISTANCES
-    *columns, packed = zip(*found, strict=True)
-    rows = _bricks(url, *columns)
+    keys, ids, bricks, packed = zip(*found, strict=True)
     try:
         joined = b"".join(packed)
     except TypeError as error:
@@ -57,7 +64,7 @@ def rows_with_distances(url: str, found: list[Any]) -> Rows:
     lengths = list(map(len, packed))
     believed.check_lengths(url, min(lengths), max(lengths))
     ends = np.fromiter(accumulate(lengths), np.int64, len(lengths))
-    return rows.having(Band(np.frombuffer(joined, np.uint8), ends))
+    return _bricks(url, keys, ids, bricks, Band(np.frombuffer(joined, np.uint8), ends))
 
 
 def pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:

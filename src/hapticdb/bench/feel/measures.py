@@ -137,7 +137,8 @@ MEASURES: Sequence[Measure] = (
         "a way of radius 1.5 s - d: an exact law changes it by k d 0.1 mm / (1.5 s - d). That is "
         "0.036 N at 0.4 voxels, 0.05 N at half a voxel and 0.11 N at 0.8, whatever the voxel size, "
         "and without bound at 1.5, where the tool must snap from one face to the other. So the "
-        "limit is one for up to half a voxel.",
+        "limit is one for up to half a voxel. The ball has more than the point: the edge catches "
+        "between its points, and slips to the next gap.",
         "<= 0.05 N up to half a voxel",
         (0.05, math.inf),
     ),

@@ -41,7 +41,7 @@ def scene(bits: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bench
     environments: dict[Layout, Environment] = {}
     for layout in LAYOUTS:
         options = hapticdb.ImportOptions(
-            grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout
+            grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout, distances=False
         )
         (report,) = hapticdb.import_files(folder / f"{layout}.db", [files.car], options)
         assert report.status == "imported"

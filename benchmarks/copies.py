@@ -38,13 +38,16 @@ class Source:
 
     @classmethod
     def of(cls, env: Environment) -> "Source":
-        """All objects of an environment that fits into memory; Z-order only."""
+        """All objects of an environment that fits into memory, with distances if all have them.
+
+        In Z-order only.
+        """
         if env.grid.curve != "z":
             raise UsageError(f"{env.url} is in {env.grid.curve} order: copies need z order")
         parts = []
         for obj in env.objects():
             ranges = object_ranges(env.grid, env.layout, obj)
-            parts.append((obj, env.store.rows_of(obj.id, *ranges)))
+            parts.append((obj, env.store.rows_of(obj.id, *ranges, distances=env.has_distances)))
         return cls(env.grid, env.layout, tuple(parts))
 
     def within(self, voxels: float) -> "Source":
@@ -114,7 +117,7 @@ class Plan:
                     transform=shift @ obj.transform,
                     bounds=obj.bounds + offset,
                 ),
-                Rows(rows.keys + key, rows.ids, rows.occupancy),
+                rows._replace(keys=rows.keys + key),
             )
             for obj, rows in self.source.parts
         ]

@@ -93,7 +93,7 @@ class Evaluation:
     def make(self, url: str, layout: Layout, curve: CurveName = "z") -> str:
         """Import the sample; all environments have the same grid except for curve and layout."""
         grid = GridOptions(bits=self.bits, extent=EXTENT, curve=curve)
-        import_file(url, self.files.car, ImportOptions(grid=grid, layout=layout))
+        import_file(url, self.files.car, ImportOptions(grid=grid, layout=layout, distances=False))
         return url
 
     def describe(self, name: str, url: str, extent: float, import_s: float) -> None:
@@ -124,7 +124,9 @@ def table_1(evaluation: Evaluation) -> None:
         (file,) = sorted((evaluation.data / folder).glob(pattern))
         evaluation.say(f"table 1: {folder}")
         url = str(evaluation.folder / f"{folder}.db")
-        options = ImportOptions(grid=GridOptions(bits=evaluation.bits, extent=extent))
+        options = ImportOptions(
+            grid=GridOptions(bits=evaluation.bits, extent=extent), distances=False
+        )
         started = time.perf_counter()
         import_file(url, file, options)
         evaluation.describe(folder, url, extent, time.perf_counter() - started)

@@ -141,7 +141,7 @@ def session(url: str, tool: Path, path: Path, rate: int, seconds: float) -> dict
 @contextlib.contextmanager
 def environments(folder: Path, model: Path) -> Iterator[dict[str, str]]:
     """The model on SQLite and on the newest PostgreSQL found: engine -> URL."""
-    options = ImportOptions(grid=GridOptions(bits=BITS, extent=EXTENT))
+    options = ImportOptions(grid=GridOptions(bits=BITS, extent=EXTENT), distances=False)
     file = str(folder / "environment.db")
     hapticdb.import_files(file, [model], options)
     binaries = max(find_binaries(), key=lambda found: found.major)

@@ -110,7 +110,7 @@ def car_at_home(folder: Path, bits: int) -> tuple[Source, Path]:
     home = folder / f"sample_{bits}.db"
     files = write_sample(folder / "sample", count=2)
     grid = hapticdb.GridOptions(bits=bits, extent=EXTENT)
-    hapticdb.import_files(home, [files.car], hapticdb.ImportOptions(grid=grid))
+    hapticdb.import_files(home, [files.car], hapticdb.ImportOptions(grid=grid, distances=False))
     with hapticdb.open(home, read_only=True) as env:
         return Source.of(env), home
 

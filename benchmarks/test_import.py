@@ -25,7 +25,7 @@ def test_import(
     jobs: int,
 ) -> None:
     options = hapticdb.ImportOptions(
-        grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout, jobs=jobs
+        grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout, jobs=jobs, distances=False
     )
     folder = tmp_path / "car"
 

@@ -25,7 +25,7 @@ def sample(tmp_path_factory: pytest.TempPathFactory) -> SampleFiles:
 @pytest.fixture(scope="module")
 def database(sample: SampleFiles) -> Path:
     path = Path(sample.car).with_name("car.db")
-    options = ImportOptions(grid=GridOptions(bits=7, extent=1.6))
+    options = ImportOptions(grid=GridOptions(bits=7, extent=1.6), distances=False)
     hapticdb.import_files(path, [sample.car], options)
     return path
 

@@ -87,7 +87,7 @@ class Served:
         self.environments: dict[Layout, Environment] = {}
         for layout in LAYOUTS:
             options = hapticdb.ImportOptions(
-                grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout
+                grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout, distances=False
             )
             where = with_environment(url, f"bench_{layout}")
             (report,) = hapticdb.import_files(where, [scene.files.car], options)
@@ -300,7 +300,7 @@ def test_import_beside_sqlite(
 ) -> None:
     """Import the same file into both engines, in turns."""
     options = hapticdb.ImportOptions(
-        grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout
+        grid=hapticdb.GridOptions(bits=bits, extent=1.6), layout=layout, distances=False
     )
     times: dict[str, list[float]] = {"sqlite": [], "postgres": []}
     numbers = itertools.count()

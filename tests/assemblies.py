@@ -29,11 +29,15 @@ def small_grid(curve: CurveName = "z") -> Grid:
 
 
 def small_options(
-    curve: CurveName | None = None, layout: Layout | None = None, jobs: int | None = None
+    curve: CurveName | None = None,
+    layout: Layout | None = None,
+    jobs: int | None = None,
+    *,
+    distances: bool | None = None,
 ) -> ImportOptions:
     """Options that ask for `small_grid`."""
     grid = GridOptions(bits=BITS, voxel_size=SIZE, origin=ORIGIN, curve=curve)
-    return ImportOptions(grid=grid, layout=layout, jobs=jobs)
+    return ImportOptions(grid=grid, layout=layout, jobs=jobs, distances=distances)
 
 
 def placement(x: float, y: float, z: float, turn: float = 0.0) -> NDArray[np.float64]:

@@ -15,7 +15,7 @@ import hapticdb
 from children import until
 from hapticdb.cli import main
 
-PLACES = ((0.0, 0.0, 0.055), (0.0, 0.0, 0.3), (0.2, 0.0, -0.052))
+PLACES = ((0.0, 0.0, 0.0635), (0.0, 0.0, 0.3), (0.2, 0.0, -0.0635))
 Run = Callable[..., tuple[int, str, str]]
 
 

@@ -189,6 +189,6 @@ def steps_of(name: str) -> list[str]:
 def felt(
     env: Environment, shell: PointShell, pose: np.ndarray[Any, Any], strategy: Strategy = "auto"
 ) -> tuple[Any, ...]:
-    touch = env.touch(shell, pose, strategy)
+    touch = env.touch(shell, pose, strategy, law="plane")
     wrench = np.concatenate([touch.force, touch.torque]).tobytes()
     return wrench, touch.hits.tolist(), [obj.id for obj in touch.objects]

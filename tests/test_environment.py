@@ -29,7 +29,7 @@ from hapticdb.grid import CurveName
 from hapticdb.ingest import files
 from hapticdb.mesh import MeshFile, parse_in_process
 from hapticdb.query.cost_model import machine_name
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from hapticdb.testing import KINDS, blob, write_voxels
 from mesh_files import gltf
@@ -359,7 +359,8 @@ def test_edits_of_another_process_are_felt_by_the_next_touch(
 
     def felt() -> list[tuple[int, float]]:
         """Ids and x positions (metres) of the objects that are hit; all strategies must agree."""
-        found = [env.touch(sphere, pose, s).objects for s in ("auto", "statement", "cbgroup")]
+        strategies: tuple[Strategy, ...] = ("auto", "statement", "cbgroup")
+        found = [env.touch(sphere, pose, s, law="plane").objects for s in strategies]
         places = [[(o.id, float(o.transform[0, 3])) for o in objects] for objects in found]
         assert places[0] == places[1] == places[2]
         return places[0]
@@ -385,11 +386,11 @@ def test_what_comes_into_an_environment_opened_empty_is_felt(
 ) -> None:
     env = hapticdb.create(tmp_path / "e.db", small_grid())
     for strategy in STRATEGIES:
-        assert not len(env.touch(sphere, np.eye(4), strategy).hits)
+        assert not len(env.touch(sphere, np.eye(4), strategy, law="plane").hits)
     with hapticdb.open(tmp_path / "e.db") as other:
         other.add(file)
         pose = placement(*other.object(2).bounds[0])
-    found = [env.touch(sphere, pose, strategy) for strategy in STRATEGIES]
+    found = [env.touch(sphere, pose, strategy, law="plane") for strategy in STRATEGIES]
     assert len(found[0].hits)
     assert len({(t.hits.tobytes(), t.force.tobytes()) for t in found}) == 1
 

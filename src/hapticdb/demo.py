@@ -1,7 +1,8 @@
 """The demo: the sample imported in both layouts, touched by every strategy, measured and compared.
 
-Hits, ids and wrench of every pose are compared bit for bit over strategies and layouts. Times are
-warm: each strategy has run before, and the strategies take turns at going first.
+Hits, ids and wrench of every pose are compared bit for bit over strategies and layouts, under the
+tangent-plane law, which all of them have. Times are warm: each strategy has run before, and the
+strategies take turns at going first.
 """
 
 import os
@@ -256,13 +257,13 @@ def _race(
     """
     for strategy in COMPARED:
         for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
-            env.touch(scene.shell, pose, strategy)
+            env.touch(scene.shell, pose, strategy, law="plane")
     felt: dict[Strategy, StrategyFigures] = {strategy: StrategyFigures() for strategy in COMPARED}
     for index, pose in enumerate(scene.poses):
         # the first strategy at a pose brings its pages into the cache: they take turns at it
         turn = index % len(COMPARED)
         for strategy in COMPARED[turn:] + COMPARED[:turn]:
-            touched = env.touch(scene.shell, pose, strategy)
+            touched = env.touch(scene.shell, pose, strategy, law="plane")
             felt[strategy].add(touched)
             found = _found(touched)
             if len(reference) == index:
@@ -286,7 +287,7 @@ def trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) ->
     """Touch along a path once, and keep force, hits and their places."""
     force, hits, points, ids, frames = [], [], [], [], []
     for index, pose in enumerate(poses):
-        touched = env.touch(shell, pose)
+        touched = env.touch(shell, pose, law="plane")
         force.append(float(np.linalg.norm(touched.force)))
         hits.append(len(touched.hits))
         pairs = touched.pairs

@@ -35,6 +35,7 @@ from hapticdb.query.touches import Touch, Touches
 from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
 from hapticdb.store.finding import find_objects
+from hapticdb.store.refusals import wants_distances
 
 _NOBODY: tuple[int, ...] = ()
 
@@ -477,7 +478,7 @@ def create(
     grid: Grid,
     *,
     layout: Layout = "brick",
-    distances: bool = False,
+    distances: bool | None = None,
 ) -> Environment:
     """Make an environment with a given grid and open it.
 
@@ -485,16 +486,15 @@ def create(
     ----------
     layout : {"brick", "voxel"}
         Rows of its index table.
-    distances : bool
-        Whether parts that are imported get distances to their surfaces beside their voxels, which
-        the smooth force law needs.
+    distances : bool or None
+        Whether parts get distances for the smooth force law; bricks do unless told otherwise.
 
     Raises
     ------
     EnvironmentExistsError
         If something exists there already.
     UsageError
-        If the layout is bricks and the order is lexicographic, or if the layout is voxel and
-        distances are asked for.
+        Bricks in lexicographic order, or distances on the layout voxel.
     """
-    return Environment(create_store(url, grid, layout, distances=distances))
+    wish = wants_distances(layout, distances)
+    return Environment(create_store(url, grid, layout, distances=wish))

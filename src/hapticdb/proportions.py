@@ -159,9 +159,10 @@ class _Tool(NamedTuple):
 
     @classmethod
     def of(cls, shell: PointShell) -> "_Tool":
-        low, high = shell.points.min(axis=0), shell.points.max(axis=0)
+        points = shell.outline
+        low, high = points.min(axis=0), points.max(axis=0)
         middle = 0.5 * (low + high)
-        radius = float(np.sqrt(((shell.points - middle) ** 2).sum(axis=1).max()))
+        radius = float(np.sqrt(((points - middle) ** 2).sum(axis=1).max()))
         return cls(middle, radius, float((high - low).max()))
 
 

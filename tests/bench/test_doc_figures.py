@@ -12,6 +12,8 @@ import pytest
 from hapticdb.bench import records
 from hapticdb.bench.drawing.draw import draw
 from hapticdb.bench.drawing.plots import plots_among
+from hapticdb.bench.feel.page import write_feel_page
+from report.laws_page import law_frame_table, law_session_table
 from report.page import write_report
 from report.plots import REPORT_KINDS
 from report.realtime_page import edit_table, frame_table, model_words, session_table
@@ -19,10 +21,14 @@ from report.realtime_page import edit_table, frame_table, model_words, session_t
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
 FILES = sorted(RESULTS.glob("*.json"))
-# left out: docs/evaluation.md is computed from results/, docs/format.md has no measurement
+# left out: evaluation.md and feel.md are computed from results/, format.md has no measurement
 PAGES = [
     ROOT / "README.md",
-    *(p for p in sorted((ROOT / "docs").glob("*.md")) if p.stem not in {"evaluation", "format"}),
+    *(
+        p
+        for p in sorted((ROOT / "docs").glob("*.md"))
+        if p.stem not in {"evaluation", "feel", "format"}
+    ),
 ]
 CLAIM = re.compile(
     r"\b(medians?|microseconds|p99|reached|took|were felt|of their time|on disk|actual time)\b",
@@ -59,6 +65,14 @@ def test_the_evaluation_is_what_the_results_say(tmp_path: Path) -> None:
     page = tmp_path / "evaluation.md"
     write_report(records.read(RESULTS), page, "../results")
     assert page.read_text() == (ROOT / "docs" / "evaluation.md").read_text()
+
+
+def test_the_page_of_forces_is_what_its_results_say(tmp_path: Path) -> None:
+    page = tmp_path / "feel.md"
+    write_feel_page(loaded("results/feel.json"), page, "../results/feel")
+    assert page.read_text() == (ROOT / "docs" / "feel.md").read_text()
+    for link in re.findall(r"\]\(([^)#]+)\)", page.read_text()):
+        assert (ROOT / "docs" / link).is_file(), link
 
 
 def test_every_plot_is_kept_and_no_other() -> None:
@@ -107,11 +121,13 @@ def test_a_measured_figure_says_where_it_comes_from(page: Path) -> None:
 
 def test_every_figure_that_is_said_to_be_measured_is_in_its_file() -> None:
     realtime, edits = loaded("results/realtime.json"), loaded("results/edits.json")
+    laws = loaded("results/both_laws.json")
     tables = {
         "results/realtime.json": [session_table(realtime), frame_table(realtime)],
         "results/edits.json": [edit_table(edits)],
+        "results/both_laws.json": [law_frame_table(laws), law_session_table(laws)],
     }
-    for one in (*realtime["sessions"], *edits["edits"]):
+    for one in (*realtime["sessions"], *edits["edits"], *laws["sessions"]):
         assert one["unknown_frames"] == 0  # the pages claim it
     shown: list[str] = []
     for page in PAGES:

@@ -62,9 +62,8 @@ def test_contacts_are_written_with_their_objects(run: Run, scene: Path) -> None:
     shell = hapticdb.PointShell.load(scene.with_name("tool.npz"))
     expected = []
     for n, one in enumerate(touches(scene.parent)):
-        depths = dict(zip(one.hits.tolist(), one.depths.tolist(), strict=True))
-        pairs = [(point, i) for point, i in one.pairs.tolist() if depths[point] > 0]
-        expected += [(n, point, depths[point], i) for point, i in pairs]
+        depths = dict(zip(one.contacts.tolist(), one.contact_depths.tolist(), strict=True))
+        expected += [(n, point, depths[point], i) for point, i in one.contact_pairs.tolist()]
     assert expected
     assert [(int(r[0]), int(r[1]), float(r[5]), int(r[6])) for r in rows] == expected
     for row in rows:

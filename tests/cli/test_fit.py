@@ -113,3 +113,12 @@ def test_info_tells_no_fit_where_an_object_has_no_distances(run: Run, floor: Pat
     out = run("info", floor)[1]
     assert not re.search(r"^fit\b", out, re.MULTILINE)
     assert json.loads(run("info", floor, "--json")[1])["fit"] is None
+
+
+def test_a_tool_that_is_felt_is_drawn_in_unless_it_is_conservative(run: Run, floor: Path) -> None:
+    args = ("feel", floor, "--tool", "tool.stl", "--device", "path.csv", "--seconds", 0.2)
+    rest = ("--no-baseline", "--json")
+    for more, inset in (((), 1.5 * VOXEL), (("--conservative",), 0.0), (("--law", "plane"), 0.0)):
+        code, out, _ = run(*args, *rest, *more)
+        assert code == 0
+        assert json.loads(out)["shell"]["inset"] == {"least": inset, "greatest": inset}

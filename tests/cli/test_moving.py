@@ -46,7 +46,7 @@ def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path)
     size = f"{found['voxel_size'] * 1000:.4g} mm"
     assert out == (
         f"{scene} and b.db hold the same: 3 objects, {found['voxels']:,} voxels, "
-        f"64^3 cells of {size}\n"
+        f"64^3 cells of {size}; distances of 3 objects in A, of 0 in B\n"
     )
 
 
@@ -257,7 +257,8 @@ def read_terminal(ours: int) -> bytes:
 
 def test_an_upgrade_says_what_it_did_and_what_it_left_out(run: Run, tmp_path: Path) -> None:
     """Exit code 1 where an object stays without distances; running again goes on."""
-    hapticdb.import_files(tmp_path / "e.db", [boxes(tmp_path / "boxes.glb")])
+    without = hapticdb.ImportOptions(distances=False)
+    hapticdb.import_files(tmp_path / "e.db", [boxes(tmp_path / "boxes.glb")], without)
     (tmp_path / "boxes.glb").rename(tmp_path / "hidden.glb")
     code, out, err = run("upgrade", "e.db")
     assert code == 1

@@ -216,7 +216,7 @@ def test_a_standby_is_read_and_refuses_to_be_written(
         assert run("calibrate", url, "--json")[0] == 0
         touched = ("--tool", made / "tool.npz", "--poses", made / "path.csv", "--json")
         for strategy in STRATEGIES:
-            args = (*touched, "--strategy", strategy)
+            args = (*touched, "--law", "plane", "--strategy", strategy)
             felt = [run("touch", place, *args)[1] for place in (primary, url)]
             assert felt[0].count('"pose"') == len(PLACES)
             assert re.sub('"query".*', "", felt[0]) == re.sub('"query".*', "", felt[1])

@@ -56,8 +56,10 @@ for n, (layout, curve) in enumerate(KINDS):
     with hapticdb.open(url) as env:
         for strategy in STRATEGIES:
             for each in (shell, loaded):
-                env.touch(each, np.eye(4), strategy, exclude=[1]).pairs
-                env.touch(each, np.eye(4), strategy).pairs
+                env.touch(each, np.eye(4), strategy, exclude=[1], law="plane").pairs
+                env.touch(each, np.eye(4), strategy, law="plane").pairs
+                if env.has_distances and strategy != "statement":
+                    env.touch(each, np.eye(4), strategy).contact_pairs
         env.calibrate()
         env.move(1, np.eye(4))
         env.voxels(1)
@@ -72,10 +74,13 @@ for n, (layout, curve) in enumerate(KINDS):
                 frames.feel(np.eye(4)[None])
                 frames.close()
 hand = Line(np.zeros(3), np.ones(3), 0.1)
-url = str(folder / "0.db")
-with hapticdb.Session(url, shell, hand, seconds=0.3, has_baseline=False) as session:
-    report = session.wait(60)
-assert report is not None and report.loop.frames > 0
+smooth = folder / "smooth.db"
+hapticdb.import_files(smooth, [stl], hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6)))
+for url, law in ((folder / "0.db", "plane"), (smooth, "smooth")):
+    with hapticdb.Session(str(url), shell, hand, seconds=0.3, has_baseline=False) as session:
+        assert session.law.name == law
+        report = session.wait(60)
+    assert report is not None and report.loop.frames > 0
 assert set(_jit.SIGNATURES) == set(compiling.NAMES)
 found = {name(entry): [sorted(map(str, entry.signatures)),
                        sorted(str(tuple(s)) for s in _jit.SIGNATURES[name(entry)])]

@@ -2,6 +2,7 @@
 
 import shutil
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from hapticdb.ingest.files import ImportOptions, import_files
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import parse_in_process
 from hapticdb.query.grouping import object_ranges
+from hapticdb.store.base import Layout
 
 
 @pytest.fixture
@@ -59,8 +61,21 @@ def test_a_moved_object_keeps_its_distances(file: Path, tmp_path: Path) -> None:
         assert env.touch(shell, np.eye(4)).law == hapticdb.DistanceField()
 
 
-def test_by_default_there_are_none(file: Path, tmp_path: Path) -> None:
-    import_files(tmp_path / "e.db", [file], options(distances=None))
+def test_bricks_have_them_by_default_and_voxels_do_not(file: Path, tmp_path: Path) -> None:
+    grid = small_options().grid
+    layouts: tuple[Layout, ...] = get_args(Layout)
+    for layout in layouts:
+        url = tmp_path / f"{layout}.db"
+        import_files(url, [file], ImportOptions(grid=grid, layout=layout))
+        made = tmp_path / f"{layout}_made.db"
+        fitted = hapticdb.Grid(0.01, (0.0, 0.0, 0.0), 6)
+        with hapticdb.open(url) as env, hapticdb.create(made, fitted, layout=layout) as new:
+            assert env.has_distances == (layout == "brick")
+            assert env.store.wants_distances == new.store.wants_distances == (layout == "brick")
+
+
+def test_without_them_the_plane_is_felt(file: Path, tmp_path: Path) -> None:
+    import_files(tmp_path / "e.db", [file], options(distances=False))
     with hapticdb.open(tmp_path / "e.db") as env:
         assert not env.has_distances
         shell = PointShell(

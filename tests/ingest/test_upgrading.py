@@ -52,7 +52,7 @@ def file(tmp_path: Path) -> Path:
 @pytest.fixture
 def plain(file: Path, tmp_path: Path) -> Path:
     """An environment without distances; its first object has been moved."""
-    hapticdb.import_files(tmp_path / "plain.db", [file], small_options())
+    hapticdb.import_files(tmp_path / "plain.db", [file], small_options(distances=False))
     with hapticdb.open(tmp_path / "plain.db") as env:
         placed = env.object(1).transform.copy()
         placed[:3, 3] += 0.013

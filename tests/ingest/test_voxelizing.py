@@ -91,7 +91,8 @@ def test_an_import_tells_the_share_of_a_part(
 
     monkeypatch.setattr("hapticdb.ingest.voxelizing.bricks_of_triangles", slow)
     path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    options = ImportOptions(grid=GridOptions(bits=BITS), layout=layout)  # type: ignore[arg-type]
+    grid = GridOptions(bits=BITS)
+    options = ImportOptions(grid=grid, layout=layout, distances=False)  # type: ignore[arg-type]
     (report,) = import_files(tmp_path / "a.db", [path], options, progress)
     assert report.status == "imported"
     assert any(0.0 < now.share < 1.0 and now.parts_done == 0 for now in heard)

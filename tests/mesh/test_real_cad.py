@@ -116,7 +116,7 @@ def test_strategies_layouts_and_the_plain_set_agree_along_a_path(
         n_hits += len(wanted.hits)
         for each in environments.values():
             for strategy in STRATEGIES:
-                touch = each.touch(shell, pose, strategy)
+                touch = each.touch(shell, pose, strategy, law="plane")
                 assert touch.hits.tolist() == wanted.hits
                 assert [obj.id for obj in touch.objects] == wanted.ids
                 assert touch.force.tobytes() == np.array(wanted.force).tobytes()

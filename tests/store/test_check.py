@@ -48,7 +48,7 @@ def used(path: Path, sphere: PointShell) -> None:
         for ask in (
             env.objects,
             lambda: env.touch(sphere, pose, "array").objects,
-            lambda: env.touch(sphere, pose, "statement").objects,
+            lambda: env.touch(sphere, pose, "statement", law="plane").objects,
             lambda: env.touch(sphere, pose, "cbgroup").objects,
             lambda: env.touch(sphere, pose).pairs,
             lambda: list(env.store.changes()),

@@ -79,13 +79,13 @@ def read(url: str, number: int, said: Connection) -> None:
     sides: set[bool] = set()
     n_frames, is_content = 0, False
     with hapticdb.open(url, read_only=True) as env:
-        env.touch(shell, np.eye(4), strategy)
+        env.touch(shell, np.eye(4), strategy, law="plane")
         said.send("ready")
         while not said.poll():
             if n_frames >= ENOUGH_FRAMES and len(sides) == 2 and not is_content:
                 is_content = True
                 said.send("seen")
-            touch = env.touch(shell, np.eye(4), strategy)
+            touch = env.touch(shell, np.eye(4), strategy, law="plane")
             n_left = int((touch.hits < 200).sum())
             n_right = len(touch.hits) - n_left
             assert min(n_left, n_right) == 0 < max(n_left, n_right), strategy
@@ -222,7 +222,7 @@ def test_a_writer_in_the_middle_stops_no_reader(url: str) -> None:
     shell = two_tools()
     with unfinished_move(url), hapticdb.open(url, read_only=True) as reader:
         for strategy in STRATEGIES:
-            assert reader.touch(shell, np.eye(4), strategy).objects
+            assert reader.touch(shell, np.eye(4), strategy, law="plane").objects
         assert len(reader.voxels(1)) == reader.object(1).voxels
         assert reader.size().rows > 0
         assert reader.quantiles().n_rows > 0
@@ -319,9 +319,9 @@ def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) 
             with admin.transaction():
                 admin.execute(f"LOCK TABLE {name}.brick IN ACCESS EXCLUSIVE MODE")
                 with pytest.raises(hapticdb.StuckError, match="did not answer in time") as told:
-                    env.touch(shell, np.eye(4), strategy)
+                    env.touch(shell, np.eye(4), strategy, law="plane")
             assert "\n" not in str(told.value)
-            assert env.touch(shell, np.eye(4), strategy).hits.tolist() == expected
+            assert env.touch(shell, np.eye(4), strategy, law="plane").hits.tolist() == expected
 
 
 @contextlib.contextmanager
@@ -343,7 +343,8 @@ def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
     shell = two_tools()
     with hapticdb.open(f"{url}&options=-cstatement_timeout%3D200", read_only=True) as env:
         expected = env.touch(shell, np.eye(4)).hits.tolist()
-        touches = [partial(env.touch, shell, np.eye(4), strategy) for strategy in STRATEGIES]
+        touch = partial(env.touch, shell, np.eye(4), law="plane")
+        touches = [partial(touch, strategy=strategy) for strategy in STRATEGIES]
         asks: list[Callable[[], object]] = [*touches, env.objects, env.size, env.quantiles]
         asks.append(partial(env.voxels, 1))
         for ask in asks:

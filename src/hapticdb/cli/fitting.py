@@ -63,10 +63,12 @@ def compare(
     tool_unit: str | None,
     path_unit: str | None,
     is_moving: bool,
+    reach: float = 0.0,
 ) -> "Proportions":
     """Compare the sizes and places of tool, path and scene; tell what does not fit.
 
-    tool : its file, or None where parts of the environment are the tool.
+    tool : its file, or None where parts of the environment are the tool; reach : distance from a
+    surface, metres, from which on a force law may feel it.
     """
     from hapticdb.proportions import compare_proportions
 
@@ -81,7 +83,7 @@ def compare(
         is_moving=is_moving,
     )
     tell(found, tool, "--path-unit")
-    if not found.misfits and found.gap and not is_moving:
+    if not found.misfits and found.gap and found.gap > reach and not is_moving:
         render.note(
             f"no pose comes within {length_text(found.gap)} of the scene: nothing can be touched"
         )

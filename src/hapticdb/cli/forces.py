@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from hapticdb.cli import render
+from hapticdb.cli.tools import inset_for
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -33,6 +34,8 @@ class ForceOptions:
         --cap, N.
     delay_ms : float or None
         --delay, milliseconds.
+    is_conservative : bool
+        --conservative: the tool's points stay on its surface.
 
     Raises
     ------
@@ -45,6 +48,7 @@ class ForceOptions:
     profile_name: str | None
     cap: float | None
     delay_ms: float | None
+    is_conservative: bool
 
     def __post_init__(self) -> None:
         """Refuse what no session takes, before anything is opened."""
@@ -72,6 +76,11 @@ class ForceOptions:
             return {"law": "smooth", "coupling": self._device_coupling()}
         self._check_plane()
         return {"law": self._plane(), "coupling": None}
+
+    def inset(self, cells: "ResidentCells") -> float:
+        """How far a tool is drawn inward on those cells, metres; see `inset_for`."""
+        law = "smooth" if cells.has_distances else "plane"
+        return inset_for(cells.grid.voxel_size, law, is_conservative=self.is_conservative)
 
     def tell_lowered(self, session: "Session") -> None:
         """Tell in one line by what a stiffness that was asked for is lowered."""

@@ -5,9 +5,11 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
+from hapticdb.cli.tools import shell_text
 
 if TYPE_CHECKING:
     from hapticdb.cli.columns import Columns
+    from hapticdb.pointshell.shell import PointShell
     from hapticdb.realtime.coupling import SettledCoupling
     from hapticdb.realtime.report import Report, Spread
     from hapticdb.realtime.resident_cells import ResidentCells
@@ -22,7 +24,11 @@ Facts = list[tuple[str, str]]
 
 
 def show(
-    report: "Report", cells: "ResidentCells", recording: str | None, path_speed: float | None
+    report: "Report",
+    cells: "ResidentCells",
+    shell: "PointShell",
+    recording: str | None,
+    path_speed: float | None,
 ) -> None:
     """Print how the loop kept its time, beside the empty loop, and what happened in it.
 
@@ -34,7 +40,8 @@ def show(
         Speed assumed for a path without times, m/s.
     """
     render.show(_loop_table(report))
-    facts = [*_frame_facts(report), *force_facts(report), *_cell_facts(report)]
+    facts = [("shell", shell_text(shell)), *_frame_facts(report)]
+    facts += [*force_facts(report), *_cell_facts(report)]
     facts.append(("warm start", f"{1e3 * report.warm_up:.3g} ms" + _cold_clause(report)))
     if report.loose_frames:
         facts.append(("in something", loose_text(report, cells)))

@@ -29,7 +29,7 @@ from hapticdb.mesh import Defects, MeshFile, Part, read_file
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
-from hapticdb.store.refusals import check_distances
+from hapticdb.store.refusals import wants_distances
 
 
 class ImportProgress(NamedTuple):
@@ -114,7 +114,8 @@ class ImportOptions:
         another geometry, placement or unit now, and remove objects whose parts the file lacks.
     distances : bool or None
         Whether parts of a new environment get distances to their surfaces, which the smooth force
-        law needs (they do not unless given); must agree with an existing one.
+        law needs; must agree with an existing one. Unless given, they do in the layout brick. The
+        layout voxel has none.
     """
 
     unit: str | None = None
@@ -230,7 +231,7 @@ class _Target:
         if not exists(url):
             layout = options.layout or "brick"
             check_curve(options.grid.curve or "z", layout)
-            check_distances(layout, distances=bool(options.distances))
+            wants_distances(layout, options.distances)
             return
         self.store = open_store(url)
         with _closing_on_error(self.store):
@@ -269,7 +270,7 @@ class _Target:
         """Make the environment, or open the one that another process has made meanwhile."""
         layout = self._options.layout or "brick"
         try:
-            wanted = bool(self._options.distances)
+            wanted = wants_distances(layout, self._options.distances)
             self.store = create_store(self._url, grid, layout, distances=wanted)
             self._is_new = True
         except EnvironmentExistsError:

@@ -325,7 +325,7 @@ def _draw_hits(
     if not len(samples):
         return
     for pose in _poses_at(found, samples):
-        pairs = env.touch(shell, pose, exclude=exclude).pairs
+        pairs = env.touch(shell, pose, exclude=exclude, law="plane").pairs
         seen = camera.project(_placed(shell.points[pairs[:, 0]], pose)) / SAMPLES
         tints = [colors.get(i, FAINT) for i in pairs[:, 1].tolist()]
         axes.scatter(seen[:, 0], seen[:, 1], s=5.0, c=tints, linewidths=0, alpha=0.8, zorder=4)

@@ -133,6 +133,17 @@ class PointShell:
         kind = "closed" if self.is_closed else "open"
         return f"PointShell({len(self)} points, {size} m, {kind}, {self.link or 'from no file'})"
 
+    @property
+    def outline(self) -> Floats:
+        """Positions (P, 3), metres, that span the tool's surface.
+
+        The corners of the surface's triangles, if it is known; else the points, put back onto the
+        surface that they were drawn inward from.
+        """
+        if isinstance(self.surface, Surface):
+            return self.surface.triangles.reshape(-1, 3)
+        return self.points - self.inset[:, None] * self.normals
+
     @classmethod
     def from_file(
         cls,

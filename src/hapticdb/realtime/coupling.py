@@ -18,6 +18,9 @@ from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.resident.cells import Place
 from hapticdb.pointshell.shell import PointShell
 
+MOST = 1e9
+"""Largest number of a `DeviceCoupling`, in its unit: more than any device has."""
+
 
 @dataclass(frozen=True)
 class Coupling:
@@ -156,8 +159,10 @@ class DeviceCoupling:
             ("fade", "s"),
         ):
             value = getattr(self, name)
-            if value is not None and not (math.isfinite(value) and value > 0.0):
-                raise UsageError(f"a coupling's {name} of {value} {unit}: give a number above 0")
+            if value is not None and not 0.0 < value <= MOST:
+                raise UsageError(
+                    f"a coupling's {name} of {value} {unit}: give a number above 0, up to {MOST:g}"
+                )
         for name, unit in (("damping", "N s/m"), ("delay", "s")):
             value = getattr(self, name)
             if value is not None and not (math.isfinite(value) and value >= 0.0):

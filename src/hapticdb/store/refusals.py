@@ -56,3 +56,16 @@ def check_distances(layout: Layout, *, distances: bool) -> None:
     """Refuse distances on the layout voxel: a row of distances belongs to a brick."""
     if distances and layout == "voxel":
         raise UsageError("the layout voxel has no distances: leave them out, or choose bricks")
+
+
+def wants_distances(layout: Layout, wish: bool | None) -> bool:  # noqa: FBT001 - a wish as given
+    """Whether a new environment has distances, by a wish or by its layout; bricks do unless told.
+
+    Raises
+    ------
+    UsageError
+        As for `check_distances`.
+    """
+    distances = layout == "brick" if wish is None else wish
+    check_distances(layout, distances=distances)
+    return distances

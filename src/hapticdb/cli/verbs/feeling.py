@@ -13,6 +13,7 @@ from hapticdb.cli.forces import ForceOptions
 from hapticdb.cli.hands import VENDORS, HandOptions
 from hapticdb.cli.options import (
     BudgetOption,
+    ConservativeOption,
     ExcludeOption,
     JsonOption,
     LawOption,
@@ -22,7 +23,7 @@ from hapticdb.cli.options import (
     UrlArgument,
 )
 from hapticdb.cli.root import Interrupted, leave
-from hapticdb.cli.tools import shell_of
+from hapticdb.cli.tools import shell_of, shell_record
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.errors import UsageError
 from hapticdb.interrupting import interrupt
@@ -175,6 +176,7 @@ def feel(
     policy: PolicyOption = "hold",
     staleness: StalenessOption = 1.0,
     law: LawOption = None,
+    conservative: ConservativeOption = False,
     stiffness: DeviceStiffnessOption = None,
     device_profile: ProfileOption = None,
     cap: CapOption = None,
@@ -193,15 +195,15 @@ def feel(
     """
     from hapticdb import Handle, Session
 
-    n_bytes, force = budget_bytes(budget), ForceOptions(law, stiffness, device_profile, cap, delay)
+    force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
     _check_loop(processor, policy, device)
     motion = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
     path_speed = motion.path_speed()
     hand, handle = motion.open(path_speed), Handle(scale=scale, clutch=clutch)
-    excluded = _excluded_ids(url, exclude)
-    shell = _compiled_shell(tool, tool_unit, points, seed, device)
-    with force.cells(url, n_bytes, excluded) as cells:
+    render.compile_kernels("feel", files=[tool])
+    with force.cells(url, budget_bytes(budget), _excluded_ids(url, exclude)) as cells:
+        shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
         session = Session(
             cells, shell, hand, rate=rate, seconds=seconds, **force.law_and_coupling(cells),
             handle=handle, policy=policy, staleness=staleness, record=record,
@@ -210,32 +212,33 @@ def feel(
         )  # fmt: skip
         force.tell_lowered(session)
         report, signals = _run(session, tool)
-        _show(report, cells, record, path_speed, json=json)
+        _show(report, cells, shell, record, path_speed, json=json)
     _exit_after(signals, report)
 
 
-def _compiled_shell(
-    tool: str, unit: str | None, points: int | None, seed: int | None, device: str
+def _shell(
+    tool: str, unit: str | None, points: int | None, seed: int | None, device: str, inset: float
 ) -> "PointShell":
-    """Compile the kernels and make the tool's shell."""
-    render.compile_kernels("feel", files=[tool])
+    """Make the tool's shell, drawn inward by `inset` metres."""
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
-    return shell_of(tool, unit, points, None if is_for_hand_alone else seed)
+    return shell_of(tool, unit, points, None if is_for_hand_alone else seed, inset=inset)
 
 
 def _show(
     report: "Report",
     cells: "ResidentCells",
+    shell: "PointShell",
     record: str | None,
     path_speed: float | None,
     *,
     json: bool,
 ) -> None:
     if json:
-        render.say_json(report.figures() | {"path_speed": path_speed})
+        more = {"path_speed": path_speed, "shell": shell_record(shell)}
+        render.say_json(report.figures() | more)
     else:
-        session_page.show(report, cells, record, path_speed)
+        session_page.show(report, cells, shell, record, path_speed)
 
 
 def _recording_limit(record: str | None, limit: str | None, *, is_continued: bool) -> int:

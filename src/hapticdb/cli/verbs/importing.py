@@ -78,7 +78,7 @@ DistancesOption = Annotated[
     typer.Option(
         "--distances/--no-distances",
         help="Store distances to surfaces, for smooth forces, in a new environment.",
-        show_default="no",
+        show_default="yes for bricks",
     ),
 ]
 

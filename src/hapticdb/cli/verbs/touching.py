@@ -118,6 +118,7 @@ def touch(
         fit = fitting.compare(
             env, shell, path, exclude=excluded, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=False,
+            reach=inset_for(env.grid.voxel_size, name, is_conservative=False),
         )  # fmt: skip
         asked = _strategy_of(strategy, env, len(path))
         touch_at = partial(

@@ -26,6 +26,7 @@ from hapticdb.kernels.resident.cells import (
     key_of_cell,
     spread_key,
 )
+from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 
 Floats = NDArray[np.float64]
 Distance = Callable[[Floats], Floats]
@@ -159,7 +160,12 @@ def field_of(distance: Distance, size: float, n_cells: ArrayLike = (2, 2, 2)) ->
         np.array(masks, dtype=np.uint64),
         np.zeros(len(payload), dtype=np.uint8),
         np.array(payload),
+        np.zeros((len(payload), 1024), dtype=np.uint32),
     )
+    slots_filled = np.arange(1, len(payload))
+    assert cells.payload is not None
+    assert cells.near is not None
+    mark_near_voxels(slots_filled, cells.payload, cells.masks, cells.words, cells.near)
     return Field(cells, Place(origin, origin, origin, size, float(side)), distance)
 
 

@@ -21,6 +21,7 @@ from hapticdb.kernels.query import contact, refining
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cells as resident
 from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.resident.frames import clusters_of
 from naive_frame import NaiveTouch, distance_at, touch_distances
 
@@ -169,9 +170,11 @@ def cells_of(scene: Merged, exclude: tuple[int, ...]) -> resident.Cells:
         key = resident.key_of_cell(*cell)
         at = resident.place_in_set(keys[0], key)
         keys[:, at], slots[:, at] = key, 1 + n
+    near = np.zeros_like(words)
+    mark_near_voxels(np.arange(1, 1 + n_cells), payload, masks, words, near)
     return resident.Cells(
         np.ones(16, dtype=np.int64), np.zeros(128, dtype=np.int64), keys, slots, words, masks,
-        np.zeros(1 + n_cells, dtype=np.uint8), payload,
+        np.zeros(1 + n_cells, dtype=np.uint8), payload, near,
     )  # fmt: skip
 
 

@@ -13,6 +13,7 @@ from hapticdb.errors import DatabaseError
 from hapticdb.grid import CurveName
 from hapticdb.kernels.field.lattice import BEYOND, VOXELS_A_STEP
 from hapticdb.kernels.resident.cells import UNKNOWN
+from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.resident import source
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -57,6 +58,13 @@ def check(residency: Residency, objects: dict[int, Points]) -> int:
         low = np.array([key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF]) << 5
         near = points[(np.abs(points - low - 16.0) < 24.0).all(axis=1)]
         assert np.array_equal(table.cells.payload[slot], steps_to(near, low - 1, 34))
+    assert table.cells.near is not None
+    near_voxels = np.zeros_like(table.cells.near)
+    mark_near_voxels(
+        slots[slots > 0], table.cells.payload, table.cells.masks, table.cells.words, near_voxels
+    )
+    filled = np.append(slots[slots > 0], 0)
+    assert np.array_equal(table.cells.near[filled], near_voxels[filled])
     return int((slots > 0).sum())
 
 

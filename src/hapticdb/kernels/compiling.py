@@ -43,6 +43,7 @@ ENTRIES = {
         "curve_keys_of_cells cells_of_curve_keys slots_to_free publish oldest_version_read "
         "cells_ahead cells_met"
     ),
+    "resident.near_voxels": "mark_near_voxels",
     "surfaces.sides": "side_votes_kernel nesting_kernel",
     "motion": "play sway survey pull",
     "field.packing": "pack_kernel unpack_kernel",
@@ -87,6 +88,7 @@ _COST = (
 )
 _RESIDENT = (
     "resident.cell_table.*",
+    "resident.near_voxels.*",
     "resident.feeling.bounding_spheres",
     "query.grouping.group_spans_by_cost",
     *_COST,

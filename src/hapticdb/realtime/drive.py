@@ -59,7 +59,7 @@ class PlaneDrive:
 
     def __init__(self, scene: DriveInputs, body: Body, scale: float) -> None:
         self._scene, self._body, self._scale = scene, body, scale
-        self._cells = scene.cells._replace(payload=None)  # distances, if any, are not read
+        self._cells = scene.cells.without_distances()  # distances, if any, are not read
         self.radius, self.hold = body.radius, body.hold
         self.least_share = 1.0
         self._met = np.empty((MET_ROWS, len(scene.clusters.points)), dtype=np.int64)

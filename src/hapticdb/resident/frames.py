@@ -15,6 +15,7 @@ from hapticdb.kernels.resident.cells import (
     GROUP,
     HITS,
     RESULTS,
+    SCRATCH_ROWS,
     UNKNOWN,
     UNKNOWNS,
     WRENCH,
@@ -79,7 +80,7 @@ def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) ->
         bounding_spheres(points, GROUP * run, 1e-3 * voxel_size, groups)
     run = run or min(len(points), FLAT_RUN)
     columns = np.ascontiguousarray(shell.points.T)
-    scratch = np.empty((6, run))
+    scratch = np.empty((SCRATCH_ROWS, run))
     return Clusters(points, np.array(shell.center), spheres, groups, run, columns, scratch)
 
 
@@ -166,7 +167,7 @@ class ResidentFrames:
             )
         self.cells = table.cells
         if not reads_distances(self.law):  # kernels are compiled for the plane without a payload
-            self.cells = table.cells._replace(payload=None)
+            self.cells = table.cells.without_distances()
         self.clusters = clusters_of(shell, residency.grid.voxel_size, run)
         self.met = np.empty(len(shell), dtype=np.int64)
         self.surroundings = surroundings_of(

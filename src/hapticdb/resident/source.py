@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import DatabaseError
 from hapticdb.kernels.field.packing import unpack
 from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.query.grouping import group_spans
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.resident.costs import costs_at_start
@@ -83,6 +84,7 @@ class CellSource:
         )  # fmt: skip
         if payload is not None:
             self._fill_distances(rows, on_curve, slots[order], payload, masks)
+            mark_near_voxels(slots, payload, masks, words, table.cells.near)
         return CellsRead(masks[slots] == 0, len(rows), len(ranges.lows))
 
     def _fill_distances(

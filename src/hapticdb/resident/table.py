@@ -60,7 +60,10 @@ class _Field(NamedTuple):
 def _fields(n_slots: int, *, has_distances: bool) -> list[_Field]:
     """All arrays of a table, in their order in memory."""
     rows, capacity = MOST_READERS, _capacity(n_slots)
-    payload = [_Field("payload", np.uint8, (n_slots, CELL_VALUES))] if has_distances else []
+    distances = [
+        _Field("payload", np.uint8, (n_slots, CELL_VALUES)),
+        _Field("near", np.uint32, (n_slots, kernels.CELL_WORDS)),
+    ]
     return [
         _Field("control", np.int64, (CONTROL_WORDS,)),
         _Field("readers", np.int64, (rows * kernels.READER_STRIDE,)),
@@ -72,7 +75,7 @@ def _fields(n_slots: int, *, has_distances: bool) -> list[_Field]:
         _Field("words", np.uint32, (n_slots, kernels.CELL_WORDS)),
         _Field("masks", np.uint64, (n_slots,)),
         _Field("used", np.uint8, (n_slots,)),
-        *payload,
+        *(distances if has_distances else []),
     ]
 
 
@@ -93,7 +96,7 @@ def _capacity(n_slots: int) -> int:
 def slots_within(budget_bytes: int, *, has_distances: bool = False) -> int:
     """Number of slots that fit into a budget, with the slot for empty cells.
 
-    A slot with distances takes 43 KiB, one without them 4 KiB.
+    A slot with distances takes 47 KiB, one without them 4 KiB.
 
     Raises
     ------

@@ -128,7 +128,7 @@ class PlaneHand(_Held):
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
         super().__init__(ground, shell, pose, terms)
-        self._cells = self._cells._replace(payload=None)
+        self._cells = self._cells.without_distances()
         coupling = Coupling(stiffness=terms.stiffness)
         self._body = coupling.body(shell, self._place, terms.stiffness)
         self._rest(pose)

@@ -58,6 +58,12 @@ def cell_place(x, y, z):
 
 
 @leaf
+def place_before(x, y, z):
+    """Way in a cell's distances from centre (0, 0, 0) to centre (x, y, z), of any cell."""
+    return (x * CELL_SIDE + y) * CELL_SIDE + z
+
+
+@leaf
 def trilinear(u000, u001, u010, u011, u100, u101, u110, u111, x, y, z):
     """Trilinear interpolation between 8 corners; x, y, z in [0, 1] from corner 000."""
     u00 = u000 + z * (u001 - u000)

@@ -25,12 +25,10 @@ import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, fields_of, inlined, leaf
 from hapticdb.kernels.field.lattice import (
-    CELL_SIDE,
     HALF_WIDTH,
     ROW_SIDE,
     STEPS,
     VOXELS_A_STEP,
-    cell_place,
     row_place,
     trilinear,
 )
@@ -125,35 +123,15 @@ def least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
     )
 
 
-def at_slot(law, payload, slot, x, y, z):  # noqa: ARG001
-    """U at a point, in voxels from the grid's origin, from its cell; payload (S, 34^3) uint8."""
-    return of_cell(payload, slot, x, y, z, np.int64(x) & -32, np.int64(y) & -32, np.int64(z) & -32)
-
-
-@inlined
-def of_cell(payload, slot, x, y, z, i, j, k):
-    """U at a point in, or under 1/2 voxel beside, the cell whose first voxel is (i, j, k)."""
-    x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
-    at = cell_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k)
-    most = np.int64(STEPS)
-    return distance_between(
-        min(most, np.int64(payload[slot, at])),
-        min(most, np.int64(payload[slot, at + 1])),
-        min(most, np.int64(payload[slot, at + CELL_SIDE])),
-        min(most, np.int64(payload[slot, at + CELL_SIDE + 1])),
-        min(most, np.int64(payload[slot, at + CELL_SIDE * CELL_SIDE])),
-        min(most, np.int64(payload[slot, at + CELL_SIDE * CELL_SIDE + 1])),
-        min(most, np.int64(payload[slot, at + CELL_SIDE * (CELL_SIDE + 1)])),
-        min(most, np.int64(payload[slot, at + CELL_SIDE * (CELL_SIDE + 1) + 1])),
-        x - 0.5 - x0,
-        y - 0.5 - y0,
-        z - 0.5 - z0,
-    )
+@leaf
+def depth_and_weight(sample, size):
+    """Depth below the onset in metres, negative above it, and the weight in the average."""
+    return size * (ONSET - sample), min(max((REACH - sample) / BLENDING, 0.0), 1.0)
 
 
 def below_onset(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # noqa: ARG001
     """Depth below the onset in metres, negative above it, and the weight in the average."""
-    return size * (ONSET - sample), min(max((REACH - sample) / BLENDING, 0.0), 1.0)
+    return depth_and_weight(sample, size)
 
 
 @leaf
@@ -167,15 +145,6 @@ def share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample)
     ahead = least_of_brick(
         payload, counts, first, end, x + AHEAD * nx, y + AHEAD * ny, z + AHEAD * nz,
         np.int64(x) & -8, np.int64(y) & -8, np.int64(z) & -8,
-    )  # fmt: skip
-    return agreement(sample, ahead)
-
-
-def share_at_slot(law, payload, slot, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
-    """How far the normal agrees with the distances of a cell, 0 to 1."""
-    ahead = of_cell(
-        payload, slot, x + AHEAD * nx, y + AHEAD * ny, z + AHEAD * nz,
-        np.int64(x) & -32, np.int64(y) & -32, np.int64(z) & -32,
     )  # fmt: skip
     return agreement(sample, ahead)
 
@@ -197,8 +166,6 @@ define(
         reach=reach_of,
         felt_within=felt_within_of,
         sample_rows=least_of_rows,
-        sample_slot=at_slot,
         share_rows=share_of_rows,
-        share_slot=share_at_slot,
     ),
 )

@@ -9,6 +9,8 @@ voxel.
 A table with distances also has, for each slot, the least distance of all objects at 34^3 voxel
 centres: the cell's own and one more on each side (`hapticdb.kernels.field.lattice`). There a
 brick's bit is also set if the brick has a row of the band, and a cell without a voxel takes a slot.
+A second array of words, `near`, has the bit of a voxel set if a point in it may count under the
+distance law (`near_voxels`). A frame reads one bit there before it looks up distances.
 
 Directories are published in versions, three buffers in turn. A frame announces which version it
 reads and uses only that one, so it never reads a half-changed directory. The writing process reuses
@@ -67,7 +69,8 @@ class Cells(NamedTuple):
     control (16,) int64; readers (16 x 8,) int64, the version that each reader reads, 0 for none;
     keys (3, capacity) int64 and slots (3, capacity) int32, the directories; words (slots, 1024)
     uint32; masks (slots,) uint64; used (slots,) uint8, set by a frame that reads the slot; payload
-    (slots, 34^3) uint8: stored distances, all BEYOND in slot 0; None in a table without them.
+    (slots, 34^3) uint8: stored distances, all BEYOND in slot 0; near (slots, 1024) uint32: voxels
+    in which a point may count under the distance law; both are None in a table without distances.
     """
 
     control: Ints
@@ -78,11 +81,16 @@ class Cells(NamedTuple):
     masks: NDArray[np.uint64]
     used: NDArray[np.uint8]
     payload: NDArray[np.uint8] | None = None
+    near: NDArray[np.uint32] | None = None
+
+    def without_distances(self) -> "Cells":
+        """The same cells for kernels that read voxels alone: they are compiled for None here."""
+        return self._replace(payload=None, near=None)
 
 
-CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, NONE)
+CELLS = fields_of(Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, NONE, NONE)
 CELLS_WITH_DISTANCES = fields_of(
-    Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, BYTES2
+    Cells, INTS, INTS, INTS2, INTS32_2, WORDS32_2, WORDS, BYTES, BYTES2, WORDS32_2
 )
 
 
@@ -99,14 +107,19 @@ class Place(NamedTuple):
 PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
 
 
+SCRATCH_ROWS = 19
+"""Rows of `Clusters.scratch`: 0-2 have the placed points in metres, 3-5 in voxels; the others
+belong to the frames of the distance law (`distance_frames`)."""
+
+
 class Clusters(NamedTuple):
     """A shell in the form that frames read.
 
     points (N, 6): metres and inward normals, tool frame, in the order of the shell; center (3,);
     spheres (C, 4): centre and radius, metres, of each run of `run` points, or (0, 4) for none;
     groups (G, 4): the same of each group of `GROUP` runs; columns (3, N): the points again, one
-    row for each axis; scratch (6, run): memory for one placed run. Each thread needs its own
-    scratch.
+    row for each axis; scratch (SCRATCH_ROWS, run): memory for one placed run. Each thread needs its
+    own scratch.
     """
 
     points: Floats

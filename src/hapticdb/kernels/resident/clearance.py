@@ -253,7 +253,7 @@ def find_clearance(
     before their points. Returns the number of poses done. It is less than B when a cell was not
     resident; then `bounds.where[STOPPED]` has the point, or the first point of the run.
     """
-    _, _, keys, slots, words, masks, used, _ = cells
+    _, _, keys, slots, words, masks, used, _, _ = cells
     points, _, spheres, _, run, _, _ = shell
     expiry, of_runs, nearest, least, state, where = bounds
     which = begin_frame(cells, reader)

@@ -36,7 +36,7 @@ from hapticdb.kernels.resident.cells import (
     place_in_set,
     slot_of,
 )
-from hapticdb.kernels.resident.feeling import free_runs
+from hapticdb.kernels.resident.runs import free_runs
 from hapticdb.kernels.rigid import (
     moved,
     pose_of_quaternion,
@@ -146,7 +146,7 @@ def hits_of_pose(cells, which, shell, transform, place, sample, count, found):
 
     sample: index of the pose, written with each hit.
     """
-    _, _, keys, slots, words, masks, used, _ = cells
+    _, _, keys, slots, words, masks, used, _, _ = cells
     points, _, spheres, groups, run, _, _ = shell
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
     cluster = start = 0

@@ -1,0 +1,63 @@
+"""Near voxels: those in which a point may count under the distance law.
+
+A voxel is near if a lower bound of the distances in it is at most the law's reach. The bound comes
+from the same stored distances that a frame interpolates, so no point that counts is missed.
+
+Proof. In a voxel, the interpolated distance takes its least value at one of 27 places: the voxel's
+centre and the middles of its faces, edges and corners, between which it is trilinear. On one axis
+these are the centre, with the value c, and the two borders, with the means of c and a neighbour.
+The least of the three is (c + min(before, c, after)) / 2. To take this least value along k, then of
+the results along j, then along i, gives a lower bound of all 27: a mean of least values is never
+above the least mean. The bound is exact where the distances fall along each axis in one direction.
+"""
+
+import numpy as np
+
+from hapticdb.kernels._jit import BYTES2, INTS, WORDS, WORDS32_2, entry
+from hapticdb.kernels.field.lattice import CELL_SIDE, STEPS, VOXELS_A_STEP
+from hapticdb.kernels.field.law import REACH
+from hapticdb.kernels.resident.cells import CELL_WORDS
+
+MOST_EIGHTHS = int(8 * REACH / VOXELS_A_STEP)
+"""Largest bound of a near voxel, in eighths of a step. The next eighth is a thousandth of a voxel
+above the reach, far more than the rounding of a frame."""
+SIDE = 32
+"""Voxels of a cell on each axis."""
+
+
+@entry(INTS, BYTES2, WORDS, WORDS32_2, WORDS32_2)
+def mark_near_voxels(places, payload, masks, words, near):
+    """Write the near voxels of cells in slots places (n,) from their distances and their voxels.
+
+    payload (S, 34^3) uint8; masks (S,) uint64; words, near (S, 1024) uint32. Occupied voxels count
+    as near. A slot whose mask is 0 has none. The loops along k are plain, so that the compiler
+    vectorizes them.
+    """
+    along_k = np.empty((CELL_SIDE * CELL_SIDE, SIDE), dtype=np.int16)
+    along_j = np.empty((CELL_SIDE * SIDE, SIDE), dtype=np.int16)
+    for n in range(places.shape[0]):
+        slot = places[n]
+        for word in range(CELL_WORDS):
+            near[slot, word] = 0
+        if masks[slot] == 0:
+            continue
+        for line in range(CELL_SIDE * CELL_SIDE):
+            at = line * CELL_SIDE
+            for k in range(SIDE):
+                middle = min(payload[slot, at + k + 1], STEPS)
+                beside = min(payload[slot, at + k], payload[slot, at + k + 2])
+                along_k[line, k] = middle + min(middle, beside)
+        for i in range(CELL_SIDE):
+            for j in range(SIDE):
+                at = i * CELL_SIDE + j
+                for k in range(SIDE):
+                    middle = along_k[at + 1, k]
+                    beside = min(along_k[at, k], along_k[at + 2, k])
+                    along_j[i * SIDE + j, k] = middle + min(middle, beside)
+        for word in range(CELL_WORDS):
+            bits = np.int64(words[slot, word])
+            for k in range(SIDE):
+                middle = along_j[word + SIDE, k]
+                beside = min(along_j[word, k], along_j[word + 2 * SIDE, k])
+                bits |= np.int64(middle + min(middle, beside) <= MOST_EIGHTHS) << k
+            near[slot, word] = bits

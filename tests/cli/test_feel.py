@@ -64,7 +64,8 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     n_frames = sum(map(len, recording.frames()))
     assert rows["frames"].split()[0] == f"{n_frames:,}"
     assert rows["recorded"] == f"{n_frames:,} frames in felt.hdbrec"
-    assert rows["objects"].startswith("1 touched: box1")  # it starts too near to box0
+    # it starts too near to box0 to feel it; whether it does when it comes free depends on its way
+    assert re.fullmatch(r"(1 touched: box1|2 touched: box0, box1)", rows["objects"])
     assert rows["resident"].endswith("in 256 MiB")
     assert "outages" not in rows
     assert max(map(len, out.splitlines())) <= 100

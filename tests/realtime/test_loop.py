@@ -120,8 +120,10 @@ def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
     hand = stroking(0.010, 0.2)
     hand.apply = applied.append  # type: ignore[assignment]
     answer, frames = run(hand, seconds=1e9)
-    # a frame's time is its deadline; a late frame reads the device later than that
-    assert frames["time"][-1] >= 0.2 - answer.loop.lateness.worst
+    # a frame's time is its deadline; a late frame reads the device later than that, and whether
+    # there is one at the very end is a matter of nanoseconds
+    period = 1.0 / 500.0
+    assert frames["time"][-1] >= 0.2 - period - answer.loop.lateness.worst - 1e-6
     assert answer.counts.peak_force > 0.0
     assert not applied[-1].any()
 

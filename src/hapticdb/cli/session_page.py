@@ -134,11 +134,9 @@ def loose_text(report: "Report", cells: "ResidentCells") -> str:
         else f"from second {report.first_loose_frame / report.rate:.3g} on it was inside"
     )
     inside = in_objects(cells, report.loose_objects)
-    end = "it never came free" if report.ended_loose else "then it was free"
-    return (
-        f"{start} {inside}: no force for {render.counted(frames, 'frame')} "
-        f"({frames / report.rate:.3g} s), since nothing is felt until the tool is free; {end}"
-    )
+    end = "it never came free" if report.ended_loose else "until it was free"
+    counted = render.counted(frames, "frame")
+    return f"{start} {inside}: no force for {counted} ({frames / report.rate:.3g} s), {end}"
 
 
 class LooseNotes:

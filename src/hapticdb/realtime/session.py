@@ -358,8 +358,9 @@ class Session:
             self._loose_objects |= named
             self._has_touched = False
         else:
-            self._has_touched = self._has_touched or bool(frames["hits"].any())
-            # before the first hit an answer about the place where the tool lay may be left
+            touched = bool((frames["hits"] | frames["contacts"]).any())
+            self._has_touched = self._has_touched or touched
+            # before the first contact an answer about the place where the tool lay may be left
             self._objects |= named if self._has_touched else named - self._loose_objects
         if self._recording is not None:
             self._recording.take(self._ring, done)

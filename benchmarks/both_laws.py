@@ -146,8 +146,8 @@ def frames_of(database: Path, model: Path, along: Path) -> list[Line]:
         return [
             resident_line(env, "resident, the tool sliding", small, poses),
             resident_line(env, "resident, the tool sliding", large, poses[::20]),
-            resident_line(env, f"resident, all touching ({name})", part,
-                          shaken(10, env.grid.voxel_size)),
+            resident_line(env, "resident, all touching", part, shaken(10, env.grid.voxel_size))
+            | {"part": name},
             *(database_line(env, strategy, small, poses[::5]) for strategy in STRATEGIES),
         ]  # fmt: skip
 

@@ -117,7 +117,7 @@ class Plan:
                     transform=shift @ obj.transform,
                     bounds=obj.bounds + offset,
                 ),
-                rows._replace(keys=rows.keys + key),
+                Rows(rows.keys + key, rows.ids, rows.occupancy, rows.distances),
             )
             for obj, rows in self.source.parts
         ]

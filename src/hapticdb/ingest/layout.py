@@ -42,7 +42,7 @@ def rows_of_bricks(bricks: Bricks, grid: Grid, layout: Layout) -> tuple[Rows, in
         keys = _reordered(keys, grid.bits, curves.Z_ORDER, grid.curve_code)
         order = np.argsort(keys)
         keys, occupancy = keys[order], occupancy[order]
-        distances = None if distances is None else picked(distances, order)
+        distances = None if distances is None else distances.picked(order)
     ids = np.zeros(len(keys), dtype=np.int64)
     return Rows(keys, ids, occupancy.reshape(-1), distances), n_voxels
 
@@ -68,16 +68,8 @@ def bricks_of_rows(rows: Rows, grid: Grid, layout: Layout) -> Bricks:
     if grid.curve != "z":
         keys = _reordered(keys, grid.bits, grid.curve_code, curves.Z_ORDER)
     order = np.argsort(keys)
-    distances = None if rows.distances is None else picked(rows.distances, order)
+    distances = None if rows.distances is None else rows.distances.picked(order)
     return Bricks(keys[order], rows.occupancy.reshape(-1, BRICK_BYTES)[order], distances)
-
-
-def picked(band: Band, which: NDArray[np.int64]) -> Band:
-    """Distances of the rows at the given places, in their order."""
-    lengths = np.diff(band.ends, prepend=0)[which]
-    ends = np.cumsum(lengths)
-    shifts = np.repeat(band.ends[which] - ends, lengths)
-    return Band(band.data[shifts + np.arange(len(shifts))], ends)
 
 
 def bricks_of_voxels(ijk: NDArray[np.int64], grid: Grid) -> Bricks:
@@ -114,7 +106,7 @@ def merged(parts: Sequence[Bricks]) -> Bricks:
     occupancy = np.concatenate([part.occupancy for part in parts])[order]
     occupancy = np.bitwise_or.reduceat(occupancy, starts, axis=0)
     bands = [part.distances for part in parts if part.distances is not None]
-    distances = picked(joined(bands), order) if len(bands) == len(parts) else None
+    distances = joined(bands).picked(order) if len(bands) == len(parts) else None
     return Bricks(keys[starts], occupancy, distances)
 
 

@@ -220,6 +220,16 @@ def test_the_path_touches_the_car_nearly_everywhere(
     assert above.min() > -0.012
 
 
+def test_the_path_begins_above_the_car(files: SampleFiles, car: list[SamplePart]) -> None:
+    """A session in which the tool begins in something would feel nothing."""
+    outside = [p.triangles() for p in car if p.name.startswith(("body/", "trim/"))]
+    map_ = heights_of_triangles(np.concatenate(outside), 0.005)
+    points = moved_points(build_wrench().vertices, read_poses(files.path)[:30])
+    above = (points[..., 2] - map_.at(points[..., 0], points[..., 1])).min(axis=1)
+    assert above[0] > 0.04
+    assert above[25:].max() < 0.006
+
+
 def plane_of_voxels(size: float) -> Floats:
     i, j = np.meshgrid(np.arange(300), np.arange(120), indexing="ij")
     return size * np.stack([i.ravel() + 0.5, j.ravel() + 0.5, np.full(i.size, 7.5)], axis=1)

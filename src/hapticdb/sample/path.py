@@ -25,6 +25,14 @@ STEP = 0.003
 DENSER = 4
 """Poses tried for each one kept: so many that equal steps of the tool can be picked among them."""
 
+LIFT = 0.05
+"""Metres above its place at which the tool of the sample's path begins. More than two voxels of a
+coarse grid, since a session in which the tool begins in something feels nothing. Larger: a longer
+way."""
+
+LANDING = 1 / 40
+"""Share of the sample's path on which the tool comes down. Larger: it slides over less."""
+
 
 class HeightMap(NamedTuple):
     """Tops of the columns of a scene.
@@ -235,8 +243,11 @@ def slide_over_voxels(
 def slide_path(parts: Sequence[SamplePart], tool_points: ArrayLike, count: int = 1000) -> Floats:
     """Poses (count, 4, 4) over the sample's car: hood, windscreen, roof, rear window, boot.
 
-    The deepest point is pressed 1 mm below the surface itself, so that the path touches whatever
-    the edge of the voxels that the car is imported with.
+    The tool comes down from above. Then its deepest point is pressed 1 mm below the surface itself,
+    so that the path touches whatever the edge of the voxels that the car is imported with.
     """
     outside = [p.triangles() for p in parts if p.name.startswith(("body/", "trim/"))]
-    return slide_over(heights_of_triangles(np.concatenate(outside)), tool_points, count, 0.001)
+    n_landing = int(LANDING * count)
+    press = np.full(count, 0.001)
+    press[:n_landing] -= np.linspace(LIFT, 0.0, n_landing, endpoint=False)
+    return slide_over(heights_of_triangles(np.concatenate(outside)), tool_points, count, press)

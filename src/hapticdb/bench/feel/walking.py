@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from hapticdb.bench.feel.couplings import RATE, Side, Terms, drive, posed
+from hapticdb.bench.feel.couplings import RATE, Side, Terms, drive, posed, straight
 from hapticdb.bench.feel.figures import largest_step, spectrum
 from hapticdb.bench.feel.ground import Ground
 from hapticdb.bench.feel.tools import ball
@@ -70,6 +70,17 @@ def plan_walk(env: Environment, places: int = PLACES) -> Walk:
     return Walk(gaussian_filter1d(hand, 10.0, axis=0, mode="nearest"), speed, size)
 
 
+def descent(env: Environment, walk: Walk) -> Floats:
+    """Straight way (M, 3) of the hand from above all objects, where the tool is free, to the walk.
+
+    A tool that begins in something feels nothing until it is free.
+    """
+    top = max(float(obj.bounds[1, 2]) for obj in env.objects())
+    start = walk.hand[0].copy()
+    start[2] = max(top, start[2]) + (RADIUS + NEAR) * walk.voxel_size
+    return straight(start, walk.hand[0], walk.speed)
+
+
 def walk_over(sides: tuple[Side, ...], url: str | Path, places: int = PLACES) -> dict[str, Any]:
     """Walk over an environment under each law.
 
@@ -85,15 +96,14 @@ def walk_over(sides: tuple[Side, ...], url: str | Path, places: int = PLACES) ->
     sides = tuple(side for side in sides if distances or not side.distances)
     with Ground(url, distances=distances) as ground:
         walk = plan_walk(ground.environment, places)
+        lead = descent(ground.environment, walk)
         apart = max(round(16.0 * ground.size / (walk.speed / RATE)), 1)
-        for place in walk.hand[::apart]:
+        for place in np.concatenate([lead[::apart], walk.hand[::apart]]):
             ground.fetch(place, NEAR)
         shell = ball(RADIUS, ground.size, POINTS)
-        start = walk.hand[0] + [0.0, 0.0, PRESS + 4.0 * ground.size]
-        lead = start + np.linspace(0.0, 1.0, 500)[:, None] * (walk.hand[0] - start)
         for side in sides:
             above = np.array([0.0, 0.0, side.onset * ground.size])
-            hand = side.grasp(ground, shell, posed(start + above), Terms())
+            hand = side.grasp(ground, shell, posed(lead[0] + above), Terms())
             drive(hand, lead + above)
             way = drive(hand, walk.hand + above)
             figures, curves = _figures_of(way.forces)

@@ -44,8 +44,8 @@ def mark_near_voxels(places, payload, masks, words, near):
         for line in range(CELL_SIDE * CELL_SIDE):
             at = line * CELL_SIDE
             for k in range(SIDE):
-                middle = min(payload[slot, at + k + 1], STEPS)
-                beside = min(payload[slot, at + k], payload[slot, at + k + 2])
+                middle = np.int16(min(payload[slot, at + k + 1], STEPS))
+                beside = np.int16(min(payload[slot, at + k], payload[slot, at + k + 2]))
                 along_k[line, k] = middle + min(middle, beside)
         for i in range(CELL_SIDE):
             for j in range(SIDE):

@@ -1,12 +1,19 @@
 """The tool that a file holds."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
-from hapticdb.errors import UsageError
+from hapticdb.errors import FileError, UsageError
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
+
+
+def expect_file(tool: str) -> None:
+    """Refuse a tool whose file is missing before anything is opened or compiled."""
+    if not Path(tool).exists():
+        raise FileError(f"cannot read {tool}: there is no such file")
 
 
 def shell_of(

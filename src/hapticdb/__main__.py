@@ -12,7 +12,8 @@ def main() -> int:
 
     try:
         return run()
-    except KeyboardInterrupt:  # once more, while the first was being answered
+    except KeyboardInterrupt:  # after the verb, when nobody else answers
+        interrupting.tell()
         return interrupting.EXIT_CODE
     finally:
         interrupting.leave()

@@ -49,11 +49,16 @@ def leave() -> None:
         )  # without a handler the alarm would end the process
 
 
+def tell() -> None:
+    """Write the one line, whatever state the program's streams are in."""
+    os.write(2, MESSAGE)
+
+
 def interrupt(_number: int, frame: FrameType | None) -> None:
     """Signal handler: raise KeyboardInterrupt or end the process, depending on the phase."""
     global _phase  # noqa: PLW0603
     if _phase == "starting":
-        os.write(2, MESSAGE)
+        tell()
         os._exit(EXIT_CODE)
     if _phase == "leaving":
         _phase = "starting"  # a second Ctrl-C ends the process at once

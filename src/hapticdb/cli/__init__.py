@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Callable, Sequence
 from itertools import takewhile
 
+from hapticdb import interrupting
 from hapticdb.cli import render
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
 from hapticdb.cli.verbs.benching import bench
@@ -87,6 +88,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         _close_stdout()
         return PIPE_CLOSED
     except (KeyboardInterrupt, Interrupted) as error:
+        interrupting.leave()  # once more would be told once more
         return _fail(str(error) or "interrupted", INTERRUPTED)
     except HapticDBError as error:
         return _fail(str(error), USER_ERROR, show_trace=is_debugging)

@@ -100,10 +100,11 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "shell": _SHELL,
     "calibrate": _COST,
     "touch": (*_SHELL, *_COST, "query.contact.*", "query.refining.*"),
-    "resident": _RESIDENT,
+    "resident": (*_RESIDENT, "field.packing.unpack_kernel"),
     "feel": (
         *_SHELL,
         *_RESIDENT,
+        "field.packing.unpack_kernel",
         "resident.feeling.feel_kernel",
         "hand.coupling.*",
         "hand.quasistatic.*",
@@ -112,7 +113,12 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "motion.*",
         "rigid.*",
     ),
-    "replay": (*_RESIDENT, "resident.feeling.*", "rigid.poses_of"),
+    "replay": (
+        *_RESIDENT,
+        "field.packing.unpack_kernel",
+        "resident.feeling.*",
+        "rigid.poses_of",
+    ),
     "sweep": (
         *_SHELL,
         *_RESIDENT,

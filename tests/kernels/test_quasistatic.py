@@ -4,6 +4,7 @@ import math
 from itertools import pairwise
 from typing import Any
 
+import numba
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ from hapticdb.kernels.hand.device_spring import contact_stiffness
 from hapticdb.kernels.rigid import product, quaternion_by
 
 Floats = NDArray[np.float64]
+NEEDS_JIT = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="too slow without the JIT")
 ONSET = 1.5
 """Voxels at which contact begins."""
 SIZE = 0.005
@@ -89,6 +91,7 @@ def test_the_force_is_exactly_zero_when_free() -> None:
     assert (hand.tool.position == hand.hand.position).all()
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize("normal", [(0, 0, 1), (0.087, 0, 1), (0.364, 0, 1), (1, 0, 1), (3, -2, 4)])
 @pytest.mark.parametrize("n_across", [3, 10])
 def test_force_along_a_plane_has_little_ripple(
@@ -108,6 +111,7 @@ def test_force_along_a_plane_has_little_ripple(
         assert np.abs(np.diff(sliding)).max() <= 0.05
 
 
+@NEEDS_JIT
 def test_entering_is_smooth_and_leaving_never_pulls() -> None:
     hand = Hand(field_of(plane([0.0, 0.0, 1.0]), SIZE), punch(3, 0.004), [0.0, 0.0, 0.012])
     hand.advance()
@@ -119,6 +123,7 @@ def test_entering_is_smooth_and_leaving_never_pulls() -> None:
     assert leaving[-1] == 0.0
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize("size", [0.005, 0.0005])
 def test_a_convex_edge_is_smooth_and_pushes_outward(size: float) -> None:
     """The hand goes round a right angle at constant depth below the surface of contact."""
@@ -141,6 +146,7 @@ def test_a_convex_edge_is_smooth_and_pushes_outward(size: float) -> None:
     assert (aside / np.linalg.norm(forces, axis=1)).max() <= 0.20
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize("size", [0.005, 0.0005])
 @pytest.mark.parametrize("n_across", [1, 3])
 def test_a_corner_is_stable_and_no_force_changes_faster_than_the_hand(
@@ -162,6 +168,7 @@ def test_a_corner_is_stable_and_no_force_changes_faster_than_the_hand(
     assert hand.follower["share"] == 1.0
 
 
+@NEEDS_JIT
 def test_a_pose_in_a_corner_has_the_least_energy() -> None:
     """Against a general minimiser of the same energy over the same spline."""
     points, target = punch(3, 0.004), np.array([-0.001, 0.0005, 0.0005])
@@ -203,6 +210,7 @@ def slot_in(field: Field, cell: tuple[int, ...]) -> int:
     return int(field.cells.slots[0][field.cells.keys[0] == key][0])
 
 
+@NEEDS_JIT
 def test_every_scale_gives_the_same_wrench() -> None:
     wrenches = []
     for scale in (1.0, 0.1, 100.0):
@@ -223,6 +231,7 @@ def test_every_scale_gives_the_same_wrench() -> None:
         np.testing.assert_allclose(other, wrenches[0], rtol=1e-6, atol=1e-9)
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize("frequency", [1.0, 5.0])
 def test_press_and_release_adds_no_energy_but_the_delay_s(frequency: float) -> None:
     hand = Hand(field_of(plane([0.0, 0.0, 1.0]), SIZE), punch(3, 0.004), [0.0, 0.0, 0.02])
@@ -236,6 +245,7 @@ def test_press_and_release_adds_no_energy_but_the_delay_s(frequency: float) -> N
     assert 0.0 < energy <= 1000.0 * dt / 2.0 * squares
 
 
+@NEEDS_JIT
 def test_damping_works_along_the_force_and_never_pulls() -> None:
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
     forces = []
@@ -250,6 +260,7 @@ def test_damping_works_along_the_force_and_never_pulls() -> None:
     assert (damped >= 0.0).all()
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize(("frequency", "acts"), [(40.0, True), (3.0, False)])
 def test_the_guard_softens_a_force_that_shakes(frequency: float, acts: bool) -> None:
     hand = Hand(field_of(plane([0.0, 0.0, 1.0]), SIZE), punch(3, 0.004), [0.0, 0.0, 0.02])
@@ -262,6 +273,7 @@ def test_the_guard_softens_a_force_that_shakes(frequency: float, acts: bool) -> 
     assert (hand.follower["share"] < 1.0) == acts
 
 
+@NEEDS_JIT
 def test_a_tool_stays_before_unknown_cells_and_its_force_fades() -> None:
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE, (4, 1, 4))
     at, way = np.array([0.0, 0.0, 0.004]), np.array([0.0, 0.0, -0.02])
@@ -328,10 +340,12 @@ def walls(n_walls: int, n_tools: int, seed: int) -> list[float]:
     return found
 
 
+@NEEDS_JIT
 def test_no_tool_passes_a_sheet_or_a_plate() -> None:
     assert min(walls(8, 8, 1)) > 0.9
 
 
+@NEEDS_JIT
 @pytest.mark.long
 def test_no_tool_of_two_thousand_passes_a_sheet_or_a_plate() -> None:
     assert min(walls(200, 10, 2)) > 0.9
@@ -345,6 +359,7 @@ def globe(radius: float) -> Floats:
     return radius * np.stack([flat * np.cos(angle), flat * np.sin(angle), height], axis=1)
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize("seed", range(6))
 def test_a_tool_astride_a_sheet_comes_free_without_a_step_and_is_then_held(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -362,6 +377,7 @@ def test_a_tool_astride_a_sheet_comes_free_without_a_step_and_is_then_held(seed:
     assert hand.sent.wrench[:3] @ normal > 0.0
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize("clearance", [0.05, 0.5])
 def test_a_peg_moves_freely_in_a_hole_with_a_clearance(clearance: float) -> None:
     size, radius = 0.001, 0.010
@@ -378,6 +394,7 @@ def test_a_peg_moves_freely_in_a_hole_with_a_clearance(clearance: float) -> None
     assert steps_of(forces) <= 0.021
 
 
+@NEEDS_JIT
 def test_a_cylinder_is_felt_all_round_with_little_ripple() -> None:
     """The force over a cylinder of 20 voxels is k times the depth, along its radius."""
     radius, depth = 20.0 * SIZE, 0.002
@@ -396,6 +413,7 @@ def test_a_cylinder_is_felt_all_round_with_little_ripple() -> None:
     assert steps_of(forces) <= 0.05
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize("size", [0.005, 0.0005])
 def test_the_force_changes_softly_when_the_tool_snaps_off_an_edge(size: float) -> None:
     """The hand goes out through the side of a right angle, deep below its top."""
@@ -415,6 +433,7 @@ def test_the_force_changes_softly_when_the_tool_snaps_off_an_edge(size: float) -
     assert (hand.rest(50) == 0.0).all()
 
 
+@NEEDS_JIT
 @pytest.mark.parametrize("ground", ["plane", "corner"])
 def test_a_hand_that_rests_on_a_surface_never_gains_energy(ground: str) -> None:
     """A mass of a light grip, pressed on with 3 N; the maximum of energy of each window falls."""

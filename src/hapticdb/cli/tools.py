@@ -10,10 +10,11 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
 
 
-def expect_file(tool: str) -> None:
-    """Refuse a tool whose file is missing before anything is opened or compiled."""
+def compile_for(tool: str, purpose: str) -> None:
+    """Compile the kernels of a purpose; refuse a tool whose file is missing before that."""
     if not Path(tool).exists():
         raise FileError(f"cannot read {tool}: there is no such file")
+    render.compile_kernels(purpose)
 
 
 def shell_of(

@@ -23,7 +23,7 @@ from hapticdb.cli.options import (
     UrlArgument,
 )
 from hapticdb.cli.root import Interrupted, leave
-from hapticdb.cli.tools import expect_file, shell_of, shell_record
+from hapticdb.cli.tools import compile_for, shell_of, shell_record
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.errors import UsageError
 from hapticdb.interrupting import interrupt
@@ -201,8 +201,7 @@ def feel(
     motion = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
     path_speed = motion.path_speed()
     hand, handle = motion.open(path_speed), Handle(scale=scale, clutch=clutch)
-    expect_file(tool)
-    render.compile_kernels("feel")
+    compile_for(tool, "feel")
     with force.cells(url, budget_bytes(budget), _excluded_ids(url, exclude)) as cells:
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
         session = Session(

@@ -11,7 +11,6 @@ import argparse
 import contextlib
 import json
 import os
-import subprocess
 import sys
 import tempfile
 import time
@@ -34,6 +33,7 @@ from hapticdb import (
     TangentPlane,
 )
 from hapticdb.bench import records
+from hapticdb.demo import write_along
 from hapticdb.kernels.resident.cells import RESULTS
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.mesh import read_file
@@ -45,6 +45,7 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.sample import write_sample
 from hapticdb.store.connect import create_store
+from in_real_time import session
 from report.laws_page import law_frame_table, law_session_table
 
 Floats = NDArray[np.float64]
@@ -60,8 +61,6 @@ LARGE = 100_000
 """Number of points of the large shells."""
 RATES = (1000, 5000)
 SEED = 20140
-PATIENCE = 600.0
-"""Seconds beyond its own duration after which a command is killed."""
 
 
 def in_turns(ways: dict[str, Callable[[], object]], n_frames: int) -> dict[str, float]:
@@ -136,12 +135,12 @@ def shaken(count: int, size: float) -> Floats:
     return poses
 
 
-def frames_of(database: Path, model: Path, along: Path) -> list[Line]:
+def frames_of(database: Path, model: Path, tool: Path, path: Path) -> list[Line]:
     """All lines of frames in one environment."""
-    poses = read_poses(along / "path.csv")
+    poses = read_poses(path)
     with hapticdb.open(database) as env:
         env.calibrate()
-        small, large = (PointShell.from_file(along / "wrench.stl", n) for n in (300, LARGE))
+        small, large = (PointShell.from_file(tool, n) for n in (300, LARGE))
         name, part = part_in_place(model)
         return [
             resident_line(env, "resident, the tool sliding", small, poses),
@@ -150,32 +149,6 @@ def frames_of(database: Path, model: Path, along: Path) -> list[Line]:
             | {"part": name},
             *(database_line(env, strategy, small, poses[::5]) for strategy in STRATEGIES),
         ]  # fmt: skip
-
-
-def along_of(folder: Path, database: Path) -> Path:
-    """Folder with a tool and a path over an environment."""
-    along = folder / "along"
-    command = [_command(), "sample", str(along), "--along", str(database)]
-    subprocess.run(command, check=True, capture_output=True, timeout=PATIENCE)
-    return along
-
-
-def _command() -> str:
-    return str(Path(sys.executable).with_name("hapticdb"))
-
-
-def session(url: str, law: str, tool: Path, path: Path, rate: int, seconds: float) -> Line:
-    """Report of `hapticdb feel`; if it fails, exit with its error text."""
-    command = [
-        _command(), "feel", url, "--tool", str(tool), "--device", str(path), "--loop", "--speed",
-        "0.2", "--rate", str(rate), "--seconds", str(seconds), "--law", law, "--json",
-    ]  # fmt: skip
-    limit = seconds + PATIENCE
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    report: Line = json.loads(done.stdout)
-    return {"law": law} | report
 
 
 def sessions_of(
@@ -192,7 +165,9 @@ def sessions_of(
             "bytes": env.size().bytes,
         }
     return [
-        about | session(str(database), law, tool, round_trip, rate, seconds)
+        about
+        | {"law": law}
+        | session(str(database), tool, round_trip, rate, seconds, ["--law", law])
         for law in LAWS
         for rate in rates
     ]
@@ -225,17 +200,15 @@ def measure(folder: Path, given: argparse.Namespace) -> dict[str, Any]:
     database = folder / f"{model.stem}.db"
     options = ImportOptions(grid=GridOptions(bits=BITS, extent=EXTENT))
     hapticdb.import_files(database, [model], options)
-    along = along_of(folder, database)
+    tool, path = write_along(folder / "along", database, frames=1000)
     rates = [int(word) for word in given.rates.split(",") if word]
     found: dict[str, Any] = {
         "commit": records.commit(),
         "machine": records.machine(),
         "versions": records.versions(),
         "model": model.name,
-        "frames": frames_of(database, model, along),
-        "sessions": sessions_of(
-            database, along / "wrench.stl", along / "path.csv", rates, given.seconds
-        ),
+        "frames": frames_of(database, model, tool, path),
+        "sessions": sessions_of(database, tool, path, rates, given.seconds),
     }
     if given.voxels:
         found["sessions"] += sessions_of(*copied(folder, given.voxels), rates, given.seconds)

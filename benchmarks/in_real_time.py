@@ -123,12 +123,14 @@ def lifted(database: Path, model: Path, name: str) -> dict[str, Any]:
     return {"part": name} | measure_frames(database, shell, poses, [own.id])
 
 
-def session(url: str, tool: Path, path: Path, rate: int, seconds: float) -> dict[str, Any]:
+def session(
+    url: str, tool: Path, path: Path, rate: int, seconds: float, options: Sequence[str] = ()
+) -> dict[str, Any]:
     """Report of `hapticdb feel`; if it fails, exit with its error text."""
     command = [
         str(Path(sys.executable).with_name("hapticdb")), "feel", url, "--tool", str(tool),
         "--device", str(path), "--loop", "--speed", "0.2", "--rate", str(rate),
-        "--seconds", str(seconds), "--json",
+        "--seconds", str(seconds), "--json", *options,
     ]  # fmt: skip
     limit = seconds + PATIENCE
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)

@@ -3,12 +3,16 @@
 from collections.abc import Mapping
 from typing import Any
 
+from report.realtime_page import times
+
 FRAME_HEAD = """\
 | frame | points | plane, us | smooth, us | smooth / plane |
 | --- | --- | --- | --- | --- |"""
 SESSION_HEAD = """\
 | environment | million voxels | law | asked, Hz | reached | late | computing | not known | N |
 | --- | --- | --- | --- | --- | --- | --- | --- | --- |"""
+
+SHARES = ("p50", "p99")
 
 
 def law_frame_table(results: Mapping[str, Any]) -> str:
@@ -32,14 +36,10 @@ def law_session_table(results: Mapping[str, Any]) -> str:
             one["law"],
             f"{one['rate']:,.0f}",
             f"{loop['rate']:,.0f}",
-            _times(loop["lateness"]),
-            _times(loop["elapsed"]),
+            times(loop["lateness"], SHARES),
+            times(loop["elapsed"], SHARES),
             f"{one['unknown_frames']:,}",
             f"{one['peak_force']:.2f}",
         ]
         lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)
-
-
-def _times(spread: Mapping[str, float]) -> str:
-    return " / ".join(f"{1e6 * spread[share]:,.0f}" for share in ("p50", "p99"))

@@ -24,17 +24,18 @@ def session_table(results: Mapping[str, Any]) -> str:
             one["engine"],
             f"{one['rate']:,.0f}",
             f"{loop['rate']:,.0f}",
-            _times(loop["lateness"]),
-            _times(loop["elapsed"]),
+            times(loop["lateness"]),
+            times(loop["elapsed"]),
             f"{empty['rate']:,.0f}",
-            _times(empty["lateness"]),
+            times(empty["lateness"]),
         ]
         lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)
 
 
-def _times(spread: Mapping[str, float]) -> str:
-    return " / ".join(f"{1e6 * spread[share]:,.0f}" for share in ("p50", "p99", "p999"))
+def times(spread: Mapping[str, float], shares: Sequence[str] = ("p50", "p99", "p999")) -> str:
+    """Percentiles of times, microseconds, in one cell of a table."""
+    return " / ".join(f"{1e6 * spread[share]:,.0f}" for share in shares)
 
 
 def frame_table(results: Mapping[str, Any]) -> str:

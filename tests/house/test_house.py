@@ -28,9 +28,12 @@ from sources import PACKAGE, ROOT, modules, named, python_files
 FLOORS: list[set[str]] = [
     {"__main__"},
     {"cli"},
+    {"server"},
+    {"page"},
     {"bench", "demo", "pictures"},
     {"pool", "warm"},
-    {"realtime", "sweeps"},
+    {"client", "hosting"},
+    {"edits", "realtime", "sweeps"},
     {"recording", "devices"},
     {"environment", "resident", "sample", "testing"},
     {"check", "difference", "ingest", "proportions", "transfer"},
@@ -39,7 +42,7 @@ FLOORS: list[set[str]] = [
     {"store"},
     {"grid"},
     {"kernels"},
-    {"units"},
+    {"protocol", "units"},
     {"errors", "interrupting"},
 ]
 LEVELS = {name: level for level, floor in enumerate(FLOORS) for name in floor}
@@ -49,6 +52,7 @@ NARROW: dict[str, set[str]] = {
     "errors": set(),
     "interrupting": set(),
     "poses": {"errors", "units"},
+    "protocol": {"errors"},
     "mesh": {"errors", "units"},
     "devices": {"errors", "kernels", "poses"},
     "sample": {"poses", "errors"},

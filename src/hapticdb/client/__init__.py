@@ -1,0 +1,1 @@
+"""Devices on another machine: mirrors of cells, and contact proxies."""

@@ -1,0 +1,1 @@
+"""Moves of objects by several people: each one transaction, with undo."""

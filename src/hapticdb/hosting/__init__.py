@@ -1,0 +1,1 @@
+"""Many hands in few processes, which share one table of cells."""

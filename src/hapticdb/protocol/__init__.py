@@ -1,0 +1,1 @@
+"""Messages between a server and its clients, to the byte."""

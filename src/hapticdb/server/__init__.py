@@ -1,0 +1,1 @@
+"""What other machines reach: relay, access, endpoints of devices, health."""

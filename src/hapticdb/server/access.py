@@ -1,0 +1,203 @@
+"""Who may do what on the server: roles, the tokens that name them, and browsers' cookies.
+
+A viewer sees, a toucher also feels, an editor also moves objects. A client shows its token once. A
+browser gets a cookie for it; a program sends the token in the header ``Authorization: Bearer`` with
+each connection. Only digests of tokens and cookies are kept.
+"""
+
+import hashlib
+import hmac
+import secrets
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from http.cookies import CookieError, SimpleCookie
+
+from hapticdb.errors import UsageError
+
+COOKIE = "hapticdb"
+"""Name of the cookie. Browsers send a cookie to all ports of a machine, so the port is appended."""
+SIGNED_IN_SECONDS = 3600.0
+"""Seconds that a cookie is good for after it was last used. Larger: a stolen cookie works longer;
+smaller: a person who was away has to show the token again sooner."""
+MOST_SIGNED_IN = 1024
+"""Greatest number of valid cookies. The one that was used longest ago makes room for a new one.
+Larger: more memory for a client that signs in again and again."""
+LEAST_TOKEN = 16
+"""Fewest characters of a token that a person chooses. Smaller: it can be guessed."""
+LONGEST_TOKEN = 256
+"""Most characters of a token. A longer one is wrong and is not hashed."""
+
+
+class Role(IntEnum):
+    """What a client may do; a greater role may also do all that a smaller one may."""
+
+    VIEWER = 1
+    TOUCHER = 2
+    EDITOR = 3
+
+    @property
+    def word(self) -> str:
+        """Its name as people write it."""
+        return self.name.lower()
+
+    @classmethod
+    def of(cls, word: str) -> "Role":
+        """Find the role of that name; a UsageError if there is none."""
+        for role in cls:
+            if role.word == word:
+                return role
+        known = ", ".join(role.word for role in cls)
+        raise UsageError(f"no role {word!r}: choose one of {known}")
+
+
+@dataclass
+class _SignedIn:
+    """A browser that has shown its token."""
+
+    role: Role
+    until: float
+
+
+class Access:
+    """The tokens of one server, and the browsers that have shown one.
+
+    Parameters
+    ----------
+    tokens : mapping of str to Role
+        The role that each token gives.
+    open_role : Role, optional
+        Role of clients that show nothing. Unless given, they have none.
+    port : int
+        Port of the server, for the name of the cookie.
+    clock : callable
+        Seconds that only grow.
+    """
+
+    def __init__(
+        self,
+        tokens: Mapping[str, Role],
+        *,
+        open_role: Role | None = None,
+        port: int = 0,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        for token in tokens:
+            check_token(token)
+        self._roles = [(_digest(token), role) for token, role in tokens.items()]
+        self._signed_in: dict[bytes, _SignedIn] = {}
+        self._clock = clock
+        self.open_role = open_role
+        self.port = port
+
+    @property
+    def needs_token(self) -> bool:
+        """Whether a client without a token may do nothing."""
+        return self.open_role is None
+
+    @property
+    def cookie_name(self) -> str:
+        """Name of this server's cookie."""
+        return f"{COOKIE}-{self.port}"
+
+    @property
+    def n_signed_in(self) -> int:
+        """Number of cookies that are valid now."""
+        now = self._clock()
+        return sum(now < known.until for known in self._signed_in.values())
+
+    def role_of_token(self, token: str) -> Role | None:
+        """Find the role that a token gives; None for a wrong one. Takes equally long for both."""
+        shown = _digest(token[: LONGEST_TOKEN + 1])
+        found = None
+        for digest, role in self._roles:
+            if hmac.compare_digest(digest, shown):
+                found = role
+        return found
+
+    def role_of_headers(self, headers: Mapping[str, str]) -> Role | None:
+        """Find the role of a client by the headers of its request.
+
+        Parameters
+        ----------
+        headers : mapping of str to str
+            With names in lower case, or one that ignores case, such as Starlette's.
+
+        Returns
+        -------
+        Role or None
+            Of its bearer token or its cookie, whose time begins anew; else the open role. None if
+            it may do nothing: also if it shows a bearer token that is wrong.
+        """
+        scheme, _, token = headers.get("authorization", "").partition(" ")
+        if scheme.lower() == "bearer":
+            return self.role_of_token(token.strip())
+        known = self._known(self.cookie_of(headers))
+        return known.role if known is not None else self.open_role
+
+    def cookie_of(self, headers: Mapping[str, str]) -> str:
+        """Take the value of this server's cookie out of a request's headers; empty without one."""
+        try:
+            morsel = SimpleCookie(headers.get("cookie", "")).get(self.cookie_name)
+        except CookieError:
+            return ""
+        return "" if morsel is None else morsel.value
+
+    def renew(self, cookie: str) -> bool:
+        """Begin the time of a cookie anew; returns whether it was still valid."""
+        return self._known(cookie) is not None
+
+    def sign_in(self, token: str) -> str | None:
+        """Value of a new cookie for a browser that shows this token; None for a wrong token."""
+        role = self.role_of_token(token)
+        if role is None:
+            return None
+        self._forget_old()
+        cookie = secrets.token_urlsafe(32)
+        self._signed_in[_digest(cookie)] = _SignedIn(role, self._clock() + SIGNED_IN_SECONDS)
+        return cookie
+
+    def sign_out(self, cookie: str) -> None:
+        """Make a cookie invalid."""
+        self._signed_in.pop(_digest(cookie), None)
+
+    def _known(self, cookie: str) -> _SignedIn | None:
+        """Find a valid cookie by its digest, which tells nothing about the cookie, and renew it."""
+        known = self._signed_in.get(_digest(cookie[:LONGEST_TOKEN])) if cookie else None
+        now = self._clock()
+        if known is None or now >= known.until:
+            return None
+        known.until = now + SIGNED_IN_SECONDS
+        return known
+
+    def _forget_old(self) -> None:
+        """Drop cookies whose time is over, and make room for one more."""
+        now = self._clock()
+        valid = {key: known for key, known in self._signed_in.items() if now < known.until}
+        oldest: Sequence[bytes] = sorted(valid, key=lambda key: valid[key].until)
+        for key in oldest[: max(len(valid) - MOST_SIGNED_IN + 1, 0)]:
+            del valid[key]
+        self._signed_in = valid
+
+
+def make_token() -> str:
+    """Make a token of 192 random bits."""
+    return secrets.token_urlsafe(24)
+
+
+def check_token(token: str) -> None:
+    """Refuse a token that can be guessed or cannot be written into a URL."""
+    if not LEAST_TOKEN <= len(token) <= LONGEST_TOKEN:
+        raise UsageError(
+            f"a token of {len(token)} characters: choose one of {LEAST_TOKEN} to {LONGEST_TOKEN}, "
+            "or let the server make one"
+        )
+    if not all(letter.isascii() and (letter.isalnum() or letter in "-._~") for letter in token):
+        raise UsageError(
+            "a token may hold letters, digits and -._~ only, so that a URL can carry it"
+        )
+
+
+def _digest(text: str) -> bytes:
+    return hashlib.sha256(text.encode("utf-8", "surrogatepass")).digest()

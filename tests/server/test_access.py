@@ -1,0 +1,115 @@
+"""Tokens, cookies and roles."""
+
+import pytest
+
+from hapticdb.errors import UsageError
+from hapticdb.server import access
+from hapticdb.server.access import Access, Role, make_token
+
+VIEWER = "a-token-for-viewers"
+EDITOR = "a-token-for-editors"
+
+
+class Clock:
+    """A clock that a test moves."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+def of_two_roles(clock: Clock) -> Access:
+    return Access({VIEWER: Role.VIEWER, EDITOR: Role.EDITOR}, port=80, clock=clock)
+
+
+def cookie_header(known: Access, token: str) -> dict[str, str]:
+    return {"cookie": f"other=1; {known.cookie_name}={known.sign_in(token)}"}
+
+
+def test_each_token_gives_its_role_by_header_and_by_cookie() -> None:
+    known = of_two_roles(Clock())
+    for token, role in ((VIEWER, Role.VIEWER), (EDITOR, Role.EDITOR)):
+        assert known.role_of_headers({"authorization": f"Bearer {token}"}) is role
+        assert known.role_of_headers(cookie_header(known, token)) is role
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {},
+        {"authorization": "Bearer"},
+        {"authorization": f"Basic {VIEWER}"},
+        {"authorization": f"Bearer {VIEWER}x"},
+        {"authorization": "Bearer " + "x" * 100_000},
+        {"cookie": f"hapticdb-80={VIEWER}"},
+        {"cookie": f"hapticdb-81={VIEWER}"},
+        {"cookie": "hapticdb-80"},
+        {"cookie": "\x00;;=;\udcff"},
+    ],
+)
+def test_whoever_shows_nothing_that_is_known_has_no_role(headers: dict[str, str]) -> None:
+    assert of_two_roles(Clock()).role_of_headers(headers) is None
+
+
+def test_a_wrong_token_has_no_role_where_no_token_has_one() -> None:
+    known = Access({EDITOR: Role.EDITOR}, open_role=Role.VIEWER)
+    assert known.role_of_headers({}) is Role.VIEWER
+    assert known.role_of_headers({"authorization": f"Bearer {VIEWER}"}) is None
+
+
+def test_no_cookie_for_a_wrong_token() -> None:
+    assert of_two_roles(Clock()).sign_in("not-the-right-token") is None
+
+
+def test_a_cookie_lives_while_it_is_used_and_ends_an_hour_later() -> None:
+    clock = Clock()
+    known = of_two_roles(clock)
+    header = cookie_header(known, VIEWER)
+    for _ in range(5):
+        clock.now += access.SIGNED_IN_SECONDS - 1.0
+        assert known.role_of_headers(header) is Role.VIEWER
+    clock.now += access.SIGNED_IN_SECONDS
+    assert known.role_of_headers(header) is None
+    assert known.n_signed_in == 0
+
+
+def test_a_browser_that_signs_out_has_no_role() -> None:
+    known = of_two_roles(Clock())
+    header = cookie_header(known, VIEWER)
+    known.sign_out(known.cookie_of(header))
+    assert known.role_of_headers(header) is None
+
+
+def test_the_cookie_used_longest_ago_makes_room() -> None:
+    clock = Clock()
+    known = of_two_roles(clock)
+    first, second = cookie_header(known, VIEWER), cookie_header(known, EDITOR)
+    for _ in range(access.MOST_SIGNED_IN):
+        clock.now += 1.0
+        assert known.role_of_headers(second) is Role.EDITOR
+        assert known.sign_in(VIEWER)
+    assert known.n_signed_in == access.MOST_SIGNED_IN
+    assert known.role_of_headers(first) is None
+    assert known.role_of_headers(second) is Role.EDITOR
+
+
+def test_tokens_that_are_made_are_accepted_and_differ() -> None:
+    made = {make_token() for _ in range(100)}
+    assert len(made) == 100
+    assert Access(dict.fromkeys(made, Role.TOUCHER)).needs_token
+
+
+@pytest.mark.parametrize(
+    "token", ["", "short", "x" * 257, "with a blank inside it", "ümläute-sind-keine-ziffern"]
+)
+def test_a_token_that_can_be_guessed_or_needs_escapes_is_refused(token: str) -> None:
+    with pytest.raises(UsageError, match="token"):
+        Access({token: Role.VIEWER})
+
+
+def test_roles_are_ordered_and_found_by_their_words() -> None:
+    assert [Role.of(role.word) for role in sorted(Role)] == [Role.VIEWER, Role.TOUCHER, Role.EDITOR]
+    with pytest.raises(UsageError, match="viewer, toucher, editor"):
+        Role.of("owner")

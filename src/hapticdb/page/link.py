@@ -1,0 +1,143 @@
+"""What the server and its page process say to one another.
+
+The page answers on a port of the loopback interface, which every user of this machine can reach. So
+the server announces each browser before it connects: it binds the connection's own port first,
+tells the page that port with the browser's name and role, waits for the answer, and connects from
+that port. The page closes every connection from another port.
+
+The messages are lines of JSON on a socket pair that the page process inherits.
+"""
+
+import contextlib
+import json
+import socket
+import threading
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, NamedTuple
+
+if TYPE_CHECKING:
+    import viser
+    from viser.infra import WebsockClientConnection
+
+LONGEST_LINE = 4096
+"""Most bytes of one message. A longer line means that something else writes there."""
+FORGOTTEN_AFTER = 256
+"""Announcements that are kept without a connection. Larger: more memory for browsers that went away
+before they were connected."""
+LATE = 1013
+"""WebSocket close code "try again later", for a connection that was not announced."""
+
+
+class PageRequest(NamedTuple):
+    """What the page process is started with.
+
+    Attributes
+    ----------
+    urls : mapping of str to str
+        The environment's address for each role: viewer, toucher, editor. The database decides what
+        each may do.
+    tools : tuple of str
+        Files of the tools to choose from; the first one is chosen at the start.
+    folders : tuple of str or None
+        Folders below which objects' files may be read; None: the folders of the files as imported.
+    link, host : int
+        Descriptors of the sockets to the server (this module) and to the `SessionHost`.
+    """
+
+    urls: Mapping[str, str]
+    tools: tuple[str, ...]
+    folders: tuple[str, ...] | None
+    link: int
+    host: int
+
+
+class Announced(NamedTuple):
+    """A browser that the server let in: how others see it, and what it may do."""
+
+    name: str
+    role: str
+
+
+class PageLink:
+    """The page's end: learns who comes next, and lets nobody else in.
+
+    Parameters
+    ----------
+    descriptor : int
+        Inherited socket, `PageRequest.link`.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._socket = socket.socket(fileno=descriptor)
+        self._lock = threading.Lock()
+        self._expected: dict[int, Announced] = {}
+        self._inside: dict[int, Announced] = {}
+        self._thread = threading.Thread(target=self._listen, name="announcements", daemon=True)
+        self._thread.start()
+
+    def guard(self, server: "viser.ViserServer") -> None:
+        """Close each connection to a viser server that was not announced."""
+        inner = server._websock_server  # noqa: SLF001 - viser shows connections nowhere else
+
+        async def check(connection: "WebsockClientConnection") -> None:
+            client = int(connection.client_id)
+            live = inner._live_connections[client]  # noqa: SLF001 - likewise
+            port = int(live.remote_address[1])
+            if not self._let_in(client, port):
+                self.tell("refused", port)
+                await live.close(LATE, "connect through the server")
+
+        inner.on_client_connect(check)
+        inner.on_client_disconnect(self._let_out)
+
+    def announced(self, client_id: int) -> Announced:
+        """Return who a client of the guarded server is.
+
+        Raises
+        ------
+        KeyError
+            If the client is not connected.
+        """
+        with self._lock:
+            return self._inside[client_id]
+
+    def tell(self, word: str, port: int = 0) -> None:
+        """Send a message to the server; does nothing if it has ended."""
+        with contextlib.suppress(OSError):
+            self._socket.sendall(line({"word": word, "port": port}))
+
+    def _let_in(self, client: int, port: int) -> bool:
+        with self._lock:
+            announced = self._expected.pop(port, None)
+            if announced is None:
+                return False
+            self._inside[client] = announced
+        self.tell("connected", port)
+        return True
+
+    def _let_out(self, connection: "WebsockClientConnection") -> None:
+        with self._lock:
+            known = self._inside.pop(int(connection.client_id), None)
+        if known is not None:
+            self.tell("closed")
+
+    def _listen(self) -> None:
+        with contextlib.suppress(ConnectionError), self._socket.makefile("rb") as stream:
+            while received := stream.readline(LONGEST_LINE):
+                message = json.loads(received)
+                announced = Announced(message["name"], message["role"])
+                with self._lock:
+                    self._expected[message["port"]] = announced
+                    while len(self._expected) > FORGOTTEN_AFTER:
+                        self._expected.pop(next(iter(self._expected)))
+                self.tell("expected", message["port"])
+
+
+def line(message: Mapping[str, object]) -> bytes:
+    """Bytes of a message."""
+    return json.dumps(message).encode() + b"\n"
+
+
+def announcement(port: int, name: str, role: str) -> bytes:
+    """Bytes that announce a browser which will connect from that port."""
+    return line({"word": "expect", "port": port, "name": name, "role": role})

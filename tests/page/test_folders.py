@@ -1,0 +1,72 @@
+"""Objects' files are read below the operator's folders only."""
+
+import os
+from pathlib import Path
+
+import pytest
+
+from hapticdb.errors import FileError, UsageError
+from hapticdb.page.folders import AllowedFolders
+
+
+@pytest.fixture
+def inside(tmp_path: Path) -> Path:
+    folder = tmp_path / "inside"
+    (folder / "deep").mkdir(parents=True)
+    (tmp_path / "secret").write_text("secret")
+    (tmp_path / "inside-too").mkdir()
+    (tmp_path / "inside-too" / "part.stl").write_text("solid")
+    (folder / "part.stl").write_text("solid")
+    (folder / "deep" / "part.stl").write_text("solid")
+    (folder / "out").symlink_to(tmp_path / "secret")
+    (folder / "within").symlink_to(folder / "part.stl")
+    (folder / "up").symlink_to(tmp_path)
+    (folder / "loop").symlink_to(folder / "loop")
+    os.mkfifo(folder / "pipe")
+    return folder
+
+
+@pytest.mark.parametrize("name", ["part.stl", "deep/part.stl", "within", "deep/../part.stl"])
+def test_a_file_below_the_folder_is_given_without_symbolic_links(inside: Path, name: str) -> None:
+    found = AllowedFolders([inside]).checked(str(inside / name))
+    assert found.read_text() == "solid"
+    assert found == found.resolve()
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../secret",
+        "out",
+        "up/secret",
+        "../inside-too/part.stl",
+        "loop",
+        "missing",
+        "pipe",
+        "deep",
+        "a\0b",
+        "x" * 5000,
+    ],
+)
+def test_every_way_out_is_refused_without_naming_a_path(inside: Path, name: str) -> None:
+    with pytest.raises(FileError) as refused:
+        AllowedFolders([inside]).checked(str(inside / name))
+    assert str(inside.parent) not in str(refused.value)
+
+
+def test_links_allow_their_folders_as_they_were_at_the_start(inside: Path) -> None:
+    allowed = AllowedFolders.of_links([str(inside / "part.stl"), "", "/no/such/folder/part.stl"])
+    assert allowed.checked(str(inside / "deep" / "part.stl"))
+    with pytest.raises(FileError):
+        allowed.checked(str(inside.parent / "secret"))
+
+
+def test_without_folders_nothing_is_read(inside: Path) -> None:
+    with pytest.raises(FileError):
+        AllowedFolders([]).checked(str(inside / "part.stl"))
+
+
+def test_a_folder_that_is_not_there_is_told(inside: Path) -> None:
+    for name in ("missing", "part.stl"):
+        with pytest.raises(UsageError, match="--files"):
+            AllowedFolders([inside / name])

@@ -31,7 +31,9 @@ if TYPE_CHECKING:
         NewerVersionError,
         NotAnEnvironmentError,
         ObjectNotFoundError,
+        OutdatedError,
         OutsideGridError,
+        ProtocolError,
         ReadOnlyError,
         StuckError,
         UsageError,
@@ -94,10 +96,12 @@ __all__ = [
     "NotAnEnvironmentError",
     "Object",
     "ObjectNotFoundError",
+    "OutdatedError",
     "OutsideGridError",
     "PointShell",
     "Pool",
     "Proportions",
+    "ProtocolError",
     "QuantileVector",
     "Query",
     "ReadOnlyError",
@@ -139,8 +143,8 @@ _HOMES = {
         "AccessError BusyError ConflictError ConnectionLostError DamagedError "
         "DatabaseError DeviceError EnvironmentExistsError EnvironmentNotFoundError "
         "FileError GeometryChangedError GridError HapticDBError MissingExtraError "
-        "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutsideGridError "
-        "ReadOnlyError StuckError UsageError"
+        "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutdatedError "
+        "OutsideGridError ProtocolError ReadOnlyError StuckError UsageError"
     ),
     "query.law": "DistanceField TangentPlane",
     "grid": "Grid GridOptions",

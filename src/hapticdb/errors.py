@@ -11,6 +11,7 @@
     ├── MissingExtraError (ImportError)       a format or device needs an extra
     ├── ObjectNotFoundError (LookupError)     no object of that id
     ├── DeviceError (OSError)                 a haptic device that is not there, or went away
+    ├── ProtocolError (ConnectionError)       a message that is none, or breaks a limit
     └── DatabaseError                         the database cannot do what was asked
         ├── EnvironmentNotFoundError (FileNotFoundError)
         ├── EnvironmentExistsError (FileExistsError)
@@ -21,6 +22,7 @@
         ├── AccessError (PermissionError)     the server does not let this user in
         ├── ConflictError                     another has written the object meanwhile
         ├── ConnectionLostError (ConnectionError)  the server went away
+        │   └── OutdatedError                 a snapshot that a server could not hold
         ├── BusyError (TimeoutError)          another writer held the database too long
         └── StuckError (TimeoutError)         the database took longer than a frame may
 
@@ -65,6 +67,10 @@ class DeviceError(HapticDBError, OSError):
     """A haptic device that is not there, does not answer or was unplugged."""
 
 
+class ProtocolError(HapticDBError, ConnectionError):
+    """A message of another machine that cannot be decoded or breaks a limit."""
+
+
 class DatabaseError(HapticDBError):
     """The database cannot do what was asked."""
 
@@ -107,6 +113,10 @@ class ConflictError(DatabaseError):
 
 class ConnectionLostError(DatabaseError, ConnectionError):
     """The server went away, or was never there."""
+
+
+class OutdatedError(ConnectionLostError):
+    """A snapshot that a server could not hold: read all of it again."""
 
 
 class StuckError(DatabaseError, TimeoutError):

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from hapticdb.errors import ProtocolError
 from hapticdb.protocol.fields import FieldsRead, FieldsWritten
-from hapticdb.protocol.header import LAYOUT, CloseCode, MessageHeader, Kind, Refusal, header_of
+from hapticdb.protocol.header import LAYOUT, CloseCode, Kind, MessageHeader, Refusal, header_of
 from sources import ROOT
 
 PAGE = (ROOT / "docs/protocol.md").read_text()

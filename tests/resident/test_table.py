@@ -91,16 +91,18 @@ def test_who_maps_a_table_with_distances_finds_them_there() -> None:
         assert other.cells.payload[3, 5] == 7
 
 
-def test_sixteen_readers_have_rows_of_their_own_and_the_next_is_refused() -> None:
+def test_readers_have_rows_of_their_own_and_the_next_is_refused() -> None:
     with CellTable.create(LEAST_BUDGET) as table:
         rows: list[int] = []
-        threads = [threading.Thread(target=lambda: rows.append(table.join())) for _ in range(16)]
+        threads = [
+            threading.Thread(target=lambda: rows.append(table.join())) for _ in range(MOST_READERS)
+        ]
         for thread in threads:
             thread.start()
         for thread in threads:
             joined(thread)
         assert sorted(rows) == list(range(MOST_READERS))
-        with pytest.raises(UsageError, match="16 readers at most"):
+        with pytest.raises(UsageError, match=f"{MOST_READERS} readers at most"):
             table.join()
         table.leave(7)
         with table.reading() as row:

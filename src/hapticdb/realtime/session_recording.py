@@ -56,14 +56,17 @@ class SessionRecording:
         self._recorder: Recorder | None = None
         self._is_going_on = False
         self._n_taken = 0
+        self._is_late = False  # the recording begins after the session
+        self._began = 0.0  # s of the session at which a late recording begins
         self._flushed_at = 0.0
 
     def __len__(self) -> int:
         """Count the frames in the file."""
         return 0 if self._recorder is None else len(self._recorder)
 
-    def begin(self, header: Header) -> None:
-        """Make or open the file."""
+    def begin(self, header: Header, first_frame: int = 0) -> None:
+        """Make or open the file. Frames are taken from number `first_frame` on, at time 0."""
+        self._n_taken, self._is_late = first_frame, first_frame > 0
         # set before the file is made: a signal may interrupt that at any moment
         self._new_file = None if os.path.lexists(self._path) else self._path
         try:
@@ -96,6 +99,9 @@ class SessionRecording:
             self.n_lost += n_frames - self._n_taken - size // 2
             self._n_taken = n_frames - size // 2
         frames = ring[np.arange(self._n_taken, n_frames) % size]
+        if self._is_late and len(frames):
+            self._is_late, self._began = False, float(frames["time"].min())
+        frames["time"] -= self._began
         with self._noting_the_end(self._recorder):
             self._recorder.append(frames)
             if time.monotonic() - self._flushed_at >= FLUSH_EVERY:

@@ -28,8 +28,9 @@ LEAST_BUDGET = 1 << 20
 """Smallest size of a table, bytes."""
 FIRST_VERSION = 1
 """Version number of a table before the first write."""
-MOST_READERS = 16
-"""Greatest number of readers of a table at the same time."""
+MOST_READERS = 80
+"""Greatest number of readers of a table at the same time: the 64 sessions of a host, and others.
+Larger: 2.5 KiB of the table for each, and eviction looks at more of them."""
 CONTROL_WORDS = 16
 """Number of int64 words in the control block."""
 HEARTBEAT, AWAY, LOADING, STOP = 8, 9, 10, 11
@@ -42,7 +43,7 @@ _joining = threading.Lock()
 class Desk(NamedTuple):
     """Messages between sessions and the fetching process; `kernels.records` defines the fields.
 
-    sessions (16,) of SESSION, one row for each session; pids (16,) int64: ids of the processes that
+    sessions (R,) of SESSION, one row for each reader; pids (R,) int64: ids of the processes that
     own the rows, 0 for none; figures () of FIGURES: counts of the fetching process.
     """
 
@@ -229,8 +230,10 @@ class CellTable:
 
     def release_dead(self) -> None:
         """Release the versions and sessions of readers that have died; their rows stay taken."""
-        for row in np.flatnonzero(self.desk.pids).tolist():
-            if not is_alive(int(self.desk.pids[row])):
+        pids = self.desk.pids
+        dead = [pid for pid in set(pids.tolist()) - {0} if not is_alive(pid)]  # one may own many
+        if dead:
+            for row in np.flatnonzero(np.isin(pids, dead)).tolist():
                 self.cells.readers[row * kernels.READER_STRIDE] = 0
                 self.desk.sessions["told"]["is_active"][row] = False
 

@@ -1,0 +1,181 @@
+"""Board: where hosted sessions' hands and frames are, in memory that several processes share.
+
+Each session has a seat: a row of `SEAT`. The process that moves the hand writes the hand's place;
+the worker process that runs the session writes what came of it. No reader waits for a writer: a
+sequence number, odd while a part of a row is written, tells a reader to read again.
+"""
+
+import mmap
+import os
+import threading
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.kernels.records import FRAME, MOST_ASKED
+from hapticdb.recording.frame import Frames
+from hapticdb.resident.table import anonymous_memory
+
+RING = 2048
+"""Frames of a session that the board holds: two seconds at 1 kHz. Larger: a recording survives
+longer pauses of the host's process, and each session takes more memory."""
+MOST_CONTACTS = 64
+"""Most contacts of a session on the board. Larger: broad contacts are drawn more densely."""
+BINS = 1000
+BIN = 5e-6
+"""Number and width (s) of the bins of a seat's histograms of times, which cover 0 to 5 ms. Larger
+bins: less exact percentiles. The worst time is kept exactly."""
+LABEL_BYTES = 128
+"""Longest label of a session, bytes of UTF-8."""
+READ_ATTEMPTS = 1000
+"""Attempts to read a part of a row that another process writes. Writing takes microseconds, so a
+part that stays unfinished belongs to a process that died."""
+FREE, TAKEN, LOST = 0, 1, 2
+"""States of a seat: nobody's; a session's; a session's whose worker process has died."""
+
+Seats = NDArray[np.void]
+
+SEAT = np.dtype(
+    [
+        # written by the host
+        ("state", "<i8"),
+        ("id", "<i8"),  # of the session
+        ("label", f"S{LABEL_BYTES}"),
+        ("worker", "<i8"),  # number of the worker process
+        ("is_recorded", "<i8"),  # whether frames have the law's wrench, for a recording
+        # written by the process that moves the hand
+        ("hand_sequence", "<i8"),
+        ("hand_time", "<i8"),  # ns, CLOCK_MONOTONIC
+        ("hand_pose", "<f8", 7),  # position m, unit quaternion, scalar first
+        ("is_held", "<i8"),  # whether somebody holds the tool
+        ("n_moves", "<i8"),
+        # written by the worker
+        ("n_frames", "<i8"),
+        ("missed", "<i8"),  # deadlines at which no frame began
+        ("in_time", "<i8"),  # frames that were done within their period
+        ("unknown_frames", "<i8"),
+        ("held_frames", "<i8"),
+        ("stale_frames", "<i8"),
+        ("worst_lateness", "<f8"),
+        ("worst_elapsed", "<f8"),
+        ("n_objects", "<i8"),
+        ("objects", "<i8", MOST_ASKED),
+        ("contacts_sequence", "<i8"),
+        ("n_contacts", "<i8"),
+        ("contacts", "<f8", (MOST_CONTACTS, 6)),  # point m and force on the tool N, world frame
+        ("lateness", "<i8", BINS + 1),  # histogram
+        ("elapsed", "<i8", BINS + 1),
+    ],
+    align=True,
+)
+"""One seat. Its frames are beside it, in `Board.rings`."""
+
+
+class Board:
+    """Seats of hosted sessions in shared memory.
+
+    Parameters
+    ----------
+    descriptor : int
+        File descriptor of the memory of a board that `create` has made, in any process. The board
+        owns it and closes it.
+
+    Attributes
+    ----------
+    seats : Seats
+        (S,) of `SEAT`.
+    rings : Frames
+        (S, RING) of `FRAME`: frame n of a session is at index n modulo RING.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+        size = os.fstat(descriptor).st_size
+        n_seats = size // _bytes_a_seat()
+        self._memory = mmap.mmap(descriptor, size)
+        self.seats: Seats = np.ndarray((n_seats,), SEAT, self._memory)
+        self.rings: Frames = np.ndarray(
+            (n_seats, RING), FRAME, self._memory, n_seats * SEAT.itemsize
+        )
+        self._taking = threading.Lock()
+
+    @classmethod
+    def create(cls, n_seats: int) -> Self:
+        """Make a board with free seats."""
+        return cls(anonymous_memory("hapticdb-board", n_seats * _bytes_a_seat()))
+
+    def close(self) -> None:
+        """Free the memory in this process; the mapping goes with the last array."""
+        if self.descriptor >= 0:
+            os.close(self.descriptor)
+            self.descriptor = -1
+
+    def take(self, session: int, label: str, worker: int) -> int:
+        """Give a free seat to a session; returns its row. The host alone calls this.
+
+        Raises
+        ------
+        UsageError
+            If no seat is free.
+        """
+        with self._taking:
+            free = np.flatnonzero(self.seats["state"] == FREE)
+            if not len(free):
+                raise UsageError(
+                    f"the host has {len(self.seats)} sessions, the most it takes: end one first"
+                )
+            row = int(free[0])
+            self.seats[row] = np.zeros((), SEAT)
+            self.seats["label"][row] = label.encode()[:LABEL_BYTES]
+            self.seats["worker"][row] = worker
+            self.seats["id"][row] = session
+            self.seats["state"][row] = TAKEN
+            return row
+
+    def release(self, row: int) -> None:
+        """Free a seat."""
+        self.seats["state"][row] = FREE
+
+    def put_hand(self, row: int, time: int, pose: NDArray[np.float64] | None) -> None:
+        """Write where the hand is: pose (7,), or None where nobody holds the tool."""
+        seats = self.seats
+        seats["hand_sequence"][row] += 1
+        if pose is not None:
+            seats["hand_pose"][row] = pose
+            seats["n_moves"][row] += 1
+        seats["hand_time"][row] = time
+        seats["is_held"][row] = pose is not None
+        seats["hand_sequence"][row] += 1
+
+    def last_frame(self, row: int) -> Frames | None:
+        """Latest frame of a seat, (1,) of `FRAME`; None before the first."""
+        for _ in range(READ_ATTEMPTS):
+            done = int(self.seats["n_frames"][row])
+            if not done:
+                return None
+            frame = self.rings[row, [(done - 1) % RING]]
+            # the ring is long: a frame that was copied slowly may still be overwritten
+            if int(self.seats["n_frames"][row]) - done < RING // 2:
+                return frame
+        raise _unreadable()
+
+    def contacts(self, row: int) -> NDArray[np.float64]:
+        """Contacts of a seat now (n, 6): points, m, and forces on the tool, N, world frame."""
+        seats = self.seats
+        for _ in range(READ_ATTEMPTS):
+            before = int(seats["contacts_sequence"][row])
+            n_contacts = min(int(seats["n_contacts"][row]), MOST_CONTACTS)
+            found: NDArray[np.float64] = seats["contacts"][row, :n_contacts].copy()
+            if before % 2 == 0 and before == int(seats["contacts_sequence"][row]):
+                return found
+        raise _unreadable()
+
+
+def _bytes_a_seat() -> int:
+    return SEAT.itemsize + RING * FRAME.itemsize
+
+
+def _unreadable() -> HapticDBError:
+    return HapticDBError("a worker process died while it wrote: end the session and begin another")

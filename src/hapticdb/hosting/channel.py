@@ -1,0 +1,105 @@
+"""Channel: pickled messages between processes of one host, with file descriptors beside them.
+
+The processes trust one another: one of them started the others, and the socket between them is a
+pair that has no name. Nothing of a client from outside goes through a channel unparsed.
+"""
+
+import contextlib
+import pickle
+import socket
+import threading
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from hapticdb.errors import HapticDBError
+
+MOST_DESCRIPTORS = 4
+"""Most file descriptors beside one message."""
+HEADER = 8
+"""Bytes of a message's length."""
+
+
+class Ask(NamedTuple):
+    """A request: what to do, and with what."""
+
+    word: str
+    content: tuple[Any, ...] = ()
+
+
+class Reply(NamedTuple):
+    """The answer to a request, or the error that it raised."""
+
+    content: Any = None
+    error: Exception | None = None
+
+
+class Channel:
+    """Messages over one end of a pair of sockets.
+
+    Parameters
+    ----------
+    sock : socket
+        A connected stream socket of the family AF_UNIX. The channel owns it.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.sock = sock
+        self._asking = threading.Lock()
+
+    def send(self, content: object, descriptors: Sequence[int] = ()) -> None:
+        """Send a message, and file descriptors with it."""
+        packed = pickle.dumps(content)
+        header = len(packed).to_bytes(HEADER, "little")
+        sent = socket.send_fds(self.sock, [header], list(descriptors))
+        self.sock.sendall(header[sent:] + packed)
+
+    def receive(self) -> tuple[Any, list[int]]:
+        """Return the next message and the descriptors that came with it.
+
+        Raises
+        ------
+        EOFError
+            If the other process has closed its end, or has died.
+        """
+        header, descriptors, _, _ = socket.recv_fds(self.sock, HEADER, MOST_DESCRIPTORS)
+        if not header:
+            raise EOFError
+        header += self._receive_exactly(HEADER - len(header))
+        packed = self._receive_exactly(int.from_bytes(header, "little"))
+        return pickle.loads(packed), descriptors  # noqa: S301 - from a process of our own
+
+    def _receive_exactly(self, size: int) -> bytes:
+        parts = bytearray()
+        while len(parts) < size:
+            part = self.sock.recv(min(size - len(parts), 1 << 20))
+            if not part:
+                raise EOFError
+            parts += part
+        return bytes(parts)
+
+    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
+        """Send a request and return the answer of the other process; one request at a time.
+
+        Raises
+        ------
+        HapticDBError
+            If the other process has ended or does not answer; and every error of the other process.
+        """
+        with self._asking:
+            try:
+                self.send(Ask(word, content), descriptors)
+                answer, _ = self.receive()
+            except (EOFError, OSError) as error:
+                self.close()  # a late answer must not be taken for that of the next request
+                raise HapticDBError(
+                    "the process that runs the sessions does not answer: begin them again"
+                ) from error
+        if answer.error is not None:
+            raise answer.error
+        return answer.content
+
+    def close(self) -> None:
+        """Close the socket; the other process then reads the end."""
+        with contextlib.suppress(OSError):
+            self.sock.shutdown(socket.SHUT_RDWR)
+        self.sock.close()

@@ -1,0 +1,114 @@
+"""Crew: the worker processes of a host, started when sessions need them."""
+
+import socket
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from hapticdb.hosting.board import TAKEN, Board
+from hapticdb.hosting.channel import Channel
+from hapticdb.hosting.worker import WorkerRequest
+from hapticdb.realtime.processes import Process
+from hapticdb.realtime.resident_cells import start_error
+
+START_PATIENCE = 120.0
+"""Seconds in which a worker must be ready: it loads every kernel of a frame."""
+ANSWER_PATIENCE = 30.0
+"""Seconds in which a worker must answer a command; normally milliseconds."""
+FILLED = 8
+"""Sessions of a worker from which another process is started, while the host may have more. Larger:
+fewer processes and less memory, and later frames."""
+
+
+class WorkerLink:
+    """A worker process, from the host.
+
+    Parameters
+    ----------
+    number : int
+        Number of the worker, from 0.
+    board : Board
+        Where its sessions' seats are.
+    rate : float
+        Frames a second.
+    """
+
+    def __init__(self, number: int, board: Board, rate: float) -> None:
+        self.number = number
+        ours, theirs = socket.socketpair()
+        with theirs:
+            request = WorkerRequest(board.descriptor, theirs.fileno(), rate)
+            self._process = Process(
+                "hapticdb.hosting.worker:work", request, [board.descriptor, theirs.fileno()]
+            )
+        ours.settimeout(ANSWER_PATIENCE)
+        self._channel = Channel(ours)
+        if self._process.receive(START_PATIENCE) is None:
+            self._channel.close()
+            raise start_error(self._process, "worker's", START_PATIENCE)
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process runs."""
+        return self._process.is_alive
+
+    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
+        """Tell the worker to do something, and return its answer; see `Channel.ask`."""
+        return self._channel.ask(word, *content, descriptors=descriptors)
+
+    def close(self) -> None:
+        """End the process."""
+        self._channel.close()
+        self._process.end()
+
+
+class Crew:
+    """Worker processes, `most` at a time.
+
+    Parameters
+    ----------
+    board : Board
+        The host's board.
+    rate : float
+        Frames a second.
+    most : int
+        Most processes.
+    """
+
+    def __init__(self, board: Board, rate: float, most: int) -> None:
+        self._board, self._rate, self._most = board, rate, most
+        self._links: list[WorkerLink] = []
+        self._next = 0
+
+    @property
+    def pids(self) -> list[int]:
+        """Process ids of those that run."""
+        return [link.pid for link in self._links if link.is_alive]
+
+    def least_busy(self) -> WorkerLink:
+        """Worker for one more session: the one with the fewest, or a new one if all are filled."""
+        for link in [link for link in self._links if not link.is_alive]:
+            self._links.remove(link)
+            link.close()
+        seats = self._board.seats
+        counts = [
+            int(np.count_nonzero((seats["state"] == TAKEN) & (seats["worker"] == link.number)))
+            for link in self._links
+        ]
+        if not counts or (min(counts) >= FILLED and len(counts) < self._most):
+            self._links.append(WorkerLink(self._next, self._board, self._rate))
+            self._next += 1
+            return self._links[-1]
+        return self._links[int(np.argmin(counts))]
+
+    def close(self) -> None:
+        """End all workers."""
+        for link in self._links:
+            link.close()
+        self._links.clear()

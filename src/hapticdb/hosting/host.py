@@ -1,0 +1,339 @@
+"""SessionHost: many hands in few worker processes, over tables of cells that they share."""
+
+import itertools
+import os
+import socket
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack, suppress
+from dataclasses import asdict
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hapticdb.devices.profiles import SCRIPTED
+from hapticdb.devices.scripted import pose_at
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.hosting.attached import serve_attached
+from hapticdb.hosting.board import LABEL_BYTES, LOST, Board
+from hapticdb.hosting.crew import Crew
+from hapticdb.hosting.hosted import HostedSession
+from hapticdb.hosting.running import Running
+from hapticdb.hosting.seat import SeatRequest
+from hapticdb.hosting.tables import SharedTables, Words
+from hapticdb.kernels.compiling import compile_missing, entries_for
+from hapticdb.kernels.rigid import is_rigid
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.poses import quaternion_of
+from hapticdb.query.choosing import chosen_law, is_smooth
+from hapticdb.query.law import ForceLaw
+from hapticdb.realtime.coupling import (
+    Coupling,
+    DeviceCoupling,
+    SettledCoupling,
+    coupling_for,
+    radius_of,
+)
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.recording.header import Header
+from hapticdb.resident.table import DEFAULT_BUDGET
+
+MOST_SESSIONS = 64
+"""Most sessions of a host, unless another number is given."""
+TEND_EVERY = 0.05
+"""Seconds between two looks after recordings and processes. Larger: less work, and what has died is
+noticed later. A recording loses frames from 2 s on."""
+LARGEST_SCALE = 1e6
+"""Greatest scale of a session, as of `hapticdb.realtime.handle`."""
+
+
+class SessionHost:
+    """Hands in an environment, many at once, each felt in real time.
+
+    Sessions run in worker processes, many in each. All sessions that feel the same objects share
+    one table of resident cells and its fetching process. Also a context manager.
+
+    Parameters
+    ----------
+    url : str
+        The environment.
+    rate : float
+        Frames a second of each session, 10 to 20,000.
+    budget_bytes : int
+        Memory of each table of cells.
+    processes : int or None
+        Most worker processes; None: one for each processor.
+    most_sessions : int
+        Most sessions at a time.
+
+    Raises
+    ------
+    UsageError
+        If a number is out of its range.
+    """
+
+    _pid = 0
+    """Id of the process that made this object. In a forked copy `close` does nothing."""
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        rate: float = 1000.0,
+        budget_bytes: int = DEFAULT_BUDGET,
+        processes: int | None = None,
+        most_sessions: int = MOST_SESSIONS,
+    ) -> None:
+        if not 10.0 <= rate <= 20_000.0:
+            raise UsageError(f"a rate of {rate} Hz: give 10 to 20,000")
+        if not 1 <= most_sessions <= MOST_SESSIONS:
+            raise UsageError(f"{most_sessions} sessions at most: give 1 to {MOST_SESSIONS}")
+        if processes is not None and processes < 1:
+            raise UsageError(f"{processes} worker processes: give 1 or more")
+        self.url, self.rate = url, rate
+        self._tables = SharedTables(url, budget_bytes)
+        self._board = Board.create(most_sessions)
+        self._crew = Crew(self._board, rate, processes or os.cpu_count() or 1)
+        self._running: dict[int, Running] = {}
+        self._ids = itertools.count(1)
+        self._changing = threading.RLock()
+        self._served: list[socket.socket] = []
+        self._is_closed = threading.Event()
+        self._failure: HapticDBError | None = None
+        self._pid = os.getpid()
+        self._tending = threading.Thread(target=self._tend, daemon=True, name="host")
+        self._tending.start()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def begin(
+        self,
+        shell: PointShell,
+        start: ArrayLike,
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        coupling: Coupling | DeviceCoupling | None = None,
+        scale: float = 1.0,
+        label: str = "",
+    ) -> HostedSession:
+        """Begin a session; its tool waits at `start` until the hand is moved.
+
+        Parameters
+        ----------
+        shell : PointShell
+            The tool.
+        start : array_like
+            Pose (4, 4) of hand and tool, scene metres.
+        where, exclude : sequence of int or str
+            Words as of `Environment.find`. The tool feels the objects that `where` chooses (all if
+            it is empty) and `exclude` does not choose.
+        coupling : DeviceCoupling, Coupling or None
+            As for `hapticdb.realtime.session.Session`. Unless it has a profile, its hand counts as
+            one that no force moves.
+        scale : float
+            S, metres of the scene for a metre of the device, for the coupling's numbers. Poses of
+            the hand are the scene's: whoever moves the hand scales them.
+        label : str
+            What the session is called where others see it; cut at 128 bytes.
+
+        Raises
+        ------
+        UsageError
+            If a number is out of its range or no seat is free.
+        ObjectNotFoundError
+            If a word chooses nothing.
+        DatabaseError
+            If the environment cannot be opened.
+        """
+        pose = pose_at(start)
+        if not is_rigid(pose):
+            raise UsageError("a session starts at a pose (4, 4) that is a rigid transform")
+        if not 0.0 < scale <= LARGEST_SCALE:
+            raise UsageError(
+                f"a scale of {scale}: give a number above 0, {LARGEST_SCALE:g} at most"
+            )
+        compile_missing(entries_for("feel"))  # here, so that no worker compiles
+        excluded = self._tables.excluded(where, exclude)
+        with self._changing:
+            if self._is_closed.is_set():
+                raise UsageError("the host is closed: make another")
+            return self._begin(shell, pose, excluded, coupling, scale, label)
+
+    def _begin(
+        self,
+        shell: PointShell,
+        pose: Any,  # noqa: ANN401 - (4, 4), checked
+        excluded: tuple[int, ...],
+        coupling: Coupling | DeviceCoupling | None,
+        scale: float,
+        label: str,
+    ) -> HostedSession:
+        """Take seat, cells and worker for a session; all are given back if one is not to be had."""
+        session = next(self._ids)
+        with ExitStack() as undo:
+            worker = self._crew.least_busy()
+            seat = self._board.take(session, label[:LABEL_BYTES], worker.number)
+            undo.callback(self._board.release, seat)
+            cells = self._tables.take(excluded)
+            undo.callback(self._tables.release, cells)
+            law = chosen_law(None, has_distances=cells.has_distances)
+            settled = self._settled(coupling, law, cells, shell, scale)
+            reader = cells.table.join()
+            undo.callback(cells.table.leave, reader)
+            cells.table.desk.pids[reader] = worker.pid
+            request = SeatRequest(
+                seat=seat, table=id(cells), n_slots=cells.table.n_slots, reader=reader,
+                grid=cells.grid, shell=shell, law=law, coupling=settled, scale=scale,
+                pose=(*pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3])[0].tolist()),
+            ).without_surface()  # fmt: skip
+            hand = np.array(request.pose)
+            self._board.seats["hand_pose"][seat] = hand
+            self._board.seats["is_held"][seat] = 1
+            worker.ask("begin", request, descriptors=[cells.table.descriptor])
+            self._running[session] = Running(request, session, cells, worker)
+            undo.pop_all()
+        return HostedSession(self._board, seat, session, self._call)
+
+    def _settled(
+        self,
+        coupling: Coupling | DeviceCoupling | None,
+        law: ForceLaw,
+        cells: ResidentCells,
+        shell: PointShell,
+        scale: float,
+    ) -> Coupling | SettledCoupling:
+        """Coupling for the session's law, with all its numbers."""
+        chosen = coupling_for(coupling, smooth=is_smooth(law))
+        if isinstance(chosen, Coupling):
+            return chosen
+        radius = radius_of(shell, cells.grid.voxel_size)
+        return chosen.settled(SCRIPTED, self.rate, scale, radius)
+
+    def sessions(self) -> list[HostedSession]:
+        """Sessions that run now, by their ids."""
+        running = sorted(self._running.items())
+        return [HostedSession(self._board, r.seat, number, self._call) for number, r in running]
+
+    # -- what sessions ask for ---------------------------------------------------------------
+
+    def _call(self, word: str, session: int, /, *content: object) -> object:
+        """Do what a session asks for; see `HostedSession`."""
+        known: dict[str, Callable[..., object]] = {
+            "set_coupling": self._set_coupling,
+            "record": self._record,
+            "stop_recording": lambda running: running.stop_recording(),
+            "recording_ended": lambda running: running.recording_ended,
+            "end": self._end,
+        }
+        with self._changing:
+            running = self._running.get(session)
+            if running is None:
+                if word == "end":
+                    return None
+                raise UsageError(f"the hosted session {session} is over: begin another")
+            return known[word](running, *content)
+
+    def _set_coupling(self, running: Running, coupling: Coupling | DeviceCoupling | None) -> None:
+        asked = running.request
+        settled = self._settled(coupling, asked.law, running.cells, asked.shell, asked.scale)
+        running.worker.ask("set_coupling", asked.seat, settled)
+
+    def _record(self, running: Running, path: str, replace: bool) -> None:  # noqa: FBT001 - of a call
+        asked = running.request
+        header = Header(
+            environment=self.url,
+            grid=asked.grid,
+            revision=running.cells.table.revision,
+            shell=asked.shell,
+            rate=self.rate,
+            law=asked.law,
+            exclude=running.cells.exclude,
+            coupling=asdict(asked.coupling),
+        )
+        running.record(path, header, self._board, replace=replace)
+
+    def _end(self, running: Running) -> None:
+        """End a session, whatever of it still works."""
+        self._running.pop(running.session, None)
+        with ExitStack() as ends:  # the last one runs first, and each runs even if another fails
+            ends.callback(self._board.release, running.seat)
+            ends.callback(self._tables.release, running.cells)
+            ends.callback(running.cells.table.leave, running.request.reader)
+            ends.callback(running.stop_recording)
+            if running.worker.is_alive:
+                running.worker.ask("end", running.seat)
+
+    # -- other processes ---------------------------------------------------------------------
+
+    def serve(self, sock: socket.socket) -> None:
+        """Reply an `AttachedHost` at the other end of a pair of sockets, in a thread of its own.
+
+        When the other end closes or its process dies, the sessions that it has begun end. The host
+        owns the socket from now on.
+        """
+        self._served.append(sock)
+        threading.Thread(
+            target=serve_attached,
+            args=(sock, (self.url, self.rate, self._board), self.begin, self._call, self.sessions),
+
+            daemon=True, name="attached",
+        ).start()  # fmt: skip
+
+    # -- looking after -----------------------------------------------------------------------
+
+    def _tend(self) -> None:
+        """Record frames, start fetching processes again, notice workers that died."""
+        while not self._is_closed.wait(TEND_EVERY):
+            with self._changing:
+                for running in list(self._running.values()):
+                    if running.worker.is_alive:
+                        running.take_frames(self._board)
+                    else:
+                        self._board.seats["state"][running.seat] = LOST
+                for cells in self._tables.all():
+                    try:
+                        cells.supervise()
+                    except HapticDBError as error:
+                        self._failure = error
+
+    @property
+    def failure(self) -> HapticDBError | None:
+        """Error that keeps the database from being read again; None while all is well."""
+        return self._failure
+
+    @property
+    def cells(self) -> list[ResidentCells]:
+        """Tables of cells in use, one for each set of excluded objects, with their figures."""
+        return self._tables.all()
+
+    @property
+    def pids(self) -> list[int]:
+        """Process ids of the workers."""
+        return self._crew.pids
+
+    def close(self) -> None:
+        """End all sessions, processes and recordings; a second call does nothing."""
+        if os.getpid() != self._pid or self._is_closed.is_set():
+            return
+        self._is_closed.set()
+        with suppress(RuntimeError):
+            self._tending.join()
+        with self._changing, ExitStack() as ends:
+            ends.callback(self._board.close)
+            ends.callback(self._tables.close)
+            ends.callback(self._crew.close)
+            for sock in self._served:
+                ends.callback(_shut, sock)
+            for running in list(self._running.values()):
+                ends.callback(self._end, running)
+
+
+def _shut(sock: socket.socket) -> None:
+    with suppress(OSError):
+        sock.shutdown(socket.SHUT_RDWR)

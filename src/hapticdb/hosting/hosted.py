@@ -1,0 +1,205 @@
+"""HostedSession: one hand that a host runs, seen from the process that moves it."""
+
+import math
+import os
+import time
+from typing import NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.devices.scripted import pose_at
+from hapticdb.errors import UsageError
+from hapticdb.hosting.board import BIN, BINS, TAKEN, Board
+from hapticdb.kernels.hand.handle import FARTHEST
+from hapticdb.kernels.rigid import is_rigid
+from hapticdb.poses import quaternion_of
+from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+from hapticdb.realtime.report import Spread
+from hapticdb.recording.frame import Frames, State
+
+
+class HostedFigures(NamedTuple):
+    """Figures of a hosted session so far.
+
+    frames : number of frames; missed : deadlines at which no frame began, because the worker was
+    busy with its sessions or the machine with other work; in_time : share of all deadlines whose
+    frame was done before the next one; lateness : seconds from a deadline to the begin of the
+    session's frame; elapsed : seconds of computing a frame; unknown, held, stale : numbers of
+    frames with a point in a cell that was not resident, with an earlier wrench, and with a database
+    that had not answered for too long; moves : poses of the hand that arrived; worker : number of
+    the worker process; recording_ended : why the recording ended early, None if it did not.
+    """
+
+    frames: int
+    missed: int
+    in_time: float
+    lateness: Spread
+    elapsed: Spread
+    unknown: int
+    held: int
+    stale: int
+    moves: int
+    worker: int
+    recording_ended: str | None = None
+
+
+class Calls(Protocol):
+    """What a hosted session asks of the host: a word, the session's id, what goes with it."""
+
+    def __call__(self, word: str, session: int, /, *content: object) -> object:
+        """Do what the word says and return its result."""
+
+
+class HostedSession:
+    """A hand in an environment that a worker process of the host runs, among others.
+
+    `move`, `latest`, `contacts`, `touched` and `figures` read and write shared memory and take
+    microseconds; the others wait for the host. Any process that has the session may call them, but
+    only one may move the hand.
+
+    Parameters
+    ----------
+    board : Board
+        Where the session's seat is.
+    seat : int
+        Row of the board.
+    session : int
+        Id of the session.
+    call : Calls
+        Reaches the host.
+
+    Attributes
+    ----------
+    id : int
+        Number of the session; no other session of the host ever has it.
+    seat : int
+        Row of the board.
+    label : str
+        What the session is called where others see it.
+    """
+
+    def __init__(self, board: Board, seat: int, session: int, call: Calls) -> None:
+        self._board, self.seat, self._call = board, seat, call
+        self.id = session
+        self.label = board.seats["label"][seat].decode(errors="ignore")
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the session has ended: by `end`, or because its process died."""
+        seats = self._board.seats
+        return bool(seats["id"][self.seat] != self.id or seats["state"][self.seat] != TAKEN)
+
+    def _open_seat(self) -> int:
+        if self.is_over:
+            raise UsageError(f"the hosted session {self.id} is over: begin another")
+        return self.seat
+
+    def move(self, pose: ArrayLike) -> None:
+        """Put the hand at a pose (4, 4) of the scene, metres; the newest one counts.
+
+        The hand moves there from where it is, in about the time between two calls, so that calls at
+        20 to 100 Hz give a smooth motion. It never goes beyond the last pose that was given.
+
+        Raises
+        ------
+        UsageError
+            If the pose is no rigid transform or is beyond 1e6 m, or the session is over.
+        """
+        matrix = pose_at(pose)
+        if not is_rigid(matrix) or np.abs(matrix[:3, 3]).max() > FARTHEST:
+            raise UsageError("a hand moves to a pose (4, 4) that is a rigid transform")
+        seat = self._open_seat()
+        hand = np.concatenate([matrix[:3, 3], quaternion_of(matrix[:3, :3])[0]])
+        self._board.put_hand(seat, time.monotonic_ns(), hand)
+
+    def let_go(self) -> None:
+        """Let go of the tool: it stays, and the force falls to zero until the next `move`."""
+        self._board.put_hand(self._open_seat(), time.monotonic_ns(), None)
+
+    def latest(self) -> Frames | None:
+        """Latest frame, (1,) of `kernels.records.FRAME`; None before the first."""
+        return self._board.last_frame(self._open_seat())
+
+    def touched(self) -> tuple[int, ...]:
+        """Ids of the objects that the tool touches now, or lies in; asked 100 times a second."""
+        seat = self._open_seat()
+        last = self._board.last_frame(seat)
+        if last is None or not (last["hits"][0] or last["state"][0] & State.IN_OBJECT):
+            return ()
+        seats = self._board.seats
+        ids = seats["objects"][seat, : int(seats["n_objects"][seat])]
+        return tuple(sorted(set(ids.tolist())))
+
+    def contacts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Points (n, 3) in contact now, m, and the forces (n, 3) on the tool there, N; world frame.
+
+        There are 64 at most, spread over all; they are written about 30 times a second.
+        """
+        found = self._board.contacts(self._open_seat())
+        return found[:, :3], found[:, 3:]
+
+    def set_coupling(self, coupling: Coupling | DeviceCoupling | None) -> None:
+        """Replace the coupling between hand and tool; None: the default one.
+
+        Raises
+        ------
+        UsageError
+            If the coupling belongs to the other force law.
+        """
+        self._call("set_coupling", self.id, coupling)
+
+    def record(self, path: str | os.PathLike[str], *, replace: bool = False) -> None:
+        """Record the frames from now on into a file.
+
+        Raises
+        ------
+        UsageError
+            If the session is recorded already, or the file exists and `replace` is False.
+        FileError
+            If the file cannot be written.
+        """
+        self._call("record", self.id, os.path.abspath(path), replace)  # noqa: PTH100 - a text to send
+
+    def stop_recording(self) -> int:
+        """End the recording, which stays; returns the number of its frames, 0 without one."""
+        n_frames = self._call("stop_recording", self.id)
+        assert isinstance(n_frames, int)  # noqa: S101 - the host counts
+        return n_frames
+
+    def figures(self) -> HostedFigures:
+        """Figures of the session so far."""
+        seat = self._open_seat()
+        row = self._board.seats[seat]
+        frames, missed = int(row["n_frames"]), int(row["missed"])
+        ended = self._call("recording_ended", self.id)
+        assert ended is None or isinstance(ended, str)  # noqa: S101 - the host tells
+        return HostedFigures(
+            frames=frames,
+            missed=missed,
+            in_time=int(row["in_time"]) / max(frames + missed, 1),
+            lateness=_spread(row["lateness"], float(row["worst_lateness"])),
+            elapsed=_spread(row["elapsed"], float(row["worst_elapsed"])),
+            unknown=int(row["unknown_frames"]),
+            held=int(row["held_frames"]),
+            stale=int(row["stale_frames"]),
+            moves=int(row["n_moves"]),
+            worker=int(row["worker"]),
+            recording_ended=ended,
+        )
+
+    def end(self) -> None:
+        """End the session and its recording; a second call does nothing."""
+        if self._board.seats["id"][self.seat] == self.id:
+            self._call("end", self.id)
+
+
+def _spread(counts: NDArray[np.int64], worst: float) -> Spread:
+    """Percentiles of a histogram of `board.BINS` bins; zeros if it is empty."""
+    sums = np.cumsum(counts)
+    total = int(sums[-1])
+    if not total:
+        return Spread(0.0, 0.0, 0.0, 0.0)
+    at = np.searchsorted(sums, [math.ceil(share * total) for share in (0.5, 0.99, 0.999)])
+    p50, p99, p999 = np.where(at == BINS, worst, np.minimum((at + 0.5) * BIN, worst)).tolist()
+    return Spread(p50, p99, p999, worst)

@@ -1,0 +1,96 @@
+"""Running: what a host keeps of a session while it runs."""
+
+import time
+from pathlib import Path
+
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.hosting.board import Board
+from hapticdb.hosting.crew import WorkerLink
+from hapticdb.hosting.seat import SeatRequest
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.realtime.session_recording import SessionRecording
+from hapticdb.recording.file import DEFAULT_LIMIT
+from hapticdb.recording.header import Header
+
+FRAMES_UNTIL_RECORDED = 2
+"""Frames after which every frame has what a recording needs."""
+FRAME_PATIENCE = 5.0
+"""Seconds in which a worker must run those frames; normally milliseconds."""
+
+
+class Running:
+    """A session that a host runs.
+
+    Parameters
+    ----------
+    request : SeatRequest
+        What the worker was told.
+    session : int
+        Id of the session.
+    cells : ResidentCells
+        Its cells, which other sessions may share.
+    worker : WorkerLink
+        The process that runs it.
+    """
+
+    def __init__(
+        self, request: SeatRequest, session: int, cells: ResidentCells, worker: WorkerLink
+    ) -> None:
+        self.request, self.session, self.cells, self.worker = request, session, cells, worker
+        self.seat = request.seat
+        self._board: Board | None = None
+        self._recording: SessionRecording | None = None
+        self.recording_ended: str | None = None
+
+    def record(self, path: str, header: Header, board: Board, *, replace: bool) -> None:
+        """Begin a recording.
+
+        Raises
+        ------
+        UsageError
+            If there is one already, or the file exists.
+        FileError
+            If the file cannot be written.
+        """
+        if self._recording is not None:
+            raise UsageError(
+                f"the hosted session {self.session} is recorded already: stop it first"
+            )
+        recording = SessionRecording(
+            Path(path), limit_bytes=DEFAULT_LIMIT, append=False, replace=replace
+        )
+        board.seats["is_recorded"][self.seat] = 1
+        try:
+            recording.begin(header, self._first_frame(board))
+        except BaseException:
+            board.seats["is_recorded"][self.seat] = 0
+            raise
+        self._recording, self._board, self.recording_ended = recording, board, None
+
+    def _first_frame(self, board: Board) -> int:
+        """Number of the first frame that has what a recording needs."""
+        first = int(board.seats["n_frames"][self.seat]) + FRAMES_UNTIL_RECORDED
+        until = time.monotonic() + FRAME_PATIENCE
+        while int(board.seats["n_frames"][self.seat]) < first:
+            if time.monotonic() > until or not self.worker.is_alive:
+                raise HapticDBError("a worker runs no frames: end the session and begin another")
+            time.sleep(1e-3)
+        return first
+
+    def take_frames(self, board: Board) -> None:
+        """Copy new frames from the board into the recording, if there is one."""
+        if self._recording is not None:
+            self._recording.take(board.rings[self.seat], int(board.seats["n_frames"][self.seat]))
+            self.recording_ended = self._recording.ended
+
+    def stop_recording(self) -> int:
+        """End the recording, which stays; returns the number of its frames, 0 without one."""
+        recording, board = self._recording, self._board
+        if recording is None or board is None:
+            return 0
+        self.take_frames(board)
+        self._recording = None
+        board.seats["is_recorded"][self.seat] = 0
+        recording.finish()
+        self.recording_ended = recording.ended
+        return len(recording)

@@ -1,0 +1,328 @@
+"""Hosted sessions: many hands in worker processes, over shared tables of cells."""
+
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from banded import write_points
+from children import PATIENCE, child, until
+from hapticdb import Environment, PointShell
+from hapticdb.errors import HapticDBError, ObjectNotFoundError, UsageError
+from hapticdb.hosting.attached import AttachedHost
+from hapticdb.hosting.host import SessionHost
+from hapticdb.hosting.hosted import HostedSession
+from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+from hapticdb.recording.file import Recording
+from hapticdb.recording.replay import replay
+from hapticdb.testing import write_voxels
+from realtime.hands import at
+from realtime.sessions import floor_points, floored, recorded
+from realtime.worlds import block, make
+
+RATE = 500.0
+"""Frames a second of the tests' sessions."""
+ABOVE, PRESSED = at(0.0, 0.0, 0.02), at(0.0, 0.0, 0.004)
+"""Poses of the ball of 12 mm: over the floor at z = 0, and pressed into it."""
+
+
+@pytest.fixture(scope="module")
+def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    """A floor with its top at z = 0, without distances."""
+    with floored(make(tmp_path_factory.mktemp("plane"), bits=6)) as env:
+        yield env
+
+
+@pytest.fixture(scope="module")
+def smooth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    """A floor just under z = 0, with distances."""
+    with make(tmp_path_factory.mktemp("smooth"), bits=6) as env:
+        write_points(env.store, floor_points(31.5), "floor")
+        yield env
+
+
+@pytest.fixture(scope="module", params=["plane", "smooth"])
+def env(request: pytest.FixtureRequest) -> Environment:
+    found: Environment = request.getfixturevalue(request.param)
+    return found
+
+
+@pytest.fixture(scope="module")
+def host(env: Environment) -> Iterator[SessionHost]:
+    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20, processes=2) as made:
+        yield made
+
+
+@pytest.fixture
+def session(host: SessionHost, sphere: PointShell) -> Iterator[HostedSession]:
+    begun = host.begin(sphere, ABOVE, label="Ä tool")
+    until(lambda: begun.latest() is not None)
+    yield begun
+    begun.end()
+
+
+def pushed(session: HostedSession) -> float:
+    """Force along z that the hand feels now, N."""
+    last = session.latest()
+    return 0.0 if last is None else float(last["applied"][0, 2])
+
+
+def press(session: HostedSession, claim: Callable[[], object]) -> None:
+    """Press the tool into the floor, as a browser does, until a claim is true."""
+    deadline = time.monotonic() + PATIENCE
+    while not claim():
+        assert time.monotonic() < deadline
+        session.move(PRESSED)
+        time.sleep(0.02)
+
+
+def test_the_floor_pushes_the_hand_up_while_it_presses(session: HostedSession) -> None:
+    assert pushed(session) == 0.0
+    press(session, lambda: pushed(session) > 0.5)
+    deadline = time.monotonic() + PATIENCE
+    while pushed(session) != 0.0:
+        assert time.monotonic() < deadline
+        session.move(ABOVE)
+        time.sleep(0.02)
+
+
+def test_the_hand_moves_in_steps_of_the_loop_between_arrivals(
+    session: HostedSession, tmp_path: Path
+) -> None:
+    session.record(tmp_path / "way.hdbrec")
+    poses = [at(0.0, 0.0, z) for z in np.linspace(0.02, 0.05, 16)]
+    for pose in poses:  # 1 m/s at 33 Hz: 2 mm a step, 30 mm in all
+        session.move(pose)
+        time.sleep(0.03)
+    until(lambda: _height(session) == pytest.approx(0.05, abs=1e-9))
+    assert session.stop_recording() > 0
+    heights = recorded(tmp_path / "way.hdbrec")["hand"][:, 2]
+    steps = np.diff(heights)
+    assert (steps >= -1e-12).all()
+    assert heights.max() <= 0.05 + 1e-12  # never beyond what was said
+    assert np.count_nonzero(steps > 1e-9) > 3 * len(poses)  # in between, too
+
+
+def _height(session: HostedSession) -> float:
+    last = session.latest()
+    assert last is not None
+    return float(last["hand"][0, 2])
+
+
+def test_letting_go_lets_the_force_fall_and_taking_the_tool_again_raises_it(
+    session: HostedSession,
+) -> None:
+    press(session, lambda: pushed(session) > 0.5)
+    session.let_go()
+    until(lambda: pushed(session) == 0.0)
+    press(session, lambda: pushed(session) > 0.5)
+
+
+def test_contacts_lie_on_the_floor_and_their_forces_lift_the_tool(session: HostedSession) -> None:
+    press(session, lambda: pushed(session) > 0.5 and len(session.contacts()[0]))
+    points, forces = session.contacts()
+    assert points.shape == forces.shape
+    assert (np.abs(points[:, 2]) < 0.006).all()
+    assert forces[:, 2].sum() > 0.0
+
+
+def test_the_object_that_is_touched_is_named_and_only_while_it_is_touched(
+    session: HostedSession, env: Environment
+) -> None:
+    assert session.touched() == ()
+    (floor,) = env.find("floor")
+    press(session, lambda: session.touched() == (floor.id,))
+    deadline = time.monotonic() + PATIENCE
+    while session.touched() != ():
+        assert time.monotonic() < deadline
+        session.move(ABOVE)
+        time.sleep(0.02)
+
+
+def test_a_recording_replays_bit_for_bit(
+    session: HostedSession, env: Environment, tmp_path: Path
+) -> None:
+    press(session, lambda: pushed(session) > 0.5)
+    path = tmp_path / "hosted.hdbrec"
+    session.record(path)
+    with pytest.raises(UsageError, match="recorded already"):
+        session.record(tmp_path / "second.hdbrec")
+    for z in np.linspace(0.004, 0.0, 20):
+        session.move(at(0.001, 0.0, z))
+        time.sleep(0.02)
+    n_frames = session.stop_recording()
+    frames = recorded(path)
+    assert len(frames) == n_frames > 100
+    assert frames["time"][0] == 0.0
+    assert frames["contacts"].max() > 0
+    result = replay(Recording(path), env)
+    assert result.n_compared > 0
+    assert result.is_equal
+
+
+def test_objects_that_a_session_leaves_out_are_not_felt(
+    host: SessionHost, sphere: PointShell, session: HostedSession
+) -> None:
+    without = host.begin(sphere, ABOVE, exclude=["floor"])
+    try:
+        assert len(host.cells) == 2
+        deadline = time.monotonic() + PATIENCE
+        while pushed(session) < 0.5:
+            assert time.monotonic() < deadline
+            session.move(PRESSED)
+            without.move(PRESSED)
+            time.sleep(0.02)
+        assert pushed(without) == 0.0
+    finally:
+        without.end()
+    assert len(host.cells) == 1
+
+
+def test_where_chooses_what_is_felt(plane: Environment, sphere: PointShell) -> None:
+    write_voxels(plane.store, block((50, 50, 50), (52, 52, 52)), "post")
+    with SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20) as host:
+        session = host.begin(sphere, ABOVE, where=["post"])
+        (floor,) = plane.find("floor")
+        assert host.cells[0].exclude == (floor.id,)
+        with pytest.raises(ObjectNotFoundError):
+            host.begin(sphere, ABOVE, where=["nothing so called"])
+        assert [one.id for one in host.sessions()] == [session.id]
+
+
+def test_a_new_coupling_is_felt(session: HostedSession, env: Environment) -> None:
+    press(session, lambda: pushed(session) > 0.5)
+    before = pushed(session)
+    is_smooth = all(obj.has_distances for obj in env.objects())
+    session.set_coupling(
+        DeviceCoupling(stiffness=100.0) if is_smooth else Coupling(stiffness=100.0)
+    )
+    press(session, lambda: 0.0 < pushed(session) < 0.5 * before)
+    with pytest.raises(UsageError, match="does not go with"):
+        session.set_coupling(Coupling() if is_smooth else DeviceCoupling())
+
+
+def test_figures_count_frames_and_label_names_the_session(session: HostedSession) -> None:
+    until(lambda: session.figures().frames > 10)
+    figures = session.figures()
+    assert session.label == "Ä tool"
+    assert 0.0 < figures.in_time <= 1.0
+    assert figures.lateness.p50 <= figures.lateness.p99 <= figures.lateness.worst
+    assert figures.elapsed.p50 > 0.0
+    assert figures.recording_ended is None
+
+
+@pytest.mark.parametrize("pose", [np.zeros((4, 4)), np.full((4, 4), np.nan), at(1e9, 0.0, 0.0)])
+def test_a_pose_that_is_none_is_refused(session: HostedSession, pose: NDArray[np.float64]) -> None:
+    with pytest.raises(UsageError):
+        session.move(pose)
+
+
+def test_a_session_that_has_ended_says_so(host: SessionHost, sphere: PointShell) -> None:
+    session = host.begin(sphere, ABOVE)
+    session.end()
+    session.end()
+    assert session.is_over
+    for use in (lambda: session.move(ABOVE), session.latest, session.figures, session.let_go):
+        with pytest.raises(UsageError, match="is over"):
+            use()
+
+
+def test_a_host_takes_no_more_sessions_than_it_was_made_for(
+    plane: Environment, sphere: PointShell
+) -> None:
+    with SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20, most_sessions=1) as host:
+        first = host.begin(sphere, ABOVE)
+        with pytest.raises(UsageError, match="end one first"):
+            host.begin(sphere, ABOVE)
+        first.end()
+        host.begin(sphere, ABOVE)
+
+
+def test_another_process_begins_sessions_and_sees_those_of_others(
+    host: SessionHost, session: HostedSession, sphere: PointShell
+) -> None:
+    ours, theirs = socket.socketpair()
+    host.serve(ours)
+    attached = AttachedHost(theirs)
+    mine = attached.begin(sphere, ABOVE, label="theirs")
+    assert {one.id for one in attached.sessions()} == {session.id, mine.id}
+    press(mine, lambda: pushed(mine) > 0.5)
+    with pytest.raises(UsageError, match="scale"):
+        attached.begin(sphere, ABOVE, scale=-1.0)
+    attached.close()
+    until(lambda: [one.id for one in host.sessions()] == [session.id])
+
+
+CLIENT = """
+import socket, time
+import numpy as np
+from hapticdb import PointShell
+from hapticdb.hosting.attached import AttachedHost
+host = AttachedHost(socket.socket(fileno=0))
+shell = PointShell(np.array([[0.0, 0.0, -0.005]]), np.array([[0.0, 0.0, 1.0]]), np.zeros(3))
+host.begin(shell, np.eye(4), label="short-lived")
+print("begun", flush=True)
+time.sleep(60)
+"""
+
+
+def test_the_sessions_of_a_process_that_dies_end(host: SessionHost) -> None:
+    ours, theirs = socket.socketpair()
+    with theirs, child([sys.executable, "-c", CLIENT], stdin=theirs.fileno(), stderr=None) as other:
+        host.serve(ours)
+        assert other.stdout is not None
+        assert other.stdout.readline() == "begun\n"
+        assert "short-lived" in [one.label for one in host.sessions()]
+        other.kill()
+    until(lambda: "short-lived" not in [one.label for one in host.sessions()])
+
+
+def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
+    plane: Environment, sphere: PointShell
+) -> None:
+    with SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20) as host:
+        session = host.begin(sphere, ABOVE)
+        os.kill(host.pids[0], signal.SIGKILL)
+        until(lambda: session.is_over)
+        with pytest.raises(UsageError, match="is over"):
+            session.move(ABOVE)
+        session.end()
+        another = host.begin(sphere, ABOVE)
+        press(another, lambda: pushed(another) > 0.5)
+
+
+def test_a_closed_host_leaves_no_process_and_refuses_sessions(
+    plane: Environment, sphere: PointShell
+) -> None:
+    host = SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20)
+    host.begin(sphere, ABOVE)
+    pids = [*host.pids, *(cells.pid for cells in host.cells)]
+    host.close()
+    host.close()
+    for pid in pids:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+    with pytest.raises(UsageError, match="closed"):
+        host.begin(sphere, ABOVE)
+
+
+@pytest.mark.parametrize(
+    "options", [{"rate": 5.0}, {"most_sessions": 0}, {"most_sessions": 100}, {"processes": 0}]
+)
+def test_numbers_out_of_range_are_refused(plane: Environment, options: dict[str, float]) -> None:
+    with pytest.raises(UsageError):
+        SessionHost(plane.url, **options)  # type: ignore[arg-type]
+
+
+def test_the_other_end_of_a_closed_socket_is_an_error() -> None:
+    ours, theirs = socket.socketpair()
+    ours.close()
+    with pytest.raises(HapticDBError, match="no host"):
+        AttachedHost(theirs)

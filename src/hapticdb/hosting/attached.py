@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from hapticdb.errors import HapticDBError
 from hapticdb.hosting.board import Board
-from hapticdb.hosting.channel import Reply, Ask, Channel
+from hapticdb.hosting.channel import Ask, Channel, Reply
 from hapticdb.hosting.hosted import Calls, HostedSession
 from hapticdb.hosting.tables import Words
 from hapticdb.pointshell.shell import PointShell

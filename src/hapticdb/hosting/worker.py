@@ -14,7 +14,7 @@ from typing import Any
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.board import Board
-from hapticdb.hosting.channel import Reply, Ask, Channel
+from hapticdb.hosting.channel import Ask, Channel, Reply
 from hapticdb.hosting.seat import Seat, SeatRequest
 from hapticdb.kernels.compiling import entries_for, load
 from hapticdb.realtime.coupling import Coupling, SettledCoupling

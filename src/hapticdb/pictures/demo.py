@@ -1,7 +1,6 @@
 """The picture of a demo: the environment's voxels, the path, the hits by object, the force."""
 
 from collections import Counter
-from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +19,7 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError
 from hapticdb.pictures.lettering import shortened
 from hapticdb.pictures.splat import Camera, Depths, shade, splat
-from hapticdb.store.base import Object
+from hapticdb.store.upward import up_axis
 
 if TYPE_CHECKING:
     from hapticdb.demo import Comparison, DemoScene, Trace
@@ -39,7 +38,6 @@ BODY = "#6f7b89"
 REST = "#b9c2cc"
 COLORS = ("#ffb000", "#35c6f4", "#ff5d73", "#7ee081", "#c792ff", "#ff8f4d")
 """Of the objects touched most, one each; all others have the colour `REST`."""
-AXES = ("x", "y", "z")
 TOOLS_SHOWN = 9
 """Poses at which the tool is drawn."""
 HITS_SHOWN = 30_000
@@ -93,15 +91,6 @@ def _palette(env: Environment, trace: "Trace") -> Palette:
     most = [i for i, _ in Counter(trace.ids.tolist()).most_common(len(COLORS))]
     names = {i: known[i].rsplit("/", 1)[-1].replace("_", " ") for i in most}
     return Palette(dict(zip(most, COLORS, strict=False)), names)
-
-
-def up_axis(objects: Iterable[Object]) -> int:
-    """Axis that points up in a scene, 0 to 2: that of most voxels; z for files that name none."""
-    votes = np.zeros(3)
-    for obj in objects:
-        said = obj.attributes.get("up")
-        votes["xyz".find(said) if isinstance(said, str) and said in AXES else 2] += obj.voxels
-    return 2 - int(np.argmax(votes[::-1]))
 
 
 def _camera(env: Environment) -> Camera:

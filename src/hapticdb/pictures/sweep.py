@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from hapticdb.environment import Environment
 from hapticdb.errors import FileError
 from hapticdb.pictures.demo import (
-    AXES,
     BODY,
     COLORS,
     FAINT,
@@ -26,12 +25,12 @@ from hapticdb.pictures.demo import (
     SIZE,
     TOWARDS,
     mixed,
-    up_axis,
 )
 from hapticdb.pictures.lettering import extent_of, shortened
 from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
+from hapticdb.store.upward import AXES, up_axis
 from hapticdb.sweeps.result import Moment, Swept
 from hapticdb.units import length_text, readable_unit
 

@@ -1,0 +1,276 @@
+"""All objects of the scene, the nodes that draw them, and the audiences that see them."""
+
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from itertools import count
+from threading import RLock
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.page.scene.colours import Rgb, colour_of
+from hapticdb.page.scene.drawings import Audience, Drawing
+from hapticdb.page.scene.nodes import BatchNode, BoxNode, Member, Node, Sight, gathered
+from hapticdb.page.scene.picking import Struck, Targets
+from hapticdb.page.scene.rigid import taken_apart
+from hapticdb.page.scene.shapes import PartShape
+from hapticdb.store.base import Object
+
+ALL = "all"
+"""Key of the audience of all browsers."""
+MOST_LOOSE = 128
+"""Moved objects that get a node of their own, instead of being merged with others again. A larger
+value makes moves cheaper and leaves more nodes after many of them."""
+
+
+class Contents:
+    """Objects, their nodes and targets; what each audience sees. Safe to use from several threads.
+
+    Parameters
+    ----------
+    audience : Audience
+        Nodes of all browsers together.
+    """
+
+    def __init__(self, audience: Audience) -> None:
+        self.lock = RLock()
+        self.records: dict[int, Object] = {}
+        """Objects by id, as the database had them when they were read last."""
+        self._members: dict[int, Member] = {}
+        self._home: dict[int, Node] = {}
+        self._targets = Targets()
+        self._audiences: dict[Hashable, tuple[Audience, Sight]] = {
+            ALL: (audience, lambda member: member.colour)
+        }
+        self._shown: dict[str, dict[str, Drawing]] = {}
+        self._stale: dict[str, Node] = {}
+        self._numbers = count()
+        self._loose: set[int] = set()
+        self._preview: dict[int, NDArray[np.float64]] = {}
+
+    def __len__(self) -> int:
+        """Number of objects."""
+        return len(self.records)
+
+    @property
+    def n_nodes(self) -> int:
+        """Nodes that all browsers are sent."""
+        with self.lock:
+            return len(self._audiences[ALL][0].names)
+
+    @property
+    def bytes_sent(self) -> int:
+        """Bytes of all arrays that were sent to all browsers, each browser counted once."""
+        return self._audiences[ALL][0].bytes_sent
+
+    # -- objects -----------------------------------------------------------------------------
+
+    def add(self, objects: Sequence[Object]) -> None:
+        """Show objects as boxes, until `shape` gives them their shapes."""
+        with self.lock:
+            members = []
+            for obj in objects:
+                self.remove([obj.id])
+                self.records[obj.id] = obj
+                pose = taken_apart(obj.transform).pose
+                members.append(Member(obj.id, pose, obj.bounds, colour_of(obj)))
+            if members:
+                self._settle([BoxNode(self._name(), members)])
+            self.refresh()
+
+    def remove(self, ids: Iterable[int]) -> None:
+        """Objects that are gone; ids that the scene does not have are passed over."""
+        with self.lock:
+            for object_id in ids:
+                if self.records.pop(object_id, None) is not None:
+                    self._leave(object_id)
+                    del self._members[object_id]
+                    self._targets.remove(object_id)
+                    self._loose.discard(object_id)
+                    self._preview.pop(object_id, None)
+
+    def shape(self, found: Sequence[tuple[Object, PartShape, NDArray[np.float64]]]) -> None:
+        """Give objects their shapes, each at its pose (4, 4); passes over those that changed since.
+
+        Where the object was moved meanwhile, the shape is shown at its newer place, if it is only a
+        rigid motion away.
+        """
+        with self.lock:
+            members = []
+            for read, shape, pose in found:
+                now = self.records.get(read.id)
+                if now is None or not is_same_shape(now, read):
+                    continue
+                member = self._members[read.id]
+                moved = motion(read.transform, self._preview.get(read.id, now.transform))
+                member.shape, member.pose = shape, moved @ pose
+                member.box = shape.bounds(member.pose)
+                self._leave(read.id)
+                members.append(member)
+            self._settle(gathered(members, self._name))
+            self.refresh()
+
+    def move(self, object_id: int, transform: ArrayLike, record: Object | None = None) -> bool:
+        """Show an object at a new placement, world_from_part (4, 4); False if there is none.
+
+        `record` is the object after a committed move. Without one the move is a preview, which the
+        next committed one of this object replaces.
+        """
+        placed = np.asarray(transform, dtype=np.float64)
+        with self.lock:
+            if object_id not in self.records:
+                return False
+            base = self.records[object_id].transform
+            member = self._members[object_id]
+            at = self._preview.get(object_id, base)
+            member.pose = motion(at, placed) @ member.pose
+            if record is None:
+                self._preview[object_id] = placed
+            else:
+                self.records[object_id] = record
+                self._preview.pop(object_id, None)
+            if member.shape is not None:
+                member.box = member.shape.bounds(member.pose)
+            elif record is not None:
+                member.box = record.bounds
+            self._moved(member)
+            return True
+
+    def placement(self, object_id: int) -> NDArray[np.float64]:
+        """World_from_part (4, 4) at which an object is shown now, previews included."""
+        with self.lock:
+            return self._preview.get(object_id, self.records[object_id].transform).copy()
+
+    def _moved(self, member: Member) -> None:
+        home = self._home[member.id]
+        self._targets.put(member.id, member.shape, member.pose, member.box)
+        if not home.is_cheap_to_move and member.shape and len(self._loose) < MOST_LOOSE:
+            self._leave(member.id)
+            self._loose.add(member.id)
+            self._settle([BatchNode(self._name(), member.shape, [member])])
+        else:
+            self._stale[home.name] = home
+
+    def _leave(self, object_id: int) -> None:
+        """Take an object out of its node."""
+        home = self._home.pop(object_id, None)
+        if home is not None:
+            del home.members[object_id]
+            self._stale[home.name] = home
+
+    def _settle(self, nodes: Iterable[Node]) -> None:
+        """Draw the members of new nodes by them."""
+        for node in nodes:
+            for member in node.members.values():
+                self._members[member.id] = member
+                self._home[member.id] = node
+                self._targets.put(member.id, member.shape, member.pose, member.box)
+            self._stale[node.name] = node
+
+    def _name(self) -> str:
+        return f"/parts/{next(self._numbers)}"
+
+    # -- audiences ---------------------------------------------------------------------------
+
+    def watch(self, key: Hashable, audience: Audience, sight: Sight) -> None:
+        """Let one browser see objects in its own way, from now on."""
+        with self.lock:
+            self._audiences[key] = (audience, sight)
+            for node in self._nodes():
+                self._sync(node, audience, sight)
+
+    def leave(self, key: Hashable) -> None:
+        """Forget a browser."""
+        with self.lock:
+            self._audiences.pop(key, None)
+
+    def see(self, key: Hashable, ids: Iterable[int]) -> None:
+        """Draw anew what one browser sees of objects, after its sight of them changed."""
+        with self.lock:
+            if key not in self._audiences:
+                return
+            audience, sight = self._audiences[key]
+            nodes = {self._home[i].name: self._home[i] for i in ids if i in self._home}
+            for node in nodes.values():
+                self._sync(node, audience, sight)
+
+    def refresh(self) -> None:
+        """Draw anew what has changed, for all audiences."""
+        with self.lock:
+            stale, self._stale = self._stale, {}
+            for node in stale.values():
+                for audience, sight in self._audiences.values():
+                    self._sync(node, audience, sight)
+
+    def _nodes(self) -> list[Node]:
+        return list({node.name: node for node in self._home.values()}.values())
+
+    def _sync(self, node: Node, audience: Audience, sight: Sight) -> None:
+        """Bring the nodes of one audience up to date with what it sees of a node's objects."""
+        wanted = node.drawings(sight) if node.members else {}
+        if audience is self._audiences[ALL][0]:
+            before = self._shown.pop(node.name, {})
+            for name in before.keys() - wanted.keys():
+                audience.drop(name)
+            if wanted:
+                self._shown[node.name] = wanted
+            for name, drawing in wanted.items():
+                audience.put(name, drawing)
+            return
+        shared = self._shown.get(node.name, {})
+        own = {name for name in audience.names if name.partition("-")[0] == node.name}
+        for name in wanted.keys() | shared.keys() | own:
+            if name in wanted and not (name in shared and wanted[name].equals(shared[name])):
+                audience.put(name, wanted[name])
+            elif name in shared and name not in wanted:
+                audience.blank(name)
+            else:
+                audience.drop(name)
+
+    # -- what is where -----------------------------------------------------------------------
+
+    def pick(
+        self, origin: ArrayLike, direction: ArrayLike, sees: Callable[[int], bool]
+    ) -> Struck | None:
+        """The nearest object that a ray meets, of those that `sees` lets pass."""
+        with self.lock:
+            return self._targets.first(origin, direction, sees)
+
+    def box(self, ids: Iterable[int] | None = None) -> NDArray[np.float64] | None:
+        """Lower and upper corner (2, 3) of objects as they are shown now; None without any."""
+        with self.lock:
+            wanted = self._members.keys() if ids is None else ids
+            boxes = [self._members[i].box for i in wanted if i in self._members]
+        if not boxes:
+            return None
+        stacked = np.stack(boxes)
+        return np.stack([stacked[:, 0].min(axis=0), stacked[:, 1].max(axis=0)])
+
+    def colours(self) -> Mapping[int, Rgb]:
+        """Own colour of each object."""
+        with self.lock:
+            return {i: member.colour for i, member in self._members.items()}
+
+    def waiting(self) -> int:
+        """Number of objects that are still boxes."""
+        with self.lock:
+            return sum(member.shape is None for member in self._members.values())
+
+
+def is_same_shape(one: Object, other: Object) -> bool:
+    """Whether two states of an object differ by a rigid motion at most."""
+    return (
+        one.digest == other.digest
+        and one.link == other.link
+        and taken_apart(one.transform).key == taken_apart(other.transform).key
+    )
+
+
+def motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The rigid motion (4, 4) from one placement to another of equal stretch, world frame."""
+    if np.array_equal(before, after):
+        return np.eye(4)
+    start, end = taken_apart(before).pose, taken_apart(after).pose
+    back = np.eye(4)
+    back[:3, :3] = start[:3, :3].T
+    back[:3, 3] = -back[:3, :3] @ start[:3, 3]
+    return np.asarray(end @ back)

@@ -1,0 +1,119 @@
+"""A distinct shape of one or more objects: what is sent to the browser, and what rays meet."""
+
+from functools import cached_property
+from itertools import count
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.page.scene.facets import Facets, sharpened
+
+_EMBREE_SIZE = 100.0
+"""Size to which a shape is scaled before Embree sees it: Embree has absolute tolerances, and parts
+are millimetres or kilometres."""
+
+_SERIALS = count()
+
+
+class RayHit(NamedTuple):
+    """Where a ray meets a shape: its distance in lengths of the direction, and the triangle."""
+
+    distance: float
+    face: int
+
+
+class PartShape:
+    """Triangles of one or more objects, in a frame about their own centre.
+
+    Parameters
+    ----------
+    facets : Facets
+        Triangles, metres, part frame.
+    """
+
+    def __init__(self, facets: Facets) -> None:
+        self.serial = next(_SERIALS)
+        """A number that no other shape of this process has."""
+        low, high = facets.vertices.min(axis=0), facets.vertices.max(axis=0)
+        self.center: NDArray[np.float64] = (low + high) / 2
+        """The frame's origin in the part frame, metres."""
+        self.half: NDArray[np.float64] = (high - low) / 2
+        """Half the edges of its bounding box (3,), metres."""
+        self.facets = Facets(facets.vertices - self.center, facets.faces)
+
+    @property
+    def n_triangles(self) -> int:
+        """Number of its triangles."""
+        return len(self.facets.faces)
+
+    @property
+    def radius(self) -> float:
+        """Radius of its bounding box, metres."""
+        return float(np.linalg.norm(self.half))
+
+    @cached_property
+    def drawn(self) -> Facets:
+        """Its triangles in their order, with vertices split at sharp edges; float32 and uint32."""
+        split = sharpened(self.facets)
+        return Facets(split.vertices.astype(np.float32), split.faces.astype(np.uint32))
+
+    def bounds(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Lower and upper corner (2, 3) of a box that holds it at a pose, metres, world frame."""
+        reach = np.abs(pose[:3, :3]) @ self.half
+        return np.stack([pose[:3, 3] - reach, pose[:3, 3] + reach])
+
+    def prepare(self) -> None:
+        """Do now what the first ray would have to wait for."""
+        _ = self._embree
+
+    @cached_property
+    def _embree(self) -> tuple[object, float]:
+        """Embree's scene of the triangles, and the factor that scales metres to it."""
+        from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415 - extra `view`
+        from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415 - likewise
+
+        scale = _EMBREE_SIZE / max(self.radius, 1e-12)
+        scene = EmbreeScene()
+        vertices = (self.facets.vertices * scale).astype(np.float32)
+        TriangleMesh(scene, vertices, self.facets.faces.astype(np.int32))
+        return scene, scale
+
+    def first_hit(
+        self, origin: NDArray[np.float64], direction: NDArray[np.float64]
+    ) -> RayHit | None:
+        """The nearest triangle that a ray meets, from either side; None if it meets none.
+
+        origin (3,) and direction (3,), of any length, are in the shape's frame. Embree finds the
+        triangle; the distance is computed in 64 bits from the triangle's plane.
+        """
+        scene, scale = self._embree
+        length = float(np.linalg.norm(direction))
+        way = direction / length
+        # a start near the shape: 32 bits resolve its triangles however far away the eye is
+        skipped = max(float(-(origin @ way)) - 2 * self.radius, 0.0)
+        start = (origin + skipped * way) * scale
+        found = scene.run(  # type: ignore[attr-defined]
+            start[None].astype(np.float32),
+            way[None].astype(np.float32),
+            query="INTERSECT",
+            output=True,
+        )
+        face = int(found["primID"][0])
+        if face < 0:
+            return None
+        a, b, c = self.facets.vertices[self.facets.faces[face]]
+        normal = np.cross(b - a, c - a)
+        across = float(normal @ way)
+        if across != 0.0:
+            distance = float(normal @ (a - origin)) / across
+            if abs(distance - skipped - float(found["tfar"][0]) / scale) < 1e-3 * self.radius:
+                return RayHit(distance / length, face)
+        return RayHit((skipped + float(found["tfar"][0]) / scale) / length, face)
+
+    def normal(self, face: int) -> NDArray[np.float64]:
+        """Unit normal (3,) of a triangle, in the shape's frame; zero for one without area."""
+        a, b, c = self.facets.vertices[self.facets.faces[face]]
+        across = np.cross(b - a, c - a)
+        length = float(np.linalg.norm(across))
+        return across / length if length > 0 else across

@@ -1,0 +1,86 @@
+"""What surrounds the objects: which way is up, the ground, light, background, the first view."""
+
+from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from viser import SceneApi, ViserServer
+
+Plane = Literal["yz", "zx", "xy"]
+PLANES: tuple[Plane, ...] = get_args(Plane)
+"""Plane of the ground, by the number of the axis that points up."""
+FIELD_OF_VIEW = 0.7
+"""Height of the first view, radians. A larger value distorts more."""
+TOWARDS = (0.62, 0.50, 0.42)
+"""Direction from the objects to the first eye: along the two axes of the ground, and up."""
+ABOVE = (226, 231, 237)
+BELOW = (250, 251, 252)
+"""Colours of the background, at the top and at the bottom of the picture."""
+LINE = (196, 202, 210)
+SECTION = (168, 176, 187)
+"""Colours of the ground's lines: all, and each tenth."""
+GROUND_EDGE = 4.0
+"""Edge of the ground, in radii of the scene."""
+
+
+class View(NamedTuple):
+    """Where an eye is, and what it looks at: positions (3,), metres, world frame."""
+
+    position: NDArray[np.float64]
+    look_at: NDArray[np.float64]
+
+
+def framing(box: NDArray[np.float64], up: int) -> View:
+    """A view from which all of a box (2, 3) is seen."""
+    center = box.mean(axis=0)
+    radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
+    way = np.zeros(3)
+    way[[(up + 1) % 3, (up + 2) % 3, up]] = TOWARDS
+    way /= np.linalg.norm(way)
+    return View(center + way * radius / np.sin(FIELD_OF_VIEW / 2), center)
+
+
+def set_stage(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
+    """Light, background, ground and first view for objects in a box (2, 3), metres."""
+    scene, radius = server.scene, max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
+    scene.set_up_direction(tuple(np.eye(3)[up]))
+    scene.configure_default_lights(enabled=True, cast_shadow=False)
+    scene.configure_environment_map("city", environment_intensity=0.25)
+    steps = np.linspace(0.0, 1.0, 64)[:, None, None]
+    shades = (1 - steps) * np.array(ABOVE) + steps * np.array(BELOW)
+    scene.set_background_image(np.tile(shades.astype(np.uint8), (1, 8, 1)), format="png")
+    set_ground(scene, box, up)
+    view = framing(box, up)
+    camera = server.initial_camera
+    camera.fov = FIELD_OF_VIEW
+    camera.near, camera.far = radius / 200, radius * 100
+    camera.up = tuple(np.eye(3)[up])
+    camera.look_at = tuple(view.look_at)
+    camera.position = tuple(view.position)
+
+
+def set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
+    """Lines below the objects, a power of ten of metres apart."""
+    radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
+    cell = 10.0 ** np.floor(np.log10(radius / 2))
+    place = box.mean(axis=0)
+    place = np.round(place / (10 * cell)) * 10 * cell
+    place[up] = box[0, up]
+    edge = float(np.ceil(GROUND_EDGE * radius / cell) * cell)
+    scene.add_grid(
+        "/ground",
+        edge,
+        edge,
+        plane=PLANES[up],
+        cell_size=float(cell),
+        section_size=float(10 * cell),
+        cell_color=LINE,
+        section_color=SECTION,
+        cell_thickness=0.7,
+        section_thickness=1.0,
+        fade_distance=6 * radius,
+        fade_from="origin",
+        position=tuple(place),
+    )

@@ -1,0 +1,65 @@
+"""Triangles that are shown are those of the files; edges are sharp where faces meet at an angle."""
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticdb.page.scene.facets import Blocks, Facets, block_facets, coarsened, cube, sharpened
+
+
+def facets_of(mesh: trimesh.Trimesh) -> Facets:
+    return Facets(np.array(mesh.vertices), np.array(mesh.faces, dtype=np.int64))
+
+
+@given(st.integers(0, 2**32), st.integers(1, 40))
+def test_splitting_keeps_every_triangle_in_its_place(seed: int, n_faces: int) -> None:
+    rng = np.random.default_rng(seed)
+    vertices = rng.integers(-2, 3, (12, 3)) / 2.0  # many equal positions
+    before = Facets(vertices, rng.integers(0, 12, (n_faces, 3)))
+    after = sharpened(before)
+    assert np.array_equal(after.triangles, before.triangles)
+    assert len(after.vertices) <= 3 * n_faces
+
+
+def test_a_cube_has_only_sharp_edges_and_a_ball_has_none() -> None:
+    ball = facets_of(trimesh.creation.icosphere(3))
+    assert len(sharpened(cube()).vertices) == 24
+    assert len(sharpened(ball).vertices) == len(ball.vertices)
+
+
+def test_a_file_without_shared_vertices_is_smooth_as_well() -> None:
+    ball = facets_of(trimesh.creation.icosphere(3))
+    loose = Facets(ball.triangles.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3))
+    assert len(sharpened(loose).vertices) == len(ball.vertices)
+
+
+def test_a_cylinder_is_sharp_at_its_rims_alone() -> None:
+    rod = facets_of(trimesh.creation.cylinder(1.0, 2.0, sections=64))
+    assert len(sharpened(rod).vertices) == 4 * 64 + 2  # each rim twice, and two centres
+
+
+@given(st.integers(0, 2**32), st.integers(1, 60))
+def test_blocks_have_the_volume_of_their_voxels_and_no_inner_sides(seed: int, n: int) -> None:
+    voxels = np.unique(np.random.default_rng(seed).integers(0, 5, (n, 3)), axis=0)
+    shown = block_facets(Blocks(voxels, 1))
+    sides = sum(
+        not (np.abs(voxels - (voxel + step)).sum(axis=1) == 0).any()
+        for voxel in voxels
+        for axis in range(3)
+        for step in (np.eye(3, dtype=np.int64)[axis], -np.eye(3, dtype=np.int64)[axis])
+    )
+    corners = shown.triangles
+    volume = np.einsum("ij,ij->i", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+    assert len(shown.faces) == 2 * sides
+    assert volume == pytest.approx(len(voxels))
+
+
+@given(st.integers(0, 2**32), st.integers(1, 50))
+def test_larger_cubes_hold_all_voxels(seed: int, most: int) -> None:
+    voxels = np.unique(np.random.default_rng(seed).integers(0, 200, (300, 3)), axis=0)
+    blocks = coarsened(voxels, most)
+    held = {tuple(place) for place in blocks.places.tolist()}
+    assert len(blocks.places) <= most
+    assert {tuple(place) for place in (voxels // blocks.edge).tolist()} == held

@@ -48,7 +48,7 @@ def test_exclude_takes_any_collection_and_no_single_id(
         assert len(env.touch(sphere, np.eye(4), exclude=nobody).hits)
     for floor in ([1], (1,), np.array([1, 1]), {1}, iter([1])):
         assert not len(env.touch(sphere, np.eye(4), exclude=floor).hits)
-    with pytest.raises(hapticdb.UsageError, match="give ids in a list"):
+    with pytest.raises(hapticdb.UsageError, match="give ids, names and patterns in a list"):
         env.touch(sphere, np.eye(4), exclude=1)  # type: ignore[arg-type]
 
 
@@ -158,7 +158,7 @@ def test_integers_and_lists_are_poses(env: Environment, sphere: PointShell) -> N
 
 def test_what_only_looks_like_ids_excludes_nothing(env: Environment, sphere: PointShell) -> None:
     for wrong in ([True], b"\x01", bytearray(b"\x01"), memoryview(b"\x01"), [np.True_]):
-        with pytest.raises(hapticdb.UsageError, match=r"give an int|give ids"):
+        with pytest.raises(hapticdb.UsageError, match=r"give an id|give ids"):
             env.touch(sphere, np.eye(4), exclude=wrong)  # type: ignore[arg-type]
     with pytest.raises(hapticdb.UsageError, match="give an int"):
         env.object(True)

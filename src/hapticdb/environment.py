@@ -2,13 +2,12 @@
 
 import os
 from collections.abc import Iterable
-from time import perf_counter_ns
 from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.errors import ConnectionLostError, ReadOnlyError
+from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
 from hapticdb.ingest.layout import voxels_of_rows
@@ -18,26 +17,17 @@ from hapticdb.mesh import read_file
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.figures import QueryFigures
-from hapticdb.query.frame import (
-    NOTHING_EXCLUDED,
-    Answer,
-    HapticQuery,
-    Strategy,
-    as_id,
-    as_ids,
-    as_poses,
-)
+from hapticdb.query.frame import Strategy, as_id
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
-from hapticdb.query.known_objects import KnownObjects
-from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law
+from hapticdb.query.law import ForceLaw, LawName, as_law
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.query.touches import Touch, Touches
-from hapticdb.store.base import Freshness, Keys, Layout, Object, Size, Store
+from hapticdb.query.touching import Touching
+from hapticdb.store.base import Freshness, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
-from hapticdb.store.finding import find_objects
+from hapticdb.store.filtering import Filter, LastFilter
+from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.refusals import wants_distances
-
-_NOBODY: tuple[int, ...] = ()
 
 
 class Environment:
@@ -49,8 +39,8 @@ class Environment:
     def __init__(self, store: Store) -> None:
         self._store = store
         self._figures = QueryFigures(store)
-        self._query = HapticQuery(store, self._figures.both)
-        self._known = KnownObjects(store)
+        self._touching = Touching(store, self._figures)
+        self._filters = LastFilter()
 
     def __repr__(self) -> str:
         return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
@@ -102,11 +92,8 @@ class Environment:
         As of the revision that the last frame has read; before the first frame, of the newest. It
         costs a statement only before the first frame and after an edit of this environment.
         """
-        if self._known.version is None:
-            with self._store.snapshot():
-                self._store.revision()  # `version` then tells of this snapshot
-                self._known.learn()
-        return self._known.have_distances
+        self._touching.learn_first()
+        return self._touching.known.have_distances
 
     def size(self) -> Size:
         """Rows, bytes and leaf blocks of the database."""
@@ -129,12 +116,28 @@ class Environment:
         return self._store.object(as_id(object_id))
 
     def find(self, *words: int | str) -> list[Object]:
-        """Objects that ids, names and patterns choose, each once, ordered by id.
+        """Objects that ids, names, patterns and attributes choose, each once, ordered by id.
 
-        ``env.find(7, "wheel*", "body/door_*")``: the rules, and the errors, are those of
-        `hapticdb.store.finding.find_objects`. A sub-assembly's name chooses all that is below it.
+        ``env.find(7, "wheel*", "body/door_*", "material=steel")``: the rules, and the errors, are
+        those of `hapticdb.store.finding.find_objects`. A sub-assembly's name chooses all that is
+        below it.
         """
         return find_objects(self._store, words)
+
+    def felt(self, where: Words = (), exclude: Words = ()) -> list[Object]:
+        """Objects that a touch with the same `where` and `exclude` feels, ordered by id.
+
+        Raises
+        ------
+        ObjectNotFoundError, UsageError
+            As for `touch`.
+        """
+        objects = self._store.objects()
+        left_out = Filter(where, exclude).left_out(objects, self.url)
+        for error in left_out.missing:
+            raise error
+        ids = set(left_out.ids.tolist())
+        return [obj for obj in objects if obj.id not in ids]
 
     def shell(
         self,
@@ -148,7 +151,7 @@ class Environment:
 
         The shell is in the world's frame, metres. So its present pose is the identity, and the
         poses of a path are displacements. Exclude the objects from the force:
-        ``exclude=[obj.id for obj in env.find(*words)]``.
+        ``exclude=words``.
 
         Parameters
         ----------
@@ -282,7 +285,8 @@ class Environment:
         pose: ArrayLike,
         strategy: Strategy = "auto",
         *,
-        exclude: Iterable[int] = _NOBODY,
+        where: Words = (),
+        exclude: Words = (),
         maxgap: int = DEFAULT_MAXGAP,
         law: ForceLaw | LawName | None = None,
     ) -> Touch:
@@ -298,8 +302,10 @@ class Environment:
             Form of the query: ``statement``, ``array``, ``points``, ``maxgap``, ``cbgroup``, or
             ``auto``: ``cbgroup`` for a frame with many keys in few ranges, else ``array``. All
             strategies find the same hits, ids and wrench, bit for bit.
-        exclude : iterable of int
-            Ids of objects to leave out: a part that is taken out must not hit itself.
+        where, exclude : iterable of int or str
+            Felt are the objects that `where` chooses, all if it is empty, without those of
+            `exclude`: a part that is taken out must not hit itself. Ids, names, patterns and
+            ``attribute=value``, as for `find`; read again whenever others have written.
         maxgap : int
             For the strategy ``maxgap``: greatest distance, in voxel keys, of neighbours that share
             a range.
@@ -312,52 +318,14 @@ class Environment:
         UsageError
             If the pose is not rigid, the strategy unknown, or objects lack what the law reads.
         ObjectNotFoundError
-            If an excluded object does not exist.
+            If a word of `where` or `exclude` chooses no object.
 
         Notes
         -----
         Points outside the grid miss. All statements of a touch read one committed revision.
         """
-        ids = NOTHING_EXCLUDED if exclude is _NOBODY else as_ids(exclude)
-        force_law = as_law(law)
-        try:
-            answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
-        except ConnectionLostError:  # a lost snapshot: repeat all of it once
-            answer = self._felt(shell, pose, strategy, maxgap, ids, force_law)
-        if ids.size:
-            self._known.check_excluded(ids)
-        self._known.check_answer(answer.ids)
-        return Touch(answer, self._known.by_id)
-
-    def _felt(
-        self,
-        shell: PointShell,
-        pose: ArrayLike,
-        strategy: Strategy,
-        maxgap: int,
-        ids: Keys,
-        law: ForceLaw | None,
-    ) -> Answer:
-        """Answer of a frame; also loads the objects of the revision that the frame read."""
-        fitting = self._known.fits(law)
-        chosen = self._known.law_of(law) if fitting else PLANE
-        answer = self._query.run(shell, pose, strategy, maxgap, ids, chosen)
-        if not fitting or self._store.version() != self._known.version:
-            with self._store.snapshot():
-                chosen = self._law_of_snapshot(law)
-                answer = self._query.run(shell, pose, strategy, maxgap, ids, chosen)
-        return answer
-
-    def _law_of_snapshot(self, law: ForceLaw | None) -> ForceLaw:
-        """The law of a frame in this snapshot; also loads the snapshot's objects."""
-        self._store.revision()  # `version` then tells of this snapshot
-        self._learn_objects()
-        return self._known.law_of(law)
-
-    def _learn_objects(self) -> None:
-        """Load the objects of the revision that this snapshot reads."""
-        if self._known.learn():
-            self._figures.drop_empty_statistics()
+        felt = self._filters.of(where, exclude)
+        return self._touching.touch(shell, pose, strategy, maxgap, felt, as_law(law))
 
     def touch_many(
         self,
@@ -365,7 +333,8 @@ class Environment:
         poses: ArrayLike,
         strategy: Strategy = "auto",
         *,
-        exclude: Iterable[int] = _NOBODY,
+        where: Words = (),
+        exclude: Words = (),
         maxgap: int = DEFAULT_MAXGAP,
         law: ForceLaw | LawName | None = None,
         contacts: bool = False,
@@ -381,7 +350,7 @@ class Environment:
             queries pose by pose, as `touch` does.
         contacts : bool
             Whether to list every contact, too.
-        shell, exclude, maxgap, law
+        shell, where, exclude, maxgap, law
             As for `touch`.
 
         Raises
@@ -389,24 +358,10 @@ class Environment:
         UsageError, ObjectNotFoundError
             As for `touch`; nothing is returned then.
         """
-        ids = NOTHING_EXCLUDED if exclude is _NOBODY else as_ids(exclude)
-        where, started = as_poses(poses), perf_counter_ns()
-
-        def felt() -> Touches:
-            with self._store.snapshot():
-                chosen = self._law_of_snapshot(as_law(law))
-                answers = self._query.run_many(shell, where, strategy, maxgap, ids, chosen)
-                return Touches(len(where), has_contacts=contacts).gather(answers)
-
-        if strategy == "cbgroup":
-            self._figures.both()  # measured outside the snapshot
-        try:
-            touches = felt()
-        except ConnectionLostError:  # a lost snapshot: repeat all of it once
-            touches = felt()
-        if ids.size:
-            self._known.check_excluded(ids)
-        return touches.name(self._known.by_id, (perf_counter_ns() - started) / 1000)
+        felt = self._filters.of(where, exclude)
+        return self._touching.touch_many(
+            shell, poses, strategy, maxgap, felt, as_law(law), contacts=contacts
+        )
 
     # -- statistics --------------------------------------------------------------------------
 
@@ -441,7 +396,7 @@ class Environment:
     def _forget(self) -> None:
         """Drop cached values that an edit of this environment has made stale."""
         self._figures.drop_statistics()
-        self._known.forget()
+        self._touching.known.forget()
 
     def _check_writable(self) -> None:
         if self._store.is_read_only:

@@ -27,6 +27,32 @@ def test_exclude_takes_names_and_patterns(run: Run, scene: Path, words: tuple[st
     assert [json.loads(line)["hits"] for line in out.splitlines()] == [0, 0, 0]
 
 
+def test_where_chooses_what_is_felt(run: Run, scene: Path) -> None:
+    """The same words for touch, sweep and feel; --exclude leaves out some of what is chosen."""
+
+    def hits(*words: str) -> list[int]:
+        out = run("touch", scene, *TOUCH, "--json", *words)[1]
+        return [json.loads(line)["hits"] for line in out.splitlines()]
+
+    everything = hits()
+    assert hits("--where", "box*") == hits("--where", "up=?") == everything
+    assert hits("--where", "box1", "--exclude", "box1") == [0, 0, 0]
+    each = [hits("--where", f"box{n}") for n in range(3)]
+    assert [max(column) for column in zip(*each, strict=True)] == everything
+    path = ("--tool", "tool.npz", "--path", "path.csv", "--json")
+    for n in range(3):
+        found = json.loads(run("sweep", scene, *path, "--where", f"box{n}")[1])
+        assert {one["id"] for one in found["objects"]} == ({n + 1} if any(each[n]) else set())
+        assert found["tool"]["excluded"] == sorted({1, 2, 3} - {n + 1})
+    hand = ("--tool", "tool.npz", "--device", "path.csv", "--policy", "wait", "--rate", 200)
+    code, out, err = run("feel", scene, *hand, "--json", "--where", "box*", "--exclude", "up=?")
+    assert (code, json.loads(out)["hit_frames"]) == (0, 0), err
+    code, out, err = run("feel", scene, *hand, "--json", "--where", "up=?")
+    assert json.loads(out)["hit_frames"] > 0, err
+    for verb in (("touch", scene, *TOUCH), ("feel", scene, *hand), ("sweep", scene, *path)):
+        refused(run(*verb, "--where", "ball"), "--where: no object 'ball'")
+
+
 def test_feel_excludes_by_name(run: Run, scene: Path) -> None:
     hand = ("--tool", "tool.npz", "--device", "path.csv", "--policy", "wait", "--rate", 200)
     code, out, err = run("feel", scene, *hand, "--json", "--exclude", "box*")
@@ -68,6 +94,6 @@ def test_move_and_remove_take_several(run: Run, scene: Path) -> None:
 def test_what_chooses_nothing_is_one_line(run: Run, scene: Path, word: str) -> None:
     refused(run("touch", scene, *TOUCH, "--exclude", word), "--exclude: no object")
     refused(run("sweep", scene, "--part", word, "--path", "path.csv"), "--part: no object")
-    refused(run("move", scene, word, "--translate", "0,0,0"), "ID|NAME: no object")
-    refused(run("remove", scene, word), "ID|NAME: no object")
+    refused(run("move", scene, word, "--translate", "0,0,0"), "WORDS: no object")
+    refused(run("remove", scene, word), "WORDS: no object")
     assert ids_in(scene) == [1, 2, 3]

@@ -81,7 +81,20 @@ def test_only_recordings_under_the_smooth_law_need_the_second_version() -> None:
     plane, smooth = (header(law=law(800.0)).packed() for law in (TangentPlane, DistanceField))
     assert version_of(plane) == 1
     assert b'"law"' not in plane  # as before there were two laws
-    assert version_of(smooth) == FORMAT_VERSION == 2
+    assert version_of(smooth) == 2
+
+
+def test_a_filter_by_words_needs_the_third_version(tmp_path: Path) -> None:
+    """Earlier releases, which know ids alone, would feel other objects, and say nothing."""
+    filters: list[dict[str, Any]] = [{"where": ["wheel*", 3]}, {"exclude": ["material=steel"]}]
+    for name, felt in zip(("a.hdbrec", "b.hdbrec"), filters, strict=True):
+        given = header(**felt)
+        assert PREAMBLE.unpack(given.packed()[: PREAMBLE.size])[1] == FORMAT_VERSION == 3
+        Recorder(tmp_path / name, given).close()
+        found = Recording(tmp_path / name).header
+        assert (found.where, found.exclude) == (given.where, given.exclude)
+        assert found.differing(given) == []
+        assert set(found.differing(HEADER)) <= {"where", "exclude"} != set()
 
 
 def test_a_session_without_frames_is_a_recording(tmp_path: Path) -> None:

@@ -93,6 +93,27 @@ def test_a_replay_asks_for_cells_and_feels_what_a_touch_of_each_frame_does(
             assert found.tobytes() == wanted.tobytes()
 
 
+def test_a_filter_is_replayed_as_it_was_felt(
+    tmp_path: Path, env: Environment, sphere: PointShell
+) -> None:
+    """Also after others have added what the words do not choose, and removed what they chose."""
+    words = ["floor", "aside"]
+    frames = felt(env, sphere)
+    header = Header(env.url, env.grid, env.store.revision(), sphere, 1000.0, law=LAW, where=words)
+    with Recorder(tmp_path / "w.hdbrec", header) as recorder:
+        recorder.append(frames)
+    found = replay(Recording(tmp_path / "w.hdbrec"), env)
+    assert (found.is_equal, found.is_same_revision) == (True, True)
+    write_voxels(
+        env.store, floor_voxels(GRID, depth=12, width=48) + np.array([0, 0, 4]), "another floor"
+    )
+    env.remove(env.find("aside")[0].id)
+    recording = Recording(tmp_path / "w.hdbrec")
+    assert replay(recording, env).is_equal
+    assert replay(recording, env, touching(env, sphere, LAW, where=words)).is_equal
+    assert not replay(recording, env, touching(env, sphere, LAW)).is_equal
+
+
 def test_an_environment_without_cells_is_replayed_by_touches(
     tmp_path: Path, sphere: PointShell
 ) -> None:

@@ -3,6 +3,7 @@
 import itertools
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ import hapticdb
 from children import joined
 from hapticdb import Environment, PointShell, UsageError
 from hapticdb.errors import GridError
+from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.resident.cells import BUFFERS, READER_STRIDE, UNKNOWN, cell_key
 from hapticdb.resident import changes
 from hapticdb.resident import residency as module
@@ -22,7 +24,7 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.slots import ROUNDS_KEPT
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.connect import open_store
-from hapticdb.testing import write_voxels
+from hapticdb.testing import voxel_object, write_voxels
 from naive import Voxel
 from realtime.worlds import Reader, block, cells_of, make, move, scatter
 
@@ -123,6 +125,53 @@ def test_excluded_objects_are_in_no_cell(tmp_path: Path, table: CellTable) -> No
     residency = Residency(env.store, table, [3, 1])
     residency.load(residency.missing(cells_of(env.grid))[:50])
     assert check(residency, voxels_by_cell(env, (1, 3))) == 50
+
+
+def test_cells_follow_the_words_of_a_filter(tmp_path: Path, table: CellTable) -> None:
+    """What others add is in the cells if the words choose it then; words that end choose nothing.
+
+    The name of the last object makes a pattern an exact name, so that objects that nobody has
+    written are felt no longer.
+    """
+
+    def named(name: str, number: int, material: str) -> int:
+        ijk = block((16 * number, 3, 3), (16 * number + 40, 9, 9))
+        record = replace(voxel_object(env.grid, ijk, name), attributes={"material": material})
+        return env.store.add(record, rows_of_voxels(ijk, env.grid, env.layout))
+
+    env = make(tmp_path)
+    named("a1", 0, "steel"), named("a2", 1, "wood"), named("b", 2, "steel")
+    store = open_store(env.url, read_only=True)
+    by_material = Residency(store, table, ["b"], where=["material=steel"])
+    with CellTable.create(LEAST_BUDGET) as other:
+        by_name = Residency(store, other, where=["a*"])
+        residencies: tuple[tuple[Residency, tuple[int, ...]], ...] = (
+            (by_material, (2, 3)),
+            (by_name, (3,)),
+        )
+        for residency, left_out in residencies:
+            residency.make_resident(cells_of(env.grid)[:40])
+            assert check(residency, voxels_by_cell(env, left_out))
+        named("c", 3, "steel"), named("d", 3, "wood")
+        residencies = ((by_material, (2, 3, 5)), (by_name, (3, 4, 5)))
+        for residency, left_out in residencies:
+            assert residency.refresh() == 2
+            residency.make_resident(cells_of(env.grid)[:40])
+            assert check(residency, voxels_by_cell(env, left_out))
+            assert residency.exclude.tolist() == list(left_out)
+        env.remove(3)
+        named("a*", 9, "wood")
+        residencies = ((by_material, (2, 5, 6)), (by_name, (1, 2, 4, 5)))
+        for residency, left_out in residencies:
+            residency.refresh()
+            residency.make_resident(cells_of(env.grid)[:40])
+            assert check(residency, voxels_by_cell(env, left_out))
+        before = by_name.revision
+        move(env.store, 1, block((5, 5, 5), (9, 9, 9)))
+        assert (by_name.refresh(), by_name.revision) == (1, before + 1)
+        by_name.make_resident(cells_of(env.grid)[:40])
+        assert check(by_name, voxels_by_cell(env, (1, 2, 4, 5)))
+    store.close()
 
 
 def full_of_voxels(folder: Path, bits: int = 8) -> Environment:

@@ -1,11 +1,23 @@
-"""Objects that the words of an option choose: ids, names, patterns."""
+"""Objects that the words of an option choose: ids, names, patterns, attributes."""
 
 from collections.abc import Iterable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.store.base import Object
+
+
+class Felt(NamedTuple):
+    """What the options --where and --exclude say.
+
+    where, exclude : their words, as Python takes them; left_out : ids of the objects that are not
+    felt now.
+    """
+
+    where: list[str]
+    exclude: list[int | str]
+    left_out: list[int]
 
 
 def chosen(env: "Environment", words: Iterable[str], option: str) -> "list[Object]":
@@ -21,3 +33,20 @@ def chosen(env: "Environment", words: Iterable[str], option: str) -> "list[Objec
 def ids_of(env: "Environment", words: Iterable[str] | None, option: str) -> list[int]:
     """Ids of those objects."""
     return [obj.id for obj in chosen(env, words or (), option)]
+
+
+def felt_objects(
+    env: "Environment",
+    where: Iterable[str] | None,
+    exclude: Iterable[str] | None,
+    parts: Iterable[int] = (),
+) -> Felt:
+    """Check the words of --where and --exclude; parts : ids of what moves, which is not felt."""
+    words, more = list(where or ()), list(exclude or ())
+    chosen(env, words, "--where")
+    chosen(env, more, "--exclude")
+    left_out: list[int | str] = [*parts, *more]
+    if not words and not left_out:
+        return Felt([], [], [])
+    is_felt = {obj.id for obj in env.felt(words, left_out)}
+    return Felt(words, left_out, [obj.id for obj in env.objects() if obj.id not in is_felt])

@@ -8,6 +8,7 @@ from hapticdb.cli.tools import inset_for
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
+    from hapticdb.cli.choosing import Felt
     from hapticdb.devices.profiles import DeviceProfile
     from hapticdb.query.law import ForceLaw, LawName
     from hapticdb.realtime.coupling import DeviceCoupling
@@ -63,12 +64,15 @@ class ForceOptions:
 
         return None if self.profile_name is None else profile_named(self.profile_name)
 
-    def cells(self, url: str, budget_bytes: int, exclude: list[int]) -> "ResidentCells":
+    def cells(self, url: str, budget_bytes: int, felt: "Felt") -> "ResidentCells":
         """Resident cells for a session; they have distances where the law reads them."""
         from hapticdb import ResidentCells
 
         distances = None if self.law_name is None else self.law_name == "smooth"
-        return ResidentCells(url, budget_bytes=budget_bytes, exclude=exclude, distances=distances)
+        return ResidentCells(
+            url, budget_bytes=budget_bytes, where=felt.where, exclude=felt.exclude,
+            distances=distances,
+        )  # fmt: skip
 
     def law_and_coupling(self, cells: "ResidentCells") -> dict[str, Any]:
         """Arguments `law` and `coupling` of a session on those cells."""

@@ -31,17 +31,24 @@ SameCurveOption = Annotated[CurveName | None, typer.Option(help=_CURVE, show_def
 
 # -- objects --------------------------------------------------------------------------------------
 
+_WORDS = "7 or 3,4, 'wheel*', attribute=value"
+
 ObjectsArgument = Annotated[
     list[str],
-    typer.Argument(
-        metavar="ID|NAME...", help="As 'hapticdb objects' lists them: 7 or 3,4 or 'wheel*'."
+    typer.Argument(metavar="WORDS...", help=f"As 'hapticdb objects' lists them: {_WORDS}."),
+]
+WhereOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="WORDS",
+        help=f"Only these objects are felt: {_WORDS}. Give it again for more.",
     ),
 ]
 ExcludeOption = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="ID|NAME",
-        help="Objects that are not felt: 7 or 3,4 or 'wheel*'. Give it again for more.",
+        metavar="WORDS",
+        help=f"Objects that are not felt: {_WORDS}. Give it again for more.",
     ),
 ]
 

@@ -7,7 +7,7 @@ from hapticdb.kernels import law as laws
 from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
 from hapticdb.store.base import Keys, Layout, Object, Store
 from hapticdb.store.believed import damaged
-from hapticdb.store.refusals import unknown_exclusion
+from hapticdb.store.filtering import ALL, NOTHING_UNFELT, Filter, Unfelt
 
 
 class KnownObjects:
@@ -29,6 +29,8 @@ class KnownObjects:
         self.by_id: dict[int, Object] = {}
         self.have_distances = False
         self.version: int | None = None
+        self._resolved_of = self.by_id
+        self._resolved_filter, self._resolved = ALL, NOTHING_UNFELT
 
     def learn(self) -> bool:
         """List the objects if the snapshot's revision is new; returns whether it is new."""
@@ -59,20 +61,30 @@ class KnownObjects:
             if object_id not in self.by_id:
                 raise damaged(self._store.url, f"rows of object {object_id}, which is not there")
 
-    def check_excluded(self, ids: Keys) -> None:
-        """Refuse exclusions of objects that do not exist.
+    def left_out(self, felt: Filter) -> Keys:
+        """Ids (E,) of the objects that a filter leaves out, ascending; of those known now."""
+        return felt.fixed_ids if felt.is_fixed else self._left_out_by(felt).ids
+
+    def check_words(self, felt: Filter) -> None:
+        """Refuse a filter of which a word chooses no object.
 
         Raises
         ------
         ObjectNotFoundError
-            When no object has one of the ids.
+            It names the word.
         """
-        wanted = ids.tolist()
-        if not set(wanted) <= set(self.by_id):  # frames without a query learn nothing
-            self._list()
-        for object_id in wanted:
-            if object_id not in self.by_id:
-                raise unknown_exclusion(object_id, self._store.url)
+        if felt.is_empty or not self._left_out_by(felt).missing:
+            return
+        self._list()  # frames without a query learn nothing
+        for error in self._left_out_by(felt).missing:
+            raise error
+
+    def _left_out_by(self, felt: Filter) -> Unfelt:
+        """What a filter leaves out of these objects; kept until either is another."""
+        if self._resolved_of is not self.by_id or self._resolved_filter != felt:
+            self._resolved = felt.left_out([*self.by_id.values()], self._store.url)
+            self._resolved_of, self._resolved_filter = self.by_id, felt
+        return self._resolved
 
     def fits(self, law: ForceLaw | None) -> bool:
         """Whether the objects have what the law reads."""

@@ -28,6 +28,7 @@ from hapticdb.resident.table import (
 )
 from hapticdb.store.base import NO_KEYS, Store, SupportsWatch
 from hapticdb.store.connect import open_store
+from hapticdb.store.filtering import ALL, Filter
 
 LOOKAHEAD = 0.05
 """Least time (s) that cells are fetched ahead of the hand. Larger: fewer unknown cells, more cells
@@ -68,15 +69,15 @@ class FetchRequest:
     """Request to a fetching process.
 
     url, grid : of the environment, which must have that grid; descriptor, n_slots : file descriptor
-    and number of slots of the table's memory; exclude : ids of objects that are left out; wrap : a
-    hook for tests.
+    and number of slots of the table's memory; felt : which objects are felt; wrap : a hook for
+    tests.
     """
 
     url: str
     descriptor: int
     n_slots: int
     grid: Grid
-    exclude: tuple[int, ...] = ()
+    felt: Filter = ALL
     wrap: Wrap | None = None
 
 
@@ -111,13 +112,13 @@ class Fetcher:
             # if an earlier fetching process has died, sessions already use the table
             self.tracker.read_desk(0.0, self.lookahead)
             self.residency = Residency(
-                self.store, self.table, request.exclude,
+                self.store, self.table, request.felt.exclude, where=request.felt.where,
                 urgent=self.tracker.urgent_cells(), clock=clock,
             )  # fmt: skip
         except BaseException:
             self.store.close()
             raise
-        self._answers = ObjectAnswers(self.table, self.residency.exclude)
+        self._answers = ObjectAnswers(self.table, self.residency)
         self._now = clock()
         self._asked_at = self._released_at = self._now
         self._confirmed_at = -np.inf

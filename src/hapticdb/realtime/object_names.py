@@ -6,6 +6,7 @@ import numpy as np
 
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.records import MOST_ASKED
+from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Keys, Store
 from hapticdb.store.objects_at import ids_near_voxels, ids_of_voxels
@@ -25,13 +26,13 @@ class ObjectAnswers:
     ----------
     table : CellTable
         Table of the sessions.
-    exclude : (E,) int64
-        Ids of objects that are left out of the force and of the answers.
+    residency : Residency
+        Its cells; objects that are left out of them are left out of the answers.
     """
 
-    def __init__(self, table: CellTable, exclude: Keys) -> None:
+    def __init__(self, table: CellTable, residency: Residency) -> None:
         self._desk = table.desk.sessions
-        self._exclude = exclude
+        self._residency = residency
         self._has_distances = table.has_distances
         self._answered: dict[int, bytes] = {}
 
@@ -57,6 +58,7 @@ class ObjectAnswers:
 
     def ids_of(self, store: Store, keys: Keys) -> Keys:
         """Ids of the objects that are felt in voxels (n,), distinct and ascending."""
+        exclude = self._residency.exclude
         if self._has_distances:
-            return ids_near_voxels(store, keys, self._exclude, NEAR)
-        return ids_of_voxels(store, keys, self._exclude)
+            return ids_near_voxels(store, keys, exclude, NEAR)
+        return ids_of_voxels(store, keys, exclude)

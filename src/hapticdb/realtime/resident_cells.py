@@ -3,19 +3,19 @@
 import os
 import threading
 import time
-from collections.abc import Iterable
 from contextlib import suppress
 from typing import NamedTuple, Self
 
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.kernels.compiling import compile_missing, entries_for
-from hapticdb.query.frame import as_ids
 from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.processes import Process
 from hapticdb.resident.residency import check_cells, check_distances
 from hapticdb.resident.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellTable
 from hapticdb.store.connect import open_store
+from hapticdb.store.filtering import Filter
+from hapticdb.store.finding import Words
 
 START_PATIENCE = 60.0
 """Seconds in which a fetching process must be ready; a calibration may take seconds. Larger: a
@@ -66,7 +66,7 @@ def start_error(process: Process, name: str, seconds: float) -> HapticDBError:
 class ResidentCells:
     """Cells of an environment in memory, fetched by a separate process.
 
-    Sessions that exclude the same objects may share one. Also a context manager.
+    Sessions that feel the same objects may share one. Also a context manager.
 
     Parameters
     ----------
@@ -74,11 +74,13 @@ class ResidentCells:
         URL of the environment, in the form of `hapticdb.open`.
     budget_bytes : int
         Memory for cells, never exceeded; 1 MiB at least.
-    exclude : iterable of int
-        Ids of objects that are left out of the force.
+    where, exclude : iterable of int or str
+        Felt are the objects that `where` chooses, all if it is empty, without those of `exclude`;
+        words as for `Environment.find`. They are read again as others write: an object that is
+        added or renamed later is felt if the words choose it then.
     distances : bool or None
         Whether the cells have distances to surfaces, for the smooth law: a tenth as many cells fit
-        then. Every object that is not excluded must have distances. None: where they have them.
+        then. Every object that is felt must have distances. None: where they have them.
     wrap : callable or None
         Takes the fetching process's store and returns the store to use; importable. For tests.
 
@@ -87,8 +89,17 @@ class ResidentCells:
     UsageError
         If the environment's curve has no cells, or the budget is too small; if cells with distances
         are asked for, and an object has none.
+    ObjectNotFoundError
+        If a word of `where` or `exclude` chooses no object now.
     DatabaseError
         If the environment cannot be opened.
+
+    Attributes
+    ----------
+    felt : Filter
+        The words of `where` and `exclude`.
+    first_objects, left_out : tuple
+        All objects when the cells were made, and the ids of those that were not felt.
     """
 
     _pid = 0
@@ -99,18 +110,19 @@ class ResidentCells:
         url: str,
         *,
         budget_bytes: int = DEFAULT_BUDGET,
-        exclude: Iterable[int] = (),
+        where: Words = (),
+        exclude: Words = (),
         distances: bool | None = None,
         wrap: Wrap | None = None,
     ) -> None:
         self.url = url
-        self.exclude: tuple[int, ...] = tuple(as_ids(exclude).tolist())
+        self.felt = Filter(where, exclude)
         self.grid, has_distances = self._read_environment(distances)
         compile_missing(entries_for("resident"))  # now: two processes would each compile them
         self.table = CellTable.create(budget_bytes, distances=has_distances)
         self.restarts = 0
         self._request = FetchRequest(
-            url, self.table.descriptor, self.table.n_slots, self.grid, self.exclude, wrap
+            url, self.table.descriptor, self.table.n_slots, self.grid, self.felt, wrap
         )
         try:
             self._process = self._start_process()
@@ -136,11 +148,14 @@ class ResidentCells:
         try:
             check_cells(store)
             self.first_objects = tuple(store.objects())
-            for object_id in self.exclude:
-                store.object(object_id)
+            left_out = self.felt.left_out(self.first_objects, store.url)
+            for error in left_out.missing:
+                raise error
             if distances:
-                check_distances(store, as_ids(self.exclude))
-            felt = [obj for obj in self.first_objects if obj.id not in self.exclude]
+                check_distances(store, left_out.ids)
+            self.left_out: tuple[int, ...] = tuple(left_out.ids.tolist())
+            ids = set(self.left_out)
+            felt = [obj for obj in self.first_objects if obj.id not in ids]
             has_all = bool(felt) and all(obj.has_distances for obj in felt)
             return store.grid, has_all if distances is None else distances
         finally:

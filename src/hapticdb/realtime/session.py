@@ -2,7 +2,6 @@
 
 import os
 import time
-from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, replace
 from typing import Literal, Self, get_args
@@ -35,6 +34,7 @@ from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.table import DEFAULT_BUDGET, anonymous_memory
+from hapticdb.store.finding import Words
 
 Policy = Literal["hold", "wait"]
 RING_SECONDS = 4.0
@@ -87,7 +87,7 @@ class Session:
         Seconds without an answer of the database after which all frames act as if all cells were
         unknown. With the policy "wait", resident cells are used on.
     budget_bytes : int or None
-    exclude : iterable of int
+    where, exclude : iterable of int or str
         As for `ResidentCells`; only with a URL, because sessions that share cells feel the same
         objects.
     record : path or None
@@ -132,7 +132,8 @@ class Session:
         policy: Policy = "hold",
         staleness: float = DEFAULT_STALENESS,
         budget_bytes: int | None = None,
-        exclude: Iterable[int] = (),
+        where: Words = (),
+        exclude: Words = (),
         record: str | os.PathLike[str] | None = None,
         append_recording: bool = False,
         replace_recording: bool = False,
@@ -148,10 +149,9 @@ class Session:
         self.timing.check_granted()
         self._has_baseline = has_baseline
         self._owns_cells = isinstance(cells, str)
-        if law is None and isinstance(coupling, Coupling):
-            law = "plane"
+        law = "plane" if law is None and isinstance(coupling, Coupling) else law
         needs_distances = None if law is None else is_smooth(law)
-        self.cells = _cells_of(cells, budget_bytes, exclude, needs_distances)
+        self.cells = _cells_of(cells, budget_bytes, where, exclude, needs_distances)
         self.law = chosen_law(law, has_distances=self.cells.has_distances)
         self._check_distances()
         self.coupling = self._settled(coupling, device)
@@ -203,7 +203,7 @@ class Session:
         cells = self.cells
         return compare_proportions(
             cells.first_objects, cells.grid.voxel_size, self.shell, poses,
-            exclude=cells.exclude, margin=sway,
+            exclude=cells.left_out, margin=sway,
         )  # fmt: skip
 
     def _begin(
@@ -255,7 +255,8 @@ class Session:
             shell=self.shell,
             rate=self.timing.rate,
             law=self.law,
-            exclude=self.cells.exclude,
+            where=self.cells.felt.where,
+            exclude=self.cells.felt.exclude,
             coupling=asdict(self.coupling),
         )
 
@@ -426,15 +427,18 @@ class Session:
 def _cells_of(
     cells: ResidentCells | str,
     budget_bytes: int | None,
-    exclude: Iterable[int],
+    where: Words,
+    exclude: Words,
     distances: bool | None,  # noqa: FBT001 - as of ResidentCells
 ) -> ResidentCells:
     """Return the given resident cells, or make new ones for the environment at a URL."""
     if isinstance(cells, str):
         budget_bytes = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
-        return ResidentCells(cells, budget_bytes=budget_bytes, exclude=exclude, distances=distances)
-    if budget_bytes is not None or tuple(exclude):
-        raise UsageError("these cells have a budget and exclusions already: give a URL instead")
+        return ResidentCells(
+            cells, budget_bytes=budget_bytes, where=where, exclude=exclude, distances=distances
+        )
+    if budget_bytes is not None or tuple(where) or tuple(exclude):
+        raise UsageError("these cells have a budget and a filter already: give a URL instead")
     if cells.is_closed:
         raise UsageError("these cells are closed: make others")
     return cells

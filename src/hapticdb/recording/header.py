@@ -7,7 +7,7 @@ import math
 import os
 import struct
 import zlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from operator import index
@@ -19,21 +19,25 @@ from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell
 from hapticdb.query.choosing import law_named
-from hapticdb.query.frame import as_ids
 from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.store.connect import redact
+from hapticdb.store.filtering import Filter
+from hapticdb.store.finding import Words
 
 MAGIC = b"HDBREC\r\n"
 """First bytes of each recording."""
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 """Newest version of the format; files of later versions are refused. A recording under the tangent
-plane is written as version 1, which earlier releases read; under another law as version 2."""
+plane is written as version 1, which earlier releases read; under another law as version 2; under a
+filter by words, which earlier releases would not see, as version 3."""
 PLANE_VERSION = 1
 """Version of recordings under the tangent plane: their header names no law."""
+LAW_VERSION = 2
+"""Version of recordings under another law that feel all objects but some ids."""
 PREAMBLE = struct.Struct("<8sIIII")
 """First fields of a header: magic, format version, bytes of JSON, points, CRC-32 of the header."""
 MOST_TEXT = 1 << 24
-"""Greatest size of a header's JSON text, bytes. Larger: more excluded objects fit."""
+"""Greatest size of a header's JSON text, bytes. Larger: more words of a filter fit."""
 
 Value = str | int | float | bool | None | list[Any] | dict[str, Any]
 
@@ -60,8 +64,9 @@ class Header:
         The force law of the recorded wrenches.
     rate : float
         Frames a second that the session was set to.
-    exclude : iterable of int
-        Ids of objects that were left out of the force.
+    where, exclude : iterable of int or str
+        Which objects were felt: see `hapticdb.store.filtering.Filter`. The words and no ids, since
+        during the session others may have added objects that the words do not choose.
     coupling : mapping
         Parameters of the virtual coupling by their names; the values are those of JSON.
     version : str
@@ -81,10 +86,11 @@ class Header:
     shell: PointShell
     rate: float
     law: ForceLaw = field(default_factory=TangentPlane)
-    exclude: Iterable[int] = ()
+    exclude: Words = ()
     coupling: Mapping[str, Value] = field(default_factory=dict)
     version: str = field(default_factory=lambda: version("hapticdb"))
     started: str = field(default_factory=_now)
+    where: Words = ()
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate > 0):
@@ -97,7 +103,10 @@ class Header:
             ) from None
         object.__setattr__(self, "coupling", coupling)
         object.__setattr__(self, "environment", redact(str(self.environment)))
-        object.__setattr__(self, "exclude", tuple(as_ids(self.exclude).tolist()))
+        felt = Filter(self.where, self.exclude)
+        exclude = felt.fixed_ids.tolist() if felt.is_fixed else felt.exclude
+        object.__setattr__(self, "where", felt.where)
+        object.__setattr__(self, "exclude", tuple(exclude))
         object.__setattr__(self, "revision", int(self.revision))
         object.__setattr__(self, "rate", float(self.rate))
 
@@ -105,7 +114,7 @@ class Header:
         """Names of the fields that differ from another header's; time, revision, version aside."""
         names = [
             name
-            for name in ("environment", "grid", "law", "rate", "exclude", "coupling")
+            for name in ("environment", "grid", "law", "rate", "where", "exclude", "coupling")
             if getattr(self, name) != getattr(other, name)
         ]
         return names if _arrays(self.shell) == _arrays(other.shell) else [*names, "shell"]
@@ -121,6 +130,7 @@ class Header:
         shell, is_plane = self.shell, isinstance(self.law, TangentPlane)
         text = json.dumps(
             ({} if is_plane else {"law": "smooth"})
+            | ({"where": self.where} if self.where else {})
             | {
                 "environment": self.environment,
                 "grid": asdict(self.grid),
@@ -135,9 +145,13 @@ class Header:
             }
         ).encode("ascii")
         if len(text) > MOST_TEXT:
-            raise UsageError(f"a recording's header of {len(text)} bytes: exclude fewer objects")
+            raise UsageError(
+                f"a recording's header of {len(text)} bytes: filter objects by fewer words"
+            )
         body = text + _arrays(self.shell)
-        number = PLANE_VERSION if is_plane else FORMAT_VERSION
+        number = PLANE_VERSION if is_plane else LAW_VERSION
+        if not Filter(self.where, self.exclude).is_fixed:
+            number = FORMAT_VERSION
         counts = PREAMBLE.pack(MAGIC, number, len(text), len(shell), 0)[:-4]
         return counts + struct.pack("<I", zlib.crc32(body, zlib.crc32(counts))) + body
 
@@ -192,6 +206,7 @@ class Header:
                 ),
                 rate=told["rate"],
                 law=law_named(told.get("law", "plane"), told["stiffness"]),
+                where=told.get("where", ()),
                 exclude=told["exclude"],
                 coupling=told["coupling"],
                 version=str(told["version"]),

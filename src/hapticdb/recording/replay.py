@@ -1,6 +1,6 @@
 """Replay: computes the wrenches of a recorded session again and compares them bit for bit."""
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -19,6 +19,8 @@ from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
+from hapticdb.store.filtering import Filter
+from hapticdb.store.finding import Words
 
 Floats = NDArray[np.float64]
 Feel = Callable[[Floats], tuple[Floats, NDArray[np.int64]]]
@@ -99,10 +101,19 @@ class Replayed:
 
 
 def touching(
-    environment: Environment, shell: PointShell, law: ForceLaw, exclude: Iterable[int] = ()
+    environment: Environment,
+    shell: PointShell,
+    law: ForceLaw,
+    exclude: Words = (),
+    where: Words = (),
 ) -> Feel:
-    """Return a function that queries the database for each pose: no resident cells, slow."""
-    excluded = _present(environment, exclude)
+    """Return a function that queries the database for each pose: no resident cells, slow.
+
+    Felt is what the words of `where` and `exclude` choose now. A word that chooses nothing is no
+    error: an object that was removed meanwhile exerts no force anyway.
+    """
+    left_out = Filter(where, exclude).left_out(environment.objects(), environment.url)
+    excluded = left_out.ids.tolist()
 
     def feel(poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
         wrenches = np.empty((len(poses), 6))
@@ -119,7 +130,11 @@ def touching(
 
 @contextmanager
 def resident(
-    environment: Environment, shell: PointShell, law: ForceLaw, exclude: Iterable[int] = ()
+    environment: Environment,
+    shell: PointShell,
+    law: ForceLaw,
+    exclude: Words = (),
+    where: Words = (),
 ) -> Iterator[Feel]:
     """Provide a function that uses resident cells, fetched before their use: as fast as a session.
 
@@ -132,18 +147,12 @@ def resident(
         distances and an object has none.
     """
     with CellTable.create(distances=is_smooth(law)) as table:
-        residency = Residency(environment.store, table, _present(environment, exclude))
+        residency = Residency(environment.store, table, exclude, where=where)
         frames = ResidentFrames(residency, shell, law)
         try:
             yield frames.wrenches
         finally:
             frames.close()
-
-
-def _present(environment: Environment, ids: Iterable[int]) -> list[int]:
-    """Ids that are still objects of the environment; a removed object exerts no force anyway."""
-    present = {obj.id for obj in environment.objects()}
-    return [i for i in ids if i in present]
 
 
 def replay(
@@ -165,7 +174,7 @@ def replay(
     environment : Environment
         The environment of the session; its revision may differ.
     feel : callable or None
-        Computes wrenches and hits with the recording's shell, law and excluded objects. None:
+        Computes wrenches and hits with the recording's shell, law and filter. None:
         resident cells in 256 MiB of memory at most; in lexicographic order, which has no cells,
         one query a frame.
     until_damage : bool
@@ -188,7 +197,7 @@ def replay(
         )
     with ExitStack() as stack:
         if feel is None:
-            felt = (environment, header.shell, header.law, header.exclude)
+            felt = (environment, header.shell, header.law, header.exclude, header.where)
             is_resident = environment.grid.is_hierarchical
             feel = stack.enter_context(resident(*felt)) if is_resident else touching(*felt)
         comparison = _Comparison(environment, feel)

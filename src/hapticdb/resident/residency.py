@@ -5,7 +5,7 @@ directory.
 """
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -14,12 +14,14 @@ import numpy as np
 from hapticdb.errors import GridError, ObjectNotFoundError, UsageError
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, Place
-from hapticdb.query.frame import as_ids
 from hapticdb.resident.changes import known_cells_touched, writes_since
+from hapticdb.resident.left_out import LeftOutObjects
 from hapticdb.resident.source import CellSource
 from hapticdb.resident.table import FIRST_VERSION, LOADING, CellTable
 from hapticdb.resident.writer import CellWriter, UnpublishedCells
 from hapticdb.store.base import NO_KEYS, Change, Keys, Store
+from hapticdb.store.filtering import Filter
+from hapticdb.store.finding import Words
 
 BATCH = 256
 """Greatest number of cells in one statement. A larger value fetches more cells a second; a smaller
@@ -53,8 +55,9 @@ def check_distances(store: Store, exclude: Keys, changes: Sequence[Change] | Non
         for object_id in {change.id for change in changes if change.action != "remove"}:
             with suppress(ObjectNotFoundError):  # removed by a later write
                 objects.append(store.object(object_id))
+    left_out = set(exclude.tolist())
     for obj in objects:
-        if not obj.has_distances and obj.id not in exclude:
+        if not obj.has_distances and obj.id not in left_out:
             raise UsageError(
                 f"object {obj.id} ({obj.name}) of {store.url} has no distances to its surface: "
                 "import it again with distances, or use the law 'plane'"
@@ -85,8 +88,9 @@ class Residency:
     table : CellTable
         A table without another writer. If an earlier writer has filled it and has ended, the urgent
         cells are read again and all others are forgotten, in one version.
-    exclude : iterable of int
-        Ids of objects that are left out of all cells.
+    exclude, where : iterable of int or str
+        Which objects are felt: see `hapticdb.store.filtering.Filter`. All others are left out of
+        all cells. The words are read again as others write; one that chooses nothing is no error.
     urgent : (n,) int64
         Cells near tools, distinct, most urgent first.
     clock : callable
@@ -110,8 +114,9 @@ class Residency:
         self,
         store: Store,
         table: CellTable,
-        exclude: Iterable[int] = (),
+        exclude: Words = (),
         *,
+        where: Words = (),
         urgent: Keys = NO_KEYS,
         clock: Callable[[], float] = time.perf_counter,
     ) -> None:
@@ -125,7 +130,8 @@ class Residency:
         self._revision = NOTHING_KNOWN
         self._commit_count = NOTHING_KNOWN
         is_first = table.version == FIRST_VERSION
-        self._source = CellSource(store, as_ids(exclude), clock, may_measure=is_first)
+        self._left_out = LeftOutObjects(Filter(where, exclude))
+        self._source = CellSource(store, self._left_out.ids, clock, may_measure=is_first)
         if not is_first:
             self._take_over(urgent)
         self.refresh()
@@ -170,7 +176,7 @@ class Residency:
 
     @property
     def exclude(self) -> Keys:
-        """Ids (E,) of objects that are left out of all cells."""
+        """Ids (E,) of the objects that are left out of all cells, at `revision`."""
         return self._source.exclude
 
     @property
@@ -276,12 +282,13 @@ class Residency:
         with self.store.snapshot():
             revision = self.store.revision()
             writes = writes_since(self.store, self._revision, revision)
-            if writes is None:
-                writes, touched = [], self.writer.known()
-                self._check_distances(None)
+            only_written = self._left_out.follow(self.store, writes)
+            self._source.exclude = self._left_out.ids
+            self._check_distances(writes if only_written else None)
+            if writes is None or not only_written:
+                touched = self.writer.known()
             else:
                 touched = known_cells_touched(writes, self.grid, self.slots_of, self.writer.known)
-                self._check_distances(writes)
             again = self._urgent[np.isin(self._urgent, touched)][:MOST_RENEWED]
             read = self._read_all(np.concatenate([asked, again]))
             commit_count = self.store.version()
@@ -289,7 +296,7 @@ class Residency:
         self._commit_count = commit_count
         if len(touched) or len(read.cells) or revision != before:
             self._publish(touched, read)
-        return len(writes), read
+        return len(writes or ()), read
 
     def _check_distances(self, changes: Sequence[Change] | None) -> None:
         """Refuse objects without distances, as `check_distances`, if the table has distances."""

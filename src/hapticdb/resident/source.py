@@ -44,7 +44,7 @@ class CellSource:
     store : Store
         A connection; it may be replaced by another one to the same environment.
     exclude : (E,) int64
-        Ids of objects that are left out of all cells.
+        Ids of objects that are left out of all cells, ascending; it may be replaced, too.
     clock : callable
         Returns seconds, to time round trips at the start.
     may_measure : bool

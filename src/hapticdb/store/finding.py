@@ -1,4 +1,4 @@
-"""Finds objects by ids, names and patterns."""
+"""Finds objects by ids, names, patterns and attributes."""
 
 import re
 from collections.abc import Callable, Iterable, Sequence
@@ -7,6 +7,7 @@ from fnmatch import translate
 from operator import index
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
+from hapticdb.store.attributes import attribute_hint, having_attribute
 from hapticdb.store.base import Object, Store
 from hapticdb.store.refusals import no_object
 
@@ -14,20 +15,26 @@ MOST_IDS = 1 << 63
 """All ids lie below this value: they are signed 64-bit integers in the databases."""
 
 
-def find_objects(store: Store, words: Iterable[int | str]) -> list[Object]:
-    """Objects that ids, names and patterns choose, each once, ordered by id.
+Words = Iterable[int | str]
+"""Ids, names, patterns and ``attribute=value``, as `find_objects` reads them."""
+
+
+def find_objects(store: Store, words: Words) -> list[Object]:
+    """Objects that ids, names, patterns and attributes choose, each once, ordered by id.
 
     Parameters
     ----------
     store : Store
-        Store of the objects. It is asked for all objects once, and only if a word is a name.
+        Store of the objects. It is asked for all objects once, and only if a word is no id.
     words : iterable of int or str
         An int, or a text of digits, is an id; ``3,4`` is several. Any other text is a name or a
         pattern as of `fnmatch`: ``*`` stands for any characters, ``?`` for one, ``[ab]`` for one of
         those; case counts. Names are paths, such as ``body/door/handle``: a text without ``/`` is
         compared with every element of the path, one with ``/`` with the path from its beginning.
         If the match is a sub-assembly, everything below it is chosen. A text that is exactly a name
-        is no pattern. A text with commas is several words, unless it matches as a whole.
+        is no pattern. A text that fits no name, but has ``=``, is ``attribute=value``: see
+        `hapticdb.store.attributes.having_attribute`. A text with commas is several words, unless it
+        chooses something as a whole.
 
     Raises
     ------
@@ -36,25 +43,114 @@ def find_objects(store: Store, words: Iterable[int | str]) -> list[Object]:
     UsageError
         When a word is neither an int nor a text.
     """
-    listed: list[Object] = []
+    checked = checked_words(words)
+    if all(isinstance(word, int) for word in checked):
+        ids = {word: None for word in checked if isinstance(word, int)}
+        return [_object_of(store, object_id) for object_id in sorted(ids)]
+    return Listing(store.objects(), store.url).chosen(checked)
 
-    def chosen(word: int | str) -> list[Object]:
+
+class Listing:
+    """All objects of one revision, for words to choose from by the rules of `find_objects`.
+
+    Parameters
+    ----------
+    objects : sequence of Object
+        In the order in which they are chosen.
+    url : str
+        URL of their environment, for messages.
+    """
+
+    def __init__(self, objects: Sequence[Object], url: str) -> None:
+        self._objects = objects
+        self._by_id = {obj.id: obj for obj in objects}
+        self._url = url
+
+    def chosen(
+        self, words: Words, missing: list[ObjectNotFoundError] | None = None
+    ) -> list[Object]:
+        """Objects that words choose, each once.
+
+        Parameters
+        ----------
+        words : iterable of int or str
+            As for `find_objects`.
+        missing : list or None
+            Takes the errors of words that choose nothing; without it, the first one is raised.
+        """
+        errors: list[ObjectNotFoundError] = []
+        found: set[int] = set()
+        for word in words:
+            found.update(self._ids_of(word, errors))
+        if missing is not None:
+            missing.extend(errors)
+        elif errors:
+            raise errors[0]
+        return [obj for obj in self._objects if obj.id in found]
+
+    def _ids_of(self, word: int | str, errors: list[ObjectNotFoundError]) -> list[int]:
         if isinstance(word, int):
-            if not -MOST_IDS <= word < MOST_IDS:
-                raise no_object(word, store.url)
-            return [store.object(word)]
+            if word not in self._by_id:
+                errors.append(no_object(word, self._url))
+                return []
+            return [word]
         pieces = [piece.strip() for piece in word.split(",")]
-        if all(piece.isascii() and piece.isdecimal() for piece in pieces):
-            return [obj for piece in pieces for obj in chosen(_id_of(piece, store.url))]
-        listed.extend([] if listed else store.objects())
-        if found := named_like(listed, word):
-            return found
-        if len(pieces) > 1:
-            return [obj for piece in pieces for obj in chosen(piece)]
-        raise _nothing_like(word, listed, store.url)
+        if not all(_is_id(piece) for piece in pieces):
+            if found := self._fitting(word):
+                return [obj.id for obj in found]
+            if len(pieces) == 1:
+                errors.append(_nothing_like(word, self._objects, self._url))
+                return []
+        elif len(pieces) == 1:  # too long for a number that Python reads
+            errors.append(ObjectNotFoundError(f"no object {word[:40]}... in {self._url}"))
+            return []
+        return [
+            i
+            for piece in pieces
+            for one in checked_words([piece])
+            for i in self._ids_of(one, errors)
+        ]
 
-    found = {obj.id: obj for word in _checked(words) for obj in chosen(word)}
-    return [found[i] for i in sorted(found)]
+    def _fitting(self, word: str) -> list[Object]:
+        return named_like(self._objects, word) or having_attribute(self._objects, word)
+
+
+def checked_words(words: Words, what: str = "objects") -> tuple[int | str, ...]:
+    """Words as ids and texts, texts of digits as ids; refuses anything else.
+
+    what : what the words are, for messages.
+    """
+    if isinstance(words, (str, bytes, bytearray, memoryview)) or not isinstance(words, Iterable):
+        raise UsageError(f"{what} {words!r}: give ids, names and patterns in a list")
+    checked: list[int | str] = []
+    for word in words:
+        try:
+            if isinstance(word, bool):
+                raise TypeError  # noqa: TRY301 - to Python a bool is an int, but it is no id
+            checked.extend(_read(word) if isinstance(word, str) else [index(word)])
+        except TypeError:
+            raise UsageError(
+                f"{what}: {word!r}: give an id, a name or a pattern, as objects() lists them"
+            ) from None
+    return tuple(checked)
+
+
+def _read(text: str) -> list[int | str]:
+    """Ids where a text is nothing else, such as ``3,4``; otherwise the text."""
+    pieces = [piece.strip() for piece in text.split(",")]
+    if all(_is_id(piece) and len(piece.lstrip("0")) <= len(str(MOST_IDS)) for piece in pieces):
+        return [int(piece) for piece in pieces]
+    return [text]
+
+
+def _is_id(piece: str) -> bool:
+    return piece.isascii() and piece.isdecimal()
+
+
+def _object_of(store: Store, object_id: int) -> Object:
+    if not -MOST_IDS <= object_id < MOST_IDS:
+        raise no_object(object_id, store.url)
+    return store.object(object_id)
 
 
 def named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
@@ -76,27 +172,6 @@ def _branches(name: str, *, is_path: bool) -> list[str]:
     return ["/".join(elements[: n + 1]) for n in range(len(elements))]
 
 
-def _checked(words: Iterable[int | str]) -> list[int | str]:
-    """Words as ids and texts; anything else is refused before the first lookup."""
-    if isinstance(words, (str, bytes)) or not isinstance(words, Iterable):
-        raise UsageError(f"objects {words!r}: give ids, names and patterns in a list")
-    checked: list[int | str] = []
-    for word in words:
-        try:
-            if isinstance(word, bool):
-                raise TypeError  # noqa: TRY301 - to Python a bool is an int, but it is no id
-            checked.append(word if isinstance(word, str) else index(word))
-        except TypeError:
-            raise UsageError(f"object {word!r}: give an id, a name or a pattern") from None
-    return checked
-
-
-def _id_of(digits: str, url: str) -> int:
-    if len(digits.lstrip("0")) > len(str(MOST_IDS)):  # Python refuses texts of 4,300 digits
-        raise ObjectNotFoundError(f"no object {digits[:40]}... in {url}")
-    return int(digits)
-
-
 def _nothing_like(word: str, objects: Sequence[Object], url: str) -> ObjectNotFoundError:
     """Build the error for a name or pattern that fits nothing."""
     folded = [replace(obj, name=obj.name.casefold()) for obj in objects]
@@ -106,7 +181,7 @@ def _nothing_like(word: str, objects: Sequence[Object], url: str) -> ObjectNotFo
     elif word.strip("*/ ") and (alike := named_like(folded, f"*{word.strip('*/ ').casefold()}*")):
         hint = f", but {names[alike[0].id]!r}" + (f" and {len(alike) - 1} more" * (len(alike) > 1))
     else:
-        hint = ""
+        hint = attribute_hint(objects, word)
     return ObjectNotFoundError(
         f"no object {word[:80]!r} in {url}{hint}; 'hapticdb objects {url}' lists the names"
     )

@@ -16,13 +16,6 @@ def no_object(object_id: int, url: str) -> ObjectNotFoundError:
     )
 
 
-def unknown_exclusion(object_id: int, url: str) -> ObjectNotFoundError:
-    """Build the error for an id to exclude that no object has."""
-    return ObjectNotFoundError(
-        f"no object {object_id} in {url} to exclude; 'hapticdb objects {url}' lists them"
-    )
-
-
 def present_already(record: Object, url: str) -> EnvironmentExistsError:
     """Build the error for a part that the environment holds already."""
     return EnvironmentExistsError(

@@ -6,7 +6,7 @@ need. A bound covers the space between samples and between points (`result.Proof
 """
 
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,12 +19,12 @@ from hapticdb.errors import (
 from hapticdb.kernels.resident import sweep as kernels
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
-from hapticdb.query.frame import as_ids
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
 from hapticdb.store.base import Keys, Object
-from hapticdb.store.refusals import unknown_exclusion
+from hapticdb.store.filtering import Filter
+from hapticdb.store.finding import Words
 from hapticdb.sweeps.clearance import ClearanceSearch
 from hapticdb.sweeps.inside import enclosed_ids
 from hapticdb.sweeps.objects import Met, Runs, pairs_in_voxels, pairs_of_hits, tally
@@ -54,7 +54,8 @@ def sweep(
     shell: PointShell,
     poses: ArrayLike,
     *,
-    exclude: Iterable[int] = (),
+    where: Words = (),
+    exclude: Words = (),
     budget_bytes: int = DEFAULT_BUDGET,
     clearance_limit: float | None = None,
     profile: bool = False,
@@ -74,8 +75,9 @@ def sweep(
     poses : (M, 4, 4) array
         `world_from_tool`, rigid, metres; at least one. Between two poses the middle of the tool's
         bounding box moves on a line, and the tool turns about it by the smaller angle.
-    exclude : iterable of int
-        Ids of objects to leave out: a part that is taken out must not hit itself.
+    where, exclude : iterable of int or str
+        Felt are the objects that `where` chooses, all if it is empty, without those of `exclude`: a
+        part that is taken out must not hit itself. Words as for `Environment.find`.
     budget_bytes : int
         Memory for resident cells; never exceeded.
     clearance_limit : float or None
@@ -93,19 +95,19 @@ def sweep(
     UsageError
         If a pose is not rigid, or the budget is too small for the tool.
     ObjectNotFoundError
-        If an excluded object does not exist.
+        If a word of `where` or `exclude` chooses no object.
     """
     shell = shell.with_cover()
     path = SweepPath.of(poses, shell, env.grid.voxel_size)
     limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
     if not (np.isfinite(limit) and limit >= 0.0):
         raise UsageError(f"clearance up to {limit} m: give a finite length, 0 or more")
-    excluded = as_ids(exclude)
+    felt = Filter(where, exclude)
     run = _Run(env, shell, path, limit, profile, proportions, progress)
     try:
-        return run.swept(excluded, budget_bytes)
+        return run.swept(felt, budget_bytes)
     except ConnectionLostError:  # a lost snapshot: repeat all of it once
-        return run.swept(excluded, budget_bytes)
+        return run.swept(felt, budget_bytes)
 
 
 class _Run:
@@ -135,28 +137,26 @@ class _Run:
         self.n_windows = min(len(path), WINDOWS)
         self.begins = -(-np.arange(self.n_windows) * len(path) // self.n_windows)
 
-    def swept(self, exclude: Keys, budget_bytes: int) -> Swept:
+    def swept(self, felt: Filter, budget_bytes: int) -> Swept:
         """Sweep from the start, in one snapshot."""
         with CellTable.create(budget_bytes) as table:
-            residency = Residency(self.store, table, exclude)
+            residency = Residency(self.store, table, felt.exclude, where=felt.where)
             frames = ResidentFrames(residency, self.shell)
             try:
                 with self.store.snapshot():
                     started = time.perf_counter()
                     residency.refresh()
-                    self._begin(frames)
+                    self._begin(frames, felt)
                     self.enclosed = enclosed_ids(residency, self.shell, self.path.poses[0])
                     self._sweep(frames)
                     return self._result(frames, time.perf_counter() - started)
             finally:
                 frames.close()
 
-    def _begin(self, frames: ResidentFrames) -> None:
-        residency = frames.residency
+    def _begin(self, frames: ResidentFrames, felt: Filter) -> None:
         self.known = {obj.id: obj for obj in self.store.objects()}
-        for i in residency.exclude.tolist():
-            if i not in self.known:
-                raise unknown_exclusion(i, self.store.url)
+        for error in felt.left_out([*self.known.values()], self.store.url).missing:
+            raise error
         voxels = self.limit / self.grid.voxel_size
         self.search = ClearanceSearch(frames, voxels) if voxels > 0.0 else None
         self.along = ClearanceSearch(frames, voxels, self.n_windows) if self.is_profiled else None

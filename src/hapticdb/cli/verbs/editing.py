@@ -56,7 +56,7 @@ def move(
     placed = _placement(pose, matrix)
     shift = translate and numbers_of(translate, 3, "--translate", "X,Y,Z in metres")
     with hapticdb.open(url) as env:
-        found = chosen(env, objects, "ID|NAME")
+        found = chosen(env, objects, "WORDS")
         if not shift and len(found) > 1:
             raise UsageError(
                 f"--pose and --matrix place one object, and {len(found)} are chosen: give one, or "
@@ -140,7 +140,7 @@ def remove(url: UrlArgument, objects: ObjectsArgument, *, json: JsonOption = Fal
     from hapticdb.cli.verbs.listing import record_of
 
     with hapticdb.open(url) as env:
-        for obj in chosen(env, objects, "ID|NAME"):  # all, or an error before any is removed
+        for obj in chosen(env, objects, "WORDS"):  # all, or an error before any is removed
             env.remove(obj.id)
             if json:
                 render.say_json(record_of(obj))

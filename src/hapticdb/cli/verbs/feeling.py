@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hapticdb.cli import fitting, render, session_page
-from hapticdb.cli.choosing import ids_of
+from hapticdb.cli.choosing import Felt, felt_objects
 from hapticdb.cli.forces import ForceOptions
 from hapticdb.cli.hands import VENDORS, HandOptions
 from hapticdb.cli.options import (
@@ -21,6 +21,7 @@ from hapticdb.cli.options import (
     ToolOption,
     ToolUnitOption,
     UrlArgument,
+    WhereOption,
 )
 from hapticdb.cli.root import Interrupted, leave
 from hapticdb.cli.tools import compile_for, shell_of, shell_record
@@ -167,6 +168,7 @@ def feel(
     loop: LoopOption = False,
     scale: ScaleOption = 1.0,
     clutch: ClutchOption = None,
+    where: WhereOption = None,
     exclude: ExcludeOption = None,
     record: RecordOption = None,
     append: AppendOption = False,
@@ -202,7 +204,7 @@ def feel(
     path_speed = motion.path_speed()
     hand, handle = motion.open(path_speed), Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel")
-    with force.cells(url, budget_bytes(budget), _excluded_ids(url, exclude)) as cells:
+    with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
         session = Session(
             cells, shell, hand, rate=rate, seconds=seconds, **force.law_and_coupling(cells),
@@ -210,8 +212,7 @@ def feel(
             append_recording=append, replace_recording=replace, record_limit_bytes=limit_bytes,
             is_fifo=fifo, processor=processor, has_baseline=not no_baseline,
         )  # fmt: skip
-        force.tell_lowered(session)
-        report, signals = _run(session, tool)
+        report, signals = _run(session, tool, force)
         _show(report, cells, shell, record, path_speed, json=json)
     _exit_after(signals, report)
 
@@ -264,17 +265,19 @@ def _check_loop(processor: int | None, policy: PolicyName, device: str) -> None:
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
 
 
-def _excluded_ids(url: str, exclude: Sequence[str] | None) -> list[int]:
+def _felt(url: str, where: Sequence[str] | None, exclude: Sequence[str] | None) -> Felt:
+    """Words of the options, checked before a process is started."""
     import hapticdb
 
-    if not exclude:
-        return []
+    if not where and not exclude:
+        return Felt([], [], [])
     with hapticdb.open(url, read_only=True) as env:
-        return ids_of(env, exclude, "--exclude")
+        return felt_objects(env, where, exclude)
 
 
-def _run(session: "Session", tool: str) -> "tuple[Report, list[int]]":
+def _run(session: "Session", tool: str, force: ForceOptions) -> "tuple[Report, list[int]]":
     """Wait for a session's end: its report, and the signals that asked for the end."""
+    force.tell_lowered(session)
     with session, _ended_by_signals(session) as signals:
         fitting.tell(session.proportions, tool, "--scale")
         report = _waited_for(session)

@@ -45,7 +45,8 @@ NO_CHECKSUMS = "none of pages; 'hapticdb copy' makes an environment that has the
 NameOption = Annotated[
     list[str] | None,
     typer.Option(
-        metavar="ID|NAME", help="Only these objects: 7 or 3,4 or 'wheel*'. Give it again for more."
+        metavar="WORDS",
+        help="Only these objects: 7 or 3,4, 'wheel*', attribute=value. Give it again for more.",
     ),
 ]
 BoxOption = Annotated[
@@ -213,15 +214,19 @@ def objects(
 ) -> None:
     """List the objects of an environment.
 
-    Verbs take objects by id, by name and by pattern. A name is a path, such as
+    Verbs take objects by id, by name, by pattern and by attribute. A name is a path, such as
     body/door/handle. A name without / fits any element of a path, a name with /
     the path from its start. The name of a sub-assembly means all objects below it.
     In a pattern * stands for anything, ? for one character, [ab] for a or b;
-    case counts.
+    case counts. attribute=value chooses the objects that have that attribute; the
+    value may be a pattern, and outer.inner=value names one inside another. A word
+    with = that fits the name of an object chooses that name.
 
     Example: hapticdb objects car.db
 
     Example: hapticdb objects car.db --name 'wheel*' --sort voxels --limit 10
+
+    Example: hapticdb objects car.db --name up=z
     """
     from contextlib import closing
 

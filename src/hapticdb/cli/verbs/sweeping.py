@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 
 from hapticdb.cli import fitting, render
-from hapticdb.cli.choosing import ids_of
+from hapticdb.cli.choosing import felt_objects, ids_of
 from hapticdb.cli.options import (
     BudgetOption,
     ExcludeOption,
@@ -19,6 +19,7 @@ from hapticdb.cli.options import (
     SeedOption,
     ToolUnitOption,
     UrlArgument,
+    WhereOption,
 )
 from hapticdb.cli.tools import shell_of
 from hapticdb.cli.values import budget_bytes
@@ -41,7 +42,7 @@ PartsOption = Annotated[
     list[str] | None,
     typer.Option(
         "--part",
-        metavar="ID|NAME",
+        metavar="WORDS",
         help="Instead of --tool: objects that move, all together; chosen as for --exclude.",
     ),
 ]
@@ -103,6 +104,7 @@ def sweep(
     tool: OptionalToolOption = None,
     part: PartsOption = None,
     path: PosesOption,
+    where: WhereOption = None,
     exclude: ExcludeOption = None,
     clearance: ClearanceOption = None,
     budget: BudgetOption = 256.0,
@@ -126,29 +128,29 @@ def sweep(
     poses = read_poses(path, unit=path_unit or "m")
     with hapticdb.open(url, read_only=True) as env:
         parts = ids_of(env, part, "--part")
-        excluded = sorted({*parts, *ids_of(env, exclude, "--exclude")})
+        felt = felt_objects(env, where, exclude, parts)
         render.compile_kernels("sweep", files=[tool] if tool else [])
         shell = _shell(env, tool, parts, tool_unit, points, seed)
         fit = fitting.compare(
-            env, shell, poses, exclude=excluded, tool=tool, tool_unit=tool_unit,
+            env, shell, poses, exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=True,
         )  # fmt: skip
         with _bar("sweeping") as progress:
             found = sweep_path(
-                env, shell, poses, exclude=excluded, budget_bytes=n_bytes,
-                clearance_limit=clearance, profile=picture is not None, proportions=fit,
-                progress=progress,
+                env, shell, poses, where=felt.where, exclude=felt.exclude,
+                budget_bytes=n_bytes, clearance_limit=clearance, profile=picture is not None,
+                proportions=fit, progress=progress,
             )  # fmt: skip
         if env.store.revision() != found.revision:
             render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
         try:
             if json:
-                render.say_json(sweep_record(found, shell, parts, excluded))
+                render.say_json(sweep_record(found, shell, parts, felt.left_out))
             else:
                 show(env, found, shell)
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
-                _draw(picture, env, shell, found, excluded, up)
+                _draw(picture, env, shell, found, felt.left_out, up)
     if not json and picture is not None:
         render.say(f"picture: {picture}")
     if found.verdict != "comes out":

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import fitting, render
-from hapticdb.cli.choosing import ids_of
+from hapticdb.cli.choosing import felt_objects
 from hapticdb.cli.csv_files import (
     CONTACTS,
     STDOUT,
@@ -35,6 +35,7 @@ from hapticdb.cli.options import (
     ToolOption,
     ToolUnitOption,
     UrlArgument,
+    WhereOption,
 )
 from hapticdb.cli.tools import inset_for, shell_of, shell_record, shell_text
 from hapticdb.errors import UsageError
@@ -85,6 +86,7 @@ def touch(
     seed: SeedOption = None,
     strategy: StrategyOption = "auto",
     maxgap: MaxgapOption = 500,
+    where: WhereOption = None,
     exclude: ExcludeOption = None,
     law: LawOption = None,
     conservative: ConservativeOption = False,
@@ -111,19 +113,20 @@ def touch(
     ):
         name = law or ("smooth" if env.has_distances else "plane")
         chosen: ForceLaw = smooth if name == "smooth" else plane
-        excluded = ids_of(env, exclude, "--exclude")
+        felt = felt_objects(env, where, exclude)
         render.compile_kernels("touch", files=[tool])
         inset = inset_for(env.grid.voxel_size, name, is_conservative=conservative)
         shell = shell_of(tool, tool_unit, points, seed, inset=inset)
         fit = fitting.compare(
-            env, shell, path, exclude=excluded, tool=tool, tool_unit=tool_unit,
+            env, shell, path, exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=False,
             reach=inset_for(env.grid.voxel_size, name, is_conservative=False),
         )  # fmt: skip
         asked = _strategy_of(strategy, env, len(path))
         touch_at = partial(
-            env.touch, shell, strategy=asked, exclude=excluded, maxgap=maxgap, law=chosen
-        )
+            env.touch, shell, strategy=asked, where=felt.where, exclude=felt.exclude,
+            maxgap=maxgap, law=chosen,
+        )  # fmt: skip
         touch_at(path[0])  # compiles kernels and reads statistics, which belong to no frame's time
         for index, pose in enumerate(path):
             output.add(index, touch_at(pose), shell, pose, fit.misfits)

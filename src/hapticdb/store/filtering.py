@@ -1,0 +1,141 @@
+"""Which objects a tool feels: those that words choose, without those that other words leave out."""
+
+from collections.abc import Iterable, Sequence
+from functools import cached_property
+from typing import NamedTuple
+
+import numpy as np
+
+from hapticdb.errors import ObjectNotFoundError
+from hapticdb.store.base import NO_KEYS, Keys, Object
+from hapticdb.store.finding import MOST_IDS, Listing, Words, checked_words
+
+
+class Unfelt(NamedTuple):
+    """Objects of one revision that are not felt.
+
+    ids (E,) int64, ascending and distinct; missing : errors of the words that choose nothing.
+    """
+
+    ids: Keys
+    missing: tuple[ObjectNotFoundError, ...]
+
+
+class Filter:
+    """Which objects are felt: those that `where` chooses, or all, without those of `exclude`.
+
+    It holds words and no objects, so that an object that is added later, or has another name or
+    other attributes later, is felt or not by the same words.
+
+    Parameters
+    ----------
+    where : iterable of int or str
+        Words as `hapticdb.store.finding.find_objects` reads them; all objects if there are none.
+    exclude : iterable of int or str
+        Words of the same kind.
+
+    Attributes
+    ----------
+    where, exclude : tuple of int or str
+        The words; texts of digits have become ids.
+
+    Raises
+    ------
+    UsageError
+        When a word is neither an int nor a text.
+    """
+
+    def __init__(self, where: Words = (), exclude: Words = ()) -> None:
+        self.where = checked_words(where, "where")
+        self.exclude = checked_words(exclude, "exclude")
+
+    def __eq__(self, other: object) -> bool:
+        return (
+            isinstance(other, Filter)
+            and self.where == other.where
+            and set(self.exclude) == set(other.exclude)
+        )
+
+    def __hash__(self) -> int:
+        return hash((self.where, frozenset(self.exclude)))
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether every object is felt."""
+        return not self.where and not self.exclude
+
+    @property
+    def is_fixed(self) -> bool:
+        """Whether the same ids are left out, whatever objects there are."""
+        return not self.where and all(isinstance(word, int) for word in self.exclude)
+
+    @cached_property
+    def fixed_ids(self) -> Keys:
+        """Ids (E,) to exclude of a filter that `is_fixed`, ascending and distinct."""
+        ids = {i for i in self.exclude if isinstance(i, int) and -MOST_IDS <= i < MOST_IDS}
+        return np.array(sorted(ids), dtype=np.int64)
+
+    def left_out(self, objects: Sequence[Object], url: str) -> Unfelt:
+        """Objects that are not felt; a word that chooses nothing is noted, and chooses nothing.
+
+        Parameters
+        ----------
+        objects : sequence of Object
+            All objects of one revision, ascending by id.
+        url : str
+            Their environment, for messages.
+        """
+        missing: list[ObjectNotFoundError] = []
+        listing = Listing(objects, url)
+        out = {obj.id for obj in _chosen(listing, "exclude", self.exclude, missing)}
+        if self.where:
+            felt = {obj.id for obj in _chosen(listing, "where", self.where, missing)}
+            out.update(obj.id for obj in objects if obj.id not in felt)
+        return Unfelt(np.array(sorted(out), dtype=np.int64), tuple(missing))
+
+
+def _chosen(
+    listing: Listing,
+    option: str,
+    words: Iterable[int | str],
+    missing: list[ObjectNotFoundError],
+) -> list[Object]:
+    """Objects that words choose; the errors name the option."""
+    errors: list[ObjectNotFoundError] = []
+    found = listing.chosen(words, errors)
+    missing.extend(ObjectNotFoundError(f"{option}: {error}") for error in errors)
+    return found
+
+
+ALL = Filter()
+"""The filter under which every object is felt."""
+NOTHING_UNFELT = Unfelt(NO_KEYS, ())
+
+
+class LastFilter:
+    """Makes filters of words, and keeps the last one: frames give the same words again and again.
+
+    Thousands of ids are checked in a tenth of a millisecond where they are those of the last frame.
+    """
+
+    def __init__(self) -> None:
+        self._words: tuple[tuple[object, ...], tuple[object, ...]] = ((), ())
+        self._filter = ALL
+
+    def of(self, where: Words, exclude: Words) -> Filter:
+        """Filter of the words; the last one if they are the same.
+
+        Raises
+        ------
+        UsageError
+            As for `Filter`.
+        """
+        if not isinstance(where, (tuple, list)) or not isinstance(exclude, (tuple, list)):
+            return Filter(where, exclude)
+        if not where and not exclude:
+            return ALL
+        words = (tuple(where), tuple(exclude))
+        is_same = words == self._words
+        if not (is_same and {*map(type, words[0]), *map(type, words[1])} <= {int, str}):
+            self._filter, self._words = Filter(*words), words
+        return self._filter

@@ -1,0 +1,247 @@
+"""`where` and `exclude` say what is felt: by every strategy, and as others write."""
+
+import os
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import hapticdb
+from hapticdb import Environment, Grid, ObjectNotFoundError, UsageError
+from hapticdb.grid import CurveName
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.frame import STRATEGIES
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
+from hapticdb.store.base import Layout, Store
+from hapticdb.store.postgres.address import with_environment
+from hapticdb.store.postgres.private_server import Binaries
+from hapticdb.store.postgres.schema_of import drop
+from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.testing import voxel_object
+from hapticdb.testing.scenes import covering
+from naive import Voxel
+from query.test_frame import (
+    BITS,
+    ORIGIN,
+    SIZE,
+    assert_same,
+    expected,
+    random_pose,
+    random_shell,
+    scene_voxels,
+)
+from servers import FOUND, base_url, named
+
+OBJECTS: tuple[tuple[str, dict[str, object]], ...] = (
+    ("body/door", {"material": "steel", "mass": 12.5}),
+    ("body/door/handle", {"material": "brass", "tags": ["left", "front"]}),
+    ("body/hood", {"material": "steel", "made": {"by": "press", "year": 1930}}),
+    ("far/material=wood", {"material": "steel", "mass": 1e3}),
+    ("wheel", {"material": "rubber", "is_spare": True}),
+)
+"""Name and attributes of the scene's objects, whose ids count from 1."""
+CHOSEN: dict[int | str, set[int]] = {
+    1: {1},
+    "5": {5},
+    "2,3": {2, 3},
+    "body": {1, 2, 3},
+    "body/*o*": {1, 2, 3},
+    "handle": {2},
+    "material=steel": {1, 3, 4},
+    "material=*e*": {1, 3, 4, 5},
+    "material=wood": {4},  # a name goes before an attribute
+    "made.by=press": {3},
+    "made.year=1930.0": {3},
+    "tags=front": {2},
+    "mass=1000": {4},
+    "mass=*": {1, 4},
+    "is_spare=true": {5},
+    "wheel,mass=12.5": {1, 5},
+}
+"""What each word chooses."""
+WORDS = st.lists(st.sampled_from(list(CHOSEN)), max_size=3)
+KINDS: list[tuple[Layout, CurveName]] = [("brick", "z"), ("voxel", "hilbert")]
+
+
+def ids_of(words: list[int | str]) -> set[int]:
+    return {i for word in words for i in CHOSEN[word]}
+
+
+def left_out(where: list[int | str], exclude: list[int | str]) -> list[int]:
+    everything = {1, 2, 3, 4, 5}
+    felt = (ids_of(where) if where else everything) - ids_of(exclude)
+    return sorted(everything - felt)
+
+
+def add(store: Store, number: int, name: str, attributes: dict[str, object]) -> int:
+    ijk = scene_voxels()[number]
+    record = replace(voxel_object(store.grid, ijk, name), attributes=attributes)
+    return store.add(record, rows_of_voxels(ijk, store.grid, store.layout))
+
+
+def make_scene(url: Path | str, layout: Layout, curve: CurveName) -> Environment:
+    env = hapticdb.create(url, Grid(SIZE, ORIGIN, BITS, curve), layout=layout, distances=False)
+    for n, (name, attributes) in enumerate(OBJECTS):
+        assert add(env.store, n, name, attributes) == n + 1
+    return env
+
+
+@pytest.fixture(scope="module", params=KINDS, ids="-".join)
+def kind(request: pytest.FixtureRequest) -> tuple[Layout, CurveName]:
+    layout, curve = request.param
+    return layout, curve
+
+
+@pytest.fixture(
+    scope="module",
+    params=[None, *FOUND],
+    ids=lambda found: "sqlite" if found is None else named(found),
+)
+def env(
+    request: pytest.FixtureRequest,
+    kind: tuple[Layout, CurveName],
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Iterator[Environment]:
+    server: Binaries | str | None = request.param
+    if server is None:
+        with make_scene(tmp_path_factory.mktemp("filter") / "e.db", *kind) as made:
+            yield made
+        return
+    made = make_scene(with_environment(base_url(server), f"filter_{os.getpid()}"), *kind)
+    yield made
+    assert isinstance(made.store, PostgresStore)
+    drop(made.store.connection)
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def plain() -> dict[Voxel, set[int]]:
+    found: dict[Voxel, set[int]] = {}
+    for n, voxels in enumerate(scene_voxels()):
+        for i, j, k in voxels.tolist():
+            found.setdefault((i, j, k), set()).add(n + 1)
+    return found
+
+
+@settings(
+    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    seed=st.integers(0, 2**32 - 1),
+    n_points=st.sampled_from([1, 9, 300]),
+    where=WORDS,
+    exclude=WORDS,
+)
+def test_all_that_touch_feel_what_a_plain_set_without_the_others_does(
+    env: Environment,
+    plain: dict[Voxel, set[int]],
+    seed: int,
+    n_points: int,
+    where: list[int | str],
+    exclude: list[int | str],
+) -> None:
+    shell, pose = random_shell(seed, n_points), random_pose(seed)
+    wanted = expected(plain, shell, pose, left_out(where, exclude))
+    for strategy in STRATEGIES:
+        touch = env.touch(shell, pose, strategy, where=where, exclude=exclude)
+        assert_same(touch, wanted)
+    many = env.touch_many(shell, [pose, pose], where=where, exclude=exclude)
+    assert many.forces.tobytes() == 2 * np.array(wanted.force).tobytes()
+    with CellTable.create(1 << 20) as table:
+        residency = Residency(env.store, table, exclude, where=where)
+        frames = ResidentFrames(residency, shell)
+        wrenches, n_hits = frames.wrenches(pose[None])
+        frames.close()
+    assert wrenches.tobytes() == np.array([*wanted.force, *wanted.torque]).tobytes()
+    assert n_hits.tolist() == [len(wanted.hits)]
+    found = {obj.id for obj in env.felt(where, exclude)}
+    assert found == {1, 2, 3, 4, 5} - set(left_out(where, exclude))
+
+
+@pytest.mark.parametrize(
+    ("word", "said"),
+    [
+        ("nobody", "no object 'nobody'"),
+        (77, "no object 77"),
+        ("material=glass", "material is 'brass', 'rubber', 'steel'"),
+        ("colour=red", "attributes are 'is_spare', 'made', 'mass', 'material', 'tags'"),
+        ("mass=12.6", "mass is '1000', '12.5'"),
+        ("=steel", "no object '=steel'"),
+    ],
+)
+def test_a_word_that_chooses_nothing_is_one_line(
+    env: Environment, word: int | str, said: str
+) -> None:
+    shell, far = random_shell(1, 3), np.eye(4)
+    far[:3, 3] = 1e6  # outside the grid, where no statement is sent
+    for pose in (random_pose(1), far):
+        for name in ("where", "exclude"):
+            words: dict[str, Any] = {name: [1, word]}
+            for touch in (partial(env.touch, shell, pose), partial(env.touch_many, shell, [pose])):
+                with pytest.raises(ObjectNotFoundError, match=f"^{name}: ") as told:
+                    touch(**words)
+                assert said in str(told.value)
+                assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("words", ["wheel", b"wheel", 5, [True], [None], [1.0]])
+def test_words_are_a_list_of_ids_and_texts(env: Environment, words: object) -> None:
+    for name in ("where", "exclude"):
+        with pytest.raises(UsageError, match=f"^{name}"):
+            env.touch(random_shell(1, 3), np.eye(4), **{name: words})  # type: ignore[arg-type]
+
+
+def test_the_last_words_do_not_stay(env: Environment) -> None:
+    """Also where a list is changed between two frames, and 1 is given as true."""
+    shell, pose = random_shell(4, 300), random_pose(4)
+    words: list[int | str] = [1]
+    first = env.touch(shell, pose, where=words)
+    words[0] = "wheel"
+    assert {o.id for o in env.touch(shell, pose, where=words).objects} <= {5}
+    assert {o.id for o in first.objects} <= {1}
+    assert env.touch(shell, pose, where=np.array([1])).force.tobytes() == first.force.tobytes()
+    env.touch(shell, pose, where=[1])
+    with pytest.raises(UsageError, match="True"):
+        env.touch(shell, pose, where=[True])
+
+
+def test_what_others_add_or_rename_is_felt_by_the_words(tmp_path: Path) -> None:
+    """A new object is felt if the words choose it, and so is one whose attributes change."""
+    shell, pose = random_shell(4, 300), np.eye(4)
+    pose[:3, 3] = np.array(ORIGIN) + SIZE * np.array((22, 21, 22))
+    with make_scene(tmp_path / "e.db", "brick", "z") as env, hapticdb.open(env.url) as writer:
+        for i in (4, 5):
+            writer.remove(i)
+
+        def felt(words: list[int | str]) -> set[int]:
+            touched = {obj.id for obj in env.touch(shell, pose, where=words).objects}
+            many = env.touch_many(shell, [pose], where=words)
+            assert {obj.id for obj in many.objects} == touched
+            return touched
+
+        steel: list[int | str] = ["material=steel"]
+        assert felt(steel) == {1, 3}
+        assert felt([1]) == {1}
+        new = add(writer.store, 1, "strut", {"material": "steel"})
+        wood = add(writer.store, 1, "plank", {"material": "wood"})
+        assert felt(steel) == {1, 3, new}
+        assert felt([1]) == {1}
+        assert felt(["material=wood"]) == {wood}
+        old = writer.object(1)
+        rows = rows_of_voxels(writer.voxels(1), writer.grid, writer.layout)
+        changed = replace(old, attributes={"material": "wood"})
+        writer.store.replace(changed, rows, covering(writer.store))
+        assert felt(steel) == {3, new}
+        assert felt(["material=wood"]) == {1, wood}
+        writer.remove(wood)
+        writer.remove(1)
+        with pytest.raises(ObjectNotFoundError, match="where: no object 'material=wood'"):
+            felt(["material=wood"])

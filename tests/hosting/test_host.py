@@ -190,7 +190,7 @@ def test_where_chooses_what_is_felt(plane: Environment, sphere: PointShell) -> N
     with SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20) as host:
         session = host.begin(sphere, ABOVE, where=["post"])
         (floor,) = plane.find("floor")
-        assert host.cells[0].exclude == (floor.id,)
+        assert host.cells[0].left_out == (floor.id,)
         with pytest.raises(ObjectNotFoundError):
             host.begin(sphere, ABOVE, where=["nothing so called"])
         assert [one.id for one in host.sessions()] == [session.id]

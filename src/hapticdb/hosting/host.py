@@ -38,6 +38,7 @@ from hapticdb.realtime.coupling import (
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.recording.header import Header
 from hapticdb.resident.table import DEFAULT_BUDGET
+from hapticdb.store.filtering import Filter
 
 MOST_SESSIONS = 64
 """Most sessions of a host, unless another number is given."""
@@ -159,17 +160,17 @@ class SessionHost:
                 f"a scale of {scale}: give a number above 0, {LARGEST_SCALE:g} at most"
             )
         compile_missing(entries_for("feel"))  # here, so that no worker compiles
-        excluded = self._tables.excluded(where, exclude)
+        felt = self._tables.checked(where, exclude)
         with self._changing:
             if self._is_closed.is_set():
                 raise UsageError("the host is closed: make another")
-            return self._begin(shell, pose, excluded, coupling, scale, label)
+            return self._begin(shell, pose, felt, coupling, scale, label)
 
     def _begin(
         self,
         shell: PointShell,
         pose: Any,  # noqa: ANN401 - (4, 4), checked
-        excluded: tuple[int, ...],
+        felt: Filter,
         coupling: Coupling | DeviceCoupling | None,
         scale: float,
         label: str,
@@ -180,7 +181,7 @@ class SessionHost:
             worker = self._crew.least_busy()
             seat = self._board.take(session, label[:LABEL_BYTES], worker.number)
             undo.callback(self._board.release, seat)
-            cells = self._tables.take(excluded)
+            cells = self._tables.take(felt)
             undo.callback(self._tables.release, cells)
             law = chosen_law(None, has_distances=cells.has_distances)
             settled = self._settled(coupling, law, cells, shell, scale)
@@ -253,7 +254,8 @@ class SessionHost:
             shell=asked.shell,
             rate=self.rate,
             law=asked.law,
-            exclude=running.cells.exclude,
+            where=running.cells.felt.where,
+            exclude=running.cells.felt.exclude,
             coupling=asdict(asked.coupling),
         )
         running.record(path, header, self._board, replace=replace)
@@ -309,7 +311,7 @@ class SessionHost:
 
     @property
     def cells(self) -> list[ResidentCells]:
-        """Tables of cells in use, one for each set of excluded objects, with their figures."""
+        """Tables of cells in use, one for each filter of what is felt, with their figures."""
         return self._tables.all()
 
     @property

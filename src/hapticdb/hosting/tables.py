@@ -1,4 +1,4 @@
-"""Tables of cells of one environment: one for each set of excluded objects, while it is used."""
+"""Tables of cells of one environment: one for each filter of what is felt, while it is used."""
 
 import threading
 from collections.abc import Sequence
@@ -6,7 +6,7 @@ from contextlib import closing
 
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.store.connect import open_store
-from hapticdb.store.finding import find_objects
+from hapticdb.store.filtering import Filter
 
 Words = Sequence[int | str]
 
@@ -24,46 +24,45 @@ class SharedTables:
 
     def __init__(self, url: str, budget_bytes: int) -> None:
         self.url, self._budget_bytes = url, budget_bytes
-        self._tables: dict[tuple[int, ...], ResidentCells] = {}
-        self._uses: dict[tuple[int, ...], int] = {}
+        self._tables: dict[Filter, ResidentCells] = {}
+        self._uses: dict[Filter, int] = {}
         self._making = threading.Lock()
 
-    def excluded(self, where: Words, exclude: Words) -> tuple[int, ...]:
-        """Ids of the objects that are not felt: chosen by `exclude`, or not chosen by `where`.
+    def checked(self, where: Words, exclude: Words) -> Filter:
+        """Filter of the words; the table of a filter follows what others add and rename.
 
         Raises
         ------
         ObjectNotFoundError
             If a word chooses nothing.
         """
-        if not where and not exclude:
-            return ()
-        with closing(open_store(self.url, read_only=True)) as store:
-            left_out = {obj.id for obj in find_objects(store, exclude)}
-            if where:
-                chosen = {obj.id for obj in find_objects(store, where)}
-                left_out |= {obj.id for obj in store.objects()} - chosen
-        return tuple(sorted(left_out))
+        felt = Filter(where, exclude)
+        if not felt.is_empty:
+            with closing(open_store(self.url, read_only=True)) as store:
+                for error in felt.left_out(store.objects(), store.url).missing:
+                    raise error
+        return felt
 
-    def take(self, excluded: tuple[int, ...]) -> ResidentCells:
-        """Table without those objects, for one more session."""
+    def take(self, felt: Filter) -> ResidentCells:
+        """Table of the objects that the filter lets feel, for one more session."""
         with self._making:
-            if excluded not in self._tables:
-                self._tables[excluded] = ResidentCells(
-                    self.url, budget_bytes=self._budget_bytes, exclude=excluded
-                )
-                self._uses[excluded] = 0
-            self._uses[excluded] += 1
-            return self._tables[excluded]
+            if felt not in self._tables:
+                self._tables[felt] = ResidentCells(
+                    self.url, budget_bytes=self._budget_bytes, where=felt.where,
+                    exclude=felt.exclude,
+                )  # fmt: skip
+                self._uses[felt] = 0
+            self._uses[felt] += 1
+            return self._tables[felt]
 
     def release(self, cells: ResidentCells) -> None:
         """Give a table back; the last session frees it."""
         with self._making:
-            excluded = cells.exclude
-            self._uses[excluded] -= 1
-            if self._uses[excluded]:
+            felt = cells.felt
+            self._uses[felt] -= 1
+            if self._uses[felt]:
                 return
-            del self._tables[excluded], self._uses[excluded]
+            del self._tables[felt], self._uses[felt]
         cells.close()
 
     def all(self) -> list[ResidentCells]:

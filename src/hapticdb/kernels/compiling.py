@@ -29,6 +29,7 @@ from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 ENTRIES = {
     "hand.coupling": "advance",
     "hand.quasistatic": "advance",
+    "proxy.linearize": "linearize",
     "surfaces.distances": "find_blocks rows_of_blocks",
     "surfaces.voxelize": "voxelize_kernel",
     "resident.clearance": "find_clearance cells_near",
@@ -55,6 +56,7 @@ ENTRIES = {
     "rigid": "poses_of",
     "surfaces.bricks": "z_keys_kernel mark_points_kernel count_kernel brick_voxels_kernel",
     "hand.handle": "is_somewhere grip carry",
+    "proxy.evaluate": "evaluate",
 }
 """Entries of each module; modules that take longest to compile come first. The names are listed
 here so that a process can check for compiled entries without loading numba."""
@@ -127,6 +129,15 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "resident.clearance.*",
         *_RANGES,
     ),
+    "proxies": (
+        *_RESIDENT,
+        "field.packing.unpack_kernel",
+        "hand.quasistatic.*",
+        "hand.servo.*",
+        "proxy.linearize.*",
+        "rigid.*",
+    ),
+    "proxy": ("proxy.evaluate.*", "hand.handle.*"),
     "everything": ("*",),
 }
 """Entries that each purpose calls; ``*`` is any name (checked by `tests/house/test_warm.py`)."""

@@ -167,6 +167,46 @@ FOLLOWER: Layout = _record(
 )
 """What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""
 
+MOST_PLANES = 16
+"""Most contact planes of a contact proxy. Larger: tools that touch in many places are modelled more
+closely; messages are longer, and a client computes longer."""
+CONTACT_MODEL: Layout = _record(
+    [
+        ("hand", "<f8", 7),  # of the model: the tool's centre as the hand holds it, unit quaternion
+        ("tool", "<f8", 7),  # the tool there: its centre, m, and its unit quaternion
+        ("center", "<f8", 3),  # of the tool, in the tool's frame, m
+        ("radius", "<f8"),  # of the point farthest from the centre, m
+        ("trust", "<f8"),  # way of that point beyond which contacts may be missing, m
+        ("wrench", "<f8", 6),  # on the hand there, about the tool's centre in the hand: N, N m
+        ("stiffness", "<f8", (6, 6)),  # K6 = -dW/dx: N/m, N, N m
+        ("spring", "<f8"),  # between hand and tool, N/m
+        ("turn_spring", "<f8"),  # N m/rad
+        ("cap", "<f8"),  # greatest force, N
+        ("turn_cap", "<f8"),  # greatest torque about the centre, N m
+        ("contact", "<f8"),  # stiffness of a contact point, N/m
+        ("onset", "<f8"),  # distance from a surface at which contact begins, m
+        ("n_planes", "<i8"),
+        ("levers", "<f8", (MOST_PLANES, 3)),  # from the tool's centre to the point that touches, m
+        ("normals", "<f8", (MOST_PLANES, 3)),  # unit, away from the surface
+        ("depths", "<f8", MOST_PLANES),  # m; negative: the point is still that far from contact
+        ("weights", "<f8", MOST_PLANES),  # points that the plane stands for
+        ("bends", "<f8", (MOST_PLANES, 2)),  # curvatures along `along` and across it, 1/m
+        ("along", "<f8", (MOST_PLANES, 3)),  # unit, at right angles to the normal
+        # scratch of the client's solver
+        ("position", "<f8", 3),  # of the tool's centre, m
+        ("quaternion", "<f8", 4),
+        ("pull", "<f8", 6),  # from tool to hand: m, rad
+        ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad
+        ("rows", "<f8", (MOST_PLANES, 7)),  # gradient, its moment, depth
+        ("is_active", "<i8", MOST_PLANES),
+        ("matrix", "<f8", (6, 6)),
+        ("series", "<f8", (6, 6)),
+        ("right", "<f8", 6),
+        ("step", "<f8", 6),
+    ]
+)
+"""A contact proxy: the tool's contacts around one pose of the hand, in the scene's axes."""
+
 FRAME: Layout = np.dtype(
     [
         ("time", "<f8"),  # s since the session's start, when the frame began

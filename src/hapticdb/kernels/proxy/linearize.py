@@ -1,0 +1,208 @@
+"""How the force changes with the hand: the stiffness K6 of a contact proxy, and where it stands.
+
+The hand feels the spring, with the tangent stiffness S, in series with the contacts. These have the
+stiffness C = sum of K J J^T over the points that push, with J = (n; r x n), and of their curvature.
+For a way dh of the hand the balance S (dh - dx) = C dx moves the tool by dx = (S + C)^-1 S dh, so
+that
+
+    K6 = -dW/dx = S - S (S + C)^-1 S
+
+which is symmetric, and never stiffer than the spring (two springs in series; Mark et al. 1996 send
+planes for that reason, Otaduy and Lin 2006 the linear model).
+"""
+
+import math
+
+from hapticdb.kernels._jit import (
+    FLOATS2,
+    INT,
+    entry,
+    leaf,
+    record_of,
+)
+from hapticdb.kernels.field.law import ONSET
+from hapticdb.kernels.hand.coupling import IS_CUT, IS_HELD
+from hapticdb.kernels.hand.device_spring import (
+    DEVICE_SPRING,
+    contact_stiffness,
+    lever_in_hand,
+    shortened,
+)
+from hapticdb.kernels.hand.quasistatic import IS_LOOSE
+from hapticdb.kernels.hand.step import add_row, factor
+from hapticdb.kernels.proxy.planes import (
+    ALONG,
+    BEND,
+    DEPTH,
+    LEVER,
+    NORMAL,
+    find_rows,
+    group_rows,
+    write_planes,
+)
+from hapticdb.kernels.records import CONTACT_MODEL, FOLLOWER, SERVO
+from hapticdb.kernels.resident.cells import (
+    CELLS_WITH_DISTANCES,
+    CLUSTERS,
+    PLACE,
+    begin_frame,
+    end_frame,
+)
+from hapticdb.kernels.rigid import moment, moved, transform_of
+
+MOST_BULGE = 0.5
+"""Share of the spring's stiffness up to which bulging surfaces lower K6. There the force turns with
+the hand; beyond 1 the tool snaps off, which no linear model can tell. Larger: nearer to that."""
+MOST_TRUST = 1.0
+"""Voxels: greatest trust radius with contacts near, because faces end. Larger: clients rely longer
+on planes that may have ended."""
+
+
+@leaf
+def write_hand(spring, shell, tool, hand, follower, flags, model):
+    """Poses, springs and the wrench on the hand into a model."""
+    lx, ly, lz = lever_in_hand(hand, shell.center)
+    transform = transform_of(tool.pose)
+    cx, cy, cz = moved(transform, shell.center[0], shell.center[1], shell.center[2])
+    at, center = hand.position, shell.center
+    model.center[0], model.center[1], model.center[2] = center[0], center[1], center[2]
+    model.hand[0], model.hand[1], model.hand[2] = at[0] + lx, at[1] + ly, at[2] + lz
+    model.tool[0], model.tool[1], model.tool[2] = cx, cy, cz
+    for part in range(4):
+        model.hand[3 + part] = hand.quaternion[part]
+        model.tool[3 + part] = tool.quaternion[part]
+    model.radius, model.cap = spring.radius, spring.cap
+    model.turn_cap = spring.turn_cap * spring.scale
+    model.spring = follower.share * spring.stiffness / spring.scale
+    model.turn_spring = follower.share * spring.turn_stiffness * spring.scale
+    for axis in range(6):
+        model.pull[axis] = follower.pull[axis]
+    is_felt = (follower.n_active > 0 or flags & IS_CUT) and not flags & (IS_LOOSE | IS_HELD)
+    for axis in range(6):
+        model.wrench[axis] = 0.0
+    if is_felt:
+        pull, k, r = follower.pull, follower.spring, follower.turn_spring
+        x, y, z = shortened(-k * pull[0], -k * pull[1], -k * pull[2], model.cap)
+        model.wrench[0], model.wrench[1], model.wrench[2] = x, y, z
+        x, y, z = shortened(-r * pull[3], -r * pull[4], -r * pull[5], model.turn_cap)
+        model.wrench[3], model.wrench[4], model.wrench[5] = x, y, z
+    return is_felt
+
+
+@leaf
+def add_spring(model, start, stiffness, cap):
+    """Add the tangent stiffness of three axes from `start` on to model.stiffness (6, 6).
+
+    A spring at its cap gives way along its pull and turns across it.
+    """
+    wrench = model.wrench
+    x, y, z = wrench[start], wrench[start + 1], wrench[start + 2]
+    size = math.sqrt(x * x + y * y + z * z)
+    is_capped = size >= cap * (1.0 - 1e-9)
+    across = stiffness
+    if is_capped:
+        pull = model.pull
+        way = math.sqrt(
+            pull[start] * pull[start] + pull[start + 1] * pull[start + 1]
+            + pull[start + 2] * pull[start + 2]
+        )  # fmt: skip
+        across = min(stiffness, cap / max(way, 1e-12))
+    for row in range(3):
+        for column in range(3):
+            value = across if row == column else 0.0
+            if is_capped:
+                value -= across * wrench[start + row] * wrench[start + column] / (size * size)
+            model.stiffness[start + row, start + column] = value
+
+
+@leaf
+def add_contacts(model, rows, count):
+    """Add the stiffness of the rows in contact to the lower triangle of model.matrix."""
+    bulge = 0.0
+    for n in range(count):
+        if rows[n, DEPTH] > 0.0:
+            force = model.contact * rows[n, DEPTH]
+            bulge += force * (max(rows[n, BEND], 0.0) + max(rows[n, BEND + 1], 0.0))
+    share = min(1.0, MOST_BULGE * model.spring / max(bulge, 1e-12))
+    for n in range(count):
+        depth = rows[n, DEPTH]
+        if depth <= 0.0:
+            continue
+        nx, ny, nz = rows[n, NORMAL], rows[n, NORMAL + 1], rows[n, NORMAL + 2]
+        rx, ry, rz = rows[n, LEVER], rows[n, LEVER + 1], rows[n, LEVER + 2]
+        add_row(model, model.contact, 0.0, nx, ny, nz, *moment(rx, ry, rz, nx, ny, nz))
+        vx, vy, vz = rows[n, ALONG], rows[n, ALONG + 1], rows[n, ALONG + 2]
+        for bend in range(2):
+            curvature = rows[n, BEND + bend]
+            if curvature != 0.0:
+                weight = -model.contact * depth * curvature * (share if curvature > 0.0 else 1.0)
+                add_row(model, weight, 0.0, vx, vy, vz, *moment(rx, ry, rz, vx, vy, vz))
+            vx, vy, vz = moment(nx, ny, nz, vx, vy, vz)
+
+
+@leaf
+def write_stiffness(model, rows, count):
+    """Write K6 into model.stiffness, from the rows in contact and the springs."""
+    for row in range(6):
+        for column in range(6):
+            model.stiffness[row, column] = 0.0
+    add_spring(model, 0, model.spring, model.cap)
+    add_spring(model, 3, model.turn_spring, model.turn_cap)
+    spring, series = model.rows, model.series
+    for row in range(6):
+        for column in range(6):
+            spring[row, column] = model.stiffness[row, column]
+            model.matrix[row, column] = spring[row, column]
+        model.matrix[row, row] += 1e-9 * (model.spring if row < 3 else model.turn_spring)
+    add_contacts(model, rows, count)
+    for row in range(6):
+        for column in range(6):
+            series[row, column] = model.matrix[row, column]
+    for column in range(6):
+        for row in range(6):
+            model.right[row] = spring[row, column]
+            for other in range(6):
+                model.matrix[row, other] = series[row, other]
+        factor(model)
+        for row in range(6):
+            total = spring[row, column]
+            for other in range(6):
+                total -= spring[row, other] * model.step[other]
+            model.stiffness[row, column] = total
+    for row in range(6):
+        for column in range(row):
+            mean = 0.5 * (model.stiffness[row, column] + model.stiffness[column, row])
+            model.stiffness[row, column] = model.stiffness[column, row] = mean
+
+
+@entry(
+    CELLS_WITH_DISTANCES, INT, CLUSTERS, PLACE, DEVICE_SPRING, record_of(SERVO),
+    record_of(FOLLOWER), FLOATS2, FLOATS2, record_of(CONTACT_MODEL),
+)  # fmt: skip
+def linearize(
+    cells, reader, shell, place, spring, servo_record, follower_record, field, rows, model_record
+):
+    """Write the contacts around the tool's pose into model_record (); see `records.CONTACT_MODEL`.
+
+    Call it after `hand.quasistatic.advance` with the same cells, records and field; neither is
+    changed. rows (N, ROW_COLUMNS): scratch, N the shell's points. A tool that lies in something, or
+    whose cells are unknown, has no planes and no force.
+    """
+    servo, follower, model = servo_record[()], follower_record[()], model_record[()]
+    tool, hand, sent = servo.tool, servo.hand, servo.sent
+    is_felt = write_hand(spring, shell, tool, hand, follower, sent.flags, model)
+    model.contact, model.onset = contact_stiffness(spring, place.size), ONSET * place.size
+    model.n_planes, model.trust = 0, 0.0
+    for row in range(6):
+        for column in range(6):
+            model.stiffness[row, column] = 0.0
+    if sent.flags & (IS_LOOSE | IS_HELD) or tool.version == 0:
+        return
+    which = begin_frame(cells, reader)
+    count, trust = find_rows(cells, which, shell, place, tool, follower, field, rows)
+    end_frame(cells, reader)
+    if is_felt:
+        write_stiffness(model, rows, count)
+    n_planes = group_rows(rows, count, spring.radius, place.size)
+    write_planes(model, rows, count, n_planes, place.size)
+    model.trust = place.size * (min(trust, MOST_TRUST) if count > 0 else trust)

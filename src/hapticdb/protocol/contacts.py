@@ -1,0 +1,298 @@
+"""Messages of contact proxies, to the byte: docs/protocol.md, "Contacts", has every field.
+
+All numbers are little-endian. Each message is checked as it is read: its length must be exactly
+what its fields need, every number must be finite, and quaternions must have unit length.
+"""
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import ProtocolError
+from hapticdb.protocol.fields import FieldsRead, FieldsWritten
+from hapticdb.protocol.header import NO_REVISION, Kind, MessageHeader, header_of
+
+Floats = NDArray[np.float64]
+
+HAND_KIND, PROXY_KIND = 128, 129
+"""Kinds of the two messages that are sent again and again."""
+IS_OPEN, IS_LOOSE, IS_WAITING = 1, 2, 4
+"""Flags. Of a hand: the clutch is open, so nothing is felt. Of a proxy: the tool lies in something,
+and feels nothing until it is free; the cells near the tool are not in memory yet."""
+MOST_PLANES = 16
+"""Most planes of a proxy. Larger: tools that touch in many places are modelled more closely."""
+MOST_NAME = 64
+"""Most bytes of a tool's name."""
+UNIT = 32767.0
+"""The number that stands for 1 in a normal, and for the tool's radius in a lever."""
+FINE = 1.0 / 8192.0
+"""Step of depths, in voxels, and of curvatures, in 1/voxel. Both reach to 4 voxels."""
+FARTHEST = 1e6
+"""Largest credible coordinate, speed, force, torque or stiffness. A larger one is malformed."""
+SKEW = 1e-3
+"""Greatest difference of a quaternion's length from 1."""
+
+HAND_BODY = np.dtype(
+    [
+        ("clock", "<f8"),
+        ("position", "<f8", 3),
+        ("quaternion", "<f4", 4),
+        ("velocity", "<f4", 6),
+        ("buttons", "<u4"),
+        ("seen", "<u4"),
+        ("flags", "<u4"),
+    ]
+)
+"""Body of a hand's message: 84 bytes, without gaps."""
+PROXY_BODY = np.dtype(
+    [
+        ("echo", "<u4"),
+        ("flags", "<u2"),
+        ("n_planes", "<u2"),
+        ("clock", "<f8"),
+        ("echo_clock", "<f8"),
+        ("kept", "<f4"),
+        ("trust", "<f4"),
+        ("position", "<f8", 3),
+        ("quaternion", "<f4", 4),
+        ("tool_offset", "<f4", 3),
+        ("tool_quaternion", "<f4", 4),
+        ("wrench", "<f4", 6),
+        ("stiffness", "<f4", 21),
+        ("spring", "<f4"),
+        ("turn_spring", "<f4"),
+    ]
+)
+"""Body of a proxy's message up to its planes: 216 bytes, without gaps."""
+PLANE = np.dtype(
+    [
+        ("lever", "<i2", 3),
+        ("normal", "<i2", 3),
+        ("depth", "<i2"),
+        ("weight", "<u2"),
+        ("bends", "<i2", 2),
+        ("along", "i1", 3),
+        ("reserved", "u1"),
+    ]
+)
+"""One plane of a proxy: 24 bytes, without gaps."""
+LOWER = np.tril_indices(6)
+"""Rows and columns of the 21 numbers of K6: its lower triangle, row by row."""
+
+
+class ProxyWish(NamedTuple):
+    """What a client asks for at first: body of its HELLO.
+
+    tool : name of one of the server's tools, empty for the only one; stiffness N/m, turn_stiffness
+    N m/rad, cap N and turn_cap N m of the spring between hand and tool, 0 for the server's choice.
+    """
+
+    tool: str = ""
+    stiffness: float = 0.0
+    turn_stiffness: float = 0.0
+    cap: float = 0.0
+    turn_cap: float = 0.0
+
+
+class ProxyTerms(NamedTuple):
+    """What the server grants: body of its WELCOME.
+
+    center (3,) : the tool's centre in the tool's frame, m; radius : of its farthest point, m;
+    stiffness, turn_stiffness, cap, turn_cap : of the spring; contact : stiffness of one contact
+    point, N/m; voxel_size, m; onset : distance from a surface at which contact begins, m; period :
+    seconds from one proxy to the next.
+    """
+
+    tool: str
+    center: tuple[float, float, float]
+    radius: float
+    stiffness: float
+    turn_stiffness: float
+    cap: float
+    turn_cap: float
+    contact: float
+    voxel_size: float
+    onset: float
+    period: float
+
+
+@dataclass(frozen=True)
+class HandState:
+    """A hand's message.
+
+    sequence : grows by 1; clock : the client's, s; position (3,) m and unit quaternion (4,), scalar
+    first, of the handle; velocity (6,) m/s, rad/s; all in the scene; buttons : a bit for each; seen
+    : sequence of the newest proxy that has arrived; is_open : nothing is to be felt.
+    """
+
+    sequence: int
+    clock: float
+    position: Floats
+    quaternion: Floats
+    velocity: Floats
+    buttons: int = 0
+    seen: int = 0
+    is_open: bool = False
+
+
+def _none(*shape: int) -> Floats:
+    return np.zeros(shape)
+
+
+@dataclass(frozen=True)
+class ProxyState:
+    """A proxy's message; see `hapticdb.kernels.records.CONTACT_MODEL` for the numbers' meaning.
+
+    sequence, revision : of this message, and of the environment; echo, echo_clock : sequence and
+    clock of the hand that it answers; kept : seconds from that hand's arrival to this message;
+    clock : the server's, s; flags; trust, m; position, quaternion : of the handle; tool_offset (3,)
+    : from the tool's centre as the hand holds it to the tool's centre, m; tool_quaternion; wrench
+    (6,); stiffness (6, 6); spring N/m, turn_spring N m/rad; planes (n,) of `PLANE`.
+    """
+
+    sequence: int
+    revision: int
+    echo: int
+    echo_clock: float
+    kept: float
+    clock: float
+    flags: int
+    trust: float
+    position: Floats
+    quaternion: Floats
+    tool_offset: Floats
+    tool_quaternion: Floats
+    wrench: Floats
+    stiffness: Floats
+    spring: float
+    turn_spring: float
+    planes: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, PLANE))
+
+
+def pack_wish(wish: ProxyWish) -> bytes:
+    """Bytes of a client's HELLO."""
+    body = FieldsWritten().text(wish.tool)
+    body.f8(wish.stiffness, wish.turn_stiffness, wish.cap, wish.turn_cap)
+    return MessageHeader(Kind.HELLO).packed() + body.joined()
+
+
+def unpack_wish(message: bytes) -> ProxyWish:
+    """Read a client's HELLO; ProtocolError if it is malformed."""
+    _expect(message, Kind.HELLO, "HELLO")
+    fields = FieldsRead(message)
+    tool = fields.text()
+    if len(tool.encode()) > MOST_NAME:
+        raise ProtocolError(f"a tool's name of more than {MOST_NAME} bytes")
+    numbers = [fields.f8() for _ in range(4)]
+    fields.end()
+    _check_range("a spring", np.array(numbers), 0.0)
+    return ProxyWish(tool, *numbers)
+
+
+def pack_terms(terms: ProxyTerms) -> bytes:
+    """Bytes of the server's WELCOME."""
+    body = FieldsWritten().text(terms.tool).f8(*terms.center).f8(*terms[2:])
+    return MessageHeader(Kind.WELCOME).packed() + body.joined()
+
+
+def unpack_terms(message: bytes) -> ProxyTerms:
+    """Read the server's WELCOME; ProtocolError if it is malformed."""
+    _expect(message, Kind.WELCOME, "WELCOME")
+    fields = FieldsRead(message)
+    tool = fields.text()
+    x, y, z = (fields.f8() for _ in range(3))
+    numbers = [fields.f8() for _ in range(9)]
+    fields.end()
+    _check_range("a centre", np.array([x, y, z]))
+    if not all(0.0 < number <= FARTHEST for number in numbers):
+        raise ProtocolError("a WELCOME with a number that is not above 0")
+    return ProxyTerms(tool, (x, y, z), *numbers)
+
+
+def pack_hand(hand: HandState) -> bytes:
+    """Bytes of a hand's message: 100."""
+    body = np.zeros((), HAND_BODY)
+    body["clock"], body["position"], body["quaternion"] = hand.clock, hand.position, hand.quaternion
+    body["velocity"], body["buttons"], body["seen"] = hand.velocity, hand.buttons, hand.seen
+    body["flags"] = IS_OPEN if hand.is_open else 0
+    return MessageHeader(HAND_KIND, hand.sequence, NO_REVISION).packed() + body.tobytes()
+
+
+def unpack_hand(message: bytes) -> HandState:
+    """Read a hand's message; ProtocolError if it is malformed."""
+    header = _expect(message, HAND_KIND, "a hand")
+    data = FieldsRead(message)
+    body = np.frombuffer(data.take(HAND_BODY.itemsize), HAND_BODY)[0]
+    data.end()
+    position, velocity = body["position"].copy(), body["velocity"].astype(np.float64)
+    _check_range("a hand", np.concatenate([position, velocity]))
+    if not np.isfinite(body["clock"]):
+        raise ProtocolError("a clock that is not finite")
+    return HandState(
+        header.number, float(body["clock"]), position, _unit(body["quaternion"]), velocity,
+        int(body["buttons"]), int(body["seen"]), bool(body["flags"] & IS_OPEN),
+    )  # fmt: skip
+
+
+def pack_proxy(proxy: ProxyState) -> bytes:
+    """Bytes of a proxy's message: 232, and 24 for each plane."""
+    body = np.zeros((), PROXY_BODY)
+    for name in PROXY_BODY.names or ():
+        if name not in ("n_planes", "stiffness"):
+            body[name] = getattr(proxy, name)
+    body["n_planes"], body["stiffness"] = len(proxy.planes), proxy.stiffness[LOWER]
+    header = MessageHeader(PROXY_KIND, proxy.sequence, proxy.revision)
+    return header.packed() + body.tobytes() + proxy.planes.tobytes()
+
+
+def unpack_proxy(message: bytes) -> ProxyState:
+    """Read a proxy's message; ProtocolError if it is malformed."""
+    header = _expect(message, PROXY_KIND, "a proxy")
+    data = FieldsRead(message)
+    body = np.frombuffer(data.take(PROXY_BODY.itemsize), PROXY_BODY)[0]
+    n_planes = int(body["n_planes"])
+    if n_planes > MOST_PLANES:
+        raise ProtocolError(f"a proxy of {n_planes} planes: at most {MOST_PLANES} may be sent")
+    planes = np.frombuffer(data.take(n_planes * PLANE.itemsize), PLANE).copy()
+    data.end()
+    wrench, lower = body["wrench"].astype(np.float64), body["stiffness"].astype(np.float64)
+    offset = body["tool_offset"].astype(np.float64)
+    position = body["position"].copy()
+    _check_range("a proxy", np.concatenate([wrench, lower, offset, position]))
+    times = np.array([body["clock"], body["echo_clock"], body["kept"]], dtype=np.float64)
+    if not np.isfinite(times).all():
+        raise ProtocolError("a proxy with a clock that is not finite")
+    springs = np.array([body["spring"], body["turn_spring"], body["trust"]], dtype=np.float64)
+    _check_range("a proxy", springs, 0.0)
+    stiffness = np.zeros((6, 6))
+    stiffness[LOWER] = lower
+    stiffness.T[LOWER] = lower
+    return ProxyState(
+        header.number, header.revision, int(body["echo"]), float(times[1]), float(times[2]),
+        float(times[0]), int(body["flags"]), float(springs[2]), position, _unit(body["quaternion"]),
+        offset, _unit(body["tool_quaternion"]), wrench, stiffness, float(springs[0]),
+        float(springs[1]), planes,
+    )  # fmt: skip
+
+
+def _expect(message: bytes, kind: int, name: str) -> MessageHeader:
+    header = header_of(message)
+    if header.kind != kind:
+        raise ProtocolError(f"a message of kind {header.kind}, where {name} must come")
+    return header
+
+
+def _check_range(what: str, numbers: Floats, least: float = -FARTHEST) -> None:
+    if not ((numbers >= least) & (numbers <= FARTHEST)).all():  # NaN fails, too
+        raise ProtocolError(f"{what} with a number that is not finite or out of its range")
+
+
+def _unit(quaternion: NDArray[np.float32]) -> Floats:
+    """Quaternion (4,) of unit length from one that was rounded."""
+    numbers = quaternion.astype(np.float64)
+    length = float(np.sqrt((numbers * numbers).sum()))
+    if not abs(length - 1.0) <= SKEW:
+        raise ProtocolError("a quaternion that has not the length 1")
+    return np.asarray(numbers / length)

@@ -42,6 +42,10 @@ class PageRequest(NamedTuple):
         Folders below which objects' files may be read; None: the folders of the files as imported.
     link, host : int
         Descriptors of the sockets to the server (this module) and to the `SessionHost`.
+    recordings : str or None
+        Folder for recordings of sessions; None: nobody records.
+    title : str
+        What stands above the panels.
     """
 
     urls: Mapping[str, str]
@@ -49,6 +53,8 @@ class PageRequest(NamedTuple):
     folders: tuple[str, ...] | None
     link: int
     host: int
+    recordings: str | None = None
+    title: str = ""
 
 
 class Announced(NamedTuple):

@@ -117,8 +117,19 @@ def demo(
         render.say_json(_record(scene, comparison, picture))
     else:
         render.say(f"picture: {picture}")
+        brick = next((one for one in scene.imported if one.layout == "brick"), scene.imported[0])
+        render.say(f"see it and feel it in a browser: hapticdb view {_quoted(brick.url)}")
     if comparison.disagreed:
         raise typer.Exit(1)
+
+
+def _quoted(url: str) -> str:
+    """URL as an argument of a shell, without its password."""
+    import shlex
+
+    from hapticdb.store.connect import redact
+
+    return shlex.quote(redact(url))
 
 
 def _record(scene: "DemoScene", comparison: "Comparison", picture: Path) -> dict[str, object]:

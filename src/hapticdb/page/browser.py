@@ -1,0 +1,332 @@
+"""One browser: its session, its filter, and the panels through which a person uses them."""
+
+import logging
+import threading
+from collections import deque
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import HapticDBError
+from hapticdb.kernels.rigid import poses_of
+from hapticdb.page import checks, colours
+from hapticdb.page.drawing import HandDrawing, add_tool, place
+from hapticdb.page.panels.parts import PartsPanel
+from hapticdb.page.panels.record import RecordPanel
+from hapticdb.page.panels.sweeps import SweepPanel
+from hapticdb.page.panels.touch import TouchPanel
+from hapticdb.page.tools import HeldTool, start_pose
+from hapticdb.page.wording import plain_name
+from hapticdb.poses import quaternion_of
+from hapticdb.realtime.coupling import DeviceCoupling
+
+if TYPE_CHECKING:
+    from viser import ClientHandle, TransformControlsEvent
+
+    from hapticdb.hosting.hosted import HostedSession
+    from hapticdb.page.site import Site, Visitor
+
+LOG = logging.getLogger("hapticdb.page")
+Floats = NDArray[np.float64]
+Event = Any
+"""An event of viser: what a callback gets."""
+
+HAND_WIDTH = 1.0
+"""Width of the hand's own workspace in metres that the scene's diagonal stands for, at the start.
+Larger: the same depth on the screen gives more force."""
+CAP = 7.0
+"""Greatest force of a hand in a browser, N: the longest arrow. As of scripted hands."""
+HISTORY = 300
+"""Samples of the plots, ten seconds of them. Larger: a longer time is seen, and more is sent."""
+
+
+class Browser:
+    """What one browser shows and does.
+
+    Its callbacks run in viser's threads, `tick` in the page's clock, and the work of sessions in
+    threads of the site: one lock keeps them apart, and no thread waits for the host with it.
+
+    Parameters
+    ----------
+    site : Site
+        What all browsers share.
+    client : ClientHandle
+        The browser, as viser knows it.
+    visitor : Visitor
+        Name and role of the person.
+    """
+
+    def __init__(self, site: "Site", client: "ClientHandle", visitor: "Visitor") -> None:
+        self.site, self.client, self.visitor = site, client, visitor
+        self.number = site.take_number()
+        self.colour = colours.of_tool(self.number)
+        self.scene = site.view.browser(client)
+        self.chosen: tuple[int, ...] = ()
+        self.taken: int | None = None
+        self.tool: HeldTool = site.tools[0]
+        self.stiffness = 1000.0
+        self.scale = site.stage.diagonal / HAND_WIDTH
+        self.session: HostedSession | None = None
+        self._unfelt: list[int] = []
+        self.hand = self._start()
+        self.history: deque[tuple[float, float, float]] = deque(maxlen=HISTORY)
+        self._begun: float | None = None
+        self._n_begins = 0
+        self._beginning = threading.Lock()
+        self._is_closed = False
+        self._shared: list[Any] = []
+        self.drawing = HandDrawing(client, site.stage.diagonal, CAP)
+        self.drawing.gizmo.on_update(self._moved)
+        self._click: Callable[[NDArray[np.float64], NDArray[np.float64]], None] | None = None
+        gui = client.gui
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Touch"):
+            self.touch = TouchPanel(self, gui)
+        with tabs.add_tab("Parts"):
+            self.parts = PartsPanel(self, gui)
+        with tabs.add_tab("Sweep"):
+            self.sweeps = SweepPanel(self, gui)
+        with tabs.add_tab("Record"):
+            self.record = RecordPanel(self, gui)
+        client.scene.on_click()(self._clicked)
+        if visitor.may("toucher"):
+            self.take_in_hand(self.tool)
+
+    # -- callbacks ---------------------------------------------------------------------------
+
+    def guarded(self, role: str, act: Callable[[Event], None]) -> Callable[[Event], None]:
+        """Return a callback that checks the role, and tells an error to the person alone."""
+
+        def call(event: Event) -> None:
+            if self._is_closed:
+                return
+            if not self.visitor.may(role):
+                self.tell(
+                    "Not allowed", f"this takes the role {role}; yours is {self.visitor.role}"
+                )
+                return
+            try:
+                act(event)
+            except HapticDBError as error:
+                self.tell("Not done", str(error))
+            except Exception:
+                LOG.exception("a callback of the page failed")
+                self.tell("Not done", "the page failed at this; the operator's log says why")
+
+        return call
+
+    def tell(self, title: str, text: str, *, is_good: bool = False) -> None:
+        """Show a notification in this browser alone."""
+        if not self._is_closed:
+            self.client.add_notification(
+                title, plain_name(text), auto_close_seconds=8.0, color="teal" if is_good else "red"
+            )
+
+    def failed(self, error: HapticDBError) -> None:
+        """Tell an error of the database."""
+        self.tell("Not done", str(error))
+
+    def _clicked(self, event: Event) -> None:
+        def act(event: Event) -> None:
+            origin = checks.numbers_of(event.ray_origin, 3, checks.FARTHEST, "a ray")
+            way = checks.numbers_of(event.ray_direction, 3, checks.FARTHEST, "a ray")
+            self.parts.clicked(origin, way)
+
+        self.guarded("viewer", act)(event)
+
+    async def _moved(self, event: "TransformControlsEvent") -> None:
+        """Move the hand; on the event loop, so that events keep their order."""
+
+        def act(event: Event) -> None:
+            self.move_hand(checks.pose_of(event.target.position, event.target.wxyz))
+            if event.phase == "end":
+                self.touch.show_place()
+
+        self.guarded("toucher", act)(event)
+
+    # -- the session -------------------------------------------------------------------------
+
+    def move_hand(self, pose: Floats) -> None:
+        """Put the hand at a pose (4, 4), metres."""
+        self.hand = seven(pose)
+        session = self.session
+        if session is not None and not session.is_over:
+            session.move(pose)
+
+    def put_hand(self, pose: Floats) -> None:
+        """Put hand and gizmo at a pose (4, 4)."""
+        self.move_hand(pose)
+        place(self.drawing.gizmo, self.hand)
+        self.touch.show_place()
+
+    def take_in_hand(self, tool: HeldTool, pose: Floats | None = None) -> None:
+        """Hold another tool, at a pose (7,) or at the start."""
+        self.tool = tool
+        self.hand = self._start() if pose is None else pose
+        self.drawing.hold(tool, self.colour, self.hand)
+        self.begin_anew(keeps_tool=False)
+        self.touch.show_place()
+
+    @property
+    def unfelt(self) -> list[int]:
+        """Ids of objects that are neither seen nor felt here: hidden ones, and a part in hand."""
+        taken = () if self.taken is None else (self.taken,)
+        return sorted({*self.scene.hidden, *taken} & self.site.objects.keys())
+
+    def filter_changed(self) -> None:
+        """Feel what is seen now: the session begins again if that is something else."""
+        if self.unfelt != self._unfelt:
+            self.begin_anew()
+
+    def begin_anew(self, *, keeps_tool: bool = True) -> None:
+        """Begin the session again with the present tool, filter and scale, later, in a worker.
+
+        keeps_tool : whether the tool stays where it is now; else it begins in the hand.
+        """
+        if not self.visitor.may("toucher") or self._is_closed:
+            return
+        self._n_begins += 1
+        number = self._n_begins
+        self.site.workers.submit(self._begin, number, keeps_tool)
+
+    def _begin(self, number: int, keeps_tool: bool) -> None:  # noqa: FBT001 - one call
+        try:
+            with self._beginning:
+                if number != self._n_begins or self._is_closed:
+                    return  # a newer wish follows
+                old, start = self.session, self.hand
+                if old is not None:
+                    frame = None if old.is_over else old.latest()
+                    if keeps_tool and frame is not None:
+                        start = np.array(frame["tool"][0])
+                    self.session = None
+                    self.record.session_ended()
+                    old.end()
+                self._unfelt = self.unfelt
+                session = self.site.host.begin(
+                    self.tool.shell, matrix(start), exclude=self._unfelt,
+                    coupling=self._coupling(), scale=self.scale, label=self.visitor.name,
+                )  # fmt: skip
+                session.move(matrix(self.hand))
+                self.session = session
+                self._share()
+            if self._is_closed:
+                self._unshare()
+                session.end()
+        except HapticDBError as error:
+            self.failed(error)
+        except Exception:
+            LOG.exception("a session could not begin")
+            self.tell("No tool", "the session could not begin; the operator's log says why")
+
+    def matrix_of_hand(self) -> Floats:
+        """Pose (4, 4) of the hand, metres."""
+        return matrix(self.hand)
+
+    def matrix_of_tool(self) -> Floats:
+        """Pose (4, 4) of the tool, metres; that of the hand without a session."""
+        session = self.session
+        frame = None if session is None or session.is_over else session.latest()
+        return matrix(self.hand if frame is None else np.array(frame["tool"][0]))
+
+    def set_stiffness(self, stiffness: float) -> None:
+        """Set the spring between hand and tool, N/m."""
+        self.stiffness = stiffness
+        session = self.session
+        if session is not None and not session.is_over:
+            session.set_coupling(self._coupling())
+
+    def _coupling(self) -> DeviceCoupling | None:
+        return DeviceCoupling(stiffness=self.stiffness) if self.site.stage.is_smooth else None
+
+    def _start(self) -> Floats:
+        stage = self.site.stage
+        pose = start_pose(stage.bounds, stage.up, stage.toward, self.tool.radius, self.number)
+        return seven(pose)
+
+    def _share(self) -> None:
+        """Show the tool, with the person's name, to everyone."""
+        self._unshare()
+        scene = self.site.server.scene
+        name = f"/people/{self.number}"
+        node = add_tool(scene, name, self.tool, self.colour, None)
+        label = scene.add_label(
+            f"{name}/name", self.visitor.name, position=(0.0, 0.0, 1.25 * self.tool.radius),
+            anchor="bottom-center",
+        )  # fmt: skip
+        place(node, self.hand)
+        self._shared = [label, node]
+
+    def _unshare(self) -> None:
+        shared, self._shared = self._shared, []
+        for node in shared:
+            node.remove()
+
+    # -- what the clock calls ----------------------------------------------------------------
+
+    def tick(self, now: float) -> None:
+        """Show the newest frame of the session; called `site.TICKS` times a second."""
+        session = self.session
+        if session is not None and session.is_over:
+            self.session = None
+            self.drawing.rest()
+            self.tell("Tool lost", "its process ended; it begins again")
+            self.begin_anew()
+            return
+        frame = None if session is None else session.latest()
+        if session is None or frame is None:
+            return
+        one = frame[0]
+        tool, wrench = np.array(one["tool"]), np.array(one["applied"])
+        shared = self._shared
+        if shared:
+            place(shared[1], tool)
+        points, _ = session.contacts()
+        touched = [self.site.objects[i] for i in session.touched() if i in self.site.objects]
+        self.drawing.show(tool, self.hand, wrench)
+        self.drawing.show_contacts(
+            points if one["contacts"] else points[:0], colours.of_contacts(points, touched)
+        )
+        self._begun = now if self._begun is None else self._begun
+        force = float(np.linalg.norm(wrench[:3]))
+        self.history.append((now - self._begun, force, 1000.0 * float(one["lateness"])))
+        self.touch.show(one, wrench, touched, now)
+        self.record.tick(now)
+
+    def objects_changed(self) -> None:
+        """Objects were added, moved or removed by someone; called in the database's thread."""
+        present = self.site.objects.keys()
+        self.chosen = tuple(i for i in self.chosen if i in present)
+        if self.taken is not None and self.taken not in present:
+            self.taken = None
+        self.parts.show_objects()
+
+    def close(self) -> None:
+        """End the session and take the tool out of everyone's view."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self.site.browsers.pop(self.client.client_id, None)
+        self.site.view.forget(self.client)
+        if self.site.edits is not None:
+            self.site.edits.forget(self.number)
+        self._unshare()
+        self.site.free_number(self.number)
+        session, self.session = self.session, None
+        if session is not None:
+            session.end()
+
+
+def seven(pose: Floats) -> Floats:
+    """Position and unit quaternion (7,) of a pose (4, 4)."""
+    return np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]])
+
+
+def matrix(numbers: Floats) -> Floats:
+    """Pose (4, 4) of position and quaternion (7,)."""
+    poses = np.empty((1, 4, 4))
+    poses_of(np.ascontiguousarray(numbers, dtype=np.float64)[None], poses)
+    found: Floats = poses[0]
+    return found

@@ -1,0 +1,109 @@
+"""Checks of values that a browser sent: a client may send anything in any field."""
+
+import math
+from collections.abc import Collection
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+
+FARTHEST = 1e6
+"""Greatest distance from the origin that a hand may be sent to, metres. Larger: poses in which
+distances of a voxel are lost in rounding are let through."""
+
+
+def number_of(value: object, low: float, high: float, what: str) -> float:
+    """Return a finite number between two bounds.
+
+    Raises
+    ------
+    UsageError
+        If it is no number, not finite, or out of its range.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        raise UsageError(f"{what}: give a number")
+    number = float(value)
+    if not math.isfinite(number) or not low <= number <= high:
+        raise UsageError(f"{what}: give a number from {low:g} to {high:g}")
+    return number
+
+
+def text_of(value: object, longest: int, what: str) -> str:
+    """Return a text of at most `longest` letters, on one line.
+
+    Raises
+    ------
+    UsageError
+        If it is no text, or longer.
+    """
+    if not isinstance(value, str) or len(value) > longest:
+        raise UsageError(f"{what}: give a text of at most {longest} letters")
+    return "".join(letter for letter in value if letter.isprintable())
+
+
+def choice_of(value: object, choices: Collection[str], what: str) -> str:
+    """Return one of the choices that are there now.
+
+    Raises
+    ------
+    UsageError
+        If it is none of them.
+    """
+    if not isinstance(value, str) or value not in choices:
+        raise UsageError(f"{what}: choose one of the list")
+    return value
+
+
+def flag_of(value: object, what: str) -> bool:
+    """Return a box's state, ticked or not.
+
+    Raises
+    ------
+    UsageError
+        If it is neither.
+    """
+    if not isinstance(value, bool):
+        raise UsageError(f"{what}: tick the box, or clear it")
+    return value
+
+
+def numbers_of(value: object, n: int, most: float, what: str) -> NDArray[np.float64]:
+    """Return `n` finite numbers (n,), none larger than `most` without its sign.
+
+    Raises
+    ------
+    UsageError
+        If they are anything else.
+    """
+    try:
+        numbers = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (n,) or not bool((np.abs(numbers) <= most).all()):
+        raise UsageError(f"{what}: give {n} numbers, {most:g} at most")
+    return numbers
+
+
+def pose_of(position: object, wxyz: object) -> NDArray[np.float64]:
+    """Pose (4, 4) of a gizmo: position in metres, quaternion scalar first, made unit here.
+
+    Raises
+    ------
+    UsageError
+        If it is not finite, farther than `FARTHEST`, or the quaternion is too short to be a turn.
+    """
+    place = numbers_of(position, 3, FARTHEST, "a place")
+    turn = numbers_of(wxyz, 4, FARTHEST, "a turn")
+    length = float(np.linalg.norm(turn))
+    if length < 1e-6:
+        raise UsageError("a turn: give a quaternion that is not zero")
+    w, x, y, z = turn / length
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), place[0]],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), place[1]],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), place[2]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )

@@ -1,0 +1,152 @@
+"""What a person's own view shows beside the objects: hand, tool, arrows, contacts, marks."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.page import colours
+from hapticdb.page.tools import HeldTool
+
+if TYPE_CHECKING:
+    from viser import ClientHandle, MeshHandle, SceneApi, SceneNodeHandle, TransformControlsHandle
+
+Floats = NDArray[np.float64]
+
+LONGEST_ARROW = 0.22
+"""Length of the longest arrow, as a share of the scene's diagonal: that of a force at the cap.
+Larger: small forces are seen better, and large ones leave the picture."""
+ARROW_BEGINS = 1e-3
+"""Share of its longest length below which an arrow is not drawn. Larger: fewer arrows."""
+HAND_GIZMO = 0.11
+"""Size of the hand's gizmo, as a share of the scene's diagonal. Larger: easier to grab, and more
+is behind it."""
+CONTACT_SHARE = 0.004
+"""Size of a contact's mark, as a share of the scene's diagonal. Larger: seen from farther away."""
+
+
+def add_tool(
+    scene: "SceneApi", name: str, tool: HeldTool, colour: colours.Colour, opacity: float | None
+) -> "MeshHandle":
+    """Add a tool's surface to a scene; returns its handle, whose pose is the tool's."""
+    return scene.add_mesh_simple(
+        name,
+        tool.vertices,
+        tool.faces,
+        color=colour,
+        opacity=opacity,
+        flat_shading=not tool.is_round,
+        side="double",
+        cast_shadow=opacity is None,
+        receive_shadow=False,
+    )
+
+
+def place(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
+    """Put a node at a pose (7,): metres, unit quaternion, scalar first."""
+    node.position = pose[:3]
+    node.wxyz = pose[3:]
+
+
+class HandDrawing:
+    """Hand and tool of the person who looks, in their view alone.
+
+    Parameters
+    ----------
+    client : ClientHandle
+        The browser.
+    diagonal : float
+        Of the scene's box, metres: sizes of arrows and marks follow it.
+    cap : float
+        Greatest force that is sent, N.
+    """
+
+    def __init__(self, client: "ClientHandle", diagonal: float, cap: float) -> None:
+        self._client = client
+        self._diagonal = diagonal
+        self.cap = cap
+        self._ghost: MeshHandle | None = None
+        self._is_touching = False
+        scene = client.scene
+        self.gizmo: TransformControlsHandle = scene.add_transform_controls(
+            "/hand", scale=HAND_GIZMO * diagonal, line_width=3.0, disable_sliders=True, opacity=0.9,
+            depth_test=False, visible=False,
+        )  # fmt: skip
+        shaft, head = 0.0035 * diagonal, 0.010 * diagonal
+        nothing = np.zeros((1, 2, 3))
+        self._force = scene.add_arrows(
+            "/force", nothing, colours.FORCE, shaft_radius=shaft, head_radius=head,
+            head_length=2.2 * head, visible=False,
+        )  # fmt: skip
+        self._torque = scene.add_arrows(
+            "/torque", nothing, colours.TORQUE, shaft_radius=0.7 * shaft, head_radius=0.8 * head,
+            head_length=1.8 * head, visible=False,
+        )  # fmt: skip
+        self._tether = scene.add_line_segments(
+            "/tether",
+            np.zeros((1, 2, 3)),
+            (120, 120, 130),
+            thickness=2.0,
+            thickness_units="screen",
+            visible=False,
+        )
+        self._contacts = scene.add_point_cloud(
+            "/contacts", np.zeros((1, 3)), colours.FORCE, point_size=CONTACT_SHARE * diagonal,
+            point_shape="circle", precision="float32", visible=False,
+        )  # fmt: skip
+
+    def hold(self, tool: HeldTool | None, colour: colours.Colour, pose: Floats) -> None:
+        """Show a tool's ghost at the gizmo, which goes to a pose (7,); None: an empty hand."""
+        if self._ghost is not None:
+            self._ghost.remove()
+            self._ghost = None
+        self.gizmo.visible = tool is not None
+        place(self.gizmo, pose)
+        if tool is not None:
+            self._ghost = add_tool(self._client.scene, "/hand/ghost", tool, colour, 0.28)
+
+    def show(self, tool: Floats, hand: Floats, wrench: Floats) -> None:
+        """Show the force and torque (6,) at the tool's place, and the line from hand to tool."""
+        with self._client.atomic():
+            longest = LONGEST_ARROW * self._diagonal
+            middle = tool[:3]
+            self._arrow(self._force, middle, wrench[:3] * (longest / self.cap))
+            lever = 0.03 * self._diagonal
+            self._arrow(self._torque, middle, wrench[3:] * (longest / (self.cap * lever)))
+            apart = float(np.linalg.norm(hand[:3] - middle))
+            is_apart = apart > 0.002 * self._diagonal
+            if is_apart:
+                self._tether.points = np.array([[middle, hand[:3]]], dtype=np.float32)
+            if self._tether.visible != is_apart:
+                self._tether.visible = is_apart
+
+    def _arrow(self, arrow: object, start: Floats, way: Floats) -> None:
+        length, longest = float(np.linalg.norm(way)), LONGEST_ARROW * self._diagonal
+        is_seen = length > ARROW_BEGINS * longest
+        if is_seen:
+            way = way * (min(length, longest) / length)
+            arrow.points = np.array([[start, start + way]], dtype=np.float32)  # type: ignore[attr-defined]
+        if arrow.visible != is_seen:  # type: ignore[attr-defined]
+            arrow.visible = is_seen  # type: ignore[attr-defined]
+
+    def point(self, arrow: object, start: Floats, force: Floats) -> None:
+        """Let an arrow show a force (3,), N, at a place."""
+        self._arrow(arrow, start, force * (LONGEST_ARROW * self._diagonal / self.cap))
+
+    def show_contacts(self, points: Floats, palette: NDArray[np.uint8]) -> None:
+        """Mark contacts (n, 3), each in its colour (n, 3)."""
+        is_touching = bool(len(points))
+        if is_touching:
+            with self._client.atomic():
+                self._contacts.points = np.asarray(points, dtype=np.float32)
+                self._contacts.colors = palette
+        if is_touching != self._is_touching:
+            self._contacts.visible = is_touching
+            self._is_touching = is_touching
+
+    def rest(self) -> None:
+        """Show no force, no contact and no line."""
+        for node in (self._force, self._torque, self._tether, self._contacts):
+            if node.visible:
+                node.visible = False
+        self._is_touching = False

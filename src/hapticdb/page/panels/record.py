@@ -1,0 +1,231 @@
+"""The tab Record: record what is felt, replay it on a slider of time, save a picture."""
+
+import time
+from datetime import UTC, datetime
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import FileError, UsageError
+from hapticdb.page import checks, colours
+from hapticdb.page.drawing import place
+from hapticdb.page.site import checked_file
+from hapticdb.page.widgets import put
+from hapticdb.page.wording import force_text, note_html, rows_html
+from hapticdb.recording.file import Recording
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from viser import GuiApi, GuiEvent
+
+    from hapticdb.page.browser import Browser
+
+Floats = NDArray[np.float64]
+
+SUFFIX = ".hdbrec"
+MOST_LISTED = 200
+"""Recordings in the list, the newest. Larger: a longer list to search in."""
+LONGEST_REPLAY = 1_000_000
+"""Frames of a recording that is replayed: a quarter of an hour at 1 kHz. Larger: more memory."""
+PICTURE = (1080, 1920)
+"""Height and width of a saved picture, pixels. Larger: more detail, and more to send."""
+NOTHING = "(none)"
+
+
+class Replay(NamedTuple):
+    """Frames that a replay shows: times (M,), s; tools (M, 7); wrenches (M, 6), N and N m."""
+
+    times: Floats
+    tools: Floats
+    wrenches: Floats
+
+
+class RecordPanel:
+    """Records this browser's session into the operator's folder, and replays what is there.
+
+    Parameters
+    ----------
+    browser : Browser
+        Whose session it is.
+    gui : GuiApi
+        Where the panel is made: inside the present container.
+    """
+
+    def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
+        self._browser = browser
+        self._replay: Replay | None = None
+        self._drawn: list[Any] = []
+        self._played_from: tuple[float, float] | None = None
+        self._is_recording = False
+        guard = browser.guarded
+        has_folder = browser.site.recordings is not None
+        may_touch = browser.visitor.may("toucher")
+        self._record = gui.add_button("Record", visible=has_folder and may_touch, color="red")
+        self._record.on_click(guard("toucher", self._record_or_stop))
+        self._state = gui.add_html(
+            "" if has_folder else note_html("The operator gave no folder for recordings.")
+        )
+        with gui.add_folder("Replay", visible=has_folder):
+            self._list = gui.add_dropdown("Recording", (NOTHING, *self._names()))
+            self._list.on_update(guard("viewer", self._choose))
+            self._time = gui.add_slider("Time, s", 0.0, 1.0, 0.01, 0.0, visible=False)
+            self._time.on_update(guard("viewer", self._slide))
+            self._play = gui.add_button("Play", visible=False)
+            self._play.on_click(guard("viewer", self._play_or_pause))
+            self._said = gui.add_html("")
+        with gui.add_folder("Picture"):
+            save = gui.add_button("Save a picture")
+            save.on_click(guard("viewer", self._save_picture))
+
+    # -- recording ---------------------------------------------------------------------------
+
+    def _names(self) -> list[str]:
+        """Names of the recordings in the folder, the newest first."""
+        folder = self._browser.site.recordings
+        if folder is None:
+            return []
+        try:
+            found = [path for path in folder.iterdir() if path.suffix == SUFFIX and path.is_file()]
+            return [path.name for path in sorted(found, key=_changed, reverse=True)[:MOST_LISTED]]
+        except OSError:
+            return []
+
+    def _record_or_stop(self, _: object) -> None:
+        browser = self._browser
+        session = browser.session
+        if session is None:
+            raise UsageError("there is no tool to record yet: wait a moment")
+        if self._is_recording:
+            n_frames = session.stop_recording()
+            self._is_recording = False
+            self._record.label = "Record"
+            self._state.content = note_html(f"Recorded {n_frames:,} frames.")
+            self._list.options = (NOTHING, *self._names())
+            return
+        at = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
+        path = checked_file(browser.site.recordings, f"{at}_{browser.number}{SUFFIX}")
+        session.record(path)
+        self._is_recording = True
+        self._record.label = "Stop"
+        self._state.content = note_html(f"Records {path.name}")
+
+    def session_ended(self) -> None:
+        """Tell that a recording ended with its session."""
+        if self._is_recording:
+            self._is_recording = False
+            self._record.label = "Record"
+            self._state.content = note_html("The recording ended: the session began anew.")
+            self._list.options = (NOTHING, *self._names())
+
+    # -- replay ------------------------------------------------------------------------------
+
+    def _choose(self, event: "GuiEvent[Any]") -> None:
+        name = checks.choice_of(event.target.value, (NOTHING, *self._names()), "a recording")
+        for node in self._drawn:
+            node.remove()
+        self._drawn, self._replay, self._played_from = [], None, None
+        is_chosen = name != NOTHING
+        self._time.visible = self._play.visible = is_chosen
+        self._said.content = ""
+        if not is_chosen:
+            return
+        recording = Recording(checked_file(self._browser.site.recordings, name))
+        if not 0 < len(recording) <= LONGEST_REPLAY:
+            raise FileError(f"{name}: {len(recording):,} frames; 1 to {LONGEST_REPLAY:,} are shown")
+        times, poses, wrenches = recording.columns("time", "tool", "applied", until_damage=True)
+        times, poses, wrenches = (np.asarray(x, np.float64) for x in (times, poses, wrenches))
+        self._replay = Replay(times - times[0], poses, wrenches)
+        self._draw(recording)
+        put(self._time, 0.0)
+        self._time.max = max(round(float(self._replay.times[-1]), 2), 0.01)
+        self._show_at(0.0)
+
+    def _draw(self, recording: Recording) -> None:
+        scene, size = self._browser.client.scene, self._browser.site.stage.diagonal
+        shell = recording.header.shell
+        assert self._replay is not None  # noqa: S101 - just read
+        way = self._replay.tools[:: max(1, len(self._replay.tools) // 500), :3]
+        cloud = scene.add_point_cloud(
+            "/replay", shell.outline, colours.TORQUE, point_size=0.004 * size,
+            point_shape="circle", precision="float32",
+        )  # fmt: skip
+        arrow = scene.add_arrows(
+            "/replay_force", np.zeros((1, 2, 3)), colours.FORCE, shaft_radius=0.0035 * size,
+            head_radius=0.01 * size, head_length=0.02 * size, visible=False,
+        )  # fmt: skip
+        self._drawn = [cloud, arrow]
+        if len(way) > 1:
+            segments = np.stack([way[:-1], way[1:]], axis=1)
+            self._drawn.append(
+                scene.add_line_segments(
+                    "/replay_way", segments, colours.TORQUE, thickness=2.0, thickness_units="screen"
+                )
+            )
+
+    def _slide(self, event: "GuiEvent[Any]") -> None:
+        if event.client is None or self._replay is None:
+            return
+        last = float(self._replay.times[-1]) + 0.01
+        at = checks.number_of(event.target.value, 0.0, max(last, self._time.max), "a time")
+        self._played_from = None
+        self._play.label = "Play"
+        self._show_at(at)
+
+    def _play_or_pause(self, _: object) -> None:
+        if self._played_from is not None:
+            self._played_from = None
+            self._play.label = "Play"
+            return
+        at = float(self._time.value)
+        if self._replay is not None and at >= float(self._replay.times[-1]) - 0.02:
+            at = 0.0
+        self._played_from = (time.monotonic(), at)
+        self._play.label = "Pause"
+
+    def tick(self, now: float) -> None:
+        """Go on playing; called by the page's clock."""
+        if self._played_from is None or self._replay is None:
+            return
+        begun, at = self._played_from
+        at += now - begun
+        last = float(self._replay.times[-1])
+        if at >= last:
+            self._played_from = None
+            self._play.label = "Play"
+        put(self._time, round(min(at, last), 2))
+        self._show_at(min(at, last))
+
+    def _show_at(self, at: float) -> None:
+        replay = self._replay
+        if replay is None or not self._drawn:
+            return
+        n = min(int(np.searchsorted(replay.times, at)), len(replay.times) - 1)
+        tool, wrench = replay.tools[n], replay.wrenches[n]
+        cloud, arrow = self._drawn[:2]
+        place(cloud, tool)
+        drawing = self._browser.drawing
+        drawing.point(arrow, tool[:3], wrench[:3])
+        force = float(np.linalg.norm(wrench[:3]))
+        self._said.content = rows_html(
+            (("Time", f"{replay.times[n]:.2f} s"), ("Force", force_text(force)))
+        )
+
+    # -- a picture ---------------------------------------------------------------------------
+
+    def _save_picture(self, _: object) -> None:
+        import imageio.v3 as iio  # noqa: PLC0415 - comes with the extra `view`
+
+        client = self._browser.client
+        height, width = PICTURE
+        picture = client.get_render(height, width, transport_format="jpeg")
+        content = iio.imwrite("<bytes>", picture[..., :3], extension=".png")
+        client.send_file_download("hapticdb.png", content, save_immediately=True)
+
+
+def _changed(path: "Path") -> float:
+    try:
+        return path.stat().st_mtime
+    except OSError:
+        return 0.0

@@ -1,0 +1,235 @@
+"""The tab Sweep: whether a tool, or a part, comes out along a way, and where it hits."""
+
+import math
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.environment import Environment
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.page import checks, colours, tools
+from hapticdb.page.drawing import add_tool, place
+from hapticdb.page.widgets import put
+from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.poses import quaternion_of
+from hapticdb.store.connect import open_store
+from hapticdb.sweeps import run as sweeps
+from hapticdb.sweeps.result import Swept
+from hapticdb.sweeps.verdict import percent, verdict_line
+
+if TYPE_CHECKING:
+    from viser import GuiApi
+
+    from hapticdb.page.browser import Browser
+
+Floats = NDArray[np.float64]
+
+MOST_POINTS = 20_000
+"""Points of a swept part. Larger: "comes out" is proved for larger parts, in more time."""
+MOST_NAMED = 8
+"""Objects that the answer names, with where each is hit."""
+WAYS = {
+    "to the hand": None, "+x": (0, 1.0), "-x": (0, -1.0), "+y": (1, 1.0), "-y": (1, -1.0),
+    "+z": (2, 1.0), "-z": (2, -1.0),
+}  # fmt: skip
+"""Ways of a sweep: the axis of the scene and its sign; None: from where it is to the hand."""
+
+
+class SweepAnswer(NamedTuple):
+    """A sweep's answer, to be drawn.
+
+    shell : what was swept; swept : the result; pose (4, 4) or None : where it hits first; marks
+    (H, 3) : its points in voxels there, metres.
+    """
+
+    shell: PointShell
+    swept: Swept
+    pose: Floats | None
+    marks: Floats
+
+
+class SweepPanel:
+    """Runs sweeps of this browser's tool or chosen part, and shows what they hit.
+
+    Parameters
+    ----------
+    browser : Browser
+        Whose tool, part and filter it uses.
+    gui : GuiApi
+        Where the panel is made: inside the present container.
+    """
+
+    def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
+        self._browser = browser
+        self._drawn: list[Any] = []
+        self._is_running = False
+        guard = browser.guarded
+        gui.add_html(
+            note_html("Moves a part or the tool along a way, and says what is in its way.")
+        )
+        self._what = gui.add_dropdown("What", ("the chosen part", "the tool"))
+        self._way = gui.add_dropdown(
+            "Way", tuple(WAYS), initial_value=f"+{'xyz'[int(browser.site.stage.up.argmax())]}"
+        )
+        diagonal = browser.site.stage.diagonal
+        self._farthest = 10.0 * diagonal
+        self._length = gui.add_number(
+            "Length, m", round(0.25 * diagonal, 3), min=0.0, max=self._farthest, step=0.001
+        )
+        self._run = gui.add_button("Run the sweep")
+        self._run.on_click(guard("viewer", self._begin))
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self._said = gui.add_html("")
+        self._clear = gui.add_button("Clear", color="gray", visible=False)
+        self._clear.on_click(guard("viewer", lambda _: self._erase()))
+
+    def _begin(self, _: object) -> None:
+        if self._is_running:
+            raise UsageError("a sweep is running: wait for it")
+        browser = self._browser
+        is_part = checks.choice_of(self._what.value, self._what.options, "what").endswith("part")
+        way = checks.choice_of(self._way.value, WAYS, "a way")
+        length = checks.number_of(self._length.value, 0.0, self._farthest, "a length")
+        if is_part and len(browser.chosen) != 1 and browser.taken is None:
+            raise UsageError("choose one part first: click it, or take it from the list")
+        part = None
+        if is_part:
+            part = browser.taken if browser.taken is not None else browser.chosen[0]
+        job = SweepJob(browser, part, way, length)
+        self._is_running = True
+        self._erase()
+        put(self._bar, 0.0)
+        self._bar.visible = True
+        self._said.content = note_html("Waits for its turn, then moves it along.")
+        browser.site.sweeping.submit(self._work, job)
+
+    def _work(self, job: "SweepJob") -> None:
+        """Sweep; in the site's thread for sweeps."""
+        try:
+            found = job.run(self._progress)
+        except HapticDBError as error:
+            self._said.content = note_html(str(error))
+        except Exception:
+            self._said.content = note_html("The sweep failed; the operator's log says why.")
+            raise
+        else:
+            self._show(found, job.name)
+        finally:
+            self._is_running = False
+            self._bar.visible = False
+
+    def _progress(self, done: int, total: int) -> None:
+        put(self._bar, 100.0 * done / max(total, 1))
+
+    def _show(self, found: SweepAnswer, name: str) -> None:
+        swept, scene = found.swept, self._browser.client.scene
+        line = verdict_line(swept, found.shell)
+        colour = {"hits": "#c62838", "comes out": "#1f8a4c"}.get(swept.verdict, "#a8730f")
+        hit = "".join(
+            f"<div>{swatch(colours.of_object(met.object.id))}"
+            f"{escaped(short_name(met.object.name))} · at {percent(met.first)}</div>"
+            for met in swept.objects[:MOST_NAMED]
+        )
+        more = len(swept.objects) - MOST_NAMED
+        self._said.content = (
+            f'<div style="margin:2px 12px;font-size:0.85em"><b style="color:{colour}">'
+            f"{escaped(name)}: {escaped(swept.verdict)}</b>"
+            f'<div style="margin:3px 0">{escaped(plain_name(line))}</div>{hit}'
+            f"{f'<div>and {more} more</div>' if more > 0 else ''}</div>"
+        )
+        self._clear.visible = True
+        if found.pose is None:
+            return
+        ghost = tools.from_shell(name, found.shell)
+        middle = tools.middle_of(found.shell)
+        pose = found.pose.copy()
+        pose[:3, 3] += pose[:3, :3] @ middle
+        node = add_tool(scene, "/swept", ghost, colours.MARK, 0.4)
+        place(node, np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]]))
+        self._drawn = [node]
+        if len(found.marks):
+            size = self._browser.site.stage.diagonal
+            self._drawn.append(
+                scene.add_point_cloud(
+                    "/swept_hits", found.marks, (255, 214, 0), point_size=0.007 * size,
+                    point_shape="circle", precision="float32",
+                )
+            )  # fmt: skip
+            self._drawn.append(
+                scene.add_label(
+                    "/swept_label", f"first hit at {percent(found.swept.first_hit.fraction)}"
+                    if found.swept.first_hit else "hit", position=found.marks.mean(axis=0),
+                    anchor="bottom-left",
+                )
+            )  # fmt: skip
+
+    def _erase(self) -> None:
+        for node in self._drawn:
+            node.remove()
+        self._drawn = []
+        self._said.content = ""
+        self._clear.visible = False
+
+
+class SweepJob:
+    """A sweep as it was asked for: later clicks do not change it.
+
+    Parameters
+    ----------
+    browser : Browser
+        Whose tool and filter it takes.
+    part : int or None
+        Id of the swept object; None: the tool.
+    way : str
+        One of `WAYS`.
+    length : float
+        Of a way along an axis, metres.
+    """
+
+    def __init__(self, browser: "Browser", part: int | None, way: str, length: float) -> None:
+        self._site = browser.site
+        self._part = part
+        self._way, self._length = WAYS[way], length
+        self._tool = browser.tool
+        self._hand = browser.matrix_of_hand()
+        self._from = browser.matrix_of_tool()
+        self._exclude = {*browser.unfelt, *(() if part is None else (part,))}
+        obj = None if part is None else browser.site.objects[part]
+        self.name = self._tool.name if obj is None else short_name(obj.name)
+
+    def run(self, progress: sweeps.SampleCallback) -> SweepAnswer:
+        """Sweep on a connection of its own."""
+        with Environment(open_store(self._site.url, read_only=True)) as env:
+            if self._part is None:
+                shell = self._tool.shell
+            else:
+                spacing = 0.5 * env.grid.voxel_size
+                shell = env.shell(self._part, points=MOST_POINTS, spacing=spacing)
+            present = [i for i in self._exclude if i in self._site.objects]
+            swept = sweeps.sweep(env, shell, self._path(shell), exclude=present, progress=progress)
+            pose, marks = None, np.empty((0, 3))
+            moment = swept.first_hit
+            if moment is not None:
+                pose = moment.pose
+                touch = env.touch(shell, pose, exclude=present, law="plane")
+                marks = shell.points[touch.hits] @ pose[:3, :3].T + pose[:3, 3]
+        return SweepAnswer(shell, swept, pose, marks)
+
+    def _path(self, shell: PointShell) -> Floats:
+        """Poses of the sweep: of the tool, or displacements of the part from its place."""
+        first = self._from if self._part is None else np.eye(4)
+        last = first.copy()
+        if self._way is not None:
+            axis, sign = self._way
+            last[axis, 3] += sign * self._length
+        elif self._part is None:
+            last = self._hand
+        elif self._part is not None:
+            middle = np.eye(4)
+            middle[:3, 3] = tools.middle_of(shell)
+            last = self._hand @ np.linalg.inv(middle)
+        if math.isclose(float(np.abs(last - first).max()), 0.0, abs_tol=1e-12):
+            raise UsageError("a way of no length: give a length, or move the hand")
+        return np.stack([first, last])

@@ -1,0 +1,217 @@
+"""The tab Touch: what is felt, as numbers, names and plots; the tool and how it feels."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.page import checks, colours
+from hapticdb.page.widgets import put
+from hapticdb.page.wording import (
+    MOST_SAID,
+    escaped,
+    force_text,
+    note_html,
+    short_name,
+    swatch,
+    torque_text,
+)
+from hapticdb.recording.frame import State
+from hapticdb.store.base import Object
+
+if TYPE_CHECKING:
+    from viser import GuiApi, GuiEvent
+
+    from hapticdb.page.browser import Browser
+
+SHOWN_EVERY = 0.2
+"""Seconds from one update of numbers and plots to the next. Larger: less to send, and numbers that
+are easier to read."""
+SECONDS = 10.0
+"""Seconds that the plots show."""
+SOFTEST, STIFFEST = 50.0, 3000.0
+"""Range of the stiffness, N/m. Larger: harder surfaces, and forces that reach the cap sooner."""
+SCALES = (0.05, 20.0)
+"""Range of the scale, times the one at the start. Larger: smaller or larger hands."""
+
+
+class TouchPanel:
+    """Shows the session's newest frame, and sets the tool, its spring and its scale.
+
+    Parameters
+    ----------
+    browser : Browser
+        Whose session it is.
+    gui : GuiApi
+        Where the panel is made: inside the present container.
+    """
+
+    def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
+        from viser.uplot import Axis, Legend, Scale, Series  # noqa: PLC0415 - the extra `view`
+
+        self._browser = browser
+        self._gui = gui
+        self._shown_at = 0.0
+        self._said = ""
+        may_touch = browser.visitor.may("toucher")
+        self._reading = gui.add_html(
+            self._reading_html(0.0, 0.0, [], "The tool is being made ready.", is_held=may_touch)
+        )
+        nothing = np.zeros(2)
+        axes = (Axis(space=60, size=32), Axis(size=40))
+        self._force = gui.add_uplot(
+            (np.array([-SECONDS, 0.0]), nothing),
+            (Series(label="s"), Series(label="N", stroke=_css(colours.FORCE), width=2)),
+            title="Force, N",
+            scales={
+                "x": Scale(time=False, min=-SECONDS, max=0.0),
+                "y": Scale(auto=False, min=0.0, max=8.0),
+            },
+            axes=axes, legend=Legend(show=False), height=130, visible=may_touch,
+        )  # fmt: skip
+        self._late = gui.add_uplot(
+            (np.array([-SECONDS, 0.0]), nothing),
+            (Series(label="s"), Series(label="ms", stroke="rgb(72,120,190)", width=1)),
+            title="Lateness of the loop, ms",
+            scales={
+                "x": Scale(time=False, min=-SECONDS, max=0.0),
+                "y": Scale(auto=False, min=0.0, max=2.0),
+            },
+            axes=axes, legend=Legend(show=False), height=100, visible=may_touch,
+        )  # fmt: skip
+        if may_touch:
+            self._add_controls(gui)
+
+    def _add_controls(self, gui: "GuiApi") -> None:
+        browser = self._browser
+        names = [tool.name for tool in browser.site.tools]
+        self._tool = gui.add_dropdown("Tool", names, initial_value=browser.tool.name)
+        self._tool.on_update(browser.guarded("toucher", self._choose_tool))
+        home = gui.add_button("Back to the start", color="gray")
+        home.on_click(browser.guarded("toucher", self._go_home))
+        with gui.add_folder("Where the hand is", expand_by_default=False):
+            step = round(browser.site.stage.diagonal / 500, 4)
+            self._place = gui.add_vector3(
+                "Place, m", tuple(np.round(browser.hand[:3], 4)), step=step
+            )
+            self._place.on_update(browser.guarded("toucher", self._type_place))
+        with gui.add_folder("How it feels", expand_by_default=False):
+            stiffness = gui.add_slider(
+                "Stiffness, N/m", SOFTEST, STIFFEST, 10.0, browser.stiffness,
+                hint="Of the spring between hand and tool: force for a metre of the hand.",
+            )  # fmt: skip
+            stiffness.on_update(browser.guarded("toucher", self._stiffen))
+            stiffness.visible = browser.site.stage.is_smooth
+            scale = gui.add_number(
+                "Scale", round(browser.scale, 3), step=0.001,
+                min=round(browser.scale * SCALES[0], 4), max=round(browser.scale * SCALES[1], 3),
+                hint="Metres of the scene for one metre of the hand.",
+            )  # fmt: skip
+            self._scales = (browser.scale * SCALES[0] * 0.999, browser.scale * SCALES[1] * 1.001)
+            scale.on_update(browser.guarded("toucher", self._rescale))
+
+    # -- callbacks ---------------------------------------------------------------------------
+
+    def _choose_tool(self, event: "GuiEvent[Any]") -> None:
+        browser = self._browser
+        names = [tool.name for tool in browser.site.tools]
+        name = checks.choice_of(event.target.value, names, "a tool")
+        if browser.taken is not None:
+            browser.parts.put_back()
+        browser.take_in_hand(browser.site.tools[names.index(name)], browser.hand)
+
+    def _go_home(self, _: object) -> None:
+        browser = self._browser
+        if browser.taken is not None:
+            browser.parts.put_back()
+        browser.take_in_hand(browser.tool)
+
+    def _type_place(self, event: "GuiEvent[Any]") -> None:
+        if event.client is None:  # set by the page
+            return
+        browser = self._browser
+        place = checks.numbers_of(event.target.value, 3, checks.FARTHEST, "a place")
+        pose = checks.pose_of(place, browser.hand[3:])
+        browser.move_hand(pose)
+        browser.drawing.gizmo.position = place
+
+    def _stiffen(self, event: "GuiEvent[Any]") -> None:
+        self._browser.set_stiffness(
+            checks.number_of(event.target.value, SOFTEST, STIFFEST, "a stiffness")
+        )
+
+    def _rescale(self, event: "GuiEvent[Any]") -> None:
+        scale = checks.number_of(event.target.value, *self._scales, "a scale")
+        if scale != self._browser.scale:
+            self._browser.scale = scale
+            self._browser.begin_anew()
+
+    # -- what is shown -----------------------------------------------------------------------
+
+    def show_place(self) -> None:
+        """Show where the hand is."""
+        if hasattr(self, "_place"):
+            x, y, z = (round(float(value), 4) for value in self._browser.hand[:3])
+            put(self._place, (x, y, z))
+
+    def show(
+        self, frame: np.void, wrench: NDArray[np.float64], touched: list[Object], now: float
+    ) -> None:
+        """Show a frame's force and torque (6,), what it touches, and both plots."""
+        if now - self._shown_at < SHOWN_EVERY:
+            return
+        self._shown_at = now
+        force, torque = float(np.linalg.norm(wrench[:3])), float(np.linalg.norm(wrench[3:]))
+        state = State(int(frame["state"]))
+        trouble = ""
+        if state & State.IN_OBJECT:
+            trouble = "The tool lies in a part: move it free, then it feels."
+        elif frame["unknown"]:
+            trouble = "Cells are being fetched."
+        said = self._reading_html(force, torque, touched, trouble, is_held=True)
+        if said != self._said:
+            self._said = said
+            self._reading.content = said
+        history = np.array(self._browser.history)
+        if len(history) > 1:
+            times = history[:, 0] - history[-1, 0]
+            self._force.data = (times, history[:, 1])
+            self._late.data = (times, np.minimum(history[:, 2], 2.0))
+
+    def _reading_html(
+        self, force: float, torque: float, touched: list[Object], trouble: str, *, is_held: bool
+    ) -> str:
+        visitor = self._browser.visitor
+        who = f"{visitor.name} · {visitor.role}"
+        if not is_held:
+            return note_html(who) + note_html(
+                "You see what others touch. To feel, ask for a token."
+            )
+        names = "".join(
+            f"<div>{swatch(colours.of_object(obj.id))}{escaped(short_name(obj.name))}</div>"
+            for obj in touched[:MOST_SAID]
+        )
+        if len(touched) > MOST_SAID:
+            names += f"<div>and {len(touched) - MOST_SAID} more</div>"
+        said = ""
+        if trouble:
+            said = f'<div style="color:#c4610a">{escaped(trouble)}</div>'
+        elif not touched:
+            said = '<span style="opacity:0.6">Touches nothing</span>'
+        big = "font-size:1.5em;font-weight:600;font-variant-numeric:tabular-nums"
+        small = "font-size:0.75em;opacity:0.65"
+        return (
+            f'<div style="margin:4px 12px 2px"><div style="{small}">{swatch(self._browser.colour)}'
+            f"{escaped(who)}</div>"
+            '<div style="display:flex;gap:24px;margin:4px 0">'
+            f'<div><div style="{small}">Force</div>'
+            f'<div style="{big}">{force_text(force)}</div></div>'
+            f'<div><div style="{small}">Torque</div>'
+            f'<div style="{big}">{torque_text(torque)}</div></div></div>'
+            '<div style="font-size:0.82em;min-height:3.2em">'
+            f"{names}{said}</div></div>"
+        )
+
+
+def _css(colour: colours.Colour) -> str:
+    return f"rgb({colour[0]},{colour[1]},{colour[2]})"

@@ -1,0 +1,88 @@
+"""The page's process: viser on the loopback interface, behind the server's relay."""
+
+import contextlib
+import io
+import socket
+import time
+from typing import TYPE_CHECKING
+
+from hapticdb.hosting.attached import AttachedHost
+from hapticdb.page.browser import Browser
+from hapticdb.page.link import PageLink, PageRequest
+from hapticdb.page.site import Site, Visitor
+from hapticdb.realtime.processes import MessageSender, parent_is_gone
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from viser import ClientHandle, ViserServer
+
+LOOKED_EVERY = 0.2
+"""Seconds from one look for the parent's end to the next. Larger: the process lives longer."""
+PANEL = 340
+"""Width of the panels, pixels. Larger: longer names, and less of the scene."""
+
+
+def work(request: PageRequest, sender: MessageSender) -> None:
+    """Serve the page until the process that started this one ends.
+
+    Sends the message ``ready`` with viser's port once browsers can connect.
+    """
+    server = new_server()
+    link = PageLink(request.link)
+    link.guard(server)
+    try:
+        with AttachedHost(socket.socket(fileno=request.host)) as host:
+            site = Site(server, host, request)
+
+            def visitor(client: "ClientHandle") -> Visitor:
+                return Visitor(*link.announced(client.client_id))
+
+            open_page(site, visitor)
+            sender.send("ready", server.get_port())
+            try:
+                while not parent_is_gone():
+                    time.sleep(LOOKED_EVERY)
+            finally:
+                site.close()
+    finally:
+        server.stop()
+
+
+def new_server() -> "ViserServer":
+    """Start viser on a free port of the loopback interface."""
+    import viser  # noqa: PLC0415 - the extra `view`
+
+    with contextlib.redirect_stdout(io.StringIO()):  # it prints a box with its own address
+        return viser.ViserServer("127.0.0.1", 0, verbose=False)
+
+
+def open_page(site: Site, visitor_of: "Callable[[ClientHandle], Visitor]") -> None:
+    """Show the scene, and make panels for each browser that connects.
+
+    visitor_of : who a browser is; a KeyError if it has gone again.
+    """
+    server = site.server
+    server.gui.set_panel_label(site.title)
+    server.gui.configure_theme(
+        show_logo=False, show_share_button=False, dark_mode=False, brand_color=(36, 99, 160)
+    )
+    server.gui.main_panel.dock_right()
+    server.gui.main_panel.set_width(PANEL)
+    server.scene.world_axes.visible = False
+
+    def connect(client: "ClientHandle") -> None:
+        try:
+            visitor = visitor_of(client)
+        except KeyError:  # it has gone again
+            return
+        site.browsers[client.client_id] = Browser(site, client, visitor)
+
+    def disconnect(client: "ClientHandle") -> None:
+        browser = site.browsers.get(client.client_id)
+        if browser is not None:
+            site.workers.submit(browser.close)
+
+    server.on_client_connect(connect)
+    server.on_client_disconnect(disconnect)
+    site.begin()

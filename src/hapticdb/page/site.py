@@ -1,0 +1,233 @@
+"""What all browsers of one page share: the environment's objects, tools, sessions, and a clock."""
+
+import logging
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.environment import Environment
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.hosting.hosted import HostedSession
+from hapticdb.page import tools
+from hapticdb.page.database import DatabaseThread
+from hapticdb.page.editing import Edits
+from hapticdb.page.folders import AllowedFolders
+from hapticdb.page.link import PageRequest
+from hapticdb.page.scene.view import SceneEdit, SceneView
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+from hapticdb.store.connect import open_store
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+    from hapticdb.page.browser import Browser
+
+LOG = logging.getLogger("hapticdb.page")
+Floats = NDArray[np.float64]
+
+TICKS = 30.0
+"""Updates of tools and arrows, a second. Larger: smoother to look at, and more of a core for each
+browser."""
+WORKERS = 4
+"""Threads that begin sessions, so that a slow one delays no other browser much."""
+ROLES = ("viewer", "toucher", "editor")
+"""Roles, each with the rights of those before it: sees, feels, moves parts."""
+
+
+class Host(Protocol):
+    """Runs sessions: a `hosting.SessionHost`, or what reaches one in another process."""
+
+    def begin(
+        self,
+        shell: PointShell,
+        start: ArrayLike,
+        *,
+        where: Sequence[int | str] = (),
+        exclude: Sequence[int | str] = (),
+        coupling: Coupling | DeviceCoupling | None = None,
+        scale: float = 1.0,
+        label: str = "",
+    ) -> HostedSession:
+        """Begin a session."""
+
+    def sessions(self) -> Sequence[HostedSession]:
+        """All sessions that run."""
+
+
+@dataclass(frozen=True)
+class Visitor:
+    """Who looks at the page through one browser: the name that others see, and the role."""
+
+    name: str
+    role: str
+
+    def may(self, role: str) -> bool:
+        """Whether the visitor has at least this role."""
+        return ROLES.index(self.role) >= ROLES.index(role)
+
+
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """Where everything happens: the box of all objects (2, 3), metres, and which way is up.
+
+    up, toward : unit vectors, the second level and towards the first eye; is_smooth : whether
+    forces come from distances to surfaces.
+    """
+
+    bounds: Floats
+    up: Floats
+    toward: Floats
+    voxel_size: float
+    is_smooth: bool
+
+    @classmethod
+    def of(cls, view: SceneView) -> "Stage":
+        """Stage of a view's objects; an empty environment has the box of its grid."""
+        box, objects = view.box(), view.objects.values()
+        bounds = view.grid.bounds if box is None else box
+        toward = np.eye(3)[(view.up + 2) % 3]
+        is_smooth = bool(objects) and all(obj.has_distances for obj in objects)
+        return cls(bounds, np.eye(3)[view.up], toward, view.grid.voxel_size, is_smooth)
+
+    @property
+    def diagonal(self) -> float:
+        """Diagonal of the box, metres."""
+        return float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
+
+
+@dataclass(eq=False)
+class Site:
+    """What all browsers share.
+
+    Attributes
+    ----------
+    server : ViserServer
+        Serves the page.
+    host : Host
+        Runs the sessions.
+    request : PageRequest
+        The environment's addresses, the operator's tools, folders and title.
+    """
+
+    server: "ViserServer"
+    host: Host
+    request: PageRequest
+    browsers: "dict[int, Browser]" = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._lock = threading.Lock()
+        self._numbers: set[int] = set()
+        self._is_ending = threading.Event()
+        request = self.request
+        self.url = request.urls["viewer"]
+        self.title = request.title or "hapticdb"
+        self.recordings = None if request.recordings is None else Path(request.recordings)
+        self.edits = Edits(request.urls["editor"]) if "editor" in request.urls else None
+        self.workers = ThreadPoolExecutor(WORKERS, thread_name_prefix="page-worker")
+        self.sweeping = ThreadPoolExecutor(1, thread_name_prefix="page-sweep")
+        self._folders = self._allowed()
+        self.view = SceneView(self.server, self.url, may_read=self._may_read)
+        self.objects = self.view.objects
+        self.stage = stage = Stage.of(self.view)
+        self.database = DatabaseThread(self.url)
+        self.tools = [
+            *tools.from_files(request.tools, stage.voxel_size, smooth=stage.is_smooth),
+            *tools.built_in(stage.diagonal, stage.voxel_size, smooth=stage.is_smooth),
+        ]
+        self._clock = threading.Thread(target=self._tick, name="page-clock", daemon=True)
+        self.view.on_edit(self._learn)
+
+    def begin(self) -> None:
+        """Start the clock that updates all browsers."""
+        self._clock.start()
+
+    def close(self) -> None:
+        """End all sessions, the clock, and the database's thread."""
+        self._is_ending.set()
+        if self._clock.is_alive():
+            self._clock.join(5.0)
+        for browser in list(self.browsers.values()):
+            browser.close()
+        self.sweeping.shutdown(cancel_futures=True)
+        self.workers.shutdown(cancel_futures=True)
+        self.view.close()
+        self.database.close()
+        if self.edits is not None:
+            self.edits.close()
+
+    def take_number(self) -> int:
+        """Return the smallest number that no browser has: it decides a tool's colour and place."""
+        with self._lock:
+            number = next(n for n in range(len(self._numbers) + 1) if n not in self._numbers)
+            self._numbers.add(number)
+            return number
+
+    def free_number(self, number: int) -> None:
+        """Let another browser have a number."""
+        with self._lock:
+            self._numbers.discard(number)
+
+    def everyone(self, act: "Callable[[Browser], None]") -> None:
+        """Do something for each browser; one that fails does not stop the others."""
+        for browser in list(self.browsers.values()):
+            try:
+                act(browser)
+            except Exception:
+                LOG.exception("a browser's update failed")
+
+    def _may_read(self, path: Path) -> bool:
+        """Whether the page may read an object's file: below the operator's folders alone."""
+        folders = self._folders
+        try:
+            folders.checked(str(path))
+        except HapticDBError:
+            return False
+        return True
+
+    def _allowed(self) -> AllowedFolders:
+        folders = self.request.folders
+        if folders is not None:
+            return AllowedFolders(folders)
+        with Environment(open_store(self.url, read_only=True)) as env:
+            return AllowedFolders.of_links(obj.link for obj in env.objects())
+
+    def _learn(self, _: SceneEdit) -> None:
+        """Objects have changed: somebody has edited the environment."""
+        self.objects = self.view.objects
+        self.everyone(lambda browser: browser.objects_changed())
+
+    def _tick(self) -> None:
+        """Update all browsers `TICKS` times a second; a late tick is not made up for."""
+        while not self._is_ending.is_set():
+            begun = time.monotonic()
+            self.everyone(partial(_tick, now=begun))
+            left = 1.0 / TICKS - (time.monotonic() - begun)
+            self._is_ending.wait(max(left, 0.002))
+
+
+def _tick(browser: "Browser", now: float) -> None:
+    browser.tick(now)
+
+
+def checked_file(folder: Path | None, name: str) -> Path:
+    """Path of a recording in the operator's folder, by the name alone.
+
+    Raises
+    ------
+    UsageError
+        If there is no folder, or the name leads out of it.
+    """
+    if folder is None:
+        raise UsageError("nothing is recorded here: the operator gave no folder (--recordings)")
+    if not name or name != Path(name).name or name.startswith("."):
+        raise UsageError("a recording has a name without a folder")
+    return folder / name

@@ -1,0 +1,194 @@
+"""Tools that a person can take in hand: built-in probes, the operator's files, parts of the scene.
+
+Each has its origin in its middle, so that its gizmo is where the tool is.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.field.law import ONSET
+from hapticdb.pointshell.orientation import Surface
+from hapticdb.pointshell.shell import PointShell
+
+Floats = NDArray[np.float64]
+
+PROBE_SHARE = 0.028
+"""Radius of the ball, as a share of the scene's diagonal. Larger: better seen, and it fits into
+fewer places."""
+LEAST_VOXELS = 3.0
+"""Least radius of a probe, voxels. Larger: probes feel smooth in coarser environments, and are
+larger there."""
+POINTS = 400
+"""Points of a tool's shell. Larger: smaller features are felt, and a frame takes longer."""
+PART_POINTS = 1500
+"""Points of a part that is taken in hand; parts have more and finer edges than probes."""
+AROUND = 40
+"""Corners around a probe. Larger: it looks rounder, and is more to send."""
+
+
+@dataclass(frozen=True, eq=False)
+class HeldTool:
+    """A tool as the page uses it.
+
+    Attributes
+    ----------
+    name : str
+        Its name for people.
+    shell : PointShell
+        Points for the force, about the tool's middle, metres.
+    vertices : (V, 3)
+        Corners of its surface in the same frame, metres.
+    faces : (F, 3)
+        Corners of each triangle.
+    is_round : bool
+        Whether it is drawn with smooth shading.
+    """
+
+    name: str
+    shell: PointShell
+    vertices: Floats
+    faces: NDArray[np.int64]
+    is_round: bool = False
+
+    @property
+    def radius(self) -> float:
+        """Distance of its farthest corner from its middle, metres."""
+        return float(np.linalg.norm(self.vertices, axis=1).max())
+
+
+def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTool]:
+    """Probes that fit a scene: a ball and a peg.
+
+    diagonal : of the scene's box, metres; smooth : whether forces come from distances, so that
+    points are drawn inward by the law's onset.
+    """
+    radius = max(PROBE_SHARE * diagonal, LEAST_VOXELS * voxel_size)
+    inset = inset_of(voxel_size, smooth=smooth)
+    ball = np.linspace(-0.5 * math.pi, 0.5 * math.pi, AROUND // 2 + 1)
+    peg = np.linspace(-0.5 * math.pi, 0.0, AROUND // 4 + 1)
+    slim, long = 0.45 * radius, 3.2 * radius
+    tip = np.column_stack([slim * np.cos(peg), slim * (1.0 + np.sin(peg)) - long / 2])
+    shaft = np.array(
+        [[slim, long / 4], [1.5 * slim, long / 4], [1.5 * slim, long / 2], [0, long / 2]]
+    )
+    profiles = {
+        "ball": radius * np.column_stack([np.cos(ball), np.sin(ball)]),
+        "peg": np.concatenate([tip, shaft]),
+    }
+    found = []
+    for name, profile in profiles.items():
+        vertices, faces = _turned(profile)
+        shell = PointShell.from_mesh(vertices, faces, POINTS, inset=inset)
+        found.append(HeldTool(name, shell, vertices, faces, is_round=name == "ball"))
+    return found
+
+
+def from_files(paths: Sequence[str], voxel_size: float, *, smooth: bool) -> list[HeldTool]:
+    """Tools of the operator's files, named by their files.
+
+    Raises
+    ------
+    FileError
+        If a file cannot be read, or holds no surface.
+    """
+    inset = inset_of(voxel_size, smooth=smooth)
+    return [
+        from_shell(Path(path).stem, PointShell.from_file(path, POINTS, inset=inset))
+        for path in paths
+    ]
+
+
+def from_shell(name: str, shell: PointShell) -> HeldTool:
+    """Tool of a shell in any frame: its origin becomes the middle of its box."""
+    middle = middle_of(shell)
+    surface = shell.surface
+    if isinstance(surface, Surface):
+        surface = surface._replace(
+            triangles=surface.triangles - middle, center=surface.center - middle
+        )
+        vertices = surface.triangles.reshape(-1, 3)
+        faces = np.arange(len(vertices)).reshape(-1, 3)
+    else:
+        vertices, faces = _hull(shell.outline - middle)
+        surface = None
+    centred = replace(
+        shell, points=shell.points - middle, center=shell.center - middle, surface=surface
+    )
+    return HeldTool(name, centred, vertices, faces)
+
+
+def middle_of(shell: PointShell) -> Floats:
+    """Middle (3,) of the box of a shell's surface, metres, the shell's frame."""
+    outline = shell.outline
+    middle: Floats = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
+    return middle
+
+
+def inset_of(voxel_size: float, *, smooth: bool) -> float:
+    """How far points of a tool are drawn inward, metres, so that contact begins at its surface."""
+    return ONSET * voxel_size if smooth else 0.0
+
+
+def _turned(profile: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Surface of a profile (P, 2), radius and height, turned about the z axis: vertices, faces."""
+    angles = np.arange(AROUND) * (2.0 * math.pi / AROUND)
+    rings = np.stack(
+        [
+            profile[:, :1] * np.cos(angles),
+            profile[:, :1] * np.sin(angles),
+            np.repeat(profile[:, 1:], AROUND, axis=1),
+        ],
+        axis=-1,
+    )
+    ring, place = np.meshgrid(np.arange(len(profile) - 1), np.arange(AROUND), indexing="ij")
+    low, high = ring * AROUND, (ring + 1) * AROUND
+    after = (place + 1) % AROUND
+    lower = np.stack([low + place, low + after, high + after], axis=-1)
+    upper = np.stack([low + place, high + after, high + place], axis=-1)
+    faces = np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
+    vertices, number = np.unique(np.round(rings.reshape(-1, 3), 9), axis=0, return_inverse=True)
+    faces = number.reshape(-1)[faces]
+    is_flat = (faces == np.roll(faces, 1, axis=1)).any(axis=1)
+    return vertices, faces[~is_flat]
+
+
+def _hull(points: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Convex hull of points (P, 3), wound outward: vertices and faces."""
+    from scipy.spatial import ConvexHull, QhullError  # noqa: PLC0415 - a third of a second
+
+    try:
+        hull = ConvexHull(points)
+    except (QhullError, ValueError) as error:
+        raise UsageError(
+            "a saved shell of fewer than four points, or flat: give its mesh"
+        ) from error
+    faces = hull.simplices.astype(np.int64)
+    corners = points[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    is_inward = np.einsum("fk,fk->f", normals, hull.equations[:, :3]) < 0.0
+    faces[is_inward] = faces[is_inward][:, ::-1]
+    return points, faces
+
+
+def start_pose(bounds: Floats, up: Floats, toward: Floats, radius: float, number: int) -> Floats:
+    """Pose (4, 4) above the scene's box, where every tool is free and is seen at once.
+
+    bounds : (2, 3) of the scene, metres; up, toward : unit vectors, the second level and towards
+    the eye; radius : of the tool, metres; number : of the person, so that tools stand side by side.
+    """
+    middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
+    side = np.cross(up, toward)
+    steps = (number + 1) // 2 * (1 if number % 2 else -1)
+    place = middle + up * (float(np.abs(up) @ half) + 1.3 * radius)
+    place = place + toward * (0.35 * float(np.abs(toward) @ half)) + side * (2.6 * radius * steps)
+    pose = np.eye(4)
+    pose[:3, 3] = place
+    upright = np.column_stack([side, np.cross(up, side), up])
+    pose[:3, :3] = upright
+    return pose

@@ -1,0 +1,67 @@
+"""Values that a browser sends are taken only if they are what the page asked for."""
+
+import math
+
+import numpy as np
+import pytest
+
+from hapticdb.errors import UsageError
+from hapticdb.page import checks
+
+
+@pytest.mark.parametrize("value", [0.0, 5, np.float64(10.0), 3.25])
+def test_a_number_within_its_range_is_taken(value: float) -> None:
+    assert checks.number_of(value, 0.0, 10.0, "a length") == float(value)
+
+
+@pytest.mark.parametrize(
+    "value", [-0.1, 10.1, math.nan, math.inf, -math.inf, True, "5", None, [5.0], {"a": 1}]
+)
+def test_any_other_number_is_refused_with_its_range(value: object) -> None:
+    with pytest.raises(UsageError, match="a length"):
+        checks.number_of(value, 0.0, 10.0, "a length")
+
+
+@pytest.mark.parametrize("value", ["c", "", None, 1, ["a"]])
+def test_what_is_not_in_the_list_is_refused(value: object) -> None:
+    assert checks.choice_of("a", ("a", "b"), "a tool") == "a"
+    with pytest.raises(UsageError):
+        checks.choice_of(value, ("a", "b"), "a tool")
+
+
+def test_a_text_is_one_line_and_not_long() -> None:
+    assert checks.text_of("wheel\x00\n\x1b left", 20, "a search") == "wheel left"
+    for value in ("x" * 21, 7, None, b"wheel"):
+        with pytest.raises(UsageError):
+            checks.text_of(value, 20, "a search")
+
+
+def test_a_box_is_ticked_or_not() -> None:
+    assert checks.flag_of(True, "voxels")
+    for value in (1, "true", None):
+        with pytest.raises(UsageError):
+            checks.flag_of(value, "voxels")
+
+
+def test_a_pose_is_a_rotation_whatever_the_quaternions_length() -> None:
+    pose = checks.pose_of((1.0, 2.0, 3.0), (2.0, 0.0, 0.0, 2.0))
+    quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert np.allclose(pose[:3, :3], quarter)
+    assert np.allclose(pose[:3, 3], (1.0, 2.0, 3.0))
+
+
+@pytest.mark.parametrize(
+    ("place", "turn"),
+    [
+        ((math.nan, 0, 0), (1, 0, 0, 0)),
+        ((0, 0, 1e9), (1, 0, 0, 0)),
+        ((0, 0), (1, 0, 0, 0)),
+        ((0, 0, 0), (0, 0, 0, 0)),
+        ((0, 0, 0), (1, math.inf, 0, 0)),
+        ("abc", (1, 0, 0, 0)),
+        (None, None),
+    ],
+)
+def test_no_other_pose_moves_a_hand(place: object, turn: object) -> None:
+    with pytest.raises(UsageError):
+        checks.pose_of(place, turn)

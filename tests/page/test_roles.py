@@ -1,0 +1,69 @@
+"""What a person may do, and where recordings may be."""
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+from hapticdb.errors import UsageError
+from hapticdb.page.browser import Browser
+from hapticdb.page.site import ROLES, Visitor, checked_file
+
+
+def browser_of(role: str) -> tuple[Browser, list[tuple[str, str]]]:
+    """Make a browser without viser that keeps what it would tell its person."""
+    browser = Browser.__new__(Browser)
+    told: list[tuple[str, str]] = []
+
+    def note(title: str, text: str, **_: object) -> None:
+        told.append((title, text))
+
+    browser.visitor = Visitor("Ada", role)
+    browser.client = SimpleNamespace(add_notification=note)  # type: ignore[assignment]
+    browser._is_closed = False
+    return browser, told
+
+
+@pytest.mark.parametrize("has", ROLES)
+@pytest.mark.parametrize("needs", ROLES)
+def test_a_callback_runs_only_for_those_who_may(has: str, needs: str) -> None:
+    browser, told = browser_of(has)
+    done: list[object] = []
+    browser.guarded(needs, done.append)("event")
+    may = ROLES.index(has) >= ROLES.index(needs)
+    assert done == (["event"] if may else [])
+    assert bool(told) != may
+    if told:
+        assert needs in told[0][1]
+
+
+def test_an_error_is_told_to_the_person_and_a_fault_names_nothing() -> None:
+    browser, told = browser_of("editor")
+
+    def refuse(_: object) -> None:
+        raise UsageError("a length: give a number from 0 to 1")
+
+    def fail(_: object) -> None:
+        raise RuntimeError("/secret/path")
+
+    browser.guarded("viewer", refuse)("event")
+    browser.guarded("viewer", fail)("event")
+    assert told[0] == ("Not done", "a length: give a number from 0 to 1")
+    assert "/secret" not in told[1][1]
+
+
+def test_nothing_happens_after_the_browser_has_gone() -> None:
+    browser, told = browser_of("editor")
+    browser._is_closed = True
+    done: list[object] = []
+    browser.guarded("viewer", done.append)("event")
+    assert done == told == []
+
+
+@pytest.mark.parametrize("name", ["", ".", "..", "../a.hdbrec", "/a.hdbrec", "a/b.hdbrec", ".a"])
+def test_a_recordings_name_never_leads_out_of_its_folder(tmp_path: Path, name: str) -> None:
+    assert checked_file(tmp_path, "a.hdbrec") == tmp_path / "a.hdbrec"
+    with pytest.raises(UsageError):
+        checked_file(tmp_path, name)
+    with pytest.raises(UsageError, match="--recordings"):
+        checked_file(None, "a.hdbrec")

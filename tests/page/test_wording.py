@@ -1,0 +1,46 @@
+"""Texts of the page: short, one line, and harmless in HTML."""
+
+import pytest
+
+from hapticdb.page.wording import (
+    escaped,
+    force_text,
+    note_html,
+    plain_name,
+    rows_html,
+    short_name,
+    torque_text,
+)
+
+HOSTILE = '<img src=x onerror="alert(1)">&amp;</td><script>'
+
+
+@pytest.mark.parametrize(
+    "html", [escaped(HOSTILE), note_html(HOSTILE), rows_html([(HOSTILE,) * 2])]
+)
+def test_no_name_becomes_a_tag(html: str) -> None:
+    assert "<img" not in html
+    assert "<script" not in html
+    assert "&lt;img" in html
+    assert "&amp;amp;" in html
+    assert html.count("</td>") == html.count("<td")
+
+
+def test_a_short_name_has_at_most_its_letters_and_keeps_both_ends() -> None:
+    name = "assembly/sub/" + "a very long name of a part, number " * 3 + "17"
+    short = short_name(name, 34)
+    assert len(short) == 34
+    assert short.startswith("a very")
+    assert short.endswith("17")
+    assert short_name("body/door", 34) == "body/door"
+    assert short_name("left/door", 6) == "door"
+
+
+def test_names_stay_on_one_line() -> None:
+    assert plain_name("a\nb\x1b[31m\u202e") == "a?b?[31m?"
+    assert plain_name("") == "(no name)"
+
+
+def test_numbers_have_few_decimals_and_their_unit() -> None:
+    assert force_text(1.23456) == "1.23 N"
+    assert torque_text(0.0314159) == "0.031 N m"

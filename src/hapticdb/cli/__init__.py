@@ -25,6 +25,7 @@ from hapticdb.cli.verbs.listing import analyze, calibrate, info, objects
 from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.replaying import replay
 from hapticdb.cli.verbs.sampling import demo, sample, warm
+from hapticdb.cli.verbs.serving import serve, view
 from hapticdb.cli.verbs.sweeping import HELP as SWEEP_HELP
 from hapticdb.cli.verbs.sweeping import sweep
 from hapticdb.cli.verbs.touching import touch
@@ -44,6 +45,8 @@ VERBS: dict[Callable[..., None], str] = {
     objects: "List the objects of an environment.",
     touch: "Touch with a tool along a path: force, torque, objects.",
     feel: "Feel in real time with a device.",
+    view: "See and feel in a browser.",
+    serve: "Let others see and feel, in browsers and with devices.",
     replay: "Compute a recorded session's wrenches again.",
     sweep: "Say whether a tool or part comes out along a path.",
     move: "Place an object anew.",

@@ -1,0 +1,307 @@
+"""The verbs view and serve."""
+
+import signal
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from hapticdb.cli import render
+from hapticdb.cli.options import UrlArgument
+from hapticdb.cli.root import Interrupted, leave
+from hapticdb.errors import MissingExtraError, UsageError
+from hapticdb.interrupting import interrupt
+
+if TYPE_CHECKING:
+    from hapticdb.server.access import Role
+    from hapticdb.server.running import Serving
+
+TERMINATED = 128 + signal.SIGTERM
+"""Exit code after SIGTERM."""
+
+ToolsOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--tool",
+        metavar="FILE",
+        help="Mesh of a tool to choose from, beside a ball and a peg. Give it again for more.",
+    ),
+]
+FilesOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="FOLDER",
+        help="Folder below which objects' files may be read to show them. Give it again for more.",
+        show_default="the folders of the files as imported",
+    ),
+]
+SecondsOption = Annotated[
+    float | None, typer.Option(metavar="S", help="End after that time.", show_default="Ctrl-C")
+]
+NoBrowserOption = Annotated[
+    bool, typer.Option("--no-browser", help="Print the address, and open no browser.")
+]
+TokenOption = Annotated[
+    bool,
+    typer.Option(
+        "--token", help="Ask for a token. One is made for each role, and printed at the start."
+    ),
+]
+RoleTokenOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ROLE=TOKEN",
+        help="A token of yours, 16 characters or more. Roles: viewer, toucher, editor.",
+    ),
+]
+TokenFileOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE", help="Tokens in a file, ROLE=TOKEN on each line: other users cannot see it."
+    ),
+]
+RoleUrlOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="ROLE=URL",
+        help="Address of the environment for a role, with the rights of a user of the database.",
+    ),
+]
+HostOption = Annotated[
+    str, typer.Option(metavar="ADDRESS", help="Address to listen on; 0.0.0.0 is all of them.")
+]
+PortOption = Annotated[int, typer.Option(metavar="N", help="Port to listen on; 0 is a free one.")]
+PrefixOption = Annotated[
+    str, typer.Option(metavar="/PATH", help="Path under which a proxy hands requests on.")
+]
+HostNameOption = Annotated[
+    list[str] | None,
+    typer.Option(metavar="NAME", help="Name of this server for browsers, such as that of a proxy."),
+]
+CertificateOption = Annotated[
+    str | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate of TLS, PEM.")
+]
+KeyOption = Annotated[
+    str | None, typer.Option("--tls-key", metavar="FILE", help="Key of the certificate, PEM.")
+]
+LogJsonOption = Annotated[
+    bool, typer.Option("--log-json", help="Write the log as JSON, an object a line.")
+]
+
+
+def view(
+    url: UrlArgument,
+    *,
+    tool: ToolsOption = None,
+    files: FilesOption = None,
+    seconds: SecondsOption = None,
+    no_browser: NoBrowserOption = False,
+) -> None:
+    """See and feel an environment in a browser on this machine.
+
+    Example: hapticdb view car.db --tool wrench.stl
+    """
+    _check_extra()
+    from hapticdb.server.access import Role, make_token
+
+    token = make_token()
+    serving = _serving(url, tool, files, {token: Role.EDITOR}, None)
+
+    def ready(port: int) -> None:
+        address = serving.address(port, token)
+        print(address, flush=True)
+        if not no_browser:
+            webbrowser.open(address)
+
+    _run(serving, ready, seconds, log_json=False, is_quiet=True)
+
+
+def serve(
+    url: UrlArgument,
+    *,
+    tool: ToolsOption = None,
+    token: TokenOption = False,
+    role_token: RoleTokenOption = None,
+    token_file: TokenFileOption = None,
+    role_url: RoleUrlOption = None,
+    host: HostOption = "127.0.0.1",
+    port: PortOption = 0,
+    prefix: PrefixOption = "",
+    host_name: HostNameOption = None,
+    files: FilesOption = None,
+    tls_cert: CertificateOption = None,
+    tls_key: KeyOption = None,
+    log_json: LogJsonOption = False,
+    seconds: SecondsOption = None,
+) -> None:
+    """Let others see and feel an environment in browsers, and devices on other machines.
+
+    Example: hapticdb serve car.db --tool wrench.stl --token
+    """
+    _check_extra()
+    from dataclasses import replace
+
+    tokens = _tokens(role_token, token_file, are_made=token)
+    serving = replace(
+        _serving(url, tool, files, tokens, role_url),
+        host=host, port=port, prefix=prefix.rstrip("/"), host_names=tuple(host_name or ()),
+        certificate=tls_cert, key=tls_key,
+    )  # fmt: skip
+
+    def ready(port: int) -> None:
+        for made, role in tokens.items() if token else ():
+            print(f"{role.word:<8}{serving.address(port, made)}", flush=True)
+        if not token:
+            print(serving.address(port), flush=True)
+        if not tokens:
+            render.note("every program on this machine may edit; --token asks for a token")
+
+    _run(serving, ready, seconds, log_json=log_json)
+
+
+def _check_extra() -> None:
+    from importlib.util import find_spec
+
+    missing = [name for name in ("viser", "starlette", "uvicorn", "prometheus_client")
+               if find_spec(name) is None]  # fmt: skip
+    if missing:
+        raise MissingExtraError(
+            f"{', '.join(missing)} not found: pip install 'hapticdb[view]' adds the browser view"
+        )
+
+
+def _serving(
+    url: str,
+    tools: Sequence[str] | None,
+    files: Sequence[str] | None,
+    tokens: "dict[str, Role]",
+    role_urls: Sequence[str] | None,
+) -> "Serving":
+    """What to serve; refuses an environment, a tool or a folder that is not there."""
+    import hapticdb
+    from hapticdb.page.folders import AllowedFolders
+    from hapticdb.server.access import Role
+    from hapticdb.server.running import Serving
+
+    urls = dict.fromkeys(Role, url)
+    for text in role_urls or ():
+        role, other = _pair(text, "--role-url")
+        urls[role] = other
+    for other in dict.fromkeys(urls.values()):
+        with hapticdb.open(other, read_only=True):
+            pass
+    for tool in tools or ():
+        if not Path(tool).is_file():
+            raise UsageError(f"--tool {tool}: no such file")
+    AllowedFolders(files or ())
+    return Serving(
+        urls=urls, tools=tuple(tools or ()), tokens=tokens,
+        open_role=None if tokens else Role.EDITOR,
+        folders=None if files is None else tuple(files), title=_title(url),
+    )  # fmt: skip
+
+
+def _title(url: str) -> str:
+    """Title of the page: the file's name, or the environment's place without secrets."""
+    from hapticdb.store.urls import redact
+
+    return f"{Path(redact(url).partition('?')[0]).stem} - hapticdb"
+
+
+def _tokens(given: Sequence[str] | None, file: str | None, *, are_made: bool) -> "dict[str, Role]":
+    """Collect the tokens of all options, with the role of each."""
+    from hapticdb.server.access import Role, check_token, make_token
+
+    lines = [(text, "--role-token") for text in given or ()]
+    if file is not None:
+        try:
+            text = Path(file).read_text("utf-8")
+        except (OSError, UnicodeDecodeError) as error:
+            raise UsageError(f"--token-file {file}: cannot be read: {error}") from None
+        lines += [(line.strip(), "--token-file") for line in text.splitlines() if line.strip()]
+    tokens: dict[str, Role] = {}
+    for text, option in lines:
+        role, token = _pair(text, option)
+        check_token(token)
+        tokens[token] = role
+    return tokens | ({make_token(): role for role in Role} if are_made else {})
+
+
+def _pair(text: str, option: str) -> "tuple[Role, str]":
+    from hapticdb.server.access import Role
+
+    word, mark, rest = text.partition("=")
+    if not mark or not rest:
+        raise UsageError(f"{option}: write ROLE=..., such as editor=...")
+    return Role.of(word), rest
+
+
+def _run(
+    serving: "Serving",
+    ready: Callable[[int], None],
+    seconds: float | None,
+    *,
+    log_json: bool,
+    is_quiet: bool = False,
+) -> None:
+    import asyncio
+    import logging
+
+    from hapticdb.server import logs, running
+
+    if seconds is not None and not seconds > 0.0:
+        raise UsageError(f"--seconds {seconds:g}: give a time above 0")
+    running.check(serving)
+    logs.begin("json" if log_json else "plain", logging.WARNING if is_quiet else logging.INFO)
+    if not running.is_near(serving.host) and serving.certificate is None:
+        render.note(
+            "tokens and forces cross the network unencrypted; give --tls-cert and --tls-key, or "
+            "put a proxy with TLS in front"
+        )
+
+    async def work() -> list[int]:
+        stop = asyncio.Event()
+        loop = asyncio.get_running_loop()
+        if seconds is not None:
+            loop.call_later(seconds, stop.set)
+        with _ended_by_signals(lambda: loop.call_soon_threadsafe(stop.set)) as signals:
+            await running.run(serving, ready, stop)
+        return signals
+
+    signals = asyncio.run(work())
+    if signal.SIGTERM in signals:
+        render.note("ended by SIGTERM")
+        raise typer.Exit(TERMINATED)
+    if signals:
+        raise Interrupted("ended by Ctrl-C")
+
+
+@contextmanager
+def _ended_by_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
+    """Let Ctrl-C or SIGTERM end the server in order, and a second one the program.
+
+    Yields the signals that came.
+    """
+    came: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {  # another's handler stays
+        number: handler
+        for number, handler in handlers.items()
+        if handler in {signal.default_int_handler, interrupt, leave}
+    }
+
+    def end(number: int, _: object) -> None:
+        came.append(number)
+        stop()
+        signal.signal(number, before[signal.Signals(number)])
+
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

@@ -1,0 +1,93 @@
+"""The application: which path leads where."""
+
+import logging
+from importlib import import_module
+
+from starlette.applications import Starlette
+from starlette.requests import Request
+from starlette.responses import JSONResponse, PlainTextResponse, Response
+from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
+from starlette.types import ASGIApp
+
+from hapticdb.server.client_page import ClientPage
+from hapticdb.server.guards import Guards
+from hapticdb.server.health import Doctor
+from hapticdb.server.relay import Relay
+from hapticdb.server.served import Served
+from hapticdb.server.signing_in import FrontDoor
+
+LOG = logging.getLogger("hapticdb.server")
+LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
+"""Addresses of this machine; a request that came by a proxy has the proxy's client instead."""
+FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "via")
+"""Headers by which proxies tell that they passed a request on."""
+DEVICES: dict[str, str] = {}
+"""Endpoints of devices: path -> ``module:function`` that gets a WebSocket."""
+
+
+def application(
+    served: Served,
+    page: ClientPage,
+    relay: Relay,
+    doctor: Doctor,
+    *,
+    prefix: str,
+    title: str,
+    host_names: tuple[str, ...] = (),
+) -> ASGIApp:
+    """Put the parts of a server together.
+
+    Parameters
+    ----------
+    served, page, relay, doctor
+        The parts.
+    prefix : str
+        Path under which all is reached; empty, or with a slash in front and none behind.
+    title : str
+        Title of pages.
+    host_names : tuple of str
+        Names under which the server may be reached.
+    """
+    door = FrontDoor(served.access, page, served.limits, prefix, title)
+
+    async def healthz(_: Request) -> Response:
+        health = await doctor.health()
+        return JSONResponse(health.words(), 200 if health.is_well else 503)
+
+    async def metrics(request: Request) -> Response:
+        if not _may_read_figures(request, served):
+            return PlainTextResponse(
+                "this needs a token, or a request from the same machine\n", 403
+            )
+        await doctor.health()  # measures the database
+        return Response(served.figures.text(), media_type="text/plain; version=0.0.4")
+
+    devices = [WebSocketRoute(path, _endpoint(place)) for path, place in DEVICES.items()]
+    routes: list[BaseRoute] = [
+        Route("/", door.view, methods=["GET"]),
+        Route("/sign-in", door.sign_in, methods=["POST"]),
+        Route("/healthz", healthz, methods=["GET"]),
+        Route("/metrics", metrics, methods=["GET"]),
+        WebSocketRoute("/", relay.browser),
+        *devices,
+    ]
+    # viser's client leaves out the last slash of the page's address
+    bare: list[BaseRoute] = [WebSocketRoute(prefix, relay.browser)] if prefix else []
+    app = Starlette(routes=[*bare, Mount(prefix, routes=routes)] if prefix else routes)
+    app.state.served = served
+    return Guards(app, host_names)
+
+
+def _endpoint(place: str):  # type: ignore[no-untyped-def]  # noqa: ANN202 - Starlette's endpoint
+    module, name = place.split(":")
+    return getattr(import_module(module), name)
+
+
+def _may_read_figures(request: Request, served: Served) -> bool:
+    """Whether a request comes from this machine and by no proxy, or shows a token."""
+    shown = request.headers.get("authorization") or served.access.cookie_of(request.headers)
+    if shown and served.access.role_of_headers(request.headers) is not None:
+        return True
+    address = request.client.host if request.client is not None else ""
+    is_direct = not any(name in request.headers for name in FORWARDED)
+    return address in LOOPBACK and is_direct and request.url.hostname in LOOPBACK

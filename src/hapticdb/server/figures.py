@@ -1,0 +1,68 @@
+"""What the server counts, for Prometheus; docs/serving.md names each figure."""
+
+from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
+from prometheus_client.registry import Collector
+
+DATABASE_BUCKETS = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
+"""Limits in seconds between which answers of the database are counted."""
+
+
+class Figures:
+    """Counters of one server."""
+
+    def __init__(self) -> None:
+        self.registry = CollectorRegistry()
+        self.browsers = Gauge(
+            "hapticdb_browsers", "Browsers that are connected.", ["role"], registry=self.registry
+        )
+        self.connections = Counter(
+            "hapticdb_browser_connections",
+            "Connections of browsers, by how they ended or why they were refused.",
+            ["end"],
+            registry=self.registry,
+        )
+        self.messages = Counter(
+            "hapticdb_relay_messages",
+            "Messages of browsers that were passed to the page.",
+            registry=self.registry,
+        )
+        self.dropped = Counter(
+            "hapticdb_relay_messages_dropped",
+            "Messages of browsers that were not passed: malformed, type, role, size or rate.",
+            ["reason"],
+            registry=self.registry,
+        )
+        self.relayed = Counter(
+            "hapticdb_relay_bytes",
+            "Bytes of messages, from browsers (in) and to them (out).",
+            ["direction"],
+            registry=self.registry,
+        )
+        self.throttled = Counter(
+            "hapticdb_relay_throttled_seconds",
+            "Seconds for which browsers that sent too much had to wait.",
+            registry=self.registry,
+        )
+        self.page_starts = Gauge(
+            "hapticdb_page_starts",
+            "How often the page process has been started.",
+            registry=self.registry,
+        )
+        self.database = Histogram(
+            "hapticdb_database_seconds",
+            "Time that the database takes to answer a health check.",
+            buckets=DATABASE_BUCKETS,
+            registry=self.registry,
+        )
+        for reason in ("malformed", "type", "role", "size", "rate"):
+            self.dropped.labels(reason)
+        for direction in ("in", "out"):
+            self.relayed.labels(direction)
+
+    def add(self, collector: Collector) -> None:
+        """Add figures that are read when they are asked for."""
+        self.registry.register(collector)
+
+    def text(self) -> bytes:
+        """All figures in the text format of Prometheus."""
+        return generate_latest(self.registry)

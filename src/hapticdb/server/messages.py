@@ -1,0 +1,217 @@
+"""Which messages of a browser reach the page, and in which form.
+
+viser's page process trusts its clients: a message may set any attribute of a widget, open a public
+tunnel, or hold a large upload in memory. So the relay decodes each message here, checks the type,
+size and range of every field, and sends on what it has encoded itself, never the client's bytes.
+"""
+
+import math
+from typing import Annotated, Literal, NamedTuple
+
+import msgspec
+from msgspec import Meta
+
+from hapticdb.server.access import Role
+
+FARTHEST = 1e9
+"""Greatest absolute value of a coordinate, metres, and of any other number. Larger: numbers that
+overflow where they are multiplied."""
+LARGEST_PICTURE = 16 << 20
+"""Most bytes of a picture that a browser sends on request. Larger: pictures of larger windows, and
+more memory for each browser that sends one."""
+LARGEST = 16 << 10
+"""Most bytes of any other message; a long text field fits. Larger: more to decode for each."""
+
+Real = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
+Whole = Annotated[int, Meta(ge=-(10**9), le=10**9)]
+Name = Annotated[str, Meta(max_length=512)]
+Text = Annotated[str, Meta(max_length=2048)]
+Three = tuple[Real, Real, Real]
+Four = tuple[Real, Real, Real, Real]
+Modifier = Annotated[str, Meta(max_length=64)] | None
+Some = Annotated[list[bool | Whole | Real | Text], Meta(max_length=64)]
+Value = bool | Whole | Real | Text | Some | None
+
+
+class _Message(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """A message of a browser; the names of its fields are viser's."""
+
+
+class ViewerCameraMessage(_Message, tag=True):
+    """Where the eye is."""
+
+    wxyz: Four
+    position: Three
+    fov: Real
+    near: Real
+    far: Real
+    image_height: Whole
+    image_width: Whole
+    look_at: Three
+    up_direction: Three
+
+
+class ScenePointerMessage(_Message, tag=True):
+    """A click into the scene."""
+
+    event_type: Literal["click", "rect-select"]
+    ray_origin: Three | None
+    ray_direction: Three | None
+    screen_pos: Annotated[list[tuple[Real, Real]], Meta(max_length=4)]
+    modifier: Modifier = None
+
+
+class SceneNodeClickMessage(_Message, tag=True):
+    """A click on a part."""
+
+    name: Name
+    instance_index: Whole | None
+    ray_origin: Three
+    ray_direction: Three
+    screen_pos: tuple[Real, Real]
+    modifier: Modifier = None
+    owner: Name = ""
+
+
+class TransformControlsUpdateMessage(_Message, tag=True):
+    """A gizmo moves."""
+
+    name: Name
+    wxyz: Four
+    position: Three
+    owner: Name = ""
+
+
+class TransformControlsDragStartMessage(_Message, tag=True):
+    """A gizmo is taken."""
+
+    name: Name
+    owner: Name = ""
+
+
+class TransformControlsDragEndMessage(_Message, tag=True):
+    """A gizmo is let go."""
+
+    name: Name
+    owner: Name = ""
+
+
+class ValueUpdate(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+    """The only attribute of a widget that a browser sets."""
+
+    value: Value
+
+
+class GuiUpdateMessage(_Message, tag=True):
+    """A widget has a new value."""
+
+    uuid: Name
+    updates: ValueUpdate
+
+
+class CommandTriggerMessage(_Message, tag=True):
+    """A command was chosen, or its key pressed."""
+
+    uuid: Name
+
+
+class GetRenderResponseMessage(_Message, tag=True):
+    """A picture that the page has asked for."""
+
+    payload: Annotated[bytes, Meta(max_length=LARGEST_PICTURE)]
+    render_uuid: Name
+
+
+class _Tag(msgspec.Struct):
+    """The type of any message."""
+
+    type: str
+
+
+Known = (
+    ViewerCameraMessage
+    | ScenePointerMessage
+    | SceneNodeClickMessage
+    | TransformControlsUpdateMessage
+    | TransformControlsDragStartMessage
+    | TransformControlsDragEndMessage
+    | GuiUpdateMessage
+    | CommandTriggerMessage
+    | GetRenderResponseMessage
+)
+FOR_HANDS = (
+    TransformControlsUpdateMessage,
+    TransformControlsDragStartMessage,
+    TransformControlsDragEndMessage,
+)
+"""Messages of someone who holds a tool; a viewer holds none."""
+
+_decoder = msgspec.msgpack.Decoder(Known)
+_tag_decoder = msgspec.msgpack.Decoder(_Tag)
+_encoder = msgspec.msgpack.Encoder()
+
+Reason = Literal["malformed", "type", "role", "size"]
+
+
+class Verdict(NamedTuple):
+    """What becomes of a message: the bytes to send on, or the reason why there are none.
+
+    Attributes
+    ----------
+    passed : bytes or None
+        What the page gets.
+    reason : str
+        ``malformed``: it is not what viser's client writes; ``type``: a type that our page does
+        not use; ``role``: one that the browser's role may not send; ``size``: too large. Empty if
+        the message passes.
+    """
+
+    passed: bytes | None
+    reason: Reason | Literal[""] = ""
+
+
+def judged(message: bytes, role: Role) -> Verdict:
+    """Decode a browser's message, and encode anew what may pass."""
+    if len(message) > LARGEST_PICTURE + LARGEST:
+        return Verdict(None, "size")
+    try:
+        decoded = _decoder.decode(message)
+    except msgspec.ValidationError:
+        return Verdict(None, "malformed" if _is_known(message) else "type")
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return Verdict(None, "malformed")
+    if not isinstance(decoded, GetRenderResponseMessage):
+        if len(message) > LARGEST:
+            return Verdict(None, "size")
+        if not _is_finite(msgspec.structs.astuple(decoded)):
+            return Verdict(None, "malformed")
+    if role < Role.TOUCHER and isinstance(decoded, FOR_HANDS):
+        return Verdict(None, "role")
+    return Verdict(_encoder.encode(decoded))
+
+
+def is_large(message: bytes) -> bool:
+    """Whether only a picture may be as large as this message."""
+    return len(message) > LARGEST
+
+
+def _is_known(message: bytes) -> bool:
+    """Whether a message that does not hold what it should has a type of ours, or none."""
+    try:
+        tag = _tag_decoder.decode(message).type
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return True
+    return tag in TYPES
+
+
+def _is_finite(content: object) -> bool:
+    """Whether no number is "not a number", which passes comparisons with bounds."""
+    if isinstance(content, float):
+        return math.isfinite(content)
+    if isinstance(content, list | tuple):
+        return all(_is_finite(part) for part in content)
+    return not isinstance(content, ValueUpdate) or _is_finite(content.value)
+
+
+TYPES = frozenset(kind.__name__ for kind in Known.__args__)
+"""Names of the types that may pass."""

@@ -1,0 +1,190 @@
+"""The page process seen from the server: started, told who comes, and started again if it dies."""
+
+import asyncio
+import contextlib
+import json
+import logging
+import socket
+from collections.abc import Callable
+from typing import Protocol
+
+from hapticdb.errors import HapticDBError
+from hapticdb.page.link import LONGEST_LINE, announcement
+from hapticdb.realtime.processes import Process
+
+LOG = logging.getLogger("hapticdb.server")
+START_PATIENCE = 120.0
+"""Seconds that a page process has to become ready; it reads and prepares the whole scene."""
+ANSWER_PATIENCE = 2.0
+"""Seconds that the page has to answer an announcement. Larger: browsers wait longer for a page that
+hangs."""
+FIRST_PAUSE = 0.5
+"""Seconds before a page that died is started again; doubled each time that it dies again."""
+LONGEST_PAUSE = 30.0
+"""Greatest such pause. Larger: a page that cannot start costs less, and comes back later."""
+LASTING = 60.0
+"""Seconds that a page must live so that its pause begins small again."""
+
+
+class PageAwayError(HapticDBError):
+    """The page process does not answer now; it may be starting again."""
+
+
+class MakesRequest(Protocol):
+    """Makes the request of a page process, given the descriptors that it inherits."""
+
+    def __call__(self, *, link: int, host: int) -> object:
+        """Return a picklable request."""
+
+
+class PageKeeper:
+    """Keeps a page process running.
+
+    Parameters
+    ----------
+    work : str
+        Function of the process, as `Process` takes it; it sends ``ready`` with its port.
+    request : callable
+        Makes the request of each process that is started.
+    serve_host : callable
+        Takes the socket at whose other end the page begins its sessions.
+    """
+
+    def __init__(
+        self, work: str, request: MakesRequest, serve_host: Callable[[socket.socket], None]
+    ) -> None:
+        self._work, self._request, self._serve_host = work, request, serve_host
+        self._process: Process | None = None
+        self._writer: asyncio.StreamWriter | None = None
+        self._reader: asyncio.StreamReader | None = None
+        self._expected: dict[int, asyncio.Future[None]] = {}
+        self._is_stopping = False
+        self.port = 0
+        self.n_starts = 0
+        self.n_refused = 0
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether browsers can be let in now."""
+        return self._process is not None and self._process.is_alive and self.port != 0
+
+    @property
+    def pid(self) -> int:
+        """Process id of the page; 0 if it does not run."""
+        return self._process.pid if self._process is not None else 0
+
+    async def start(self) -> None:
+        """Start a page process and wait until it is ready.
+
+        Raises
+        ------
+        HapticDBError
+            With which the page ended, or because it did not become ready.
+        """
+        ours, theirs = socket.socketpair()
+        host_ours, host_theirs = socket.socketpair()
+        with theirs, host_theirs:
+            descriptors = theirs.fileno(), host_theirs.fileno()
+            request = self._request(link=descriptors[0], host=descriptors[1])
+            process = await asyncio.to_thread(Process, self._work, request, descriptors)
+        self._process = process  # `stop` can end it from now on
+        self._serve_host(host_ours)
+        try:
+            self.port = await asyncio.to_thread(_port_of, process)
+        except BaseException:
+            ours.close()
+            self._process = None
+            await asyncio.to_thread(process.end)
+            raise
+        self._reader, self._writer = await asyncio.open_connection(sock=ours, limit=LONGEST_LINE)
+        self.n_starts += 1
+        LOG.info("the page is ready", extra={"pid": process.pid})
+
+    async def keep(self) -> None:
+        """Listen to the page, and start it again each time that it ends; until `stop`."""
+        loop = asyncio.get_running_loop()
+        pause = FIRST_PAUSE
+        while True:
+            began = loop.time()
+            await self._listen()
+            if self._is_stopping:
+                return
+            await self._end()
+            if loop.time() - began > LASTING:
+                pause = FIRST_PAUSE
+            LOG.error("the page process ended; it is started again in %.3g s", pause)
+            await asyncio.sleep(pause)
+            pause = min(2.0 * pause, LONGEST_PAUSE)
+            try:
+                await self.start()
+            except HapticDBError as error:
+                LOG.error("the page cannot start: %s", error)  # noqa: TRY400 - its message says all
+
+    async def announce(self, port: int, name: str, role: str) -> int:
+        """Announce a browser that will connect from a port; returns the page's port.
+
+        Raises
+        ------
+        PageAwayError
+            If the page does not answer.
+        """
+        if not self.is_ready or self._writer is None:
+            raise PageAwayError("the page is starting; try again in a few seconds")
+        answer: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+        self._expected[port] = answer
+        try:
+            self._writer.write(announcement(port, name, role))
+            await asyncio.wait_for(answer, ANSWER_PATIENCE)
+        except (TimeoutError, OSError):
+            raise PageAwayError("the page does not answer; try again in a few seconds") from None
+        finally:
+            self._expected.pop(port, None)
+        return self.port
+
+    async def answers(self) -> bool:
+        """Whether the page answers now."""
+        try:
+            await self.announce(0, "", "viewer")
+        except PageAwayError:
+            return False
+        return True
+
+    async def stop(self) -> None:
+        """End the page process, which ends its sessions first."""
+        self._is_stopping = True
+        await self._end()
+
+    async def _listen(self) -> None:
+        """Take the page's messages until it ends."""
+        reader = self._reader
+        if reader is None:
+            return
+        with contextlib.suppress(OSError, ValueError):
+            while received := await reader.readline():
+                message = json.loads(received)
+                answer = self._expected.get(message["port"])
+                if message["word"] == "expected" and answer is not None and not answer.done():
+                    answer.set_result(None)
+                elif message["word"] == "refused":
+                    self.n_refused += 1
+                    LOG.warning("a connection to the page went round the server: closed")
+
+    async def _end(self) -> None:
+        self.port = 0
+        for answer in self._expected.values():
+            if not answer.done():
+                answer.set_exception(PageAwayError("the page ended; try again in a few seconds"))
+        process, writer = self._process, self._writer
+        self._process = self._reader = self._writer = None
+        if process is not None:
+            await asyncio.to_thread(process.end)
+        if writer is not None:
+            writer.close()
+
+
+def _port_of(process: Process) -> int:
+    """Wait until a page process is ready; its port."""
+    message = process.receive(START_PATIENCE)
+    if message is None:
+        raise HapticDBError("the page process ended before it was ready")
+    return int(message.content)

@@ -1,0 +1,244 @@
+"""Relays the WebSocket of a browser to the page, message by message, within limits.
+
+From the browser only what `messages.judged` lets pass, as fast as the limits allow; to the browser
+everything, and no faster than it reads.
+"""
+
+import asyncio
+import contextlib
+import logging
+import re
+import socket
+from collections.abc import Coroutine, Iterator
+
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from websockets.asyncio.client import ClientConnection, connect
+from websockets.exceptions import ConnectionClosed, InvalidHandshake
+from websockets.typing import Subprotocol
+
+from hapticdb.server.access import Access, Role
+from hapticdb.server.figures import Figures
+from hapticdb.server.limits import Limits, TokenBucket
+from hapticdb.server.messages import is_large, judged
+from hapticdb.server.page_keeper import PageAwayError, PageKeeper
+
+LOG = logging.getLogger("hapticdb.server")
+VERSION = re.compile(r"viser-v[0-9A-Za-z.+-]{1,32}")
+"""The subprotocol by which viser's client names its version; the page compares it."""
+WAITING_MESSAGES = 4
+"""Messages of the page that wait for one browser. Larger: a browser that reads slowly holds more
+memory, before the page waits for it."""
+CONNECT_PATIENCE = 5.0
+"""Seconds for the connection to the page."""
+RENEW_EVERY = 60.0
+"""Seconds between two looks at a browser's cookie. Larger: a cookie that became invalid works
+longer."""
+
+GOING_AWAY, POLICY, TOO_LARGE, TRY_LATER, SIGNED_OUT = 1001, 1008, 1009, 1013, 4401
+"""WebSocket close codes; the last one is ours."""
+
+
+class Closing(Exception):  # noqa: N818 - an end, and not always an error
+    """Ends a browser's connection with a code and words for its console.
+
+    reason : str
+        The figure that counts it.
+    """
+
+    def __init__(self, code: int, words: str, reason: str) -> None:
+        super().__init__(words)
+        self.code, self.words, self.reason = code, words, reason
+
+
+class Relay:
+    """Connects browsers with the page.
+
+    Parameters
+    ----------
+    access : Access
+        Roles of browsers.
+    keeper : PageKeeper
+        The page.
+    limits : Limits
+        What one browser, and all together, may do.
+    figures : Figures
+        Counts what passes and what does not.
+    """
+
+    def __init__(
+        self, access: Access, keeper: PageKeeper, limits: Limits, figures: Figures
+    ) -> None:
+        self._access, self._keeper = access, keeper
+        self._limits, self._figures = limits, figures
+        self._arrivals = TokenBucket(limits.browsers_per_second, limits.browsers_at_once)
+        self._numbers: set[int] = set()
+
+    @property
+    def n_browsers(self) -> int:
+        """Number of browsers that are connected."""
+        return len(self._numbers)
+
+    async def browser(self, websocket: WebSocket) -> None:
+        """Serve one browser until it or the page leaves, or a limit ends it."""
+        reason = "refused"
+        try:
+            reason = await self._served(websocket)
+        except Closing as closing:
+            reason = closing.reason
+            LOG.info("a browser's connection ends: %s", closing.words)
+            if websocket.application_state is not WebSocketState.DISCONNECTED:
+                with contextlib.suppress(RuntimeError, WebSocketDisconnect):
+                    await websocket.close(closing.code, closing.words)
+        finally:
+            self._figures.connections.labels(reason).inc()
+
+    async def _served(self, websocket: WebSocket) -> str:
+        """Serve a browser; returns why it ended."""
+        role = self._access.role_of_headers(websocket.headers)
+        if role is None:
+            raise Closing(POLICY, "sign in first", "refused")
+        if len(self._numbers) >= self._limits.browsers or not self._arrivals.take():
+            raise Closing(TRY_LATER, "too many browsers; try again later", "full")
+        offered = [Subprotocol(p) for p in websocket.scope["subprotocols"] if VERSION.fullmatch(p)]
+        if len(offered) != 1:
+            raise Closing(POLICY, "this is no browser's page", "refused")
+        with self._numbered() as number:
+            name = f"Guest {number}"
+            upstream = await self._connected(name, role, offered[0])
+            try:
+                await websocket.accept(upstream.subprotocol)
+                LOG.info("a browser is connected", extra={"guest": name, "role": role.word})
+                with self._figures.browsers.labels(role.word).track_inprogress():
+                    return await _either(
+                        self._up(websocket, upstream, role), self._down(websocket, upstream)
+                    )
+            finally:
+                await upstream.close(GOING_AWAY)
+                LOG.info("a browser has left", extra={"guest": name, "role": role.word})
+
+    @contextlib.contextmanager
+    def _numbered(self) -> Iterator[int]:
+        """Give a browser the smallest number that is free."""
+        number = next(n for n in range(1, len(self._numbers) + 2) if n not in self._numbers)
+        self._numbers.add(number)
+        try:
+            yield number
+        finally:
+            self._numbers.discard(number)
+
+    async def _connected(self, name: str, role: Role, version: Subprotocol) -> ClientConnection:
+        """Connect to the page from a port that was announced before."""
+        sock = socket.socket()
+        try:
+            sock.setblocking(False)  # noqa: FBT003 - its only argument
+            sock.bind(("127.0.0.1", 0))
+            port = await self._keeper.announce(sock.getsockname()[1], name, role.word)
+            await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
+            return await connect(
+                f"ws://127.0.0.1:{port}/",
+                sock=sock,
+                subprotocols=[version],
+                compression=None,  # it costs more time than the loopback interface needs
+                max_size=None,
+                max_queue=WAITING_MESSAGES,
+                ping_interval=None,
+                open_timeout=CONNECT_PATIENCE,
+                proxy=None,
+            )
+        except (PageAwayError, OSError, InvalidHandshake, TimeoutError) as error:
+            sock.close()
+            LOG.warning("the page cannot be reached: %s", error)
+            raise Closing(TRY_LATER, "the page is starting; try again", "page away") from None
+
+    async def _up(self, websocket: WebSocket, upstream: ClientConnection, role: Role) -> str:
+        """Pass on what the browser sends, as far as it may."""
+        strict = _Strictness(self._limits, self._figures)
+        cookie = self._access.cookie_of(websocket.headers)
+        renewed = 0.0
+        while True:
+            try:
+                async with asyncio.timeout(self._limits.idle_seconds):
+                    received = await websocket.receive()
+            except TimeoutError:
+                raise Closing(GOING_AWAY, "nothing was done for a long time", "idle") from None
+            if received["type"] == "websocket.disconnect":
+                return "left"
+            message = received.get("bytes") or b""
+            self._figures.relayed.labels("in").inc(len(message))
+            await strict.wait_for(message)
+            verdict = judged(message, role)
+            if verdict.passed is None:
+                strict.refuse(verdict.reason)
+                continue
+            now = asyncio.get_running_loop().time()
+            if cookie and now - renewed > RENEW_EVERY:
+                renewed = now
+                if not self._access.renew(cookie):
+                    raise Closing(SIGNED_OUT, "signed out", "signed out")
+            if is_large(message) and not strict.pictures.take():
+                strict.refuse("rate")
+                continue
+            self._figures.messages.inc()
+            try:
+                await upstream.send(verdict.passed)
+            except ConnectionClosed:
+                return "page ended"
+
+    async def _down(self, websocket: WebSocket, upstream: ClientConnection) -> str:
+        """Pass on what the page sends."""
+        sent = self._figures.relayed.labels("out")
+        with contextlib.suppress(ConnectionClosed, WebSocketDisconnect):
+            async for message in upstream:
+                if isinstance(message, bytes):
+                    sent.inc(len(message))
+                    await websocket.send_bytes(message)
+            code = upstream.close_code or GOING_AWAY
+            # 1002 tells viser's client that its version is another one
+            raise Closing(code if code == 1002 else GOING_AWAY, "the page has ended", "page ended")
+        return "page ended" if upstream.close_code is not None else "left"
+
+
+class _Strictness:
+    """Slows down a browser that sends too much, and ends one that goes on."""
+
+    def __init__(self, limits: Limits, figures: Figures) -> None:
+        self._limits, self._figures = limits, figures
+        self._messages = TokenBucket(limits.messages_per_second, limits.messages_at_once)
+        self._bytes = TokenBucket(limits.bytes_per_second, limits.bytes_at_once)
+        self.pictures = TokenBucket(limits.pictures_per_second, limits.pictures_at_once)
+        self._n_bad = 0
+        self._throttled = 0.0
+
+    async def wait_for(self, message: bytes) -> None:
+        """Wait until the browser may send that message; the browser's own queue grows meanwhile."""
+        size = 0 if is_large(message) else len(message)
+        wait = max(self._messages.wait(), self._bytes.wait(size))
+        if wait > 0.0:
+            self._throttled += wait
+            self._figures.throttled.inc(wait)
+            if self._throttled > self._limits.throttled_seconds:
+                raise Closing(POLICY, "too many messages", "flood")
+            await asyncio.sleep(wait)
+        elif self._messages.wait(self._limits.messages_at_once / 2.0) == 0.0:
+            self._throttled = 0.0  # it has paused
+        self._messages.take()
+        self._bytes.take(size)
+
+    def refuse(self, reason: str) -> None:
+        """Count a message that does not pass."""
+        self._figures.dropped.labels(reason).inc()
+        self._n_bad += 1
+        if self._n_bad > self._limits.bad_messages:
+            raise Closing(POLICY, "too many messages that mean nothing here", "bad messages")
+
+
+async def _either(*works: Coroutine[None, None, str]) -> str:
+    """Run both directions until one ends, and end the other."""
+    tasks = [asyncio.create_task(work) for work in works]
+    try:
+        done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
+        return next(iter(done)).result()
+    finally:
+        for task in tasks:
+            task.cancel()
+        await asyncio.gather(*tasks, return_exceptions=True)

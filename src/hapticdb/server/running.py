@@ -1,0 +1,257 @@
+"""A server from its start to its end: the processes, the order in which they begin and stop."""
+
+import asyncio
+import contextlib
+import ipaddress
+import logging
+import re
+import socket
+import ssl
+from collections.abc import Awaitable, Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import uvicorn
+
+from hapticdb.errors import UsageError
+from hapticdb.hosting.host import SessionHost
+from hapticdb.page.link import PageRequest
+from hapticdb.server.access import Access, Role
+from hapticdb.server.app import application
+from hapticdb.server.client_page import client_page
+from hapticdb.server.figures import Figures
+from hapticdb.server.guards import is_address
+from hapticdb.server.health import Doctor, HostCollector
+from hapticdb.server.limits import Limits
+from hapticdb.server.messages import LARGEST, LARGEST_PICTURE
+from hapticdb.server.page_keeper import PageKeeper
+from hapticdb.server.relay import Relay
+from hapticdb.server.served import Served
+from hapticdb.server.transports import limited
+
+if TYPE_CHECKING:
+    from starlette.types import ASGIApp
+
+LOG = logging.getLogger("hapticdb.server")
+PAGE = "hapticdb.page.process:work"
+"""The page's process."""
+PING_EVERY = 20.0
+"""Seconds between two pings to a browser, and for its answer. Larger: a browser that vanished holds
+its session longer."""
+PREFIX = re.compile(r"(/[A-Za-z0-9_-]+)*")
+"""What a prefix may be."""
+HEADER_BYTES = 16 << 10
+"""Most bytes of the headers of a request."""
+
+
+@dataclass(frozen=True)
+class Serving:
+    """What a server is started with.
+
+    Attributes
+    ----------
+    urls : mapping of Role to str
+        The environment's address for each role.
+    tools : tuple of str
+        Files of tools.
+    tokens : mapping of str to Role
+        What each token gives.
+    open_role : Role or None
+        Role of clients without a token.
+    host, port : str, int
+        Where it listens; 0 is a free port.
+    prefix : str
+        Path under which it is reached, such as ``/hapticdb``; empty for none.
+    host_names : tuple of str
+        Names under which it may be reached.
+    folders : tuple of str or None
+        Folders below which objects' files may be read; None: those of the files as imported.
+    certificate, key : str or None
+        Files of TLS.
+    title : str
+        Title of the page.
+    limits : Limits
+        What clients may ask for.
+    page : str
+        Function of the page's process.
+    """
+
+    urls: Mapping[Role, str]
+    tools: tuple[str, ...] = ()
+    tokens: Mapping[str, Role] = field(default_factory=dict)
+    open_role: Role | None = None
+    host: str = "127.0.0.1"
+    port: int = 0
+    prefix: str = ""
+    host_names: tuple[str, ...] = ()
+    folders: tuple[str, ...] | None = None
+    certificate: str | None = None
+    key: str | None = None
+    title: str = "hapticdb"
+    limits: Limits = field(default_factory=Limits)
+    page: str = PAGE
+
+    def address(self, port: int, token: str = "") -> str:
+        """Address for a browser on this machine."""
+        scheme = "http" if self.certificate is None else "https"
+        host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self.host, self.host)  # noqa: S104 - compared
+        if ":" in host and not host.startswith("["):
+            host = f"[{host}]"
+        query = f"?token={token}" if token else ""
+        return f"{scheme}://{host}:{port}{self.prefix}/{query}"
+
+
+class _Server(uvicorn.Server):
+    """uvicorn without its signal handlers: the verb has its own."""
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+
+def check(serving: Serving) -> None:
+    """Refuse what must not be served.
+
+    Raises
+    ------
+    UsageError
+        If another machine could reach the server without a token; if a prefix, or the files of
+        TLS, cannot be used.
+    """
+    if not is_near(serving.host) and serving.open_role is not None:
+        raise UsageError(
+            f"--host {serving.host}: other machines can reach that address, so clients need a "
+            "token; add --token"
+        )
+    if not PREFIX.fullmatch(serving.prefix):
+        raise UsageError(f"--prefix {serving.prefix}: write it as /name")
+    if (serving.certificate is None) != (serving.key is None):
+        raise UsageError("--tls-cert and --tls-key belong together: give both")
+    if serving.certificate is not None:
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(
+                serving.certificate, serving.key
+            )
+        except (OSError, ssl.SSLError) as error:
+            raise UsageError(f"--tls-cert {serving.certificate}: cannot be used: {error}") from None
+
+
+def is_near(host: str) -> bool:
+    """Whether only this machine reaches that address."""
+    if is_address(host):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+def listening(serving: Serving) -> socket.socket:
+    """Bind the server's socket; a UsageError if the address cannot be had."""
+    try:
+        found = socket.getaddrinfo(
+            serving.host, serving.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )
+        return socket.create_server(found[0][4][:2], family=found[0][0], backlog=128)
+    except (OSError, OverflowError) as error:
+        raise UsageError(
+            f"cannot listen on port {serving.port} of {serving.host}: {error}; choose another by "
+            "--port, 0 for a free one"
+        ) from None
+
+
+async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Event) -> None:
+    """Serve until `stop` is set; then end in order, so that no recording is lost.
+
+    First no connection is taken any more and browsers are told to go; then the page ends its
+    sessions; then the host ends those that are left and finishes their recordings.
+
+    Parameters
+    ----------
+    serving : Serving
+        What is served, and how.
+    ready : callable
+        Called with the port when browsers can come.
+    stop : asyncio.Event
+        Set when the server shall end.
+    """
+    check(serving)
+    page = await asyncio.to_thread(client_page, serving.title)
+    async with contextlib.AsyncExitStack() as ends:
+        sock = ends.enter_context(listening(serving))
+        port = int(sock.getsockname()[1])
+        access = Access(serving.tokens, open_role=serving.open_role, port=port)
+        host = await asyncio.to_thread(SessionHost, serving.urls[Role.VIEWER])
+        ends.push_async_callback(asyncio.to_thread, host.close)
+        served = Served(serving.urls, serving.tools, access, serving.limits, Figures(), host)
+        served.figures.add(HostCollector(host))
+        keeper = PageKeeper(serving.page, partial(_page_request, serving), host.serve)
+        served.figures.page_starts.set_function(lambda: keeper.n_starts)
+        ends.push_async_callback(keeper.stop)
+        if not await _unless(stop, keeper.start()):
+            return
+        keeping = asyncio.create_task(keeper.keep())
+        ends.push_async_callback(_cancelled, keeping)
+        doctor = Doctor(served, keeper)
+        ends.push_async_callback(asyncio.to_thread, doctor.close)
+        app = application(
+            served, page, Relay(access, keeper, serving.limits, served.figures), doctor,
+            prefix=serving.prefix, title=serving.title, host_names=serving.host_names,
+        )  # fmt: skip
+        server = _Server(_config(app, serving))
+        running = asyncio.create_task(server.serve([sock]))
+        ready(port)
+        LOG.info("serving", extra={"port": port})
+        await _unless(stop, asyncio.shield(running))
+        LOG.info("stopping")
+        server.should_exit = True
+        await running
+    LOG.info("stopped")
+
+
+def _page_request(serving: Serving, *, link: int, host: int) -> PageRequest:
+    urls = {role.word: url for role, url in serving.urls.items()}
+    return PageRequest(urls, serving.tools, serving.folders, link, host)
+
+
+async def _unless(stop: asyncio.Event, work: Awaitable[None]) -> bool:
+    """Wait for work; returns False as soon as `stop` is set before its end."""
+    stopping = asyncio.create_task(stop.wait())
+    working = asyncio.ensure_future(work)
+    try:
+        await asyncio.wait([working, stopping], return_when=asyncio.FIRST_COMPLETED)
+        if not working.done():
+            return False
+        await working
+        return True
+    finally:
+        stopping.cancel()
+        working.cancel()
+
+
+async def _cancelled(task: "asyncio.Task[None]") -> None:
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+
+
+def _config(app: "ASGIApp", serving: Serving) -> uvicorn.Config:
+    limits = serving.limits
+    http, websocket = limited(limits)
+    return uvicorn.Config(
+        app,
+        http=http,
+        ws=websocket,
+        ws_max_size=LARGEST_PICTURE + LARGEST,
+        ws_per_message_deflate=False,  # compressing costs more time than it saves here
+        ws_ping_interval=PING_EVERY,
+        ws_ping_timeout=PING_EVERY,
+        lifespan="off",
+        log_config=None,
+        access_log=False,
+        server_header=False,
+        limit_concurrency=limits.connections,
+        timeout_graceful_shutdown=max(int(limits.stop_seconds), 1),
+        h11_max_incomplete_event_size=HEADER_BYTES,
+        ssl_certfile=None if serving.certificate is None else Path(serving.certificate),
+        ssl_keyfile=None if serving.key is None else Path(serving.key),
+    )

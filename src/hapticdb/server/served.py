@@ -1,0 +1,37 @@
+"""What the endpoints of one server share."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from hapticdb.hosting.host import SessionHost
+from hapticdb.server.access import Access, Role
+from hapticdb.server.figures import Figures
+from hapticdb.server.limits import Limits
+
+
+@dataclass(frozen=True)
+class Served:
+    """An environment as one server offers it; endpoints find it as ``app.state.served``.
+
+    Attributes
+    ----------
+    urls : mapping of Role to str
+        The environment's address for each role.
+    tools : tuple of str
+        Files of the tools that the operator offers.
+    access : Access
+        What a client may do, by the headers of its request.
+    limits : Limits
+        What one client, and all together, may ask for.
+    figures : Figures
+        Counters for the operator.
+    host : SessionHost
+        Where sessions run.
+    """
+
+    urls: Mapping[Role, str]
+    tools: tuple[str, ...]
+    access: Access
+    limits: Limits
+    figures: Figures
+    host: SessionHost

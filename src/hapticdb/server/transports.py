@@ -1,0 +1,77 @@
+"""uvicorn's protocols with limits that it does not have itself."""
+
+import asyncio
+from typing import Any, ClassVar
+
+from uvicorn.protocols.http.h11_impl import H11Protocol
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.frames import Frame
+
+from hapticdb.server.limits import Limits, TokenBucket
+
+PROTOCOL_ERROR, POLICY = 1002, 1008
+"""WebSocket close codes."""
+
+
+class PatientHttp(H11Protocol):
+    """Cuts connections that do not send a complete request in time."""
+
+    limits: ClassVar[Limits] = Limits()
+
+    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
+        """Begin the time for the first request."""
+        super().connection_made(transport)
+        self.loop.call_later(self.limits.request_seconds, self._cut_if_silent)
+
+    def _cut_if_silent(self) -> None:
+        is_waiting = self.transport.get_protocol() is self and self.cycle is None
+        if is_waiting and not self.transport.is_closing():
+            self.transport.close()
+
+
+class StrictWebSocket(WebSocketsSansIOProtocol):
+    """Ends connections that send messages in too many pieces, or too many pings."""
+
+    limits: ClassVar[Limits] = Limits()
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:  # noqa: ANN401 - uvicorn's own
+        super().__init__(*args, **kwargs)
+        self._pings = TokenBucket(self.limits.pings_per_second, self.limits.pings_at_once)
+
+    def handle_cont(self, event: Frame) -> None:
+        """Take a further piece of a message."""
+        if len(self.frames) >= self.limits.fragments:
+            self._fail(PROTOCOL_ERROR, "a message in too many pieces")
+            return
+        super().handle_cont(event)
+
+    def handle_ping(self) -> None:
+        """Answer a ping."""
+        if self._pings.take():
+            super().handle_ping()
+        else:
+            self._fail(POLICY, "too many pings")
+
+    def handle_pong(self, event: Frame) -> None:
+        """Take a pong, which may be unasked."""
+        if self._pings.take():
+            super().handle_pong(event)
+        else:
+            self._fail(POLICY, "too many pongs")
+
+    def _fail(self, code: int, words: str) -> None:
+        if self.transport.is_closing():
+            return
+        self.conn.fail(code, words)
+        self.queue.put_nowait({"type": "websocket.disconnect", "code": code, "reason": words})
+        self.transport.write(b"".join(self.conn.data_to_send()))
+        self.close_sent = True
+        self.transport.close()
+
+
+def limited(limits: Limits) -> tuple[type[PatientHttp], type[StrictWebSocket]]:
+    """Protocols under these limits."""
+    return (
+        type("LimitedHttp", (PatientHttp,), {"limits": limits}),
+        type("LimitedWebSocket", (StrictWebSocket,), {"limits": limits}),
+    )

@@ -1,0 +1,48 @@
+"""A small page for tests of the server: a viser server with one slider and one gizmo."""
+
+import threading
+import time
+from typing import Any
+
+import viser
+
+from hapticdb.page.link import PageLink, PageRequest
+from hapticdb.realtime.processes import MessageSender, parent_is_gone
+
+
+def work(request: PageRequest, sender: MessageSender) -> None:
+    """Serve the page until the server ends."""
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    link = PageLink(request.link)
+    link.guard(server)
+    slider = server.gui.add_slider("slider", 0.0, 1.0, 0.1, 0.5)
+    said = server.gui.add_markdown("nothing yet")
+    clock = server.scene.add_label("/clock", "0")
+    gizmo = server.scene.add_transform_controls("/gizmo")
+
+    @slider.on_update
+    def _(_: Any) -> None:
+        said.content = f"slider {slider.value}"
+
+    @gizmo.on_update
+    def _(_: Any) -> None:
+        said.content = f"gizmo {gizmo.position[0]:.3f}"
+
+    @server.on_client_connect
+    def _(client: viser.ClientHandle) -> None:
+        who = link.announced(client.client_id)
+        client.gui.add_markdown(f"{who.name} is a {who.role}")
+
+    sender.send("ready", server.get_port())
+    number = 0
+    while not parent_is_gone():
+        number += 1
+        clock.text = str(number)
+        time.sleep(0.02)
+    server.stop()
+    threading.Event().wait(0.01)
+
+
+def fail(_request: PageRequest, _sender: MessageSender) -> None:
+    """Cannot start."""
+    raise OSError("no such scene")

@@ -11,6 +11,7 @@ from pathlib import Path
 import msgspec
 import viser
 from websockets.sync.client import ClientConnection, connect
+from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
 
 from children import PATIENCE, joined
@@ -114,12 +115,12 @@ def running(serving: Serving) -> Iterator[Running]:
     assert errors == []
 
 
-def sent(connection: ClientConnection, message: object) -> None:
+def sent(connection: Connection, message: object) -> None:
     """Send a message as viser's client encodes it."""
     connection.send(msgspec.msgpack.encode(message))
 
 
-def messages(connection: ClientConnection, seconds: float = PATIENCE) -> list[dict[str, object]]:
+def messages(connection: Connection, seconds: float = PATIENCE) -> list[dict[str, object]]:
     """Messages of the next frame of the page."""
     import zstandard  # noqa: PLC0415 - comes with viser
 
@@ -131,7 +132,7 @@ def messages(connection: ClientConnection, seconds: float = PATIENCE) -> list[di
     return found
 
 
-def text_until(connection: ClientConnection, words: str) -> str:
+def text_until(connection: Connection, words: str) -> str:
     """Read what the page sends until these words are in it; all that was read."""
     seen = ""
     while words not in seen:

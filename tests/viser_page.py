@@ -2,7 +2,6 @@
 
 import threading
 import time
-from typing import Any
 
 import viser
 
@@ -21,11 +20,11 @@ def work(request: PageRequest, sender: MessageSender) -> None:
     gizmo = server.scene.add_transform_controls("/gizmo")
 
     @slider.on_update
-    def _(_: Any) -> None:
+    def _(_: object) -> None:
         said.content = f"slider {slider.value}"
 
     @gizmo.on_update
-    def _(_: Any) -> None:
+    def _(_: object) -> None:
         said.content = f"gizmo {gizmo.position[0]:.3f}"
 
     @server.on_client_connect

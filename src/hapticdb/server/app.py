@@ -1,5 +1,6 @@
 """The application: which path leads where."""
 
+import asyncio
 import logging
 from importlib import import_module
 
@@ -60,7 +61,8 @@ def application(
                 "this needs a token, or a request from the same machine\n", 403
             )
         await doctor.health()  # measures the database
-        return Response(served.figures.text(), media_type="text/plain; version=0.0.4")
+        text = await asyncio.to_thread(served.figures.text)  # sessions may be beginning
+        return Response(text, media_type="text/plain; version=0.0.4")
 
     devices = [WebSocketRoute(path, _endpoint(place)) for path, place in DEVICES.items()]
     routes: list[BaseRoute] = [

@@ -87,7 +87,8 @@ def _policy(scripts: list[bytes]) -> str:
             "default-src 'none'",
             f"script-src {digests} 'wasm-unsafe-eval'",  # zstd is WebAssembly
             "worker-src blob:",  # the socket's worker is part of the program
-            "connect-src 'self'",
+            # data: and blob: are the page's own bytes (its light, textures): nothing leaves by them
+            "connect-src 'self' data: blob:",
             "img-src 'self' data: blob:",
             "font-src data:",
             "style-src 'unsafe-inline'",  # widgets set styles; a style runs nothing

@@ -1,6 +1,7 @@
 """Whether each part of a running server answers, and the figures of sessions and their tables."""
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Iterator
@@ -11,8 +12,9 @@ from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
 from hapticdb.environment import Environment
-from hapticdb.errors import HapticDBError
+from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.host import SessionHost
+from hapticdb.hosting.hosted import HostedFigures
 from hapticdb.server.access import Role
 from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.served import Served
@@ -71,10 +73,8 @@ class Doctor:
             if self._last is not None and now - self._last[0] < GOOD_FOR:
                 return self._last[1]
             database, page = await asyncio.gather(self._asked(), self._keeper.answers())
-            host = self._served.host
-            is_fetching = host.failure is None
-            are_working = all(not session.is_lost for session in host.sessions())
-            found = Health(database, is_fetching, are_working, page)
+            are_working = await asyncio.to_thread(self._are_working)
+            found = Health(database, self._served.host.failure is None, are_working, page)
             if not found.is_well:
                 LOG.warning("a part does not answer", extra=found.words())
             self._last = (now, found)
@@ -84,6 +84,10 @@ class Doctor:
         """Close the connection to the database."""
         self._thread.submit(self._forget)
         self._thread.shutdown(wait=True)
+
+    def _are_working(self) -> bool:
+        """Whether no session has lost its process."""
+        return not any(session.is_over for session in self._served.host.sessions())
 
     async def _asked(self) -> bool:
         loop = asyncio.get_running_loop()
@@ -128,12 +132,11 @@ class HostCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield one family of figures after another."""
-        sessions = self._host.sessions()
-        yield GaugeMetricFamily("hapticdb_sessions", "Sessions that run.", len(sessions))
+        figures = self._figures()
+        yield GaugeMetricFamily("hapticdb_sessions", "Sessions that run.", len(figures))
         yield GaugeMetricFamily(
             "hapticdb_workers", "Worker processes that run.", len(self._host.pids)
         )
-        figures = [session.figures() for session in sessions]
         for name, words, values in (
             ("frames", "Frames of the sessions that run.", [f.frames for f in figures]),
             ("missed", "Deadlines at which no frame began.", [f.missed for f in figures]),
@@ -154,14 +157,22 @@ class HostCollector(Collector):
                 f"hapticdb_session_{name}_seconds", f"{words} Of the worst session.",
                 labels=["quantile"],
             )  # fmt: skip
-            for quantile, values in (
+            for quantile, times in (
                 ("0.5", [spread.p50 for spread in spreads]),
                 ("0.99", [spread.p99 for spread in spreads]),
                 ("1", [spread.worst for spread in spreads]),
             ):
-                family.add_metric([quantile], max(values, default=0.0))
+                family.add_metric([quantile], max(times, default=0.0))
             yield family
         yield from self._cells()
+
+    def _figures(self) -> list[HostedFigures]:
+        """Figures of the sessions that run; one may end meanwhile."""
+        found = []
+        for session in self._host.sessions():
+            with contextlib.suppress(UsageError):
+                found.append(session.figures())
+        return found
 
     def _cells(self) -> Iterator[Metric]:
         """Figures of the tables of cells, added up; of times the worst."""

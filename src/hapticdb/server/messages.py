@@ -33,7 +33,7 @@ Some = Annotated[list[bool | Whole | Real | Text], Meta(max_length=64)]
 Value = bool | Whole | Real | Text | Some | None
 
 
-class _Message(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+class _Message(msgspec.Struct, forbid_unknown_fields=True):
     """A message of a browser; the names of its fields are viser's."""
 
 
@@ -96,7 +96,7 @@ class TransformControlsDragEndMessage(_Message, tag=True):
     owner: Name = ""
 
 
-class ValueUpdate(msgspec.Struct, forbid_unknown_fields=True, frozen=True):
+class ValueUpdate(msgspec.Struct, forbid_unknown_fields=True):
     """The only attribute of a widget that a browser sets."""
 
     value: Value

@@ -95,7 +95,7 @@ class FrontDoor:
         answer.set_cookie(
             self._access.cookie_name,
             cookie,
-            path=f"{self._prefix}/",
+            path=self._prefix or "/",  # the socket of viser has no slash behind the prefix
             secure=request.url.scheme == "https",
             httponly=True,
             samesite="strict",

@@ -1,0 +1,51 @@
+"""docs/serving.md gives the limits and figures that the code has, and deploy/ what it promises."""
+
+import re
+from pathlib import Path
+
+from hapticdb.hosting.host import SessionHost
+from hapticdb.server import access, messages
+from hapticdb.server.figures import Figures
+from hapticdb.server.health import HostCollector
+from hapticdb.server.limits import Limits
+from sources import ROOT
+
+PAGE = (ROOT / "docs" / "serving.md").read_text()
+
+
+def test_the_table_of_limits_is_that_of_the_code() -> None:
+    shown = dict(re.findall(r"^\| `(\w+)` \| ([\d.]+) \|", PAGE, re.MULTILINE))
+    known = vars(Limits()) | {
+        name: getattr(module, name)
+        for module, name in (
+            (messages, "LARGEST"),
+            (messages, "LARGEST_PICTURE"),
+            (access, "SIGNED_IN_SECONDS"),
+            (access, "MOST_SIGNED_IN"),
+        )
+    }
+    assert {name: float(value) for name, value in shown.items()} == known
+
+
+def test_the_page_names_every_figure_and_no_other(environment: Path) -> None:
+    figures = Figures()
+    with SessionHost(str(environment)) as host:
+        figures.add(HostCollector(host))
+        found = set(re.findall(r"^# HELP (\w+)", figures.text().decode(), re.MULTILINE))
+    assert set(re.findall(r"^\| `(hapticdb_\w+)` \|", PAGE, re.MULTILINE)) == {
+        name for name in found if not name.endswith("_created")
+    }
+
+
+def test_the_unit_waits_longer_than_the_server_needs_to_stop() -> None:
+    unit = (ROOT / "deploy" / "hapticdb.service").read_text()
+    waits = re.search(r"^TimeoutStopSec=(\d+)", unit, re.MULTILINE)
+    assert waits is not None
+    assert float(waits[1]) > 3.0 * Limits().stop_seconds
+    for line in ("DynamicUser=yes", "ProtectSystem=strict", "NoNewPrivileges=yes"):
+        assert line in unit
+
+
+def test_the_container_runs_without_root() -> None:
+    words = (ROOT / "deploy" / "Containerfile").read_text()
+    assert re.search(r"^USER (?!0\b|root\b)", words, re.MULTILINE)

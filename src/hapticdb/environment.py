@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable
+from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -11,7 +12,7 @@ from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
 from hapticdb.ingest.layout import voxels_of_rows
-from hapticdb.ingest.moving import move_object, shift_objects
+from hapticdb.ingest.moving import move_object, restore_object, shift_objects
 from hapticdb.ingest.originals import shell_of_objects
 from hapticdb.mesh import read_file
 from hapticdb.pointshell.shell import PointShell
@@ -25,9 +26,9 @@ from hapticdb.query.touches import Touch, Touches
 from hapticdb.query.touching import Touching
 from hapticdb.store.base import Freshness, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
-from hapticdb.store.filtering import Filter, LastFilter
+from hapticdb.store.filtering import Filter, FiltersOfWords
 from hapticdb.store.finding import Words, find_objects
-from hapticdb.store.refusals import wants_distances
+from hapticdb.store.refusals import check_unwritten, wants_distances
 
 
 class Environment:
@@ -40,7 +41,7 @@ class Environment:
         self._store = store
         self._figures = QueryFigures(store)
         self._touching = Touching(store, self._figures)
-        self._filters = LastFilter()
+        self._filters = FiltersOfWords()
 
     def __repr__(self) -> str:
         return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
@@ -216,11 +217,51 @@ class Environment:
             self._forget()
         return report
 
-    def remove(self, object_id: int) -> None:
-        """Remove an object and its rows, in one transaction."""
+    def remove(self, object_id: int, *, revision: int | None = None) -> Object:
+        """Remove an object and its rows, in one transaction; returns the object as it was.
+
+        Parameters
+        ----------
+        revision : int or None
+            The `Object.revision` on which the decision is based.
+
+        Raises
+        ------
+        ConflictError
+            If `revision` is given and the object has been written since; then it stays.
+        """
         self._check_writable()
-        self._store.remove(as_id(object_id), self._covering)
+        removed: list[Object] = []
+
+        def covering(known: Object) -> Iterable[tuple[int, int]]:
+            if revision is not None:  # inside the transaction
+                check_unwritten(replace(known, revision=revision), known, self.url)
+            removed.append(known)
+            return self._covering(known)
+
+        self._store.remove(as_id(object_id), covering)
         self._forget()
+        return removed[-1]
+
+    def restore(self, removed: Object) -> Object:
+        """Put a removed object back, in one transaction; reads its file again.
+
+        Parameters
+        ----------
+        removed : Object
+            As `remove` has returned it: its id, transform and attributes are kept.
+
+        Raises
+        ------
+        EnvironmentExistsError
+            If the part is in the environment.
+        GeometryChangedError
+            If the object's file is missing or has another geometry now.
+        """
+        self._check_writable()
+        object_id = restore_object(self._store, removed)
+        self._forget()
+        return self.object(object_id)
 
     def move(self, object_id: int, transform: ArrayLike, *, revision: int | None = None) -> Object:
         """Move an object to a new placement, in one transaction; reads its file again.

@@ -232,7 +232,7 @@ def test_a_lock_held_too_long_is_told(url: str) -> None:
     impatient = f"{url}&options=-clock_timeout%3D200"
     with hapticdb.open(impatient) as env:
         with unfinished_move(url):
-            for edit in (lambda: env.remove(1), lambda: env.move(1, np.eye(4))):
+            for edit in (partial(env.remove, 1), partial(env.move, 1, np.eye(4))):
                 with pytest.raises(hapticdb.BusyError, match="try again later") as told:
                     edit()
                 assert "\n" not in str(told.value)

@@ -18,6 +18,9 @@ from hapticdb.store.base import Covering, Object, Store
 RESTORE = "restore the file, or remove the object and import it again"
 """Advice in messages about an object whose file has changed."""
 
+IMPORT_AGAIN = "import the file again"
+"""Advice in messages about a removed object whose file has changed."""
+
 Floats = NDArray[np.float64]
 
 
@@ -28,6 +31,19 @@ def move_object(
     placed = _as_transform(transform)
     ((_, part),) = parts_of([old], "moved", RESTORE)
     _write_moved(store, old, part, placed, revision or 0, covering)
+
+
+def restore_object(store: Store, record: Object) -> int:
+    """Write an object that was removed, at its place and with its id; see `Environment.restore`."""
+    ((_, part),) = parts_of([record], "put back", IMPORT_AGAIN)
+    bounds = bounds_inside(part, record.link, store.grid, record.transform)
+    rows, n_voxels = rows_of_part(
+        part, store.grid, store.layout, record.transform, distances=record.has_distances
+    )
+    new = replace(
+        record, voxels=n_voxels, bounds=bounds, revision=0, rows_crc=None, distances_crc=None
+    )
+    return store.add(new, rows)
 
 
 def shift_objects(

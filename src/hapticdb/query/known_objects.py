@@ -7,7 +7,7 @@ from hapticdb.kernels import law as laws
 from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
 from hapticdb.store.base import Keys, Layout, Object, Store
 from hapticdb.store.believed import damaged
-from hapticdb.store.filtering import ALL, NOTHING_UNFELT, Filter, Unfelt
+from hapticdb.store.filtering import Filter, Unfelt, keep_last
 
 
 class KnownObjects:
@@ -29,8 +29,7 @@ class KnownObjects:
         self.by_id: dict[int, Object] = {}
         self.have_distances = False
         self.version: int | None = None
-        self._resolved_of = self.by_id
-        self._resolved_filter, self._resolved = ALL, NOTHING_UNFELT
+        self._unfelt: dict[Filter, Unfelt] = {}
 
     def learn(self) -> bool:
         """List the objects if the snapshot's revision is new; returns whether it is new."""
@@ -43,6 +42,7 @@ class KnownObjects:
     def _list(self) -> None:
         objects = self._store.objects()
         self.by_id = {obj.id: obj for obj in objects}
+        self._unfelt = {}
         self.have_distances = bool(objects) and all(obj.has_distances for obj in objects)
 
     def forget(self) -> None:
@@ -80,11 +80,12 @@ class KnownObjects:
             raise error
 
     def _left_out_by(self, felt: Filter) -> Unfelt:
-        """What a filter leaves out of these objects; kept until either is another."""
-        if self._resolved_of is not self.by_id or self._resolved_filter != felt:
-            self._resolved = felt.left_out([*self.by_id.values()], self._store.url)
-            self._resolved_of, self._resolved_filter = self.by_id, felt
-        return self._resolved
+        """What a filter leaves out of these objects; kept until they are others."""
+        found = self._unfelt.get(felt)
+        if found is None:
+            found = felt.left_out([*self.by_id.values()], self._store.url)
+            keep_last(self._unfelt, felt, found)
+        return found
 
     def fits(self, law: ForceLaw | None) -> bool:
         """Whether the objects have what the law reads."""

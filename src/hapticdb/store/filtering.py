@@ -2,13 +2,19 @@
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from hapticdb.errors import ObjectNotFoundError
-from hapticdb.store.base import NO_KEYS, Keys, Object
+from hapticdb.store.base import Keys, Object
 from hapticdb.store.finding import MOST_IDS, Listing, Words, checked_words
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+MOST_KEPT = 16
+"""Filters whose objects are kept for the next frame. A larger value serves more filters in turns
+without choosing objects again, and takes more memory."""
 
 
 class Unfelt(NamedTuple):
@@ -50,13 +56,17 @@ class Filter:
         self.exclude = checked_words(exclude, "exclude")
 
     def __eq__(self, other: object) -> bool:
-        return (
+        return self is other or (
             isinstance(other, Filter)
             and self.where == other.where
             and set(self.exclude) == set(other.exclude)
         )
 
     def __hash__(self) -> int:
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
         return hash((self.where, frozenset(self.exclude)))
 
     @property
@@ -72,7 +82,7 @@ class Filter:
     @cached_property
     def fixed_ids(self) -> Keys:
         """Ids (E,) to exclude of a filter that `is_fixed`, ascending and distinct."""
-        ids = {i for i in self.exclude if isinstance(i, int) and -MOST_IDS <= i < MOST_IDS}
+        ids = {i for i in self.exclude if isinstance(i, int) and 0 < i < MOST_IDS}
         return np.array(sorted(ids), dtype=np.int64)
 
     def left_out(self, objects: Sequence[Object], url: str) -> Unfelt:
@@ -109,21 +119,19 @@ def _chosen(
 
 ALL = Filter()
 """The filter under which every object is felt."""
-NOTHING_UNFELT = Unfelt(NO_KEYS, ())
 
 
-class LastFilter:
-    """Makes filters of words, and keeps the last one: frames give the same words again and again.
+class FiltersOfWords:
+    """Makes filters of words, and keeps the last ones: frames give the same words again and again.
 
-    Thousands of ids are checked in a tenth of a millisecond where they are those of the last frame.
+    Thousands of ids are looked up in a tenth of a millisecond where an earlier frame gave the same.
     """
 
     def __init__(self) -> None:
-        self._words: tuple[tuple[object, ...], tuple[object, ...]] = ((), ())
-        self._filter = ALL
+        self._filters: dict[tuple[tuple[object, ...], tuple[object, ...]], Filter] = {}
 
     def of(self, where: Words, exclude: Words) -> Filter:
-        """Filter of the words; the last one if they are the same.
+        """Filter of the words; the same one for the same words.
 
         Raises
         ------
@@ -135,7 +143,17 @@ class LastFilter:
         if not where and not exclude:
             return ALL
         words = (tuple(where), tuple(exclude))
-        is_same = words == self._words
-        if not (is_same and {*map(type, words[0]), *map(type, words[1])} <= {int, str}):
-            self._filter, self._words = Filter(*words), words
-        return self._filter
+        if not {*map(type, words[0]), *map(type, words[1])} <= {int, str}:  # 1 equals True
+            return Filter(*words)
+        felt = self._filters.get(words)
+        if felt is None:
+            felt = Filter(*words)
+            keep_last(self._filters, words, felt)
+        return felt
+
+
+def keep_last(kept: dict[Key, Value], key: Key, value: Value) -> None:
+    """Keep a value under a new key; the oldest of more than `MOST_KEPT` is dropped."""
+    kept[key] = value
+    if len(kept) > MOST_KEPT:
+        del kept[next(iter(kept))]

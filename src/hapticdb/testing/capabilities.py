@@ -62,6 +62,12 @@ class CapabilitiesContract(StoreCase):
         np.testing.assert_allclose(store.statement(frame)[:3], [0, 0, 4.0])
         without = frame._replace(exclude=np.array([1], dtype=np.int64))
         np.testing.assert_allclose(store.statement(without)[:3], [0, 0, 2.0])
+        far_apart, many = np.array([1, 1 << 40]), np.arange(2, 9000)
+        for others, force in ((far_apart, 2.0), (many, 4.0), (many + 7, 4.0)):
+            without = frame._replace(exclude=others)
+            np.testing.assert_allclose(store.statement(without)[:3], [0, 0, force])
+            left_out = set(store.statement_hits(without)[1].tolist())
+            assert left_out == {1, 2} - set(others.tolist())
         nothing = frame._replace(exclude=np.array([1, 2], dtype=np.int64))
         assert not store.statement(nothing).any()
         assert not len(store.statement_hits(nothing)[0])

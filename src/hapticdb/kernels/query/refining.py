@@ -81,15 +81,30 @@ def rows_of_keys(keys, row_keys):
 
 @leaf
 def counting_rows(row_ids, exclude):
-    """Mask (R,) bool of the rows whose objects are not excluded."""
+    """Mask (R,) bool of the rows whose objects are not in exclude (E,), ascending and distinct.
+
+    An excluded id has id - exclude[0] smaller ids before it, less the ids in between that are not
+    excluded: the search begins between these bounds, which are close where almost all are excluded.
+    """
     counts = np.empty(row_ids.shape[0], dtype=np.bool_)
     for row in range(row_ids.shape[0]):
         counts[row] = True
-    if exclude.shape[0] > 0:
+    total = exclude.shape[0]
+    if total > 0:
+        first, last = exclude[0], exclude[total - 1]
+        n_between = last - first + 1 - total
         for row in range(row_ids.shape[0]):
-            for n in range(exclude.shape[0]):
-                if exclude[n] == row_ids[row]:
-                    counts[row] = False
+            before = row_ids[row] - first
+            if before < 0 or row_ids[row] > last:
+                continue
+            low, high = max(before - n_between, np.int64(0)), min(before, np.int64(total - 1))
+            while low < high:
+                middle = (low + high) >> 1
+                if exclude[middle] < row_ids[row]:
+                    low = middle + 1
+                else:
+                    high = middle
+            counts[row] = exclude[low] != row_ids[row]
     return counts
 
 

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from hapticdb.store import believed
 from hapticdb.store.base import (
+    NO_KEYS,
     NO_OCCUPANCY,
     Change,
     Keys,
@@ -23,6 +24,9 @@ from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import records, statements
 from hapticdb.store.refusals import no_object
 
+MOST_BITS = 1 << 20
+"""Ids from the least to the greatest excluded one up to which a bit for each is sent: 128 KiB. A
+larger value sends more; beyond it the ids are sent, and each row is compared with each of them."""
 HAS_BAND = "SELECT to_regclass('band') IS NOT NULL"
 
 
@@ -36,6 +40,8 @@ class PostgresReader:
         self._shift = row_shift(layout)
         self._seen = -1
         self._has_band = False
+        self._excluded = NO_KEYS
+        self._excluded_parameters: list[wire.Parameter] = []
 
     def version(self) -> int:
         """The revision that the last read has seen."""
@@ -122,9 +128,7 @@ class PostgresReader:
         """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
         text = statements.WRENCH[self._layout]
         parameters = wire.shell(frame)
-        if frame.exclude.size:
-            text = statements.without_excluded(text, self._layout, len(parameters) + 1)
-            parameters.append(wire.int8s(frame.exclude))
+        text, parameters = self._without_excluded(text, parameters, frame.exclude)
         (found,) = self._connection.fetch(text, *parameters)
         return np.zeros(6) if found is None else wire.read_float8s(found)
 
@@ -132,12 +136,24 @@ class PostgresReader:
         """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
         text = statements.HITS[self._layout]
         parameters = [wire.int8s(frame.addresses)]
-        if frame.exclude.size:
-            text = statements.without_excluded(text, self._layout, 2)
-            parameters.append(wire.int8s(frame.exclude))
+        text, parameters = self._without_excluded(text, parameters, frame.exclude)
         ordinals, ids, seen = self._connection.fetch(text, *parameters)
         self._seen = wire.read_int8(seen or b"")
         return wire.read_int8s(ordinals) - 1, wire.read_int8s(ids)
+
+    def _without_excluded(
+        self, text: str, parameters: list[wire.Parameter], exclude: Keys
+    ) -> tuple[str, list[wire.Parameter]]:
+        """A statement and its parameters with a condition that leaves objects out."""
+        if not exclude.size:
+            return text, parameters
+        if exclude is not self._excluded:
+            self._excluded, self._excluded_parameters = exclude, _excluded_parameters(exclude)
+        leave_out = statements.without_excluded
+        if len(self._excluded_parameters) == 1:
+            leave_out = statements.without_few
+        text = leave_out(text, self._layout, len(parameters) + 1)
+        return text, [*parameters, *self._excluded_parameters]
 
     # -- objects --------------------------------------------------------------------------------
 
@@ -169,6 +185,17 @@ class PostgresReader:
             (since,),
         ):
             yield believed.change_of(self._url, row)
+
+
+def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:
+    """Parameters that stand for ids (E,), ascending; a single one where they are far apart."""
+    low, high = int(exclude[0]), int(exclude[-1])
+    if high - low >= MOST_BITS:
+        return [wire.int8s(exclude)]
+    is_excluded = np.zeros(high - low + 1, dtype=np.bool_)
+    is_excluded[exclude - low] = True
+    bits = np.packbits(is_excluded, bitorder="little").tobytes()
+    return [wire.int8(low), wire.int8(high), wire.Parameter(wire.BYTEA, bits)]
 
 
 def _is_in_order(rows: Rows) -> bool:

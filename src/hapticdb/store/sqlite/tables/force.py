@@ -15,7 +15,7 @@ from hapticdb.grid import Grid
 from hapticdb.kernels import law as laws
 from hapticdb.kernels.query import refining
 from hapticdb.store import believed
-from hapticdb.store.base import BRICK_BYTES, Layout, LocatedShell, row_shift
+from hapticdb.store.base import BRICK_BYTES, Keys, Layout, LocatedShell, row_shift
 
 WRENCH = {
     "voxel": """
@@ -41,7 +41,8 @@ SELECT shell.rowid, id
  WHERE z_val = shell.value >> 9
    AND get_bit(occupancy, shell.value & 511)""",
 }
-KEY_TEST = {"voxel": "z_val = shell.value", "brick": "z_val = shell.value >> 9"}
+LAST_TEST = {"voxel": "z_val = shell.value", "brick": "get_bit(occupancy, shell.value & 511)"}
+"""The last condition of the statements on a row."""
 
 
 def wrench_statement(layout: Layout, frame: LocatedShell) -> tuple[str, tuple[Any, ...]]:
@@ -66,7 +67,9 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
             raise believed.damaged(connection.filename, "a brick of the wrong length")
         return occupancy[bit >> 3] >> (bit & 7) & 1  # as PostgreSQL's function of that name
 
+    is_felt = _LastExcluded().is_felt
     connection.create_aggregate_function("force", cast("Any", force), 3)
+    connection.create_scalar_function("is_felt", cast("Any", is_felt), 2)
     connection.create_scalar_function("get_bit", cast("Any", get_bit), 2, deterministic=True)
 
 
@@ -110,9 +113,27 @@ class _Force:
 def _without_excluded(
     sql: str, layout: Layout, bindings: tuple[Any, ...], frame: LocatedShell
 ) -> tuple[str, tuple[Any, ...]]:
-    """Leave objects out of a statement: one more condition on the row's id."""
+    """Leave objects out of a statement: one more condition on the row's id.
+
+    A set in Python: SQLite would build an index of the ids for each statement, which takes longer
+    than the frame where thousands are left out.
+    """
     if not frame.exclude.size:
         return sql, bindings
-    test = KEY_TEST[layout]
-    condition = f"{test} AND id NOT IN carray(?{len(bindings) + 1})"
-    return sql.replace(test, condition), (*bindings, apsw.carray(frame.exclude))
+    test = LAST_TEST[layout]
+    condition = f"{test} AND is_felt(?{len(bindings) + 1}, id)"
+    return sql.replace(test, condition), (*bindings, apsw.pyobject(frame.exclude))
+
+
+class _LastExcluded:
+    """The excluded ids of the last frame as a set; most frames exclude what the last one did."""
+
+    def __init__(self) -> None:
+        self._ids: Keys | None = None
+        self._set: frozenset[int] = frozenset()
+
+    def is_felt(self, exclude: Keys, object_id: int) -> bool:
+        """Whether an object is not among the excluded ones."""
+        if exclude is not self._ids:
+            self._ids, self._set = exclude, frozenset(exclude.tolist())
+        return object_id not in self._set

@@ -98,6 +98,11 @@ class BrowserScene:
         return {i for i in list(self._contents.records) if not self._look.sees(i)}
 
     @property
+    def bytes_sent(self) -> int:
+        """Bytes of triangles, places and colours sent to this browser alone, uncompressed."""
+        return self._audience.bytes_sent
+
+    @property
     def highlighted(self) -> set[int]:
         """Ids of the objects that are highlighted."""
         return set(self._look.marked)

@@ -58,6 +58,13 @@ class Contents:
             return len(self._audiences[ALL][0].names)
 
     @property
+    def n_triangles(self) -> int:
+        """Triangles of all objects that have their shape."""
+        with self.lock:
+            shapes = [member.shape for member in self._members.values()]
+            return sum(shape.n_triangles for shape in shapes if shape is not None)
+
+    @property
     def bytes_sent(self) -> int:
         """Bytes of all arrays that were sent to all browsers, each browser counted once."""
         return self._audiences[ALL][0].bytes_sent
@@ -98,7 +105,7 @@ class Contents:
             members = []
             for read, shape, pose in found:
                 now = self.records.get(read.id)
-                if now is None or not is_same_shape(now, read):
+                if now is None or not (now is read or is_same_shape(now, read)):
                     continue
                 member = self._members[read.id]
                 moved = motion(read.transform, self._preview.get(read.id, now.transform))

@@ -18,10 +18,10 @@ from hapticdb.page.scene.facets import Facets
 if TYPE_CHECKING:
     from viser import BatchedMeshHandle, SceneApi, SceneNodeHandle
 
-LEAST_SIMPLIFIED = 600
+LEAST_SIMPLIFIED = 64
 """Vertices from which the browser makes coarser copies of a shape for a distant eye. A larger value
 saves time when the scene opens, and draws more triangles of distant shapes."""
-COARSER = ((14.0, 0.4), (45.0, 0.12))
+COARSER = ((14.0, 0.4), (45.0, 0.1))
 """Distances, in radii of a shape, from which the browser draws a share of its triangles. At 14
 radii a shape fills a fifth of the picture's height."""
 

@@ -1,5 +1,6 @@
 """Geometry as it is shown: triangles with smooth and sharp edges, voxels as blocks, boxes."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,8 +11,11 @@ from scipy.sparse.csgraph import connected_components
 SHARP = np.cos(np.radians(30.0))
 """Cosine of the angle between two faces above which their common edge is drawn sharp. A larger
 value (a smaller angle) makes more edges sharp, and more vertices to send."""
-_MIX = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
-"""Odd numbers that mix three coordinates into one number, to find equal positions."""
+_MIX = np.array(
+    [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93],
+    dtype=np.uint64,
+)
+"""Odd numbers that mix three coordinates and a shape into one number, to find equal positions."""
 _CUBE = np.array(
     [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
 )  # fmt: skip
@@ -44,30 +48,45 @@ def sharpened(facets: Facets) -> Facets:
     if a path of smooth edges around that point joins them. Equal positions count as one point,
     because many files repeat them for every triangle.
     """
-    faces = facets.faces
-    if not len(faces):
-        return Facets(np.empty((0, 3)), faces)
-    points = _welded(facets.vertices)[faces]
-    corners = _smooth_pairs(facets.triangles, points)
-    n = faces.size
-    graph = coo_array((np.ones(len(corners), dtype=np.int8), corners.T), shape=(n, n))
-    n_vertices, label = connected_components(graph, directed=False)
-    vertices = np.empty((n_vertices, 3))
-    vertices[label] = facets.vertices[faces.reshape(-1)]
-    return Facets(vertices, label.astype(np.int64).reshape(-1, 3))
+    return sharpened_each([facets])[0]
 
 
-def _welded(vertices: NDArray[np.floating]) -> NDArray[np.int64]:
-    """A number (V,) for each vertex, equal for equal positions."""
-    positions = np.ascontiguousarray(
-        vertices + 0.0, dtype=np.float64
-    )  # -0.0 equals 0.0, but its bits differ
-    mixed = (positions.view(np.uint64) * _MIX).sum(axis=1, dtype=np.uint64)
+def sharpened_each(several: Sequence[Facets]) -> list[Facets]:
+    """`sharpened` of each; ten times faster for many small shapes than one after another."""
+    n_vertices = [len(facets.vertices) for facets in several]
+    first = np.cumsum([0, *n_vertices])
+    vertices = np.concatenate([facets.vertices for facets in several])
+    pairs = zip(several, first.tolist(), strict=False)
+    faces = np.concatenate([facets.faces + start for facets, start in pairs])
+    points = _welded(vertices, np.repeat(np.arange(len(several)), n_vertices))[faces]
+    corners = _smooth_pairs(vertices[faces], points)
+    graph = coo_array((np.ones(len(corners), dtype=np.int8), corners.T), shape=(faces.size,) * 2)
+    _, found = connected_components(graph, directed=False)
+    # numbers in the order of the corners, so that those of each shape are neighbours
+    _, seen_first, label = np.unique(found, return_index=True, return_inverse=True)
+    order = np.empty(len(seen_first), dtype=np.int64)
+    order[np.argsort(seen_first)] = np.arange(len(seen_first))
+    label = order[label].reshape(-1, 3)
+    split = vertices[faces.reshape(-1)[np.sort(seen_first)]]
+    made, start, begin = [], 0, 0
+    for facets in several:
+        own = label[start : start + len(facets.faces)]
+        end = int(own.max()) + 1 if len(own) else begin
+        made.append(Facets(split[begin:end], own - begin))
+        start, begin = start + len(own), end
+    return made
+
+
+def _welded(vertices: NDArray[np.floating], shape: NDArray[np.int64]) -> NDArray[np.int64]:
+    """A number (V,) for each vertex, equal for equal positions in the same shape (V,)."""
+    keys = np.empty((len(vertices), 4))
+    keys[:, :3], keys[:, 3] = vertices + 0.0, shape  # -0.0 equals 0.0, but its bits differ
+    mixed = (keys.view(np.uint64) * _MIX).sum(axis=1, dtype=np.uint64)
     mixed ^= mixed >> np.uint64(29)
     _, first, number = np.unique(mixed, return_index=True, return_inverse=True)
-    if np.array_equal(positions[first][number], positions):
+    if np.array_equal(keys[first][number], keys):
         return number.astype(np.int64)
-    return np.unique(positions, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1).astype(np.int64)
 
 
 def _smooth_pairs(triangles: NDArray[np.float64], points: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -16,7 +16,7 @@ from hapticdb.ingest.originals import found_parts
 from hapticdb.mesh import Part
 from hapticdb.page.scene.facets import Facets
 from hapticdb.page.scene.rigid import taken_apart
-from hapticdb.page.scene.shapes import PartShape
+from hapticdb.page.scene.shapes import PartShape, draw_each
 from hapticdb.store.base import Object
 
 MayRead = Callable[[Path], bool]
@@ -29,7 +29,7 @@ processors to spare, and take more memory."""
 SHOW_EVERY_S = 0.5
 """Seconds after which the shapes read so far are shown. A larger value merges more of the parts of
 many small files, and shows them later."""
-SHOW_TRIANGLES = 400_000
+SHOW_TRIANGLES = 1_000_000
 """Triangles after which the shapes read so far are shown."""
 
 
@@ -70,6 +70,10 @@ class ShapeReader:
         self._ended.set()
         self._wanted.put(None)
 
+    def close_when_done(self) -> None:
+        """End the thread after it has read what waits."""
+        self._wanted.put(None)
+
     def join(self, timeout: float) -> None:
         """Wait until the thread has ended."""
         self._thread.join(timeout)
@@ -89,21 +93,29 @@ class ShapeReader:
             (lost if paths[obj.link] is None else allowed).append(obj)
         self._lost(lost)
         ready: list[ShapedObject] = []
-        shown = monotonic()
+        shown, n_triangles = monotonic(), 0
         for some, parts in _files(allowed, paths, pool, self._ended):
-            missing = []
-            for obj, part in zip(some, parts, strict=True):
+            missing, digest = [], ""
+            # by digest: a batch of equal parts is complete when it is shown
+            for obj, part in sorted(zip(some, parts, strict=True), key=lambda both: both[0].digest):
                 if self._ended.is_set():
                     return
+                if obj.digest != digest and (
+                    n_triangles > SHOW_TRIANGLES or monotonic() - shown > SHOW_EVERY_S
+                ):
+                    self._show_drawn(ready)
+                    ready, shown, n_triangles = [], monotonic(), 0
+                digest = obj.digest
                 if part is None or part.faces is None:
                     missing.append(obj)
                     continue
                 ready.append(self._shaped(obj, part))
-                n_triangles = sum(shape.n_triangles for _, shape, _ in ready)
-                if n_triangles > SHOW_TRIANGLES or monotonic() - shown > SHOW_EVERY_S:
-                    self._show(ready)
-                    ready, shown = [], monotonic()
+                n_triangles += ready[-1][1].n_triangles
             self._lost(missing)
+        self._show_drawn(ready)
+
+    def _show_drawn(self, ready: Sequence[ShapedObject]) -> None:
+        draw_each({shape.serial: shape for _, shape, _ in ready}.values())
         self._show(ready)
 
     def _shaped(self, obj: Object, part: Part) -> ShapedObject:
@@ -116,7 +128,6 @@ class ShapeReader:
             if np.linalg.det(placed.stretch) < 0:
                 faces = faces[:, ::-1]
             shape = PartShape(Facets(part.vertices @ placed.stretch.T, faces))
-            shape.prepare()
             self._shapes[key] = shape
         return obj, shape, centred(placed.pose, shape)
 

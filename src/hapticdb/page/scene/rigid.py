@@ -1,5 +1,7 @@
 """Placements taken apart: what a shape is stretched by, and the rigid rest."""
 
+import math
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -8,6 +10,8 @@ from numpy.typing import NDArray
 SAME = 1e-7
 """Greatest difference of two stretches that count as one, relative. A larger value shares more
 shapes between placements and shows them less exactly."""
+REMEMBERED = 1 << 14
+"""Placements whose parts are kept, 1 kB each. A larger value saves time in larger scenes."""
 
 
 class Placed(NamedTuple):
@@ -24,12 +28,22 @@ class Placed(NamedTuple):
     def key(self) -> bytes:
         """Bytes that are equal for stretches that differ by rounding alone."""
         size = max(float(np.abs(self.stretch).max()), 1e-300)
-        step = SAME * 2.0 ** np.round(np.log2(size))
-        return np.asarray(np.round(self.stretch / step), dtype=np.int64).tobytes()
+        exponent = round(math.log2(size))
+        steps = np.round(self.stretch / (SAME * 2.0**exponent))
+        return np.append(steps, exponent).astype(np.int64).tobytes()
 
 
 def taken_apart(transform: NDArray[np.float64]) -> Placed:
-    """Polar decomposition of an affine placement (4, 4), which may mirror, scale or flatten."""
+    """Polar decomposition of an affine placement (4, 4), which may mirror, scale or flatten.
+
+    Both matrices are read-only.
+    """
+    return _taken_apart(np.asarray(transform, dtype=np.float64).tobytes())
+
+
+@lru_cache(maxsize=REMEMBERED)
+def _taken_apart(placement: bytes) -> Placed:
+    transform = np.frombuffer(placement).reshape(4, 4)
     pose = np.eye(4)
     pose[:3, 3] = transform[:3, 3]
     left, sizes, right = np.linalg.svd(transform[:3, :3])
@@ -39,6 +53,7 @@ def taken_apart(transform: NDArray[np.float64]) -> Placed:
         mirror = np.diag([-1.0, 1.0, 1.0])
         rotation, stretch = rotation @ mirror, mirror @ stretch
     pose[:3, :3] = rotation
+    pose.flags.writeable = stretch.flags.writeable = False
     return Placed(pose, stretch)
 
 

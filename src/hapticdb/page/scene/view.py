@@ -135,6 +135,11 @@ class SceneView:
         return self._contents.n_nodes
 
     @property
+    def n_triangles(self) -> int:
+        """Triangles of all objects that have their shape."""
+        return self._contents.n_triangles
+
+    @property
     def bytes_sent(self) -> int:
         """Bytes of triangles, places and colours sent to each browser, before compression."""
         return self._contents.bytes_sent
@@ -292,5 +297,4 @@ def _blocks(obj: Object, voxels: NDArray[np.int64], grid: Grid) -> ShapedObject:
     """Blocks of an object's voxels, in the world frame, as its shape."""
     vertices, faces = block_facets(coarsened(voxels, MOST_BLOCKS))
     shape = PartShape(Facets(vertices * grid.voxel_size + np.array(grid.origin), faces))
-    shape.prepare()
     return obj, shape, centred(np.eye(4), shape)

@@ -1,0 +1,163 @@
+"""What browsers draw is what the files hold, less what they hide, at the places of now."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb.mesh import read_file
+from hapticdb.page.scene.colours import MARKED, colour_of, sent
+from hapticdb.page.scene.contents import Contents
+from hapticdb.page.scene.drawings import Audience
+from hapticdb.page.scene.nodes import Member
+from hapticdb.page.scene.reading import ShapeReader
+from hapticdb.store.base import Object
+from recorded_scene import RecordedScene, are_same, drawn, write_parts
+
+
+class Shown:
+    """Contents of an environment with their shapes, and the triangles of each object."""
+
+    def __init__(self, path: Path) -> None:
+        with hapticdb.open(path, read_only=True) as env:
+            self.objects = env.objects()
+        parts = {part.name: part for part in read_file(self.objects[0].link).parts}
+        self.triangles = {obj.id: parts[obj.name].triangles(obj.transform) for obj in self.objects}
+        self.scene = RecordedScene()
+        self.contents = Contents(Audience(cast("Any", self.scene)))
+        self.contents.add(self.objects)
+        self.n_boxes = len(drawn(self.scene))
+        reader = ShapeReader(lambda _: True, self.contents.shape, lambda _: None)
+        reader.read(self.objects)
+        reader.close_when_done()
+        reader.join(60.0)
+
+    def of(self, ids: set[int]) -> NDArray[np.float64]:
+        return np.concatenate([np.empty((0, 3, 3)), *(self.triangles[i] for i in sorted(ids))])
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_parts(tmp_path_factory.mktemp("parts"))
+
+
+@pytest.fixture
+def shown(path: Path) -> Iterator[Shown]:
+    return Shown(path)
+
+
+def test_boxes_come_first_and_then_every_triangle_once(shown: Shown) -> None:
+    assert shown.n_boxes == 12 * len(shown.objects)
+    assert shown.contents.waiting() == 0
+    assert are_same(drawn(shown.scene), shown.of(set(shown.triangles)))
+
+
+def test_equal_parts_are_one_node_and_a_mirrored_one_is_drawn_too(shown: Shown) -> None:
+    assert len(shown.scene.nodes) < 10
+    assert shown.contents.n_triangles == sum(map(len, shown.triangles.values()))
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.sets(st.integers(1, 34)), st.sets(st.integers(1, 34)), st.integers(0, 2))
+def test_one_browser_hides_and_marks_for_itself(
+    path: Path, hidden: set[int], marked: set[int], rounds: int
+) -> None:
+    shown, own = _SHOWN.setdefault(path, Shown(path)), RecordedScene()
+    state: dict[str, set[int]] = {"hidden": set(), "marked": set()}
+
+    def sight(member: Member) -> tuple[int, int, int] | None:
+        if member.id in state["hidden"]:
+            return None
+        return MARKED if member.id in state["marked"] else member.colour
+
+    shown.contents.watch("one", Audience(cast("Any", own)), sight)
+    everything = set(shown.triangles)
+    for _ in range(rounds + 1):
+        state["hidden"], state["marked"] = hidden, marked
+        shown.contents.see("one", everything)
+        seen = drawn(shown.scene, own)
+        assert are_same(seen, shown.of(everything - hidden))
+        state["hidden"], state["marked"] = set(), set()
+        shown.contents.see("one", everything)
+        assert own.nodes == {}  # it sees the shared nodes again
+    shown.contents.leave("one")
+    assert are_same(drawn(shown.scene), shown.of(everything))
+
+
+_SHOWN: dict[Path, Shown] = {}
+
+
+def test_what_is_marked_has_the_colour_of_marks(shown: Shown) -> None:
+    own, rod = RecordedScene(), next(o.id for o in shown.objects if o.name == "rod")
+    shown.contents.watch(
+        "one", Audience(cast("Any", own)), lambda m: MARKED if m.id == rod else m.colour
+    )
+    colours = [
+        tuple(node.__dict__["batched_colors"][0])
+        for node in own.nodes.values()
+        if node.__dict__["vertices"] is not None
+    ]
+    assert tuple(sent(np.array(MARKED, dtype=np.uint8))) in colours
+
+
+def placed(obj: Object, seed: int) -> NDArray[np.float64]:
+    """Another place of an object: turned about the world's z, and shifted."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, 6)
+    motion = np.eye(4)
+    motion[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    motion[:3, 3] = rng.uniform(-0.2, 0.2, 3)
+    return motion @ obj.transform
+
+
+def moved(triangles: NDArray[np.float64], obj: Object, to: NDArray[np.float64]) -> Any:  # noqa: ANN401
+    way = to @ np.linalg.inv(obj.transform)
+    return triangles @ way[:3, :3].T + way[:3, 3]
+
+
+def test_moves_are_drawn_in_place_and_send_few_bytes(shown: Shown) -> None:
+    contents, expected = shown.contents, dict(shown.triangles)
+    for obj in (shown.objects[0], shown.objects[3], shown.objects[-1], shown.objects[-2]):
+        for seed in (1, 2):
+            to = placed(obj, seed + obj.id)
+            assert contents.move(obj.id, to)
+            contents.refresh()
+            expected[obj.id] = moved(shown.triangles[obj.id], obj, to)
+        before = contents.bytes_sent
+        contents.move(obj.id, placed(obj, 77))
+        contents.refresh()
+        assert contents.bytes_sent - before < 28 * 35
+        contents.move(obj.id, to)
+        contents.refresh()
+    seen, files = drawn(shown.scene), np.concatenate(list(expected.values()))
+    assert are_same(seen, files)
+
+
+def test_a_commit_takes_the_place_of_a_preview(shown: Shown) -> None:
+    obj = shown.objects[-1]
+    shown.contents.move(obj.id, placed(obj, 5))
+    shown.contents.move(obj.id, obj.transform, obj)
+    shown.contents.refresh()
+    assert np.allclose(shown.contents.placement(obj.id), obj.transform)
+    assert are_same(drawn(shown.scene), shown.of(set(shown.triangles)))
+
+
+def test_removed_objects_are_not_drawn(shown: Shown) -> None:
+    gone = {shown.objects[0].id, shown.objects[3].id, shown.objects[-2].id}
+    shown.contents.remove([*gone, 10_000])
+    shown.contents.refresh()
+    left = set(shown.triangles) - gone
+    assert are_same(drawn(shown.scene), shown.of(left))
+    assert shown.contents.pick([0, 0, -5], [0, 0, 1], lambda i: i in gone) is None
+
+
+def test_colours_do_not_depend_on_other_objects(shown: Shown) -> None:
+    colours = shown.contents.colours()
+    assert {obj.id: colour_of(obj) for obj in shown.objects[::-1]} == dict(colours)
+    assert len(set(colours.values())) > 2

@@ -1,0 +1,120 @@
+"""A scene that records what a browser would draw, and an environment of a few parts."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+import hapticdb
+
+
+class RecordedNode:
+    """A node that was added; its properties may be set, as of viser's handles."""
+
+    def __init__(self, nodes: "RecordedScene", name: str, **props: Any) -> None:  # noqa: ANN401
+        self._nodes = nodes
+        self._name = name
+        self.visible = True
+        self.__dict__.update(props)
+
+    def remove(self) -> None:
+        del self._nodes.nodes[self._name]
+
+
+class RecordedScene:
+    """What is drawn by one scope of viser: nodes by name."""
+
+    def __init__(self) -> None:
+        self.nodes: dict[str, RecordedNode] = {}
+        self.n_added = 0
+
+    def add_batched_meshes_simple(
+        self,
+        name: str,
+        vertices: NDArray[np.float32],
+        faces: NDArray[np.uint32],
+        wxyzs: NDArray[np.float64],
+        positions: NDArray[np.float64],
+        **props: Any,  # noqa: ANN401
+    ) -> RecordedNode:
+        self.n_added += 1
+        given = {"batched_wxyzs": np.asarray(wxyzs, np.float32), "vertices": vertices}
+        given |= {"batched_positions": np.asarray(positions, np.float32), "faces": faces}
+        self.nodes[name] = RecordedNode(self, name, **given, **props)
+        return self.nodes[name]
+
+    def add_frame(self, name: str, **props: Any) -> RecordedNode:  # noqa: ANN401
+        self.nodes[name] = RecordedNode(self, name, vertices=None, **props)
+        return self.nodes[name]
+
+
+def drawn(shared: RecordedScene, own: RecordedScene | None = None) -> NDArray[np.float64]:
+    """All triangles (n, 3, 3) that one browser draws: its own nodes hide shared ones by name."""
+    nodes = shared.nodes | (own.nodes if own is not None else {})
+    found = [np.empty((0, 3, 3))]
+    for node in nodes.values():
+        props = node.__dict__
+        if props["vertices"] is None:
+            continue
+        corners = props["vertices"].astype(np.float64)[props["faces"].astype(np.int64)]
+        count = len(props["batched_positions"])
+        sizes = np.broadcast_to(
+            np.asarray(props["batched_scales"], float).reshape(count, -1), (count, 3)
+        )
+        for wxyz, position, size in zip(
+            props["batched_wxyzs"], props["batched_positions"], sizes, strict=True
+        ):
+            if size.any():
+                found.append((corners * size) @ turned(wxyz).T + position)
+    return np.concatenate(found)
+
+
+def turned(wxyz: NDArray[np.float32]) -> NDArray[np.float64]:
+    """Rotation (3, 3) of a unit quaternion."""
+    w, x, y, z = (float(value) for value in wxyz)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
+def are_same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
+    """Whether two sets of triangles (n, 3, 3) are equal to 10 um, in any order and winding."""
+    if len(one) != len(other) or not len(one):
+        return len(one) == len(other)
+    first, second = cKDTree(_moments(one)), cKDTree(_moments(other))
+    there, back = first.query(second.data)[0], second.query(first.data)[0]
+    return bool(max(there.max(), back.max()) < 1e-5)
+
+
+def _moments(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Numbers (n, 12) that tell triangles apart and do not depend on the order of the corners."""
+    squares = np.einsum("nci,ncj->nij", triangles, triangles)
+    return np.concatenate([triangles.mean(axis=1), squares.reshape(-1, 9)], axis=1)
+
+
+def write_parts(folder: Path, n_balls: int = 30) -> Path:
+    """An environment of equal balls, one of them mirrored, boxes, and a rod; returns its path."""
+    scene = trimesh.Scene()
+    ball = trimesh.creation.icosphere(1, 0.03)
+    for n in range(n_balls):
+        at = trimesh.transformations.rotation_matrix(0.3 * n, [1, 2, 3])
+        at[:3, 3] = 0.1 * (n % 8), 0.1 * (n // 8), 0.0
+        if n == 3:
+            at[:3, :3] = at[:3, :3] @ np.diag([1.0, -1.0, 1.0])
+        scene.add_geometry(ball, f"ball-{n}", geom_name="ball", transform=at)
+    for n in range(3):
+        box = trimesh.creation.box((0.2, 0.1, 0.05 + 0.01 * n))
+        at = trimesh.transformations.translation_matrix([0.1, 0.2, 0.2 + 0.1 * n])
+        scene.add_geometry(box, f"frame-{n}", geom_name=f"box-{n}", transform=at)
+    rod = trimesh.creation.cylinder(0.02, 0.4, sections=24)
+    scene.add_geometry(rod, "rod", geom_name="rod", transform=np.diag([1.0, 2.0, 1.0, 1.0]))
+    scene.export(folder / "parts.glb")
+    grid = hapticdb.Grid(0.01, (-0.5, -0.5, -0.5), 8)
+    with hapticdb.create(folder / "parts.db", grid, distances=False) as env:
+        env.add(folder / "parts.glb")
+    return folder / "parts.db"

@@ -41,7 +41,10 @@ class RecordedScene:
         **props: Any,  # noqa: ANN401
     ) -> RecordedNode:
         self.n_added += 1
-        given = {"batched_wxyzs": np.asarray(wxyzs, np.float32), "vertices": vertices}
+        given: dict[str, Any] = {
+            "batched_wxyzs": np.asarray(wxyzs, np.float32),
+            "vertices": vertices,
+        }
         given |= {"batched_positions": np.asarray(positions, np.float32), "faces": faces}
         self.nodes[name] = RecordedNode(self, name, **given, **props)
         return self.nodes[name]
@@ -88,7 +91,7 @@ def are_same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:
         return len(one) == len(other)
     first, second = cKDTree(_moments(one)), cKDTree(_moments(other))
     there, back = first.query(second.data)[0], second.query(first.data)[0]
-    return bool(max(there.max(), back.max()) < 1e-5)
+    return bool(np.max(there) < 1e-5 and np.max(back) < 1e-5)
 
 
 def _moments(triangles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -1,6 +1,5 @@
 """What browsers draw is what the files hold, less what they hide, at the places of now."""
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, cast
 
@@ -48,7 +47,7 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def shown(path: Path) -> Iterator[Shown]:
+def shown(path: Path) -> Shown:
     return Shown(path)
 
 

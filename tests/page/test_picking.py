@@ -77,7 +77,8 @@ def test_a_box_is_met_until_its_shape_is_there() -> None:
     targets.put(3, None, np.eye(4), np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
     found = targets.first([0.2, 0.1, 5.0], [0, 0, -2.0], lambda _: True)
     assert found is not None
-    assert (found.id, found.distance) == (3, pytest.approx(4.0))
+    assert found.id == 3
+    assert found.distance == pytest.approx(4.0)
     assert found.normal.tolist() == [0, 0, 1]
     targets.remove(3)
     assert targets.first([0.2, 0.1, 5.0], [0, 0, -2.0], lambda _: True) is None

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 import viser
+from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import ClientConnection, connect
 from websockets.sync.connection import Connection
 from websockets.typing import Subprotocol
@@ -138,3 +139,13 @@ def text_until(connection: Connection, words: str) -> str:
     while words not in seen:
         seen += str(messages(connection))
     return seen
+
+
+def close_code(connection: Connection) -> int:
+    """Read until the server closes the connection; its code."""
+    try:
+        for _ in range(100_000):
+            connection.recv(timeout=PATIENCE)
+    except ConnectionClosed as closed:
+        return 1006 if closed.rcvd is None else closed.rcvd.code
+    raise AssertionError("the server goes on")

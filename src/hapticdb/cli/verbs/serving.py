@@ -39,7 +39,8 @@ FilesOption = Annotated[
     ),
 ]
 SecondsOption = Annotated[
-    float | None, typer.Option(metavar="S", help="End after that time.", show_default="Ctrl-C")
+    float | None,
+    typer.Option(metavar="S", help="End that long after the start.", show_default="Ctrl-C"),
 ]
 NoBrowserOption = Annotated[
     bool, typer.Option("--no-browser", help="Print the address, and open no browser.")
@@ -262,13 +263,19 @@ def _run(
             "put a proxy with TLS in front"
         )
 
+    render.note(f"preparing {serving.title.partition(' - ')[0]}")
+
     async def work() -> list[int]:
         stop = asyncio.Event()
         loop = asyncio.get_running_loop()
-        if seconds is not None:
-            loop.call_later(seconds, stop.set)
+
+        def begun(port: int) -> None:
+            ready(port)
+            if seconds is not None:
+                loop.call_later(seconds, stop.set)
+
         with _ended_by_signals(lambda: loop.call_soon_threadsafe(stop.set)) as signals:
-            await running.run(serving, ready, stop)
+            await running.run(serving, begun, stop)
         return signals
 
     signals = asyncio.run(work())

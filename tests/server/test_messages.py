@@ -1,0 +1,111 @@
+"""Of a browser's messages only what our page uses passes, checked and encoded anew."""
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hapticdb.server.access import Role
+from hapticdb.server.messages import LARGEST, LARGEST_PICTURE, Verdict, judged
+from serving import CAMERA
+
+encode = msgspec.msgpack.encode
+GIZMO = {
+    "type": "TransformControlsUpdateMessage",
+    "name": "/tool",
+    "wxyz": [1, 0, 0, 0],
+    "position": [0.5, 0, 0],
+    "owner": "3",
+}
+VALUES = [True, 3, 0.5, "word", [1, 2.5], ["a", "b"], None]
+
+
+def value(content: object) -> bytes:
+    return encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": content}})
+
+
+@pytest.mark.parametrize("message", [CAMERA, GIZMO, {"type": "CommandTriggerMessage", "uuid": "a"}])
+def test_what_viser_sends_passes_with_the_same_content(message: dict[str, object]) -> None:
+    passed = judged(encode(message), Role.EDITOR).passed
+    assert passed is not None
+    assert message.items() <= msgspec.msgpack.decode(passed).items()
+
+
+@pytest.mark.parametrize("content", VALUES)
+def test_values_of_widgets_pass(content: object) -> None:
+    passed = judged(value(content), Role.VIEWER).passed
+    assert passed is not None
+    assert msgspec.msgpack.decode(passed)["updates"] == {"value": content}
+
+
+@pytest.mark.parametrize(
+    "type_",
+    ["ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload", "FileTransferPart",
+     "SceneNodeUpdateMessage", "RunJavascriptMessage", "GuiFormSubmitMessage", "no such type"],
+)  # fmt: skip
+def test_types_that_our_page_does_not_use_never_pass(type_: str) -> None:
+    for more in ({}, {"uuid": "a"}, {"name": "/tool", "updates": {"visible": False}}):
+        assert judged(encode({"type": type_} | more), Role.EDITOR) == Verdict(None, "type")
+
+
+@pytest.mark.parametrize(
+    "updates",
+    [
+        {},
+        {"visible": False},
+        {"value": 1, "disabled": True},
+        {"value": {"a": 1}},
+        {"value": [[1]]},
+        {"value": "x" * 2049},
+        {"value": [0] * 65},
+        {"value": float("nan")},
+        {"value": [float("inf")]},
+        {"value": 1e12},
+        {"value": b"bytes"},
+    ],
+)
+def test_no_other_attribute_and_no_wild_value_passes(updates: dict[str, object]) -> None:
+    message = {"type": "GuiUpdateMessage", "uuid": "a", "updates": updates}
+    assert judged(encode(message), Role.EDITOR) == Verdict(None, "malformed")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"position": [0, 0]},
+        {"position": ["0", 0, 0]},
+        {"position": [float("nan"), 0, 0]},
+        {"wxyz": None},
+        {"name": "x" * 513},
+        {"more": 1},
+    ],
+)
+def test_a_gizmo_with_wrong_fields_does_not_pass(change: dict[str, object]) -> None:
+    assert judged(encode(GIZMO | change), Role.EDITOR) == Verdict(None, "malformed")
+
+
+def test_a_viewer_moves_no_gizmo_and_a_toucher_does() -> None:
+    assert judged(encode(GIZMO), Role.VIEWER) == Verdict(None, "role")
+    assert judged(encode(GIZMO), Role.TOUCHER).passed is not None
+
+
+def test_only_a_picture_is_large() -> None:
+    picture = {"type": "GetRenderResponseMessage", "render_uuid": "a"}
+    assert judged(encode(picture | {"payload": bytes(1 << 20)}), Role.VIEWER).passed is not None
+    too_large = encode(picture | {"payload": bytes(LARGEST_PICTURE + LARGEST)})
+    assert judged(too_large, Role.VIEWER) == Verdict(None, "size")
+    assert judged(b"\x91" * 1_000_000, Role.EDITOR).passed is None
+
+
+@given(st.binary(max_size=300))
+def test_any_bytes_are_judged_without_an_error(message: bytes) -> None:
+    assert judged(message, Role.EDITOR).passed is None or msgspec.msgpack.decode(message)
+
+
+@given(st.data())
+def test_damaged_messages_are_judged_without_an_error(data: st.DataObject) -> None:
+    message = bytearray(encode(data.draw(st.sampled_from([CAMERA, GIZMO]))))
+    for _ in range(3):
+        message[data.draw(st.integers(0, len(message) - 1))] = data.draw(st.integers(0, 255))
+    passed = judged(bytes(message), Role.EDITOR).passed
+    assert passed is None or msgspec.msgpack.decode(passed)["type"]

@@ -1,0 +1,215 @@
+"""What a stranger, another site, or a client that misbehaves can do: nothing."""
+
+import contextlib
+import os
+import signal
+import socket
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+
+import hapticdb
+from children import PATIENCE, until
+from hapticdb.errors import UsageError
+from hapticdb.server.access import Role
+from hapticdb.server.limits import Limits
+from hapticdb.server.running import Serving, check
+from serving import CAMERA, PROTOCOL, TOKENS, Running, close_code, running, sent, text_until, urls
+
+EDITOR = "a-token-for-editor"
+
+
+@pytest.fixture(scope="module")
+def server(environment: Path) -> Iterator[Running]:
+    limits = replace(Limits(), browsers_at_once=2000.0, sign_ins_at_once=30.0, bad_messages=1000)
+    serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
+    with running(serving) as found:
+        yield found
+
+
+def test_without_a_token_there_is_only_the_form(server: Running) -> None:
+    answer, body = server.ask("/")
+    assert (answer.status, b"viser" in body.lower()) == (401, False)
+    with pytest.raises(InvalidStatus):
+        server.browser()
+
+
+def test_a_token_becomes_a_cookie_that_scripts_and_other_sites_do_not_get(server: Running) -> None:
+    answer, body = server.ask(f"/?token={EDITOR}")
+    assert answer.status == 200
+    assert EDITOR.encode() not in body
+    cookie, *flags = (part.strip() for part in str(answer.getheader("set-cookie")).split(";"))
+    assert {flag.lower() for flag in flags} == {"httponly", "samesite=strict", "path=/"}
+    answer, body = server.ask("/", cookie=cookie)
+    assert (answer.status, b"data-p=" in body) == (200, True)
+    with server.browser(None, Cookie=cookie) as browser:
+        sent(browser, CAMERA)
+        assert "is a editor" in text_until(browser, "is a editor")
+
+
+@pytest.mark.parametrize("host", ["evil.example", "evil.example:80", "127.0.0.1.evil.example", ""])
+def test_a_rebound_name_is_refused(server: Running, host: str) -> None:
+    answer, _ = server.ask("/healthz", Host=host)
+    assert answer.status in {400, 403}
+    with pytest.raises(InvalidStatus):
+        server.browser(Role.EDITOR, Host=host)
+
+
+@pytest.mark.parametrize("origin", ["http://evil.example", "null", "http://127.0.0.1:1", "file://"])
+def test_another_site_opens_no_socket_and_sends_no_form(server: Running, origin: str) -> None:
+    with pytest.raises(InvalidStatus):
+        server.browser(Role.EDITOR, Origin=origin)
+    answer, _ = server.ask("/sign-in", "POST", f"token={EDITOR}".encode(), Origin=origin)
+    assert (answer.status, answer.getheader("set-cookie")) == (403, None)
+
+
+def test_a_form_needs_an_origin_and_a_small_body(server: Running) -> None:
+    assert server.ask("/sign-in", "POST", b"token=x")[0].status == 403
+    own = f"http://{server.place}"
+    assert server.ask("/sign-in", "POST", b"x" * 5000, Origin=own)[0].status == 413
+    answer, _ = server.ask("/sign-in", "POST", f"token={EDITOR}".encode(), Origin=own)
+    assert (answer.status, answer.getheader("location")) == (303, "/")
+
+
+def test_every_answer_has_the_headers_that_restrain_browsers(server: Running) -> None:
+    for path in ("/", "/healthz", "/no/such/path", f"/?token={EDITOR}"):
+        answer, body = server.ask(path)
+        policy = str(answer.getheader("content-security-policy"))
+        assert "frame-ancestors 'none'" in policy
+        assert "unsafe-eval" not in policy.replace("wasm-unsafe-eval", "")
+        assert answer.getheader("x-content-type-options") == "nosniff"
+        assert answer.getheader("referrer-policy") == "same-origin"
+        assert b"Traceback" not in body
+        assert str(Path.cwd()).encode() not in body
+
+
+def test_figures_need_a_token_or_this_machine(server: Running) -> None:
+    assert b"hapticdb_sessions" in server.ask("/metrics")[1]
+    far = {"X-Forwarded-For": "203.0.113.7"}
+    assert server.ask("/metrics", **far)[0].status == 403
+    bearer = {"Authorization": f"Bearer {EDITOR}"}
+    assert server.ask("/metrics", **far, **bearer)[0].status == 200
+
+
+def test_malformed_and_unknown_messages_reach_nobody(server: Running) -> None:
+    with server.browser(Role.EDITOR) as healthy, server.browser(Role.EDITOR) as bad:
+        for browser in (healthy, bad):
+            sent(browser, CAMERA)
+        for message in (b"", b"\xc1", b"\x91" * 500, os.urandom(200)):
+            bad.send(message)
+        bad.send("text")
+        sent(bad, {"type": "ShareUrlRequest"})
+        text_until(bad, "is a editor")
+        text_until(healthy, "is a editor")
+    seen = server.ask("/metrics")[1].decode()
+    assert 'hapticdb_relay_messages_dropped_total{reason="type"} 1.0' in seen
+
+
+def test_a_client_that_sends_nothing_useful_is_closed(environment: Path) -> None:
+    limits = replace(Limits(), bad_messages=20)
+    serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
+    with running(serving) as server, server.browser(Role.VIEWER) as browser:
+        for _ in range(30):
+            browser.send(b"\xc1")
+        assert close_code(browser) == 1008
+
+
+def test_a_flood_is_slowed_down_and_then_closed(environment: Path) -> None:
+    limits = replace(Limits(), messages_per_second=100.0, messages_at_once=10.0,
+                     throttled_seconds=0.5)  # fmt: skip
+    serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
+    with running(serving) as server, server.browser(Role.EDITOR) as browser:
+        with contextlib.suppress(ConnectionClosed):
+            for _ in range(2000):
+                sent(browser, CAMERA)
+        assert close_code(browser) == 1008
+        text = server.ask("/metrics")[1].decode()
+    assert 'hapticdb_browser_connections_total{end="flood"} 1.0' in text
+
+
+def test_the_page_is_started_again_and_browsers_come_back(environment: Path) -> None:
+    serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:work")
+    before = _children()
+    with running(serving) as server:
+        with server.browser(Role.EDITOR) as browser:
+            sent(browser, CAMERA)
+            text_until(browser, "is a editor")
+            for pid in _children() - before:
+                if b"viser_page" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                    os.kill(pid, signal.SIGKILL)
+            assert close_code(browser) in {1001, 1006}
+        until(lambda: _is_back(server))
+
+
+def _is_back(server: Running) -> bool:
+    try:
+        with server.browser(Role.VIEWER) as browser:
+            sent(browser, CAMERA)
+            return "is a viewer" in text_until(browser, "is a viewer")
+    except (InvalidStatus, ConnectionClosed):
+        return False
+
+
+def _children() -> set[int]:
+    found = set()
+    for path in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            fields = path.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if fields[1] == str(os.getpid()):
+            found.add(int(path.parent.name))
+    return found
+
+
+def test_a_silent_connection_is_cut(environment: Path) -> None:
+    limits = replace(Limits(), request_seconds=0.2)
+    serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
+    with running(serving) as server:
+        for first in (b"", b"GET / HTTP/1.1\r\nHost: x\r\nX: "):
+            with socket.create_connection(("127.0.0.1", server.port), PATIENCE) as slow:
+                slow.sendall(first)
+                assert slow.recv(1) == b""
+
+
+def test_a_page_that_cannot_start_ends_the_server_with_its_error(environment: Path) -> None:
+    serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:fail")
+    with pytest.raises(hapticdb.HapticDBError, match="no such scene"), running(serving):
+        pass
+
+
+@pytest.mark.parametrize("host", ["::", "192.0.2.1", "example.org", "10.0.0.1"])
+def test_another_address_needs_a_token(host: str) -> None:
+    serving = Serving(urls("car.db"), open_role=Role.EDITOR, host=host)
+    with pytest.raises(UsageError, match="--token"):
+        check(serving)
+    check(replace(serving, open_role=None, tokens=TOKENS))
+
+
+@pytest.mark.long
+def test_a_hundred_thousand_malformed_messages_change_nothing(server: Running) -> None:
+    """A healthy browser goes on meanwhile, and memory does not grow."""
+    with server.browser(Role.EDITOR) as healthy:
+        sent(healthy, CAMERA)
+        text_until(healthy, "is a editor")
+        memory = []
+        for _ in range(2):
+            for _ in range(125):
+                with connect(
+                    f"ws://{server.place}", subprotocols=PROTOCOL, proxy=None, compression=None,
+                    additional_headers={"Authorization": f"Bearer {EDITOR}"},
+                ) as bad:  # fmt: skip
+                    for number in range(400):
+                        bad.send(os.urandom(number % 64))
+            text_until(healthy, "clock")
+            memory.append(_resident_bytes())
+    assert memory[1] - memory[0] < 16 << 20
+
+
+def _resident_bytes() -> int:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE")

@@ -38,8 +38,10 @@ LOG = logging.getLogger("hapticdb.server")
 PAGE = "hapticdb.page.process:work"
 """The page's process."""
 PING_EVERY = 20.0
-"""Seconds between two pings to a browser, and for its answer. Larger: a browser that vanished holds
-its session longer."""
+"""Seconds between two pings to a browser. Larger: a browser that vanished is noticed later."""
+PING_PATIENCE = 60.0
+"""Seconds for the answer to a ping, which waits behind the scene on a slow network. Larger: a
+browser that vanished holds its session longer."""
 PREFIX = re.compile(r"(/[A-Za-z0-9_-]+)*")
 """What a prefix may be."""
 HEADER_BYTES = 16 << 10
@@ -244,7 +246,7 @@ def _config(app: "ASGIApp", serving: Serving) -> uvicorn.Config:
         ws_max_size=LARGEST_PICTURE + LARGEST,
         ws_per_message_deflate=False,  # compressing costs more time than it saves here
         ws_ping_interval=PING_EVERY,
-        ws_ping_timeout=PING_EVERY,
+        ws_ping_timeout=PING_PATIENCE,
         lifespan="off",
         log_config=None,
         access_log=False,

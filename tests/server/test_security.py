@@ -89,10 +89,10 @@ def test_every_answer_has_the_headers_that_restrain_browsers(server: Running) ->
 
 def test_figures_need_a_token_or_this_machine(server: Running) -> None:
     assert b"hapticdb_sessions" in server.ask("/metrics")[1]
-    far = {"X-Forwarded-For": "203.0.113.7"}
-    assert server.ask("/metrics", **far)[0].status == 403
-    bearer = {"Authorization": f"Bearer {EDITOR}"}
-    assert server.ask("/metrics", **far, **bearer)[0].status == 200
+    far = "203.0.113.7"
+    assert server.ask("/metrics", X_Forwarded_For=far)[0].status == 403
+    shown = f"Bearer {EDITOR}"
+    assert server.ask("/metrics", X_Forwarded_For=far, Authorization=shown)[0].status == 200
 
 
 def test_malformed_and_unknown_messages_reach_nobody(server: Running) -> None:

@@ -302,6 +302,7 @@ class Browser:
         if self.taken is not None and self.taken not in present:
             self.taken = None
         self.parts.show_objects()
+        self.parts.moving.renew()
 
     def close(self) -> None:
         """End the session and take the tool out of everyone's view."""
@@ -312,6 +313,7 @@ class Browser:
         self.site.view.forget(self.client)
         if self.site.edits is not None:
             self.site.edits.forget(self.number)
+        self.parts.moving.leave()
         self._unshare()
         self.site.free_number(self.number)
         session, self.session = self.session, None

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.page import checks, colours
+from hapticdb.page import checks
 from hapticdb.page.widgets import put
 from hapticdb.store.base import Object
 
@@ -38,8 +38,8 @@ class MovingControls:
         self._browser = browser
         self._object: Object | None = None
         self._gizmo: Any = None
-        self._ghost: Any = None
         self._start = np.eye(4)
+        self._is_dragged = False
         is_seen = browser.visitor.may("editor") and browser.site.edits is not None
         with gui.add_folder("Move", expand_by_default=False, visible=is_seen):
             self._moves = gui.add_checkbox(
@@ -67,11 +67,21 @@ class MovingControls:
         self._gizmo = scene.add_transform_controls(
             "/move", scale=MOVING_GIZMO * size, line_width=3.5, position=middle, depth_test=False
         )
-        scene.add_box(
-            "/move/ghost", dimensions=obj.bounds[1] - obj.bounds[0], color=colours.HELD,
-            opacity=0.25, cast_shadow=False,
-        )  # fmt: skip
         self._gizmo.on_update(self._dragged)
+
+    def renew(self) -> None:
+        """Put the gizmo where the part is now, if somebody has moved it."""
+        obj = self._object
+        if obj is None or self._is_dragged:
+            return
+        now = self._browser.site.objects.get(obj.id)
+        if now is None or now.revision != obj.revision:
+            self.follow()
+
+    def leave(self) -> None:
+        """Take back a move that was not finished when the browser went."""
+        if self._is_dragged and self._object is not None:
+            self._browser.site.view.put_back(self._object.id)
 
     def _switch(self, event: "GuiEvent[Any]") -> None:
         if checks.flag_of(event.target.value, "moving") and len(self._browser.chosen) != 1:
@@ -83,8 +93,13 @@ class MovingControls:
         """Write the part's new placement when it is let go of."""
 
         def act(event: "TransformControlsEvent") -> None:
+            pose = checks.pose_of(event.target.position, event.target.wxyz)
+            self._is_dragged = event.phase != "end"
             if event.phase == "end":
-                self._write(checks.pose_of(event.target.position, event.target.wxyz))
+                self._write(pose)
+            elif self._object is not None:  # everyone sees where it goes
+                way = pose @ np.linalg.inv(self._start)
+                self._browser.site.view.move(self._object.id, way @ self._object.transform)
 
         self._browser.guarded("editor", act)(event)
 
@@ -96,6 +111,7 @@ class MovingControls:
 
         def refused(error: Exception) -> None:
             browser.tell("Not moved", str(error))
+            browser.site.view.put_back(obj.id)
             self.follow()
 
         assert browser.site.edits is not None  # noqa: S101 - else the box is not there
@@ -112,4 +128,3 @@ class MovingControls:
 
     def _written(self, said: str) -> None:
         self._browser.tell("Moved", said, is_good=True)
-        self.follow()

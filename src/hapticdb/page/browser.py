@@ -38,6 +38,9 @@ HAND_WIDTH = 1.0
 Larger: the same depth on the screen gives more force."""
 CAP = 7.0
 """Greatest force of a hand in a browser, N: the longest arrow. As of scripted hands."""
+LEAST_SEEN = 1e-4
+"""Least motion that is drawn, as a share of the scene's diagonal, and of a turn. Larger: less is
+sent while a hand rests, and slow motions become steps."""
 HISTORY = 300
 """Samples of the plots, ten seconds of them. Larger: a longer time is seen, and more is sent."""
 
@@ -77,6 +80,7 @@ class Browser:
         self._beginning = threading.Lock()
         self._is_closed = False
         self._shared: list[Any] = []
+        self._shown = np.full(7, np.inf)
         self.drawing = HandDrawing(client, site.stage.diagonal, CAP)
         self.drawing.gizmo.on_update(self._moved)
         self._click: Callable[[NDArray[np.float64], NDArray[np.float64]], None] | None = None
@@ -257,6 +261,7 @@ class Browser:
             anchor="bottom-center",
         )  # fmt: skip
         place(node, self.hand)
+        self._shown = np.full(7, np.inf)
         self._shared = [label, node]
 
     def _unshare(self) -> None:
@@ -281,8 +286,9 @@ class Browser:
         one = frame[0]
         tool, wrench = np.array(one["tool"]), np.array(one["applied"])
         shared = self._shared
-        if shared:
+        if shared and has_moved(tool, self._shown, self.site.stage.diagonal):
             place(shared[1], tool)
+            self._shown = tool
         points, _ = session.contacts()
         touched = [self.site.objects[i] for i in session.touched() if i in self.site.objects]
         self.drawing.show(tool, self.hand, wrench)
@@ -319,6 +325,12 @@ class Browser:
         session, self.session = self.session, None
         if session is not None:
             session.end()
+
+
+def has_moved(pose: Floats, before: Floats, diagonal: float) -> bool:
+    """Whether a pose (7,) looks other than before, in a scene of that diagonal, metres."""
+    change = np.abs(pose - before)
+    return bool((change[:3] > LEAST_SEEN * diagonal).any() or (change[3:] > LEAST_SEEN).any())
 
 
 def seven(pose: Floats) -> Floats:

@@ -18,6 +18,9 @@ LONGEST_ARROW = 0.22
 Larger: small forces are seen better, and large ones leave the picture."""
 ARROW_BEGINS = 1e-3
 """Share of its longest length below which an arrow is not drawn. Larger: fewer arrows."""
+LEAST_DRAWN = 2e-4
+"""Least change that is drawn: of places as a share of the diagonal, of forces as one of the cap.
+Larger: less is sent while a hand rests."""
 HAND_GIZMO = 0.11
 """Size of the hand's gizmo, as a share of the scene's diagonal. Larger: easier to grab, and more
 is behind it."""
@@ -67,6 +70,8 @@ class HandDrawing:
         self.cap = cap
         self._ghost: MeshHandle | None = None
         self._is_touching = False
+        self._seen = np.full(12, 1e300)
+        self._marked = np.empty((0, 3))
         scene = client.scene
         self.gizmo: TransformControlsHandle = scene.add_transform_controls(
             "/hand", scale=HAND_GIZMO * diagonal, line_width=3.0, disable_sliders=True, opacity=0.9,
@@ -107,6 +112,10 @@ class HandDrawing:
 
     def show(self, tool: Floats, hand: Floats, wrench: Floats) -> None:
         """Show the force and torque (6,) at the tool's place, and the line from hand to tool."""
+        seen = np.concatenate([tool[:3], hand[:3], wrench / self.cap * self._diagonal])
+        if np.abs(seen - self._seen).max() < LEAST_DRAWN * self._diagonal:
+            return
+        self._seen = seen
         with self._client.atomic():
             longest = LONGEST_ARROW * self._diagonal
             middle = tool[:3]
@@ -136,7 +145,11 @@ class HandDrawing:
     def show_contacts(self, points: Floats, palette: NDArray[np.uint8]) -> None:
         """Mark contacts (n, 3), each in its colour (n, 3)."""
         is_touching = bool(len(points))
-        if is_touching:
+        is_other = len(points) != len(self._marked) or bool(
+            (np.abs(points - self._marked) > LEAST_DRAWN * self._diagonal).any()
+        )
+        if is_touching and is_other:
+            self._marked = points
             with self._client.atomic():
                 self._contacts.points = np.asarray(points, dtype=np.float32)
                 self._contacts.colors = palette
@@ -146,6 +159,7 @@ class HandDrawing:
 
     def rest(self) -> None:
         """Show no force, no contact and no line."""
+        self._seen = np.full(12, 1e300)
         for node in (self._force, self._torque, self._tether, self._contacts):
             if node.visible:
                 node.visible = False

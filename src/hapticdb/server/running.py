@@ -74,6 +74,8 @@ class Serving:
         Files of TLS.
     title : str
         Title of the page.
+    recordings : str or None
+        Folder for recordings of sessions; None: nobody records.
     limits : Limits
         What clients may ask for.
     page : str
@@ -92,6 +94,7 @@ class Serving:
     certificate: str | None = None
     key: str | None = None
     title: str = "hapticdb"
+    recordings: str | None = None
     limits: Limits = field(default_factory=Limits)
     page: str = PAGE
 
@@ -212,7 +215,9 @@ async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Even
 
 def _page_request(serving: Serving, *, link: int, host: int) -> PageRequest:
     urls = {role.word: url for role, url in serving.urls.items()}
-    return PageRequest(urls, serving.tools, serving.folders, link, host)
+    return PageRequest(
+        urls, serving.tools, serving.folders, link, host, serving.recordings, serving.title
+    )
 
 
 async def _unless(stop: asyncio.Event, work: Awaitable[None]) -> bool:

@@ -38,6 +38,10 @@ FilesOption = Annotated[
         show_default="the folders of the files as imported",
     ),
 ]
+RecordingsOption = Annotated[
+    str | None,
+    typer.Option(metavar="FOLDER", help="Folder in which people's sessions may be recorded."),
+]
 SecondsOption = Annotated[
     float | None,
     typer.Option(metavar="S", help="End that long after the start.", show_default="Ctrl-C"),
@@ -98,6 +102,7 @@ def view(
     *,
     tool: ToolsOption = None,
     files: FilesOption = None,
+    recordings: RecordingsOption = None,
     seconds: SecondsOption = None,
     no_browser: NoBrowserOption = False,
 ) -> None:
@@ -109,7 +114,7 @@ def view(
     from hapticdb.server.access import Role, make_token
 
     token = make_token()
-    serving = _serving(url, tool, files, {token: Role.EDITOR}, None)
+    serving = _serving(url, tool, files, {token: Role.EDITOR}, None, recordings)
 
     def ready(port: int) -> None:
         address = serving.address(port, token)
@@ -133,6 +138,7 @@ def serve(
     prefix: PrefixOption = "",
     host_name: HostNameOption = None,
     files: FilesOption = None,
+    recordings: RecordingsOption = None,
     tls_cert: CertificateOption = None,
     tls_key: KeyOption = None,
     log_json: LogJsonOption = False,
@@ -147,7 +153,7 @@ def serve(
 
     tokens = _tokens(role_token, token_file, are_made=token)
     serving = replace(
-        _serving(url, tool, files, tokens, role_url),
+        _serving(url, tool, files, tokens, role_url, recordings),
         host=host, port=port, prefix=prefix.rstrip("/"), host_names=tuple(host_name or ()),
         certificate=tls_cert, key=tls_key,
     )  # fmt: skip
@@ -180,6 +186,7 @@ def _serving(
     files: Sequence[str] | None,
     tokens: "dict[str, Role]",
     role_urls: Sequence[str] | None,
+    recordings: str | None,
 ) -> "Serving":
     """What to serve; refuses an environment, a tool or a folder that is not there."""
     import hapticdb
@@ -198,10 +205,13 @@ def _serving(
         if not Path(tool).is_file():
             raise UsageError(f"--tool {tool}: no such file")
     AllowedFolders(files or ())
+    if recordings is not None and not Path(recordings).is_dir():
+        raise UsageError(f"--recordings {recordings}: no such folder")
     return Serving(
         urls=urls, tools=tuple(tools or ()), tokens=tokens,
         open_role=None if tokens else Role.EDITOR,
         folders=None if files is None else tuple(files), title=_title(url),
+        recordings=None if recordings is None else str(Path(recordings).resolve()),
     )  # fmt: skip
 
 

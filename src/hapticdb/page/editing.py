@@ -6,36 +6,53 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.edits.editor import Editor
 from hapticdb.environment import Environment
-from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.errors import ConflictError, HapticDBError, UsageError
 from hapticdb.page.database import DatabaseThread
 from hapticdb.page.wording import short_name
 from hapticdb.store.base import Object
 
-MOST_UNDONE = 50
-"""Moves of a person that can be undone. Larger: further back."""
-
 
 class PersonsEdits:
-    """Moves of one person in an environment, and their undo."""
+    """Edits of one person in an environment, each one transaction, and their undo."""
 
     def __init__(self, env: Environment) -> None:
-        self._env = env
-        self._done: list[tuple[Object, NDArray[np.float64]]] = []
+        self._editor = Editor(env)
 
     def move(self, obj: Object, way: NDArray[np.float64]) -> str:
-        """Displace an object, as it was read, by (4, 4); returns what was done, in words."""
-        after = self._env.move(obj.id, way @ obj.transform, revision=obj.revision)
-        self._done = [*self._done[1 - MOST_UNDONE :], (after, obj.transform)]
-        return short_name(obj.name)
+        """Displace an object, as the person saw it, by (4, 4); returns its name.
+
+        Raises
+        ------
+        ConflictError
+            If somebody has written the object since.
+        """
+        self._check(obj)
+        return short_name(self._editor.move(obj.id, way @ obj.transform).name)
+
+    def take_out(self, obj: Object) -> str:
+        """Take an object, as the person saw it, out of the scene; errors as for `move`."""
+        self._check(obj)
+        return f"{short_name(self._editor.take_out(obj.id).name)} is out"
+
+    def put_back(self) -> str:
+        """Put back the object that this person took out last."""
+        out = self._editor.taken_out
+        if not out:
+            raise UsageError("you have taken no part out")
+        return f"{short_name(self._editor.put_back(out[-1].id).name)} is back"
 
     def undo(self) -> str:
-        """Put the object of the last move back, unless somebody has moved it since."""
-        if not self._done:
-            raise UsageError("there is no move of yours to undo")
-        after, before = self._done.pop()
-        self._env.move(after.id, before, revision=after.revision)
-        return f"{short_name(after.name)} is back"
+        """Undo the person's last step; ConflictError if somebody has written its object since."""
+        return self._editor.undo()
+
+    def _check(self, obj: Object) -> None:
+        if self._editor.look(obj.id)[0].revision != obj.revision:
+            raise ConflictError(
+                f"{short_name(obj.name)}: somebody has moved it since you saw it; it is shown "
+                "where it is now"
+            )
 
 
 class Edits:

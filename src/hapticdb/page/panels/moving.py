@@ -47,6 +47,11 @@ class MovingControls:
                 hint="For everyone: the part is moved in the database when you let go of it.",
             )  # fmt: skip
             self._moves.on_update(browser.guarded("editor", self._switch))
+            self._out = gui.add_button_group(
+                "For everyone", ("Take out", "Put back"),
+                hint="Takes the chosen part out of the database, or puts yours back.",
+            )  # fmt: skip
+            self._out.on_click(browser.guarded("editor", self._take_out))
             self._undo = gui.add_button("Undo", color="gray")
             self._undo.on_click(browser.guarded("editor", self._undo_last))
 
@@ -119,6 +124,20 @@ class MovingControls:
             browser.number, lambda edits: edits.move(obj, way), self._written, refused
         )
 
+    def _take_out(self, event: "GuiEvent[Any]") -> None:
+        word = checks.choice_of(event.target.value, ("Take out", "Put back"), "a step")
+        browser = self._browser
+        edits = browser.site.edits
+        if edits is None:
+            return
+        if word == "Put back":
+            edits.ask(browser.number, lambda own: own.put_back(), self._written, browser.failed)
+            return
+        if len(browser.chosen) != 1:
+            raise UsageError("choose one part first: click it, or take it from the list")
+        obj = browser.site.objects[browser.chosen[0]]
+        edits.ask(browser.number, lambda own: own.take_out(obj), self._written, browser.failed)
+
     def _undo_last(self, _: object) -> None:
         browser = self._browser
         if browser.site.edits is not None:
@@ -127,4 +146,4 @@ class MovingControls:
             )
 
     def _written(self, said: str) -> None:
-        self._browser.tell("Moved", said, is_good=True)
+        self._browser.tell("Done", said, is_good=True)

@@ -14,21 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.kernels.records import FRAME, MOST_ASKED
+from hapticdb.kernels.records import FRAME, LABEL_BYTES, MOST_SHOWN, SEAT
 from hapticdb.recording.frame import Frames
 from hapticdb.resident.table import anonymous_memory
 
 RING = 2048
 """Frames of a session that the board holds: two seconds at 1 kHz. Larger: a recording survives
 longer pauses of the host's process, and each session takes more memory."""
-MOST_CONTACTS = 64
-"""Most contacts of a session on the board. Larger: broad contacts are drawn more densely."""
-BINS = 1000
-BIN = 5e-6
-"""Number and width (s) of the bins of a seat's histograms of times, which cover 0 to 5 ms. Larger
-bins: less exact percentiles. The worst time is kept exactly."""
-LABEL_BYTES = 128
-"""Longest label of a session, bytes of UTF-8."""
 READ_ATTEMPTS = 1000
 """Attempts to read a part of a row that another process writes. Writing takes microseconds, so a
 part that stays unfinished belongs to a process that died."""
@@ -36,41 +28,7 @@ FREE, TAKEN, LOST = 0, 1, 2
 """States of a seat: nobody's; a session's; a session's whose worker process has died."""
 
 Seats = NDArray[np.void]
-
-SEAT = np.dtype(
-    [
-        # written by the host
-        ("state", "<i8"),
-        ("id", "<i8"),  # of the session
-        ("label", f"S{LABEL_BYTES}"),
-        ("worker", "<i8"),  # number of the worker process
-        ("is_recorded", "<i8"),  # whether frames have the law's wrench, for a recording
-        # written by the process that moves the hand
-        ("hand_sequence", "<i8"),
-        ("hand_time", "<i8"),  # ns, CLOCK_MONOTONIC
-        ("hand_pose", "<f8", 7),  # position m, unit quaternion, scalar first
-        ("is_held", "<i8"),  # whether somebody holds the tool
-        ("n_moves", "<i8"),
-        # written by the worker
-        ("n_frames", "<i8"),
-        ("missed", "<i8"),  # deadlines at which no frame began
-        ("in_time", "<i8"),  # frames that were done within their period
-        ("unknown_frames", "<i8"),
-        ("held_frames", "<i8"),
-        ("stale_frames", "<i8"),
-        ("worst_lateness", "<f8"),
-        ("worst_elapsed", "<f8"),
-        ("n_objects", "<i8"),
-        ("objects", "<i8", MOST_ASKED),
-        ("contacts_sequence", "<i8"),
-        ("n_contacts", "<i8"),
-        ("contacts", "<f8", (MOST_CONTACTS, 6)),  # point m and force on the tool N, world frame
-        ("lateness", "<i8", BINS + 1),  # histogram
-        ("elapsed", "<i8", BINS + 1),
-    ],
-    align=True,
-)
-"""One seat. Its frames are beside it, in `Board.rings`."""
+"""Rows of `kernels.records.SEAT`."""
 
 
 class Board:
@@ -166,7 +124,7 @@ class Board:
         seats = self.seats
         for _ in range(READ_ATTEMPTS):
             before = int(seats["contacts_sequence"][row])
-            n_contacts = min(int(seats["n_contacts"][row]), MOST_CONTACTS)
+            n_contacts = min(int(seats["n_contacts"][row]), MOST_SHOWN)
             found: NDArray[np.float64] = seats["contacts"][row, :n_contacts].copy()
             if before % 2 == 0 and before == int(seats["contacts_sequence"][row]):
                 return found

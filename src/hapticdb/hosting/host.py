@@ -16,13 +16,14 @@ from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.attached import serve_attached
-from hapticdb.hosting.board import LABEL_BYTES, LOST, Board
+from hapticdb.hosting.board import LOST, Board
 from hapticdb.hosting.crew import Crew
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.hosting.running import Running
-from hapticdb.hosting.seat import SeatRequest
+from hapticdb.hosting.stations import SeatRequest
 from hapticdb.hosting.tables import SharedTables, Words
 from hapticdb.kernels.compiling import compile_missing, entries_for
+from hapticdb.kernels.records import LABEL_BYTES
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
@@ -159,7 +160,7 @@ class SessionHost:
             raise UsageError(
                 f"a scale of {scale}: give a number above 0, {LARGEST_SCALE:g} at most"
             )
-        compile_missing(entries_for("feel"))  # here, so that no worker compiles
+        compile_missing(entries_for("host"))  # here, so that no worker compiles
         felt = self._tables.checked(where, exclude)
         with self._changing:
             if self._is_closed.is_set():

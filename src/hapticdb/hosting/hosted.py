@@ -10,8 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import UsageError
-from hapticdb.hosting.board import BIN, BINS, TAKEN, Board
+from hapticdb.hosting.board import TAKEN, Board
 from hapticdb.kernels.hand.handle import FARTHEST
+from hapticdb.kernels.records import TIME_BIN, TIME_BINS
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.poses import quaternion_of
 from hapticdb.realtime.coupling import Coupling, DeviceCoupling
@@ -195,11 +196,13 @@ class HostedSession:
 
 
 def _spread(counts: NDArray[np.int64], worst: float) -> Spread:
-    """Percentiles of a histogram of `board.BINS` bins; zeros if it is empty."""
+    """Percentiles of a histogram of `TIME_BINS` bins; zeros if it is empty."""
     sums = np.cumsum(counts)
     total = int(sums[-1])
     if not total:
         return Spread(0.0, 0.0, 0.0, 0.0)
     at = np.searchsorted(sums, [math.ceil(share * total) for share in (0.5, 0.99, 0.999)])
-    p50, p99, p999 = np.where(at == BINS, worst, np.minimum((at + 0.5) * BIN, worst)).tolist()
+    p50, p99, p999 = np.where(
+        at == TIME_BINS, worst, np.minimum((at + 0.5) * TIME_BIN, worst)
+    ).tolist()
     return Spread(p50, p99, p999, worst)

@@ -6,7 +6,7 @@ from pathlib import Path
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.board import Board
 from hapticdb.hosting.crew import WorkerLink
-from hapticdb.hosting.seat import SeatRequest
+from hapticdb.hosting.stations import SeatRequest
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT

@@ -1,7 +1,8 @@
 """A worker process of the host: one loop that runs the frames of many sessions, period by period.
 
-Commands of the host come over a channel and are done by a thread beside the loop: a session is made
-there, and enters the loop between two periods.
+The loop is one kernel in a thread of its own, which needs no interpreter. Commands of the host come
+over a channel and are done beside it: a session is made there, and enters the loop between two
+periods.
 """
 
 import os
@@ -15,13 +16,14 @@ from typing import Any
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.board import Board
 from hapticdb.hosting.channel import Ask, Channel, Reply
-from hapticdb.hosting.seat import Seat, SeatRequest
-from hapticdb.kernels.compiling import entries_for, load
-from hapticdb.realtime.coupling import Coupling, SettledCoupling
+from hapticdb.hosting.stations import SeatRequest, Stations
+from hapticdb.kernels.compiling import load
 from hapticdb.realtime.deadlines import SPIN, Timing, undisturbed
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.resident.table import CellTable
 
+ENTRIES = ("hosting.loop.run", "resident.feeling.bounding_spheres")
+"""Kernels that a worker calls; the loop's has all others that a frame needs within it."""
 LOOK_EVERY = 0.25
 """Seconds between two checks whether the host still lives."""
 LEAVE_PATIENCE = 5.0
@@ -51,14 +53,12 @@ class Worker:
         self._channel = Channel(socket.socket(fileno=request.sock))
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
-        self._seats: tuple[Seat, ...] = ()  # replaced as a whole, between two periods
-        self._periods = 0
-        self._is_over = False
+        self._stations = Stations(self._board, request.rate, SPIN)
 
     # -- commands ----------------------------------------------------------------------------
 
     def obey(self) -> None:
-        """Do what the host says until it ends; the work of the thread beside the loop."""
+        """Do what the host says until it ends; the work of the thread beside the loop's."""
         try:
             while not parent_is_gone():
                 if select.select([self._channel.sock], [], [], LOOK_EVERY)[0]:
@@ -67,7 +67,7 @@ class Worker:
         except (EOFError, OSError):
             pass
         finally:
-            self._is_over = True
+            self._stations.stop()
 
     def _answer(self, ask: Ask, descriptors: list[int]) -> Reply:
         try:
@@ -85,72 +85,39 @@ class Worker:
         elif word == "end":
             self._end(content[0])
         elif word == "set_coupling":
-            self._set_coupling(*content)
+            self._stations.set_coupling(*content)
         else:
             raise UsageError(f"a worker does not know the command {word!r}")
 
     def _begin(self, request: SeatRequest, descriptor: int) -> None:
         if request.table not in self._tables:
             self._tables[request.table] = CellTable(os.dup(descriptor), request.n_slots)
-        seat = Seat(request, self._board, self._tables[request.table])
-        seat.began = time.monotonic_ns()
-        self._seats = (*self._seats, seat)
+        self._stations.begin(request, self._tables[request.table])
 
-    def _end(self, row: int) -> None:
-        leaving = [seat for seat in self._seats if seat.request.seat == row]
-        self._seats = tuple(seat for seat in self._seats if seat.request.seat != row)
-        periods, until = self._periods, time.monotonic() + LEAVE_PATIENCE
-        while self._periods < periods + 2:
+    def _end(self, seat: int) -> None:
+        self._stations.withdraw(seat)
+        last, until = self._stations.n_periods + 2, time.monotonic() + LEAVE_PATIENCE
+        while self._stations.n_periods < last:
             if time.monotonic() > until:
                 raise HapticDBError("a worker's loop hangs: end the host")
             time.sleep(0.5 / self._rate)
-        for seat in leaving:
-            seat.stop()
-        used = {seat.request.table for seat in self._seats}
+        self._stations.free(seat)
+        used = self._stations.used_tables()
         for name in [name for name in self._tables if name not in used]:
             self._tables.pop(name).close()
 
-    def _set_coupling(self, row: int, coupling: Coupling | SettledCoupling) -> None:
-        for seat in self._seats:
-            if seat.request.seat == row:
-                seat.set_coupling(coupling)
-
-    # -- the loop ----------------------------------------------------------------------------
-
     def run(self) -> None:
-        """Run periods until the host ends."""
-        clock, period = time.monotonic_ns, round(1e9 / self._rate)
-        spin = round(SPIN * 1e9)
-        due = clock() + period
-        before = due - period
-        while not self._is_over:
-            left = due - clock() - spin
-            if left > 0:
-                time.sleep(left * 1e-9)
-            begun = clock()
-            while begun < due:
-                begun = clock()
-            dt, before = (begun - before) * 1e-9, begun
-            seats = self._seats
-            for seat in seats:
-                seat.frame(clock(), due, dt, clock)
-            self._periods += 1
-            done = clock()
-            due += period
-            behind = max(-(-(done - due) // period), 0)
-            for seat in seats:
-                row = self._board.seats[seat.request.seat : seat.request.seat + 1]
-                row["in_time"] += behind == 0
-                row["missed"] += behind
-            due += behind * period
+        """Run periods until the host ends; the work of the loop's thread."""
+        with undisturbed(Timing(self._rate)):
+            self._stations.run()
 
 
 def work(request: WorkerRequest, sender: MessageSender) -> None:
     """Run a worker; the work of the process."""
-    load(entries_for("feel"))
+    load(ENTRIES)
     worker = Worker(request)
-    obeying = threading.Thread(target=worker.obey, daemon=True)
-    with undisturbed(Timing(request.rate)):
-        obeying.start()
-        sender.send("ready", None)
-        worker.run()
+    looping = threading.Thread(target=worker.run, daemon=True)
+    looping.start()
+    sender.send("ready", None)
+    worker.obey()
+    looping.join(LEAVE_PATIENCE)

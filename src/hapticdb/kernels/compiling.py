@@ -30,6 +30,7 @@ ENTRIES = {
     "hand.coupling": "advance",
     "hand.quasistatic": "advance",
     "proxy.linearize": "linearize",
+    "hosting.loop": "run",
     "surfaces.distances": "find_blocks rows_of_blocks",
     "surfaces.voxelize": "voxelize_kernel",
     "resident.clearance": "find_clearance cells_near",
@@ -61,7 +62,7 @@ ENTRIES = {
 """Entries of each module; modules that take longest to compile come first. The names are listed
 here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
-TOGETHER = {"resident.feeling": "hand.coupling"}
+TOGETHER = {"resident.feeling": "hand.coupling", "hosting.loop": "hand.quasistatic"}
 """Modules that are compiled after another module in the same process: they share its leaves."""
 LONGEST_S = 600.0
 """Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
@@ -115,6 +116,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "motion.*",
         "rigid.*",
     ),
+    "host": (*_RESIDENT, "field.packing.unpack_kernel", "hosting.*"),
     "replay": (
         *_RESIDENT,
         "field.packing.unpack_kernel",

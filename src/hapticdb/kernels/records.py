@@ -284,3 +284,107 @@ FIGURES: Layout = _record(
     ]
 )
 """Counts and latencies of the fetching process."""
+
+MOST_SHOWN = 64
+"""Most contacts of a hosted session that others see. Larger: broad contacts are drawn more
+densely."""
+TIME_BINS, TIME_BIN = 1000, 5e-6
+"""Number and width (s) of the bins of a seat's histograms of times, which cover 0 to 5 ms. Larger
+bins: less exact percentiles. The worst time is kept exactly."""
+LABEL_BYTES = 128
+"""Longest label of a hosted session, bytes of UTF-8."""
+
+SEAT: Layout = _record(
+    [
+        # written by the host
+        ("state", "<i8"),  # named in `hapticdb.hosting.board`
+        ("id", "<i8"),  # of the session
+        ("label", f"S{LABEL_BYTES}"),
+        ("worker", "<i8"),  # number of the worker process
+        ("is_recorded", "<i8"),  # frames have the law's wrench, for a recording
+        # written by the process that moves the hand
+        ("hand_sequence", "<i8"),  # odd while the next fields are written
+        ("hand_time", "<i8"),  # ns, CLOCK_MONOTONIC
+        ("hand_pose", "<f8", 7),  # position m, unit quaternion, scalar first
+        ("is_held", "<i8"),  # somebody holds the tool
+        ("n_moves", "<i8"),
+        # written by the worker
+        ("n_frames", "<i8"),
+        ("missed", "<i8"),  # deadlines at which no frame began
+        ("in_time", "<i8"),  # frames that were done within their period
+        ("unknown_frames", "<i8"),
+        ("held_frames", "<i8"),
+        ("stale_frames", "<i8"),
+        ("worst_lateness", "<f8"),  # s
+        ("worst_elapsed", "<f8"),  # s
+        ("n_objects", "<i8"),
+        ("objects", "<i8", MOST_ASKED),  # ids of what is touched
+        ("contacts_sequence", "<i8"),  # odd while the contacts are written
+        ("n_contacts", "<i8"),
+        ("contacts", "<f8", (MOST_SHOWN, 6)),  # point m and force on the tool N, world frame
+        ("lateness", "<i8", TIME_BINS + 1),  # histogram
+        ("elapsed", "<i8", TIME_BINS + 1),
+    ]
+)
+"""A hosted session on the board (`hapticdb.hosting.board`), which several processes share."""
+
+WAY: Layout = _record(
+    [
+        ("arriving", "<f8", 7),  # pose on the board: position m, unit quaternion
+        ("start", "<f8", 7),
+        ("end", "<f8", 7),
+        ("began", "<i8"),  # ns
+        ("seconds", "<f8"),  # that the way takes
+    ]
+)
+"""The way of a hand to the pose that arrived last."""
+
+STATION: Layout = _record(
+    [
+        ("is_running", "<i8"),  # all other fields are complete
+        ("seat", "<i8"),  # row of the board
+        ("reader", "<i8"),  # row of the table of cells
+        ("is_smooth", "<i8"),  # the cells have distances
+        # addresses of the table's arrays and of its row SESSION, and sizes
+        *((name, "<i8") for name in ("control", "readers", "keys", "slots", "words", "masks")),
+        *((name, "<i8") for name in ("used", "payload", "near", "session")),
+        *((name, "<i8") for name in ("n_control", "n_readers", "n_slots", "capacity")),
+        ("heartbeat", "<i8"),  # index in the control block: time of the database's last answer
+        # addresses of records: SERVO, FOLLOWER, TOLD
+        *((name, "<i8") for name in ("servo", "follower", "told")),
+        # addresses of the tool's arrays, and their sizes
+        *((name, "<i8") for name in ("points", "center", "spheres", "groups", "columns")),
+        *((name, "<i8") for name in ("scratch", "field", "met")),
+        *((name, "<i8") for name in ("n_points", "n_spheres", "n_groups", "run")),
+        ("place", "<f8", 5),  # origin and voxel size m, voxels on an axis
+        ("bits", "<i8"),  # of the grid's curve, on an axis
+        ("curve", "<i8"),  # its code
+        ("coupling", "<i8"),  # which of the two rows is used: the other one may be written
+        ("springs", "<f8", (2, 9)),  # fields of DeviceSpring, with distances
+        ("bodies", "<f8", (2, 11)),  # fields of Body, without
+        ("stiffness", "<f8"),  # of the law of a recording, N/m
+        ("scale", "<f8"),  # metres of the scene for a metre of the device
+        # the hand between arrivals
+        ("seen", "<i8"),  # sequence number of the last arrival
+        ("arrived", "<i8"),  # ns
+        ("gap", "<i8"),  # ns, mean time between arrivals
+        ("is_let_go", "<i8"),
+        ("way", WAY),
+        # times, ns
+        ("began", "<i8"),
+        ("last", "<i8"),  # frame
+        ("asked_at", "<i8"),
+        ("shown_at", "<i8"),
+    ]
+)
+"""A hosted session in its worker: where its memory is, and what it keeps between periods."""
+
+PACE: Layout = _record(
+    [
+        ("is_over", "<i8"),
+        ("periods", "<i8"),  # done so far
+        ("period", "<i8"),  # ns
+        ("spin", "<i8"),  # ns before a deadline at which the loop watches the clock
+    ]
+)
+"""What a worker's loop is told, and what it tells."""

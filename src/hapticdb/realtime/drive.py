@@ -13,18 +13,15 @@ from hapticdb.kernels.hand import coupling as plane_kernels
 from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.anchors import BEFORE, MET_ROWS
 from hapticdb.kernels.hand.body import Body
-from hapticdb.kernels.hand.device_spring import DeviceSpring, contact_stiffness
+from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.near_points import (
-    ALONG,
     FIELD_ROWS,
     FLOOR,
     NEAR,
     NEAR_POINTS,
     NEAR_ROWS,
-    ONSETS,
     U,
 )
-from hapticdb.kernels.law import AVERAGE_FROM
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS
 from hapticdb.kernels.resident import feeling
 from hapticdb.kernels.resident.cells import UNKNOWNS, Cells, Clusters, Place
@@ -97,20 +94,6 @@ class PlaneDrive:
         """Indices of the last frame's hits, as many as it had."""
         return self._met[BEFORE, :n_hits]
 
-    def contacts(self, n_hits: int) -> tuple[Indices, Floats]:
-        """Indices (n,) of the points in contact, and the forces (n, 3) there, N, world frame."""
-        scene = self._scene
-        points = self._met[BEFORE, :n_hits]
-        size, origin = scene.place.size, np.array(scene.place[:3])
-        rotation, at = scene.pose[:3, :3], scene.pose[:3, 3]
-        placed = scene.clusters.points[points, :3] @ rotation.T + at
-        normals = scene.clusters.points[points, 3:] @ rotation.T
-        middles = (np.floor((placed - origin) / size) + 0.5) * size + origin
-        depths = ((middles - placed) * normals).sum(axis=1)
-        is_contact = depths > 0.0
-        share = self._body.stiffness / max(n_hits / AVERAGE_FROM, 1.0)
-        return points[is_contact], (share * depths[:, None] * normals)[is_contact]
-
     def feel(self) -> None:
         """Nothing to do: the frame at the tool's pose is computed in each step."""
 
@@ -176,20 +159,6 @@ class SmoothDrive:
         side, n_near = int(self._follower["side"]), int(self._follower["n_near"])
         distances = self._field[NEAR + side * NEAR_ROWS + U, :n_near]
         return self._met[NEAR_POINTS + side, :n_near][distances < FLOOR]
-
-    def contacts(self, n_hits: int) -> tuple[Indices, Floats]:
-        """Indices (n,) of the points in contact, and the forces (n, 3) there, N, world frame."""
-        follower, field = self._follower, self._field
-        side, n_near = int(follower["side"]), int(follower["n_near"])
-        if follower["is_loose"] or not n_hits:
-            return np.empty(0, dtype=np.int64), np.empty((0, 3))
-        rows, near = NEAR + side * NEAR_ROWS, self._met[NEAR_POINTS + side, :n_near]
-        size = self._scene.place.size
-        depths = size * (field[ONSETS, near] - field[rows + U, :n_near])
-        is_contact = depths > 0.0
-        stiffness = contact_stiffness(self._spring, size)
-        along = field[rows + ALONG : rows + ALONG + 3, :n_near].T
-        return near[is_contact], (stiffness * depths[:, None] * along)[is_contact]
 
     def feel(self) -> None:
         """Compute the law's frame at the tool's pose for the recording, after `step`.

@@ -45,6 +45,9 @@ BATCHES_REMEMBERED = 32
 """Batches whose latencies count. A larger value follows a database that gets faster more slowly."""
 IDLE = 1e-3
 """Seconds between rounds while no cell is missing. A larger value notices a moving hand later."""
+MOST_IDLE = 1e-2
+"""Greatest of these times (s), which is as long as a round takes if that is more. Larger: with many
+sessions more of the processor is left to loops, and a moving hand is noticed later."""
 ASK_EVERY = 5e-3
 """Seconds between queries for the objects that a tool touches. Larger: names come later."""
 POLL_EVERY = 0.02
@@ -266,11 +269,14 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
                 fetcher.reopen()
             if not is_ready:
                 fetcher.warm_up()
+            begun = time.monotonic()
             is_busy = fetcher.round()
+            took = time.monotonic() - begun
             if not is_ready:
                 sender.send("ready", fetcher.store.engine)
             if not is_busy:
-                time.sleep(IDLE)
+                # with many sessions a round takes long: half the processor is left to their loops
+                time.sleep(max(IDLE, min(took, MOST_IDLE)))
             is_lost, is_ready, patience = False, True, RETRY[0]
         except (GridError, UsageError):
             raise

@@ -1,0 +1,1 @@
+"""The loop of a worker that runs many sessions, as one kernel."""

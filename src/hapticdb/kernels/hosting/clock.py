@@ -1,0 +1,39 @@
+"""The system's clock and its sleep, for a kernel that runs a loop without the interpreter."""
+
+import time
+
+from numba import config, types
+
+from hapticdb.kernels._jit import leaf
+
+MONOTONIC = int(time.CLOCK_MONOTONIC)
+"""The system's number of the clock that `time.monotonic_ns` reads."""
+SECOND = 1_000_000_000
+"""Nanoseconds."""
+
+if config.DISABLE_JIT:
+
+    def now_ns(moment):  # noqa: ARG001 - as below
+        """Nanoseconds of `time.monotonic_ns`."""
+        return time.monotonic_ns()
+
+    def sleep_ns(moment, nanoseconds):  # noqa: ARG001 - as below
+        """Sleep."""
+        time.sleep(nanoseconds * 1e-9)
+
+else:
+    _clock_gettime = types.ExternalFunction("clock_gettime", types.int32(types.int32, types.uintp))
+    _nanosleep = types.ExternalFunction("nanosleep", types.int32(types.uintp, types.uintp))
+
+    @leaf
+    def now_ns(moment):
+        """Nanoseconds of `time.monotonic_ns`. moment (4,) int64 is scratch memory."""
+        _clock_gettime(MONOTONIC, moment.ctypes.data)
+        return moment[0] * SECOND + moment[1]
+
+    @leaf
+    def sleep_ns(moment, nanoseconds):
+        """Sleep for less than a second. moment (4,) int64 is scratch memory."""
+        moment[0] = 0
+        moment[1] = nanoseconds
+        _nanosleep(moment.ctypes.data, moment.ctypes.data)

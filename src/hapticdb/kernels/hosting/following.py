@@ -1,0 +1,80 @@
+"""Following: where a hand is between two arrivals of its pose, at the loop's own rate.
+
+At each arrival the hand starts from where it is and moves to the new pose in a little more than the
+usual time between two arrivals. So the motion has no jumps, its delay is bounded, and the hand
+never goes where nobody has put it: when arrivals stop, it rests at the last pose.
+"""
+
+import math
+
+from hapticdb.kernels._jit import leaf
+from hapticdb.kernels.resident.fence import fence
+from hapticdb.kernels.rigid import product, quaternion_by, turn_of
+
+STRETCH = 1.25
+"""Time of the way to a new pose, in times between two arrivals. Larger: less stopping when arrivals
+come unevenly, and more delay."""
+LONGEST_GAP_NS, USUAL_GAP_NS = 60_000_000, 33_000_000
+"""Nanoseconds: the longest time between two arrivals that counts, and the one that is assumed
+before the second arrival. Larger: smoother for slower senders, and more delay."""
+SILENCE_NS = 250_000_000
+"""Nanoseconds without an arrival after which the next one says nothing about the sender's rate."""
+
+
+@leaf
+def take_arrival(station, seat, hand, now):
+    """Begin the way to a pose that has arrived on the board, if it is written to its end."""
+    sequence = seat.hand_sequence
+    if sequence == station.seen or sequence & 1:
+        return
+    fence()
+    arrived, is_held = seat.hand_time, seat.is_held
+    pose, way = seat.hand_pose, station.way
+    for n in range(7):
+        way.arriving[n] = pose[n]
+    fence()
+    if seat.hand_sequence != sequence:
+        return  # it is being written again: the next period takes it
+    gap = arrived - station.arrived
+    station.arrived, station.seen = arrived, sequence
+    if 0 < gap < SILENCE_NS:
+        station.gap += (min(gap, LONGEST_GAP_NS) - station.gap) // 2
+    if not is_held:
+        station.is_let_go = 1
+        return
+    # who takes the tool again takes it where the hand is now
+    is_new = station.is_let_go != 0
+    for n in range(3):
+        way.start[n] = way.arriving[n] if is_new else hand.position[n]
+        way.end[n] = way.arriving[n]
+    for n in range(4):
+        way.start[3 + n] = way.arriving[3 + n] if is_new else hand.quaternion[n]
+        way.end[3 + n] = way.arriving[3 + n]
+    station.is_let_go = 0
+    way.began, way.seconds = now, STRETCH * 1e-9 * station.gap
+
+
+@leaf
+def follow_hand(station, seat, hand, now):
+    """Write where the hand is at a time, ns; NaN while nobody holds the tool."""
+    take_arrival(station, seat, hand, now)
+    position, turned, velocity = hand.position, hand.quaternion, hand.velocity
+    if station.is_let_go:
+        position[0] = math.nan
+        return
+    way = station.way
+    start, end = way.start, way.end
+    passed = 1e-9 * (now - way.began)
+    share = 1.0 if passed >= way.seconds else passed / way.seconds
+    rate = 0.0 if share == 1.0 else 1.0 / way.seconds
+    w, x, y, z = start[3], start[4], start[5], start[6]
+    tx, ty, tz = turn_of(*product(end[3], end[4], end[5], end[6], w, -x, -y, -z))
+    w, x, y, z = product(*quaternion_by(share * tx, share * ty, share * tz), w, x, y, z)
+    length = math.sqrt(w * w + x * x + y * y + z * z)
+    turned[0], turned[1], turned[2], turned[3] = w / length, x / length, y / length, z / length
+    for axis in range(3):
+        position[axis] = (
+            end[axis] if share == 1.0 else (start[axis] + share * (end[axis] - start[axis]))
+        )
+        velocity[axis] = rate * (end[axis] - start[axis])
+    velocity[3], velocity[4], velocity[5] = rate * tx, rate * ty, rate * tz

@@ -1,0 +1,115 @@
+"""The hand of a hosted session between arrivals, and memory at addresses."""
+
+import math
+import time
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb.kernels.hosting.clock import now_ns, sleep_ns
+from hapticdb.kernels.hosting.following import LONGEST_GAP_NS, STRETCH, follow_hand
+from hapticdb.kernels.hosting.memory import array_at
+from hapticdb.kernels.records import HAND, PACE, SEAT, STATION
+
+MS = 1_000_000
+"""Nanoseconds of a millisecond."""
+
+
+class Followed:
+    """A hand that starts at x = 0 and is told where to go."""
+
+    def __init__(self, gap_ms: float) -> None:
+        self.station, self.seat = np.zeros(1, STATION)[0], np.zeros(1, SEAT)[0]
+        self.hand = np.zeros(1, HAND)[0]
+        self.station.gap = round(gap_ms * MS)
+        self.station.way.seconds = 1e-9
+        for pose in (self.hand.quaternion, self.station.way.start[3:], self.station.way.end[3:]):
+            pose[0] = 1.0
+
+    def arrive(self, now: int, x: float, *, is_held: bool = True, turn: float = 0.0) -> None:
+        self.seat.hand_pose[:] = (x, 0.0, 0.0, math.cos(turn / 2), 0.0, 0.0, math.sin(turn / 2))
+        self.seat.hand_time, self.seat.is_held = now, is_held
+        self.seat.hand_sequence += 2
+
+    def at(self, now: int) -> float:
+        follow_hand(self.station, self.seat, self.hand, now)
+        return float(self.hand.position[0])
+
+
+def test_a_hand_moves_evenly_to_the_pose_that_arrived_and_rests_there() -> None:
+    hand = Followed(gap_ms=40.0)
+    hand.arrive(1000 * MS, 0.01)
+    way = STRETCH * 40.0
+    heights = [hand.at(round((1000 + share * way) * MS)) for share in (0.0, 0.25, 0.5, 1.0, 7.0)]
+    assert heights == pytest.approx([0.0, 0.0025, 0.005, 0.01, 0.01], abs=1e-9)
+    assert hand.hand.velocity[0] == 0.0
+
+
+def test_a_hand_turns_evenly_too() -> None:
+    hand = Followed(gap_ms=40.0)
+    hand.arrive(1000 * MS, 0.0, turn=0.4)
+    hand.at(1000 * MS)
+    hand.at(1025 * MS)
+    assert 2.0 * math.atan2(hand.hand.quaternion[3], hand.hand.quaternion[0]) == pytest.approx(0.2)
+    assert hand.hand.velocity[5] == pytest.approx(0.4 / 0.05)
+
+
+@given(
+    gaps=st.lists(st.integers(5, 100), min_size=2, max_size=20),
+    steps=st.lists(st.floats(0.0, 0.01), min_size=20, max_size=20),
+)
+def test_a_hand_has_no_jumps_and_never_goes_beyond_what_arrived(
+    gaps: list[int], steps: list[float]
+) -> None:
+    hand, now, x, last = Followed(gap_ms=33.0), 1000, 0.0, 0.0
+    for gap, step in zip(gaps, steps, strict=False):
+        x += step
+        hand.arrive(now * MS, x)
+        for _ in range(gap):
+            place = hand.at(now * MS)
+            assert last - 1e-12 <= place <= x + 1e-12
+            assert place - last <= 0.05  # of a way of 0.2 at most
+            last, now = place, now + 1
+    delay = round(STRETCH * LONGEST_GAP_NS / MS)
+    assert hand.at((now + delay) * MS) == pytest.approx(x, abs=1e-12)
+
+
+def test_a_hand_that_let_go_is_nowhere_and_takes_the_tool_again_where_it_is_then() -> None:
+    hand = Followed(gap_ms=40.0)
+    hand.arrive(1000 * MS, 0.01, is_held=False)
+    assert math.isnan(hand.at(1000 * MS))
+    hand.arrive(2000 * MS, 0.5)
+    assert hand.at(2000 * MS) == 0.5
+
+
+def test_a_pose_that_is_being_written_is_taken_later() -> None:
+    hand = Followed(gap_ms=40.0)
+    hand.arrive(1000 * MS, 0.01)
+    hand.seat.hand_sequence += 1
+    assert hand.at(1100 * MS) == 0.0
+    hand.seat.hand_sequence += 1
+    hand.at(1100 * MS)
+    assert hand.at(1200 * MS) == pytest.approx(0.01)
+
+
+def test_an_array_at_an_address_is_the_same_memory() -> None:
+    numbers: NDArray[np.float64] = np.arange(12.0)
+    view = array_at(numbers.ctypes.data, (3, 4), np.float64)  # type: ignore[no-untyped-call]
+    view[2, 3] = 100.0
+    assert numbers[-1] == 100.0
+    pace = np.zeros((), PACE)
+    array_at(pace.ctypes.data, (), PACE)["periods"] = 7  # type: ignore[no-untyped-call]
+    assert pace["periods"] == 7
+
+
+def test_the_clock_is_the_systems_and_a_sleep_takes_its_time() -> None:
+    moment = np.zeros(4, dtype=np.int64)
+    before = time.monotonic_ns()
+    begun = now_ns(moment)  # type: ignore[no-untyped-call]
+    sleep_ns(moment, 2 * MS)  # type: ignore[no-untyped-call]
+    ended = now_ns(moment)  # type: ignore[no-untyped-call]
+    assert before <= begun <= ended - 2 * MS
+    assert ended <= time.monotonic_ns()

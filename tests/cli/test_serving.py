@@ -1,0 +1,65 @@
+"""The verbs view and serve, with mistakes and signals."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+
+import hapticdb
+from children import PATIENCE, child
+from hapticdb.cli import main
+from hapticdb.cli.verbs.serving import TERMINATED
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    path = tmp_path / "scene.db"
+    hapticdb.create(path, hapticdb.Grid(0.01, (0.0, 0.0, 0.0), 6)).close()
+    return path
+
+
+@pytest.mark.parametrize(
+    ("args", "words"),
+    [
+        (["--host", "192.0.2.1"], "--token"),
+        (["--role-token", "owner=0123456789abcdef"], "viewer, toucher, editor"),
+        (["--role-token", "editor=short"], "16"),
+        (["--role-token", "editor"], "ROLE="),
+        (["--token-file", "none"], "--token-file none"),
+        (["--tool", "none.stl"], "no such file"),
+        (["--files", "none"], "no such folder"),
+        (["--prefix", "a b"], "--prefix"),
+        (["--tls-cert", "cert.pem"], "--tls-key"),
+        (["--seconds", "0"], "--seconds"),
+        (["--role-url", "editor=none.db"], "none.db"),
+    ],
+)
+def test_a_mistake_is_one_line_and_starts_nothing(
+    scene: Path, capsys: pytest.CaptureFixture[str], args: list[str], words: str
+) -> None:
+    assert main(["serve", str(scene), *args]) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    assert words in told.err
+    assert len(told.err.splitlines()) == 1
+
+
+@pytest.mark.long
+def test_sigterm_ends_the_server_in_order(scene: Path) -> None:
+    command = [sys.executable, "-m", "hapticdb", "serve", str(scene), "--token", "--log-json"]
+    with child(command, env=dict(os.environ)) as server:
+        assert server.stdout is not None
+        assert server.stderr is not None
+        lines = [server.stdout.readline().split() for _ in range(3)]
+        assert [role for role, _ in lines] == ["viewer", "toucher", "editor"]
+        place = lines[0][1].partition("?")[0]
+        with urlopen(f"{place}healthz", timeout=PATIENCE) as answer:  # noqa: S310 - our own
+            assert b'"status":"ok"' in answer.read()
+        server.send_signal(signal.SIGTERM)
+        told = server.stderr.read()
+        assert server.wait(PATIENCE) == TERMINATED
+    assert '"event": "stopped"' in told
+    assert "?token=" not in told

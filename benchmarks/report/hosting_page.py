@@ -20,7 +20,7 @@ def hosted_table(results: Mapping[str, Any]) -> str:
             f"{one['workers']}",
             f"{one['rate']:,.0f}",
             f"{100 * one['in_time']:.1f}",
-            f"{100 * one['least_in_time']:.1f}",
+            f"{max(100 * one['least_in_time'], 0.0):.1f}",
             times(one["lateness"], SHARES),
             times(one["elapsed"], SHARES),
             f"{one['worker_mb'] / one['sessions']:,.1f}",

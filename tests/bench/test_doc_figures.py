@@ -13,6 +13,7 @@ from hapticdb.bench import records
 from hapticdb.bench.drawing.draw import draw
 from hapticdb.bench.drawing.plots import plots_among
 from hapticdb.bench.feel.page import write_feel_page
+from report.hosting_page import hosted_table
 from report.laws_page import law_frame_table, law_session_table
 from report.page import write_report
 from report.plots import REPORT_KINDS
@@ -126,6 +127,7 @@ def test_every_figure_that_is_said_to_be_measured_is_in_its_file() -> None:
         "results/realtime.json": [session_table(realtime), frame_table(realtime)],
         "results/edits.json": [edit_table(edits)],
         "results/both_laws.json": [law_frame_table(laws), law_session_table(laws)],
+        "results/many_sessions.json": [hosted_table(loaded("results/many_sessions.json"))],
     }
     for one in (*realtime["sessions"], *edits["edits"], *laws["sessions"]):
         assert one["unknown_frames"] == 0  # the pages claim it

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticdb.errors import GridError, ObjectNotFoundError, UsageError
+from hapticdb.errors import GridError, ObjectNotFoundError, OutdatedError, UsageError
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, Place
 from hapticdb.resident.changes import known_cells_touched, writes_since
@@ -274,6 +274,14 @@ class Residency:
         return n_writes
 
     def _follow_writes(self, asked: Keys) -> tuple[int, UnpublishedCells]:
+        """Update the known cells in one snapshot; in a second one if the first was outdated."""
+        try:
+            return self._follow_once(asked)
+        except OutdatedError:  # what a server had pushed was not the newest any more
+            self.writer.slots.free_lost()
+            return self._follow_once(asked)
+
+    def _follow_once(self, asked: Keys) -> tuple[int, UnpublishedCells]:
         """Update the known cells to the last revision, and read the unknown cells `asked` (n,).
 
         The most urgent touched cells are read again, the others are forgotten. So memory and time

@@ -136,10 +136,13 @@ class BuiltIn(NamedTuple):
 FILE_SCHEME = "sqlite"
 """The engine of paths, which have no scheme."""
 POSTGRES = BuiltIn("hapticdb.store.postgres.engine", "psycopg", "hapticdb[postgres]")
+SERVER = BuiltIn("hapticdb.store.remote.engine", "websockets", "hapticdb[client]")
 BUILT_IN = {
     FILE_SCHEME: BuiltIn("hapticdb.store.sqlite.engine"),
     "postgresql": POSTGRES,
     "postgres": POSTGRES,
+    "ws": SERVER,
+    "wss": SERVER,
 }
 
 
@@ -180,5 +183,6 @@ def _installed(scheme: str) -> Engine:
 def unknown_scheme(scheme: str) -> UsageError:
     """Build the error for a URL that no engine opens."""
     return UsageError(
-        f"scheme {scheme!r}: give a path, sqlite:///path, or postgresql://host/database"
+        f"scheme {scheme!r}: give a path, sqlite:///path, postgresql://host/database, "
+        "or ws://host:port"
     )

@@ -1,0 +1,1 @@
+"""The endpoint `/device/cells`: rows and objects for clients that compute their own forces."""

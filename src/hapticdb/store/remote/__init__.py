@@ -1,0 +1,1 @@
+"""Environments behind a hapticdb server, to read: ``ws://host:port``."""

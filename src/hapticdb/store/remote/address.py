@@ -60,7 +60,8 @@ def parse_address(url: str) -> RemoteAddress:
     for pair in parts.query.split("&") if parts.query else []:
         key, equals, value = pair.partition("=")
         if key not in given or not equals:
-            raise UsageError(f"{shown}: a server's URL has the parameters token and ca, no others")
+            place = shown.partition("?")[0]  # a misspelt token is not shown either
+            raise UsageError(f"{place}: a server's URL has the parameters token and ca, no others")
         given[key] = unquote(value)
     token = given["token"] or os.environ.get(TOKEN_VARIABLE, "")
     if not (token.isascii() and token.isprintable()) or " " in token:

@@ -22,7 +22,7 @@ LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 """Addresses of this machine; a request that came by a proxy has the proxy's client instead."""
 FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "via")
 """Headers by which proxies tell that they passed a request on."""
-DEVICES: dict[str, str] = {}
+DEVICES: dict[str, str] = {"/device/cells": "hapticdb.server.cells.endpoint:serve_cells"}
 """Endpoints of devices: path -> ``module:function`` that gets a WebSocket."""
 
 

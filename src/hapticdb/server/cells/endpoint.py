@@ -8,11 +8,13 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from hapticdb.protocol.header import CloseCode
+from hapticdb.server.access import Role
 from hapticdb.server.cells.answers import Answers
 from hapticdb.server.cells.client import CellsClient
 from hapticdb.server.cells.limits import CellsLimits
 from hapticdb.server.cells.readers import Readers
 from hapticdb.server.cells.watcher import Watcher
+from hapticdb.server.served import Served
 
 Admission = Callable[[Mapping[str, str]], bool]
 """Tells by the headers of an opening request, names in lower case, whether a client may read."""
@@ -67,9 +69,8 @@ class CellsEndpoint:
             await client.serve()
         finally:
             self._clients.discard(client)
-            if not self._clients and self._watcher is not None:
-                self._watcher.stop()
-                self._watcher = None
+            if not self._clients:
+                await self._rest()
 
     def _status_of(self, socket: WebSocket) -> int:
         """HTTP status of a refusal; 0 for a client that may enter."""
@@ -104,10 +105,30 @@ class CellsEndpoint:
         self._is_closed = True
         for client in list(self._clients):
             client.send_away(CloseCode.ENDS, "the server ends")
-        if self._watcher is not None:
-            self._watcher.stop()
-        if self._readers is not None:
-            await self._readers.close()
+        await self._rest()
+
+    async def _rest(self) -> None:
+        """Close watcher and stores: without clients nothing is held open."""
+        watcher, self._watcher = self._watcher, None
+        readers, self._readers = self._readers, None
+        if watcher is not None:
+            watcher.stop()
+        if readers is not None:
+            await readers.close()
+
+
+async def serve_cells(socket: WebSocket) -> None:
+    """Serve one connection with what the server's application knows: `Served`."""
+    served: Served = socket.app.state.served
+
+    def may_enter(headers: Mapping[str, str]) -> bool:
+        role = served.access.role_of_headers(headers)
+        return role is not None and role >= Role.TOUCHER
+
+    if not hasattr(socket.app.state, "cells"):
+        socket.app.state.cells = CellsEndpoint(served.urls[Role.TOUCHER], may_enter=may_enter)
+    endpoint: CellsEndpoint = socket.app.state.cells
+    await endpoint(socket.scope, socket.receive, socket.send)
 
 
 async def _deny(socket: WebSocket, status: int) -> None:

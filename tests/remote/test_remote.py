@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
+from websockets.sync.client import ClientConnection, connect
 
 from hapticdb import Grid
 from hapticdb.errors import (
@@ -172,7 +172,7 @@ def test_snapshots_hold_beside_a_writer(remote: RemoteStore, environment: str) -
     assert len(seen) > 1
 
 
-def raw_client(server: DeviceServer, environment: str) -> "object":
+def raw_client(server: DeviceServer, environment: str) -> ClientConnection:
     return connect(server.url(environment) + "/device/cells", proxy=None, compression=None)
 
 
@@ -186,7 +186,7 @@ def test_malformed_messages_end_their_own_connection_alone(
     rng = np.random.default_rng(1)
     random_ones = [hello[: int(rng.integers(3))] + rng.bytes(20) for _ in range(20)]
     expected = len(remote.scan(*EVERYWHERE))
-    cases = [
+    cases: list[tuple[list[bytes | str], int | None]] = [
         ([b"short"], CloseCode.MALFORMED),
         ([hello, scan + huge], CloseCode.MALFORMED),
         ([hello, scan + bytes(8) + b"more"], CloseCode.MALFORMED),
@@ -196,7 +196,7 @@ def test_malformed_messages_end_their_own_connection_alone(
         *(([hello, message], None) for message in random_ones),
     ]
     for messages, code in cases:
-        with raw_client(device_server, environment) as client:  # type: ignore[attr-defined]
+        with raw_client(device_server, environment) as client:
             with suppress(ConnectionClosed):
                 for message in messages:
                     client.send(message)
@@ -240,7 +240,7 @@ def test_a_server_that_comes_back_is_used_again(environment: str, tmp_path: Path
 
 
 def test_a_header_answers_with_its_number(device_server: DeviceServer, environment: str) -> None:
-    with raw_client(device_server, environment) as client:  # type: ignore[attr-defined]
+    with raw_client(device_server, environment) as client:
         client.send(MessageHeader(Kind.HELLO, 77).packed())
         found = header_of(client.recv(timeout=ANSWER_S))
         assert (found.kind, found.number) == (Kind.WELCOME, 77)

@@ -2,7 +2,8 @@
 
 from dataclasses import dataclass
 
-from hapticdb.server.limits import MIB
+MIB = 1 << 20
+"""Bytes of a MiB."""
 
 
 @dataclass(frozen=True)

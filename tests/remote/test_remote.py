@@ -184,7 +184,9 @@ def test_malformed_messages_end_their_own_connection_alone(
     scan = MessageHeader(Kind.SCAN, 2).packed()
     huge = b"\x00\x00\x00\x00\xff\xff\xff\xff"
     rng = np.random.default_rng(1)
-    random_ones = [hello[: int(rng.integers(3))] + rng.bytes(20) for _ in range(20)]
+    random_ones: list[bytes | str] = [
+        hello[: int(rng.integers(3))] + rng.bytes(20) for _ in range(20)
+    ]
     expected = len(remote.scan(*EVERYWHERE))
     cases: list[tuple[list[bytes | str], int | None]] = [
         ([b"short"], CloseCode.MALFORMED),
@@ -193,7 +195,7 @@ def test_malformed_messages_end_their_own_connection_alone(
         ([hello, b"hd\x09" + bytes(13)], CloseCode.VERSION),
         ([hello, "text"], CloseCode.MALFORMED),
         ([scan + bytes(8)], CloseCode.MALFORMED),
-        *(([hello, message], None) for message in random_ones),
+        *[([hello, message], None) for message in random_ones],
     ]
     for messages, code in cases:
         with raw_client(device_server, environment) as client:
@@ -242,5 +244,5 @@ def test_a_server_that_comes_back_is_used_again(environment: str, tmp_path: Path
 def test_a_header_answers_with_its_number(device_server: DeviceServer, environment: str) -> None:
     with raw_client(device_server, environment) as client:
         client.send(MessageHeader(Kind.HELLO, 77).packed())
-        found = header_of(client.recv(timeout=ANSWER_S))
+        found = header_of(client.recv(timeout=ANSWER_S, decode=False))
         assert (found.kind, found.number) == (Kind.WELCOME, 77)

@@ -41,13 +41,15 @@ LINES = {
     "grant": "scene.db anna --as viewer",
     "sample": "made --frames 2",
     "warm": "",
+    "view": "scene.db --no-browser --seconds 1",
+    "serve": "scene.db --seconds 1",
 }
 """Arguments of each verb, without a picture."""
 REFUSED = {"grant": 2}
 """Verbs with an exit code other than 0: an SQLite file has no roles."""
 DRAWING = {"demo", "bench"}
 """Verbs that always draw."""
-LONG = {"feel", "replay", "sweep", "calibrate", "sample", "warm"}
+LONG = {"feel", "replay", "sweep", "calibrate", "sample", "warm", "view", "serve"}
 TRIANGLE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n"
 
 

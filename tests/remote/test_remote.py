@@ -94,8 +94,8 @@ def test_links_have_no_folders(device_server: DeviceServer, tmp_path: Path) -> N
     ijk = blob(1, (20, 20, 20))
     with closing(create_store(url, GRID, "brick")) as store:
         made = voxel_object(GRID, ijk, "part")
-        told = {"unit": "m", "source": "/home/somebody/part.stl", "in": ["C:\\parts"]}
-        made = replace(made, link="/home/somebody/part.stl", attributes=told)
+        told = {"unit": "m", "source": "/srv/parts/part.stl", "in": ["C:\\parts"]}
+        made = replace(made, link="/srv/parts/part.stl", attributes=told)
         store.add(made, rows_of_voxels(ijk, GRID, "brick"))
         own = store.object(1)
     with closing(RemoteStore(device_server.url(url))) as remote:

@@ -128,8 +128,8 @@ def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Pat
     env = make(tmp_path, bits=9)
     size = env.grid.voxel_size
     rng = np.random.default_rng(1)
-    middles = np.array(env.grid.origin) + size * (32.0 * rng.integers(1, 15, (100, 3)) + 1.0)
-    points = np.repeat(middles, RUN, axis=0) + rng.uniform(0.0, size, (100 * RUN, 3))
+    middles = np.array(env.grid.origin) + size * (32.0 * rng.integers(1, 15, (90, 3)) + 1.0)
+    points = np.repeat(middles, RUN, axis=0) + rng.uniform(0.0, size, (90 * RUN, 3))
     normals = np.tile((0.0, 0.0, 1.0), (len(points), 1))
     shell = PointShell(points, normals, np.zeros(3))
     write_voxels(env.store, env.grid.voxels_of(middles))

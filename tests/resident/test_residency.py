@@ -123,8 +123,8 @@ def test_excluded_objects_are_in_no_cell(tmp_path: Path, table: CellTable) -> No
     env = make(tmp_path)
     scatter(env)
     residency = Residency(env.store, table, [3, 1])
-    residency.load(residency.missing(cells_of(env.grid))[:50])
-    assert check(residency, voxels_by_cell(env, (1, 3))) == 50
+    residency.load(residency.missing(cells_of(env.grid))[:40])
+    assert check(residency, voxels_by_cell(env, (1, 3))) == 40
 
 
 def test_cells_follow_the_words_of_a_filter(tmp_path: Path, table: CellTable) -> None:
@@ -223,9 +223,9 @@ def test_empty_cells_beyond_number_do_not_push_out_those_at_the_tool(
     env = make(tmp_path, bits=9)  # 4096 cells, all without voxels
     residency = Residency(env.store, table)
     cells = cells_of(env.grid)
-    near = cells[:50]
-    for at in range(0, 4096, 50):
-        residency.load(residency.missing(cells[at : at + 50]))
+    near = cells[:40]
+    for at in range(0, 4096, 40):
+        residency.load(residency.missing(cells[at : at + 40]))
         residency.want(near, residency.slots_of(near))
         residency.load(residency.missing(near))
         assert (residency.slots_of(near) == 0).all()

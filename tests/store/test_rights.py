@@ -397,6 +397,8 @@ def lines(url: str) -> dict[str, list[str]]:
         "grant": [url, "pg_monitor", "--as", "viewer"],
         "remove": [url, "1"],
         "demo": ["shown", "--url", url],
+        "view": [url, "--no-browser", "--seconds", "1"],
+        "serve": [url, "--seconds", "1"],
     }
 
 

@@ -19,6 +19,7 @@ from hapticdb.errors import GeometryChangedError
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.pointshell.shell import fibonacci_sphere
 from hapticdb.poses import rotation_of
+from hapticdb.resident.table import LEAST_BUDGET, slots_within
 from hapticdb.store.base import Layout
 from hapticdb.sweeps import run as sweeping
 from hapticdb.sweeps.path import SweepPath
@@ -356,8 +357,10 @@ def test_the_least_budget_finds_the_same(tmp_path: Path) -> None:
     with hapticdb.create(tmp_path / "spots.db", grid) as env:
         write(env, np.unique(spots, axis=0), "spots")
         large = sweep(env, shell, poses, clearance_limit=0.05, profile=True)
-        small = sweep(env, shell, poses, clearance_limit=0.05, profile=True, budget_bytes=1 << 20)
-    assert small.cells > large.cells
+        small = sweep(
+            env, shell, poses, clearance_limit=0.05, profile=True, budget_bytes=LEAST_BUDGET
+        )
+    assert small.cells > 2 * slots_within(LEAST_BUDGET)  # so cells have made room for others
     assert (small.hits, small.contacts) == (large.hits, large.contacts)
     assert np.array_equal(small.profile.clearances, large.profile.clearances)
     for one, same in zip(small.objects, large.objects, strict=True):

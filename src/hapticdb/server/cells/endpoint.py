@@ -1,5 +1,6 @@
 """The endpoint for cells as an ASGI application, to be mounted as a WebSocket route."""
 
+import asyncio
 import contextlib
 from collections.abc import Callable, Mapping
 
@@ -67,6 +68,8 @@ class CellsEndpoint:
         try:
             await socket.accept()
             await client.serve()
+        except asyncio.CancelledError:
+            pass  # only the server's end cancels, and uvicorn would log a traceback
         finally:
             self._clients.discard(client)
             if not self._clients:

@@ -113,7 +113,8 @@ def of_database(env: Environment, shell: PointShell, places: Floats) -> dict[str
 
 def of_cells(env: Environment, shell: PointShell, places: Floats) -> dict[str, Any]:
     """Figures of frames against resident cells: a table for each filter."""
-    tables, frames, alive = [], {}, []
+    frames: dict[str, Frame] = {}
+    tables, alive = [], []
     for name, words in (("all", []), *((str(n), words) for n, words in FILTERS.items())):
         table = CellTable.create(256 << 20)
         tables.append(table)

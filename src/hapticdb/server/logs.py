@@ -3,6 +3,8 @@
 import json
 import logging
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Literal
 
 STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message"}
@@ -51,12 +53,21 @@ def words_of(record: logging.LogRecord) -> str:
     return " ".join(words.split())
 
 
-def begin(form: Literal["plain", "json"], level: int = logging.INFO) -> None:
-    """Write the server's events to standard error from now on."""
+@contextmanager
+def written(form: Literal["plain", "json"], level: int = logging.INFO) -> Iterator[None]:
+    """Write the server's events to standard error inside the block."""
     handler = logging.StreamHandler(sys.stderr)
     handler.setFormatter(JsonLine() if form == "json" else PlainLine())
+    before = []
     for name in LOGGERS:
         logger = logging.getLogger(name)
+        before.append((logger, logger.handlers, logger.propagate, logger.level))
         logger.handlers = [handler]
         logger.propagate = False
         logger.setLevel(level if name == "hapticdb" else max(level, logging.WARNING))
+    try:
+        yield
+    finally:
+        for logger, handlers, propagates, former in before:
+            logger.handlers, logger.propagate = handlers, propagates
+            logger.setLevel(former)

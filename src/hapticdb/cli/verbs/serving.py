@@ -266,7 +266,6 @@ def _run(
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"--seconds {seconds:g}: give a time above 0")
     running.check(serving)
-    logs.begin("json" if log_json else "plain", logging.WARNING if is_quiet else logging.INFO)
     if not running.is_near(serving.host) and serving.certificate is None:
         render.note(
             "tokens and forces cross the network unencrypted; give --tls-cert and --tls-key, or "
@@ -288,7 +287,9 @@ def _run(
             await running.run(serving, begun, stop)
         return signals
 
-    signals = asyncio.run(work())
+    level = logging.WARNING if is_quiet else logging.INFO
+    with logs.written("json" if log_json else "plain", level):
+        signals = asyncio.run(work())
     if signal.SIGTERM in signals:
         render.note("ended by SIGTERM")
         raise typer.Exit(TERMINATED)

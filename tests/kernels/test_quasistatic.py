@@ -268,7 +268,7 @@ def test_the_guard_softens_a_force_that_shakes(frequency: float, acts: bool) -> 
     flags = 0
     for n in range(1000):
         hand.move([0.0, 0.0, 0.004 + 0.001 * math.sin(2e-3 * math.pi * frequency * n)])
-        flags |= int(hand.sent.flags)
+        flags |= int(hand.sent.marks)
     assert bool(flags & quasistatic.IS_SOFTER) == acts
     assert (hand.follower["share"] < 1.0) == acts
 
@@ -282,7 +282,7 @@ def test_a_tool_stays_before_unknown_cells_and_its_force_fades() -> None:
     for _ in range(15):
         hand.move([0.0, 0.2, 0.004])
         assert hand.sent.unknown > 0
-        assert hand.sent.flags & IS_HELD
+        assert hand.sent.marks & IS_HELD
         assert hand.missed[0] > 0
     assert hand.sent.wrench[2] == before
     hand.rest(60)
@@ -367,7 +367,7 @@ def test_a_tool_astride_a_sheet_comes_free_without_a_step_and_is_then_held(seed:
     start = rng.uniform(-2.5, 2.5) * size * normal
     hand = Hand(field_of(sheet(normal), size), globe(3.0 * size), start, cap=8.0)
     hand.advance()
-    assert hand.sent.flags & quasistatic.IS_LOOSE
+    assert hand.sent.marks & quasistatic.IS_LOOSE
     for n in range(300):
         assert np.abs(hand.move(start + normal * size * n / 15.0)).max() == 0.0
     assert (hand.tool.position == hand.hand.position).all()
@@ -425,7 +425,7 @@ def test_the_force_changes_softly_when_the_tool_snaps_off_an_edge(size: float) -
     forces, stretches, flags = [hand.advance()], [], 0
     for way in np.arange(0.0, 12.0 * size, step):
         forces.append(hand.move(start + way * slope))
-        flags |= int(hand.sent.flags)
+        flags |= int(hand.sent.marks)
         stretches.append(float(np.linalg.norm(hand.hand.position - hand.tool.position)))
     snap = -1000.0 * np.diff(stretches).min()
     assert (snap > 2.0) == bool(flags & quasistatic.IS_SNAPPING) == (size == 0.005)

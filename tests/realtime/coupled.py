@@ -143,7 +143,7 @@ class Tool:
 
     @property
     def flags(self) -> int:
-        return int(self.sent.flags)
+        return int(self.sent.marks)
 
     @property
     def is_at_rest(self) -> bool:

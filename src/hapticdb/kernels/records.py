@@ -117,7 +117,7 @@ SENT: Layout = _record(
         ("unknown", "<i8"),  # points, at the pose that was tried
         ("deepest", "<f8"),  # m
         ("n_steps", "<i8"),  # made
-        ("flags", "<i8"),  # named in `kernels.hand.coupling`
+        ("marks", "<i8"),  # bits named in `kernels.hand.coupling`; `flags` is NumPy's own name
         ("revision", "<i8"),  # of the database
     ]
 )

@@ -261,7 +261,7 @@ class Loop:
         A request that stays would be answered again at each write, for voxels that are no longer
         touched. A request withdrawn at once would never be answered by a slow database.
         """
-        if self.sent.hits or self.sent.flags & quasistatic.IS_LOOSE:
+        if self.sent.hits or self.sent.marks & quasistatic.IS_LOOSE:
             self._ask(self.drive.touching(self.sent.hits.item()))
             self._asked_at = now
         elif self._asked_at and self.cells.control[HEARTBEAT] > self._asked_at + WITHDRAWN_NS:
@@ -278,7 +278,7 @@ class Loop:
         buttons: int,
         state: int,
     ) -> None:
-        if self.request.is_recorded and not self.sent.flags.item() & kernels.IS_HELD:
+        if self.request.is_recorded and not self.sent.marks.item() & kernels.IS_HELD:
             poses_of(self._tool_pose, self._pose)
             self.drive.feel()
         servo.note(self.ring, at, begun, dt, lateness, elapsed, self.servo, buttons, state)
@@ -339,13 +339,13 @@ class Loop:
         device.apply(np.zeros(6))
         self.counts.frames = deadlines.frames
         self.counts.least_share = self.drive.least_share
-        self.counts.ended_loose = bool(self.sent.flags.item() & quasistatic.IS_LOOSE)
+        self.counts.ended_loose = bool(self.sent.marks.item() & quasistatic.IS_LOOSE)
         return deadlines.figures()
 
     def _count(self, is_clutch_open: bool, is_stale: bool) -> int:  # noqa: FBT001 - of a frame
         """Add a frame to the counts; returns its recorded state."""
         counts, sent = self.counts, self.sent
-        flags = sent.flags.item()
+        flags = sent.marks.item()
         state = State(0)
         counts.substeps += sent.n_steps.item()
         if sent.hits or flags:

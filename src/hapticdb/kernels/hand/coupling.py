@@ -468,5 +468,5 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
     sent.unknown = n_unknown
     sent.deepest = frame[DEEPEST]
     sent.n_steps = n_steps
-    sent.flags = flags
+    sent.marks = flags
     sent.revision = revision

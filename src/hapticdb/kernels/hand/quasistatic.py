@@ -381,7 +381,7 @@ def advance(
     revision = cells.control[REVISION + which]  # before end_frame: then the buffer may be reused
     end_frame(cells, reader)
     is_held = is_held or found == NOT_KNOWN
-    sent.flags = finish(
+    sent.marks = finish(
         spring, shell, place, tool, hand, follower, field, met, is_held, found, dt, sent.wrench
     )
     sent.hits = np.int64(tool.felt[HITS])

@@ -142,7 +142,7 @@ def step_smooth(station, seat, shell, place, dt, field, met, missed, poses, felt
     place_tool(servo.tool, poses[0])
     if is_shown:
         show_smooth(seat, shell, poses[0], place, spring, follower, field, met)
-    if seat.is_recorded and not servo.sent.flags & IS_HELD:
+    if seat.is_recorded and not servo.sent.marks & IS_HELD:
         feel_again(station, cells, shell, place, poses, met, missed, felts, servo)
     return spring.radius
 
@@ -167,7 +167,7 @@ def step_plane(station, seat, shell, place, dt, met, missed, poses, is_shown):
 @leaf
 def ask_objects(station, seat, session_record, shell, place, follower, sent, field, met, pose):
     """Ask for the objects that are touched, and show those that were answered."""
-    n_touching = list_touching(follower, field, met, sent.hits, (sent.flags & IS_LOOSE) != 0)
+    n_touching = list_touching(follower, field, met, sent.hits, (sent.marks & IS_LOOSE) != 0)
     name_voxels(
         session_record, shell, pose, place, station.bits, station.curve, met[TOUCHING], n_touching
     )
@@ -210,13 +210,13 @@ def run_session(station, seat, ring, missed, poses, felts, due, moment):
     lateness, elapsed = 1e-9 * (begun - due), 1e-9 * (now_ns(moment) - begun)
     note(
         ring, seat.n_frames, 1e-9 * (begun - station.began), dt, lateness, elapsed, servo_record,
-        np.int64(0), state_of_flags(sent.flags),
+        np.int64(0), state_of_flags(sent.marks),
     )  # fmt: skip
     fence()
     seat.n_frames += 1
     count_times(seat, lateness, elapsed)
     seat.unknown_frames += sent.unknown > 0
-    seat.held_frames += (sent.flags & IS_HELD) != 0
+    seat.held_frames += (sent.marks & IS_HELD) != 0
     seat.stale_frames += hand.is_stale
 
 

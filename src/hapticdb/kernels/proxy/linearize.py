@@ -190,13 +190,13 @@ def linearize(
     """
     servo, follower, model = servo_record[()], follower_record[()], model_record[()]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
-    is_felt = write_hand(spring, shell, tool, hand, follower, sent.flags, model)
+    is_felt = write_hand(spring, shell, tool, hand, follower, sent.marks, model)
     model.contact, model.onset = contact_stiffness(spring, place.size), ONSET * place.size
     model.n_planes, model.trust = 0, 0.0
     for row in range(6):
         for column in range(6):
             model.stiffness[row, column] = 0.0
-    if sent.flags & (IS_LOOSE | IS_HELD) or tool.version == 0:
+    if sent.marks & (IS_LOOSE | IS_HELD) or tool.version == 0:
         return
     which = begin_frame(cells, reader)
     count, trust = find_rows(cells, which, shell, place, tool, follower, field, rows)

@@ -198,6 +198,8 @@ def test_where_chooses_what_is_felt(plane: Environment, sphere: PointShell) -> N
 
 def test_a_new_coupling_is_felt(session: HostedSession, env: Environment) -> None:
     press(session, lambda: pushed(session) > 0.5)
+    risen = time.monotonic() + 0.5  # the hand comes down over a few moves
+    press(session, lambda: time.monotonic() > risen)
     before = pushed(session)
     is_smooth = all(obj.has_distances for obj in env.objects())
     session.set_coupling(

@@ -9,7 +9,6 @@ import threading
 import traceback
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Literal
 from urllib.parse import quote, urlencode
 
 import numpy as np
@@ -28,6 +27,7 @@ from hapticdb.difference import diff_environments
 from hapticdb.query import cost_model, quantiles
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.connect import grant, redact
+from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
@@ -35,7 +35,6 @@ from hapticdb.testing import floor_voxels, write_voxels
 from hapticdb.transfer import copy_environment
 from servers import SETTINGS, Place
 
-Right = Literal["viewer", "toucher", "editor", "nobody"]
 GRID = Grid(0.005, (0, 0, 0), 7)
 PASSWORD = 'no\' "secret" %40'  # noqa: S105 - of roles that live as long as a test
 NAMES: dict[Right, str] = {
@@ -391,8 +390,7 @@ def lines(url: str) -> dict[str, list[str]]:
         "replay": ["felt.hdbrec", url],
         "sweep": [url, *by, "--path", "path.csv"],
         "move": [url, "1", "--translate", "0,0,0.01"],
-        "copy": [url, "copy.db"],
-        "diff": [url, "copy.db"],
+        **{verb: [url, "copy.db"] for verb in ("copy", "diff")},
         "bench": [url, "--quick"],
         "grant": [url, "pg_monitor", "--as", "viewer"],
         "remove": [url, "1"],

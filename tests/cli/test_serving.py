@@ -11,7 +11,7 @@ import pytest
 import hapticdb
 from children import PATIENCE, child
 from hapticdb.cli import main
-from hapticdb.cli.verbs.serving import TERMINATED
+from hapticdb.cli.root import TERMINATED
 
 
 @pytest.fixture

@@ -2,7 +2,7 @@
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Annotated, Any
 
@@ -64,6 +64,10 @@ def leave(number: int, _: object) -> None:
     raise SystemExit(128 + number)
 
 
+TERMINATED = 128 + signal.SIGTERM
+"""Exit code of a verb that SIGTERM has ended in order."""
+
+
 def _show_version(*, wanted: bool) -> None:
     if wanted:
         from hapticdb import __version__
@@ -105,3 +109,31 @@ def root(
     del version, debug  # seen by their callbacks and by `main`
     if context.invoked_subcommand is None:
         print(context.get_help())
+
+
+@contextmanager
+def ended_by_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
+    """Let Ctrl-C or SIGTERM end a verb's work in order, and a second one the program.
+
+    stop : asks the work to end. Yields the signals that came.
+    """
+    came: list[int] = []
+    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    before = {  # another's handler stays
+        number: handler
+        for number, handler in handlers.items()
+        if handler in {signal.default_int_handler, interrupting.interrupt, leave}
+    }
+
+    def end(number: int, _: object) -> None:
+        came.append(number)
+        stop()
+        signal.signal(number, before[signal.Signals(number)])
+
+    for number in before:
+        signal.signal(number, end)
+    try:
+        yield came
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

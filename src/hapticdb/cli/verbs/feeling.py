@@ -1,8 +1,7 @@
 """The verb feel."""
 
 import signal
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
@@ -23,11 +22,10 @@ from hapticdb.cli.options import (
     UrlArgument,
     WhereOption,
 )
-from hapticdb.cli.root import Interrupted, leave
+from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.cli.tools import compile_for, shell_of, shell_record
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.errors import UsageError
-from hapticdb.interrupting import interrupt
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
@@ -36,8 +34,6 @@ if TYPE_CHECKING:
     from hapticdb.realtime.session import Session
 
 PolicyName = Literal["hold", "wait"]
-TERMINATED = 128 + signal.SIGTERM
-"""Exit code after SIGTERM."""
 LOOK_EVERY = 0.25
 """Seconds between two looks at the session: how late is told that its recording has ended, or that
 the tool lies in an object."""
@@ -278,7 +274,7 @@ def _felt(url: str, where: Sequence[str] | None, exclude: Sequence[str] | None) 
 def _run(session: "Session", tool: str, force: ForceOptions) -> "tuple[Report, list[int]]":
     """Wait for a session's end: its report, and the signals that asked for the end."""
     force.tell_lowered(session)
-    with session, _ended_by_signals(session) as signals:
+    with session, ended_by_signals(session.ask_to_end) as signals:
         fitting.tell(session.proportions, tool, "--scale")
         report = _waited_for(session)
     return report, signals
@@ -303,31 +299,3 @@ def _waited_for(session: "Session") -> "Report":
             render.note(f"{session.recording_ended}; the session goes on without it")
             is_told = True
     return report
-
-
-@contextmanager
-def _ended_by_signals(session: "Session") -> Iterator[list[int]]:
-    """Let Ctrl-C or SIGTERM end the session, with its report, and a second one the program.
-
-    Yields the signals that came.
-    """
-    came: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    before = {  # another's handler stays
-        number: handler
-        for number, handler in handlers.items()
-        if handler in {signal.default_int_handler, interrupt, leave}
-    }
-
-    def end(number: int, _: object) -> None:
-        came.append(number)
-        session.ask_to_end()
-        signal.signal(number, before[signal.Signals(number)])
-
-    for number in before:
-        signal.signal(number, end)
-    try:
-        yield came
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

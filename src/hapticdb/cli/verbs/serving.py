@@ -2,8 +2,7 @@
 
 import signal
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,16 +10,13 @@ import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.options import UrlArgument
-from hapticdb.cli.root import Interrupted, leave
+from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.errors import MissingExtraError, UsageError
-from hapticdb.interrupting import interrupt
 
 if TYPE_CHECKING:
     from hapticdb.server.access import Role
     from hapticdb.server.running import Serving
 
-TERMINATED = 128 + signal.SIGTERM
-"""Exit code after SIGTERM."""
 
 ToolsOption = Annotated[
     list[str] | None,
@@ -283,7 +279,7 @@ def _run(
             if seconds is not None:
                 loop.call_later(seconds, stop.set)
 
-        with _ended_by_signals(lambda: loop.call_soon_threadsafe(stop.set)) as signals:
+        with ended_by_signals(lambda: loop.call_soon_threadsafe(stop.set)) as signals:
             await running.run(serving, begun, stop)
         return signals
 
@@ -295,31 +291,3 @@ def _run(
         raise typer.Exit(TERMINATED)
     if signals:
         raise Interrupted("ended by Ctrl-C")
-
-
-@contextmanager
-def _ended_by_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
-    """Let Ctrl-C or SIGTERM end the server in order, and a second one the program.
-
-    Yields the signals that came.
-    """
-    came: list[int] = []
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-    before = {  # another's handler stays
-        number: handler
-        for number, handler in handlers.items()
-        if handler in {signal.default_int_handler, interrupt, leave}
-    }
-
-    def end(number: int, _: object) -> None:
-        came.append(number)
-        stop()
-        signal.signal(number, before[signal.Signals(number)])
-
-    for number in before:
-        signal.signal(number, end)
-    try:
-        yield came
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)

@@ -3,6 +3,7 @@
 import fnmatch
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -149,6 +150,30 @@ def test_a_verb_compiles_its_own_kernels_once_and_says_so(tmp_path: Path) -> Non
     ready = f"{len(NAMES)} kernels ready:"
     assert done.stdout.startswith(f"{ready} {len(NAMES) - len(so_far)} compiled now")
     assert finished(command("warm"), env=env).stdout.startswith(f"{ready} 0 compiled now")
+
+
+@NEEDS_JIT
+@pytest.mark.parametrize("change", ["another copy", "another time"])
+def test_what_another_copy_of_the_package_has_compiled_is_missing_here(
+    tmp_path: Path, change: str
+) -> None:
+    """numba keeps code by the path and the time of its source, even where sources are equal."""
+    copies = [tmp_path / name / "hapticdb" for name in ("first", "second")]
+    for copy in copies:
+        shutil.copytree(Path(compiling.__file__).parents[1], copy)  # with the sources' times
+    told = []
+    for n, work in enumerate(["compile_missing(names)", "0", "0"]):
+        copy = copies[n == 2 and change == "another copy"]
+        if n == 2 and change == "another time":
+            os.utime(copy / "kernels" / "rigid.py", (1e9, 1e9))
+        code = (
+            "from hapticdb.kernels.compiling import compile_missing, missing; "
+            f"names = ['rigid.poses_of']; {work}; print(missing(names))"
+        )
+        cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(copy.parent)}
+        done = finished([sys.executable, "-c", code], env=os.environ | cache, check=True)
+        told.append(done.stdout.strip())
+    assert told == ["[]", "[]", "['rigid.poses_of']"]
 
 
 @NEEDS_JIT

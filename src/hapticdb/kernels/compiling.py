@@ -4,7 +4,7 @@ numba compiles one function at a time in a process, with any number of threads. 
 compiles whole modules of entries, because two processes that wrote the index of one entry would
 lose each other's work. The machine code goes into the cache on disk; the process that asked, and
 every later process, loads it from there. A mark file beside the code says that an entry is
-compiled, so that numba need not be loaded to find out.
+compiled for this copy of the package, so that numba need not be loaded to find out.
 """
 
 import contextlib
@@ -332,4 +332,13 @@ def _target() -> str:
 
 
 def _mark_of(name: str) -> Path:
-    return Path(CACHE_FOLDER) / f"{name}.{_target()}.compiled"
+    """Mark file of an entry, as it was compiled for this copy of the package.
+
+    Copies of the package with equal sources share the folder, but not the code in it: numba keeps
+    code by the path of its source file, and drops it when that file has another time.
+    """
+    source = Path(__file__).parent.joinpath(*name.split(".")[:-1]).with_suffix(".py").absolute()
+    known = source.stat()
+    words = f"{source}\0{known.st_mtime_ns}\0{known.st_size}"
+    copy = hashlib.sha256(words.encode()).hexdigest()[:16]
+    return Path(CACHE_FOLDER) / f"{name}.{_target()}.{copy}.compiled"

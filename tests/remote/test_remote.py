@@ -23,8 +23,8 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.protocol import cells as bodies
 from hapticdb.protocol.header import CloseCode, Kind, MessageHeader, header_of
 from hapticdb.store.connect import create_store, open_store
-from hapticdb.store.remote.address import parse_address
 from hapticdb.store.remote.store import RemoteStore
+from hapticdb.store.urls import parse_address
 from hapticdb.testing import blob, is_noticed, voxel_object, write_voxels
 from hapticdb.testing.scenes import EVERYWHERE, covering
 from remote.device_server import DeviceServer
@@ -238,7 +238,9 @@ def test_a_server_that_comes_back_is_used_again(environment: str, tmp_path: Path
     server.close()
     with pytest.raises(ConnectionLostError):
         store.revision()
-    store.close()
+    with DeviceServer(tmp_path / "log", port=server.port), closing(store):
+        assert store.revision() == 2
+        assert {one.id for one in store.objects()} == {1, 2}
 
 
 def test_a_header_answers_with_its_number(device_server: DeviceServer, environment: str) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from http import HTTPStatus
 from typing import TypeVar
 
-from websockets.exceptions import InvalidHandshake, InvalidStatus, WebSocketException
+from websockets.exceptions import InvalidStatus, WebSocketException
 from websockets.sync.client import ClientConnection
 from websockets.sync.client import connect as connect_websocket
 
@@ -28,8 +28,8 @@ from hapticdb.protocol.cells import MOST_ANSWER, WelcomeBody, welcome_of
 from hapticdb.protocol.fields import FieldsRead
 from hapticdb.protocol.header import NO_REVISION, Kind, MessageHeader, Refusal, header_of
 from hapticdb.store.refusals import check_outside
-from hapticdb.store.remote.address import RemoteAddress
 from hapticdb.store.threads import check_thread, this_thread
+from hapticdb.store.urls import RemoteAddress
 
 Answer = TypeVar("Answer")
 Message = tuple[MessageHeader, FieldsRead]
@@ -171,7 +171,7 @@ class RemoteConnection:
                 f"{self.shown}: the server's certificate is not trusted ({error.verify_message}); "
                 "?ca=FILE names the file of a private authority"
             ) from error
-        except (OSError, TimeoutError, InvalidHandshake) as error:
+        except (OSError, TimeoutError, WebSocketException) as error:
             cause = " ".join(str(error).split()) or type(error).__name__
             raise ConnectionLostError(f"{self.shown} cannot be reached: {cause}") from error
 

@@ -7,8 +7,8 @@ from hapticdb.errors import EnvironmentNotFoundError, ReadOnlyError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.engines import Capability
-from hapticdb.store.remote.address import parse_address
 from hapticdb.store.remote.store import RemoteStore
+from hapticdb.store.urls import parse_address
 
 
 class RemoteEngine:

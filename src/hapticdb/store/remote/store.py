@@ -31,9 +31,9 @@ from hapticdb.store.messages import (
     rows_of_body,
 )
 from hapticdb.store.refusals import no_object
-from hapticdb.store.remote.address import parse_address
 from hapticdb.store.remote.connection import RemoteConnection
 from hapticdb.store.remote.news import RemoteNews
+from hapticdb.store.urls import parse_address
 
 BEATS = 4.0
 """The server is alive if something came within so many of its beats. Larger: a late beat costs no

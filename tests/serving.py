@@ -72,6 +72,15 @@ class Running:
         )  # fmt: skip
 
 
+def browser_at(place: str, token: str) -> ClientConnection:
+    """Connect to the page at a host and port, as viser's client does."""
+    shown = {"Origin": f"http://{place}", "Authorization": f"Bearer {token}"}
+    return connect(
+        f"ws://{place}", subprotocols=PROTOCOL, additional_headers=shown, proxy=None,
+        compression=None, open_timeout=PATIENCE,
+    )  # fmt: skip
+
+
 def urls(url: str | Path) -> dict[Role, str]:
     """The same address for each role."""
     return dict.fromkeys(Role, str(url))

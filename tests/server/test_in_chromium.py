@@ -4,14 +4,13 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import ConsoleMessage, Page, sync_playwright
+from playwright.sync_api import ConsoleMessage, Page
 
+from chromium import chromium
 from hapticdb.server.access import Role
 from hapticdb.server.running import Serving
 from serving import TOKENS, Running, running, urls
 
-CHROMIUM = "/usr/bin/chromium"
-ARGUMENTS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 INJECTED = """() => {
     const script = document.createElement("script");
     script.textContent = "window.injected = 1";
@@ -32,12 +31,8 @@ def server(environment: Path) -> Iterator[Running]:
 
 @pytest.fixture
 def page() -> Iterator[Page]:
-    with sync_playwright() as play:
-        browser = play.chromium.launch(executable_path=CHROMIUM, args=ARGUMENTS)
-        try:
-            yield browser.new_page(viewport={"width": 640, "height": 400})
-        finally:
-            browser.close()
+    with chromium() as browser:
+        yield browser.new_page(viewport={"width": 640, "height": 400})
 
 
 def test_the_view_opens_by_its_link_and_works_under_the_policy(server: Running, page: Page) -> None:

@@ -95,6 +95,18 @@ def test_figures_need_a_token_or_this_machine(server: Running) -> None:
     assert server.ask("/metrics", X_Forwarded_For=far, Authorization=shown)[0].status == 200
 
 
+def test_open_connections_of_devices_are_counted(server: Running) -> None:
+    def is_counted(number: str) -> bool:
+        text = server.ask("/metrics")[1].decode()
+        return f'hapticdb_devices{{endpoint="cells"}} {number}\n' in text
+
+    shown = {"Authorization": f"Bearer a-token-for-{Role.TOUCHER.word}"}
+    address = f"ws://{server.place}{server.prefix}/device/cells"
+    with connect(address, additional_headers=shown, proxy=None, compression=None):
+        until(lambda: is_counted("1.0"))
+    until(lambda: is_counted("0.0"))
+
+
 def test_malformed_and_unknown_messages_reach_nobody(server: Running) -> None:
     with server.browser(Role.EDITOR) as healthy, server.browser(Role.EDITOR) as bad:
         for browser in (healthy, bad):

@@ -2,6 +2,7 @@
 
 import asyncio
 import logging
+from collections.abc import Awaitable, Callable
 from importlib import import_module
 
 from starlette.applications import Starlette
@@ -9,6 +10,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.types import ASGIApp
+from starlette.websockets import WebSocket
 
 from hapticdb.server.client_page import ClientPage
 from hapticdb.server.guards import Guards
@@ -22,7 +24,10 @@ LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 """Addresses of this machine; a request that came by a proxy has the proxy's client instead."""
 FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "via")
 """Headers by which proxies tell that they passed a request on."""
-DEVICES: dict[str, str] = {"/device/cells": "hapticdb.server.cells.endpoint:serve_cells"}
+DEVICES: dict[str, str] = {
+    "/device/cells": "hapticdb.server.cells.endpoint:serve_cells",
+    "/device/contacts": "hapticdb.server.contacts.serving:serve_contacts",
+}
 """Endpoints of devices: path -> ``module:function`` that gets a WebSocket."""
 
 
@@ -64,7 +69,9 @@ def application(
         text = await asyncio.to_thread(served.figures.text)  # sessions may be beginning
         return Response(text, media_type="text/plain; version=0.0.4")
 
-    devices = [WebSocketRoute(path, _endpoint(place)) for path, place in DEVICES.items()]
+    devices = [
+        WebSocketRoute(path, _counted(path, place, served)) for path, place in DEVICES.items()
+    ]
     routes: list[BaseRoute] = [
         Route("/", door.view, methods=["GET"]),
         Route("/sign-in", door.sign_in, methods=["POST"]),
@@ -80,9 +87,17 @@ def application(
     return Guards(app, host_names)
 
 
-def _endpoint(place: str):  # type: ignore[no-untyped-def]  # noqa: ANN202 - Starlette's endpoint
+def _counted(path: str, place: str, served: Served) -> Callable[[WebSocket], Awaitable[None]]:
+    """Endpoint of devices whose open connections are counted."""
     module, name = place.split(":")
-    return getattr(import_module(module), name)
+    serve = getattr(import_module(module), name)
+    connected = served.figures.devices.labels(path.rpartition("/")[2])
+
+    async def attend(websocket: WebSocket) -> None:
+        with connected.track_inprogress():
+            await serve(websocket)
+
+    return attend
 
 
 def _may_read_figures(request: Request, served: Served) -> bool:

@@ -21,6 +21,12 @@ class Figures:
             ["end"],
             registry=self.registry,
         )
+        self.devices = Gauge(
+            "hapticdb_devices",
+            "Connections of devices that are open, those that still ask among them.",
+            ["endpoint"],
+            registry=self.registry,
+        )
         self.messages = Counter(
             "hapticdb_relay_messages",
             "Messages of browsers that were passed to the page.",

@@ -21,6 +21,7 @@ from hapticdb.page.link import PageRequest
 from hapticdb.server.access import Access, Role
 from hapticdb.server.app import application
 from hapticdb.server.client_page import client_page
+from hapticdb.server.contacts.serving import prepare
 from hapticdb.server.figures import Figures
 from hapticdb.server.guards import is_address
 from hapticdb.server.health import Doctor, HostCollector
@@ -80,6 +81,9 @@ class Serving:
         What clients may ask for.
     page : str
         Function of the page's process.
+    awaits_devices : bool
+        Whether devices on other machines are expected: the server is ready when what their
+        endpoints call is loaded. Otherwise the first one waits for it.
     """
 
     urls: Mapping[Role, str]
@@ -97,6 +101,7 @@ class Serving:
     recordings: str | None = None
     limits: Limits = field(default_factory=Limits)
     page: str = PAGE
+    awaits_devices: bool = False
 
     def address(self, port: int, token: str = "") -> str:
         """Address for a browser on this machine."""
@@ -114,6 +119,19 @@ class _Server(uvicorn.Server):
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
         yield
+
+
+class _Config(uvicorn.Config):
+    """uvicorn's configuration, whose TLS sends no session tickets.
+
+    A ticket comes just after the handshake. A client that reads in one thread and writes in another
+    may lose its first request then, because OpenSSL's connections are not made for two threads.
+    """
+
+    def load(self) -> None:
+        super().load()
+        if self.ssl is not None:
+            self.ssl.num_tickets = 0
 
 
 def check(serving: Serving) -> None:
@@ -192,7 +210,8 @@ async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Even
         keeper = PageKeeper(serving.page, partial(_page_request, serving), host.serve)
         served.figures.page_starts.set_function(lambda: keeper.n_starts)
         ends.push_async_callback(keeper.stop)
-        if not await _unless(stop, keeper.start()):
+        preparing = asyncio.to_thread(prepare) if serving.awaits_devices else asyncio.sleep(0)
+        if not await _unless(stop, _together(keeper.start(), preparing)):
             return
         keeping = asyncio.create_task(keeper.keep())
         ends.push_async_callback(_cancelled, keeping)
@@ -235,6 +254,10 @@ async def _unless(stop: asyncio.Event, work: Awaitable[None]) -> bool:
         working.cancel()
 
 
+async def _together(*works: Awaitable[None]) -> None:
+    await asyncio.gather(*works)
+
+
 async def _cancelled(task: "asyncio.Task[None]") -> None:
     task.cancel()
     with contextlib.suppress(asyncio.CancelledError):
@@ -244,7 +267,7 @@ async def _cancelled(task: "asyncio.Task[None]") -> None:
 def _config(app: "ASGIApp", serving: Serving) -> uvicorn.Config:
     limits = serving.limits
     http, websocket = limited(limits)
-    return uvicorn.Config(
+    return _Config(
         app,
         http=http,
         ws=websocket,

@@ -1,6 +1,7 @@
 """uvicorn's protocols with limits that it does not have itself."""
 
 import asyncio
+import socket
 from typing import Any, ClassVar
 
 from uvicorn.protocols.http.h11_impl import H11Protocol
@@ -14,18 +15,23 @@ PROTOCOL_ERROR, POLICY = 1002, 1008
 
 
 class PatientHttp(H11Protocol):
-    """Cuts connections that do not send a complete request in time."""
+    """Begins every connection; cuts those that do not send a complete request in time."""
 
     limits: ClassVar[Limits] = Limits()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin the time for the first request."""
+        """Begin the time for the first request; let small messages leave at once."""
         super().connection_made(transport)
+        # asyncio does so only for sockets that know their protocol's number, which accepted ones
+        # do not
+        connection = transport.get_extra_info("socket")
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self.loop.call_later(self.limits.request_seconds, self._cut_if_silent)
 
     def _cut_if_silent(self) -> None:
-        is_waiting = self.transport.get_protocol() is self and self.cycle is None
-        if is_waiting and not self.transport.is_closing():
+        if self.transport.is_closing():  # one of TLS knows no protocol any more
+            return
+        if self.transport.get_protocol() is self and self.cycle is None:
             self.transport.close()
 
 

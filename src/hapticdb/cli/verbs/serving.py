@@ -151,7 +151,7 @@ def serve(
     serving = replace(
         _serving(url, tool, files, tokens, role_url, recordings),
         host=host, port=port, prefix=prefix.rstrip("/"), host_names=tuple(host_name or ()),
-        certificate=tls_cert, key=tls_key,
+        certificate=tls_cert, key=tls_key, awaits_devices=True,
     )  # fmt: skip
 
     def ready(port: int) -> None:
@@ -268,6 +268,7 @@ def _run(
             "put a proxy with TLS in front"
         )
 
+    render.compile_kernels("host", "shell", *(["proxies"] if serving.awaits_devices else []))
     render.note(f"preparing {serving.title.partition(' - ')[0]}")
 
     async def work() -> list[int]:

@@ -5,7 +5,7 @@ import contextlib
 import logging
 from contextlib import ExitStack
 
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from hapticdb.errors import DamagedError, HapticDBError, ProtocolError
 from hapticdb.protocol import cells as bodies
@@ -32,6 +32,8 @@ from hapticdb.store.messages import welcome_body
 
 LONGEST_REASON = 120
 """Most bytes of a close frame's reason; the protocol has room for 123."""
+LEFT = 1006
+"""WebSocket's code for a peer that has left without a word."""
 LOG = logging.getLogger(__name__)
 
 
@@ -171,6 +173,9 @@ class CellsClient:
     ) -> None:
         message = MessageHeader(kind, number, revision).packed() + body
         async with self._sending, asyncio.timeout(self._limits.sending_s):
+            # after a push that failed, starlette raises an error of a program at fault
+            if self._socket.application_state is WebSocketState.DISCONNECTED:
+                raise WebSocketDisconnect(LEFT)
             await self._socket.send_bytes(message)
 
     async def _pay(self, bucket: TokenBucket, amount: float) -> None:

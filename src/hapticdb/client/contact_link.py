@@ -1,0 +1,156 @@
+"""ContactLink: one connection to a server's contact endpoint, its opening and its messages."""
+
+import logging
+import socket
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+from hapticdb.errors import (
+    AccessError,
+    ConnectionLostError,
+    MissingExtraError,
+    ProtocolError,
+    UsageError,
+)
+from hapticdb.protocol.contacts import (
+    HandState,
+    ProxyState,
+    ProxyTerms,
+    ProxyWish,
+    pack_hand,
+    pack_wish,
+    unpack_proxy,
+    unpack_terms,
+)
+from hapticdb.store.urls import CONTACTS, parse_address
+
+if TYPE_CHECKING:
+    from websockets.sync.client import ClientConnection
+
+LARGEST = 4096
+"""Bytes of the largest message that is accepted. Larger: a wrong server may cost more memory."""
+GRANTED_WITHIN = 60.0
+"""Seconds in which a server that has answered must grant a tool: the first client's cells and tools
+are made then. Larger: a server that hangs is noticed later."""
+PING_EVERY, PING_PATIENCE = 2.0, 10.0
+"""Seconds between two pings, and until an answer must come; then the connection counts as lost.
+Larger: a server that is frozen is noticed later, and a busy one is kept. The force waits for
+neither."""
+
+
+class ContactLink:
+    """A connection that has been granted a tool.
+
+    Parameters
+    ----------
+    connection : ClientConnection
+        Of the package websockets; the link closes it.
+    terms : ProxyTerms
+        What the server granted.
+    """
+
+    def __init__(self, connection: "ClientConnection", terms: ProxyTerms) -> None:
+        self._connection, self.terms = connection, terms
+
+    def receive(self) -> tuple[ProxyState, int]:
+        """Wait for the next proxy; returns it and its size in bytes.
+
+        Raises
+        ------
+        ConnectionLostError
+            If the connection has ended; the message has the server's reason.
+        ProtocolError
+            If the message is malformed.
+        """
+        message = _received(self._connection, None)
+        return unpack_proxy(message), len(message)
+
+    def send(self, hand: HandState) -> None:
+        """Send a hand; ConnectionLostError if the connection has ended."""
+        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+        try:
+            self._connection.send(pack_hand(hand))
+        except (ConnectionClosed, OSError) as error:
+            raise ConnectionLostError(f"the server is gone: {error}") from error
+
+    def close(self) -> None:
+        """Disconnect at once: a server that is frozen is not waited for."""
+        with suppress(OSError):
+            self._connection.socket.shutdown(socket.SHUT_RDWR)
+        with suppress(OSError):
+            self._connection.close()
+
+
+def connect(url: str, wish: ProxyWish, patience: float) -> ContactLink:
+    """Connect to a server and ask for a tool.
+
+    Raises
+    ------
+    UsageError
+        If the URL is wrong or the server refuses the wish.
+    AccessError
+        If the server refuses the token.
+    ConnectionLostError
+        If the server cannot be reached, does not answer within `patience` seconds, or does not
+        grant a tool within `GRANTED_WITHIN`.
+    """
+    address = parse_address(url, CONTACTS)
+    try:
+        from websockets.exceptions import InvalidStatus, WebSocketException  # noqa: PLC0415 - an extra
+        from websockets.sync.client import connect as open_connection  # noqa: PLC0415 - an extra
+    except ImportError:
+        raise MissingExtraError(
+            "the package websockets is missing: pip install 'hapticdb[client]'"
+        ) from None
+    quiet = logging.getLogger("hapticdb.client.websockets")
+    quiet.setLevel(logging.CRITICAL)  # every failure is raised, or is `ContactProxy.error`
+    headers = {"Authorization": f"Bearer {address.token}"} if address.token else {}
+    try:
+        connection = open_connection(
+            address.endpoint,
+            ssl=address.trust(), compression=None, additional_headers=headers, proxy=None,
+            max_size=LARGEST, max_queue=None, open_timeout=patience, close_timeout=1.0,
+            ping_interval=PING_EVERY, ping_timeout=PING_PATIENCE,
+            logger=quiet,
+        )  # fmt: skip
+    except InvalidStatus as error:
+        status = error.response.status_code
+        if status in (401, 403):
+            raise AccessError(
+                f"{address.shown}: the server refuses this token, or there is none: give "
+                "?token=TOKEN, or set HAPTICDB_TOKEN"
+            ) from None
+        raise ConnectionLostError(f"{address.shown}: the server answers {status}") from None
+    except (OSError, TimeoutError, WebSocketException) as error:
+        raise ConnectionLostError(
+            f"{address.shown}: no answer ({error}); is it running?"
+        ) from error
+    try:
+        connection.send(pack_wish(wish))
+        return ContactLink(connection, unpack_terms(_received(connection, GRANTED_WITHIN)))
+    except BaseException:
+        connection.close()
+        raise
+
+
+def _received(connection: "ClientConnection", patience: float | None) -> bytes:
+    """Wait for the next binary message."""
+    from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+    try:
+        message = connection.recv(patience)
+    except ConnectionClosed as error:
+        frame = error.rcvd
+        if frame is not None and frame.reason:
+            if 4000 <= frame.code < 4500:
+                raise UsageError(f"the server refuses: {frame.reason}") from None
+            raise ConnectionLostError(f"the server ends: {frame.reason}") from None
+        raise ConnectionLostError("the connection to the server is lost") from None
+    except TimeoutError:
+        raise ConnectionLostError("the server does not answer: connect again") from None
+    except OSError as error:
+        raise ConnectionLostError(f"the connection to the server is lost: {error}") from error
+    if isinstance(message, str):
+        raise ProtocolError("a text message, where a binary one must come")
+    return message

@@ -1,0 +1,1 @@
+"""The endpoint of remote hands that feel by contact proxies."""

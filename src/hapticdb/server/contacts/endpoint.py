@@ -1,0 +1,271 @@
+"""The endpoint /device/contacts: a remote hand comes in, contact proxies go out (docs/protocol.md).
+
+Each connection has a tool of its own (`hosting.contact_source`). Hands replace one another: only
+the newest one is answered, at the server's rate. A proxy is sent only while the client has seen
+most of the last ones, so nothing queues for a client that does not read. Proxies are computed in
+threads, without the interpreter lock.
+"""
+
+import asyncio
+import logging
+import time
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+from starlette.responses import PlainTextResponse, Response
+from starlette.routing import WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from hapticdb.errors import DatabaseError, HapticDBError, ProtocolError, UsageError
+from hapticdb.hosting.contact_source import RATE, ContactSource
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.protocol.contacts import (
+    HandState,
+    ProxyWish,
+    pack_proxy,
+    pack_terms,
+    unpack_hand,
+    unpack_wish,
+)
+from hapticdb.protocol.header import CloseCode
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.server.access import Role
+from hapticdb.server.limits import TokenBucket
+
+LOG = logging.getLogger("hapticdb.server")
+PATH = "/device/contacts"
+"""Path of the endpoint below the server's prefix."""
+MOST_CLIENTS = 16
+"""Most clients at a time. Larger: more remote hands, each about 1 ms of computing in 10 ms."""
+MESSAGES_A_SECOND = 1000.0
+"""Messages a second that are read from one client; a faster one is read no sooner, so that TCP
+slows it down. Larger: a flood costs the server more."""
+BURST = 64.0
+"""Messages that may come at once. Larger: likewise."""
+FIRST_WITHIN = 10.0
+"""Seconds in which a client must ask for a tool."""
+IDLE_AFTER = 30.0
+"""Seconds without a hand after which a client is dropped. Larger: clients that hang keep their
+place longer."""
+UNSEEN = 32
+"""Most proxies that a client may not have seen yet: a third of a second. Larger: longer round trips
+are possible at the full rate, and more is on the way to a client that does not read."""
+LOOKS_EVERY = 1.0
+"""Seconds between two looks at the process that fetches cells. Larger: after its end, edits are
+felt later."""
+LARGEST = 1024
+"""Bytes of the largest message that is accepted."""
+REASON_BYTES = 120
+"""Most bytes of a close frame's reason: WebSocket allows 123."""
+
+
+RoleOfHeaders = Callable[[Mapping[str, str]], Role | None]
+"""Finds the role of a client by the headers of its request; see `server.access`."""
+
+
+def may_feel(headers: Mapping[str, str], role_of_headers: RoleOfHeaders) -> bool:
+    """Whether a client with these headers may feel; a browser, which has an origin, may not."""
+    role = role_of_headers(headers)
+    return role is not None and role >= Role.TOUCHER and "origin" not in headers
+
+
+class Contacts:
+    """What the endpoint serves: tools by name, in the cells of one environment.
+
+    Parameters
+    ----------
+    cells : ResidentCells
+        With distances.
+    tools : mapping of str to PointShell
+        By the names that clients give.
+    role_of_headers : callable
+        Finds the role of a client by the headers of its request; see `server.access`.
+    rate : float
+        Proxies a second to each client.
+    most_clients : int
+        Clients at a time.
+    idle_after : float
+        Seconds without a hand after which a client is dropped.
+    """
+
+    def __init__(
+        self,
+        cells: ResidentCells,
+        tools: Mapping[str, PointShell],
+        role_of_headers: RoleOfHeaders,
+        *,
+        rate: float = RATE,
+        most_clients: int = MOST_CLIENTS,
+        idle_after: float = IDLE_AFTER,
+    ) -> None:
+        self._cells, self._tools, self._role_of = cells, dict(tools), role_of_headers
+        self._rate, self._most, self._idle = rate, most_clients, idle_after
+        self._threads = ThreadPoolExecutor(max_workers=4, thread_name_prefix="contacts")
+        self.n_clients = 0
+        """Clients that are connected now."""
+        self.n_proxies = 0
+        """Proxies computed so far."""
+        self.seconds = 0.0
+        """Seconds spent on them in the threads."""
+        self.n_refused = 0
+        """Connections that were closed for a fault of the client."""
+
+    def route(self) -> WebSocketRoute:
+        """Route of the endpoint, for a Starlette application."""
+        return WebSocketRoute(PATH, self.serve)
+
+    def close(self) -> None:
+        """End the threads."""
+        self._threads.shutdown(wait=True, cancel_futures=True)
+
+    async def serve(self, websocket: WebSocket) -> None:
+        """Serve one client until it leaves."""
+        if not may_feel(websocket.headers, self._role_of):
+            await websocket.close(1008)  # before it is accepted: the answer is 403
+            return
+        if self.n_clients >= self._most:
+            await websocket.send_denial_response(busy())
+            return
+        await websocket.accept()
+        await self.attend(websocket)
+
+    async def attend(self, websocket: WebSocket, first: bytes | None = None) -> None:
+        """Serve one client whose connection was accepted, until it leaves.
+
+        first: its first message, if that has been read already.
+        """
+        self.n_clients += 1
+        try:
+            await self._serve(websocket, first)
+        except (ProtocolError, UsageError) as error:
+            await self._refuse(websocket, CloseCode.MALFORMED, str(error))
+        except TimeoutError:
+            await self._refuse(websocket, CloseCode.IDLE, "nothing came for too long")
+        except (WebSocketDisconnect, asyncio.CancelledError):
+            pass
+        except HapticDBError:
+            await self._refuse(websocket, CloseCode.FAILED, "the server's database fails now")
+        finally:
+            self.n_clients -= 1
+
+    async def _refuse(self, websocket: WebSocket, code: int, reason: str) -> None:
+        self.n_refused += code != CloseCode.FAILED
+        if websocket.application_state is WebSocketState.CONNECTED:
+            short = reason.encode()[:REASON_BYTES].decode("utf-8", "ignore")
+            await websocket.close(int(code), short)
+
+    async def _serve(self, websocket: WebSocket, first: bytes | None) -> None:
+        wish = unpack_wish(await first_message(websocket) if first is None else first)
+        loop = asyncio.get_running_loop()
+        source = await loop.run_in_executor(self._threads, self._source, wish)
+        state = _Client(self._rate)
+        try:
+            await websocket.send_bytes(pack_terms(source.terms))
+            async with asyncio.TaskGroup() as group:
+                group.create_task(self._answer(websocket, state, source))
+                group.create_task(self._supervise())
+                await self._listen(websocket, state)
+        except* WebSocketDisconnect:
+            pass
+        except* (HapticDBError, TimeoutError) as errors:
+            raise errors.exceptions[0] from None
+        finally:  # in a thread, because a proxy may just be computed
+            await asyncio.shield(loop.run_in_executor(None, source.close))
+
+    async def _supervise(self) -> None:
+        """Let the process that fetches cells be started again if it has ended."""
+        loop = asyncio.get_running_loop()
+        while True:
+            await asyncio.sleep(LOOKS_EVERY)
+            try:
+                await loop.run_in_executor(self._threads, self._cells.supervise)
+            except HapticDBError as error:
+                LOG.exception("the cells of contact proxies cannot be fetched any more")
+                raise DatabaseError("cells cannot be fetched any more") from error
+
+    def _source(self, wish: ProxyWish) -> ContactSource:
+        """Tool for a wish."""
+        name = wish.tool
+        if not name and len(self._tools) == 1:
+            name = next(iter(self._tools))
+        if name not in self._tools:
+            raise UsageError(f"no tool of that name: there are {', '.join(sorted(self._tools))}")
+        return ContactSource(self._cells, self._tools[name], wish._replace(tool=name), self._rate)
+
+    async def _listen(self, websocket: WebSocket, state: "_Client") -> None:
+        """Keep the newest hand; read no faster than is allowed."""
+        while True:
+            message = await asyncio.wait_for(_receive(websocket), self._idle)
+            wait = state.allowed.wait()
+            if wait > 0.0:
+                await asyncio.sleep(wait)
+            state.allowed.take()
+            state.take(unpack_hand(message))
+
+    async def _answer(self, websocket: WebSocket, state: "_Client", source: ContactSource) -> None:
+        """Send a proxy for the newest hand, at the rate."""
+        loop = asyncio.get_running_loop()
+        due = loop.time()
+        while True:
+            due = max(due + 1.0 / self._rate, loop.time())
+            await asyncio.sleep(due - loop.time())
+            hand = state.hand
+            if hand is None or state.sent - hand.seen > UNSEEN:
+                continue
+            proxy, seconds = await loop.run_in_executor(
+                self._threads, _timed_proxy, source, hand, state.arrived
+            )
+            self.n_proxies += 1
+            self.seconds += seconds
+            state.sent = source.n_sent
+            await websocket.send_bytes(proxy)
+
+
+@dataclass
+class _Client:
+    """What is known of one client."""
+
+    rate: float
+
+    def __post_init__(self) -> None:
+        self.allowed = TokenBucket(MESSAGES_A_SECOND, BURST)
+        self.hand: HandState | None = None
+        self.arrived = 0.0
+        self.sent = 0
+
+    def take(self, hand: HandState) -> None:
+        """Make a hand the newest one, unless an older message came late."""
+        if self.hand is None or hand.sequence > self.hand.sequence:
+            self.hand, self.arrived = hand, time.monotonic()
+
+
+def _timed_proxy(source: ContactSource, hand: HandState, arrived: float) -> tuple[bytes, float]:
+    """Message of a proxy, and the seconds that it took."""
+    start = time.perf_counter()
+    message = pack_proxy(source.proxy(hand, time.monotonic() - arrived))
+    return message, time.perf_counter() - start
+
+
+async def first_message(websocket: WebSocket) -> bytes:
+    """Wait for a client's first message; TimeoutError after `FIRST_WITHIN`."""
+    return await asyncio.wait_for(_receive(websocket), FIRST_WITHIN)
+
+
+async def _receive(websocket: WebSocket) -> bytes:
+    """Wait for the next binary message."""
+    event: Mapping[str, Any] = await websocket.receive()
+    if event["type"] == "websocket.disconnect":
+        raise WebSocketDisconnect(event.get("code", 1000))
+    message = event.get("bytes")
+    if message is None:
+        raise ProtocolError("a text message, where a binary one must come")
+    if len(message) > LARGEST:
+        raise ProtocolError(f"a message of {len(message)} bytes: at most {LARGEST} may be sent")
+    return bytes(message)
+
+
+def busy() -> Response:
+    """Answer to one client too many."""
+    return PlainTextResponse("too many remote hands: try again later\n", 503)

@@ -1,0 +1,130 @@
+"""Contact proxies of a served environment: cells and tools are held while somebody feels them."""
+
+import asyncio
+import logging
+from pathlib import Path
+
+from starlette.websockets import WebSocket, WebSocketDisconnect
+
+from hapticdb.errors import HapticDBError, ProtocolError
+from hapticdb.kernels.compiling import entries_for, load
+from hapticdb.page.tools import POINTS, built_in, inset_of
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.protocol.header import CloseCode
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.server.access import Role
+from hapticdb.server.contacts.endpoint import MOST_CLIENTS, Contacts, busy, first_message, may_feel
+from hapticdb.server.served import Served
+from hapticdb.store.base import scene_bounds
+
+LOG = logging.getLogger("hapticdb.server")
+FAILED = "this environment cannot be felt by contact proxies now: its operator finds why in the log"
+"""Reason of a close frame, 123 bytes at most."""
+
+
+class ServedContacts:
+    """The endpoint of one server; its cells and tools are made for the first client.
+
+    They are freed when the last client has left.
+
+    Parameters
+    ----------
+    served : Served
+        What the server offers.
+    """
+
+    def __init__(self, served: Served) -> None:
+        self._served = served
+        self._changing = asyncio.Lock()
+        self._contacts: Contacts | None = None
+        self._cells: ResidentCells | None = None
+        self._n_clients = 0
+
+    async def serve(self, websocket: WebSocket) -> None:
+        """Serve one client until it leaves.
+
+        It is accepted at once, and granted its tool when cells and tools are there: that takes
+        seconds for the first one, in which pings are answered.
+        """
+        if not may_feel(websocket.headers, self._served.access.role_of_headers):
+            await websocket.close(1008)  # before it is accepted: the answer is 403
+            return
+        if self._n_clients >= MOST_CLIENTS:
+            await websocket.send_denial_response(busy())
+            return
+        self._n_clients += 1
+        try:
+            await websocket.accept()
+            # read before the wait: uvicorn answers no ping while a message is not taken
+            first = await first_message(websocket)
+            contacts = await self._opened()
+            if contacts is None:
+                await websocket.close(int(CloseCode.FAILED), FAILED)
+            else:
+                await contacts.attend(websocket, first)
+        except (ProtocolError, TimeoutError):
+            await websocket.close(int(CloseCode.MALFORMED), "a HELLO must come first")
+        except WebSocketDisconnect:
+            pass
+        finally:
+            self._n_clients -= 1
+            await asyncio.shield(self._rest())
+
+    async def _opened(self) -> Contacts | None:
+        """What serves clients, made if need be; None if that fails now."""
+        async with self._changing:
+            if self._contacts is None:
+                try:
+                    await asyncio.to_thread(self._open)
+                except HapticDBError:
+                    LOG.exception("contact proxies cannot be served")
+            return self._contacts
+
+    async def _rest(self) -> None:
+        """Free cells and tools if nobody feels them."""
+        async with self._changing:
+            if not self._n_clients:
+                await asyncio.to_thread(self._close)
+
+    def _open(self) -> None:
+        served = self._served
+        cells = ResidentCells(served.urls[Role.TOUCHER], distances=True)
+        try:
+            tools = _tools(served.tools, cells)
+            self._contacts = Contacts(cells, tools, served.access.role_of_headers)
+        except BaseException:
+            cells.close()
+            raise
+        self._cells = cells
+
+    def _close(self) -> None:
+        contacts, self._contacts = self._contacts, None
+        cells, self._cells = self._cells, None
+        if contacts is not None:
+            contacts.close()
+        if cells is not None:
+            cells.close()
+
+
+def prepare() -> None:
+    """Load the kernels of contact proxies, so that the first client does not wait for them."""
+    load(entries_for("proxies", "shell"))
+
+
+def _tools(files: tuple[str, ...], cells: ResidentCells) -> dict[str, PointShell]:
+    """The operator's tools by the names of their files, in their own frames; else two probes."""
+    size = cells.grid.voxel_size
+    if files:
+        inset = inset_of(size, smooth=True)
+        return {Path(file).stem: PointShell.from_file(file, POINTS, inset=inset) for file in files}
+    bounds = scene_bounds(cells.first_objects)
+    diagonal = 0.0 if bounds is None else float(((bounds[1] - bounds[0]) ** 2).sum() ** 0.5)
+    return {tool.name: tool.shell for tool in built_in(diagonal, size, smooth=True)}
+
+
+async def serve_contacts(websocket: WebSocket) -> None:
+    """Serve one connection with what the server's application knows: `Served`."""
+    state = websocket.app.state
+    if not hasattr(state, "contacts"):
+        state.contacts = ServedContacts(state.served)
+    await state.contacts.serve(websocket)

@@ -1,0 +1,71 @@
+"""SIGTERM to `view` and `serve` while somebody records: the recording stays, whole."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+from urllib.parse import parse_qs, urlsplit
+
+import pytest
+
+import hapticdb
+from children import child, until
+from hapticdb import Grid
+from hapticdb.cli.root import TERMINATED
+from hapticdb.recording.file import Recording
+from hapticdb.recording.replay import replay
+from hapticdb.testing import floor_voxels, write_voxels
+from page_person import PagePerson
+from serving import browser_at
+
+GRID = Grid(0.01, (0.0, 0.0, 0.0), 6)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("verb", "option"), [("serve", "--token"), ("view", "--no-browser")])
+def test_sigterm_keeps_a_recording_that_is_under_way(
+    tmp_path: Path, verb: str, option: str
+) -> None:
+    scene, folder = tmp_path / "scene.db", tmp_path / "recordings"
+    with hapticdb.create(scene, GRID) as env:
+        write_voxels(env.store, floor_voxels(GRID), "floor")
+    folder.mkdir()
+    command = [
+        sys.executable, "-m", "hapticdb", verb, str(scene), option, "--recordings", str(folder),
+    ]  # fmt: skip
+    with child(command, env=dict(os.environ)) as server:
+        assert server.stdout is not None
+        lines = [server.stdout.readline() for _ in range(3 if verb == "serve" else 1)]
+        address = urlsplit(lines[-1].split()[-1])
+        (token,) = parse_qs(address.query)["token"]
+        with browser_at(address.netloc, token) as browser:
+            person = PagePerson(browser)
+            until(lambda: _is_recording(person))
+            until(lambda: (person.look(), _size(folder) > 20_000)[1])
+            server.send_signal(signal.SIGTERM)
+            assert server.wait(60.0) == TERMINATED
+    (path,) = _recorded(folder)
+    recording = Recording(path)
+    assert recording.damaged_at is None
+    assert not recording.n_torn
+    with hapticdb.open(scene, read_only=True) as env:
+        found = replay(recording, env)
+    assert found.is_equal
+    assert found.n_compared > 100
+
+
+def _is_recording(person: PagePerson) -> bool:
+    """Press the button until it says that it records: the session begins some time later."""
+    person.find("Record")
+    person.press("Record")
+    person.look(1.0)
+    return "Stop" in person.labels()
+
+
+def _size(folder: Path) -> int:
+    """Bytes of all recordings."""
+    return sum(path.stat().st_size for path in _recorded(folder))
+
+
+def _recorded(folder: Path) -> list[Path]:
+    return sorted(folder.glob("*.hdbrec"))

@@ -1,0 +1,128 @@
+"""Hands for tests of contact proxies, and servers in processes of their own that they feel."""
+
+import contextlib
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from websockets.sync.client import ClientConnection, connect
+
+from children import PIPE, child
+from contact_server import TOKEN, save_shell
+from hapticdb.bench.feel.ground import Ground
+from hapticdb.bench.feel.scenes import plane
+from hapticdb.bench.feel.tools import flat_tool
+from hapticdb.client.contact_proxy import ContactProxy
+from hapticdb.kernels.compiling import compile_missing, entries_for
+from hapticdb.protocol.contacts import HandState, ProxyWish, pack_hand, pack_wish, unpack_terms
+
+Floats = NDArray[np.float64]
+SIZE = 0.005
+DEPTH = 0.003
+"""Metres below the onset of contact at which hands rest."""
+STILL = np.zeros(6)
+
+
+class Served:
+    """A server's process, its port, and where the surface is."""
+
+    def __init__(
+        self, process: "subprocess.Popen[str]", origin: Floats, file: str, plate: Path
+    ) -> None:
+        self.process, self.origin, self.file, self.plate = process, origin, file, plate
+        assert process.stdout is not None
+        self.port = int(process.stdout.readline() or 0)
+
+    def url(self, token: str = TOKEN) -> str:
+        return f"ws://127.0.0.1:{self.port}?token={token}"
+
+    def pose(self, depth: float) -> Floats:
+        """Hand (4, 4) whose plate is at a depth below the onset of contact, m."""
+        pose = np.eye(4)
+        pose[:3, 3] = self.origin
+        pose[2, 3] += 1.5 * SIZE - depth
+        return pose
+
+
+@contextlib.contextmanager
+def serving(folder: Path, **options: float) -> Iterator[Served]:
+    """A server over a level plane, with a flat tool; killed at the end, frozen or not."""
+    compile_missing(entries_for("resident", "proxies", "proxy"))  # no force waits for it
+    with Ground.of_scenes(folder, [plane("level", np.eye(3))], SIZE, distances=True) as ground:
+        origin = ground.origins["level"]
+    (url,) = folder.glob("*.db")
+    save_shell(folder / "plate.npz", flat_tool(3, SIZE, np.eye(3)))
+    with started(str(url), folder / "plate.npz", origin, **options) as server:
+        yield server
+
+
+@contextlib.contextmanager
+def started(url: str, plate: Path, origin: Floats, **options: float) -> Iterator[Served]:
+    """A server over an environment that is there; options as `contact_server` takes them."""
+    program = str(Path(__file__).with_name("contact_server.py"))
+    given = [f"--{name}={value}" for name, value in options.items()]
+    with child(
+        [sys.executable, program, url, f"plate={plate}", *given], stdin=PIPE, stderr=None
+    ) as process:
+        try:
+            yield Served(process, origin, url, plate)
+        finally:
+            process.kill()
+
+
+def pressed(served: Served, proxy: ContactProxy) -> Floats:
+    """Come down to DEPTH and wait until the force is that of a spring; returns the wrench.
+
+    The server has to see the hand while it is free: where it sees it first, it puts the tool.
+    """
+    until = time.monotonic() + 30.0
+    while not proxy.told.is_fresh and time.monotonic() < until:
+        proxy.wrench(served.pose(-0.002), STILL)
+        time.sleep(2e-3)
+    for depth in np.linspace(-0.002, DEPTH, 200):
+        proxy.wrench(served.pose(depth), STILL)
+        time.sleep(2e-3)
+    while time.monotonic() < until:
+        wrench = proxy.wrench(served.pose(DEPTH), STILL)
+        if wrench[2] == pytest.approx(1000.0 * DEPTH, rel=0.06):
+            return wrench
+        time.sleep(1e-3)
+    pytest.fail(f"no force within 30 s: {wrench}, {proxy.told}, {proxy.figures()}")
+
+
+def falls_to_zero(served: Served, proxy: ContactProxy) -> list[tuple[float, float]]:
+    """Times and forces until there is none."""
+    began, felt = time.monotonic(), []
+    while time.monotonic() < began + 20.0:
+        force = proxy.wrench(served.pose(DEPTH), STILL)[2]
+        felt.append((time.monotonic() - began, force))
+        if force == 0.0:
+            return felt
+        time.sleep(1e-3)
+    pytest.fail("the force stays")
+
+
+def opened(served: Served, token: str = TOKEN) -> ClientConnection:
+    return connect(
+        f"ws://127.0.0.1:{served.port}/device/contacts", compression=None, proxy=None,
+        additional_headers={"Authorization": f"Bearer {token}"}, open_timeout=30,
+    )  # fmt: skip
+
+
+def granted(served: Served) -> ClientConnection:
+    connection = opened(served)
+    connection.send(pack_wish(ProxyWish()))
+    assert unpack_terms(connection.recv(30)).tool == "plate"  # type: ignore[arg-type]
+    return connection
+
+
+def hand_at(served: Served, sequence: int, seen: int = 0) -> bytes:
+    position = served.pose(DEPTH)[:3, 3]
+    return pack_hand(
+        HandState(sequence, time.monotonic(), position, np.eye(4)[0], STILL, seen=seen)
+    )

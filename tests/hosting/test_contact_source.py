@@ -1,0 +1,96 @@
+"""Contact proxies, through their bytes, against the coupling on this machine."""
+
+import time
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hapticdb.bench.feel.couplings import SmoothHand, Terms, posed, straight
+from hapticdb.bench.feel.ground import Ground
+from hapticdb.bench.feel.scenes import convex_edge, slope_axes
+from hapticdb.bench.feel.sliding import SPEED, way_round_edge
+from hapticdb.bench.feel.tools import ball
+from hapticdb.client.proxy_force import ProxyForce
+from hapticdb.hosting.contact_source import ContactSource
+from hapticdb.protocol.contacts import (
+    IS_WAITING,
+    HandState,
+    ProxyWish,
+    pack_proxy,
+    unpack_proxy,
+)
+from hapticdb.realtime.resident_cells import ResidentCells
+
+Floats = NDArray[np.float64]
+SIZE, RADIUS, DEPTH = 0.005, 4.0, 0.8
+"""Voxel size, m; radius of the ball and depth of the hand below the onset, voxels."""
+CAP = 7.0
+"""Greatest force, N, that a server grants where a client asks for none."""
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+class Undamped(SmoothHand):
+    """The coupling as the server grants it: its caps, and no damper, which is the client's."""
+
+    def __init__(self, ground: Ground, place: Floats) -> None:
+        super().__init__(ground, ball(RADIUS, SIZE, 300), posed(place), Terms())
+        lever = self._spring.radius
+        self._spring = self._spring._replace(damping=0.0, cap=CAP, turn_cap=CAP * lever)
+
+
+def round_the_edge(folder: Path) -> tuple[str, Floats, Floats]:
+    """An environment, a hand's places round its edge and forces there (M, 3), one a millisecond."""
+    scene = convex_edge(slope_axes(20.0))
+    with Ground.of_scenes(folder, [scene], SIZE, distances=True) as ground:
+        way, _ = way_round_edge((1.5 - DEPTH + RADIUS) * SIZE, 0.01)
+        first = straight(way[0] + np.array([0.0, 0.0, 0.008]), way[0], SPEED)
+        places = ground.origins[scene.name] + np.concatenate([first, way]) @ scene.axes.T
+        hand = Undamped(ground, places[0])
+        forces = np.array([hand.step(posed(place), np.zeros(6)) for place in places])
+    (url,) = folder.glob("*.db")
+    return str(url), places, forces
+
+
+def felt(source: ContactSource, places: Floats, delay: int) -> Floats:
+    """Forces (M, 3) of proxies that arrive `delay` milliseconds after their hand."""
+    force, near = ProxyForce(source.terms), np.zeros_like(places)
+    until = time.monotonic() + 60.0
+    while source.proxy(HandState(1, 0.0, places[0], UPRIGHT, np.zeros(6))).flags & IS_WAITING:
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    rest = 100  # milliseconds at the first place: proxies blend in
+    path = np.concatenate([np.repeat(places[:1], rest, axis=0), places])
+    coming: deque[tuple[int, bytes]] = deque()
+    for n, place in enumerate(path):
+        if n % 10 == 0:
+            hand = HandState(n + 1, n * 1e-3, place, UPRIGHT, np.zeros(6))
+            coming.append((n + delay, pack_proxy(source.proxy(hand))))
+        while coming and coming[0][0] <= n:
+            assert force.take(unpack_proxy(coming.popleft()[1]), n * 1e-3)
+        wrench = force.wrench(np.concatenate([place, UPRIGHT]), np.zeros(6), n * 1e-3)
+        near[max(n - rest, 0)] = wrench[:3]
+    return near
+
+
+@pytest.mark.parametrize(("delay", "bound"), [(0, 0.08), (10, 0.10), (50, 0.20)])
+def test_proxies_go_round_a_convex_edge_as_the_coupling_does(
+    tmp_path: Path, delay: int, bound: float
+) -> None:
+    """RMS error as a share of the force; the hand goes 0.5 mm from one proxy to the next.
+
+    The ball rolls over its points, so the force of the coupling itself jumps between them.
+    """
+    url, places, forces = round_the_edge(tmp_path)
+    with (
+        ResidentCells(url, budget_bytes=64 << 20, distances=True) as cells,
+        ContactSource(cells, ball(RADIUS, SIZE, 300), ProxyWish()) as source,
+    ):
+        near = felt(source, places, delay)
+        assert source.share == 1.0  # sliding is no shaking
+    error = float(np.sqrt(((near - forces) ** 2).sum(axis=1).mean()))
+    force = float(np.sqrt((forces**2).sum(axis=1).mean()))
+    assert force > 1.0
+    assert error < bound * force

@@ -1,0 +1,225 @@
+"""Remote hands against a server in a process of its own: force, faults, floods."""
+
+import contextlib
+import os
+import signal
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Iterator
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+from websockets.typing import Origin
+
+from children import child, joined
+from contact_hands import DEPTH, SIZE, STILL, Served, granted, hand_at, pressed, serving
+from contact_server import TOKEN
+from hapticdb.bench.feel.ground import Ground
+from hapticdb.bench.feel.scenes import plane
+from hapticdb.client.contact_proxy import ContactProxy
+from hapticdb.errors import AccessError, ConnectionLostError, UsageError
+from hapticdb.kernels.compiling import compile_missing, entries_for
+from hapticdb.protocol.contacts import unpack_proxy
+
+
+@pytest.fixture(scope="module")
+def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    with serving(tmp_path_factory.mktemp("served")) as server:
+        yield server
+
+
+def test_a_remote_hand_feels_the_surface(served: Served) -> None:
+    with ContactProxy(served.url(), "plate") as proxy:
+        assert proxy.terms.center == (0.0, 0.0, 0.0)
+        wrench = pressed(served, proxy)
+        assert np.abs(wrench[:2]).max() < 0.2
+        figures = proxy.figures()
+        assert figures.proxies > 0
+        assert figures.bytes <= (232 + 16 * 24) * figures.proxies
+        for depth in np.linspace(DEPTH, -0.002, 50):
+            last = proxy.wrench(served.pose(depth), STILL)
+            time.sleep(2e-3)
+        time.sleep(0.05)
+        last = proxy.wrench(served.pose(-0.002), STILL)
+        assert not last.any()
+
+
+def test_the_scale_makes_turns_weaker_and_forces_equal(served: Served) -> None:
+    from hapticdb.realtime.handle import Handle  # noqa: PLC0415 - of this test alone
+
+    with ContactProxy(served.url(), handle=Handle(scale=2.0)) as proxy:
+        until, felt = time.monotonic() + 15.0, 0.0
+        for share in np.linspace(0.0, 1.0, 200):
+            pose = served.pose(share * 2.0 * DEPTH)
+            pose[:3, 3] /= 2.0
+            felt = proxy.wrench(pose, STILL)[2]
+            time.sleep(2e-3)
+        while time.monotonic() < until and felt != pytest.approx(1000.0 * DEPTH, rel=0.06):
+            felt = proxy.wrench(pose, STILL)[2]
+            time.sleep(1e-3)
+        for _ in range(300):  # it stays: a force that is passed on the way down does not count
+            felt = proxy.wrench(pose, STILL)[2]
+            time.sleep(1e-3)
+        assert felt == pytest.approx(1000.0 * DEPTH, rel=0.06)
+
+
+def test_a_wrong_token_an_unknown_tool_and_no_server_are_told(served: Served) -> None:
+    with pytest.raises(AccessError, match="token"):
+        ContactProxy(served.url("some-other-token-of-nobody"))
+    with pytest.raises(UsageError, match="no tool of that name: there are plate"):
+        ContactProxy(served.url(), "hammer")
+    with pytest.raises(ConnectionLostError, match="is it running"):
+        ContactProxy("ws://127.0.0.1:9")
+
+
+def test_a_page_of_a_browser_is_refused(served: Served) -> None:
+    with pytest.raises(InvalidStatus) as refused:
+        connect(
+            f"ws://127.0.0.1:{served.port}/device/contacts", origin=Origin("http://evil.example"),
+            additional_headers={"Authorization": f"Bearer {TOKEN}"}, proxy=None,
+        )  # fmt: skip
+    assert refused.value.response.status_code == 403
+
+
+@pytest.mark.parametrize(
+    ("message", "reason"),
+    [
+        (b"", "a header has 16"),
+        (b"xx" + bytes(98), "does not begin with 'hd'"),
+        (b"hd\x01\x80" + bytes(40), "inside a field"),
+        ("text", "a text message"),
+    ],
+)
+def test_a_malformed_message_closes_with_a_plain_reason(
+    served: Served, message: bytes | str, reason: str
+) -> None:
+    with granted(served) as connection:
+        connection.send(message)
+        with pytest.raises(ConnectionClosed) as closed:
+            connection.recv(30)
+    frame = closed.value.rcvd
+    assert frame is not None
+    assert frame.code == 4400
+    assert reason in frame.reason
+
+
+def test_a_client_that_does_not_read_gets_no_queue(served: Served) -> None:
+    """Without an acknowledgement the server sends no more than a third of a second's proxies."""
+    with granted(served) as connection:
+        began = time.monotonic()
+        sequences: list[int] = []
+        while time.monotonic() < began + 1.5:
+            connection.send(hand_at(served, len(sequences) + 1))
+            try:
+                proxy = unpack_proxy(connection.recv(0.02))  # type: ignore[arg-type]
+            except TimeoutError:
+                continue
+            sequences.append(proxy.sequence)
+    assert 1 <= len(sequences) <= 40
+    assert sequences == sorted(sequences)
+
+
+def test_a_flood_harms_no_other_hand(served: Served) -> None:
+    """5,000 hands at once, sent without reading: another hand feels its surface meanwhile."""
+    with ContactProxy(served.url()) as proxy, granted(served) as flooding:
+        pressed(served, proxy)
+        losses = proxy.figures().losses
+        for n in range(5000):
+            flooding.send(hand_at(served, n + 1))
+            if n % 50 == 0:
+                proxy.wrench(served.pose(DEPTH), STILL)
+        pressed(served, proxy)
+        assert proxy.figures().losses == losses
+        assert proxy.is_connected
+
+
+def test_many_malformed_clients_leave_the_server_healthy(served: Served) -> None:
+    random = np.random.default_rng(7)
+    with ContactProxy(served.url()) as proxy:
+        for _ in range(60):
+            with granted(served) as connection:
+                connection.send(random.bytes(int(random.integers(0, 300))))
+                with pytest.raises(ConnectionClosed):
+                    connection.recv(30)
+        pressed(served, proxy)
+    assert served.process.poll() is None
+
+
+def test_a_flood_of_malformed_messages_leaves_others_alone(served: Served) -> None:
+    """20,000 messages from 40 clients, 500 of each at once, beside a hand that feels."""
+    random = np.random.default_rng(11)
+
+    def flood() -> None:
+        for _ in range(40):
+            with granted(served) as connection:
+                for _ in range(500):
+                    connection.protocol.send_binary(random.bytes(int(random.integers(0, 200))))
+                with contextlib.suppress(OSError):  # closed at the first one
+                    connection.socket.sendall(b"".join(connection.protocol.data_to_send()))
+
+    with ContactProxy(served.url()) as proxy:
+        pressed(served, proxy)
+        before = proxy.figures()
+        flooding = threading.Thread(target=flood, daemon=True)
+        flooding.start()
+        until = time.monotonic() + 200.0
+        while flooding.is_alive() and time.monotonic() < until:
+            proxy.wrench(served.pose(DEPTH), STILL)
+            time.sleep(1e-3)
+        joined(flooding)
+        after = proxy.figures()
+        assert after.losses == before.losses
+        assert after.proxies > before.proxies
+        pressed(served, proxy)
+    assert served.process.poll() is None
+
+
+def test_a_client_that_sends_nothing_is_dropped(tmp_path: Path) -> None:
+    with serving(tmp_path, idle=0.5) as server:
+        with granted(server) as connection:
+            connection.send(hand_at(server, 1))
+            with pytest.raises(ConnectionClosed) as closed:
+                deque(iter(lambda: connection.recv(30), None), maxlen=0)  # proxies come first
+            frame = closed.value.rcvd
+            assert frame is not None
+            assert frame.code == 4408
+        with ContactProxy(server.url()) as proxy:  # its place is free
+            pressed(server, proxy)
+
+
+@pytest.mark.long
+def test_a_served_environment_has_the_endpoint_and_probes(tmp_path: Path) -> None:
+    compile_missing(entries_for("resident", "proxies", "proxy"))
+    with Ground.of_scenes(tmp_path, [plane("level", np.eye(3))], SIZE, distances=True) as ground:
+        origin = ground.origins["level"]
+    (url,) = tmp_path.glob("*.db")
+    command = [sys.executable, "-m", "hapticdb", "serve", str(url), "--token"]
+    with child(command, env=dict(os.environ)) as server:
+        assert server.stdout is not None
+        lines = dict(server.stdout.readline().split() for _ in range(3))
+        for role in ("viewer", "toucher"):
+            parts = urlsplit(lines[role])
+            address = f"ws://{parts.netloc}?{parts.query}"
+            if role == "viewer":
+                with pytest.raises(AccessError):
+                    ContactProxy(address, "ball")
+                continue
+            with pytest.raises(UsageError, match="ball, peg"):
+                ContactProxy(address, "wrench")
+            with ContactProxy(address, "ball") as proxy:
+                pose = np.eye(4)
+                pose[:3, 3] = origin + np.array([0.0, 0.0, 0.08])  # the ball is free there
+                began, up = time.monotonic(), 0.0
+                while up < 0.5 and time.monotonic() < began + 30.0:
+                    pose[2, 3] = max(pose[2, 3] - 2e-5, origin[2])
+                    up = float(proxy.wrench(pose, STILL)[2])
+                    time.sleep(1e-3)
+                assert up >= 0.5, (proxy.told, proxy.figures())
+        server.send_signal(signal.SIGTERM)
+        assert server.wait(30) == 143

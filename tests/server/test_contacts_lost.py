@@ -1,0 +1,129 @@
+"""Servers that freeze, vanish, come back, or never answer: what the hand feels then."""
+
+import os
+import signal
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+import numpy as np
+import pytest
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.server import ServerConnection, serve
+
+from children import joined, until
+from contact_hands import DEPTH, STILL, Served, falls_to_zero, pressed, serving, started
+from hapticdb.client import contact_link, contact_proxy
+from hapticdb.client.contact_proxy import ContactProxy
+from hapticdb.errors import ConnectionLostError
+from hapticdb.protocol.contacts import ProxyTerms, pack_terms
+
+
+@pytest.fixture
+def mortal(tmp_path: Path) -> Iterator[Served]:
+    """A server that the test may freeze or kill."""
+    with serving(tmp_path) as server:
+        yield server
+
+
+@pytest.mark.parametrize("how", [signal.SIGSTOP, signal.SIGKILL])
+def test_the_force_falls_to_zero_when_the_server_stops(mortal: Served, how: int) -> None:
+    with ContactProxy(mortal.url()) as proxy:
+        full = pressed(mortal, proxy)[2]
+        os.kill(mortal.process.pid, how)
+        felt = falls_to_zero(mortal, proxy)
+        assert max(force for _, force in felt) <= 1.1 * full
+        assert not proxy.told.is_fresh
+        for _ in range(20):
+            assert not proxy.wrench(mortal.pose(DEPTH), STILL).any()
+            time.sleep(1e-3)
+
+
+def test_the_force_comes_back_with_a_server_that_goes_on(mortal: Served) -> None:
+    with ContactProxy(mortal.url()) as proxy:
+        pressed(mortal, proxy)
+        os.kill(mortal.process.pid, signal.SIGSTOP)
+        falls_to_zero(mortal, proxy)
+        os.kill(mortal.process.pid, signal.SIGCONT)
+        pressed(mortal, proxy)
+
+
+def test_the_force_comes_back_with_a_server_that_is_started_again(mortal: Served) -> None:
+    with ContactProxy(mortal.url()) as proxy:
+        pressed(mortal, proxy)
+        mortal.process.kill()
+        falls_to_zero(mortal, proxy)
+        with started(mortal.file, mortal.plate, mortal.origin, port=mortal.port) as again:
+            until(lambda: proxy.wrench(again.pose(-DEPTH), STILL)[2] == 0.0 and proxy.told.is_fresh)
+            pressed(again, proxy)  # the tool was free when its new server took it
+            assert proxy.figures().losses == 1
+            assert proxy.error is None
+
+
+def test_the_process_that_fetches_is_started_again(mortal: Served) -> None:
+    def children() -> set[str]:
+        tasks = Path(f"/proc/{mortal.process.pid}/task").glob("*/children")
+        return {pid for task in tasks for pid in task.read_text().split()}
+
+    with ContactProxy(mortal.url()) as proxy:
+        pressed(mortal, proxy)
+        (fetching,) = children()
+        os.kill(int(fetching), signal.SIGKILL)
+        until(lambda: children() not in (set(), {fetching}))
+        pressed(mortal, proxy)
+        assert proxy.error is None
+
+
+# -- servers that never answer ---------------------------------------------------------------------
+
+
+@contextmanager
+def stalling(answer: Callable[[ServerConnection], None]) -> Iterator[str]:
+    """URL of a server that answers a client's first message as it is told, and no other."""
+
+    def work(connection: ServerConnection) -> None:
+        with suppress(ConnectionClosed):
+            connection.recv(30)
+            answer(connection)
+            while True:
+                connection.recv(30)
+
+    with serve(work, "127.0.0.1", 0, compression=None) as server:
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
+        server.shutdown()
+        joined(thread)
+
+
+def test_a_server_that_accepts_and_never_answers_is_given_up(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(contact_proxy, "PATIENCE", 0.5)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listening,
+        pytest.raises(ConnectionLostError, match="is it running"),
+    ):
+        ContactProxy(f"ws://127.0.0.1:{listening.getsockname()[1]}")
+
+
+def test_a_server_that_never_grants_a_tool_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(contact_link, "GRANTED_WITHIN", 0.5)
+    with (
+        stalling(lambda _: None) as url,
+        pytest.raises(ConnectionLostError, match="does not answer"),
+    ):
+        ContactProxy(url)
+
+
+def test_without_any_proxy_there_is_no_force() -> None:
+    terms = ProxyTerms("a", (0.0, 0.0, 0.0), 0.01, 1000.0, 0.1, 7.0, 0.07, 5e4, 0.005, 0.0075, 0.01)
+    with stalling(lambda c: c.send(pack_terms(terms))) as url, ContactProxy(url) as proxy:
+        began = time.monotonic()
+        while time.monotonic() < began + 0.5:
+            assert not proxy.wrench(np.eye(4), STILL).any()
+            time.sleep(1e-3)
+        assert proxy.is_connected

@@ -1,0 +1,108 @@
+"""A server on PostgreSQL whose addresses are of users with few rights: browsers cannot write."""
+
+import contextlib
+import os
+from collections.abc import Iterator
+from urllib.parse import quote, urlencode
+
+import psycopg
+import pytest
+from psycopg import conninfo, sql
+
+import hapticdb
+from children import until
+from hapticdb import Grid
+from hapticdb.server.access import Role
+from hapticdb.server.running import Serving
+from hapticdb.store.connect import grant
+from hapticdb.store.postgres.address import parse
+from hapticdb.testing import blob, write_voxels
+from page_person import PagePerson
+from servers import Place
+from serving import TOKENS, running
+
+PASSWORD = "of-a-test"  # noqa: S105 - of roles that live as long as a test
+GRID = Grid(0.01, (0.0, 0.0, 0.0), 6)
+
+
+@pytest.fixture
+def urls(place: Place, admin: psycopg.Connection) -> Iterator[dict[Role, str]]:
+    """The environment's address as its viewer, as its toucher and as its editor."""
+    url = place()
+    with hapticdb.create(url, GRID) as env:
+        write_voxels(env.store, blob(1, (20, 20, 20)), "wheel")
+        write_voxels(env.store, blob(2, (40, 40, 40)), "door")
+    names = {role: f"hapticdb_test_{role.word}_{os.getpid()}" for role in Role}
+    address = parse(url)
+    known = conninfo.conninfo_to_dict(address.conninfo)
+    found = {}
+    for role, name in names.items():
+        user = sql.Identifier(name)
+        admin.execute(sql.SQL("CREATE ROLE {} LOGIN PASSWORD {}").format(user, PASSWORD))
+        grant(url, name, role.word)  # type: ignore[arg-type]
+        wanted = {**known, "user": name, "password": PASSWORD, "environment": address.environment}
+        found[role] = f"postgresql:///?{urlencode(wanted, quote_via=quote)}"
+    yield found
+    for name in names.values():
+        admin.execute(sql.SQL("DROP OWNED BY {}").format(sql.Identifier(name)))
+        admin.execute(sql.SQL("DROP ROLE {}").format(sql.Identifier(name)))
+
+
+def stored(admin: psycopg.Connection, url: str) -> list[object]:
+    """Everything that is stored in an environment, as the owner sees it."""
+    schema = sql.Identifier(parse(url).environment)
+    found: list[object] = []
+    for table in ("environment", "object", "brick", "change"):
+        query = sql.SQL("SELECT * FROM {}.{} ORDER BY 1, 2").format(schema, sql.Identifier(table))
+        found += admin.execute(query).fetchall()
+    return found
+
+
+def take_the_wheel_out(person: PagePerson) -> None:
+    person.press("wheel")
+    person.choose("For everyone", "Take out")
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("sender", [Role.VIEWER, Role.EDITOR])
+def test_what_reads_as_a_viewer_cannot_write_whatever_is_sent(
+    urls: dict[Role, str], admin: psycopg.Connection, sender: Role
+) -> None:
+    """Whoever has stolen even the editor's token: the database refuses."""
+    url = urls[Role.VIEWER]
+    before = stored(admin, url)
+    serving = Serving(dict.fromkeys(Role, url), tokens=TOKENS)
+    with running(serving) as server, server.browser(sender) as browser:
+        person = PagePerson(browser)
+        take_the_wheel_out(person)
+        if sender is Role.EDITOR:
+            until(person.look)
+        person.put_everything()
+        assert person.n_messages
+        assert server.ask("/healthz")[0].status == 200
+    assert stored(admin, url) == before
+    told = "".join(person.told)
+    for word in (PASSWORD, "hapticdb_test", parse(url).environment, "Traceback"):
+        assert word not in told
+
+
+@pytest.mark.long
+def test_only_an_editors_browser_reaches_the_address_that_may_write(
+    urls: dict[Role, str], admin: psycopg.Connection
+) -> None:
+    """The same steps change nothing for a viewer and a toucher, and do for an editor."""
+    url = urls[Role.VIEWER]
+    before = stored(admin, url)
+    with running(Serving(urls, tokens=TOKENS)) as server:
+        for role in (Role.VIEWER, Role.TOUCHER):
+            with server.browser(role) as browser:
+                person = PagePerson(browser)
+                take_the_wheel_out(person)
+                person.put_everything()
+            assert stored(admin, url) == before
+        with server.browser(Role.EDITOR) as browser:
+            person = PagePerson(browser)
+            take_the_wheel_out(person)
+            until(lambda: (person.look(), stored(admin, url) != before)[1])
+    with contextlib.closing(hapticdb.open(url, read_only=True)) as env:
+        assert [obj.name for obj in env.objects()] == ["door"]

@@ -1,0 +1,178 @@
+"""What WebSockets run over: TLS that is verified, no compression, no delay of small segments."""
+
+import socket
+import ssl
+from collections.abc import Iterator
+from contextlib import closing
+from http.client import HTTPSConnection
+from pathlib import Path
+from typing import Any
+
+import pytest
+from websockets.sync.client import connect
+
+import hapticdb
+from children import PATIENCE, finished
+from hapticdb.errors import AccessError, FileError
+from hapticdb.server.access import Role
+from hapticdb.server.running import Serving
+from hapticdb.server.transports import StrictWebSocket
+from hapticdb.store.remote.store import RemoteStore
+from serving import CAMERA, PROTOCOL, TOKENS, Running, running, sent, text_until, urls
+
+TOKEN = "a-token-for-toucher"  # noqa: S105
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory: pytest.TempPathFactory) -> tuple[str, str]:
+    """Files of a certificate of 127.0.0.1 that has signed itself, and of its key."""
+    return made_certificate(tmp_path_factory.mktemp("tls"), "IP:127.0.0.1")
+
+
+def made_certificate(folder: Path, name: str) -> tuple[str, str]:
+    certificate, key = folder / "cert.pem", folder / "key.pem"
+    command = [
+        "openssl", "req", "-x509", "-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1",
+        "-nodes", "-days", "2", "-subj", "/CN=hapticdb", "-addext", f"subjectAltName={name}",
+        "-keyout", str(key), "-out", str(certificate),
+    ]  # fmt: skip
+    finished(command, check=True)
+    return str(certificate), str(key)
+
+
+def served(environment: Path, certificate: tuple[str, str] | None) -> Serving:
+    cert, key = certificate or (None, None)
+    return Serving(
+        urls(environment), tokens=TOKENS, certificate=cert, key=key, page="viser_page:work",
+        awaits_devices=True,
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def secure(environment: Path, certificate: tuple[str, str]) -> Iterator[Running]:
+    with running(served(environment, certificate)) as found:
+        yield found
+
+
+@pytest.mark.long
+def test_every_connection_of_many_is_answered(
+    secure: Running, certificate: tuple[str, str]
+) -> None:
+    """With tickets after the handshake, a few in a hundred were not."""
+    url = f"wss://{secure.place}?token={TOKEN}&ca={certificate[0]}"
+    for _ in range(150):
+        with hapticdb.open(url, read_only=True) as env:
+            assert env.grid.bits == 6
+
+
+def test_a_client_trusts_the_file_that_it_is_given(
+    secure: Running, certificate: tuple[str, str]
+) -> None:
+    url = f"wss://{secure.place}?token={TOKEN}&ca={certificate[0]}"
+    with hapticdb.open(url, read_only=True) as env:
+        assert env.objects() == []
+
+
+def test_a_client_trusts_what_ssl_cert_file_names(
+    secure: Running, certificate: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", certificate[0])
+    with hapticdb.open(f"wss://{secure.place}?token={TOKEN}", read_only=True) as env:
+        assert env.objects() == []
+
+
+def test_a_stranger_is_not_trusted_and_gets_no_token(
+    secure: Running, tmp_path: Path, environment: Path, certificate: tuple[str, str]
+) -> None:
+    """Neither an unknown certificate, nor that of another name, nor another file's."""
+    url = f"wss://{secure.place}?token={TOKEN}"
+    other, _ = made_certificate(tmp_path, "IP:127.0.0.1")
+    for untrusted in (url, f"{url}&ca={other}"):
+        with pytest.raises(AccessError, match=r"certificate is not trusted.*\?ca=FILE") as told:
+            hapticdb.open(untrusted, read_only=True)
+        assert TOKEN not in str(told.value)
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    named = made_certificate(elsewhere, "DNS:haptics.example.org")
+    with (
+        running(served(environment, named)) as found,
+        pytest.raises(AccessError, match="certificate is not trusted"),
+    ):
+        hapticdb.open(f"wss://{found.place}?token={TOKEN}&ca={named[0]}", read_only=True)
+    with pytest.raises(FileError, match="no file of certificates"):
+        hapticdb.open(f"{url}&ca={certificate[0]}.none", read_only=True)
+
+
+def test_a_browser_uses_the_page_over_tls(secure: Running, certificate: tuple[str, str]) -> None:
+    trust = ssl.create_default_context(cafile=certificate[0])
+    with closing(HTTPSConnection("127.0.0.1", secure.port, timeout=PATIENCE, context=trust)) as ask:
+        ask.request("GET", f"/?token={TOKEN}")
+        answer = ask.getresponse()
+        assert answer.status == 200
+        assert "secure" in str(answer.getheader("set-cookie")).lower()
+    shown = {"Origin": f"https://{secure.place}", "Authorization": f"Bearer {TOKEN}"}
+    with connect(
+        f"wss://{secure.place}", ssl=trust, subprotocols=PROTOCOL, additional_headers=shown,
+        proxy=None, compression=None, open_timeout=PATIENCE,
+    ) as browser:  # fmt: skip
+        sent(browser, CAMERA)
+        assert "is a toucher" in text_until(browser, "is a toucher")
+
+
+def test_a_client_without_tls_gets_no_further(secure: Running) -> None:
+    with pytest.raises(hapticdb.HapticDBError, match="cannot be reached"):
+        hapticdb.open(f"ws://{secure.place}?token={TOKEN}", read_only=True)
+
+
+@pytest.mark.parametrize("is_secure", [False, True])
+def test_small_messages_leave_at_once_and_uncompressed(
+    environment: Path,
+    certificate: tuple[str, str],
+    monkeypatch: pytest.MonkeyPatch,
+    is_secure: bool,
+) -> None:
+    """TCP_NODELAY at both ends, for devices and browsers; no extension, even if asked for."""
+    noted: list[int] = []
+    begin = StrictWebSocket.connection_made
+
+    def connection_made(self: StrictWebSocket, transport: Any) -> None:  # noqa: ANN401 - asyncio's
+        begin(self, transport)
+        own = transport.get_extra_info("socket")
+        noted.append(own.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
+
+    monkeypatch.setattr(StrictWebSocket, "connection_made", connection_made)
+    query = f"?ca={certificate[0]}&token={TOKEN}" if is_secure else f"?token={TOKEN}"
+    scheme = "wss" if is_secure else "ws"
+    trust = ssl.create_default_context(cafile=certificate[0]) if is_secure else None
+    with running(served(environment, certificate if is_secure else None)) as found:
+        with closing(RemoteStore(f"{scheme}://{found.place}{query}")) as store:
+            link = store._connection._link
+            assert link is not None
+            assert link.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+            assert link.request is not None
+            assert "Sec-WebSocket-Extensions" not in link.request.headers
+            assert link.protocol.extensions == []
+        shown = {"Authorization": f"Bearer {TOKEN}"}
+        page = shown | {"Origin": f"{scheme.replace('ws', 'http')}://{found.place}"}
+        for path, headers, protocols in (
+            ("/device/cells", shown, None),
+            ("/", page, PROTOCOL),
+        ):
+            with connect(
+                f"{scheme}://{found.place}{path}", ssl=trust, additional_headers=headers,
+                subprotocols=protocols, proxy=None, compression="deflate", open_timeout=PATIENCE,
+            ) as asking:  # fmt: skip
+                assert asking.request is not None
+                assert "permessage-deflate" in asking.request.headers["Sec-WebSocket-Extensions"]
+                assert asking.protocol.extensions == []
+    assert len(noted) == 3
+    assert all(noted)
+
+
+@pytest.mark.parametrize("role", [None, Role.VIEWER])
+def test_over_tls_too_a_device_needs_the_right(
+    secure: Running, certificate: tuple[str, str], role: Role | None
+) -> None:
+    token = f"&token=a-token-for-{role.word}" if role else ""
+    with pytest.raises(AccessError, match="does not let this client in"):
+        hapticdb.open(f"wss://{secure.place}?ca={certificate[0]}{token}", read_only=True)

@@ -1,13 +1,15 @@
 """People edit on the page: who comes second is told, and nothing is lost."""
 
 import threading
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
 import hapticdb
-from hapticdb.errors import ConflictError, UsageError
+from hapticdb.errors import ConflictError, HapticDBError, UsageError
 from hapticdb.page.editing import Edits
 from hapticdb.sample.write import write_sample
 
@@ -58,3 +60,18 @@ def test_two_people_who_move_one_part(sample: str) -> None:
             assert [obj.name for obj in env.objects()] == [seen.name]
     finally:
         edits.close()
+
+
+def test_an_error_does_not_tell_where_the_environment_is(sample: str, tmp_path: Path) -> None:
+    edits = Edits(sample)
+    try:
+        with hapticdb.open(sample, read_only=True) as env:
+            gone = replace(env.objects()[0], id=999)
+        found = done(edits, 0, lambda own: own.take_out(gone))
+    finally:
+        edits.close()
+    nowhere = done(Edits(str(tmp_path / "none.db")), 0, lambda own: own.undo())
+    for error in (found, nowhere):
+        assert isinstance(error, HapticDBError)
+        assert str(Path(sample).parent) not in str(error)
+        assert str(tmp_path) not in str(error)

@@ -251,7 +251,7 @@ class Browser:
         return seven(pose)
 
     def _share(self) -> None:
-        """Show the tool, with the person's name, to everyone."""
+        """Show the tool to everyone, with the person's name to everyone else."""
         self._unshare()
         scene = self.site.server.scene
         name = f"/people/{self.number}"
@@ -260,9 +260,10 @@ class Browser:
             f"{name}/name", self.visitor.name, position=(0.0, 0.0, 1.25 * self.tool.radius),
             anchor="bottom-center",
         )  # fmt: skip
+        unseen = self.client.scene.add_frame(f"{name}/name", show_axes=False, visible=False)
         place(node, self.hand)
         self._shown = np.full(7, np.inf)
-        self._shared = [label, node]
+        self._shared = [unseen, label, node]
 
     def _unshare(self) -> None:
         shared, self._shared = self._shared, []
@@ -273,6 +274,7 @@ class Browser:
 
     def tick(self, now: float) -> None:
         """Show the newest frame of the session; called `site.TICKS` times a second."""
+        self.record.tick(now)  # viewers replay, too
         session = self.session
         if session is not None and session.is_over:
             self.session = None
@@ -287,7 +289,7 @@ class Browser:
         tool, wrench = np.array(one["tool"]), np.array(one["applied"])
         shared = self._shared
         if shared and has_moved(tool, self._shown, self.site.stage.diagonal):
-            place(shared[1], tool)
+            place(shared[-1], tool)
             self._shown = tool
         points, _ = session.contacts()
         touched = [self.site.objects[i] for i in session.touched() if i in self.site.objects]
@@ -299,7 +301,6 @@ class Browser:
         force = float(np.linalg.norm(wrench[:3]))
         self.history.append((now - self._begun, force, 1000.0 * float(one["lateness"])))
         self.touch.show(one, wrench, touched, now)
-        self.record.tick(now)
 
     def objects_changed(self) -> None:
         """Objects were added, moved or removed by someone; called in the database's thread."""

@@ -8,10 +8,11 @@ from numpy.typing import NDArray
 
 from hapticdb.edits.editor import Editor
 from hapticdb.environment import Environment
-from hapticdb.errors import ConflictError, HapticDBError, UsageError
+from hapticdb.errors import AccessError, ConflictError, HapticDBError, UsageError
 from hapticdb.page.database import DatabaseThread
 from hapticdb.page.wording import short_name
 from hapticdb.store.base import Object
+from hapticdb.store.urls import redact
 
 
 class PersonsEdits:
@@ -76,14 +77,33 @@ class Edits:
         then: Callable[[str], Any],
         failed: Callable[[HapticDBError], Any],
     ) -> None:
-        """Do an edit of a person later; then call `then` or `failed`."""
-        if self._thread is None:
-            self._thread = DatabaseThread(self._url, read_only=False)
+        """Do an edit of a person later; then call `then` or `failed`.
+
+        The error that `failed` gets names neither the environment's address nor its user.
+        """
+
+        def refused(error: HapticDBError) -> None:
+            failed(self._without_address(error))
+
+        try:
+            self._thread = self._thread or DatabaseThread(self._url, read_only=False)
+        except HapticDBError as error:
+            refused(error)
+            return
 
         def work(env: Environment) -> str:
             return job(self._of.setdefault(person, PersonsEdits(env)))
 
-        self._thread.ask(work, then, failed)
+        self._thread.ask(work, then, refused)
+
+    def _without_address(self, error: HapticDBError) -> HapticDBError:
+        """Return an error as people elsewhere may read it."""
+        if isinstance(error, AccessError):
+            return AccessError("the server may only read its database: nothing was changed")
+        text, address = str(error), redact(self._url)
+        if address in text:
+            return HapticDBError(text.replace(address, "the environment"))
+        return error
 
     def forget(self, person: int) -> None:
         """Forget a person's moves."""

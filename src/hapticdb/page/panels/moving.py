@@ -70,8 +70,9 @@ class MovingControls:
         size = browser.site.stage.diagonal
         scene = browser.client.scene
         self._gizmo = scene.add_transform_controls(
-            "/move", scale=MOVING_GIZMO * size, line_width=3.5, position=middle, depth_test=False
-        )
+            "/move", scale=MOVING_GIZMO * size, line_width=3.5, position=middle,
+            disable_sliders=True, depth_test=False,
+        )  # fmt: skip
         self._gizmo.on_update(self._dragged)
 
     def renew(self) -> None:

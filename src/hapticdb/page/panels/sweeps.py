@@ -16,7 +16,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
 from hapticdb.store.connect import open_store
 from hapticdb.sweeps import run as sweeps
-from hapticdb.sweeps.result import Swept
+from hapticdb.sweeps.result import Moment, Swept
 from hapticdb.sweeps.verdict import percent, verdict_line
 
 if TYPE_CHECKING:
@@ -40,13 +40,13 @@ WAYS = {
 class SweepAnswer(NamedTuple):
     """A sweep's answer, to be drawn.
 
-    shell : what was swept; swept : the result; pose (4, 4) or None : where it hits first; marks
-    (H, 3) : its points in voxels there, metres.
+    shell : what was swept; swept : the result; moment : where it is caught, or else where it hits
+    first, or None; marks (H, 3) : its points in voxels there, metres.
     """
 
     shell: PointShell
     swept: Swept
-    pose: Floats | None
+    moment: Moment | None
     marks: Floats
 
 
@@ -140,11 +140,12 @@ class SweepPanel:
             f"{f'<div>and {more} more</div>' if more > 0 else ''}</div>"
         )
         self._clear.visible = True
-        if found.pose is None:
+        moment = found.moment
+        if moment is None:
             return
         ghost = tools.from_shell(name, found.shell)
         middle = tools.middle_of(found.shell)
-        pose = found.pose.copy()
+        pose = moment.pose.copy()
         pose[:3, 3] += pose[:3, :3] @ middle
         node = add_tool(scene, "/swept", ghost, colours.MARK, 0.4)
         place(node, np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]]))
@@ -159,9 +160,8 @@ class SweepPanel:
             )  # fmt: skip
             self._drawn.append(
                 scene.add_label(
-                    "/swept_label", f"first hit at {percent(found.swept.first_hit.fraction)}"
-                    if found.swept.first_hit else "hit", position=found.marks.mean(axis=0),
-                    anchor="bottom-left",
+                    "/swept_label", f"{_word_of(swept)} at {percent(moment.fraction)}",
+                    position=found.marks.mean(axis=0), anchor="bottom-left",
                 )
             )  # fmt: skip
 
@@ -209,13 +209,13 @@ class SweepJob:
                 shell = env.shell(self._part, points=MOST_POINTS, spacing=spacing)
             present = [i for i in self._exclude if i in self._site.objects]
             swept = sweeps.sweep(env, shell, self._path(shell), exclude=present, progress=progress)
-            pose, marks = None, np.empty((0, 3))
-            moment = swept.first_hit
+            marks = np.empty((0, 3))
+            moment = swept.caught or swept.first_hit
             if moment is not None:
                 pose = moment.pose
                 touch = env.touch(shell, pose, exclude=present, law="plane")
                 marks = shell.points[touch.hits] @ pose[:3, :3].T + pose[:3, 3]
-        return SweepAnswer(shell, swept, pose, marks)
+        return SweepAnswer(shell, swept, moment, marks)
 
     def _path(self, shell: PointShell) -> Floats:
         """Poses of the sweep: of the tool, or displacements of the part from its place."""
@@ -233,3 +233,7 @@ class SweepJob:
         if math.isclose(float(np.abs(last - first).max()), 0.0, abs_tol=1e-12):
             raise UsageError("a way of no length: give a length, or move the hand")
         return np.stack([first, last])
+
+
+def _word_of(swept: Swept) -> str:
+    return "first hit" if swept.caught is None else "caught"

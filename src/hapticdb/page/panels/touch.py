@@ -174,9 +174,9 @@ class TouchPanel:
             self._reading.content = said
         history = np.array(self._browser.history)
         if len(history) > 1:
-            times = history[:, 0] - history[-1, 0]
-            self._force.data = (times, history[:, 1])
-            self._late.data = (times, np.minimum(history[:, 2], 2.0))
+            times, force_then, late_then = last_seconds(history).T
+            self._force.data = (times, force_then)
+            self._late.data = (times, np.minimum(late_then, 2.0))
 
     def _reading_html(
         self, force: float, torque: float, touched: list[Object], trouble: str, *, is_held: bool
@@ -211,6 +211,17 @@ class TouchPanel:
             '<div style="font-size:0.82em;min-height:3.2em">'
             f"{names}{said}</div></div>"
         )
+
+
+def last_seconds(history: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rows (n, 3) of the last `SECONDS`, their times from now, and zeros where nothing was yet.
+
+    A plot always shows the range of its times, so that these are always the same.
+    """
+    rows = history.copy()
+    rows[:, 0] -= history[-1, 0]
+    rows = rows[rows[:, 0] >= -SECONDS]
+    return np.vstack([[-SECONDS, 0.0, 0.0], [rows[0, 0], 0.0, 0.0], rows])
 
 
 def _css(colour: colours.Colour) -> str:

@@ -1,0 +1,140 @@
+"""Chromium for tests: Debian's, without a window, drawing in software; every wait has an end."""
+
+import os
+import re
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import imageio.v3 as iio
+import numpy as np
+from numpy.typing import NDArray
+from playwright.sync_api import Browser, Locator, Page, ViewportSize, sync_playwright
+
+from hapticdb.page.scene.stage import FIELD_OF_VIEW, View
+
+Floats = NDArray[np.float64]
+
+SIZE: ViewportSize = {"width": 800, "height": 480}
+"""Size of a page. Larger: drawing in software takes longer, about as its area."""
+PATIENCE = 120.0
+"""Seconds that any wait lasts at most: drawing in software is slow on a busy machine."""
+DRAGGED_STEPS = 10
+"""Places of the pointer on the way of a drag. Larger: each waits for a picture to be drawn."""
+
+
+@contextmanager
+def chromium() -> Iterator[Browser]:
+    """Run Chromium; a missing one fails the test."""
+    with sync_playwright() as play:
+        browser = play.chromium.launch(
+            executable_path="/usr/bin/chromium",
+            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
+        )
+        try:
+            yield browser
+        finally:
+            browser.close()
+
+
+def new_page(browser: Browser, address: str) -> Page:
+    """Open an address as a person of its own does: no cookie is shared."""
+    page = browser.new_context(viewport=SIZE).new_page()
+    page.set_default_timeout(1000.0 * PATIENCE)
+    page.goto(address)
+    return page
+
+
+def until(holds: Callable[[], bool], what: str, page: Page) -> None:
+    """Wait until something holds, and let the page go on meanwhile."""
+    end = time.monotonic() + PATIENCE
+    while not holds():
+        assert time.monotonic() < end, (
+            f"{what}: not within {PATIENCE:g} s; the page says: "
+            + (page.locator("body").inner_text()[-600:])
+        )
+        page.wait_for_timeout(100)
+
+
+def close_notes(page: Page) -> None:
+    """Close all notifications, such as viser's of drawing in software."""
+    page.evaluate(
+        "document.querySelectorAll('.mantine-Notification-closeButton').forEach(b => b.click())"
+    )
+
+
+def force_on(page: Page) -> float | None:
+    """Force that the tab Touch shows, newtons; None if it shows none."""
+    found = re.search(r"Force\s*([\d.]+) N", page.locator("body").inner_text())
+    return None if found is None else float(found.group(1))
+
+
+def field(page: Page, label: str) -> Locator:
+    """Field beside a label."""
+    return page.locator(f"xpath=//*[text()='{label}']/following::input[1]")
+
+
+def hand_fields(page: Page) -> list[Locator]:
+    """Three fields of the hand's place, in its opened folder."""
+    return page.locator("xpath=//*[text()='Place, m']/following::input[position()<=3]").all()
+
+
+def hand_on(page: Page) -> Floats:
+    """Place of the hand (3,), metres, as its opened folder shows it."""
+    return np.array([float(entry.input_value()) for entry in hand_fields(page)])
+
+
+class Eye:
+    """Where a page that was not turned shows places of the scene, in its pixels.
+
+    Parameters
+    ----------
+    page : Page
+        The page.
+    view : View
+        Its first view.
+    up : int
+        Number of the axis that points up.
+    """
+
+    def __init__(self, page: Page, view: View, up: int) -> None:
+        canvas = page.locator("canvas").first.bounding_box()
+        assert canvas is not None
+        ahead = view.look_at - view.position
+        self._ahead = ahead / np.linalg.norm(ahead)
+        right = np.cross(self._ahead, np.eye(3)[up])
+        self._right = right / np.linalg.norm(right)
+        self._over = np.cross(self._right, self._ahead)
+        self._place = view.position
+        self._middle = (canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2)
+        self._length = 0.5 * canvas["height"] / np.tan(FIELD_OF_VIEW / 2)
+
+    def pixel(self, place: Floats) -> tuple[float, float]:
+        """Pixel of a place (3,), metres."""
+        way = place - self._place
+        share = self._length / (way @ self._ahead)
+        return (
+            float(self._middle[0] + share * (way @ self._right)),
+            float(self._middle[1] - share * (way @ self._over)),
+        )
+
+
+def drag(page: Page, eye: Eye, grabbed: Floats, way: Floats) -> None:
+    """Drag what is at a place (3,) by a way (3,), metres, with the pointer."""
+    start, end = np.array(eye.pixel(grabbed)), np.array(eye.pixel(grabbed + way))
+    page.mouse.move(*start)
+    page.wait_for_timeout(400)  # a gizmo notices the pointer when it is drawn next
+    page.mouse.down()
+    for share in np.linspace(0.0, 1.0, DRAGGED_STEPS)[1:]:
+        page.mouse.move(*(start + share * (end - start)))
+        page.wait_for_timeout(60)  # viser sends 20 places of a gizmo a second
+    page.mouse.up()
+    page.wait_for_timeout(300)
+
+
+def picture(page: Page, name: str, folder: Path) -> Floats:
+    """Take a picture (height, width, 3) of a page; HAPTICDB_TEST_PICTURES names another folder."""
+    path = Path(os.environ.get("HAPTICDB_TEST_PICTURES") or folder) / f"{name}.png"
+    image = iio.imread(page.screenshot(path=path), extension=".png")
+    return np.asarray(image[..., :3], dtype=np.float64)

@@ -13,11 +13,14 @@ from hapticdb.bench import records
 from hapticdb.bench.drawing.draw import draw
 from hapticdb.bench.drawing.plots import plots_among
 from hapticdb.bench.feel.page import write_feel_page
+from report.floods_page import flood_table
 from report.hosting_page import hosted_table
 from report.laws_page import law_frame_table, law_session_table
 from report.page import write_report
 from report.plots import REPORT_KINDS
+from report.proxies_page import proxy_table
 from report.realtime_page import edit_table, frame_table, model_words, session_table
+from report.remote_page import remote_table
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "results"
@@ -128,7 +131,11 @@ def test_every_figure_that_is_said_to_be_measured_is_in_its_file() -> None:
         "results/edits.json": [edit_table(edits)],
         "results/both_laws.json": [law_frame_table(laws), law_session_table(laws)],
         "results/many_sessions.json": [hosted_table(loaded("results/many_sessions.json"))],
+        "results/contact_proxies.json": [proxy_table(loaded("results/contact_proxies.json"))],
+        "results/floods.json": [flood_table(loaded("results/floods.json"))],
+        "results/remote_cells.json": [remote_table(loaded("results/remote_cells.json"))],
     }
+    assert loaded("results/floods.json")["tracebacks"] == 0  # the page claims it
     for one in (*realtime["sessions"], *edits["edits"], *laws["sessions"]):
         assert one["unknown_frames"] == 0  # the pages claim it
     shown: list[str] = []

@@ -9,9 +9,10 @@ import base64
 import contextlib
 import json
 import os
+import signal
 import socket
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
@@ -24,10 +25,18 @@ import children
 from hapticdb.protocol.cells import MOST_REQUEST
 from hapticdb.server.cells.endpoint import CellsEndpoint
 from hapticdb.server.cells.limits import CellsLimits
+from hapticdb.store.base import Store
+from hapticdb.store.remote import connection
 
 TOKEN = "a-token-of-the-tests"  # noqa: S105
-LIFE_S = 1100.0
+LIFE_S = 5400.0
 """Seconds after which a server that a run has left is ended."""
+
+
+def impatient(store: Store) -> Store:
+    """Give an answer up soon, in a fetching process."""
+    connection.ANSWER_SECONDS = connection.OPEN_SECONDS = 5.0
+    return store
 
 
 def may_enter(headers: Mapping[str, str]) -> bool:
@@ -55,9 +64,9 @@ class AnyEnvironment:
                 await endpoint.close()
 
 
-async def serve(limits: CellsLimits, certificate: tuple[str, str] | None) -> None:
+async def serve(limits: CellsLimits, certificate: tuple[str, str] | None, port: int) -> None:
     app = Starlette(routes=[WebSocketRoute("/{name}/device/cells", AnyEnvironment(limits))])
-    listening = socket.create_server(("127.0.0.1", 0))
+    listening = socket.create_server(("127.0.0.1", port))
     files: dict[str, Any] = {}
     if certificate:
         files = {"ssl_certfile": certificate[0], "ssl_keyfile": certificate[1]}
@@ -83,9 +92,14 @@ class DeviceServer:
     """The server's process, from the test's side."""
 
     def __init__(
-        self, log: Path, certificate: tuple[str, str] | None = None, **limits: float
+        self,
+        log: Path,
+        certificate: tuple[str, str] | None = None,
+        *,
+        port: int = 0,
+        **limits: float,
     ) -> None:
-        told = json.dumps({"limits": limits, "certificate": certificate})
+        told = json.dumps({"limits": limits, "certificate": certificate, "port": port})
         self.log = log
         self._opened = contextlib.ExitStack()
         errors = self._opened.enter_context(log.open("ab"))
@@ -118,6 +132,20 @@ class DeviceServer:
     def __exit__(self, *_: object) -> None:
         self.close()
 
+    @contextlib.contextmanager
+    def stalled(self) -> Iterator[None]:
+        """Stop the process meanwhile: it answers nothing and closes nothing."""
+        self.process.send_signal(signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            self.process.send_signal(signal.SIGCONT)
+
+    def kill(self) -> None:
+        """End the process as a failure of its machine does: without a word."""
+        self.process.kill()
+        self.process.wait(children.PATIENCE)
+
     def close(self) -> None:
         with contextlib.suppress(OSError):
             if self.process.stdin is not None:
@@ -127,4 +155,4 @@ class DeviceServer:
 
 if __name__ == "__main__":
     asked = json.loads(sys.argv[1])
-    asyncio.run(serve(CellsLimits(**asked["limits"]), asked["certificate"]))
+    asyncio.run(serve(CellsLimits(**asked["limits"]), asked["certificate"], asked["port"]))

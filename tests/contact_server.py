@@ -15,11 +15,13 @@ from pathlib import Path
 import numpy as np
 import uvicorn
 from starlette.applications import Starlette
+from starlette.routing import WebSocketRoute
+from starlette.websockets import WebSocket
 
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Access, Role
-from hapticdb.server.contacts.endpoint import IDLE_AFTER, Contacts
+from hapticdb.server.contacts.endpoint import IDLE_AFTER, Contacts, is_admitted
 
 TOKEN = "a-token-for-tests-only"  # noqa: S105 - of no use elsewhere
 
@@ -40,12 +42,18 @@ async def serve(
 ) -> None:
     """Serve until standard input closes."""
     with ResidentCells(url, budget_bytes=64 << 20, distances=True) as cells:
-        contacts = Contacts(
-            cells, tools, Access({TOKEN: Role.TOUCHER}).role_of_headers, idle_after=idle
-        )
+        contacts = Contacts(cells, tools, idle_after=idle)
+        role_of_headers = Access({TOKEN: Role.TOUCHER}).role_of_headers
+
+        async def attend(websocket: WebSocket) -> None:
+            if await is_admitted(websocket, role_of_headers, contacts.n_clients):
+                await websocket.accept()
+                await contacts.attend(websocket)
+
         config = uvicorn.Config(
-            Starlette(routes=[contacts.route()]), log_level="warning", ws="websockets-sansio",
-            ws_max_size=4096, ws_per_message_deflate=False, lifespan="off",
+            Starlette(routes=[WebSocketRoute("/device/contacts", attend)]),
+            ws="websockets-sansio", ws_max_size=4096, ws_per_message_deflate=False,
+            log_level="warning", lifespan="off",
         )  # fmt: skip
         server = uvicorn.Server(config)
         with socket.create_server(("127.0.0.1", port)) as listening:

@@ -74,7 +74,7 @@ def test_a_wrong_token_an_unknown_tool_and_no_server_are_told(served: Served) ->
         ContactProxy(served.url("some-other-token-of-nobody"))
     with pytest.raises(UsageError, match="no tool of that name: there are plate"):
         ContactProxy(served.url(), "hammer")
-    with pytest.raises(ConnectionLostError, match="is it running"):
+    with pytest.raises(ConnectionLostError, match="cannot be reached"):
         ContactProxy("ws://127.0.0.1:9")
 
 

@@ -18,7 +18,7 @@ from children import joined, until
 from contact_hands import DEPTH, STILL, Served, falls_to_zero, pressed, serving, started
 from hapticdb.client import contact_link, contact_proxy
 from hapticdb.client.contact_proxy import ContactProxy
-from hapticdb.errors import ConnectionLostError
+from hapticdb.errors import ConnectionLostError, ProtocolError
 from hapticdb.protocol.contacts import ProxyTerms, pack_terms
 
 
@@ -81,7 +81,7 @@ def test_the_process_that_fetches_is_started_again(mortal: Served) -> None:
 
 
 @contextmanager
-def stalling(answer: Callable[[ServerConnection], None]) -> Iterator[str]:
+def stalling(answer: Callable[[ServerConnection], None], port: int = 0) -> Iterator[str]:
     """URL of a server that answers a client's first message as it is told, and no other."""
 
     def work(connection: ServerConnection) -> None:
@@ -91,7 +91,7 @@ def stalling(answer: Callable[[ServerConnection], None]) -> Iterator[str]:
             while True:
                 connection.recv(30)
 
-    with serve(work, "127.0.0.1", 0, compression=None) as server:
+    with serve(work, "127.0.0.1", port, compression=None) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()
         yield f"ws://127.0.0.1:{server.socket.getsockname()[1]}"
@@ -105,7 +105,7 @@ def test_a_server_that_accepts_and_never_answers_is_given_up(
     monkeypatch.setattr(contact_proxy, "PATIENCE", 0.5)
     with (
         socket.create_server(("127.0.0.1", 0)) as listening,
-        pytest.raises(ConnectionLostError, match="is it running"),
+        pytest.raises(ConnectionLostError, match="cannot be reached"),
     ):
         ContactProxy(f"ws://127.0.0.1:{listening.getsockname()[1]}")
 
@@ -127,3 +127,15 @@ def test_without_any_proxy_there_is_no_force() -> None:
             assert not proxy.wrench(np.eye(4), STILL).any()
             time.sleep(1e-3)
         assert proxy.is_connected
+
+
+def test_the_force_comes_back_after_a_server_that_talks_nonsense(mortal: Served) -> None:
+    with ContactProxy(mortal.url()) as proxy:
+        pressed(mortal, proxy)
+        mortal.process.kill()
+        falls_to_zero(mortal, proxy)
+        with stalling(lambda connection: connection.send(b"nonsense"), mortal.port):
+            until(lambda: isinstance(proxy.error, ProtocolError))
+        with started(mortal.file, mortal.plate, mortal.origin, port=mortal.port) as again:
+            until(lambda: proxy.wrench(again.pose(-DEPTH), STILL)[2] == 0.0 and proxy.told.is_fresh)
+            pressed(again, proxy)

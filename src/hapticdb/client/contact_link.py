@@ -6,7 +6,6 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hapticdb.errors import (
-    AccessError,
     ConnectionLostError,
     MissingExtraError,
     ProtocolError,
@@ -67,12 +66,7 @@ class ContactLink:
 
     def send(self, hand: HandState) -> None:
         """Send a hand; ConnectionLostError if the connection has ended."""
-        from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
-
-        try:
-            self._connection.send(pack_hand(hand))
-        except (ConnectionClosed, OSError) as error:
-            raise ConnectionLostError(f"the server is gone: {error}") from error
+        _send(self._connection, pack_hand(hand))
 
     def close(self) -> None:
         """Disconnect at once: a server that is frozen is not waited for."""
@@ -90,48 +84,45 @@ def connect(url: str, wish: ProxyWish, patience: float) -> ContactLink:
     UsageError
         If the URL is wrong or the server refuses the wish.
     AccessError
-        If the server refuses the token.
+        If the server refuses the token, or its certificate is not trusted.
+    BusyError
+        If the server has too many clients.
     ConnectionLostError
         If the server cannot be reached, does not answer within `patience` seconds, or does not
         grant a tool within `GRANTED_WITHIN`.
+    EnvironmentNotFoundError
+        If another server answers there.
     """
     address = parse_address(url, CONTACTS)
     try:
-        from websockets.exceptions import InvalidStatus, WebSocketException  # noqa: PLC0415 - an extra
-        from websockets.sync.client import connect as open_connection  # noqa: PLC0415 - an extra
+        from hapticdb.protocol.opening import open_websocket  # noqa: PLC0415 - an extra
     except ImportError:
         raise MissingExtraError(
             "the package websockets is missing: pip install 'hapticdb[client]'"
         ) from None
     quiet = logging.getLogger("hapticdb.client.websockets")
     quiet.setLevel(logging.CRITICAL)  # every failure is raised, or is `ContactProxy.error`
-    headers = {"Authorization": f"Bearer {address.token}"} if address.token else {}
+    connection = open_websocket(
+        address.endpoint, token=address.token, trust=address.trust(), shown=address.shown,
+        max_size=LARGEST, max_queue=None, open_timeout=patience, close_timeout=1.0,
+        ping_interval=PING_EVERY, ping_timeout=PING_PATIENCE,
+        logger=quiet,
+    )  # fmt: skip
     try:
-        connection = open_connection(
-            address.endpoint,
-            ssl=address.trust(), compression=None, additional_headers=headers, proxy=None,
-            max_size=LARGEST, max_queue=None, open_timeout=patience, close_timeout=1.0,
-            ping_interval=PING_EVERY, ping_timeout=PING_PATIENCE,
-            logger=quiet,
-        )  # fmt: skip
-    except InvalidStatus as error:
-        status = error.response.status_code
-        if status in (401, 403):
-            raise AccessError(
-                f"{address.shown}: the server refuses this token, or there is none: give "
-                "?token=TOKEN, or set HAPTICDB_TOKEN"
-            ) from None
-        raise ConnectionLostError(f"{address.shown}: the server answers {status}") from None
-    except (OSError, TimeoutError, WebSocketException) as error:
-        raise ConnectionLostError(
-            f"{address.shown}: no answer ({error}); is it running?"
-        ) from error
-    try:
-        connection.send(pack_wish(wish))
+        _send(connection, pack_wish(wish))
         return ContactLink(connection, unpack_terms(_received(connection, GRANTED_WITHIN)))
     except BaseException:
         connection.close()
         raise
+
+
+def _send(connection: "ClientConnection", message: bytes) -> None:
+    from websockets.exceptions import ConnectionClosed  # noqa: PLC0415 - an extra
+
+    try:
+        connection.send(message)
+    except (ConnectionClosed, OSError) as error:
+        raise ConnectionLostError(f"the server is gone: {error}") from error
 
 
 def _received(connection: "ClientConnection", patience: float | None) -> bytes:

@@ -20,7 +20,7 @@ from hapticdb.client.contact_link import ContactLink, connect
 from hapticdb.client.proxy_force import ForceState, ProxyForce
 from hapticdb.devices.profiles import HAND_STIFFNESS
 from hapticdb.devices.protocol import Reading
-from hapticdb.errors import AccessError, ConnectionLostError, HapticDBError, UsageError
+from hapticdb.errors import ConnectionLostError, HapticDBError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.records import HAND, pose_numbers
 from hapticdb.protocol.contacts import HandState, ProxyTerms, ProxyWish
@@ -80,9 +80,13 @@ class ContactProxy:
     UsageError
         If the URL or a number is wrong, or the server has no such tool.
     AccessError
-        If the server refuses the token.
+        If the server refuses the token, or its certificate is not trusted.
+    BusyError
+        If the server has too many clients.
     ConnectionLostError
         If the server cannot be reached.
+    EnvironmentNotFoundError
+        If another server answers there.
     """
 
     def __init__(
@@ -234,7 +238,7 @@ class ContactProxy:
             return
         try:
             link = connect(self._url, self._wish, PATIENCE)
-        except (AccessError, UsageError, ConnectionLostError) as error:
+        except HapticDBError as error:
             self.error = error
             return
         if link.terms != self.terms:

@@ -14,8 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
-from starlette.responses import PlainTextResponse, Response
-from starlette.routing import WebSocketRoute
+from starlette.responses import PlainTextResponse
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from hapticdb.errors import DatabaseError, HapticDBError, ProtocolError, UsageError
@@ -35,8 +34,6 @@ from hapticdb.server.access import Role
 from hapticdb.server.limits import TokenBucket
 
 LOG = logging.getLogger("hapticdb.server")
-PATH = "/device/contacts"
-"""Path of the endpoint below the server's prefix."""
 MOST_CLIENTS = 16
 """Most clients at a time. Larger: more remote hands, each about 1 ms of computing in 10 ms."""
 MESSAGES_A_SECOND = 1000.0
@@ -65,10 +62,21 @@ RoleOfHeaders = Callable[[Mapping[str, str]], Role | None]
 """Finds the role of a client by the headers of its request; see `server.access`."""
 
 
-def may_feel(headers: Mapping[str, str], role_of_headers: RoleOfHeaders) -> bool:
-    """Whether a client with these headers may feel; a browser, which has an origin, may not."""
-    role = role_of_headers(headers)
-    return role is not None and role >= Role.TOUCHER and "origin" not in headers
+async def is_admitted(websocket: WebSocket, role_of_headers: RoleOfHeaders, n_clients: int) -> bool:
+    """Whether a client may be accepted. It is told if it may not feel, or is one too many.
+
+    A browser, which has an origin, may not feel here.
+    """
+    role = role_of_headers(websocket.headers)
+    if role is None or role < Role.TOUCHER or "origin" in websocket.headers:
+        await websocket.close(1008)  # before it is accepted: the answer is 403
+        return False
+    if n_clients >= MOST_CLIENTS:
+        await websocket.send_denial_response(
+            PlainTextResponse("too many remote hands: try again later\n", 503)
+        )
+        return False
+    return True
 
 
 class Contacts:
@@ -80,12 +88,8 @@ class Contacts:
         With distances.
     tools : mapping of str to PointShell
         By the names that clients give.
-    role_of_headers : callable
-        Finds the role of a client by the headers of its request; see `server.access`.
     rate : float
         Proxies a second to each client.
-    most_clients : int
-        Clients at a time.
     idle_after : float
         Seconds without a hand after which a client is dropped.
     """
@@ -94,14 +98,12 @@ class Contacts:
         self,
         cells: ResidentCells,
         tools: Mapping[str, PointShell],
-        role_of_headers: RoleOfHeaders,
         *,
         rate: float = RATE,
-        most_clients: int = MOST_CLIENTS,
         idle_after: float = IDLE_AFTER,
     ) -> None:
-        self._cells, self._tools, self._role_of = cells, dict(tools), role_of_headers
-        self._rate, self._most, self._idle = rate, most_clients, idle_after
+        self._cells, self._tools = cells, dict(tools)
+        self._rate, self._idle = rate, idle_after
         self._threads = ThreadPoolExecutor(max_workers=4, thread_name_prefix="contacts")
         self.n_clients = 0
         """Clients that are connected now."""
@@ -112,27 +114,12 @@ class Contacts:
         self.n_refused = 0
         """Connections that were closed for a fault of the client."""
 
-    def route(self) -> WebSocketRoute:
-        """Route of the endpoint, for a Starlette application."""
-        return WebSocketRoute(PATH, self.serve)
-
     def close(self) -> None:
         """End the threads."""
         self._threads.shutdown(wait=True, cancel_futures=True)
 
-    async def serve(self, websocket: WebSocket) -> None:
-        """Serve one client until it leaves."""
-        if not may_feel(websocket.headers, self._role_of):
-            await websocket.close(1008)  # before it is accepted: the answer is 403
-            return
-        if self.n_clients >= self._most:
-            await websocket.send_denial_response(busy())
-            return
-        await websocket.accept()
-        await self.attend(websocket)
-
     async def attend(self, websocket: WebSocket, first: bytes | None = None) -> None:
-        """Serve one client whose connection was accepted, until it leaves.
+        """Serve one accepted client until it leaves.
 
         first: its first message, if that has been read already.
         """
@@ -264,8 +251,3 @@ async def _receive(websocket: WebSocket) -> bytes:
     if len(message) > LARGEST:
         raise ProtocolError(f"a message of {len(message)} bytes: at most {LARGEST} may be sent")
     return bytes(message)
-
-
-def busy() -> Response:
-    """Answer to one client too many."""
-    return PlainTextResponse("too many remote hands: try again later\n", 503)

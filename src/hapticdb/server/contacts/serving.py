@@ -13,7 +13,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.header import CloseCode
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Role
-from hapticdb.server.contacts.endpoint import MOST_CLIENTS, Contacts, busy, first_message, may_feel
+from hapticdb.server.contacts.endpoint import Contacts, first_message, is_admitted
 from hapticdb.server.served import Served
 from hapticdb.store.base import scene_bounds
 
@@ -46,11 +46,8 @@ class ServedContacts:
         It is accepted at once, and granted its tool when cells and tools are there: that takes
         seconds for the first one, in which pings are answered.
         """
-        if not may_feel(websocket.headers, self._served.access.role_of_headers):
-            await websocket.close(1008)  # before it is accepted: the answer is 403
-            return
-        if self._n_clients >= MOST_CLIENTS:
-            await websocket.send_denial_response(busy())
+        role_of_headers = self._served.access.role_of_headers
+        if not await is_admitted(websocket, role_of_headers, self._n_clients):
             return
         self._n_clients += 1
         try:
@@ -91,7 +88,7 @@ class ServedContacts:
         cells = ResidentCells(served.urls[Role.TOUCHER], distances=True)
         try:
             tools = _tools(served.tools, cells)
-            self._contacts = Contacts(cells, tools, served.access.role_of_headers)
+            self._contacts = Contacts(cells, tools)
         except BaseException:
             cells.close()
             raise

@@ -1,23 +1,18 @@
 """A connection to a server: requests and answers, pushes, and the way back after a loss."""
 
 import contextlib
-import ssl
 import time
 from collections.abc import Callable, Iterator
-from http import HTTPStatus
 from typing import TypeVar
 
-from websockets.exceptions import InvalidStatus, WebSocketException
+from websockets.exceptions import WebSocketException
 from websockets.sync.client import ClientConnection
-from websockets.sync.client import connect as connect_websocket
 
 from hapticdb.errors import (
-    AccessError,
     BusyError,
     ConnectionLostError,
     DamagedError,
     DatabaseError,
-    EnvironmentNotFoundError,
     HapticDBError,
     OutdatedError,
     ProtocolError,
@@ -27,6 +22,7 @@ from hapticdb.errors import (
 from hapticdb.protocol.cells import MOST_ANSWER, WelcomeBody, welcome_of
 from hapticdb.protocol.fields import FieldsRead
 from hapticdb.protocol.header import NO_REVISION, Kind, MessageHeader, Refusal, header_of
+from hapticdb.protocol.opening import open_websocket
 from hapticdb.store.refusals import check_outside
 from hapticdb.store.threads import check_thread, this_thread
 from hapticdb.store.urls import RemoteAddress
@@ -89,7 +85,6 @@ class RemoteConnection:
         self.heard_at = 0.0
         self.n_connected = 0
         self._hear = hear
-        self._trust = address.trust()
         self._thread = this_thread()
         self._depth = 0
         self._number = 0
@@ -100,22 +95,17 @@ class RemoteConnection:
 
     def _connect(self) -> WelcomeBody:
         """Connect once, and greet."""
-        token = self.address.token
-        headers = {"Authorization": f"Bearer {token}"} if token else {}
-        with self._named_errors():
-            self._link = connect_websocket(
-                self.address.endpoint,
-                ssl=self._trust,
-                compression=None,
-                additional_headers=headers,
-                user_agent_header="hapticdb",
-                proxy=None,  # a proxy between would add its delays: TLS passes, or nothing
-                open_timeout=OPEN_SECONDS,
-                close_timeout=CLOSE_SECONDS,
-                ping_interval=None,  # beats come anyway, and every request has a time limit
-                max_size=MOST_ANSWER,
-                max_queue=FRAMES_HELD,
-            )
+        self._link = open_websocket(
+            self.address.endpoint,
+            token=self.address.token,
+            trust=self.address.trust(),
+            shown=self.shown,
+            open_timeout=OPEN_SECONDS,
+            close_timeout=CLOSE_SECONDS,
+            ping_interval=None,  # beats come anyway, and every request has a time limit
+            max_size=MOST_ANSWER,
+            max_queue=FRAMES_HELD,
+        )
         self.n_connected += 1
         header, body = self._exchange(Kind.HELLO, b"")
         if header.kind != Kind.WELCOME:
@@ -158,36 +148,6 @@ class RemoteConnection:
                 f"{self.shown} is another environment than before: open it again"
             )
         self.welcome = welcome
-
-    @contextlib.contextmanager
-    def _named_errors(self) -> Iterator[None]:
-        """Turn errors of a connection that cannot be made into those of hapticdb."""
-        try:
-            yield
-        except InvalidStatus as error:
-            raise self._denied(error.response.status_code) from error
-        except ssl.SSLCertVerificationError as error:
-            raise AccessError(
-                f"{self.shown}: the server's certificate is not trusted ({error.verify_message}); "
-                "?ca=FILE names the file of a private authority"
-            ) from error
-        except (OSError, TimeoutError, WebSocketException) as error:
-            cause = " ".join(str(error).split()) or type(error).__name__
-            raise ConnectionLostError(f"{self.shown} cannot be reached: {cause}") from error
-
-    def _denied(self, status: int) -> HapticDBError:
-        if status in {HTTPStatus.UNAUTHORIZED, HTTPStatus.FORBIDDEN}:
-            return AccessError(
-                f"{self.shown}: the server does not let this client in; give a token of a toucher "
-                "as ?token=TOKEN or in HAPTICDB_TOKEN"
-            )
-        if status in {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.TOO_MANY_REQUESTS}:
-            return BusyError(f"{self.shown} has too many clients now: try again later")
-        if status in {HTTPStatus.BAD_GATEWAY, HTTPStatus.GATEWAY_TIMEOUT}:
-            return ConnectionLostError(f"{self.shown}: only a proxy answers (status {status})")
-        return EnvironmentNotFoundError(
-            f"no hapticdb server at {self.shown} (status {status}): 'hapticdb serve' starts one"
-        )
 
     def give_to(self, thread: int) -> None:
         """Give the connection to another thread, or to `NOBODY`. No call may be under way."""

@@ -203,9 +203,7 @@ def measure(folder: Path, given: argparse.Namespace) -> dict[str, Any]:
     tool, path = write_along(folder / "along", database, frames=1000)
     rates = [int(word) for word in given.rates.split(",") if word]
     found: dict[str, Any] = {
-        "commit": records.commit(),
-        "machine": records.machine(),
-        "versions": records.versions(),
+        **records.conditions(),
         "model": model.name,
         "frames": frames_of(database, model, tool, path),
         "sessions": sessions_of(database, tool, path, rates, given.seconds),

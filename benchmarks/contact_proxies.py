@@ -225,9 +225,7 @@ def measure(folder: Path, *, is_busy: bool) -> Line:
         lines += more
         times.append(spent)
     return {
-        "commit": records.commit(),
-        "machine": records.machine(),
-        "versions": records.versions(),
+        **records.conditions(),
         "car": found[3],
         "points": POINTS,
         "is_busy": is_busy,

@@ -199,9 +199,7 @@ def measure(folder: Path, given: argparse.Namespace) -> Line:
             print(json.dumps(lines[-1]), file=sys.stderr, flush=True)
     log = server.log.read_text()
     return {
-        "commit": records.commit(),
-        "machine": records.machine(),
-        "versions": records.versions(),
+        **records.conditions(),
         "environment": Path(url).stem,
         "points": len(shell),
         "messages": given.messages,

@@ -156,9 +156,7 @@ def environments(folder: Path, model: Path) -> Iterator[dict[str, str]]:
 def about() -> dict[str, Any]:
     """Commit, machine and versions: the head of both result files of a run."""
     return {
-        "commit": records.commit(),
-        "machine": records.machine(),
-        "versions": records.versions(),
+        **records.conditions(),
     }
 
 

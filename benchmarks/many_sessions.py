@@ -206,9 +206,7 @@ def measure(folder: Path, given: argparse.Namespace) -> Line:
             lines.append(measured(url, shell, poses, count, given.seconds))
             print(json.dumps(lines[-1]), file=sys.stderr, flush=True)
     return {
-        "commit": records.commit(),
-        "machine": records.machine(),
-        "versions": records.versions(),
+        **records.conditions(),
         "environment": Path(url).name,
         "points": len(shell),
         "arrivals": ARRIVALS,

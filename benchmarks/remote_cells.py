@@ -219,9 +219,7 @@ def measure(folder: Path, given: argparse.Namespace) -> Line:
             lines.append(one)
             print(json.dumps(one), file=sys.stderr, flush=True)
     return {
-        "commit": records.commit(),
-        "machine": records.machine(),
-        "versions": records.versions(),
+        **records.conditions(),
         "environment": Path(own).stem,
         "points": len(shell),
         "speed": SPEED,

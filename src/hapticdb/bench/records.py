@@ -132,6 +132,11 @@ def commit(root: Path = ROOT) -> str:
     return f"unknown, version {version('hapticdb')}"
 
 
+def conditions() -> dict[str, Any]:
+    """What every record says first: commit, machine and versions."""
+    return {"commit": commit(), "machine": machine(), "versions": versions()}
+
+
 def versions() -> dict[str, str]:
     """Versions of the packages that take part; those that are not installed are left out."""
     found = {}

@@ -59,11 +59,15 @@ class Browser:
         The browser, as viser knows it.
     visitor : Visitor
         Name and role of the person.
+    number : int
+        Of the browser at this site, freed by `close`.
     """
 
-    def __init__(self, site: "Site", client: "ClientHandle", visitor: "Visitor") -> None:
+    def __init__(
+        self, site: "Site", client: "ClientHandle", visitor: "Visitor", number: int
+    ) -> None:
         self.site, self.client, self.visitor = site, client, visitor
-        self.number = site.take_number()
+        self.number = number
         self.colour = colours.of_tool(self.number)
         self.scene = site.view.browser(client)
         self.chosen: tuple[int, ...] = ()
@@ -310,13 +314,14 @@ class Browser:
             self.taken = None
         self.parts.show_objects()
         self.parts.moving.renew()
+        if not set(self.unfelt) <= set(self._unfelt):  # one that is not seen has come
+            self.begin_anew()
 
     def close(self) -> None:
-        """End the session and take the tool out of everyone's view."""
-        if self._is_closed:
+        """End the session and take the tool out of everyone's view; again it does nothing."""
+        if self.site.browsers.pop(self.client.client_id, None) is None:
             return
         self._is_closed = True
-        self.site.browsers.pop(self.client.client_id, None)
         self.site.view.forget(self.client)
         if self.site.edits is not None:
             self.site.edits.forget(self.number)

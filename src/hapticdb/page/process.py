@@ -76,7 +76,16 @@ def open_page(site: Site, visitor_of: "Callable[[ClientHandle], Visitor]") -> No
             visitor = visitor_of(client)
         except KeyError:  # it has gone again
             return
-        site.browsers[client.client_id] = Browser(site, client, visitor)
+        number = site.take_number()
+        try:
+            browser = Browser(site, client, visitor, number)
+        except BaseException:
+            site.view.forget(client)
+            site.free_number(number)
+            raise
+        site.browsers[client.client_id] = browser
+        if client.client_id not in server.get_clients():  # it has gone while that was made
+            site.workers.submit(browser.close)
 
     def disconnect(client: "ClientHandle") -> None:
         browser = site.browsers.get(client.client_id)

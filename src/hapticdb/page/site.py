@@ -39,6 +39,8 @@ TICKS = 30.0
 browser."""
 WORKERS = 4
 """Threads that begin sessions, so that a slow one delays no other browser much."""
+PAINTERS = 4
+"""Threads that wait for pictures of browsers. Larger: more slow browsers are waited for at once."""
 ROLES = ("viewer", "toucher", "editor")
 """Roles, each with the rights of those before it: sees, feels, moves parts."""
 
@@ -134,6 +136,7 @@ class Site:
         self.edits = Edits(request.urls["editor"]) if "editor" in request.urls else None
         self.workers = ThreadPoolExecutor(WORKERS, thread_name_prefix="page-worker")
         self.sweeping = ThreadPoolExecutor(1, thread_name_prefix="page-sweep")
+        self.painting = ThreadPoolExecutor(PAINTERS, thread_name_prefix="page-painter")
         self._folders = self._allowed()
         self.view = SceneView(self.server, self.url, may_read=self._may_read)
         self.objects = self.view.objects
@@ -157,6 +160,7 @@ class Site:
             self._clock.join(5.0)
         for browser in list(self.browsers.values()):
             browser.close()
+        self.painting.shutdown(wait=False, cancel_futures=True)  # a browser may never answer
         self.sweeping.shutdown(cancel_futures=True)
         self.workers.shutdown(cancel_futures=True)
         self.view.close()

@@ -1,5 +1,6 @@
 """The tab Record: record what is felt, replay it on a slider of time, save a picture."""
 
+import threading
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -31,6 +32,9 @@ LONGEST_REPLAY = 1_000_000
 """Frames of a recording that is replayed: a quarter of an hour at 1 kHz. Larger: more memory."""
 PICTURE = (1080, 1920)
 """Height and width of a saved picture, pixels. Larger: more detail, and more to send."""
+PICTURE_SECONDS = 30.0
+"""Seconds in which a browser must send a picture. Larger: a slow browser is waited for longer, and
+those that never answer make others wait."""
 NOTHING = "(none)"
 
 
@@ -55,6 +59,7 @@ class RecordPanel:
 
     def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
         self._browser = browser
+        self._is_painting = threading.Lock()
         self._replay: Replay | None = None
         self._drawn: list[Any] = []
         self._played_from: tuple[float, float] | None = None
@@ -215,11 +220,32 @@ class RecordPanel:
     # -- a picture ---------------------------------------------------------------------------
 
     def _save_picture(self, _: object) -> None:
+        """Ask the browser for a picture, in a thread: it may answer late or never."""
+        if not self._is_painting.acquire(blocking=False):
+            raise UsageError("a picture is being taken: wait for it")
+        try:
+            self._browser.site.painting.submit(self._painted)
+        except BaseException:
+            self._is_painting.release()
+            raise
+
+    def _painted(self) -> None:
+        self._browser.guarded("viewer", self._paint)(None)
+        self._is_painting.release()
+
+    def _paint(self, _: object) -> None:
         import imageio.v3 as iio  # noqa: PLC0415 - comes with the extra `view`
 
         client = self._browser.client
         height, width = PICTURE
-        picture = client.get_render(height, width, transport_format="jpeg")
+        try:
+            picture = client.get_render(
+                height, width, transport_format="jpeg", timeout=PICTURE_SECONDS
+            )
+        except (TimeoutError, RuntimeError) as error:
+            raise UsageError(
+                f"this browser has sent no picture within {PICTURE_SECONDS:g} s: try again later"
+            ) from error
         content = iio.imwrite("<bytes>", picture[..., :3], extension=".png")
         client.send_file_download("hapticdb.png", content, save_immediately=True)
 

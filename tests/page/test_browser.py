@@ -1,0 +1,172 @@
+"""Browsers come and go, some never answer, and none feels what it does not show."""
+
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from hapticdb.errors import UsageError
+from hapticdb.page import process
+from hapticdb.page.browser import Browser
+from hapticdb.page.panels.record import RecordPanel
+from hapticdb.page.site import Visitor
+
+
+class PretendServer:
+    """viser's server as far as `open_page` needs it: connects and disconnects clients."""
+
+    def __init__(self) -> None:
+        nothing = SimpleNamespace(
+            set_panel_label=lambda *_: None,
+            configure_theme=lambda **_: None,
+            main_panel=SimpleNamespace(dock_right=lambda: None, set_width=lambda _: None),
+        )
+        self.gui = nothing
+        self.scene = SimpleNamespace(world_axes=SimpleNamespace(visible=True))
+        self.clients: dict[int, Any] = {}
+
+    def on_client_connect(self, call: Any) -> None:  # noqa: ANN401 - a callback
+        self.connect = call
+
+    def on_client_disconnect(self, call: Any) -> None:  # noqa: ANN401 - a callback
+        self.disconnect = call
+
+    def get_clients(self) -> dict[int, Any]:
+        return dict(self.clients)
+
+
+class PretendSite:
+    """A site whose workers work at once."""
+
+    def __init__(self) -> None:
+        self.server = PretendServer()
+        self.title = "a scene"
+        self.browsers: dict[int, Any] = {}
+        self.numbers: set[int] = set()
+        self.forgotten: list[object] = []
+        self.view = SimpleNamespace(forget=self.forgotten.append)
+        self.workers = SimpleNamespace(submit=lambda work: work())
+
+    def begin(self) -> None:
+        pass
+
+    def take_number(self) -> int:
+        self.numbers.add(len(self.numbers))
+        return len(self.numbers) - 1
+
+    def free_number(self, number: int) -> None:
+        self.numbers.discard(number)
+
+
+@pytest.fixture
+def site(monkeypatch: pytest.MonkeyPatch) -> PretendSite:
+    made = PretendSite()
+
+    class PretendBrowser:
+        def __init__(self, site: PretendSite, client: Any, visitor: Visitor, number: int) -> None:  # noqa: ANN401
+            self.site, self.client, self.number = site, client, number
+            if visitor.name == "leaves":
+                site.server.clients.clear()
+                site.server.disconnect(client)
+            if visitor.name == "breaks":
+                raise OSError("no room")
+
+        def close(self) -> None:
+            assert self.site.browsers.pop(self.client.client_id) is self
+            self.site.free_number(self.number)
+
+    monkeypatch.setattr(process, "Browser", PretendBrowser)
+    return made
+
+
+def connect(site: PretendSite, name: str) -> None:
+    client = SimpleNamespace(client_id=7)
+    process.open_page(site, lambda _: Visitor(name, "viewer"))  # type: ignore[arg-type]
+    site.server.clients[7] = client
+    site.server.connect(client)
+
+
+def test_a_browser_that_stays_is_known_until_it_leaves(site: PretendSite) -> None:
+    connect(site, "stays")
+    assert list(site.browsers) == [7]
+    assert site.numbers == {0}
+    site.server.disconnect(site.server.clients.pop(7))
+    assert not site.browsers
+    assert not site.numbers
+
+
+def test_a_browser_that_leaves_while_its_panels_are_made_leaves_nothing(site: PretendSite) -> None:
+    connect(site, "leaves")
+    assert not site.browsers
+    assert not site.numbers
+
+
+def test_a_browser_whose_panels_cannot_be_made_leaves_nothing(site: PretendSite) -> None:
+    with pytest.raises(OSError, match="no room"):
+        connect(site, "breaks")
+    assert not site.browsers
+    assert not site.numbers
+    assert site.forgotten == [site.server.clients[7]]
+
+
+def test_a_browser_that_sends_no_picture_holds_no_thread_of_the_page() -> None:
+    """Each callback returns at once; one picture is asked for at a time, and its end is told."""
+    asked: list[float] = []
+    answer = threading.Event()
+    told: list[str] = []
+    work: list[Any] = []
+
+    def get_render(*_: object, timeout: float, **__: object) -> None:
+        asked.append(timeout)
+        assert answer.is_set()
+        raise TimeoutError
+
+    def guarded(_: str, act: Any) -> Any:  # noqa: ANN401 - callbacks
+        def call(event: object) -> None:
+            try:
+                act(event)
+            except UsageError as error:
+                told.append(str(error))
+
+        return call
+
+    panel = RecordPanel.__new__(RecordPanel)
+    panel._is_painting = threading.Lock()
+    panel._browser = SimpleNamespace(  # type: ignore[assignment]
+        client=SimpleNamespace(get_render=get_render),
+        guarded=guarded,
+        site=SimpleNamespace(painting=SimpleNamespace(submit=work.append)),
+    )
+    for _ in range(3):
+        guarded("viewer", panel._save_picture)(None)
+    assert len(work) == 1
+    assert not asked
+    assert told == ["a picture is being taken: wait for it"] * 2
+    answer.set()
+    work.pop()()
+    assert asked
+    assert asked[0] < 60.0
+    assert "no picture" in told.pop()
+    guarded("viewer", panel._save_picture)(None)
+    assert len(work) == 1
+
+
+@pytest.mark.parametrize(
+    ("felt_without", "hidden", "n_begun"),
+    [([3], {3}, 0), ([3], {3, 7}, 1), ([3, 5], {3}, 0), ([], {7}, 1)],
+    ids=["as before", "an unseen one comes", "an unseen one goes", "the first unseen one"],
+)
+def test_what_is_not_seen_is_not_felt_when_it_comes(
+    felt_without: list[int], hidden: set[int], n_begun: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    browser = Browser.__new__(Browser)
+    begun: list[bool] = []
+    browser.site = SimpleNamespace(objects=dict.fromkeys((1, 3, 7)))  # type: ignore[assignment]
+    browser.scene = SimpleNamespace(hidden=hidden)  # type: ignore[assignment]
+    browser.chosen, browser.taken, browser._unfelt = (), None, felt_without
+    nothing = SimpleNamespace(show_objects=lambda: None, moving=SimpleNamespace(renew=lambda: None))
+    browser.parts = nothing  # type: ignore[assignment]
+    monkeypatch.setattr(browser, "begin_anew", lambda: begun.append(True))
+    browser.objects_changed()
+    assert len(begun) == n_begun

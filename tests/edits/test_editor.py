@@ -166,6 +166,53 @@ def test_an_undo_does_not_take_another_step_back(
     assert np.array_equal(env.object(1).transform, theirs)
 
 
+@pytest.mark.parametrize("looks_at_all", [False, True])
+def test_after_a_look_at_another_step_the_steps_before_it_are_done(
+    one: Editor, other: Editor, env: Environment, looks_at_all: bool
+) -> None:
+    """Neither undo nor redo goes back behind what another has written; other objects' steps do."""
+    one.move(2, shifted(env, 2, 0.1))
+    one.move(1, shifted(env, 1, 0.1))
+    one.move(1, shifted(env, 1, 0.1))
+    one.undo()
+    other.look()
+    other.move(1, shifted(env, 1, -0.2))
+    theirs = env.object(1).transform
+    one.look(None if looks_at_all else 1)
+    assert not one.can_redo
+    one.move(1, shifted(env, 1, 0.3))
+    one.undo()
+    assert np.array_equal(env.object(1).transform, theirs)
+    assert one.undo() == "undid: moved 2 (box1) by 100 mm"
+    assert not one.can_undo
+    assert np.array_equal(env.object(1).transform, theirs)
+
+
+def test_own_steps_can_be_undone_after_a_look(one: Editor, env: Environment) -> None:
+    before = state_of(env)
+    one.move(1, shifted(env, 1, 0.1))
+    one.look()
+    one.take_out(2)
+    one.look()
+    one.undo()
+    one.look(1)
+    one.undo()
+    assert state_of(env) == before
+    one.look()
+    assert one.can_redo
+
+
+def test_what_another_has_put_back_is_not_put_back_after_a_look(
+    one: Editor, env: Environment, url: str
+) -> None:
+    removed = one.take_out(2)
+    with hapticdb.open(url) as theirs:
+        theirs.restore(removed)
+    one.look()
+    assert (one.taken_out, one.can_undo) == ((), False)
+    assert 2 in {obj.id for obj in env.objects()}
+
+
 def test_what_another_has_taken_out_is_told(one: Editor, other: Editor, env: Environment) -> None:
     one.move(1, shifted(env, 1, 0.1))
     place = shifted(env, 1, 0.2)

@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 
 import hapticdb
+from children import until
+from hapticdb.edits.editor import Editor
 from hapticdb.errors import ConflictError, HapticDBError, UsageError
+from hapticdb.page import database, editing
 from hapticdb.page.editing import Edits
 from hapticdb.sample.write import write_sample
+from hapticdb.store.base import Object
+from hapticdb.store.connect import open_store
 
 
 @pytest.fixture(scope="module")
@@ -44,8 +49,9 @@ def test_two_people_who_move_one_part(sample: str) -> None:
             seen = env.objects()[0]
             up = np.eye(4)
             up[2, 3] = 0.002
-            said = done(edits, 0, lambda own: own.move(seen, up))
-            assert isinstance(said, str)
+            moved = done(edits, 0, lambda own: own.move(seen, up))
+            assert isinstance(moved, Object)
+            assert moved.revision == env.object(seen.id).revision
             assert np.allclose(env.object(seen.id).transform, up @ seen.transform)
             second = done(edits, 1, lambda own: own.move(seen, np.linalg.inv(up)))
             assert isinstance(second, ConflictError)
@@ -60,6 +66,82 @@ def test_two_people_who_move_one_part(sample: str) -> None:
             assert [obj.name for obj in env.objects()] == [seen.name]
     finally:
         edits.close()
+
+
+@pytest.mark.parametrize("tries_again", [False, True])
+def test_an_undo_after_another_persons_move_leaves_it(sample: str, tries_again: bool) -> None:
+    """Whether the first is told of the conflict, or sees the other's move and goes on from it."""
+    edits = Edits(sample)
+    up = np.eye(4)
+    up[2, 3] = 0.002
+    try:
+        with hapticdb.open(sample, read_only=True) as env:
+            before = env.objects()[0]
+            mine = done(edits, 0, lambda own: own.move(before, up))
+            theirs = done(edits, 1, lambda own: own.move(mine, up))
+            seen = theirs if tries_again else mine
+            found = done(edits, 0, lambda own: own.move(seen, up))
+            assert isinstance(found, Object if tries_again else ConflictError)
+            if tries_again:
+                done(edits, 0, lambda own: own.undo())
+            refused = done(edits, 0, lambda own: own.undo())
+            assert str(refused).startswith("there is nothing" if tries_again else "cannot undo")
+            now = env.object(before.id)
+            assert np.array_equal(now.transform, theirs.transform)
+            done(edits, 1, lambda own: own.move(now, np.linalg.inv(up @ up)))
+    finally:
+        edits.close()
+
+
+def test_a_person_has_one_editor(sample: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It reads all objects when it is made."""
+    made: list[Editor] = []
+
+    def make(env: hapticdb.Environment) -> Editor:
+        made.append(Editor(env))
+        return made[-1]
+
+    monkeypatch.setattr(editing, "Editor", make)
+    edits = Edits(sample)
+    try:
+        for person in (3, 3, 4, 3):
+            done(edits, person, lambda own: own.undo())
+        assert len(made) == 2
+        edits.forget(3)
+        done(edits, 3, lambda own: own.undo())
+        assert len(made) == 3
+    finally:
+        edits.close()
+
+
+def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
+    sample: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    may_go_on = threading.Event()
+    opened: list[threading.Thread] = []
+    answers: list[object] = []
+
+    def wait_and_open(*args: Any, **options: Any) -> Any:  # noqa: ANN401
+        assert may_go_on.wait(60.0)
+        opened.append(threading.current_thread())
+        if len(opened) == 1:
+            raise HapticDBError("the server is away")
+        return open_store(*args, **options)
+
+    monkeypatch.setattr(database, "open_store", wait_and_open)
+    edits = Edits(sample)
+    try:
+        for person in range(3):
+            edits.ask(person, lambda own: own.undo(), answers.append, answers.append)
+        assert (opened, answers) == ([], [])
+        may_go_on.set()
+        until(lambda: len(answers) == 3)
+    finally:
+        edits.close()
+    assert str(answers[0]) == "the server is away"
+    assert [str(answer) for answer in answers[1:]] == ["there is nothing to undo"] * 2
+    assert len(opened) == 2
+    assert len(set(opened)) == 1
 
 
 def test_an_error_does_not_tell_where_the_environment_is(sample: str, tmp_path: Path) -> None:

@@ -64,14 +64,19 @@ def test_moves_removals_and_additions_of_others_are_followed(
     with SceneView(server, str(place)) as view, hapticdb.open(place) as other:
         assert view.wait_until_shown(SECONDS)
         edits = Edits(view)
+        tree = view.tree()
         rod = other.find("rod")[0]
         to = rod.transform.copy()
         to[:3, 3] += 0.1, 0.05, 0.0
         moved = other.move(rod.id, to)
+        edits.wait(moved.revision)
+        assert view.tree() is tree  # every browser asks for it after every commit
         other.remove(1)
         edits.wait(moved.revision + 1)
         assert np.allclose(view.placement(rod.id), to)
         assert 1 not in view.objects
+        assert view.tree().count == 15
+        assert 1 not in view.tree().all_ids()
         box = view.box([rod.id])
         assert box is not None
         assert np.allclose(box, moved.bounds, atol=1e-6)
@@ -81,7 +86,7 @@ def test_moves_removals_and_additions_of_others_are_followed(
         other.add(place.with_suffix(".glb"))
         edits.wait(moved.revision + 2)
         assert view.wait_until_shown(SECONDS)
-        assert len(view.objects) == 16
+        assert len(view.objects) == view.tree().count == 16
 
 
 @pytest.mark.parametrize("gone", [True, False])

@@ -1,6 +1,7 @@
 """Editor: one person's edits of a scene that others edit, too, with undo and redo."""
 
 import os
+from collections.abc import Set as AbstractSet
 from typing import Self
 
 import numpy as np
@@ -73,12 +74,20 @@ class Editor:
     def look(self, object_id: int | None = None) -> list[Object]:
         """Read an object, or all; later steps are based on what is read here.
 
+        Undo and redo keep the same rule as other steps: nothing of another is lost. They would put
+        an object back to a placement from before the other's write, so if somebody else has written
+        an object since this editor has seen it, its steps so far can be neither undone nor done
+        again, and what this editor has taken out is no longer its own to put back.
+
         Raises
         ------
         ObjectNotFoundError
             If there is no object of that id.
         """
         some = self._env.objects() if object_id is None else [self._env.object(object_id)]
+        written = {obj.id for obj in some if self._seen.get(obj.id) != obj.revision}
+        self._drop(written)
+        self._out = {i: obj for i, obj in self._out.items() if i not in written}
         self._seen.update((obj.id, obj.revision) for obj in some)
         return some
 
@@ -204,8 +213,7 @@ class Editor:
             else:
                 self._put_back(self._out.get(step.object_id, step.before))
         except ConflictError as error:
-            self._done = [one for one in self._done if one.object_id != step.object_id]
-            self._undone = [one for one in self._undone if one.object_id != step.object_id]
+            self._drop({step.object_id})
             refused = f"cannot {what} ({step.describe()}): {error}"
             self._tell(refused)
             raise ConflictError(refused) from error
@@ -233,6 +241,7 @@ class Editor:
             moved = self._env.move(before.id, place, revision=seen)
         except ObjectNotFoundError:
             raise self._gone(before.id) from None
+        self._seen[moved.id] = seen
         self._see(moved, place)
         return moved
 
@@ -254,6 +263,11 @@ class Editor:
         self._out.pop(removed.id, None)
         self._see(now, removed.transform)
         return now
+
+    def _drop(self, ids: AbstractSet[int]) -> None:
+        """Forget the steps of objects that somebody else has written."""
+        self._done = [step for step in self._done if step.object_id not in ids]
+        self._undone = [step for step in self._undone if step.object_id not in ids]
 
     def _see(self, written: Object, place: NDArray[np.float64]) -> None:
         """Note the revision of an own write, unless another write came before it was read."""

@@ -324,7 +324,7 @@ class Browser:
         self._is_closed = True
         self.site.view.forget(self.client)
         if self.site.edits is not None:
-            self.site.edits.forget(self.number)
+            self.site.edits.forget(self.client.client_id)
         self.parts.moving.leave()
         self._unshare()
         self.site.free_number(self.number)

@@ -29,21 +29,27 @@ class DatabaseThread:
         The environment.
     read_only : bool
         Whether its jobs only read.
+    opens_later : bool
+        Whether the environment is opened for the first job, and for each later one again while it
+        cannot be; such a job fails. Else it is opened now, and the caller waits for it.
 
     Raises
     ------
     DatabaseError
-        If the environment cannot be opened.
+        If the environment cannot be opened now.
     """
 
-    def __init__(self, url: str, *, read_only: bool = True) -> None:
-        self._url, self._read_only = url, read_only
-        self._jobs: queue.Queue[Callable[[Environment], None]] = queue.Queue(MOST_WAITING)
+    def __init__(self, url: str, *, read_only: bool = True, opens_later: bool = False) -> None:
+        self._url, self._read_only, self._opens_later = url, read_only, opens_later
+        self._env: Environment | None = None
+        self._jobs: queue.Queue[Callable[[], None]] = queue.Queue(MOST_WAITING)
         self._is_ending = threading.Event()
         self._is_ready = threading.Event()
         self._error: BaseException | None = None
         self._thread = threading.Thread(target=self._run, name="database", daemon=True)
         self._thread.start()
+        if opens_later:
+            return
         self._is_ready.wait()
         if self._error is not None:
             raise self._error
@@ -64,9 +70,9 @@ class DatabaseThread:
             Get its result, or its error; they should be short.
         """
 
-        def work(env: Environment) -> None:
+        def work() -> None:
             try:
-                answer = job(env)
+                answer = job(self._opened())
             except HapticDBError as error:
                 failed(error)
             else:
@@ -84,24 +90,33 @@ class DatabaseThread:
 
     def _run(self) -> None:
         try:
-            with Environment(open_store(self._url, read_only=self._read_only)) as env:
-                self._is_ready.set()
-                while not self._is_ending.is_set():
-                    self._turn(env)
+            if not self._opens_later:
+                self._opened()
+            self._is_ready.set()
+            while not self._is_ending.is_set():
+                self._turn()
         except BaseException as error:
             self._error = error
             if self._is_ready.is_set():
                 LOG.exception("the page's database thread ended")
         finally:
             self._is_ready.set()
+            if self._env is not None:
+                self._env.close()
 
-    def _turn(self, env: Environment) -> None:
+    def _opened(self) -> Environment:
+        """The environment, which is opened if it is not yet open."""
+        if self._env is None:
+            self._env = Environment(open_store(self._url, read_only=self._read_only))
+        return self._env
+
+    def _turn(self) -> None:
         """Do a job if there is one within the time."""
         try:
             job = self._jobs.get(timeout=ENDS_WITHIN)
         except queue.Empty:
             return
         try:
-            job(env)
+            job()
         except Exception:
             LOG.exception("a job of the page failed")

@@ -1,7 +1,8 @@
 """Edits that people make on the page: one thread, one writable connection, undo for each person."""
 
+import threading
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,15 +15,18 @@ from hapticdb.page.wording import short_name
 from hapticdb.store.base import Object
 from hapticdb.store.urls import redact
 
+Answer = TypeVar("Answer")
+
 
 class PersonsEdits:
     """Edits of one person in an environment, each one transaction, and their undo."""
 
     def __init__(self, env: Environment) -> None:
+        self._env = env
         self._editor = Editor(env)
 
-    def move(self, obj: Object, way: NDArray[np.float64]) -> str:
-        """Displace an object, as the person saw it, by (4, 4); returns its name.
+    def move(self, obj: Object, way: NDArray[np.float64]) -> Object:
+        """Displace an object, as the person saw it, by (4, 4); returns it as it is now.
 
         Raises
         ------
@@ -30,7 +34,7 @@ class PersonsEdits:
             If somebody has written the object since.
         """
         self._check(obj)
-        return short_name(self._editor.move(obj.id, way @ obj.transform).name)
+        return self._editor.move(obj.id, way @ obj.transform)
 
     def take_out(self, obj: Object) -> str:
         """Take an object, as the person saw it, out of the scene; errors as for `move`."""
@@ -49,7 +53,15 @@ class PersonsEdits:
         return self._editor.undo()
 
     def _check(self, obj: Object) -> None:
-        if self._editor.look(obj.id)[0].revision != obj.revision:
+        """Base the next step on an object as the person saw it, if nobody has written it since.
+
+        The editor looks at the object only then. After a look at what another has written, an undo
+        would be based on that, too.
+        """
+        now = self._env.object(obj.id)
+        if now.revision == obj.revision:
+            now = self._editor.look(obj.id)[0]
+        if now.revision != obj.revision:
             raise ConflictError(
                 f"{short_name(obj.name)}: somebody has moved it since you saw it; it is shown "
                 "where it is now"
@@ -67,34 +79,44 @@ class Edits:
 
     def __init__(self, url: str) -> None:
         self._url = url
+        self._lock = threading.Lock()
         self._thread: DatabaseThread | None = None
         self._of: dict[int, PersonsEdits] = {}
 
     def ask(
         self,
         person: int,
-        job: Callable[[PersonsEdits], str],
-        then: Callable[[str], Any],
+        job: Callable[[PersonsEdits], Answer],
+        then: Callable[[Answer], Any],
         failed: Callable[[HapticDBError], Any],
     ) -> None:
-        """Do an edit of a person later; then call `then` or `failed`.
+        """Do an edit of a person later; then call `then` or `failed`. Waits for no database.
 
-        The error that `failed` gets names neither the environment's address nor its user.
+        Parameters
+        ----------
+        person : int
+            A number that nobody else ever gets, such as viser's id of a client.
+        job : callable
+            Gets the person's edits.
+        then, failed : callable
+            Get its result, or its error, which names neither the environment's address nor its
+            user.
         """
 
         def refused(error: HapticDBError) -> None:
             failed(self._without_address(error))
 
-        try:
-            self._thread = self._thread or DatabaseThread(self._url, read_only=False)
-        except HapticDBError as error:
-            refused(error)
-            return
+        def work(env: Environment) -> Answer:
+            own = self._of.get(person)
+            if own is None:
+                own = self._of[person] = PersonsEdits(env)
+            return job(own)
 
-        def work(env: Environment) -> str:
-            return job(self._of.setdefault(person, PersonsEdits(env)))
-
-        self._thread.ask(work, then, refused)
+        with self._lock:
+            if self._thread is None:
+                self._thread = DatabaseThread(self._url, read_only=False, opens_later=True)
+            thread = self._thread
+        thread.ask(work, then, refused)
 
     def _without_address(self, error: HapticDBError) -> HapticDBError:
         """Return an error as people elsewhere may read it."""
@@ -111,5 +133,7 @@ class Edits:
 
     def close(self) -> None:
         """End the thread."""
-        if self._thread is not None:
-            self._thread.close()
+        with self._lock:
+            thread = self._thread
+        if thread is not None:
+            thread.close()

@@ -1,5 +1,8 @@
 """Moving a part by its gizmo, in the tab Parts: one transaction when it is let go of, and undo."""
 
+import threading
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -7,7 +10,9 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.page import checks
+from hapticdb.page.editing import PersonsEdits
 from hapticdb.page.widgets import put
+from hapticdb.page.wording import short_name
 from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
@@ -23,8 +28,38 @@ LEAST_WAY = 1e-9
 lost; at 0 a click on the gizmo would be an edit."""
 
 
+@dataclass(eq=False)
+class HeldPart:
+    """A part on its gizmo.
+
+    Attributes
+    ----------
+    object : Object
+        The part, as this browser's moves are based on it.
+    start : (4, 4) float64
+        Pose of the gizmo at which the part is where `object` has it.
+    left : (4, 4) float64
+        Pose at which the gizmo was let go of last.
+    n_waiting : int
+        Moves that are not yet written.
+    """
+
+    object: Object
+    start: NDArray[np.float64]
+    left: NDArray[np.float64]
+    n_waiting: int = 0
+
+    def way_to(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Displacement (4, 4) of the part when the gizmo is at a pose."""
+        way: NDArray[np.float64] = pose @ np.linalg.inv(self.start)
+        return way
+
+
 class MovingControls:
     """Moves the chosen part, for editors.
+
+    Drags come on viser's event loop, answers in the thread of the edits, others' edits in the
+    follower's, and choices in viser's pool: one lock is held around what changes the gizmo.
 
     Parameters
     ----------
@@ -36,9 +71,9 @@ class MovingControls:
 
     def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
         self._browser = browser
-        self._object: Object | None = None
+        self._lock = threading.RLock()
+        self._held: HeldPart | None = None
         self._gizmo: Any = None
-        self._start = np.eye(4)
         self._is_dragged = False
         is_seen = browser.visitor.may("editor") and browser.site.edits is not None
         with gui.add_folder("Move", expand_by_default=False, visible=is_seen):
@@ -56,38 +91,46 @@ class MovingControls:
             self._undo.on_click(browser.guarded("editor", self._undo_last))
 
     def follow(self) -> None:
-        """Put the gizmo on the chosen part, where the box is ticked."""
-        if self._gizmo is not None:
-            self._gizmo.remove()
-            self._gizmo = self._object = None
+        """Put the gizmo on the chosen part, if the box is ticked; a drag that runs is dropped."""
         browser = self._browser
-        if not self._moves.value or len(browser.chosen) != 1:
-            return
-        obj = browser.site.objects[browser.chosen[0]]
-        middle = obj.bounds.mean(axis=0)
-        self._object, self._start = obj, np.eye(4)
-        self._start[:3, 3] = middle
-        size = browser.site.stage.diagonal
-        scene = browser.client.scene
-        self._gizmo = scene.add_transform_controls(
-            "/move", scale=MOVING_GIZMO * size, line_width=3.5, position=middle,
-            disable_sliders=True, depth_test=False,
-        )  # fmt: skip
-        self._gizmo.on_update(self._dragged)
+        with self._lock:
+            self.leave()
+            if self._gizmo is not None:
+                self._gizmo.remove()
+                self._gizmo = self._held = None
+            chosen = browser.chosen
+            obj = browser.site.objects.get(chosen[0]) if len(chosen) == 1 else None
+            if not self._moves.value or obj is None:
+                return
+            start = np.eye(4)
+            start[:3, 3] = obj.bounds.mean(axis=0)
+            self._held = HeldPart(obj, start, start)
+            size = browser.site.stage.diagonal
+            self._gizmo = browser.client.scene.add_transform_controls(
+                "/move", scale=MOVING_GIZMO * size, line_width=3.5, position=start[:3, 3],
+                disable_sliders=True, depth_test=False,
+            )  # fmt: skip
+            self._gizmo.on_update(partial(self._dragged, self._held))
 
     def renew(self) -> None:
-        """Put the gizmo where the part is now, if somebody has moved it."""
-        obj = self._object
-        if obj is None or self._is_dragged:
-            return
-        now = self._browser.site.objects.get(obj.id)
-        if now is None or now.revision != obj.revision:
-            self.follow()
+        """Put the gizmo where the part is now, if somebody has moved it.
+
+        While the person drags it, or own moves wait to be written, the gizmo stays.
+        """
+        with self._lock:
+            held = self._held
+            if held is None or self._is_dragged or held.n_waiting:
+                return
+            now = self._browser.site.objects.get(held.object.id)
+            if now is None or now.revision > held.object.revision:
+                self.follow()
 
     def leave(self) -> None:
-        """Take back a move that was not finished when the browser went."""
-        if self._is_dragged and self._object is not None:
-            self._browser.site.view.put_back(self._object.id)
+        """Take back a move that is not finished, as when the browser goes."""
+        with self._lock:
+            if self._is_dragged and self._held is not None:
+                self._browser.site.view.put_back(self._held.object.id)
+            self._is_dragged = False
 
     def _switch(self, event: "GuiEvent[Any]") -> None:
         if checks.flag_of(event.target.value, "moving") and len(self._browser.chosen) != 1:
@@ -95,35 +138,67 @@ class MovingControls:
             raise UsageError("choose one part first: click it, or take it from the list")
         self.follow()
 
-    async def _dragged(self, event: "TransformControlsEvent") -> None:
-        """Write the part's new placement when it is let go of."""
+    async def _dragged(self, held: HeldPart, event: "TransformControlsEvent") -> None:
+        """Write the part's new placement when it is let go of, by a person who is still there."""
 
         def act(event: "TransformControlsEvent") -> None:
             pose = checks.pose_of(event.target.position, event.target.wxyz)
-            self._is_dragged = event.phase != "end"
-            if event.phase == "end":
-                self._write(pose)
-            elif self._object is not None:  # everyone sees where it goes
-                way = pose @ np.linalg.inv(self._start)
-                self._browser.site.view.move(self._object.id, way @ self._object.transform)
+            with self._lock:
+                if held is not self._held:  # the gizmo was put elsewhere: this drag is over
+                    if event.phase == "end":
+                        self.leave()
+                    return
+                self._is_dragged = True
+                if event.phase != "end":  # everyone sees where it goes
+                    place = held.way_to(pose) @ held.object.transform
+                    self._browser.site.view.move(held.object.id, place)
+                elif self._has_gone():
+                    self.leave()
+                else:
+                    self._is_dragged = False
+                    self._let_go(held, pose)
 
         self._browser.guarded("editor", act)(event)
 
-    def _write(self, pose: NDArray[np.float64]) -> None:
-        obj, browser = self._object, self._browser
-        way = pose @ np.linalg.inv(self._start)
-        if obj is None or float(np.abs(way - np.eye(4)).max()) < LEAST_WAY:
+    def _has_gone(self) -> bool:
+        """Whether the connection was lost: viser ends the drags of a lost browser, too."""
+        browser = self._browser
+        return browser.client.client_id not in browser.site.server.get_clients()
+
+    def _let_go(self, held: HeldPart, pose: NDArray[np.float64]) -> None:
+        """Write a move that ends at a pose; one that follows another is based on its result."""
+        browser = self._browser
+        if float(np.abs(pose @ np.linalg.inv(held.left) - np.eye(4)).max()) < LEAST_WAY:
+            self.renew()
             return
+        held.left = pose
+        held.n_waiting += 1
+
+        def move(edits: PersonsEdits) -> Object:
+            with self._lock:
+                obj, way = held.object, held.way_to(pose)
+            moved = edits.move(obj, way)
+            if np.array_equal(moved.transform, way @ obj.transform):  # nobody wrote after it
+                with self._lock:
+                    held.object, held.start = moved, pose
+            return moved
+
+        def written(moved: Object) -> None:
+            with self._lock:
+                held.n_waiting -= 1
+                self.renew()
+            self._written(short_name(moved.name))
 
         def refused(error: Exception) -> None:
             browser.tell("Not moved", str(error))
-            browser.site.view.put_back(obj.id)
-            self.follow()
+            browser.site.view.put_back(held.object.id)
+            with self._lock:
+                held.n_waiting -= 1
+                if held is self._held:
+                    self.follow()
 
         assert browser.site.edits is not None  # noqa: S101 - else the box is not there
-        browser.site.edits.ask(
-            browser.number, lambda edits: edits.move(obj, way), self._written, refused
-        )
+        browser.site.edits.ask(browser.client.client_id, move, written, refused)
 
     def _take_out(self, event: "GuiEvent[Any]") -> None:
         word = checks.choice_of(event.target.value, ("Take out", "Put back"), "a step")
@@ -132,18 +207,22 @@ class MovingControls:
         if edits is None:
             return
         if word == "Put back":
-            edits.ask(browser.number, lambda own: own.put_back(), self._written, browser.failed)
+            edits.ask(
+                browser.client.client_id, lambda own: own.put_back(), self._written, browser.failed
+            )
             return
         if len(browser.chosen) != 1:
             raise UsageError("choose one part first: click it, or take it from the list")
         obj = browser.site.objects[browser.chosen[0]]
-        edits.ask(browser.number, lambda own: own.take_out(obj), self._written, browser.failed)
+        edits.ask(
+            browser.client.client_id, lambda own: own.take_out(obj), self._written, browser.failed
+        )
 
     def _undo_last(self, _: object) -> None:
         browser = self._browser
         if browser.site.edits is not None:
             browser.site.edits.ask(
-                browser.number, lambda edits: edits.undo(), self._written, browser.failed
+                browser.client.client_id, lambda edits: edits.undo(), self._written, browser.failed
             )
 
     def _written(self, said: str) -> None:

@@ -84,6 +84,7 @@ class SceneView:
         self._listeners: list[Callable[[SceneEdit], None]] = []
         self._browsers: dict[int, BrowserScene] = {}
         self._folded: list[tuple[int, str]] | None = None
+        self._tree: Branch | None = None
         self._settled = Condition()
         self._staged = False
         self.up = 2
@@ -150,9 +151,14 @@ class SceneView:
             return self._settled.wait_for(lambda: self.n_waiting == 0, timeout)
 
     def tree(self) -> Branch:
-        """All objects as sub-assemblies, by the elements of their names, with counts."""
+        """All objects as sub-assemblies, by the elements of their names, with counts.
+
+        The same object, which nobody may change, until objects come, go or get other names.
+        """
         with self._contents.lock:
-            return tree_of({i: obj.name for i, obj in self._contents.records.items()})
+            if self._tree is None:
+                self._tree = tree_of({i: obj.name for i, obj in self._contents.records.items()})
+            return self._tree
 
     def search(self, text: str) -> list[int]:
         """Ids of the objects whose name holds each word of a text, in any case; best first."""
@@ -245,6 +251,8 @@ class SceneView:
     def _follow(self, followed: Followed) -> None:
         """Show what was committed: the first time, all objects."""
         with self._contents.lock, self._server.atomic():
+            if self._has_other_names(followed):
+                self._folded = self._tree = None
             self._contents.remove(followed.removed)
             anew = []
             for obj in followed.written:
@@ -254,7 +262,6 @@ class SceneView:
                 else:
                     anew.append(obj)
             self._contents.add(anew)
-            self._folded = None
             self.revision = followed.revision
             self._set_stage()
         if anew:
@@ -267,6 +274,13 @@ class SceneView:
         for tell in list(self._listeners):
             tell(edit)
         self._tell_settled()
+
+    def _has_other_names(self, followed: Followed) -> bool:
+        """Whether the names of the objects are others after a commit; a move leaves them."""
+        known = self._contents.records
+        return bool(followed.removed) or any(
+            obj.id not in known or known[obj.id].name != obj.name for obj in followed.written
+        )
 
     def _set_stage(self) -> None:
         box = self._contents.box()

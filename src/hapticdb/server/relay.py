@@ -30,6 +30,9 @@ WAITING_MESSAGES = 4
 memory, before the page waits for it."""
 CONNECT_PATIENCE = 5.0
 """Seconds for the connection to the page."""
+CLOSING_PATIENCE = 5.0
+"""Seconds that a browser has to take the close frame. Larger: one that does not read is served for
+longer."""
 RENEW_EVERY = 60.0
 """Seconds between two looks at a browser's cookie. Larger: a cookie that became invalid works
 longer."""
@@ -87,8 +90,9 @@ class Relay:
             reason = closing.reason
             LOG.info("a browser's connection ends: %s", closing.words)
             if websocket.application_state is not WebSocketState.DISCONNECTED:
-                with contextlib.suppress(RuntimeError, WebSocketDisconnect):
-                    await websocket.close(closing.code, closing.words)
+                with contextlib.suppress(RuntimeError, TimeoutError, WebSocketDisconnect):
+                    async with asyncio.timeout(CLOSING_PATIENCE):
+                        await websocket.close(closing.code, closing.words)
         finally:
             self._figures.connections.labels(reason).inc()
 

@@ -65,6 +65,16 @@ class StrictWebSocket(WebSocketsSansIOProtocol):
         else:
             self._fail(POLICY, "too many pongs")
 
+    def keepalive_timeout(self) -> None:
+        """Cut a client that has not answered a ping; whoever waits to send to it goes on."""
+        super().keepalive_timeout()
+        self.transport.abort()
+
+    def on_task_complete(self, task: "asyncio.Task[None]") -> None:
+        """Give a client that is no longer served a little time to read the last messages."""
+        super().on_task_complete(task)
+        self.loop.call_later(self.close_timeout, self.transport.abort)
+
     def _fail(self, code: int, words: str) -> None:
         if self.transport.is_closing():
             return

@@ -1,12 +1,14 @@
 """What a stranger, another site, or a client that misbehaves can do: nothing."""
 
 import contextlib
+import errno
 import os
 import signal
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -15,6 +17,8 @@ from websockets.sync.client import connect
 import hapticdb
 from children import PATIENCE, until
 from hapticdb.errors import UsageError
+from hapticdb.realtime.processes import Process
+from hapticdb.server import access, page_keeper, relay
 from hapticdb.server.access import Role
 from hapticdb.server.limits import Limits
 from hapticdb.server.running import Serving, check
@@ -155,6 +159,31 @@ def test_the_page_is_started_again_and_browsers_come_back(environment: Path) -> 
                     os.kill(pid, signal.SIGKILL)
             assert close_code(browser) in {1001, 1006}
         until(lambda: _is_back(server))
+
+
+def test_a_machine_without_room_for_the_page_gets_it_later(
+    environment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a process nor a socket may be had for a moment; nothing stays open of the tries."""
+    serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:work")
+    before = _children()
+    tries: list[int] = []
+
+    def begin(*given: Any) -> Process:  # noqa: ANN401 - as Process takes them
+        tries.append(len(list(Path("/proc/self/fd").iterdir())))
+        if len(tries) < 3:
+            raise BlockingIOError(errno.EAGAIN, "no room for a process")
+        return Process(*given)
+
+    monkeypatch.setattr(page_keeper, "FIRST_PAUSE", 0.05)
+    with running(serving) as server:
+        monkeypatch.setattr(page_keeper, "Process", begin)
+        for pid in _children() - before:
+            if b"viser_page" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                os.kill(pid, signal.SIGKILL)
+        until(lambda: len(tries) == 3)
+        until(lambda: _is_back(server))
+    assert tries[1] <= tries[0]
 
 
 def _is_back(server: Running) -> bool:

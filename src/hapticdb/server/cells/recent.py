@@ -40,7 +40,7 @@ class RecentCells:
     def copy(self) -> "RecentCells":
         """Copy them as they are now, for another thread: `note` may be called meanwhile."""
         made = RecentCells(self._shift)
-        made._batches = self._batches.copy()  # noqa: SLF001 - of the same class
+        made._batches = self._batches.copy()
         made.distances = self.distances
         return made
 

@@ -13,17 +13,18 @@ import numpy as np
 import pytest
 from starlette.websockets import WebSocket, WebSocketState
 
-from children import PATIENCE
+from children import PATIENCE, joined
 from hapticdb import Grid
 from hapticdb.protocol import cells as bodies
 from hapticdb.protocol.header import Kind, MessageHeader, header_of
-from hapticdb.server.cells import recent
+from hapticdb.server.cells import readers, recent
 from hapticdb.server.cells.answers import Answers
 from hapticdb.server.cells.client import CellsClient
 from hapticdb.server.cells.limits import CellsLimits
 from hapticdb.server.cells.readers import Readers
 from hapticdb.server.cells.recent import RecentCells
 from hapticdb.server.cells.watcher import Watcher
+from hapticdb.store.base import Store
 from hapticdb.store.connect import create_store, open_store
 from hapticdb.testing import blob, write_voxels
 from hapticdb.testing.scenes import EVERYWHERE, covering
@@ -52,7 +53,7 @@ class Peer:
         self._to_server: asyncio.Queue[dict[str, object]] = asyncio.Queue()
         self._to_client: asyncio.Queue[bytes | None] = asyncio.Queue()
         self.client = CellsClient(
-            cast(WebSocket, self), self.readers, cast(Watcher, self.watcher), Answers(),
+            cast("WebSocket", self), self.readers, cast("Watcher", self.watcher), Answers(),
             CellsLimits(),
         )  # fmt: skip
 
@@ -139,3 +140,55 @@ def test_a_scan_that_ends_while_news_are_made_ends_no_client(
             await peer.until(Kind.NUMBERS)
 
     asyncio.run(work())
+
+
+def test_a_request_that_is_refused_closes_no_store(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened: list[str] = []
+
+    def opening(url: str, *, read_only: bool) -> Store:
+        opened.append(url)
+        return open_store(url, read_only=read_only)
+
+    monkeypatch.setattr(readers, "open_store", opening)
+
+    async def work() -> None:
+        async with greeted(url) as peer:
+            for _ in range(3):
+                peer.send(Kind.QUANTILES, bodies.pack_numbers(0))
+                await peer.until(Kind.REFUSED)
+
+    asyncio.run(work())
+    assert opened == [url]
+
+
+def test_what_is_found_for_one_client_keeps_nobody_who_asks_for_something_else() -> None:
+    answers = Answers()
+    is_begun, may_end = threading.Event(), threading.Event()
+    found: list[int] = []
+
+    def slow() -> int:
+        is_begun.set()
+        assert may_end.wait(PATIENCE)
+        return 1
+
+    first = threading.Thread(target=lambda: found.append(answers._once(("size", 1), slow)))
+    second = threading.Thread(target=lambda: found.append(answers._once(("costs", 1), lambda: 2)))
+    first.start()
+    assert is_begun.wait(PATIENCE)
+    second.start()
+    second.join(5.0)
+    before = list(found)
+    may_end.set()
+    joined(first)
+    joined(second)
+    assert before == [2]
+    assert answers._once(("size", 1), lambda: 3) == 1
+
+
+def test_what_could_not_be_found_is_looked_for_again() -> None:
+    answers = Answers()
+    with pytest.raises(ZeroDivisionError):
+        answers._once(("size", 1), lambda: 1 // 0)
+    assert answers._once(("size", 1), lambda: 3) == 3

@@ -217,6 +217,51 @@ def test_a_silent_connection_is_cut(environment: Path) -> None:
                 assert slow.recv(1) == b""
 
 
+def test_a_form_that_does_not_come_and_a_second_request_are_cut(environment: Path) -> None:
+    limits = replace(Limits(), request_seconds=0.2)
+    serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
+    with running(serving) as server:
+        host = f"Host: {server.place}\r\n"
+        form = f"Origin: http://{server.place}\r\nContent-Length: 2000\r\n"
+        with socket.create_connection(("127.0.0.1", server.port), PATIENCE) as slow:
+            slow.sendall(f"POST /sign-in HTTP/1.1\r\n{host}{form}\r\n".encode())
+            assert _read_until_end(slow).startswith(b"HTTP/1.1 408 ")
+        with socket.create_connection(("127.0.0.1", server.port), PATIENCE) as slow:
+            # nothing answers the first letter of the next request
+            slow.sendall(f"GET /none HTTP/1.1\r\n{host}\r\nG".encode())
+            assert _read_until_end(slow).startswith(b"HTTP/1.1 404 ")
+
+
+def _read_until_end(connection: socket.socket) -> bytes:
+    read = b""
+    while piece := connection.recv(1 << 16):
+        read += piece
+    return read
+
+
+def test_an_old_cookie_keeps_no_browser_out_where_everybody_may_enter(environment: Path) -> None:
+    serving = Serving(urls(environment), open_role=Role.TOUCHER, page="viser_page:work")
+    with running(serving) as server:
+        cookie = f"hapticdb-{server.port}=of-an-earlier-run"
+        with server.browser(None, Cookie=cookie) as browser:
+            sent(browser, CAMERA)
+            until(lambda: b"hapticdb_relay_messages_total 1.0" in server.ask("/metrics")[1])
+            text_until(browser, "clock")
+
+
+def test_a_cookie_that_runs_out_ends_its_browsers_connection(
+    server: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(relay, "RENEW_EVERY", -1.0)
+    answer, _ = server.ask(f"/?token={EDITOR}")
+    cookie = str(answer.getheader("set-cookie")).partition(";")[0]
+    with server.browser(None, Cookie=cookie) as browser:
+        monkeypatch.setattr(access, "SIGNED_IN_SECONDS", -1.0)
+        for _ in range(2):  # the first one's look begins the time anew
+            sent(browser, CAMERA)
+        assert close_code(browser) == 4401
+
+
 def test_a_page_that_cannot_start_ends_the_server_with_its_error(environment: Path) -> None:
     serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:fail")
     with pytest.raises(hapticdb.HapticDBError, match="no such scene"), running(serving):

@@ -7,7 +7,7 @@ from collections.abc import AsyncIterator
 from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any, TypeVar, cast
 
 import numpy as np
 import pytest
@@ -29,6 +29,7 @@ from hapticdb.store.connect import create_store, open_store
 from hapticdb.testing import blob, write_voxels
 from hapticdb.testing.scenes import EVERYWHERE, covering
 
+Item = TypeVar("Item")
 GRID = Grid(0.01, (0, 0, 0), 6)
 SCAN = bodies.pack_ranges(*EVERYWHERE, distances=False)
 
@@ -40,6 +41,10 @@ def url(tmp_path: Path) -> str:
         write_voxels(store, blob(1, (20, 20, 20)), "one")
         write_voxels(store, blob(2, (24, 20, 20)), "two")
     return made
+
+
+async def taken(queue: "asyncio.Queue[Item]") -> Item:
+    return await asyncio.wait_for(asyncio.Queue.get(queue), PATIENCE)
 
 
 class Peer:
@@ -58,7 +63,7 @@ class Peer:
         )  # fmt: skip
 
     async def receive(self) -> dict[str, object]:
-        return await self._to_server.get()
+        return await taken(self._to_server)
 
     async def send_bytes(self, message: bytes) -> None:
         self._to_client.put_nowait(message)
@@ -74,7 +79,7 @@ class Peer:
     async def until(self, kind: Kind) -> bytes:
         """Next message of a kind."""
         while True:
-            message = await asyncio.wait_for(self._to_client.get(), PATIENCE)
+            message = await taken(self._to_client)
             assert message is not None, f"closed with {self.closed}"
             if header_of(message).kind == kind:
                 return message

@@ -23,6 +23,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.protocol import cells as bodies
 from hapticdb.protocol.header import CloseCode, Kind, MessageHeader, header_of
 from hapticdb.store.connect import create_store, open_store
+from hapticdb.store.remote import store as remote_store
 from hapticdb.store.remote.store import RemoteStore
 from hapticdb.store.urls import parse_address
 from hapticdb.testing import blob, is_noticed, voxel_object, write_voxels
@@ -125,6 +126,27 @@ def test_what_a_client_has_read_is_pushed_with_a_write(
     for found, wanted in zip(rows[:3], expected[:3], strict=True):
         np.testing.assert_array_equal(found, wanted)
     assert remote.version() == 3
+
+
+def test_a_client_that_watches_is_not_silent_for_long(
+    remote: RemoteStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server drops whoever sends nothing, and beats alone need no question."""
+    remote.watch()
+    told: list[Kind] = []
+    tell = remote._connection.tell
+
+    def telling(kind: Kind, *, revision: int) -> None:
+        told.append(kind)
+        tell(kind, revision=revision)
+
+    monkeypatch.setattr(remote._connection, "tell", telling)
+    assert not remote.has_changed()
+    assert told == []
+    monkeypatch.setattr(remote_store, "SILENT_SECONDS", -1.0)
+    assert not remote.has_changed()
+    assert told == [Kind.NOTED]
+    assert remote.revision() == 2
 
 
 def test_what_was_pushed_is_not_mixed_with_a_later_revision(

@@ -109,13 +109,17 @@ def test_a_malformed_message_closes_with_a_plain_reason(
     assert reason in frame.reason
 
 
-def test_a_client_that_does_not_read_gets_no_queue(served: Served) -> None:
-    """Without an acknowledgement the server sends no more than a third of a second's proxies."""
+@pytest.mark.parametrize("seen", [0, 0xFFFFFFFF])
+def test_a_client_that_does_not_read_gets_no_queue(served: Served, seen: int) -> None:
+    """Without an acknowledgement the server sends no more than a third of a second's proxies.
+
+    Nor with one of a proxy that was not sent.
+    """
     with granted(served) as connection:
         began = time.monotonic()
         sequences: list[int] = []
         while time.monotonic() < began + 1.5:
-            connection.send(hand_at(served, len(sequences) + 1))
+            connection.send(hand_at(served, len(sequences) + 1, seen))
             try:
                 proxy = unpack_proxy(connection.recv(0.02))  # type: ignore[arg-type]
             except TimeoutError:

@@ -1,12 +1,14 @@
 """What a stranger, another site, or a client that misbehaves can do: nothing."""
 
 import contextlib
+import errno
 import os
 import signal
 import socket
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
@@ -15,6 +17,8 @@ from websockets.sync.client import connect
 import hapticdb
 from children import PATIENCE, until
 from hapticdb.errors import UsageError
+from hapticdb.realtime.processes import Process
+from hapticdb.server import access, page_keeper, relay
 from hapticdb.server.access import Role
 from hapticdb.server.limits import Limits
 from hapticdb.server.running import Serving, check
@@ -157,6 +161,31 @@ def test_the_page_is_started_again_and_browsers_come_back(environment: Path) -> 
         until(lambda: _is_back(server))
 
 
+def test_a_machine_without_room_for_the_page_gets_it_later(
+    environment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a process nor a socket may be had for a moment; nothing stays open of the tries."""
+    serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:work")
+    before = _children()
+    tries: list[int] = []
+
+    def begin(*given: Any) -> Process:  # noqa: ANN401 - as Process takes them
+        tries.append(len(list(Path("/proc/self/fd").iterdir())))
+        if len(tries) < 3:
+            raise BlockingIOError(errno.EAGAIN, "no room for a process")
+        return Process(*given)
+
+    monkeypatch.setattr(page_keeper, "FIRST_PAUSE", 0.05)
+    with running(serving) as server:
+        monkeypatch.setattr(page_keeper, "Process", begin)
+        for pid in _children() - before:
+            if b"viser_page" in Path(f"/proc/{pid}/cmdline").read_bytes():
+                os.kill(pid, signal.SIGKILL)
+        until(lambda: len(tries) == 3)
+        until(lambda: _is_back(server))
+    assert tries[1] <= tries[0]
+
+
 def _is_back(server: Running) -> bool:
     try:
         with server.browser(Role.VIEWER) as browser:
@@ -186,6 +215,51 @@ def test_a_silent_connection_is_cut(environment: Path) -> None:
             with socket.create_connection(("127.0.0.1", server.port), PATIENCE) as slow:
                 slow.sendall(first)
                 assert slow.recv(1) == b""
+
+
+def test_a_form_that_does_not_come_and_a_second_request_are_cut(environment: Path) -> None:
+    limits = replace(Limits(), request_seconds=0.2)
+    serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
+    with running(serving) as server:
+        host = f"Host: {server.place}\r\n"
+        form = f"Origin: http://{server.place}\r\nContent-Length: 2000\r\n"
+        with socket.create_connection(("127.0.0.1", server.port), PATIENCE) as slow:
+            slow.sendall(f"POST /sign-in HTTP/1.1\r\n{host}{form}\r\n".encode())
+            assert _read_until_end(slow).startswith(b"HTTP/1.1 408 ")
+        with socket.create_connection(("127.0.0.1", server.port), PATIENCE) as slow:
+            # nothing answers the first letter of the next request
+            slow.sendall(f"GET /none HTTP/1.1\r\n{host}\r\nG".encode())
+            assert _read_until_end(slow).startswith(b"HTTP/1.1 404 ")
+
+
+def _read_until_end(connection: socket.socket) -> bytes:
+    read = b""
+    while piece := connection.recv(1 << 16):
+        read += piece
+    return read
+
+
+def test_an_old_cookie_keeps_no_browser_out_where_everybody_may_enter(environment: Path) -> None:
+    serving = Serving(urls(environment), open_role=Role.TOUCHER, page="viser_page:work")
+    with running(serving) as server:
+        cookie = f"hapticdb-{server.port}=of-an-earlier-run"
+        with server.browser(None, Cookie=cookie) as browser:
+            sent(browser, CAMERA)
+            until(lambda: b"hapticdb_relay_messages_total 1.0" in server.ask("/metrics")[1])
+            text_until(browser, "clock")
+
+
+def test_a_cookie_that_runs_out_ends_its_browsers_connection(
+    server: Running, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(relay, "RENEW_EVERY", -1.0)
+    answer, _ = server.ask(f"/?token={EDITOR}")
+    cookie = str(answer.getheader("set-cookie")).partition(";")[0]
+    with server.browser(None, Cookie=cookie) as browser:
+        monkeypatch.setattr(access, "SIGNED_IN_SECONDS", -1.0)
+        for _ in range(2):  # the first one's look begins the time anew
+            sent(browser, CAMERA)
+        assert close_code(browser) == 4401
 
 
 def test_a_page_that_cannot_start_ends_the_server_with_its_error(environment: Path) -> None:

@@ -92,20 +92,9 @@ class Access:
         self.port = port
 
     @property
-    def needs_token(self) -> bool:
-        """Whether a client without a token may do nothing."""
-        return self.open_role is None
-
-    @property
     def cookie_name(self) -> str:
         """Name of this server's cookie."""
         return f"{COOKIE}-{self.port}"
-
-    @property
-    def n_signed_in(self) -> int:
-        """Number of cookies that are valid now."""
-        now = self._clock()
-        return sum(now < known.until for known in self._signed_in.values())
 
     def role_of_token(self, token: str) -> Role | None:
         """Find the role that a token gives; None for a wrong one. Takes equally long for both."""
@@ -157,10 +146,6 @@ class Access:
         cookie = secrets.token_urlsafe(32)
         self._signed_in[_digest(cookie)] = _SignedIn(role, self._clock() + SIGNED_IN_SECONDS)
         return cookie
-
-    def sign_out(self, cookie: str) -> None:
-        """Make a cookie invalid."""
-        self._signed_in.pop(_digest(cookie), None)
 
     def _known(self, cookie: str) -> _SignedIn | None:
         """Find a valid cookie by its digest, which tells nothing about the cookie, and renew it."""

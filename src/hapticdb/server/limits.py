@@ -35,14 +35,15 @@ class Limits:
         Time without any message of a browser, after which it is closed. Larger: forgotten tabs
         hold their sessions longer.
     sign_ins_per_second, sign_ins_at_once : float
-        Tokens that are tried, by all clients together. Larger: a token is guessed sooner.
+        Tokens that are tried in browsers, by all clients together. Larger: one is guessed sooner.
+        Tokens of programs are not counted: their length alone protects them.
     form_bytes : int
         Bytes of a sign-in form.
     connections : int
         TCP connections at once; more are answered with 503.
     request_seconds : float
-        Time for the first complete request of a connection. Larger: slow clients hold connections
-        longer.
+        Time for the headers of each request of a connection, and for a form. Larger: slow clients
+        hold connections longer.
     fragments : int
         Pieces of one WebSocket message. Larger: empty pieces cost more memory.
     pings_per_second, pings_at_once : float

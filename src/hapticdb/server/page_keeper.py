@@ -61,7 +61,6 @@ class PageKeeper:
         self._is_stopping = False
         self.port = 0
         self.n_starts = 0
-        self.n_refused = 0
 
     @property
     def is_ready(self) -> bool:
@@ -80,13 +79,10 @@ class PageKeeper:
         ------
         HapticDBError
             With which the page ended, or because it did not become ready.
+        OSError
+            If the machine has no room for another process, or for its sockets.
         """
-        ours, theirs = socket.socketpair()
-        host_ours, host_theirs = socket.socketpair()
-        with theirs, host_theirs:
-            descriptors = theirs.fileno(), host_theirs.fileno()
-            request = self._request(link=descriptors[0], host=descriptors[1])
-            process = await asyncio.to_thread(Process, self._work, request, descriptors)
+        process, ours, host_ours = await self._begun()
         self._process = process  # `stop` can end it from now on
         self._serve_host(host_ours)
         try:
@@ -99,6 +95,20 @@ class PageKeeper:
         self._reader, self._writer = await asyncio.open_connection(sock=ours, limit=LONGEST_LINE)
         self.n_starts += 1
         LOG.info("the page is ready", extra={"pid": process.pid})
+
+    async def _begun(self) -> tuple[Process, socket.socket, socket.socket]:
+        """Begin a page process; it, and our ends of its link and of its way to the host."""
+        with contextlib.ExitStack() as ours:
+            pairs = []
+            with contextlib.ExitStack() as theirs:
+                for _ in range(2):
+                    own, other = socket.socketpair()
+                    pairs.append((ours.enter_context(own), theirs.enter_context(other)))
+                link, host = (other.fileno() for _, other in pairs)
+                request = self._request(link=link, host=host)
+                process = await asyncio.to_thread(Process, self._work, request, (link, host))
+            ours.pop_all()  # nothing failed, so they stay open
+        return process, pairs[0][0], pairs[1][0]
 
     async def keep(self) -> None:
         """Listen to the page, and start it again each time that it ends; until `stop`."""
@@ -117,7 +127,7 @@ class PageKeeper:
             pause = min(2.0 * pause, LONGEST_PAUSE)
             try:
                 await self.start()
-            except HapticDBError as error:
+            except (HapticDBError, OSError) as error:
                 LOG.error("the page cannot start: %s", error)  # noqa: TRY400 - its message says all
 
     async def announce(self, port: int, name: str, role: str) -> int:
@@ -166,7 +176,6 @@ class PageKeeper:
                 if message["word"] == "expected" and answer is not None and not answer.done():
                     answer.set_result(None)
                 elif message["word"] == "refused":
-                    self.n_refused += 1
                     LOG.warning("a connection to the page went round the server: closed")
 
     async def _end(self) -> None:

@@ -30,6 +30,9 @@ WAITING_MESSAGES = 4
 memory, before the page waits for it."""
 CONNECT_PATIENCE = 5.0
 """Seconds for the connection to the page."""
+CLOSING_PATIENCE = 5.0
+"""Seconds that a browser has to take the close frame. Larger: one that does not read is served for
+longer."""
 RENEW_EVERY = 60.0
 """Seconds between two looks at a browser's cookie. Larger: a cookie that became invalid works
 longer."""
@@ -87,8 +90,9 @@ class Relay:
             reason = closing.reason
             LOG.info("a browser's connection ends: %s", closing.words)
             if websocket.application_state is not WebSocketState.DISCONNECTED:
-                with contextlib.suppress(RuntimeError, WebSocketDisconnect):
-                    await websocket.close(closing.code, closing.words)
+                with contextlib.suppress(RuntimeError, TimeoutError, WebSocketDisconnect):
+                    async with asyncio.timeout(CLOSING_PATIENCE):
+                        await websocket.close(closing.code, closing.words)
         finally:
             self._figures.connections.labels(reason).inc()
 
@@ -97,6 +101,9 @@ class Relay:
         role = self._access.role_of_headers(websocket.headers)
         if role is None:
             raise Closing(POLICY, "sign in first", "refused")
+        cookie = self._access.cookie_of(websocket.headers)
+        if not self._access.renew(cookie):
+            cookie = ""  # an old one, which the role does not come from
         if len(self._numbers) >= self._limits.browsers or not self._arrivals.take():
             raise Closing(TRY_LATER, "too many browsers; try again later", "full")
         offered = [Subprotocol(p) for p in websocket.scope["subprotocols"] if VERSION.fullmatch(p)]
@@ -110,7 +117,7 @@ class Relay:
                 LOG.info("a browser is connected", extra={"guest": name, "role": role.word})
                 with self._figures.browsers.labels(role.word).track_inprogress():
                     return await _either(
-                        self._up(websocket, upstream, role), self._down(websocket, upstream)
+                        self._up(websocket, upstream, role, cookie), self._down(websocket, upstream)
                     )
             finally:
                 await upstream.close(GOING_AWAY)
@@ -150,10 +157,11 @@ class Relay:
             LOG.warning("the page cannot be reached: %s", error)
             raise Closing(TRY_LATER, "the page is starting; try again", "page away") from None
 
-    async def _up(self, websocket: WebSocket, upstream: ClientConnection, role: Role) -> str:
-        """Pass on what the browser sends, as far as it may."""
+    async def _up(
+        self, websocket: WebSocket, upstream: ClientConnection, role: Role, cookie: str
+    ) -> str:
+        """Pass on what the browser sends, as far as it may; while its cookie, if any, is valid."""
         strict = _Strictness(self._limits, self._figures)
-        cookie = self._access.cookie_of(websocket.headers)
         renewed = 0.0
         while True:
             try:

@@ -1,5 +1,6 @@
 """The first page of a browser: a token becomes a cookie, and the cookie opens the view."""
 
+import asyncio
 import html
 from urllib.parse import parse_qs
 
@@ -70,10 +71,13 @@ class FrontDoor:
         """Answer the form."""
         body = b""
         try:
-            async for piece in request.stream():
-                body += piece
-                if len(body) > self._limits.form_bytes:
-                    return PlainTextResponse("the form is too large\n", 413)
+            async with asyncio.timeout(self._limits.request_seconds):
+                async for piece in request.stream():
+                    body += piece
+                    if len(body) > self._limits.form_bytes:
+                        return PlainTextResponse("the form is too large\n", 413)
+        except TimeoutError:
+            return PlainTextResponse("the form came too slowly\n", 408, {"connection": "close"})
         except ClientDisconnect:
             return Response(status_code=400)
         fields = parse_qs(body.decode("ascii", "replace"), max_num_fields=4)

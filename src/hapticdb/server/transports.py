@@ -15,7 +15,7 @@ PROTOCOL_ERROR, POLICY = 1002, 1008
 
 
 class PatientHttp(H11Protocol):
-    """Begins every connection; cuts those that do not send a complete request in time."""
+    """Begins every connection; cuts those that do not send each request in time."""
 
     limits: ClassVar[Limits] = Limits()
 
@@ -26,17 +26,34 @@ class PatientHttp(H11Protocol):
         # do not
         connection = transport.get_extra_info("socket")
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        self.loop.call_later(self.limits.request_seconds, self._cut_if_silent)
+        self._silence: asyncio.TimerHandle | None = None
+        self._expect_request()
 
-    def _cut_if_silent(self) -> None:
+    def on_response_complete(self) -> None:
+        """Begin the time for the next request."""
+        self._expect_request()
+        super().on_response_complete()
+
+    def _expect_request(self) -> None:
+        """Begin the time for a request, which becomes a cycle when its headers are complete."""
+        if self._silence is not None:
+            self._silence.cancel()
+        seconds = self.limits.request_seconds
+        self._silence = self.loop.call_later(seconds, self._cut_if_silent, self.cycle)
+
+    def _cut_if_silent(self, last: object) -> None:
         if self.transport.is_closing():  # one of TLS knows no protocol any more
             return
-        if self.transport.get_protocol() is self and self.cycle is None:
+        if self.transport.get_protocol() is self and self.cycle is last:
             self.transport.close()
 
 
 class StrictWebSocket(WebSocketsSansIOProtocol):
-    """Ends connections that send messages in too many pieces, or too many pings."""
+    """Ends connections that send messages in too many pieces, or too many pings.
+
+    A connection whose client does not read is cut, because asyncio would keep it until the client
+    has read everything.
+    """
 
     limits: ClassVar[Limits] = Limits()
 
@@ -64,6 +81,16 @@ class StrictWebSocket(WebSocketsSansIOProtocol):
             super().handle_pong(event)
         else:
             self._fail(POLICY, "too many pongs")
+
+    def keepalive_timeout(self) -> None:
+        """Cut a client that has not answered a ping; whoever waits to send to it goes on."""
+        super().keepalive_timeout()
+        self.transport.abort()
+
+    def on_task_complete(self, task: "asyncio.Task[None]") -> None:
+        """Give a client that is no longer served a little time to read the last messages."""
+        super().on_task_complete(task)
+        self.loop.call_later(self.close_timeout, self.transport.abort)
 
     def _fail(self, code: int, words: str) -> None:
         if self.transport.is_closing():

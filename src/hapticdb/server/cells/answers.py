@@ -51,6 +51,15 @@ class CellsAnswer(NamedTuple):
     asked: Asked | None = None
 
 
+class _Remembered:
+    """What is the same for all clients, once one of them has found it."""
+
+    def __init__(self) -> None:
+        self.finding = threading.Lock()
+        self.is_found = False
+        self.found: object = None
+
+
 class Answers:
     """Answers requests of all clients of one environment. Threads may share it.
 
@@ -58,7 +67,7 @@ class Answers:
     """
 
     def __init__(self) -> None:
-        self._remembered: dict[tuple[object, ...], object] = {}
+        self._remembered: dict[tuple[object, ...], _Remembered] = {}
         self._remembering = threading.Lock()
         self._answers: dict[int, Callable[[Store, int, FieldsRead], tuple[Kind, bytes]]] = {
             Kind.REVISION: self._revision,
@@ -104,8 +113,12 @@ class Answers:
                 alike = [known for known in self._remembered if known[0] == key[0]]
                 for known in alike[: max(len(alike) - REMEMBERED + 1, 0)]:
                     del self._remembered[known]
-                self._remembered[key] = find()
-            found: Found = self._remembered[key]  # type: ignore[assignment]
+                self._remembered[key] = _Remembered()
+            remembered = self._remembered[key]
+        with remembered.finding:  # those who ask for something else do not wait for it
+            if not remembered.is_found:
+                remembered.found, remembered.is_found = find(), True
+            found: Found = remembered.found  # type: ignore[assignment]
             return found
 
     @staticmethod

@@ -347,8 +347,9 @@ class CellsClient:
             if len(self._in_flight) >= NEWS_IN_FLIGHT or recent is None:
                 return
             async with self._readers.lent() as store:
+                read = recent.copy()  # in a thread, while further scans are noted here
                 revision, news = await self._readers.run(
-                    store, lambda one: news_since(one, since, recent)
+                    store, lambda one: news_since(one, since, read)
                 )
             if revision == self._notified:
                 return

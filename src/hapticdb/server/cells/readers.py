@@ -7,6 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from hapticdb.errors import ConnectionLostError, DatabaseError, HapticDBError
+from hapticdb.server.cells.answers import RequestRefusedError
 from hapticdb.store.base import Store
 from hapticdb.store.connect import open_store
 from hapticdb.store.threads import NOBODY, this_thread
@@ -66,6 +67,9 @@ class Readers:
                 is_sound = True
             except ConnectionLostError:
                 is_sound = not self.is_outdated(store)  # it connects again by itself
+                raise
+            except RequestRefusedError:
+                is_sound = True  # the request was at fault
                 raise
             finally:
                 await self._take_back(store, is_sound=is_sound)

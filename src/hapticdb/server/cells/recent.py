@@ -37,6 +37,13 @@ class RecentCells:
         if len(asked.lows):
             self._batches.append((asked.lows >> self._shift, asked.highs >> self._shift))
 
+    def copy(self) -> "RecentCells":
+        """Copy them as they are now, for another thread: `note` may be called meanwhile."""
+        made = RecentCells(self._shift)
+        made._batches = self._batches.copy()
+        made.distances = self.distances
+        return made
+
     def touched(self, changes: list[Change], at_most: int) -> Keys:
         """Keys on the curve (n,), ascending, of the remembered cells in the ranges of changes.
 

@@ -7,6 +7,7 @@ threads, without the interpreter lock.
 """
 
 import asyncio
+import contextlib
 import logging
 import time
 from collections.abc import Callable, Mapping
@@ -52,6 +53,9 @@ are possible at the full rate, and more is on the way to a client that does not 
 LOOKS_EVERY = 1.0
 """Seconds between two looks at the process that fetches cells. Larger: after its end, edits are
 felt later."""
+CLOSING_WITHIN = 5.0
+"""Seconds that a client has to take a close frame. Larger: one that does not read keeps its place
+longer."""
 LARGEST = 1024
 """Bytes of the largest message that is accepted."""
 REASON_BYTES = 120
@@ -111,8 +115,6 @@ class Contacts:
         """Proxies computed so far."""
         self.seconds = 0.0
         """Seconds spent on them in the threads."""
-        self.n_refused = 0
-        """Connections that were closed for a fault of the client."""
 
     def close(self) -> None:
         """End the threads."""
@@ -138,10 +140,11 @@ class Contacts:
             self.n_clients -= 1
 
     async def _refuse(self, websocket: WebSocket, code: int, reason: str) -> None:
-        self.n_refused += code != CloseCode.FAILED
         if websocket.application_state is WebSocketState.CONNECTED:
             short = reason.encode()[:REASON_BYTES].decode("utf-8", "ignore")
-            await websocket.close(int(code), short)
+            with contextlib.suppress(TimeoutError, WebSocketDisconnect):  # it does not read
+                async with asyncio.timeout(CLOSING_WITHIN):
+                    await websocket.close(int(code), short)
 
     async def _serve(self, websocket: WebSocket, first: bytes | None) -> None:
         wish = unpack_wish(await first_message(websocket) if first is None else first)
@@ -199,7 +202,7 @@ class Contacts:
             due = max(due + 1.0 / self._rate, loop.time())
             await asyncio.sleep(due - loop.time())
             hand = state.hand
-            if hand is None or state.sent - hand.seen > UNSEEN:
+            if hand is None or state.n_unseen > UNSEEN:
                 continue
             proxy, seconds = await loop.run_in_executor(
                 self._threads, _timed_proxy, source, hand, state.arrived
@@ -221,6 +224,15 @@ class _Client:
         self.hand: HandState | None = None
         self.arrived = 0.0
         self.sent = 0
+
+    @property
+    def n_unseen(self) -> int:
+        """Number of proxies that the client has not seen yet.
+
+        A number that was not sent yet, such as one of an earlier connection, says nothing.
+        """
+        seen = 0 if self.hand is None or self.hand.seen > self.sent else self.hand.seen
+        return self.sent - seen
 
     def take(self, hand: HandState) -> None:
         """Make a hand the newest one, unless an older message came late."""

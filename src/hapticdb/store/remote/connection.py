@@ -72,8 +72,8 @@ class RemoteConnection:
     ----------
     welcome : WelcomeBody
         What the server tells about its environment.
-    heard_at : float
-        Time of the last message, as of `time.monotonic`.
+    heard_at, sent_at : float
+        Times of the last message that came and of the last one that went, as of `time.monotonic`.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class RemoteConnection:
         self.address = address
         self.shown = address.shown
         self.is_closed = False
-        self.heard_at = 0.0
+        self.heard_at = self.sent_at = 0.0
         self.n_connected = 0
         self._hear = hear
         self._thread = this_thread()
@@ -233,6 +233,7 @@ class RemoteConnection:
         if self._link is None:
             raise ConnectionLostError(f"{self.shown}: the connection was lost")
         self._link.send(message)
+        self.sent_at = time.monotonic()
 
     def _received(self, seconds: float) -> bytes | None:
         """Next message; None if none comes in that time."""

@@ -38,6 +38,9 @@ from hapticdb.store.urls import parse_address
 BEATS = 4.0
 """The server is alive if something came within so many of its beats. Larger: a late beat costs no
 question; smaller: a server that hangs is asked sooner."""
+SILENT_SECONDS = 30.0
+"""Seconds without a message to the server after which one that watches says that it is there.
+Larger: fewer messages; above a server's limit (120 s) it ends the connection."""
 ANY_REVISION = -1
 """Revision that a snapshot asks for if any will do."""
 
@@ -199,7 +202,7 @@ class RemoteStore:
             self.watch()
             return True
         changed, self._has_changed = self._has_changed, False
-        if changed:
+        if changed or time.monotonic() - connection.sent_at > SILENT_SECONDS:
             connection.tell(Kind.NOTED, revision=self._pushed_revision)
         return changed
 

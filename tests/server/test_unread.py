@@ -1,0 +1,138 @@
+"""Clients that stop reading: they are cut, and whoever sends to them goes on."""
+
+import asyncio
+import contextlib
+import socket
+import time
+from collections.abc import AsyncIterator, Callable
+from typing import Any, NoReturn, cast
+
+import pytest
+import uvicorn
+from starlette.datastructures import Headers
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketState
+
+from children import PATIENCE
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.server import relay
+from hapticdb.server.access import Access
+from hapticdb.server.contacts import endpoint
+from hapticdb.server.contacts.endpoint import Contacts
+from hapticdb.server.figures import Figures
+from hapticdb.server.limits import Limits
+from hapticdb.server.page_keeper import PageKeeper
+from hapticdb.server.relay import Relay
+from hapticdb.server.transports import StrictWebSocket
+
+OPENING = (
+    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+)
+MORE_THAN_BUFFERS = bytes(16 << 20)
+
+
+@contextlib.asynccontextmanager
+async def unread(app: ASGIApp, *, ping: float | None) -> AsyncIterator[uvicorn.Server]:
+    """A server, and a WebSocket to it that reads nothing."""
+    config = uvicorn.Config(
+        app, ws=StrictWebSocket, lifespan="off", log_config=None, ws_ping_interval=ping,
+        ws_ping_timeout=ping, timeout_graceful_shutdown=1, ws_per_message_deflate=False,
+    )  # fmt: skip
+    server = uvicorn.Server(config)
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        serving = asyncio.create_task(server.serve([listening]))
+        with socket.create_connection(listening.getsockname(), PATIENCE) as client:
+            client.sendall(OPENING)
+            yield server
+        server.should_exit = True
+        await asyncio.wait_for(serving, PATIENCE)
+
+
+async def until(claim: Callable[[], object]) -> None:
+    deadline = time.monotonic() + PATIENCE
+    while not claim():
+        assert time.monotonic() < deadline
+        await asyncio.sleep(0.01)
+
+
+def test_sending_to_a_client_that_answers_no_ping_ends() -> None:
+    ended: list[bool] = []
+
+    async def send_for_ever(_scope: Scope, _receive: Receive, send: Send) -> None:
+        await send({"type": "websocket.accept"})
+        try:
+            while True:
+                await send({"type": "websocket.send", "bytes": MORE_THAN_BUFFERS})
+        except (OSError, RuntimeError):
+            ended.append(True)
+
+    async def work() -> None:
+        async with unread(send_for_ever, ping=0.2):
+            await until(lambda: ended)
+
+    asyncio.run(work())
+
+
+def test_a_client_that_does_not_read_the_last_message_is_cut(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    is_served: list[bool] = []
+    begin = StrictWebSocket.connection_made
+
+    def connection_made(self: StrictWebSocket, transport: Any) -> None:  # noqa: ANN401 - asyncio's
+        begin(self, transport)
+        self.close_timeout = 0.1
+
+    monkeypatch.setattr(StrictWebSocket, "connection_made", connection_made)
+
+    async def send_once(_scope: Scope, _receive: Receive, send: Send) -> None:
+        await send({"type": "websocket.accept"})
+        await send({"type": "websocket.send", "bytes": MORE_THAN_BUFFERS})
+        is_served.append(True)
+
+    async def work() -> None:
+        async with unread(send_once, ping=None) as server:
+            await until(lambda: is_served)
+            await until(lambda: not server.server_state.connections)
+
+    asyncio.run(work())
+
+
+class Unwilling:
+    """A WebSocket that takes no close frame."""
+
+    application_state = WebSocketState.CONNECTED
+    headers = Headers()
+
+    @staticmethod
+    async def close(*_: object) -> NoReturn:
+        await asyncio.sleep(2.0 * PATIENCE)
+        raise AssertionError
+
+
+def test_a_remote_hand_that_takes_no_close_frame_keeps_no_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(endpoint, "CLOSING_WITHIN", 0.01)
+    contacts = Contacts(cast("ResidentCells", None), {})
+
+    async def work() -> None:
+        attending = contacts.attend(cast("WebSocket", Unwilling()), b"malformed")
+        await asyncio.wait_for(attending, PATIENCE)
+
+    asyncio.run(work())
+    assert contacts.n_clients == 0
+    contacts.close()
+
+
+def test_a_browser_that_takes_no_close_frame_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(relay, "CLOSING_PATIENCE", 0.01)
+    figures = Figures()
+    served = Relay(Access({}), cast("PageKeeper", None), Limits(), figures)
+
+    async def work() -> None:
+        await asyncio.wait_for(served.browser(cast("WebSocket", Unwilling())), PATIENCE)
+
+    asyncio.run(work())
+    assert b'hapticdb_browser_connections_total{end="refused"} 1.0' in figures.text()

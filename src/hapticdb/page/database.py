@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from hapticdb.environment import Environment
 from hapticdb.errors import HapticDBError
+from hapticdb.page.folders import AllowedFolders, FoldersEnvironment
 from hapticdb.store.connect import open_store
 
 LOG = logging.getLogger("hapticdb.page")
@@ -20,6 +21,12 @@ ENDS_WITHIN = 0.2
 Answer = TypeVar("Answer")
 
 
+def opened(url: str, folders: AllowedFolders | None, *, read_only: bool = True) -> Environment:
+    """Open an environment; objects' files are read below these folders only, if any are given."""
+    store = open_store(url, read_only=read_only)
+    return Environment(store) if folders is None else FoldersEnvironment(store, folders)
+
+
 class DatabaseThread:
     """An environment, opened in a thread of its own, that does the jobs of all browsers in turn.
 
@@ -29,6 +36,8 @@ class DatabaseThread:
         The environment.
     read_only : bool
         Whether its jobs only read.
+    folders : AllowedFolders or None
+        Where its jobs may read objects' files; None: everywhere.
 
     Raises
     ------
@@ -36,8 +45,10 @@ class DatabaseThread:
         If the environment cannot be opened.
     """
 
-    def __init__(self, url: str, *, read_only: bool = True) -> None:
-        self._url, self._read_only = url, read_only
+    def __init__(
+        self, url: str, *, read_only: bool = True, folders: AllowedFolders | None = None
+    ) -> None:
+        self._url, self._read_only, self._folders = url, read_only, folders
         self._jobs: queue.Queue[Callable[[Environment], None]] = queue.Queue(MOST_WAITING)
         self._is_ending = threading.Event()
         self._is_ready = threading.Event()
@@ -84,7 +95,7 @@ class DatabaseThread:
 
     def _run(self) -> None:
         try:
-            with Environment(open_store(self._url, read_only=self._read_only)) as env:
+            with opened(self._url, self._folders, read_only=self._read_only) as env:
                 self._is_ready.set()
                 while not self._is_ending.is_set():
                     self._turn(env)

@@ -116,7 +116,7 @@ class MovingControls:
             return
 
         def refused(error: Exception) -> None:
-            browser.tell("Not moved", str(error))
+            browser.tell("Not moved", browser.site.error_text(error))
             browser.site.view.put_back(obj.id)
             self.follow()
 

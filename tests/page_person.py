@@ -24,6 +24,7 @@ class PagePerson:
         self._connection = connection
         self.widgets: dict[str, dict[str, Any]] = {}
         self.told: list[str] = []
+        self.received: list[str] = []
         self.n_messages = 0
         sent(connection, CAMERA)
 
@@ -39,6 +40,8 @@ class PagePerson:
     def _take(self, message: dict[str, Any]) -> None:
         self.n_messages += 1
         kind, uuid = str(message["type"]), message.get("uuid")
+        if kind.startswith("Gui") or "Notification" in kind:
+            self.received.append(str(message))
         if kind == "GuiUpdateMessage" and uuid in self.widgets:
             self.widgets[uuid].update(message["updates"])
         elif kind.startswith("Gui") and isinstance(message.get("props"), dict) and uuid:

@@ -1,7 +1,10 @@
 """Objects' files are read below the operator's folders only."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -70,3 +73,42 @@ def test_a_folder_that_is_not_there_is_told(inside: Path) -> None:
     for name in ("missing", "part.stl"):
         with pytest.raises(UsageError, match="--files"):
             AllowedFolders([inside / name])
+
+
+def test_a_folder_that_may_not_be_entered_adds_none(
+    inside: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of an ordinary user: /home of others, in a service that may not see it."""
+    closed = inside.parent / "closed"
+    closed.mkdir()
+    (closed / "part.stl").write_text("solid")
+    links = [str(closed / "part.stl"), str(inside / "part.stl")]
+    real = os.stat
+
+    def stat(path: Any, **more: Any) -> os.stat_result:  # noqa: ANN401 - as of os.stat
+        if str(path).startswith(str(closed)):
+            raise PermissionError(13, "Permission denied", str(path))
+        return real(path, **more)
+
+    monkeypatch.setattr(os, "stat", stat)
+    allowed = AllowedFolders.of_links(links)
+    assert allowed.checked(links[1])
+    with pytest.raises(FileError):
+        allowed.checked(links[0])
+    with pytest.raises(UsageError, match="--files"):
+        AllowedFolders([closed])
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can become another user")
+def test_the_folders_of_another_user_add_none(tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+    (closed / "deep").mkdir(parents=True)
+    (closed / "deep" / "part.stl").write_text("solid")
+    closed.chmod(0o700)
+    code = (
+        "import os, sys; from hapticdb.page.folders import AllowedFolders; os.setuid(65534)\n"
+        "AllowedFolders.of_links(sys.argv[1:]); print('begun')"
+    )
+    command = [sys.executable, "-c", code, str(closed / "deep" / "part.stl")]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
+    assert found.stdout == "begun\n", found.stderr

@@ -8,6 +8,7 @@ import pytest
 from hapticdb.errors import UsageError
 from hapticdb.page.browser import Browser
 from hapticdb.page.site import ROLES, Visitor, checked_file
+from hapticdb.page.wording import error_text
 
 
 def browser_of(role: str) -> tuple[Browser, list[tuple[str, str]]]:
@@ -20,6 +21,9 @@ def browser_of(role: str) -> tuple[Browser, list[tuple[str, str]]]:
 
     browser.visitor = Visitor("Ada", role)
     browser.client = SimpleNamespace(add_notification=note)  # type: ignore[assignment]
+    browser.site = SimpleNamespace(  # type: ignore[assignment]
+        error_text=lambda error: error_text(error, ())
+    )
     browser._is_closed = False
     return browser, told
 

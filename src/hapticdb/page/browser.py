@@ -118,10 +118,10 @@ class Browser:
             try:
                 act(event)
             except HapticDBError as error:
-                self.tell("Not done", str(error))
-            except Exception:
+                self.failed(error)
+            except Exception as error:
                 LOG.exception("a callback of the page failed")
-                self.tell("Not done", "the page failed at this; the operator's log says why")
+                self.failed(error)
 
         return call
 
@@ -132,9 +132,9 @@ class Browser:
                 title, plain_name(text), auto_close_seconds=8.0, color="teal" if is_good else "red"
             )
 
-    def failed(self, error: HapticDBError) -> None:
-        """Tell an error of the database."""
-        self.tell("Not done", str(error))
+    def failed(self, error: Exception) -> None:
+        """Tell an error, in words that name nothing of the server's machine."""
+        self.tell("Not done", self.site.error_text(error))
 
     def _clicked(self, event: Event) -> None:
         def act(event: Event) -> None:

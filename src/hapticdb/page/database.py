@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 from hapticdb.environment import Environment
 from hapticdb.errors import HapticDBError
+from hapticdb.page.folders import AllowedFolders, FoldersEnvironment
 from hapticdb.store.connect import open_store
 
 LOG = logging.getLogger("hapticdb.page")
@@ -20,6 +21,12 @@ ENDS_WITHIN = 0.2
 Answer = TypeVar("Answer")
 
 
+def opened(url: str, folders: AllowedFolders | None, *, read_only: bool = True) -> Environment:
+    """Open an environment; objects' files are read below these folders only, if any are given."""
+    store = open_store(url, read_only=read_only)
+    return Environment(store) if folders is None else FoldersEnvironment(store, folders)
+
+
 class DatabaseThread:
     """An environment, opened in a thread of its own, that does the jobs of all browsers in turn.
 
@@ -29,6 +36,8 @@ class DatabaseThread:
         The environment.
     read_only : bool
         Whether its jobs only read.
+    folders : AllowedFolders or None
+        Where its jobs may read objects' files; None: everywhere.
     opens_later : bool
         Whether the environment is opened for the first job, and for each later one again while it
         cannot be; such a job fails. Else it is opened now, and the caller waits for it.
@@ -39,8 +48,16 @@ class DatabaseThread:
         If the environment cannot be opened now.
     """
 
-    def __init__(self, url: str, *, read_only: bool = True, opens_later: bool = False) -> None:
-        self._url, self._read_only, self._opens_later = url, read_only, opens_later
+    def __init__(
+        self,
+        url: str,
+        *,
+        read_only: bool = True,
+        folders: AllowedFolders | None = None,
+        opens_later: bool = False,
+    ) -> None:
+        self._url, self._read_only, self._folders = url, read_only, folders
+        self._opens_later = opens_later
         self._env: Environment | None = None
         self._jobs: queue.Queue[Callable[[], None]] = queue.Queue(MOST_WAITING)
         self._is_ending = threading.Event()
@@ -107,7 +124,7 @@ class DatabaseThread:
     def _opened(self) -> Environment:
         """The environment, which is opened if it is not yet open."""
         if self._env is None:
-            self._env = Environment(open_store(self._url, read_only=self._read_only))
+            self._env = opened(self._url, self._folders, read_only=self._read_only)
         return self._env
 
     def _turn(self) -> None:

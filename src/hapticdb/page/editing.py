@@ -11,9 +11,9 @@ from hapticdb.edits.editor import Editor
 from hapticdb.environment import Environment
 from hapticdb.errors import AccessError, ConflictError, HapticDBError, UsageError
 from hapticdb.page.database import DatabaseThread
-from hapticdb.page.wording import short_name
+from hapticdb.page.folders import AllowedFolders
+from hapticdb.page.wording import error_text, short_name
 from hapticdb.store.base import Object
-from hapticdb.store.urls import redact
 
 Answer = TypeVar("Answer")
 
@@ -75,10 +75,12 @@ class Edits:
     ----------
     url : str
         The environment, as one who may write reaches it.
+    folders : AllowedFolders or None
+        Where objects' files may be read; None: everywhere.
     """
 
-    def __init__(self, url: str) -> None:
-        self._url = url
+    def __init__(self, url: str, folders: AllowedFolders | None = None) -> None:
+        self._url, self._folders = url, folders
         self._lock = threading.Lock()
         self._thread: DatabaseThread | None = None
         self._of: dict[int, PersonsEdits] = {}
@@ -114,7 +116,9 @@ class Edits:
 
         with self._lock:
             if self._thread is None:
-                self._thread = DatabaseThread(self._url, read_only=False, opens_later=True)
+                self._thread = DatabaseThread(
+                    self._url, read_only=False, folders=self._folders, opens_later=True
+                )
             thread = self._thread
         thread.ask(work, then, refused)
 
@@ -122,10 +126,8 @@ class Edits:
         """Return an error as people elsewhere may read it."""
         if isinstance(error, AccessError):
             return AccessError("the server may only read its database: nothing was changed")
-        text, address = str(error), redact(self._url)
-        if address in text:
-            return HapticDBError(text.replace(address, "the environment"))
-        return error
+        text = error_text(error, (self._url,))
+        return error if text == str(error) else HapticDBError(text)
 
     def forget(self, person: int) -> None:
         """Forget a person's moves."""

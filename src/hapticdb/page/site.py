@@ -22,6 +22,7 @@ from hapticdb.page.editing import Edits
 from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.link import PageRequest
 from hapticdb.page.scene.view import SceneEdit, SceneView
+from hapticdb.page.wording import error_text
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import Coupling, DeviceCoupling
 from hapticdb.store.connect import open_store
@@ -133,15 +134,17 @@ class Site:
         self.url = request.urls["viewer"]
         self.title = request.title or "hapticdb"
         self.recordings = None if request.recordings is None else Path(request.recordings)
-        self.edits = Edits(request.urls["editor"]) if "editor" in request.urls else None
+        self.edits: Edits | None = None
         self.workers = ThreadPoolExecutor(WORKERS, thread_name_prefix="page-worker")
         self.sweeping = ThreadPoolExecutor(1, thread_name_prefix="page-sweep")
         self.painting = ThreadPoolExecutor(PAINTERS, thread_name_prefix="page-painter")
-        self._folders = self._allowed()
+        self.folders = self._allowed()
+        if "editor" in request.urls:
+            self.edits = Edits(request.urls["editor"], self.folders)
         self.view = SceneView(self.server, self.url, may_read=self._may_read)
         self.objects = self.view.objects
         self.stage = stage = Stage.of(self.view)
-        self.database = DatabaseThread(self.url)
+        self.database = DatabaseThread(self.url, folders=self.folders)
         self.tools = [
             *tools.from_files(request.tools, stage.voxel_size, smooth=stage.is_smooth),
             *tools.built_in(stage.diagonal, stage.voxel_size, smooth=stage.is_smooth),
@@ -188,11 +191,19 @@ class Site:
             except Exception:
                 LOG.exception("a browser's update failed")
 
+    def error_text(self, error: BaseException) -> str:
+        """Words of an error as any browser may read them; see `wording.error_text`."""
+        request = self.request
+        files = [obj.link for obj in self.objects.values()] + list(request.tools)
+        folders = {file.rpartition("/")[0] for file in files} | {*(request.folders or ())}
+        if request.recordings is not None:
+            folders.add(request.recordings)
+        return error_text(error, request.urls.values(), folders)
+
     def _may_read(self, path: Path) -> bool:
         """Whether the page may read an object's file: below the operator's folders alone."""
-        folders = self._folders
         try:
-            folders.checked(str(path))
+            self.folders.checked(str(path))
         except HapticDBError:
             return False
         return True

@@ -1,15 +1,51 @@
-"""Texts of the page: numbers with few decimals, names that fit, and everything escaped in HTML."""
+"""Texts of the page: numbers with few decimals, names that fit, and everything escaped in HTML.
+
+Errors name files and addresses of the server's machine; `error_text` takes them out.
+"""
 
 import html
+import re
 from collections.abc import Iterable
 
+from hapticdb.errors import HapticDBError
 from hapticdb.store.base import Object
+from hapticdb.store.urls import redact
 from hapticdb.units import length_text
 
 LONGEST_NAME = 34
 """Letters of a name on a button or in a line. Larger: more of a name is seen, and buttons wrap."""
 MOST_SAID = 6
 """Names in one list of what is touched. Larger: the panel grows and jumps while a tool slides."""
+
+FAULT = "the page failed at this; the operator's log says why"
+"""All that a browser gets of an error that nobody has foreseen."""
+ENVIRONMENT = "the environment"
+"""What stands for its address."""
+ADDRESS = re.compile(r"\b[a-zA-Z][\w+.-]*://[^\s'\"]*")
+"""A URL, to its end."""
+FOLDERS = re.compile(r"""(?<![^\s'"`(\[<=:,;])/(?=[^\s/])(?:[^/\n:'",;]+/)*""")
+"""All of an absolute path but its last name. Names may have spaces."""
+
+
+def error_text(error: BaseException, addresses: Iterable[str], folders: Iterable[str] = ()) -> str:
+    """Words of an error as any browser may read them: without addresses and folders.
+
+    Parameters
+    ----------
+    addresses : iterable of str
+        URLs of the environment, with their passwords or without.
+    folders : iterable of str
+        Known folders; an absolute path in another one is found by its form. Files keep their names.
+    """
+    if not isinstance(error, HapticDBError):
+        return FAULT
+    text = str(error)
+    known = {shown for url in addresses for shown in (url, redact(url)) if shown}
+    for shown in sorted(known, key=len, reverse=True):
+        text = re.sub(rf"(?<!\w){re.escape(shown)}(?!\w)", ENVIRONMENT, text)
+    for folder in sorted({one.rstrip("/") for one in folders} - {""}, key=len, reverse=True):
+        text = re.sub(rf"(?<!\w){re.escape(folder)}/", "", text)
+    return FOLDERS.sub("", ADDRESS.sub(ENVIRONMENT, text))
 
 
 def plain_name(name: str) -> str:

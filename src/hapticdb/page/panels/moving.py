@@ -190,7 +190,7 @@ class MovingControls:
             self._written(short_name(moved.name))
 
         def refused(error: Exception) -> None:
-            browser.tell("Not moved", str(error))
+            browser.tell("Not moved", browser.site.error_text(error))
             browser.site.view.put_back(held.object.id)
             with self._lock:
                 held.n_waiting -= 1

@@ -1,20 +1,20 @@
 """The tab Sweep: whether a tool, or a part, comes out along a way, and where it hits."""
 
+import logging
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.environment import Environment
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page import checks, colours, tools
+from hapticdb.page.database import opened
 from hapticdb.page.drawing import add_tool, place
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
-from hapticdb.store.connect import open_store
 from hapticdb.sweeps import run as sweeps
 from hapticdb.sweeps.result import Moment, Swept
 from hapticdb.sweeps.verdict import percent, verdict_line
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
     from hapticdb.page.browser import Browser
 
+LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
 
 MOST_POINTS = 20_000
@@ -108,14 +109,12 @@ class SweepPanel:
     def _work(self, job: "SweepJob") -> None:
         """Sweep; in the site's thread for sweeps."""
         try:
-            found = job.run(self._progress)
+            self._show(job.run(self._progress), job.name)
         except HapticDBError as error:
-            self._said.content = note_html(str(error))
+            self._said.content = note_html(self._browser.site.error_text(error))
         except Exception:
+            LOG.exception("a sweep of the page failed")
             self._said.content = note_html("The sweep failed; the operator's log says why.")
-            raise
-        else:
-            self._show(found, job.name)
         finally:
             self._is_running = False
             self._bar.visible = False
@@ -201,7 +200,7 @@ class SweepJob:
 
     def run(self, progress: sweeps.SampleCallback) -> SweepAnswer:
         """Sweep on a connection of its own."""
-        with Environment(open_store(self._site.url, read_only=True)) as env:
+        with opened(self._site.url, self._site.folders) as env:
             if self._part is None:
                 shell = self._tool.shell
             else:

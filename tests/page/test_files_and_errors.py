@@ -1,0 +1,164 @@
+"""The page reads objects' files below the operator's folders only, and its errors name no place."""
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import hapticdb
+from children import until
+from hapticdb.errors import DatabaseError, FileError, HapticDBError
+from hapticdb.page.browser import Browser
+from hapticdb.page.wording import FAULT, error_text
+from page_person import PagePerson
+from pages import page_of, two_parts
+
+WAY = np.eye(4)
+WAY[2, 3] = 0.02
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    folder = tmp_path / "of the operator"
+    folder.mkdir()
+    return two_parts(folder)
+
+
+def choose(browser: Browser, name: str) -> int:
+    """Choose the part of a file, as by a click; its id."""
+    (found,) = (obj for obj in browser.site.objects.values() if obj.link.endswith(f"/{name}"))
+    browser.parts.choose((found.id,))
+    return found.id
+
+
+def told(person: PagePerson, *, after: int) -> str:
+    """Wait for one notification more than there were."""
+    until(lambda: (person.look(0.05), len(person.told) > after)[1])
+    return person.told[after]
+
+
+def said_of_sweep(person: PagePerson, words: str) -> None:
+    until(lambda: (person.look(0.05), any(words in text for text in person.received))[1])
+
+
+def test_files_outside_the_operators_folders_are_not_read(scene: Path, tmp_path: Path) -> None:
+    (tmp_path / "other").mkdir()
+    with hapticdb.open(scene, read_only=True) as env:
+        before = {obj.id: obj.revision for obj in env.objects()}
+    with page_of(scene, folders=(str(tmp_path / "other"),)) as (site, person, browser):
+        chosen = choose(browser, "box.stl")
+        person.press("Take this part in hand")
+        assert "--files" in told(person, after=0)
+        person.press("Run the sweep")
+        said_of_sweep(person, "--files")
+        assert site.edits is not None
+        seen = site.objects[chosen]
+        site.edits.ask(browser.number, lambda own: own.move(seen, WAY), str, browser.failed)
+        assert "--files" in told(person, after=1)
+        site.edits.ask(browser.number, lambda own: own.take_out(seen), str, browser.failed)
+        site.edits.ask(browser.number, lambda own: own.put_back(), str, browser.failed)
+        assert "--files" in told(person, after=2)
+        assert browser.taken is None
+    with hapticdb.open(scene, read_only=True) as env:
+        assert {obj.id: obj.revision for obj in env.objects()} == {
+            one: revision for one, revision in before.items() if one != chosen
+        }
+
+
+def test_files_below_the_folders_are_moved_and_put_back(scene: Path) -> None:
+    with page_of(scene) as (site, person, browser):
+        seen = site.objects[choose(browser, "box.stl")]
+        assert site.edits is not None
+        done: list[str] = []
+        for job in (
+            lambda own: own.move(seen, WAY),
+            lambda own: own.undo(),
+        ):
+            site.edits.ask(browser.number, job, done.append, browser.failed)
+        until(lambda: len(done) == 2 or bool(person.told))
+        person.press("Take this part in hand")
+        until(lambda: browser.taken == seen.id)
+        assert person.told == []
+
+
+def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) -> None:
+    folder = scene.parent
+    recordings = folder / "recorded here"
+    recordings.mkdir()
+    (recordings / "bad.hdbrec").write_bytes(b"nothing")
+    with page_of(scene, recordings=recordings) as (site, person, browser):
+        choose(browser, "box.stl")
+        errors = []
+
+        def ask(job: Any) -> None:  # noqa: ANN401 - a job of the database
+            site.database.ask(job, str, browser.failed)
+
+        (folder / "box.stl").write_bytes(b"solid nonsense")
+        person.press("Take this part in hand")
+        errors.append(told(person, after=0))
+        assert "box.stl" in errors[-1]
+        person.press("Run the sweep")
+        said_of_sweep(person, "cannot be a tool")
+
+        shutil.copy(folder / "ball.stl", folder / "box.stl")
+        person.press("Take this part in hand")
+        errors.append(told(person, after=1))
+        assert "box.stl no longer holds the geometry" in errors[-1]
+
+        (folder / "box.stl").unlink()
+        person.press("Take this part in hand")
+        errors.append(told(person, after=2))
+        assert "not there" in errors[-1]
+
+        ask(lambda env: env.object(999))
+        errors.append(told(person, after=3))
+        assert "no object 999 in the environment" in errors[-1]
+        ask(lambda env: env.find("nothing like it"))
+        errors.append(told(person, after=4))
+
+        person.choose("Recording", "bad.hdbrec")
+        errors.append(told(person, after=5))
+        assert "bad.hdbrec" in errors[-1]
+        until(lambda: browser.session is not None)
+        shutil.rmtree(recordings)
+        person.press("Record")
+        errors.append(told(person, after=6))
+        assert ".hdbrec" in errors[-1]
+        person.look()
+        for text in person.received:
+            for secret in (str(folder), str(folder.parent), folder.name, "scene.db", "Traceback"):
+                assert secret not in text, text
+
+
+URL = "postgresql://ada:s3cret@db.example:5432/cars?environment=beetle&password=s3cret"
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        ("cannot read /srv/a/b.stl: it is empty", "cannot read b.stl: it is empty"),
+        ("'/srv/our parts/b.stl' is gone", "'b.stl' is gone"),
+        ("no object 3 in /srv/car.db", "no object 3 in the environment"),
+        ("no object 3 in data/car.db; 'hapticdb objects data/car.db'",
+         "no object 3 in the environment; 'hapticdb objects the environment'"),
+        (f"no object 3 in {URL}", "no object 3 in the environment"),
+        ("the server of postgresql://ada@db.example:5432/cars?environment=beetle&password=*** is",
+         "the server of the environment is"),
+        ("wss://there:1/x?token=s3cret: no answer", "the environment no answer"),
+        ("known:folder, of parts/a.stl", "a.stl"),
+        ("body/door/handle is back, 3 N/m, 1 / 2", "body/door/handle is back, 3 N/m, 1 / 2"),
+        ("give a number from 0 to 1", "give a number from 0 to 1"),
+    ],
+)  # fmt: skip
+def test_addresses_and_folders_are_taken_out_of_errors(said: str, expected: str) -> None:
+    addresses = ("/srv/car.db", "data/car.db", URL)
+    found = error_text(FileError(said), addresses, ("known:folder, of parts/", "", "/"))
+    assert found == expected
+    assert error_text(HapticDBError(found), addresses) == found
+
+
+def test_what_nobody_has_foreseen_is_told_without_its_words() -> None:
+    assert error_text(RuntimeError("/srv/a: s3cret"), ()) == FAULT
+    assert error_text(DatabaseError("busy"), ()) == "busy"

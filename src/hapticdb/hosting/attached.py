@@ -1,6 +1,6 @@
 """AttachedHost: a host's sessions from another process, over a pair of sockets."""
 
-import os
+import logging
 import socket
 from collections.abc import Callable
 from typing import Any, Self
@@ -9,11 +9,13 @@ from numpy.typing import ArrayLike
 
 from hapticdb.errors import HapticDBError
 from hapticdb.hosting.board import Board
-from hapticdb.hosting.channel import Ask, Channel, Reply
+from hapticdb.hosting.channel import Ask, Channel
 from hapticdb.hosting.hosted import Calls, HostedSession
 from hapticdb.hosting.tables import Words
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+
+LOG = logging.getLogger("hapticdb.hosting")
 
 
 class AttachedHost:
@@ -110,22 +112,18 @@ class Attachment:
         """Reply requests until the other process leaves; then end its sessions."""
         try:
             while True:
-                ask, descriptors = self._channel.receive()
-                for descriptor in descriptors:
-                    os.close(descriptor)
-                try:
-                    answer = Reply(self._do(ask))
-                except HapticDBError as error:
-                    answer = Reply(error=error)
-                self._channel.send(answer)
+                self._channel.reply(self._do)
         except (EOFError, OSError):
             pass
         finally:
             self._channel.close()
             for session in self._begun:
-                self._call("end", session)
+                try:
+                    self._call("end", session)
+                except Exception:
+                    LOG.exception("session %d of a process that left did not end well", session)
 
-    def _do(self, ask: Ask) -> Any:  # noqa: ANN401 - the answer to any request
+    def _do(self, ask: Ask, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request
         if ask.word == "begin":
             shell, start, options = ask.content
             session = self._begin(shell, start, **options)

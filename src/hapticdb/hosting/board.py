@@ -94,7 +94,14 @@ class Board:
 
     def release(self, row: int) -> None:
         """Free a seat."""
-        self.seats["state"][row] = FREE
+        with self._taking:
+            self.seats["state"][row] = FREE
+
+    def lose(self, row: int, session: int) -> None:
+        """Tell that a session's worker has died, unless the seat is free or another's by now."""
+        with self._taking:
+            if self.seats["state"][row] == TAKEN and self.seats["id"][row] == session:
+                self.seats["state"][row] = LOST
 
     def put_hand(self, row: int, time: int, pose: NDArray[np.float64] | None) -> None:
         """Write where the hand is: pose (7,), or None where nobody holds the tool."""

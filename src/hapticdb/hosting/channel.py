@@ -5,14 +5,17 @@ pair that has no name. Nothing of a client from outside goes through a channel u
 """
 
 import contextlib
+import logging
+import os
 import pickle
 import socket
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from hapticdb.errors import HapticDBError
 
+LOG = logging.getLogger("hapticdb.hosting")
 MOST_DESCRIPTORS = 4
 """Most file descriptors beside one message."""
 HEADER = 8
@@ -97,6 +100,36 @@ class Channel:
         if answer.error is not None:
             raise answer.error
         return answer.content
+
+    def reply(self, do: Callable[[Ask, list[int]], Any]) -> None:
+        """Receive a request, do it, and send its result or the error that it raised.
+
+        An error that is no HapticDBError is logged, and sent as one without its words.
+
+        Parameters
+        ----------
+        do : callable
+            Gets the request and the descriptors that came with it, which are closed afterwards.
+
+        Raises
+        ------
+        EOFError, OSError
+            If the other process has closed its end, or has died; never for what `do` raises.
+        """
+        ask, descriptors = self.receive()
+        try:
+            answer = Reply(do(ask, descriptors))
+        except HapticDBError as error:
+            answer = Reply(error=error)
+        except Exception:
+            LOG.exception("a request failed: %s", ask.word)
+            answer = Reply(
+                error=HapticDBError("the host failed at this request: its log says why; try again")
+            )
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        self.send(answer)
 
     def close(self) -> None:
         """Close the socket; the other process then reads the end."""

@@ -1,11 +1,12 @@
 """SessionHost: many hands in few worker processes, over tables of cells that they share."""
 
 import itertools
+import logging
 import os
 import socket
 import threading
-from collections.abc import Callable
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from typing import Any, Self
 
@@ -16,9 +17,9 @@ from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.attached import serve_attached
-from hapticdb.hosting.board import LOST, Board
+from hapticdb.hosting.board import Board
 from hapticdb.hosting.crew import Crew
-from hapticdb.hosting.hosted import HostedSession
+from hapticdb.hosting.hosted import HostedSession, Recorded
 from hapticdb.hosting.running import Running
 from hapticdb.hosting.stations import SeatRequest
 from hapticdb.hosting.tables import SharedTables, Words
@@ -41,6 +42,7 @@ from hapticdb.recording.header import Header
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.filtering import Filter
 
+LOG = logging.getLogger("hapticdb.hosting")
 MOST_SESSIONS = 64
 """Most sessions of a host, unless another number is given."""
 TEND_EVERY = 0.05
@@ -104,8 +106,13 @@ class SessionHost:
         self._is_closed = threading.Event()
         self._failure: HapticDBError | None = None
         self._pid = os.getpid()
-        self._tending = threading.Thread(target=self._tend, daemon=True, name="host")
-        self._tending.start()
+        self._logged: set[str] = set()
+        self._tending = [
+            threading.Thread(target=self._tend, args=(look,), daemon=True, name="host")
+            for look in (self._look_after_sessions, self._look_after_cells)
+        ]
+        for thread in self._tending:
+            thread.start()
 
     def __enter__(self) -> Self:
         return self
@@ -229,7 +236,7 @@ class SessionHost:
         known: dict[str, Callable[..., object]] = {
             "set_coupling": self._set_coupling,
             "record": self._record,
-            "stop_recording": lambda running: running.stop_recording(),
+            "stop_recording": lambda running: running.stop_recording(self._board),
             "recording_ended": lambda running: running.recording_ended,
             "end": self._end,
         }
@@ -261,16 +268,19 @@ class SessionHost:
         )
         running.record(path, header, self._board, replace=replace)
 
-    def _end(self, running: Running) -> None:
-        """End a session, whatever of it still works."""
+    def _end(self, running: Running) -> Recorded:
+        """End a session, whatever of it still works; returns what its recording has."""
         self._running.pop(running.session, None)
         with ExitStack() as ends:  # the last one runs first, and each runs even if another fails
             ends.callback(self._board.release, running.seat)
             ends.callback(self._tables.release, running.cells)
             ends.callback(running.cells.table.leave, running.request.reader)
-            ends.callback(running.stop_recording)
-            if running.worker.is_alive:
-                running.worker.ask("end", running.seat)
+            try:
+                if running.worker.is_alive:
+                    running.worker.ask("end", running.seat)
+            finally:
+                recorded = running.stop_recording(self._board)
+        return recorded
 
     # -- other processes ---------------------------------------------------------------------
 
@@ -290,20 +300,39 @@ class SessionHost:
 
     # -- looking after -----------------------------------------------------------------------
 
-    def _tend(self) -> None:
-        """Record frames, start fetching processes again, notice workers that died."""
+    def _tend(self, look: Callable[[], None]) -> None:
+        """Look after something again and again; without `_changing`, which a slow begin holds."""
         while not self._is_closed.wait(TEND_EVERY):
-            with self._changing:
-                for running in list(self._running.values()):
-                    if running.worker.is_alive:
-                        running.take_frames(self._board)
-                    else:
-                        self._board.seats["state"][running.seat] = LOST
-                for cells in self._tables.all():
-                    try:
-                        cells.supervise()
-                    except HapticDBError as error:
-                        self._failure = error
+            look()
+
+    def _look_after_sessions(self) -> None:
+        """Record frames, notice workers that died."""
+        for running in list(self._running.values()):
+            with self._surviving("recording a session"):
+                if running.worker.is_alive:
+                    running.take_frames(self._board)
+                else:
+                    self._board.lose(running.seat, running.session)
+
+    def _look_after_cells(self) -> None:
+        """Start fetching processes again that have ended."""
+        for cells in self._tables.all():
+            with self._surviving("starting a fetching process again"):
+                try:
+                    cells.supervise()
+                except HapticDBError as error:
+                    self._failure = error
+
+    @contextmanager
+    def _surviving(self, work: str) -> Iterator[None]:
+        """Go on after an error, which is logged when it is met for the first time."""
+        try:
+            yield
+        except Exception as error:
+            said = f"{work}: {type(error).__name__}: {error}"
+            if said not in self._logged:
+                self._logged.add(said)
+                LOG.exception("%s failed; later errors of this kind are not logged", work)
 
     @property
     def failure(self) -> HapticDBError | None:
@@ -325,8 +354,9 @@ class SessionHost:
         if os.getpid() != self._pid or self._is_closed.is_set():
             return
         self._is_closed.set()
-        with suppress(RuntimeError):
-            self._tending.join()
+        for thread in self._tending:
+            with suppress(RuntimeError):
+                thread.join()
         with self._changing, ExitStack() as ends:
             ends.callback(self._board.close)
             ends.callback(self._tables.close)

@@ -45,6 +45,13 @@ class HostedFigures(NamedTuple):
     recording_ended: str | None = None
 
 
+class Recorded(NamedTuple):
+    """What a recording has at its end: frames, and frames that were lost on the way to it."""
+
+    frames: int
+    lost: int
+
+
 class Calls(Protocol):
     """What a hosted session asks of the host: a word, the session's id, what goes with it."""
 
@@ -78,11 +85,14 @@ class HostedSession:
         Row of the board.
     label : str
         What the session is called where others see it.
+    lost_frames : int
+        Frames that this session's last recording lacks; known when this object has ended it.
     """
 
     def __init__(self, board: Board, seat: int, session: int, call: Calls) -> None:
         self._board, self.seat, self._call = board, seat, call
         self.id = session
+        self.lost_frames = 0
         self.label = board.seats["label"][seat].decode(errors="ignore")
 
     @property
@@ -164,9 +174,16 @@ class HostedSession:
 
     def stop_recording(self) -> int:
         """End the recording, which stays; returns the number of its frames, 0 without one."""
-        n_frames = self._call("stop_recording", self.id)
-        assert isinstance(n_frames, int)  # noqa: S101 - the host counts
-        return n_frames
+        return self._ended_recording("stop_recording")
+
+    def _ended_recording(self, word: str) -> int:
+        """Do what ends a recording; returns the number of its frames."""
+        recorded = self._call(word, self.id)
+        if recorded is None:  # the session was over
+            return 0
+        assert isinstance(recorded, Recorded)  # noqa: S101 - the host counts
+        self.lost_frames = recorded.lost
+        return recorded.frames
 
     def figures(self) -> HostedFigures:
         """Figures of the session so far."""
@@ -192,7 +209,7 @@ class HostedSession:
     def end(self) -> None:
         """End the session and its recording; a second call does nothing."""
         if self._board.seats["id"][self.seat] == self.id:
-            self._call("end", self.id)
+            self._ended_recording("end")
 
 
 def _spread(counts: NDArray[np.int64], worst: float) -> Spread:

@@ -1,11 +1,13 @@
 """Running: what a host keeps of a session while it runs."""
 
+import threading
 import time
 from pathlib import Path
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.board import Board
 from hapticdb.hosting.crew import WorkerLink
+from hapticdb.hosting.hosted import Recorded
 from hapticdb.hosting.stations import SeatRequest
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session_recording import SessionRecording
@@ -38,8 +40,8 @@ class Running:
     ) -> None:
         self.request, self.session, self.cells, self.worker = request, session, cells, worker
         self.seat = request.seat
-        self._board: Board | None = None
         self._recording: SessionRecording | None = None
+        self._taking = threading.Lock()
         self.recording_ended: str | None = None
 
     def record(self, path: str, header: Header, board: Board, *, replace: bool) -> None:
@@ -65,7 +67,8 @@ class Running:
         except BaseException:
             board.seats["is_recorded"][self.seat] = 0
             raise
-        self._recording, self._board, self.recording_ended = recording, board, None
+        self.recording_ended = None
+        self._recording = recording
 
     def _first_frame(self, board: Board) -> int:
         """Number of the first frame that has what a recording needs."""
@@ -78,19 +81,27 @@ class Running:
         return first
 
     def take_frames(self, board: Board) -> None:
-        """Copy new frames from the board into the recording, if there is one."""
-        if self._recording is not None:
-            self._recording.take(board.rings[self.seat], int(board.seats["n_frames"][self.seat]))
-            self.recording_ended = self._recording.ended
+        """Copy new frames from the board into the recording, if there is one; in any thread."""
+        with self._taking:
+            recording = self._recording
+            if recording is not None:
+                try:
+                    recording.take(board.rings[self.seat], int(board.seats["n_frames"][self.seat]))
+                except Exception:
+                    recording.ended = "the recording ended early: the host failed at it"
+                    raise
+                finally:
+                    self.recording_ended = recording.ended
 
-    def stop_recording(self) -> int:
-        """End the recording, which stays; returns the number of its frames, 0 without one."""
-        recording, board = self._recording, self._board
-        if recording is None or board is None:
-            return 0
-        self.take_frames(board)
-        self._recording = None
-        board.seats["is_recorded"][self.seat] = 0
-        recording.finish()
-        self.recording_ended = recording.ended
-        return len(recording)
+    def stop_recording(self, board: Board) -> Recorded:
+        """End the recording, which stays."""
+        try:
+            self.take_frames(board)
+        finally:
+            with self._taking:
+                recording, self._recording = self._recording, None
+            board.seats["is_recorded"][self.seat] = 0
+            if recording is not None:
+                recording.finish()
+                self.recording_ended = recording.ended
+        return Recorded(0, 0) if recording is None else Recorded(len(recording), recording.n_lost)

@@ -66,9 +66,8 @@ class SharedTables:
         cells.close()
 
     def all(self) -> list[ResidentCells]:
-        """Tables that are in use."""
-        with self._making:
-            return list(self._tables.values())
+        """Tables that are in use; does not wait while one is made."""
+        return list(self._tables.values())
 
     def close(self) -> None:
         """Free all tables."""

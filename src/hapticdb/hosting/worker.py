@@ -11,11 +11,10 @@ import socket
 import threading
 import time
 from dataclasses import dataclass
-from typing import Any
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.board import Board
-from hapticdb.hosting.channel import Ask, Channel, Reply
+from hapticdb.hosting.channel import Ask, Channel
 from hapticdb.hosting.stations import SeatRequest, Stations
 from hapticdb.kernels.compiling import load
 from hapticdb.realtime.deadlines import SPIN, Timing, undisturbed
@@ -62,24 +61,14 @@ class Worker:
         try:
             while not parent_is_gone():
                 if select.select([self._channel.sock], [], [], LOOK_EVERY)[0]:
-                    ask, descriptors = self._channel.receive()
-                    self._channel.send(self._answer(ask, descriptors))
+                    self._channel.reply(self._do)
         except (EOFError, OSError):
             pass
         finally:
             self._stations.stop()
 
-    def _answer(self, ask: Ask, descriptors: list[int]) -> Reply:
-        try:
-            self._do(ask.word, ask.content, descriptors)
-            return Reply()
-        except HapticDBError as error:
-            return Reply(error=error)
-        finally:
-            for descriptor in descriptors:
-                os.close(descriptor)
-
-    def _do(self, word: str, content: tuple[Any, ...], descriptors: list[int]) -> None:
+    def _do(self, ask: Ask, descriptors: list[int]) -> None:
+        word, content = ask
         if word == "begin":
             self._begin(content[0], descriptors[0])
         elif word == "end":

@@ -4,6 +4,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
+from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -49,7 +50,8 @@ class Browser:
     """What one browser shows and does.
 
     Its callbacks run in viser's threads, `tick` in the page's clock, and the work of sessions in
-    threads of the site: one lock keeps them apart, and no thread waits for the host with it.
+    threads of the site, in one of them at a time: `_beginning` is that one's. No thread waits for
+    the host with `_swapping`, under which the session is exchanged.
 
     Parameters
     ----------
@@ -80,8 +82,9 @@ class Browser:
         self.hand = self._start()
         self.history: deque[tuple[float, float, float]] = deque(maxlen=HISTORY)
         self._begun: float | None = None
-        self._n_begins = 0
-        self._beginning = threading.Lock()
+        self._keeps_tool: bool | None = None  # of the session to begin; None: none is wanted
+        self._over: list[HostedSession] = []  # to be ended
+        self._beginning, self._swapping = threading.Lock(), threading.Lock()
         self._is_closed = False
         self._shared: list[Any] = []
         self._shown = np.full(7, np.inf)
@@ -195,39 +198,87 @@ class Browser:
         """
         if not self.visitor.may("toucher") or self._is_closed:
             return
-        self._n_begins += 1
-        number = self._n_begins
-        self.site.workers.submit(self._begin, number, keeps_tool)
+        with self._swapping:
+            self._keeps_tool = keeps_tool and self._keeps_tool is not False
+        self.site.workers.submit(self._begin_wanted)
 
-    def _begin(self, number: int, keeps_tool: bool) -> None:  # noqa: FBT001 - one call
-        try:
-            with self._beginning:
-                if number != self._n_begins or self._is_closed:
-                    return  # a newer wish follows
-                old, start = self.session, self.hand
-                if old is not None:
-                    frame = None if old.is_over else old.latest()
-                    if keeps_tool and frame is not None:
-                        start = np.array(frame["tool"][0])
-                    self.session = None
-                    self.record.session_ended()
-                    old.end()
-                self._unfelt = self.unfelt
-                session = self.site.host.begin(
-                    self.tool.shell, matrix(start), exclude=self._unfelt,
-                    coupling=self._coupling(), scale=self.scale, label=self.visitor.name,
-                )  # fmt: skip
-                session.move(matrix(self.hand))
+    def _begin_wanted(self) -> None:
+        """Begin sessions while one is wanted; does nothing if another worker does so already."""
+        while self._keeps_tool is not None and self._beginning.acquire(blocking=False):
+            try:
+                self._begin()
+            except HapticDBError as error:
+                self.failed(error)
+            except Exception:
+                LOG.exception("a session could not begin")
+                self.tell("No tool", "the session could not begin; the operator's log says why")
+            finally:
+                self._beginning.release()
+
+    def _begin(self) -> None:
+        """End the session, and begin another if one is wanted still."""
+        with self._swapping:
+            keeps_tool, self._keeps_tool = self._keeps_tool, None
+        if keeps_tool is None or self._is_closed:
+            return
+        tool = self._leave_session()
+        self._end_sessions()
+        start = tool if keeps_tool and tool is not None else self.hand
+        self._unfelt = self.unfelt
+        with ExitStack() as undo:
+            undo.callback(self.drawing.rest)
+            undo.callback(self._unshare)
+            session = self.site.host.begin(
+                self.tool.shell, matrix(start), exclude=self._unfelt,
+                coupling=self._coupling(), scale=self.scale, label=self.visitor.name,
+            )  # fmt: skip
+            undo.callback(session.end)
+            session.move(matrix(self.hand))
+            self._share()
+            with self._swapping:
+                if self._is_closed:
+                    return
                 self.session = session
-                self._share()
-            if self._is_closed:
-                self._unshare()
+                undo.pop_all()
+
+    def _leave_session(self) -> Floats | None:
+        """Give up the session, if there is one; returns the pose (7,) of its tool."""
+        session = self.session
+        if session is None or not self._give_up(session):
+            return None
+        self.record.session_ended()
+        try:
+            frame = session.latest()
+        except HapticDBError:  # it is over
+            return None
+        return None if frame is None else np.array(frame["tool"][0])
+
+    def _give_up(self, session: "HostedSession") -> bool:
+        """Have no session any more; False if it was given up already. `_end_sessions` ends it."""
+        with self._swapping:
+            if self.session is not session:
+                return False
+            self.session = None
+            self._over.append(session)
+            return True
+
+    def _end_sessions(self) -> None:
+        """End the sessions that were given up, and tell what their recordings lack."""
+        with self._swapping:
+            over, self._over = self._over, []
+        for session in over:
+            try:
                 session.end()
-        except HapticDBError as error:
-            self.failed(error)
-        except Exception:
-            LOG.exception("a session could not begin")
-            self.tell("No tool", "the session could not begin; the operator's log says why")
+            except Exception:  # all of it that works has ended
+                LOG.exception("a session did not end well")
+            self._tell_lost_frames(session)
+
+    def _tell_lost_frames(self, session: "HostedSession") -> None:
+        n_lost, session.lost_frames = session.lost_frames, 0
+        if n_lost:
+            self.tell(
+                "Recording incomplete", f"{n_lost:,} frames were lost: the server was too busy"
+            )
 
     def matrix_of_hand(self) -> Floats:
         """Pose (4, 4) of the hand, metres."""
@@ -281,11 +332,14 @@ class Browser:
         self.record.tick(now)  # viewers replay, too
         session = self.session
         if session is not None and session.is_over:
-            self.session = None
-            self.drawing.rest()
-            self.tell("Tool lost", "its process ended; it begins again")
-            self.begin_anew()
+            if self._give_up(session):
+                self.drawing.rest()
+                self.record.session_ended()
+                self.tell("Tool lost", "its process ended; it begins again")
+                self.begin_anew()
             return
+        if session is not None and session.lost_frames:
+            self._tell_lost_frames(session)
         frame = None if session is None else session.latest()
         if session is None or frame is None:
             return
@@ -328,9 +382,10 @@ class Browser:
         self.parts.moving.leave()
         self._unshare()
         self.site.free_number(self.number)
-        session, self.session = self.session, None
-        if session is not None:
-            session.end()
+        with self._swapping:
+            session, self.session = self.session, None
+            self._over += [] if session is None else [session]
+        self._end_sessions()
 
 
 def has_moved(pose: Floats, before: Floats, diagonal: float) -> bool:

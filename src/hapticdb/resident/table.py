@@ -122,7 +122,8 @@ class CellTable:
     Parameters
     ----------
     descriptor : int
-        File descriptor of the memory of a table that `create` has made, in any process.
+        File descriptor of the memory of a table that `create` has made, in any process. The table
+        owns it and closes it.
     n_slots : int
         Number of its slots.
 
@@ -146,7 +147,11 @@ class CellTable:
         self.size_bytes = os.fstat(descriptor).st_size
         # the size tells the two kinds apart, so no process can take one for the other
         self.has_distances = self.size_bytes == _bytes_of(n_slots, has_distances=True)
-        self._memory = mmap.mmap(descriptor, self.size_bytes)
+        try:
+            self._memory = mmap.mmap(descriptor, self.size_bytes)
+        except OSError:
+            self.close()
+            raise
         views: dict[str, NDArray[np.generic]] = {}
         at = 0
         for name, dtype, shape in _fields(n_slots, has_distances=self.has_distances):

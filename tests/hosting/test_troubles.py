@@ -1,0 +1,206 @@
+"""Trouble of one session stays its own: a failed or slow begin, a dead worker, a full machine."""
+
+import errno
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from children import joined, until
+from hapticdb import Environment, PointShell
+from hapticdb.errors import HapticDBError
+from hapticdb.hosting.attached import Attachment
+from hapticdb.hosting.board import FREE, LOST, TAKEN, Board
+from hapticdb.hosting.channel import Channel
+from hapticdb.hosting.host import SessionHost
+from hapticdb.hosting.hosted import HostedSession
+from hapticdb.realtime.session_recording import SessionRecording
+from realtime.hands import at
+from realtime.sessions import floored
+from realtime.worlds import make
+
+ABOVE = at(0.0, 0.0, 0.02)
+"""A pose of the ball of 12 mm over the floor at z = 0."""
+PATIENCE = 30.0
+"""Seconds in which the host must do what takes it milliseconds."""
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    with floored(make(tmp_path_factory.mktemp("plane"), bits=6)) as made:
+        yield made
+
+
+@pytest.fixture(scope="module")
+def host(env: Environment) -> Iterator[SessionHost]:
+    with SessionHost(env.url, rate=500.0, budget_bytes=8 << 20, processes=1) as made:
+        yield made
+
+
+@pytest.fixture
+def session(host: SessionHost, sphere: PointShell) -> Iterator[HostedSession]:
+    begun = host.begin(sphere, ABOVE)
+    yield begun
+    begun.end()
+
+
+def recording_of(host: SessionHost, session: HostedSession) -> SessionRecording:
+    """The recording of a session, in the host."""
+    found = host._running[session.id]._recording
+    assert found is not None
+    return found
+
+
+def is_recorded_further(host: SessionHost, session: HostedSession) -> None:
+    """Wait until frames are added to the recording."""
+    recording = recording_of(host, session)
+    before = len(recording)
+    until(lambda: len(recording) > before, patience=PATIENCE)
+
+
+def full(*_: object, **__: object) -> HostedSession:
+    """Fail as a machine that has no more files or memory."""
+    raise OSError(errno.EMFILE, "Too many open files", "/secret/path")
+
+
+class Served:
+    """An attachment in a thread, whose host has `ended` the sessions of these ids."""
+
+    def __init__(self) -> None:
+        ours, theirs = socket.socketpair()
+        self.channel, self.ended = Channel(theirs), list[int]()
+        self.attachment = Attachment(Channel(ours), full, self._call, list)
+        self.thread = threading.Thread(target=self.attachment.serve)
+        self.thread.start()
+
+    def _call(self, word: str, session: int, /, *_: object) -> object:
+        self.ended.append(session)
+        if session == 1:
+            raise OSError(errno.ENOMEM, "Cannot allocate memory")
+        return word
+
+    def leave(self) -> None:
+        self.channel.close()
+        joined(self.thread)
+
+
+def test_an_error_of_the_machine_is_answered_and_the_channel_stays(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    served = Served()
+    try:
+        with pytest.raises(HapticDBError, match="its log says why") as found:
+            served.channel.ask("begin", None, None, {})
+        assert "/secret" not in str(found.value)
+        assert served.channel.ask("sessions") == []
+    finally:
+        served.leave()
+    assert [record.exc_info is not None for record in caplog.records] == [True]
+
+
+def test_each_session_of_a_process_that_leaves_ends_even_if_one_fails_at_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    served = Served()
+    served.attachment._begun |= {1, 2}
+    served.leave()
+    assert sorted(served.ended) == [1, 2]
+    assert len(caplog.records) == 1
+
+
+def test_a_seat_that_is_free_or_anothers_is_not_lost() -> None:
+    board = Board.create(1)
+    row = board.take(7, "first", 0)
+    board.release(row)
+    board.lose(row, 7)
+    assert board.seats["state"][row] == FREE
+    assert board.take(8, "second", 0) == row
+    board.lose(row, 7)
+    assert board.seats["state"][row] == TAKEN
+    board.lose(row, 8)
+    assert board.seats["state"][row] == LOST
+    board.close()
+
+
+def test_looking_after_sessions_survives_errors_and_logs_each_once(
+    host: SessionHost,
+    session: HostedSession,
+    sphere: PointShell,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    rounds = []
+
+    def fail(*_: object) -> None:
+        rounds.append(0)
+        full()
+
+    other = host.begin(sphere, ABOVE)
+    try:
+        other.record(tmp_path / "other.hdbrec")
+        with monkeypatch.context() as patch:
+            patch.setattr(host.cells[0], "supervise", fail)
+            patch.setattr(host._running[session.id], "take_frames", fail)
+            until(lambda: len(rounds) > 10, patience=PATIENCE)
+            is_recorded_further(host, other)
+    finally:
+        other.end()
+    said = [record.getMessage().partition(" failed")[0] for record in caplog.records]
+    assert sorted(said) == ["recording a session", "starting a fetching process again"]
+    assert host.failure is None
+
+
+def test_a_slow_begin_keeps_no_recording_waiting_and_hides_no_death(
+    host: SessionHost,
+    session: HostedSession,
+    sphere: PointShell,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    is_slow, may_go_on = threading.Event(), threading.Event()
+    take = host._tables.take
+
+    def wait(felt: object) -> object:
+        with host._tables._making:  # held while a table's process starts
+            is_slow.set()
+            assert may_go_on.wait(PATIENCE)
+        return take(felt)  # type: ignore[arg-type]
+
+    session.record(tmp_path / "slow.hdbrec")
+
+    def begin() -> None:
+        with pytest.raises(HapticDBError, match="does not answer"):  # its worker has died by then
+            host.begin(sphere, ABOVE)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(host._tables, "take", wait)
+        thread = threading.Thread(target=begin)
+        thread.start()
+        try:
+            assert is_slow.wait(PATIENCE)
+            is_recorded_further(host, session)
+            assert len(host.cells) == 1
+            os.kill(host.pids[0], signal.SIGKILL)
+            until(lambda: session.is_over, patience=PATIENCE)
+        finally:
+            may_go_on.set()
+            joined(thread)
+
+
+def test_a_recording_that_lost_frames_says_how_many(
+    host: SessionHost, session: HostedSession, tmp_path: Path
+) -> None:
+    session.record(tmp_path / "late.hdbrec")
+    is_recorded_further(host, session)
+    with host._running[session.id]._taking:
+        recording_of(host, session)._n_taken -= 3000  # as if nobody had looked for 6 s
+    assert session.stop_recording() > 0
+    assert session.lost_frames > 1000
+    session.record(tmp_path / "again.hdbrec")
+    session.end()
+    assert session.lost_frames == 0

@@ -1,0 +1,187 @@
+"""A browser's session begins, is lost, fails and ends: nothing of it stays in the host."""
+
+import threading
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from children import until
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.page.browser import Browser
+from hapticdb.page.site import Visitor
+
+PATIENCE = 30.0
+"""Seconds in which workers must do what takes them microseconds."""
+
+
+class FakeSession:
+    """A session that has ended, died, or runs."""
+
+    def __init__(self, start: Any) -> None:  # noqa: ANN401 - a pose
+        self.start = np.array(start)
+        self.is_over, self.n_ends, self.lost_frames, self.lost_at_end = False, 0, 0, 0
+
+    def move(self, _: object) -> None:
+        """Nobody feels it."""
+
+    def latest(self) -> None:
+        """There is no frame yet."""
+        if self.is_over:
+            raise UsageError("the session is over")
+
+    def end(self) -> None:
+        self.n_ends, self.is_over, self.lost_frames = self.n_ends + 1, True, self.lost_at_end
+
+
+class FakeHost:
+    """A host that begins sessions when `may_begin`, or fails with `error`."""
+
+    def __init__(self) -> None:
+        self.begun: list[FakeSession] = []
+        self.n_asked, self.error = 0, HapticDBError("no seat is free")
+        self.is_failing, self.may_begin = False, threading.Event()
+        self.may_begin.set()
+
+    def begin(self, _: object, start: object, **__: object) -> FakeSession:
+        self.n_asked += 1
+        assert self.may_begin.wait(PATIENCE)
+        if self.is_failing:
+            raise self.error
+        self.begun.append(FakeSession(start))
+        return self.begun[-1]
+
+
+class Person(Browser):
+    """A browser without viser that keeps what it would tell and show its person."""
+
+    def __init__(self, host: FakeHost, workers: ThreadPoolExecutor) -> None:
+        self.visitor, self.number, self.taken = Visitor("Ada", "toucher"), 0, None
+        self.told: list[str] = []
+        self.said: list[str] = []
+        client = SimpleNamespace(
+            client_id=0, add_notification=lambda *words, **_: self._keep(words)
+        )
+        site = SimpleNamespace(
+            host=host, workers=workers, objects={}, edits=None, browsers={0: self},
+            view=SimpleNamespace(forget=lambda _: None), free_number=lambda _: None,
+            stage=SimpleNamespace(is_smooth=False, diagonal=1.0),
+        )  # fmt: skip
+        self.client, self.site = client, site  # type: ignore[assignment]
+        self.scene = SimpleNamespace(hidden=())  # type: ignore[assignment]
+        self.tool, self.scale = SimpleNamespace(shell=None), 1.0  # type: ignore[assignment]
+        self.hand, self.session = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), None
+        self.drawing = self._part("rest")
+        self.record = self._part("tick", "session_ended")
+        self.parts = SimpleNamespace(moving=self._part("leave"))  # type: ignore[assignment]
+        self._unfelt, self._keeps_tool, self._over, self._is_closed = [], None, [], False
+        self._beginning, self._swapping = threading.Lock(), threading.Lock()
+
+    def _keep(self, words: tuple[str, ...]) -> None:
+        self.told.append(": ".join(words))
+
+    def _part(self, *names: str) -> Any:  # noqa: ANN401 - in place of panels
+        def keeps(name: str) -> Any:  # noqa: ANN401
+            return lambda *_: self.said.append(name)
+
+        return SimpleNamespace(**{name: keeps(name) for name in names})
+
+    def _share(self) -> None:
+        self.said.append("share")
+
+    def _unshare(self) -> None:
+        self.said.append("unshare")
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether no worker is at its sessions, and none is asked to be."""
+        return self._keeps_tool is None and not self._beginning.locked()
+
+
+@pytest.fixture
+def host() -> FakeHost:
+    return FakeHost()
+
+
+@pytest.fixture
+def person(host: FakeHost) -> Iterator[Person]:
+    with ThreadPoolExecutor(4) as workers:
+        made = Person(host, workers)
+        made.begin_anew()
+        until(lambda: made.session is not None, patience=PATIENCE)
+        until(lambda: made.is_idle, patience=PATIENCE)
+        made.said.clear()
+        yield made
+        host.may_begin.set()
+
+
+def test_a_lost_session_is_ended_in_the_host_and_the_panel_knows(
+    host: FakeHost, person: Person
+) -> None:
+    host.begun[0].is_over = True
+    for n in range(3):
+        person.tick(float(n))
+    until(lambda: len(host.begun) == 2 and person.is_idle, patience=PATIENCE)
+    assert host.begun[0].n_ends == 1
+    assert person.session is host.begun[1]  # type: ignore[comparison-overlap]
+    assert person.said.count("session_ended") == person.said.count("rest") == 1
+    assert person.told == ["Tool lost: its process ended; it begins again"]
+
+
+def test_a_lost_session_of_a_browser_that_goes_is_ended(host: FakeHost, person: Person) -> None:
+    host.may_begin.clear()
+    host.begun[0].is_over = True
+    person.tick(0.0)
+    until(lambda: host.n_asked == 2, patience=PATIENCE)
+    person.close()
+    host.may_begin.set()
+    until(lambda: person.is_idle and len(host.begun) == 2, patience=PATIENCE)
+    assert [one.n_ends for one in host.begun] == [1, 1]
+    assert person.session is None
+    assert person.said[-2:] == ["unshare", "rest"]
+
+
+def test_a_begin_that_fails_takes_force_and_tool_out_of_view(
+    host: FakeHost, person: Person
+) -> None:
+    host.is_failing = True
+    person.begin_anew()
+    until(lambda: person.told, patience=PATIENCE)
+    assert person.told == ["Not done: no seat is free"]
+    assert person.said == ["session_ended", "unshare", "rest"]
+    assert person.session is None
+    assert host.begun[0].n_ends == 1
+
+
+def test_many_quick_wishes_take_one_worker_and_the_newest_is_done(
+    host: FakeHost, person: Person
+) -> None:
+    host.may_begin.clear()
+    person.begin_anew()
+    until(lambda: host.n_asked == 2, patience=PATIENCE)
+    for _ in range(8):
+        person.begin_anew()
+    person.hand = np.array([0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0])
+    free = person.site.workers.submit(lambda: "free")
+    assert free.result(PATIENCE) == "free"  # other browsers' workers
+    host.may_begin.set()
+    until(lambda: person.is_idle, patience=PATIENCE)
+    assert len(host.begun) == 3  # the first, the slow one, and one for the eight
+    assert host.begun[-1].start[2, 3] == 0.5
+    assert [one.n_ends for one in host.begun] == [1, 1, 0]
+    assert person.session is host.begun[-1]  # type: ignore[comparison-overlap]
+
+
+def test_a_recording_that_lost_frames_tells_so_at_its_end(host: FakeHost, person: Person) -> None:
+    host.begun[0].lost_frames = 1200  # its person pressed Stop
+    person.tick(0.0)
+    person.tick(0.1)
+    host.begun[0].lost_at_end = 7
+    person.begin_anew()
+    until(lambda: len(host.begun) == 2 and person.is_idle, patience=PATIENCE)
+    assert [one.partition(" were lost")[0] for one in person.told] == [
+        "Recording incomplete: 1,200 frames", "Recording incomplete: 7 frames"
+    ]  # fmt: skip

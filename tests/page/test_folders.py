@@ -1,13 +1,13 @@
 """Objects' files are read below the operator's folders only."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from children import finished
 from hapticdb.errors import FileError, UsageError
 from hapticdb.page.folders import AllowedFolders
 
@@ -110,5 +110,5 @@ def test_the_folders_of_another_user_add_none(tmp_path: Path) -> None:
         "AllowedFolders.of_links(sys.argv[1:]); print('begun')"
     )
     command = [sys.executable, "-c", code, str(closed / "deep" / "part.stl")]
-    found = subprocess.run(command, capture_output=True, text=True, timeout=60.0, check=False)
+    found = finished(command)
     assert found.stdout == "begun\n", found.stderr

@@ -91,6 +91,7 @@ class Table:
             objects={part.id: part},
             stage=SimpleNamespace(diagonal=1.0),
             server=SimpleNamespace(get_clients=lambda: self.clients),
+            error_text=str,
             view=SimpleNamespace(
                 move=lambda _, place: self.previews.append(place),
                 put_back=lambda _: self.previews.append(None),

@@ -68,7 +68,7 @@ class Person(Browser):
         site = SimpleNamespace(
             host=host, workers=workers, objects={}, edits=None, browsers={0: self},
             view=SimpleNamespace(forget=lambda _: None), free_number=lambda _: None,
-            stage=SimpleNamespace(is_smooth=False, diagonal=1.0),
+            stage=SimpleNamespace(is_smooth=False, diagonal=1.0), error_text=str,
         )  # fmt: skip
         self.client, self.site = client, site  # type: ignore[assignment]
         self.scene = SimpleNamespace(hidden=())  # type: ignore[assignment]

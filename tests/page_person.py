@@ -73,10 +73,11 @@ class PagePerson:
 
     def put(self, uuid: str, value: object) -> None:
         """Send a value of a widget, whatever it is."""
-        sent(
-            self._connection,
-            {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}},
-        )
+        self.send({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
+
+    def send(self, message: dict[str, object]) -> None:
+        """Send any message."""
+        sent(self._connection, message)
 
     def put_everything(self) -> None:
         """Send every widget many values, as a client of one's own can."""

@@ -1,6 +1,7 @@
 """The page reads objects' files below the operator's folders only, and its errors name no place."""
 
 import shutil
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -8,9 +9,10 @@ import numpy as np
 import pytest
 
 import hapticdb
-from children import until
+from children import PATIENCE, until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
 from hapticdb.page.browser import Browser
+from hapticdb.page.panels.touch import PART
 from hapticdb.page.wording import FAULT, error_text
 from page_person import PagePerson
 from pages import page_of, two_parts
@@ -162,3 +164,37 @@ def test_addresses_and_folders_are_taken_out_of_errors(said: str, expected: str)
 def test_what_nobody_has_foreseen_is_told_without_its_words() -> None:
     assert error_text(RuntimeError("/srv/a: s3cret"), ()) == FAULT
     assert error_text(DatabaseError("busy"), ()) == "busy"
+
+
+def test_the_part_in_hand_is_the_only_one_that_is_unseen(scene: Path) -> None:
+    with page_of(scene) as (site, person, browser):
+        box = choose(browser, "box.stl")
+        person.press("Take this part in hand")
+        until(lambda: browser.taken == box)
+        ball = choose(browser, "ball.stl")
+        person.press("Take this part in hand")
+        until(lambda: (browser.scene.hidden, browser.taken) == ({ball}, ball))
+        tool = person.find("Tool")
+        until(lambda: (person.look(0.05), person.widgets[tool]["value"] == PART)[1])
+        person.press("Put it back")
+        until(lambda: (browser.scene.hidden, browser.taken) == (set(), None))
+        until(lambda: (person.look(0.05), person.widgets[tool]["value"] == "ball")[1])
+        person.choose("Tool", "peg")
+        until(lambda: browser.tool is site.tools[1])
+        assert person.told == []
+
+
+def test_voxels_are_not_drawn_after_their_box_was_cleared(scene: Path) -> None:
+    with page_of(scene) as (site, person, browser):
+        choose(browser, "box.stl")
+        is_cleared, is_done = threading.Event(), threading.Event()
+        site.database.ask(lambda _: is_cleared.wait(PATIENCE), str, browser.failed)
+        parts = browser.parts
+        person.choose("Voxels", value=True)
+        until(lambda: parts._voxel_box.value)
+        person.choose("Voxels", value=False)
+        until(lambda: not parts._voxel_box.value)
+        site.workers.submit(is_cleared.set)
+        site.database.ask(lambda _: None, lambda _: is_done.set(), browser.failed)
+        assert is_done.wait(PATIENCE)
+        assert parts._voxels is None

@@ -11,7 +11,16 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from children import until
-from hapticdb.page.link import LATE, Announced, PageLink, announcement
+from hapticdb.page.link import (
+    BREAKS_RULES,
+    LATE,
+    LONGEST_WORDS,
+    MOST_FAILED,
+    Announced,
+    PageLink,
+    announcement,
+)
+from serving import CAMERA, close_code, sent
 
 PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
 
@@ -101,3 +110,50 @@ def test_a_port_is_good_for_one_connection(
         assert first.recv(timeout=20.0)
         with connect(address, subprotocols=PROTOCOL) as second, pytest.raises(ConnectionClosed):
             second.recv(timeout=20.0)
+
+
+def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(
+    page: tuple[socket.socket, PageLink, viser.ViserServer],
+    caplog: pytest.LogCaptureFixture,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """Asyncio would write a traceback for each of them."""
+    ours, _, server = page
+    slider = server.gui.add_slider("slider", 0.0, 1.0, 0.1, 0.5)
+    vector = server.gui.add_vector3("vector", (0.0, 0.0, 0.0))
+    server.scene.on_click()(lambda _: None)
+    click = {"type": "ScenePointerMessage", "event_type": "click", "ray_origin": None,
+             "ray_direction": None, "screen_pos": [], "modifier": None}  # fmt: skip
+    update = {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid}
+    wrong = [
+        click,
+        update | {"updates": {"value": "x" * 1000 + "\n"}},
+        update | {"updates": {"value": None}},
+        update | {"uuid": vector._impl.uuid, "updates": {"value": None}},
+        update | {"uuid": vector._impl.uuid, "updates": {"value": ["a", "b", "c"]}},
+    ]
+    for _ in range(2):
+        sock = bound()
+        port = sock.getsockname()[1]
+        ours.sendall(announcement(port, "Guest 1", "viewer"))
+        assert said(ours)["word"] == "expected"
+        address = f"ws://127.0.0.1:{server.get_port()}"
+        sock.connect(("127.0.0.1", server.get_port()))
+        caplog.clear()
+        with connect(address, sock=sock, subprotocols=PROTOCOL) as browser:
+            assert said(ours)["word"] == "connected"
+            sent(browser, CAMERA)
+            until(lambda: bool(server.get_clients()))
+            for number in range(MOST_FAILED):
+                sent(browser, wrong[number % len(wrong)])
+            sent(browser, update | {"updates": {"value": 0.7}})
+            assert close_code(browser) == BREAKS_RULES
+        assert said(ours)["word"] == "closed"
+        until(lambda: not server.get_clients())
+        lines = [record.getMessage() for record in caplog.records if record.name != "websockets"]
+        assert len(lines) == MOST_FAILED
+        for record in caplog.records:
+            assert record.exc_info is None
+            assert "\n" not in record.getMessage()
+            assert len(record.getMessage()) < LONGEST_WORDS + 100
+    assert "Traceback" not in "".join(capfd.readouterr())

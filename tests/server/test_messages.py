@@ -17,6 +17,14 @@ GIZMO = {
     "position": [0.5, 0, 0],
     "owner": "3",
 }
+CLICK = {
+    "type": "ScenePointerMessage",
+    "event_type": "click",
+    "ray_origin": [0, 0, 1],
+    "ray_direction": [0, 0, -1],
+    "screen_pos": [[0.5, 0.5]],
+    "modifier": None,
+}
 VALUES = [True, 3, 0.5, "word", [1, 2.5], ["a", "b"], None]
 
 
@@ -24,7 +32,9 @@ def value(content: object) -> bytes:
     return encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": content}})
 
 
-@pytest.mark.parametrize("message", [CAMERA, GIZMO, {"type": "CommandTriggerMessage", "uuid": "a"}])
+@pytest.mark.parametrize(
+    "message", [CAMERA, GIZMO, CLICK, {"type": "CommandTriggerMessage", "uuid": "a"}]
+)
 def test_what_viser_sends_passes_with_the_same_content(message: dict[str, object]) -> None:
     passed = judged(encode(message), Role.EDITOR).passed
     assert passed is not None
@@ -82,6 +92,20 @@ def test_no_other_attribute_and_no_wild_value_passes(updates: dict[str, object])
 )
 def test_a_gizmo_with_wrong_fields_does_not_pass(change: dict[str, object]) -> None:
     assert judged(encode(GIZMO | change), Role.EDITOR) == Verdict(None, "malformed")
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"ray_origin": None},
+        {"ray_direction": None},
+        {"screen_pos": []},
+        {"screen_pos": [[0, 0]] * 5},
+        {"event_type": "rect-select", "screen_pos": [[0, 0], [1, 1]]},
+    ],
+)
+def test_a_click_has_a_ray_and_a_place(change: dict[str, object]) -> None:
+    assert judged(encode(CLICK | change), Role.EDITOR) == Verdict(None, "malformed")
 
 
 def test_a_viewer_moves_no_gizmo_and_a_toucher_does() -> None:

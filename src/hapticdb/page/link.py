@@ -10,22 +10,33 @@ The messages are lines of JSON on a socket pair that the page process inherits.
 
 import contextlib
 import json
+import logging
 import socket
 import threading
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 if TYPE_CHECKING:
     import viser
-    from viser.infra import WebsockClientConnection
+    from viser.infra import Message, WebsockClientConnection
 
+LOG = logging.getLogger("hapticdb.page")
 LONGEST_LINE = 4096
 """Most bytes of one message. A longer line means that something else writes there."""
 FORGOTTEN_AFTER = 256
 """Announcements that are kept without a connection. Larger: more memory for browsers that went away
 before they were connected."""
+LONGEST_WORDS = 200
+"""Letters of an error of viser in the log. Larger: more of what a client sent stands there."""
 LATE = 1013
 """WebSocket close code "try again later", for a connection that was not announced."""
+
+
+BREAKS_RULES = 1008
+"""WebSocket close code "policy violation"."""
+MOST_FAILED = 20
+"""Messages of one connection that viser cannot take in, such as a text for a slider, before it is
+closed. Larger: such a client fills the log longer."""
 
 
 class PageRequest(NamedTuple):
@@ -82,19 +93,30 @@ class PageLink:
         self._thread.start()
 
     def guard(self, server: "viser.ViserServer") -> None:
-        """Close each connection to a viser server that was not announced."""
+        """Close each connection to a viser server that was not announced, or sends nonsense.
+
+        A message that viser fails at is one line of the log, whatever viser raises.
+        """
         inner = server._websock_server  # noqa: SLF001 - viser shows connections nowhere else
+        live_connections = inner._live_connections  # noqa: SLF001 - likewise
+        nonsense = _Nonsense(live_connections)
 
         async def check(connection: "WebsockClientConnection") -> None:
             client = int(connection.client_id)
-            live = inner._live_connections[client]  # noqa: SLF001 - likewise
+            live = live_connections[connection.client_id]
             port = int(live.remote_address[1])
             if not self._let_in(client, port):
                 self.tell("refused", port)
                 await live.close(LATE, "connect through the server")
+            nonsense.contain(connection)
 
+        def leave(connection: "WebsockClientConnection") -> None:
+            nonsense.forget(int(connection.client_id))
+            self._let_out(connection)
+
+        nonsense.contain(inner)
         inner.on_client_connect(check)
-        inner.on_client_disconnect(self._let_out)
+        inner.on_client_disconnect(leave)
 
     def announced(self, client_id: int) -> Announced:
         """Return who a client of the guarded server is.
@@ -137,6 +159,47 @@ class PageLink:
                     while len(self._expected) > FORGOTTEN_AFTER:
                         self._expected.pop(next(iter(self._expected)))
                 self.tell("expected", message["port"])
+
+
+class _Nonsense:
+    """Messages that viser fails at: each is one line of the log, and too many end a connection.
+
+    Parameters
+    ----------
+    connections : mapping of int to connection
+        All that are open, by their clients.
+    """
+
+    def __init__(self, connections: Mapping[Any, Any]) -> None:
+        self._connections = connections
+        self._failed: dict[int, int] = {}
+
+    def contain(self, place: Any) -> None:  # noqa: ANN401 - the server, or a connection
+        """Let nothing out that viser raises where it handles a message."""
+        handle = place._handle_incoming_message  # noqa: SLF001 - viser has no public place
+
+        async def handled(client_id: int, message: "Message") -> None:
+            try:
+                await handle(client_id, message)
+            except Exception as error:  # noqa: BLE001 - viser checks little of what it is sent
+                await self._fail(int(client_id), message, error)
+
+        place._handle_incoming_message = handled  # noqa: SLF001 - likewise
+
+    def forget(self, client: int) -> None:
+        """Forget a client that has gone."""
+        self._failed.pop(client, None)
+
+    async def _fail(self, client: int, message: "Message", error: Exception) -> None:
+        live = self._connections.get(client)
+        failed = self._failed.get(client, 0) + 1
+        if live is None or failed > MOST_FAILED:
+            return  # it has gone, or is being closed
+        self._failed[client] = failed
+        words = " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_WORDS]
+        LOG.warning("a browser's %s cannot be taken in: %s", type(message).__name__, words)
+        if failed == MOST_FAILED:
+            await live.close(BREAKS_RULES, "too many messages that mean nothing here")
 
 
 def line(message: Mapping[str, object]) -> bytes:

@@ -54,10 +54,10 @@ class ViewerCameraMessage(_Message, tag=True):
 class ScenePointerMessage(_Message, tag=True):
     """A click into the scene."""
 
-    event_type: Literal["click", "rect-select"]
-    ray_origin: Three | None
-    ray_direction: Three | None
-    screen_pos: Annotated[list[tuple[Real, Real]], Meta(max_length=4)]
+    event_type: Literal["click"]
+    ray_origin: Three
+    ray_direction: Three
+    screen_pos: Annotated[list[tuple[Real, Real]], Meta(min_length=1, max_length=4)]
     modifier: Modifier = None
 
 

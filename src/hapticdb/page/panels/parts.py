@@ -192,7 +192,7 @@ class PartsPanel:
         browser.scene.highlight(browser.chosen)
         self._say_chosen()
         self.moving.follow()
-        if self._voxels is not None:
+        if self._voxel_box.value:
             self._draw_voxels()
 
     def _chosen(self) -> list[Object]:
@@ -255,13 +255,18 @@ class PartsPanel:
         if checks.flag_of(event.target.value, "voxels"):
             self._only()
             self._draw_voxels()
-        elif self._voxels is not None:
-            self._voxels.remove()
-            self._voxels = None
+        else:
+            self._clear_voxels()
+
+    def _clear_voxels(self) -> None:
+        drawn, self._voxels = self._voxels, None
+        if drawn is not None:
+            drawn.remove()
 
     def _draw_voxels(self) -> None:
         chosen = self._chosen()
         if len(chosen) != 1:
+            self._clear_voxels()
             return
         obj = chosen[0]
 
@@ -269,11 +274,18 @@ class PartsPanel:
             found = env.voxels(obj.id)
             return env.grid.centers(found[:: -(-len(found) // MOST_VOXELS)])
 
+        def is_wanted() -> bool:
+            return bool(self._voxel_box.value) and self._browser.chosen == (obj.id,)
+
         def draw(places: Floats) -> None:
+            if not is_wanted():  # the box was cleared, or another part chosen, meanwhile
+                return
             self._voxels = self._client.scene.add_point_cloud(
                 "/voxels", places, colours.of_object(obj.id), point_shape="square",
                 point_size=0.9 * self._browser.site.stage.voxel_size, precision="float32",
             )  # fmt: skip
+            if not self._voxel_box.value:
+                self._clear_voxels()
 
         self._browser.site.database.ask(centers, draw, self._browser.failed)
 
@@ -289,12 +301,15 @@ class PartsPanel:
             return env.shell(obj.id, points=tools.PART_POINTS, inset=inset)
 
         def hold(found: PointShell) -> None:
-            browser.taken = obj.id
+            before, browser.taken = browser.taken, obj.id
+            if before is not None and before != obj.id:
+                browser.scene.show((before,))
             middle = tools.middle_of(found)
             browser.take_in_hand(
                 tools.from_shell(obj.name, found), np.array([*middle, 1.0, 0.0, 0.0, 0.0])
             )
             browser.scene.hide((obj.id,))
+            browser.touch.show_tool()
             self._back.visible = True
 
         browser.site.database.ask(shell, hold, browser.failed)
@@ -307,6 +322,7 @@ class PartsPanel:
         browser.taken = None
         self._back.visible = False
         browser.take_in_hand(browser.site.tools[0])
+        browser.touch.show_tool()
 
     # -- distances ---------------------------------------------------------------------------
 

@@ -31,6 +31,8 @@ SECONDS = 10.0
 """Seconds that the plots show."""
 SOFTEST, STIFFEST = 50.0, 3000.0
 """Range of the stiffness, N/m. Larger: harder surfaces, and forces that reach the cap sooner."""
+PART = "(a part)"
+"""The tool in the list while a part of the scene is held."""
 SCALES = (0.05, 20.0)
 """Range of the scale, times the one at the start. Larger: smaller or larger hands."""
 
@@ -114,11 +116,16 @@ class TouchPanel:
 
     def _choose_tool(self, event: "GuiEvent[Any]") -> None:
         browser = self._browser
+        if event.client is None:  # set by the page
+            return
         names = [tool.name for tool in browser.site.tools]
+        if event.target.value == PART and not self._is_of_the_list:
+            return
         name = checks.choice_of(event.target.value, names, "a tool")
         if browser.taken is not None:
             browser.parts.put_back()
         browser.take_in_hand(browser.site.tools[names.index(name)], browser.hand)
+        self.show_tool()
 
     def _go_home(self, _: object) -> None:
         browser = self._browser
@@ -147,6 +154,22 @@ class TouchPanel:
             self._browser.begin_anew()
 
     # -- what is shown -----------------------------------------------------------------------
+
+    @property
+    def _is_of_the_list(self) -> bool:
+        """Whether the tool is one of the site's, and no part."""
+        return self._browser.tool in self._browser.site.tools
+
+    def show_tool(self) -> None:
+        """Show which tool is in the hand, so that each other one can be chosen."""
+        if not hasattr(self, "_tool"):
+            return
+        browser = self._browser
+        names = [tool.name for tool in browser.site.tools]
+        options = names if self._is_of_the_list else [*names, PART]
+        if list(self._tool.options) != options:
+            self._tool.options = options
+        put(self._tool, browser.tool.name if self._is_of_the_list else PART)
 
     def show_place(self) -> None:
         """Show where the hand is."""

@@ -20,9 +20,10 @@ def browser_of(role: str) -> tuple[Browser, list[tuple[str, str]]]:
         told.append((title, text))
 
     browser.visitor = Visitor("Ada", role)
-    browser.client = SimpleNamespace(add_notification=note)  # type: ignore[assignment]
+    browser.client = SimpleNamespace(client_id=3, add_notification=note)  # type: ignore[assignment]
     browser.site = SimpleNamespace(  # type: ignore[assignment]
-        error_text=lambda error: error_text(error, ())
+        error_text=lambda error: error_text(error, ()),
+        server=SimpleNamespace(get_clients=lambda: {3: browser.client}),
     )
     browser._is_closed = False
     return browser, told
@@ -71,3 +72,18 @@ def test_a_recordings_name_never_leads_out_of_its_folder(tmp_path: Path, name: s
         checked_file(tmp_path, name)
     with pytest.raises(UsageError, match="--recordings"):
         checked_file(None, "a.hdbrec")
+
+
+def test_a_fault_of_a_browser_that_has_gone_is_no_traceback(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    browser, told = browser_of("viewer")
+    browser.site.server.get_clients = dict
+
+    def fail(_: object) -> None:
+        raise RuntimeError("no such client")
+
+    with caplog.at_level("INFO"):
+        browser.guarded("viewer", fail)("event")
+    assert not told
+    assert [(one.levelname, one.exc_info) for one in caplog.records] == [("INFO", None)]

@@ -123,10 +123,18 @@ class Browser:
             except HapticDBError as error:
                 self.failed(error)
             except Exception as error:
+                if self.has_gone:  # viser fails at what is shown to nobody
+                    LOG.info("a callback of a browser that has gone failed: %r", error)
+                    return
                 LOG.exception("a callback of the page failed")
                 self.failed(error)
 
         return call
+
+    @property
+    def has_gone(self) -> bool:
+        """Whether the connection was lost, which viser may tell later."""
+        return self.client.client_id not in self.site.server.get_clients()
 
     def tell(self, title: str, text: str, *, is_good: bool = False) -> None:
         """Show a notification in this browser alone."""

@@ -100,7 +100,7 @@ class MovingControls:
                 self._gizmo = self._held = None
             chosen = browser.chosen
             obj = browser.site.objects.get(chosen[0]) if len(chosen) == 1 else None
-            if not self._moves.value or obj is None:
+            if not self._moves.value or obj is None or not browser.visitor.may("editor"):
                 return
             start = np.eye(4)
             start[:3, 3] = obj.bounds.mean(axis=0)
@@ -152,18 +152,13 @@ class MovingControls:
                 if event.phase != "end":  # everyone sees where it goes
                     place = held.way_to(pose) @ held.object.transform
                     self._browser.site.view.move(held.object.id, place)
-                elif self._has_gone():
+                elif self._browser.has_gone:  # viser ends the drags of a lost browser, too
                     self.leave()
                 else:
                     self._is_dragged = False
                     self._let_go(held, pose)
 
         self._browser.guarded("editor", act)(event)
-
-    def _has_gone(self) -> bool:
-        """Whether the connection was lost: viser ends the drags of a lost browser, too."""
-        browser = self._browser
-        return browser.client.client_id not in browser.site.server.get_clients()
 
     def _let_go(self, held: HeldPart, pose: NDArray[np.float64]) -> None:
         """Write a move that ends at a pose; one that follows another is based on its result."""

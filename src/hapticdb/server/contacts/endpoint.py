@@ -17,7 +17,13 @@ from typing import Any
 from starlette.responses import PlainTextResponse
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from hapticdb.errors import DatabaseError, HapticDBError, ProtocolError, UsageError
+from hapticdb.errors import (
+    DatabaseError,
+    HapticDBError,
+    OtherVersionError,
+    ProtocolError,
+    UsageError,
+)
 from hapticdb.hosting.contact_source import RATE, ContactSource
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.contacts import (
@@ -126,6 +132,8 @@ class Contacts:
         self.n_clients += 1
         try:
             await self._serve(websocket, first)
+        except OtherVersionError as error:
+            await self._refuse(websocket, CloseCode.VERSION, str(error))
         except (ProtocolError, UsageError) as error:
             await self._refuse(websocket, CloseCode.MALFORMED, str(error))
         except TimeoutError:

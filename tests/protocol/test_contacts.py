@@ -1,6 +1,7 @@
 """Messages of contact proxies: what is packed is read again, and nothing malformed is accepted."""
 
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -121,7 +122,8 @@ def test_wish_and_terms_are_read_as_they_were_packed() -> None:
 )
 def test_terms_have_numbers_in_their_ranges(name: str, value: float, is_read: bool) -> None:
     terms = ProxyTerms("a", (1.0, -2.0, 3.0), 0.1, 1e3, 2.0, 7.0, 0.5, 5e4, 1e-3, 1.5e-3, 0.01)
-    message = pack_terms(terms._replace(**{name: value}))
+    given: dict[str, Any] = {name: value}
+    message = pack_terms(terms._replace(**given))
     if is_read:
         assert getattr(unpack_terms(message), name) == value
     else:

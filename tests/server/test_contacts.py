@@ -16,6 +16,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.frames import Close
 from websockets.sync.client import ClientConnection, connect
+from websockets.sync.connection import Connection
 from websockets.typing import Origin
 
 from children import child, joined
@@ -113,7 +114,7 @@ def test_a_malformed_message_closes_with_a_plain_reason(
     assert reason in frame.reason
 
 
-def closed_by(connection: ClientConnection) -> Close:
+def closed_by(connection: Connection) -> Close:
     """What the server says at a connection's end, after the messages before it."""
     with pytest.raises(ConnectionClosed) as closed:
         deque(iter(lambda: connection.recv(30), None), maxlen=0)

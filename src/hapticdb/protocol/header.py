@@ -59,9 +59,8 @@ class Kind(IntEnum):
 class Refusal(IntEnum):
     """Why a request was not answered.
 
-    USAGE : it cannot be asked for; NO_OBJECT : kept free, a question for an object that is not there
-    has an empty answer; AWAY : the server's database cannot be reached now; DAMAGED : the
-    environment is damaged; TOO_MUCH : over a limit; OUTDATED : the snapshot has ended, or the
+    USAGE : it cannot be asked for; NO_OBJECT : kept free, since what is not there has an empty
+    answer; AWAY : the server's database cannot be reached now; DAMAGED : the environment is damaged; TOO_MUCH : over a limit; OUTDATED : the snapshot has ended, or the
     revision asked for is not the newest; BUSY : too many others ask; FAILED : anything else.
     """
 

@@ -12,7 +12,6 @@
     ├── ObjectNotFoundError (LookupError)     no object of that id
     ├── DeviceError (OSError)                 a haptic device that is not there, or went away
     ├── ProtocolError (ConnectionError)       a message that is none, or breaks a limit
-    │   └── OtherVersionError                 a message of another version of the protocol
     └── DatabaseError                         the database cannot do what was asked
         ├── EnvironmentNotFoundError (FileNotFoundError)
         ├── EnvironmentExistsError (FileExistsError)
@@ -70,10 +69,6 @@ class DeviceError(HapticDBError, OSError):
 
 class ProtocolError(HapticDBError, ConnectionError):
     """A message of another machine that cannot be decoded or breaks a limit."""
-
-
-class OtherVersionError(ProtocolError):
-    """A message of another version of the protocol."""
 
 
 class DatabaseError(HapticDBError):

@@ -4,7 +4,7 @@ import struct
 from enum import IntEnum
 from typing import NamedTuple
 
-from hapticdb.errors import OtherVersionError, ProtocolError
+from hapticdb.errors import ProtocolError
 
 MAGIC = b"hd"
 """First two bytes of each message."""
@@ -60,8 +60,9 @@ class Refusal(IntEnum):
     """Why a request was not answered.
 
     USAGE : it cannot be asked for; NO_OBJECT : kept free, since what is not there has an empty
-    answer; AWAY : the server's database cannot be reached now; DAMAGED : the environment is damaged; TOO_MUCH : over a limit; OUTDATED : the snapshot has ended, or the
-    revision asked for is not the newest; BUSY : too many others ask; FAILED : anything else.
+    answer; AWAY : the server's database cannot be reached now; DAMAGED : the environment is
+    damaged; TOO_MUCH : over a limit; OUTDATED : the snapshot has ended, or the revision asked for
+    is not the newest; BUSY : too many others ask; FAILED : anything else.
     """
 
     USAGE = 1
@@ -83,6 +84,10 @@ class CloseCode(IntEnum):
     IDLE = 4408
     REPLACED = 4410
     FAILED = 4500
+
+
+class OtherVersionError(ProtocolError):
+    """A message of another version of the protocol."""
 
 
 class MessageHeader(NamedTuple):

@@ -17,13 +17,7 @@ from typing import Any
 from starlette.responses import PlainTextResponse
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
-from hapticdb.errors import (
-    DatabaseError,
-    HapticDBError,
-    OtherVersionError,
-    ProtocolError,
-    UsageError,
-)
+from hapticdb.errors import DatabaseError, HapticDBError, ProtocolError, UsageError
 from hapticdb.hosting.contact_source import RATE, ContactSource
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.contacts import (
@@ -34,7 +28,7 @@ from hapticdb.protocol.contacts import (
     unpack_hand,
     unpack_wish,
 )
-from hapticdb.protocol.header import CloseCode
+from hapticdb.protocol.header import CloseCode, OtherVersionError
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Role
 from hapticdb.server.limits import TokenBucket

@@ -30,7 +30,7 @@ CAMERA = {
 """The first message of viser's client."""
 
 
-WRONG = (
+WRONG: tuple[object, ...] = (
     True, False, 0, 1, -1, 1.0, -1e9, "", "x", "Take out", None, [], [0.0], [0.0, 0.0, 0.1],
     ["a", "b", "c"], [True, 1], [""] * 64,
 )  # fmt: skip

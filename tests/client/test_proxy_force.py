@@ -134,3 +134,17 @@ def test_damping_acts_along_the_force_and_never_pulls() -> None:
     assert force.wrench(hand(-2e-3), away, 0.2)[2] == 0.0
     assert force.wrench(hand(-2e-3), -0.01 * away, 0.2)[2] == pytest.approx(full + 1.0)
     assert force.wrench(hand(-2e-3), -away, 0.2)[2] == pytest.approx(2.0 * full)
+
+
+def test_damping_leaves_the_torque_as_it_is() -> None:
+    """The handle is half a voxel beside the tool's centre, so the force has a moment about it."""
+    terms = TERMS._replace(center=(SIZE / 2.0, 0.0, 0.0))
+    plain, damped = ProxyForce(terms), ProxyForce(terms, damping=100.0)
+    for force in (plain, damped):
+        fed(force, 0.2, -2e-3)
+    down = np.array([0.0, 0.0, -0.01, 0.0, 0.0, 0.0])
+    expected = plain.wrench(hand(-2e-3), down, 0.2)
+    found = damped.wrench(hand(-2e-3), down, 0.2)
+    assert found[2] == pytest.approx(expected[2] + 1.0)
+    assert abs(expected[4]) > 1e-3
+    assert found[3:] == pytest.approx(expected[3:])

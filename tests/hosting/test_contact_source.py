@@ -10,14 +10,17 @@ from numpy.typing import NDArray
 
 from hapticdb.bench.feel.couplings import SmoothHand, Terms, posed, straight
 from hapticdb.bench.feel.ground import Ground
-from hapticdb.bench.feel.scenes import convex_edge, slope_axes
+from hapticdb.bench.feel.scenes import convex_edge, plane, slope_axes
 from hapticdb.bench.feel.sliding import SPEED, way_round_edge
 from hapticdb.bench.feel.tools import ball
 from hapticdb.client.proxy_force import ProxyForce
 from hapticdb.hosting.contact_source import ContactSource
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.contacts import (
+    IS_LOOSE,
     IS_WAITING,
     HandState,
+    ProxyState,
     ProxyWish,
     pack_proxy,
     unpack_proxy,
@@ -54,13 +57,21 @@ def round_the_edge(folder: Path) -> tuple[str, Floats, Floats]:
     return str(url), places, forces
 
 
+def first_proxy(source: ContactSource, place: Floats) -> ProxyState:
+    """Proxy of a hand at rest (3,), as soon as the cells there are in memory."""
+    until = time.monotonic() + 60.0
+    while True:
+        proxy = source.proxy(HandState(1, 0.0, place, UPRIGHT, np.zeros(6)))
+        if not proxy.flags & IS_WAITING:
+            return proxy
+        assert time.monotonic() < until
+        time.sleep(0.01)
+
+
 def felt(source: ContactSource, places: Floats, delay: int) -> Floats:
     """Forces (M, 3) of proxies that arrive `delay` milliseconds after their hand."""
     force, near = ProxyForce(source.terms), np.zeros_like(places)
-    until = time.monotonic() + 60.0
-    while source.proxy(HandState(1, 0.0, places[0], UPRIGHT, np.zeros(6))).flags & IS_WAITING:
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    first_proxy(source, places[0])
     rest = 100  # milliseconds at the first place: proxies blend in
     path = np.concatenate([np.repeat(places[:1], rest, axis=0), places])
     coming: deque[tuple[int, bytes]] = deque()
@@ -94,3 +105,22 @@ def test_proxies_go_round_a_convex_edge_as_the_coupling_does(
     force = float(np.sqrt((forces**2).sum(axis=1).mean()))
     assert force > 1.0
     assert error < bound * force
+
+
+def test_a_tip_in_a_narrow_gap_gets_proxies_that_its_client_reads(tmp_path: Path) -> None:
+    """In the middle, nearer than the onset to both sheets, no gradient tells which is nearer."""
+    gap = plane("gap", np.eye(3), layers=(-1.45, 1.45))
+    with Ground.of_scenes(tmp_path, [gap], SIZE, distances=True) as ground:
+        middle = ground.origins["gap"]
+    (url,) = tmp_path.glob("*.db")
+    tip = PointShell(np.zeros((1, 3)), np.eye(3)[2:], np.zeros(3), is_closed=False)
+    with (
+        ResidentCells(str(url), budget_bytes=64 << 20, distances=True) as cells,
+        ContactSource(cells, tip, ProxyWish()) as source,
+    ):
+        for height in np.linspace(0.0, 0.1, 10):
+            place = middle + np.array([0.0, 0.0, height * SIZE])
+            read = unpack_proxy(pack_proxy(first_proxy(source, place)))
+    assert not read.flags & IS_LOOSE
+    assert read.trust == 0.0
+    assert len(read.planes) == 0

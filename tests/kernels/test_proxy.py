@@ -256,3 +256,16 @@ def test_a_proxy_goes_round_a_convex_edge(speed: float, bound: float) -> None:
     force = float(np.sqrt((exact**2).sum(axis=1).mean()))
     assert force > 0.8 * STIFFNESS * depth
     assert error < bound * force
+
+
+def test_a_depth_beyond_the_onset_gives_no_nan() -> None:
+    """Only a wrong server sends one: there is no surface behind the surface."""
+    field = field_of(plane(UP), SIZE)
+    model = model_of(pressed(field, POINT, np.array([0, 0, ONSET - 2e-3]), 4e-3 * np.eye(3)[2]))
+    at = model["hand"].copy()
+    for depth in np.linspace(0.5, 4.0, 8) * SIZE:
+        model["depths"][0], model["bends"][0] = depth, 4.0 / SIZE
+        for by in ([0.0, 0.0, 0.0], [0.01, 0.0, 0.0], [0.01, 0.0, 0.008], [-0.02, 0.01, 0.02]):
+            moved = at.copy()
+            moved[:3] += by
+            assert np.isfinite(evaluated(model, moved)).all()

@@ -122,8 +122,10 @@ def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(
     slider = server.gui.add_slider("slider", 0.0, 1.0, 0.1, 0.5)
     vector = server.gui.add_vector3("vector", (0.0, 0.0, 0.0))
     server.scene.on_click()(lambda _: None)
-    click = {"type": "ScenePointerMessage", "event_type": "click", "ray_origin": None,
-             "ray_direction": None, "screen_pos": [], "modifier": None}  # fmt: skip
+    click: dict[str, object] = {
+        "type": "ScenePointerMessage", "event_type": "click", "ray_origin": None,
+        "ray_direction": None, "screen_pos": [], "modifier": None,
+    }  # fmt: skip
     update = {"type": "GuiUpdateMessage", "uuid": slider._impl.uuid}
     wrong = [
         click,

@@ -78,7 +78,7 @@ def test_a_fault_of_a_browser_that_has_gone_is_no_traceback(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     browser, told = browser_of("viewer")
-    browser.site.server.get_clients = dict
+    browser.site.server.get_clients = dict  # type: ignore[method-assign]
 
     def fail(_: object) -> None:
         raise RuntimeError("no such client")

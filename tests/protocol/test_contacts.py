@@ -1,6 +1,7 @@
 """Messages of contact proxies: what is packed is read again, and nothing malformed is accepted."""
 
 import struct
+from typing import Any
 
 import numpy as np
 import pytest
@@ -106,6 +107,47 @@ def test_wish_and_terms_are_read_as_they_were_packed() -> None:
     assert unpack_wish(pack_wish(wish)) == wish
     terms = ProxyTerms("a", (1.0, -2.0, 3.0), 0.1, 1e3, 2.0, 7.0, 0.5, 5e4, 1e-3, 1.5e-3, 0.01)
     assert unpack_terms(pack_terms(terms)) == terms
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "is_read"),
+    [
+        ("contact", 1.25e6, True),  # 1000 N/m at a scale of 0.04
+        ("contact", 3.4e7, True),  # 7 N in voxels of 1 um
+        ("contact", 2e12, False),
+        ("contact", np.nan, False),
+        ("cap", 2e6, False),
+        ("period", 0.0, False),
+    ],
+)
+def test_terms_have_numbers_in_their_ranges(name: str, value: float, is_read: bool) -> None:
+    terms = ProxyTerms("a", (1.0, -2.0, 3.0), 0.1, 1e3, 2.0, 7.0, 0.5, 5e4, 1e-3, 1.5e-3, 0.01)
+    given: dict[str, Any] = {name: value}
+    message = pack_terms(terms._replace(**given))
+    if is_read:
+        assert getattr(unpack_terms(message), name) == value
+    else:
+        with pytest.raises(ProtocolError, match=f"a WELCOME whose {name} is .* above 0"):
+            unpack_terms(message)
+
+
+@pytest.mark.parametrize("clock", [2e6, -2e6, 1e9])
+def test_a_clock_may_have_run_for_long(clock: float) -> None:
+    """2e6 s are three weeks of uptime."""
+    hand = HandState(1, clock, np.zeros(3), np.eye(4)[0], np.zeros(6))
+    assert unpack_hand(pack_hand(hand)).clock == clock
+    proxy = ProxyState(**{**vars(proxy_of()), "clock": clock, "echo_clock": clock})
+    found = unpack_proxy(pack_proxy(proxy))
+    assert (found.clock, found.echo_clock) == (clock, clock)
+
+
+@pytest.mark.parametrize("clock", [np.nan, np.inf, -np.inf])
+def test_a_clock_that_is_not_finite_is_refused(clock: float) -> None:
+    with pytest.raises(ProtocolError, match="clock"):
+        unpack_hand(pack_hand(HandState(1, clock, np.zeros(3), np.eye(4)[0], np.zeros(6))))
+    for name in ("clock", "echo_clock", "kept"):
+        with pytest.raises(ProtocolError, match="clock"):
+            unpack_proxy(pack_proxy(ProxyState(**{**vars(proxy_of()), name: clock})))
 
 
 @given(st.one_of(st.binary(max_size=700), hands.map(pack_hand), proxies.map(pack_proxy)), st.data())

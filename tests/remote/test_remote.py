@@ -16,11 +16,13 @@ from hapticdb.errors import (
     AccessError,
     ConnectionLostError,
     OutdatedError,
+    ProtocolError,
     ReadOnlyError,
     UsageError,
 )
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.protocol import cells as bodies
+from hapticdb.protocol.fields import FieldsRead, FieldsWritten
 from hapticdb.protocol.header import CloseCode, Kind, MessageHeader, header_of
 from hapticdb.store.connect import create_store, open_store
 from hapticdb.store.remote import store as remote_store
@@ -251,6 +253,21 @@ def test_rows_beyond_an_answer_are_continued(device_server: DeviceServer, tmp_pa
                 for found, wanted in zip(rows[:2], expected[:2], strict=True):
                     np.testing.assert_array_equal(found, wanted)
             assert remote.count(expected.keys.copy(), expected.keys.copy()) == len(expected)
+
+
+@pytest.mark.parametrize("resume", [0, 3, 5])
+def test_an_answer_that_leads_nowhere_is_refused(
+    remote: RemoteStore, monkeypatch: pytest.MonkeyPatch, resume: int
+) -> None:
+    """A server that answers no rows, and that it goes on where the question began or before."""
+    none = np.zeros(0, np.int64)
+    body = bodies.RowsBody(none, none, np.zeros(0, np.uint8), resume=resume).write(FieldsWritten())
+    monkeypatch.setattr(remote, "_ask", lambda *_, **__: FieldsRead(body.joined(), 0))
+    keys = np.array([5, 9])
+    with pytest.raises(ProtocolError, match="leads nowhere"):
+        remote.scan(keys, keys + 1)
+    with pytest.raises(ProtocolError, match="leads nowhere"):
+        remote.lookup(keys)
 
 
 def test_a_server_that_comes_back_is_used_again(environment: str, tmp_path: Path) -> None:

@@ -14,7 +14,9 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import connect
+from websockets.frames import Close
+from websockets.sync.client import ClientConnection, connect
+from websockets.sync.connection import Connection
 from websockets.typing import Origin
 
 from children import child, joined
@@ -26,6 +28,9 @@ from hapticdb.client.contact_proxy import ContactProxy
 from hapticdb.errors import AccessError, ConnectionLostError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.protocol.contacts import unpack_proxy
+from hapticdb.server.contacts import endpoint
+from hapticdb.server.running import Serving
+from serving import TOKENS, running, urls
 
 
 @pytest.fixture(scope="module")
@@ -88,25 +93,55 @@ def test_a_page_of_a_browser_is_refused(served: Served) -> None:
 
 
 @pytest.mark.parametrize(
-    ("message", "reason"),
+    ("message", "code", "reason"),
     [
-        (b"", "a header has 16"),
-        (b"xx" + bytes(98), "does not begin with 'hd'"),
-        (b"hd\x01\x80" + bytes(40), "inside a field"),
-        ("text", "a text message"),
+        (b"", 4400, "a header has 16"),
+        (b"xx" + bytes(98), 4400, "does not begin with 'hd'"),
+        (b"hd\x01\x80" + bytes(40), 4400, "inside a field"),
+        ("text", 4400, "a text message"),
+        (bytes(1025), 4400, "at most 1024"),
+        (bytes(5000), 1009, ""),  # more than the web server of this test reads
+        (b"hd\x02\x80" + bytes(96), 4426, "version 2"),
     ],
 )
 def test_a_malformed_message_closes_with_a_plain_reason(
-    served: Served, message: bytes | str, reason: str
+    served: Served, message: bytes | str, code: int, reason: str
 ) -> None:
     with granted(served) as connection:
         connection.send(message)
-        with pytest.raises(ConnectionClosed) as closed:
-            connection.recv(30)
-    frame = closed.value.rcvd
-    assert frame is not None
-    assert frame.code == 4400
+        frame = closed_by(connection)
+    assert frame.code == code
     assert reason in frame.reason
+
+
+def closed_by(connection: Connection) -> Close:
+    """What the server says at a connection's end, after the messages before it."""
+    with pytest.raises(ConnectionClosed) as closed:
+        deque(iter(lambda: connection.recv(30), None), maxlen=0)
+    assert closed.value.rcvd is not None
+    return closed.value.rcvd
+
+
+def test_the_first_message_must_come_and_be_of_this_version(
+    environment: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the server that people start; it tells when it ends, too."""
+    monkeypatch.setattr(endpoint, "FIRST_WITHIN", 0.3)
+    shown = {"Authorization": "Bearer a-token-for-toucher"}
+    with running(Serving(urls(environment), tokens=TOKENS, page="viser_page:work")) as server:
+        address = f"ws://{server.place}/device/contacts"
+
+        def reached(path: str = address) -> ClientConnection:
+            return connect(path, additional_headers=shown, proxy=None, compression=None)
+
+        with reached() as silent:
+            assert closed_by(silent).code == 4408
+        with reached() as talking:
+            talking.send("text")
+            assert closed_by(talking).code == 4400
+        last = reached(f"ws://{server.place}/device/cells")
+    with last:
+        assert closed_by(last).code in {1001, 1012}
 
 
 @pytest.mark.parametrize("seen", [0, 0xFFFFFFFF])
@@ -188,11 +223,7 @@ def test_a_client_that_sends_nothing_is_dropped(tmp_path: Path) -> None:
     with serving(tmp_path, idle=0.5) as server:
         with granted(server) as connection:
             connection.send(hand_at(server, 1))
-            with pytest.raises(ConnectionClosed) as closed:
-                deque(iter(lambda: connection.recv(30), None), maxlen=0)  # proxies come first
-            frame = closed.value.rcvd
-            assert frame is not None
-            assert frame.code == 4408
+            assert closed_by(connection).code == 4408
         with ContactProxy(server.url()) as proxy:  # its place is free
             pressed(server, proxy)
 

@@ -8,18 +8,21 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from children import joined, until
+from children import PATIENCE, joined, until
 from contact_hands import DEPTH, STILL, Served, falls_to_zero, pressed, serving, started
 from hapticdb.client import contact_link, contact_proxy
 from hapticdb.client.contact_proxy import ContactProxy
-from hapticdb.errors import ConnectionLostError, ProtocolError
+from hapticdb.errors import ConnectionLostError, ProtocolError, UsageError
 from hapticdb.protocol.contacts import ProxyTerms, pack_terms
+
+TERMS = ProxyTerms("a", (0.0, 0.0, 0.0), 0.01, 1000.0, 0.1, 7.0, 0.07, 5e4, 0.005, 0.0075, 0.01)
 
 
 @pytest.fixture
@@ -119,9 +122,43 @@ def test_a_server_that_never_grants_a_tool_is_given_up(monkeypatch: pytest.Monke
         ContactProxy(url)
 
 
+@pytest.mark.parametrize("damping", [-1.0, np.nan, np.inf])
+def test_a_wrong_damping_is_refused_before_anything_is_connected(damping: float) -> None:
+    with pytest.raises(UsageError, match="give 0 or more"):
+        ContactProxy("ws://127.0.0.1:9", damping=damping)  # where no server is
+
+
+def test_a_connection_that_is_made_while_the_proxy_closes_is_closed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[contact_link.ContactLink] = []
+    is_trying, may_go_on = threading.Event(), threading.Event()
+
+    def slow(url: str, *wish: Any) -> contact_link.ContactLink:  # noqa: ANN401 - as `connect`
+        is_trying.set()
+        assert may_go_on.wait(PATIENCE)
+        made.append(contact_link.connect(url, *wish))
+        return made[-1]
+
+    monkeypatch.setattr(contact_proxy, "RECONNECT_EVERY", 0.01)
+    with stalling(lambda c: c.send(pack_terms(TERMS))) as url:
+        proxy = ContactProxy(url)
+        monkeypatch.setattr(contact_proxy, "connect", slow)
+        assert proxy._link is not None
+        proxy._link.close()
+        assert is_trying.wait(PATIENCE)
+        monkeypatch.setattr(contact_proxy, "PATIENCE", 0.01)  # `close` waits no longer
+        proxy.close()
+        may_go_on.set()
+        for thread in proxy._threads:
+            joined(thread)
+        (link,) = made
+        with pytest.raises(ConnectionLostError):
+            link.receive()
+
+
 def test_without_any_proxy_there_is_no_force() -> None:
-    terms = ProxyTerms("a", (0.0, 0.0, 0.0), 0.01, 1000.0, 0.1, 7.0, 0.07, 5e4, 0.005, 0.0075, 0.01)
-    with stalling(lambda c: c.send(pack_terms(terms))) as url, ContactProxy(url) as proxy:
+    with stalling(lambda c: c.send(pack_terms(TERMS))) as url, ContactProxy(url) as proxy:
         began = time.monotonic()
         while time.monotonic() < began + 0.5:
             assert not proxy.wrench(np.eye(4), STILL).any()

@@ -8,6 +8,7 @@ The network has threads of its own, so `wrench` never waits: it evaluates the ne
 hand is now. If the server is late, stops or vanishes, the force falls to zero here.
 """
 
+import math
 import threading
 import time
 from contextlib import suppress
@@ -101,6 +102,8 @@ class ContactProxy:
         damping: float | None = None,
         handle: Handle | None = None,
     ) -> None:
+        if damping is not None and not 0.0 <= damping < math.inf:
+            raise UsageError(f"a damping of {damping} N s/m: give 0 or more")
         compile_missing(entries_for("proxy"))
         self.handle = handle or Handle()
         scale = self.handle.scale
@@ -118,8 +121,6 @@ class ContactProxy:
         self.terms: ProxyTerms = self._link.terms
         """What the server granted, in the scene's units."""
         given = 0.5e-3 * self.terms.stiffness * scale if damping is None else damping
-        if not given >= 0.0:
-            raise UsageError(f"a damping of {damping} N s/m: give 0 or more")
         self._force = ProxyForce(self.terms, given / scale)
         self.error: HapticDBError | None = None
         """Why the server is not reached now; None while it is."""
@@ -246,6 +247,8 @@ class ContactProxy:
             self.error = UsageError("the server has come back with another tool: connect anew")
             return
         self._link, self.error = link, None
+        if self._is_closed.is_set():  # `close` may have looked before the link was there
+            link.close()
 
     def _send(self) -> None:
         """Send the newest hand again and again."""

@@ -142,13 +142,18 @@ class ProxyForce:
             wrench[:] = self._plain + (allowed / size) * change
 
     def _damped(self, wrench: Floats, velocity: Floats) -> Floats:
-        """Wrench with the damper along the force: at most the cap, and never a pull."""
+        """Wrench with the damper along the force: at most the cap, and never a pull.
+
+        The torque stays.
+        """
         force = float(np.linalg.norm(wrench[:3]))
         if force == 0.0 or self._damping == 0.0:
             return wrench
         speed = float(wrench[:3] @ velocity[:3]) / force
-        damped = force + min(max(-self._damping * speed, -force), force)
-        return wrench * (min(damped, self.terms.cap) / force)
+        size = min(force + min(max(-self._damping * speed, -force), force), self.terms.cap)
+        damped = wrench.copy()
+        damped[:3] *= size / force
+        return damped
 
 
 def model_of(proxy: ProxyState, terms: ProxyTerms) -> Model:

@@ -30,7 +30,11 @@ UNIT = 32767.0
 FINE = 1.0 / 8192.0
 """Step of depths, in voxels, and of curvatures, in 1/voxel. Both reach to 4 voxels."""
 FARTHEST = 1e6
-"""Largest credible coordinate, speed, force, torque or stiffness. A larger one is malformed."""
+"""Largest credible coordinate, speed, force, torque or stiffness of a spring. A larger one is
+malformed."""
+STIFFEST = 1e12
+"""Largest credible stiffness of a contact, N/m: it grows as voxels get smaller, since one point
+stops a spring's force within a part of a voxel."""
 SKEW = 1e-3
 """Greatest difference of a quaternion's length from 1."""
 
@@ -206,8 +210,12 @@ def unpack_terms(message: bytes) -> ProxyTerms:
     numbers = [fields.f8() for _ in range(9)]
     fields.end()
     _check_range("a centre", np.array([x, y, z]))
-    if not all(0.0 < number <= FARTHEST for number in numbers):
-        raise ProtocolError("a WELCOME with a number that is not above 0")
+    for name, number in zip(ProxyTerms._fields[2:], numbers, strict=True):
+        most = STIFFEST if name == "contact" else FARTHEST
+        if not 0.0 < number <= most:
+            raise ProtocolError(
+                f"a WELCOME whose {name} is {number:g}: it must be above 0, {most:g} at most"
+            )
     return ProxyTerms(tool, (x, y, z), *numbers)
 
 

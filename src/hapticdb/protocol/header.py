@@ -59,10 +59,10 @@ class Kind(IntEnum):
 class Refusal(IntEnum):
     """Why a request was not answered.
 
-    USAGE : it cannot be asked for; NO_OBJECT : no object of that id; AWAY : the server's database
-    cannot be reached now; DAMAGED : the environment is damaged; TOO_MUCH : over a limit; OUTDATED :
-    the snapshot has ended, or the revision asked for is not the newest; BUSY : too many others ask;
-    FAILED : anything else.
+    USAGE : it cannot be asked for; NO_OBJECT : kept free, since what is not there has an empty
+    answer; AWAY : the server's database cannot be reached now; DAMAGED : the environment is
+    damaged; TOO_MUCH : over a limit; OUTDATED : the snapshot has ended, or the revision asked for
+    is not the newest; BUSY : too many others ask; FAILED : anything else.
     """
 
     USAGE = 1
@@ -84,6 +84,10 @@ class CloseCode(IntEnum):
     IDLE = 4408
     REPLACED = 4410
     FAILED = 4500
+
+
+class OtherVersionError(ProtocolError):
+    """A message of another version of the protocol."""
 
 
 class MessageHeader(NamedTuple):
@@ -108,7 +112,9 @@ def header_of(message: bytes) -> MessageHeader:
     Raises
     ------
     ProtocolError
-        When the message is too short, is no message of hapticdb, or has another version.
+        When the message is too short or is no message of hapticdb.
+    OtherVersionError
+        When it has another version.
     """
     if len(message) < LAYOUT.size:
         raise ProtocolError(f"a message of {len(message)} bytes: a header has {LAYOUT.size}")
@@ -116,7 +122,7 @@ def header_of(message: bytes) -> MessageHeader:
     if magic != MAGIC:
         raise ProtocolError("a message that does not begin with 'hd'")
     if version != VERSION:
-        raise ProtocolError(
+        raise OtherVersionError(
             f"a message of version {version}, where version {VERSION} is spoken: "
             "install the same hapticdb on both sides"
         )

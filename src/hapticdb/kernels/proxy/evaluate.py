@@ -66,7 +66,8 @@ def place_contacts(model):
     A point that has moved by a along the normal and by p and q across it is at the distance
     sqrt((u + a)^2 + u (c p^2 + e q^2)) from a surface that bulges with curvatures c and e, u its
     distance before: exact round planes, edges and corners, and to second order elsewhere. Where the
-    surface is hollow, the distance is u + a + (c p^2 + e q^2) / 2.
+    surface is hollow, or the point lies behind it (u < 0, which only a wrong server sends), the
+    distance is u + a + (c p^2 + e q^2) / 2.
     """
     turned, first, at = model.quaternion, model.tool, model.position
     tw, tx, ty, tz = product(
@@ -88,7 +89,7 @@ def place_contacts(model):
         q = bends[1] * (wx * dx + wy * dy + wz * dz)
         bent = p * (vx * dx + vy * dy + vz * dz) + q * (wx * dx + wy * dy + wz * dz)
         u = model.onset - model.depths[n]
-        if bent > 0.0 and u + a > 0.0:
+        if bent > 0.0 and u >= 0.0 and u + a > 0.0:
             after = math.sqrt((u + a) * (u + a) + u * bent)
             slope, sideways = (u + a) / after, u / after
         else:

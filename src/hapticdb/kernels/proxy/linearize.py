@@ -205,4 +205,5 @@ def linearize(
         write_stiffness(model, rows, count)
     n_planes = group_rows(rows, count, spring.radius, place.size)
     write_planes(model, rows, count, n_planes, place.size)
-    model.trust = place.size * (min(trust, MOST_TRUST) if count > 0 else trust)
+    # below 0 in a narrow gap, where no gradient tells which side is nearer
+    model.trust = place.size * max(min(trust, MOST_TRUST) if count > 0 else trust, 0.0)

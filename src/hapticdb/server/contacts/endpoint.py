@@ -29,7 +29,7 @@ from hapticdb.protocol.contacts import (
     unpack_hand,
     unpack_wish,
 )
-from hapticdb.protocol.header import CloseCode
+from hapticdb.protocol.header import CloseCode, OtherVersionError
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Role
 from hapticdb.server.limits import TokenBucket
@@ -128,6 +128,8 @@ class Contacts:
         self.n_clients += 1
         try:
             await self._serve(websocket, first)
+        except OtherVersionError as error:
+            await self._refuse(websocket, CloseCode.VERSION, str(error))
         except (ProtocolError, UsageError) as error:
             await self._refuse(websocket, CloseCode.MALFORMED, str(error))
         except TimeoutError:

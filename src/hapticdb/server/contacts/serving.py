@@ -59,8 +59,10 @@ class ServedContacts:
                 await websocket.close(int(CloseCode.FAILED), FAILED)
             else:
                 await contacts.attend(websocket, first)
-        except (ProtocolError, TimeoutError):
-            await websocket.close(int(CloseCode.MALFORMED), "a HELLO must come first")
+        except ProtocolError as error:
+            await websocket.close(int(CloseCode.MALFORMED), str(error))
+        except TimeoutError:
+            await websocket.close(int(CloseCode.IDLE), "a HELLO must come first")
         except WebSocketDisconnect:
             pass
         finally:

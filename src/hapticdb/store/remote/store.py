@@ -7,7 +7,7 @@ from typing import NoReturn
 
 import numpy as np
 
-from hapticdb.errors import DatabaseError, ReadOnlyError, UsageError
+from hapticdb.errors import DatabaseError, ProtocolError, ReadOnlyError, UsageError
 from hapticdb.protocol import cells as bodies
 from hapticdb.protocol.fields import FieldsRead
 from hapticdb.protocol.header import Kind, MessageHeader
@@ -279,8 +279,9 @@ class RemoteStore:
                 parts.append(rows_of_body(self.url, body, self.layout, distances=distances))
                 done = int(highs[some][-1]) + 1
                 if body.resume != bodies.COMPLETE:
-                    if len(body.keys) and body.resume <= int(body.keys[-1]):
-                        raise DatabaseError(f"{self.url}: the server's answer leads nowhere")
+                    last = int(body.keys[-1]) if len(body.keys) else -1
+                    if body.resume <= max(int(lows[0]), last):
+                        raise ProtocolError(f"{self.url}: the server's answer leads nowhere")
                     done = body.resume
                 first = int(np.searchsorted(highs, done))
                 is_key = lows is highs

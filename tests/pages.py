@@ -23,7 +23,7 @@ from serving import PROTOCOL
 class OnlyRecords:
     """A session that feels nothing."""
 
-    is_over = False
+    is_over, lost_frames = False, 0
 
     def move(self, pose: object) -> None:
         pass

@@ -161,8 +161,7 @@ class Site:
         self._is_ending.set()
         if self._clock.is_alive():
             self._clock.join(5.0)
-        for browser in list(self.browsers.values()):
-            browser.close()
+        self.everyone(lambda browser: browser.close())
         self.painting.shutdown(wait=False, cancel_futures=True)  # a browser may never answer
         self.sweeping.shutdown(cancel_futures=True)
         self.workers.shutdown(cancel_futures=True)
@@ -189,7 +188,7 @@ class Site:
             try:
                 act(browser)
             except Exception:
-                LOG.exception("a browser's update failed")
+                LOG.exception("a browser's update or end failed")
 
     def error_text(self, error: BaseException) -> str:
         """Words of an error as any browser may read them; see `wording.error_text`."""

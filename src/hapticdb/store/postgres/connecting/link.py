@@ -156,6 +156,15 @@ class Link:
 
     def run(self, text: str, parameters: Sequence[Parameter]) -> pq.abc.PGresult:
         """Result of a statement, which is prepared when it is first run."""
+        self.send(text, parameters)
+        return self.take()
+
+    def send(self, text: str, parameters: Sequence[Parameter]) -> None:
+        """Send a statement, which is prepared when it is first sent; `take` gives its result.
+
+        Statements on several links are answered at the same time if all are sent before the first
+        result is taken.
+        """
         name = self._prepared.get(text)
         if name is None:
             name = f"hapticdb_{len(self._prepared)}".encode()
@@ -165,6 +174,10 @@ class Link:
             self._prepared[text] = name
         values = [parameter.value for parameter in parameters]
         self._pgconn.send_query_prepared(name, values, [1] * len(values), 1)
+        self._pgconn.flush()
+
+    def take(self) -> pq.abc.PGresult:
+        """Result of the statement that was sent."""
         return self._result()
 
     def hear(self) -> None:

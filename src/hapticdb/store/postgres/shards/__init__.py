@@ -1,0 +1,1 @@
+"""An environment whose rows are on several PostgreSQL servers."""

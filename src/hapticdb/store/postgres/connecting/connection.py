@@ -143,10 +143,14 @@ class ServerConnection:
         with failures.named_errors(self.shown):
             self._link.send(text, parameters)
 
-    def take(self) -> list[bytes | None]:
-        """First row of the statement that was sent, every value in its binary form."""
+    def take(self, patience_ms: int | None = None) -> list[bytes | None]:
+        """First row of the statement that was sent, every value in its binary form.
+
+        patience_ms : raise StuckError and close the connection when it takes longer; None for the
+        connection's own limit.
+        """
         with failures.named_errors(self.shown):
-            result = self._link.take()
+            result = self._link.take(patience_ms)
             return [result.get_value(0, column) for column in range(result.nfields)]
 
     def rows(self, text: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:

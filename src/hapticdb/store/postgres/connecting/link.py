@@ -176,9 +176,15 @@ class Link:
         self._pgconn.send_query_prepared(name, values, [1] * len(values), 1)
         self._pgconn.flush()
 
-    def take(self) -> pq.abc.PGresult:
-        """Result of the statement that was sent."""
-        return self._result()
+    def take(self, patience_ms: int | None = None) -> pq.abc.PGresult:
+        """Result of the statement that was sent; patience_ms : wait no longer for each part."""
+        if patience_ms is None:
+            return self._result()
+        before, self._limit_ms = self._limit_ms, patience_ms
+        try:
+            return self._result()
+        finally:
+            self._limit_ms = before
 
     def hear(self) -> None:
         """Give notifications that have arrived to the notify handlers. Never waits.

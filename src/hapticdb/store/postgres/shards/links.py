@@ -7,7 +7,13 @@ from typing import NamedTuple, TypeVar
 
 import psycopg
 
-from hapticdb.errors import ConnectionLostError, DamagedError, OutdatedError, ShardAwayError
+from hapticdb.errors import (
+    ConnectionLostError,
+    DamagedError,
+    OutdatedError,
+    ShardAwayError,
+    StuckError,
+)
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.connecting.wire import Parameter
@@ -84,6 +90,10 @@ class Shards:
         place = self.places[shard]
         return f"shard {place.number} ({place.host})"
 
+    def is_connected(self, shard: int) -> bool:
+        """Whether there is a connection to a shard."""
+        return self._made[shard] is not None
+
     def connection(self, shard: int) -> ShardConnection:
         """Connection to a shard, made when it is first asked for."""
         made = self._made[shard]
@@ -135,23 +145,55 @@ class Shards:
         ShardAwayError
             When a shard cannot be reached.
         """
-        self.coordinator.check_thread()
-        links: list[ServerConnection] = []
-        statements: list[tuple[str, tuple[Parameter, ...]]] = []
-        if first is not None:
-            links.append(self.coordinator)
-            statements.append((first, ()))
         for ask in asks:
-            links.append(self.connection(ask.shard))
-            statements.append((ask.text, ask.parameters))
-        answers = _together(links, statements)
-        for at, answer in enumerate(answers):
-            if answer is None:
-                is_shard = links[at] is not self.coordinator
-                with named_away() if is_shard else contextlib.nullcontext():
-                    answers[at] = links[at].fetch(statements[at][0], *statements[at][1])
-        known = [answer or [] for answer in answers]
-        return (known[0], known[1:]) if first is not None else ([], known)
+            self.connection(ask.shard)
+        found, answers = self.ask_once(asks, first)
+        known = []
+        for ask, answer in zip(asks, answers, strict=True):
+            with named_away():
+                known.append(answer or self.connection(ask.shard).fetch(ask.text, *ask.parameters))
+        return found, known
+
+    def ask_once(
+        self, asks: Sequence[Ask], first: str | None, patience_ms: int | None = None
+    ) -> tuple[Answer, list[Answer | None]]:
+        """Answers as of `ask`, without a second try: None for a shard whose connection is lost.
+
+        patience_ms : how long a shard may take before its connection counts as lost; None for the
+        limit of the connection, after which StuckError is raised.
+        """
+        self.coordinator.check_thread()
+        waiting: list[ServerConnection] = []
+        answers: list[Answer | None] = [None] * len(asks)
+        found: Answer | None = None
+        lost = (ConnectionLostError,) if patience_ms is None else (ConnectionLostError, StuckError)
+        try:
+            # all are sent before the first is taken
+            if first is not None:
+                with contextlib.suppress(ConnectionLostError):
+                    self.coordinator.send(first)
+                    waiting.append(self.coordinator)
+            for ask in asks:
+                with contextlib.suppress(*lost):
+                    connection = self.connection(ask.shard)
+                    connection.send(ask.text, *ask.parameters)
+                    waiting.append(connection)
+            if first is not None and self.coordinator in waiting:
+                with contextlib.suppress(ConnectionLostError):
+                    found = self.coordinator.take()
+                waiting.remove(self.coordinator)
+            for at, ask in enumerate(asks):
+                if (connection := self.connection(ask.shard)) in waiting:
+                    with contextlib.suppress(*lost):
+                        answers[at] = connection.take(patience_ms)
+                    waiting.remove(connection)
+        except BaseException:
+            for one in waiting:  # no later statement may get these answers
+                one.driver.close()
+            raise
+        if first is not None and found is None:
+            found = self.coordinator.fetch(first)
+        return found or [], answers
 
     # -- writing ---------------------------------------------------------------------------------
 
@@ -186,33 +228,6 @@ class Shards:
         if errors:
             raise errors[0]
         return [work_of.result() for work_of in begun]
-
-
-def _together(
-    links: Sequence[ServerConnection], statements: Sequence[tuple[str, tuple[Parameter, ...]]]
-) -> list[Answer | None]:
-    """Answers to statements that are all sent before the first is taken; None for a lost link.
-
-    A link that was sent a statement is taken from or closed, whatever happens, so that no later
-    statement gets its answer.
-    """
-    answers: list[Answer | None] = [None] * len(links)
-    waiting: list[int] = []
-    try:
-        for at, (link, (text, parameters)) in enumerate(zip(links, statements, strict=True)):
-            with contextlib.suppress(ConnectionLostError):
-                link.send(text, *parameters)
-                waiting.append(at)
-        while waiting:
-            at = waiting[0]
-            with contextlib.suppress(ConnectionLostError):
-                answers[at] = links[at].take()
-            waiting.pop(0)
-    except BaseException:
-        for at in waiting:
-            links[at].driver.close()
-        raise
-    return answers
 
 
 @contextlib.contextmanager

@@ -16,10 +16,11 @@ import numpy as np
 from hapticdb.errors import DamagedError, OutdatedError
 from hapticdb.store import believed
 from hapticdb.store.base import NO_KEYS, NO_OCCUPANCY, Keys, Layout, Rows, Table, row_shift
-from hapticdb.store.batches import joined, no_rows
+from hapticdb.store.batches import PartialRows, joined, no_rows
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import statements
+from hapticdb.store.postgres.shards.away import AwayShards
 from hapticdb.store.postgres.shards.links import Answer, Ask, Shards
 from hapticdb.store.postgres.shards.pieces import pieces_of_keys, pieces_of_ranges
 from hapticdb.store.postgres.shards.view import NEWEST, View, Views
@@ -30,6 +31,7 @@ TRIES = 20
 writes come faster than reads."""
 LAST = int(np.iinfo(np.int64).max)
 Plan = Callable[[View], Sequence[Ask]]
+Send = Callable[[Sequence[Ask], str | None], tuple[Answer, Sequence[Answer | None]]]
 
 
 class ShardedReader:
@@ -45,6 +47,7 @@ class ShardedReader:
         self._objects = objects
         self._depth = 0
         self._held: View | None = None
+        self.away = AwayShards(shards)
         self.views = Views(connection, row_shift(layout))
 
     # -- at which revision -----------------------------------------------------------------------
@@ -73,20 +76,27 @@ class ShardedReader:
         ShardAwayError
             When a shard that is asked cannot be reached.
         """
+        view, _, answers = self._asked(plan, self._shards.ask)
+        return view, [answer for answer in answers if answer is not None]
+
+    def _asked(self, plan: Plan, send: Send) -> tuple[View, Sequence[Ask], Sequence[Answer | None]]:
+        """View, statements and answers; None for an answer that `send` did not get."""
         if self._held is not None:
-            _, answers = self._shards.ask(plan(self._held))
+            asks = plan(self._held)
+            _, answers = send(asks, None)
             if not self._are_whole(self._held, answers):
                 raise _outdated(self._url)
-            return self._seen(self._held), answers
+            return self._seen(self._held), asks, answers
         is_renewed = False
         for _ in range(TRIES):
             view = self.views.known
             if view.revision < 0:
                 view, is_renewed = self.views.load(), True
-            first, answers = self._shards.ask(plan(view), None if is_renewed else NEWEST)
+            asks = plan(view)
+            first, answers = send(asks, None if is_renewed else NEWEST)
             is_newest = is_renewed or self.views.is_known(first)
             if is_newest and self._are_whole(view, answers):
-                return self._seen(view), answers
+                return self._seen(view), asks, answers
             self.views.load()
             is_renewed = True
         raise _outdated(self._url)
@@ -95,9 +105,11 @@ class ShardedReader:
         self._objects.note_seen(view.revision)
         return view
 
-    def _are_whole(self, view: View, answers: Sequence[Answer]) -> bool:
+    def _are_whole(self, view: View, answers: Sequence[Answer | None]) -> bool:
         """Whether all rows of that view were there when the shards answered."""
         for answer in answers:
+            if answer is None:
+                continue
             _, swept, moved = wire.read_int8s(answer[-1]).tolist() if answer[-1] else (0, -1, -1)
             if swept > view.revision or moved > view.epoch:
                 return False
@@ -172,6 +184,22 @@ class ShardedReader:
             return no_rows(distances=distances)
         text = statements.SCAN[self._table(distances=distances)]
         return self.live(*self.ask(_ranges_plan(text, lows, highs)), distances=distances)
+
+    def scan_partly(self, lows: Keys, highs: Keys, *, distances: bool = False) -> PartialRows:
+        """Rows as of `scan` of the shards that answer, and the ranges of those that are away."""
+        if not lows.size or self._has_no(distances=distances):
+            return PartialRows(no_rows(distances=distances), NO_KEYS.reshape(0, 2))
+        text = statements.SCAN[self._table(distances=distances)]
+        view, asks, answers = self._asked(_ranges_plan(text, lows, highs), self.away.ask)
+        there = [answer for answer in answers if answer is not None]
+        is_away = {ask.shard for ask, answer in zip(asks, answers, strict=True) if answer is None}
+        away = [
+            np.stack([piece.lows, piece.highs], axis=1)
+            for piece in pieces_of_ranges(view.firsts, lows, highs)
+            if piece.shard in is_away
+        ]
+        rows = self.live(view, there, distances=distances)
+        return PartialRows(rows, np.concatenate([NO_KEYS.reshape(0, 2), *away]))
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""

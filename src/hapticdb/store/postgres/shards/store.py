@@ -31,6 +31,7 @@ class ShardedStore(ServerStore):
         rows = self._rows = ShardedReader(connection, shards, self.layout, self._reader)
         self.lookup, self.lookup_each = rows.lookup, rows.lookup_each
         self.scan, self.count, self.rows_of = rows.scan, rows.count, rows.rows_of
+        self.scan_partly, self.shards_away = rows.scan_partly, rows.away.names
         self._sweeper = Sweeper(connection, shards, self.layout)
         try:
             self._take_over(
@@ -57,6 +58,7 @@ class ShardedStore(ServerStore):
 
     def close(self) -> None:
         """Close all connections."""
+        self._rows.away.close()
         self._shards.close()
         super().close()
 

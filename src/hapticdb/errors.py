@@ -22,7 +22,8 @@
         ├── AccessError (PermissionError)     the server does not let this user in
         ├── ConflictError                     another has written the object meanwhile
         ├── ConnectionLostError (ConnectionError)  the server went away
-        │   └── OutdatedError                 a snapshot that a server could not hold
+        │   ├── OutdatedError                 a snapshot that a server could not hold
+        │   └── ShardAwayError                a server that holds a part of the rows
         ├── BusyError (TimeoutError)          another writer held the database too long
         └── StuckError (TimeoutError)         the database took longer than a frame may
 
@@ -117,6 +118,10 @@ class ConnectionLostError(DatabaseError, ConnectionError):
 
 class OutdatedError(ConnectionLostError):
     """A snapshot that a server could not hold: read all of it again."""
+
+
+class ShardAwayError(ConnectionLostError):
+    """A server that holds a part of the environment's rows went away; the other servers answer."""
 
 
 class StuckError(DatabaseError, TimeoutError):

@@ -103,6 +103,7 @@ PUBLIC = [
     "Report",
     "ResidentCells",
     "Session",
+    "ShardAwayError",
     "StuckError",
     "Swept",
     "TangentPlane",

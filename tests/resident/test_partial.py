@@ -178,7 +178,7 @@ def test_cells_of_a_shard_that_is_away_stay_unknown_and_the_others_are_published
     assert check(scene.residency, voxels_by_cell(scene.env)) == 18
 
 
-def test_cells_with_distances_likewise(tmp_path: Path, table: CellTable) -> None:
+def test_cells_with_distances_likewise(tmp_path: Path) -> None:
     with make(tmp_path) as env, CellTable.create(8 << 20, distances=True) as table:
         write_points(env.store, np.array([[63.5, 12.5, 12.5]]))  # on the border of the halves
         away = tmp_path / "away"
@@ -289,7 +289,7 @@ def test_a_statement_that_was_outdated_is_repeated_in_a_snapshot(scene: Setting)
     assert check(scene.residency, voxels_by_cell(scene.env)) == 9
 
 
-# --- work that needs all cells ----------------------------------------------------------------------
+# --- work that needs all cells --------------------------------------------------------------------
 
 
 def test_work_that_needs_all_cells_says_which_shard_is_away(

@@ -163,7 +163,7 @@ class LooseNotes:
 
 
 class ShardNotes:
-    """Tells on the command line when a server of a part of the rows is away, and when it is back."""
+    """Tells on the command line when a server of some of the rows is away, and when it is back."""
 
     def __init__(self) -> None:
         self._away: tuple[str, ...] = ()

@@ -60,8 +60,8 @@ CONFIRM_EVERY = 0.1
 """Seconds between queries for the revision if the engine reports commits. Such a report may need no
 round trip, so only a query shows that the database still answers."""
 RELEASE_EVERY = 1.0
-"""Seconds between checks for sessions whose processes have ended. Larger: rows stay longer. Names of
-objects for which a shard was away are asked for again as often."""
+"""Seconds between checks for sessions whose processes have ended, and between queries for objects'
+names for which a shard was away. Larger: rows stay longer, names come later."""
 RETRY = (0.05, 0.5)
 """Seconds until a lost database is tried again: first and greatest delay; it doubles each time."""
 

@@ -43,8 +43,8 @@ def meeting(away: NDArray[np.int64], lows: Keys, highs: Keys) -> NDArray[np.bool
     if not len(away):
         return np.zeros(len(lows), dtype=np.bool_)
     first = np.searchsorted(away[:, 1], lows)  # the first range that does not end before
-    is_there = first < len(away)
-    return is_there & (away[np.minimum(first, len(away) - 1), 0] <= highs)
+    begins = away[np.minimum(first, len(away) - 1), 0]
+    return np.asarray((first < len(away)) & (begins <= highs))
 
 
 def away_error(store: Store, n_cells: int) -> ShardAwayError:

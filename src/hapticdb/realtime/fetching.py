@@ -2,7 +2,8 @@
 
 The process has a connection of its own and is the only writer of its table. Sessions report where
 tool and hand are and how they move. The process asks the database for the cells within reach,
-nearest first, follows the writes of others, and names the objects that tools touch.
+nearest first, follows the writes of others, and names the objects that tools touch. If one of
+several servers is away (a shard), its cells are unknown until it is back, and all others go on.
 """
 
 import contextlib
@@ -12,12 +13,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticdb.errors import GridError, HapticDBError, UsageError
+from hapticdb.errors import GridError, HapticDBError, ShardAwayError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.realtime.object_names import ObjectAnswers
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.tracking import SessionTracker
 from hapticdb.realtime.wishes import Motion, Wish
+from hapticdb.resident.outages import OutageCounter
 from hapticdb.resident.pushing import SupportsPush
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
@@ -58,7 +60,8 @@ CONFIRM_EVERY = 0.1
 """Seconds between queries for the revision if the engine reports commits. Such a report may need no
 round trip, so only a query shows that the database still answers."""
 RELEASE_EVERY = 1.0
-"""Seconds between checks for sessions whose processes have ended. Larger: rows stay longer."""
+"""Seconds between checks for sessions whose processes have ended, and between queries for objects'
+names for which a shard was away. Larger: rows stay longer, names come later."""
 RETRY = (0.05, 0.5)
 """Seconds until a lost database is tried again: first and greatest delay; it doubles each time."""
 
@@ -109,6 +112,7 @@ class Fetcher:
         self.tracker = SessionTracker(self.table, request.grid)
         self._clock = clock
         self._figures = self.table.desk.figures
+        self._outages = OutageCounter(self.table)
         self._evicted_before = int(self._figures["evicted"])
         self._latencies: list[float] = [0.0]
         self.store = self._open()
@@ -149,7 +153,8 @@ class Fetcher:
         assert wish is not None  # noqa: S101 - the origin is finite
         self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
         self.residency.warm_up()
-        self._answers.ids_of(self.store, np.zeros(1, dtype=np.int64))
+        with contextlib.suppress(ShardAwayError):  # then the first answer loads its kernels
+            self._answers.ids_of(self.store, np.zeros(1, dtype=np.int64))
 
     @property
     def lookahead(self) -> float:
@@ -167,11 +172,14 @@ class Fetcher:
             self._is_confirmed = True
             self._answers.forget()
         is_busy = self._bring_in(self._now - before)
+        if self._outages.count(self.residency.shards_away, self._now - before):
+            self._answers.retry()
         if self._now - self._asked_at >= ASK_EVERY:
             self._asked_at = self._now
             self._answers.answer(self.store, self.tracker.sessions)
         if self._now - self._released_at >= RELEASE_EVERY:
             self._released_at = self._now
+            self._answers.retry()
             self.table.release_dead()
         if self._is_confirmed:
             # Set only here: the database has answered every query of this round, so all resident
@@ -198,8 +206,8 @@ class Fetcher:
         """Fetch the most urgent missing cells of all sessions; returns whether any was fetched."""
         has_moved = self.tracker.read_desk(elapsed, self.lookahead)
         missing = NO_KEYS
-        has_new_version = self._version_seen != self.table.version
-        if has_moved or has_new_version or self.tracker.has_met_unknown_cells():
+        is_due = self._version_seen != self.table.version or self.residency.is_due
+        if has_moved or is_due or self.tracker.has_met_unknown_cells():
             self._version_seen = self.table.version
             missing = self.tracker.missing_cells(self.residency)
         self.tracker.report_missing()
@@ -207,6 +215,8 @@ class Fetcher:
             return False
         loaded = self.residency.load(missing[:BATCH])
         self._is_confirmed |= loaded.ranges > 0  # without room in the table, no query is sent
+        if loaded.n_away:
+            self._version_seen = -1  # look for the cells after these, also if nothing was published
         self._record_figures(loaded)
         return loaded.cells > 0
 
@@ -230,6 +240,7 @@ class Fetcher:
         """Mark the database as unreachable for all sessions, so that their forces fall to zero."""
         self.table.cells.control[AWAY] = 1
         self._figures["losses"] += 1
+        self._outages.stop()
 
     def reopen(self) -> None:
         """Open the database again, and follow the writes made meanwhile."""

@@ -4,6 +4,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from hapticdb.errors import ShardAwayError
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.records import MOST_ASKED
 from hapticdb.resident.residency import Residency
@@ -35,13 +36,23 @@ class ObjectAnswers:
         self._residency = residency
         self._has_distances = table.has_distances
         self._answered: dict[int, bytes] = {}
+        self._unanswered: set[int] = set()
 
     def forget(self) -> None:
         """Forget all answers, so that every request is answered again: the database has changed."""
         self._answered.clear()
 
+    def retry(self) -> None:
+        """Answer again the requests that could not be answered because a shard was away."""
+        for row in self._unanswered:
+            self._answered.pop(row, None)
+        self._unanswered.clear()
+
     def answer(self, store: Store, rows: Iterable[int]) -> None:
-        """Answer the sessions in `rows` whose requests have changed since the last answer."""
+        """Answer the sessions in `rows` whose requests have changed since the last answer.
+
+        A request that needs a shard that is away keeps the last answer until `retry`.
+        """
         before, self._answered = self._answered, {}
         for row in rows:
             n_asked = int(self._desk["n_asked"][row])
@@ -51,9 +62,13 @@ class ObjectAnswers:
             keys = np.unique(self._desk["asked"][row, :n_asked])
             question = keys.tobytes()
             if before.get(row) != question:
-                ids = self.ids_of(store, keys)[:MOST_ASKED]
-                self._desk["objects"][row, : len(ids)] = ids
-                self._desk["n_objects"][row] = len(ids)
+                try:
+                    ids = self.ids_of(store, keys)[:MOST_ASKED]
+                except ShardAwayError:  # the sessions after this one get their answers
+                    self._unanswered.add(row)
+                else:
+                    self._desk["objects"][row, : len(ids)] = ids
+                    self._desk["n_objects"][row] = len(ids)
             self._answered[row] = question
 
     def ids_of(self, store: Store, keys: Keys) -> Keys:

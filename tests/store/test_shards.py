@@ -16,6 +16,7 @@ from psycopg import sql
 import hapticdb
 from hapticdb import (
     AccessError,
+    ConflictError,
     DamagedError,
     EnvironmentExistsError,
     EnvironmentNotFoundError,
@@ -27,6 +28,7 @@ from hapticdb import (
 )
 from hapticdb.check import check_environment
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.cost_model import CostModel
 from hapticdb.query.frame import Strategy
 from hapticdb.store.connect import grant, open_store
 from hapticdb.store.postgres.address import parse
@@ -208,6 +210,30 @@ def test_statement_is_refused_in_one_line(store: ShardedStore) -> None:
         pytest.raises(UsageError, match="choose another strategy"),
     ):
         env.touch(shell, np.eye(4), strategy="statement", law="plane")
+
+
+def test_costs_are_fitted_and_kept_without_those_of_statement(store: ShardedStore) -> None:
+    with hapticdb.open(store.url) as env:
+        costs = env.calibrate()
+    assert costs.aggregate == np.inf
+    kept = store.costs(next(iter(store._connection.rows("SELECT machine FROM cost")))[0])
+    assert kept is not None
+    assert "descent" in kept
+    assert "aggregate" not in kept
+    assert CostModel.from_figures(kept) == costs
+
+
+def test_an_edit_of_an_object_that_another_has_written_is_refused(store: ShardedStore) -> None:
+    with hapticdb.open(store.url) as env:
+        (floor,) = env.objects()
+        moved(store, 4)
+        before = everything(store).keys.tolist()
+        with pytest.raises(ConflictError):
+            env.remove(floor.id, revision=floor.revision)
+        assert everything(store).keys.tolist() == before
+        assert env.remove(floor.id).name == "floor"
+        assert not len(everything(store))
+        assert [change.action for change in store.changes()] == ["add", "move", "remove"]
 
 
 # -- swept -----------------------------------------------------------------------------------------

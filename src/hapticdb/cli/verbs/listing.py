@@ -345,7 +345,8 @@ def calibrate(
     if not is_kept:
         render.note(f"{env.url} can only be read: the figures were measured, and not kept")
     if json:
-        figures = {name: getattr(costs, name) for name in (*MEANINGS, *RATIOS)}
+        known = costs.figures()
+        figures = {name: known[name] for name in (*MEANINGS, *RATIOS) if name in known}
         render.say_json({"figures": figures, "spread": dict(costs.spread), "kept": is_kept})
         return
     render.show(_costs_table(costs))
@@ -397,8 +398,9 @@ def _age(freshness: "Freshness") -> str:
 
 def _costs_table(costs: "CostModel") -> Columns:
     rows = []
-    for name, meaning in MEANINGS.items():
+    figures = costs.figures()  # without those of strategies that the engine lacks
+    for name in filter(figures.__contains__, MEANINGS):
         spread = costs.spread.get(name)
         known = "" if spread is None else f"± {100 * spread:.0f} %"
-        rows.append((name, f"{getattr(costs, name):.3f}", known, meaning))
+        rows.append((name, f"{figures[name]:.3f}", known, MEANINGS[name]))
     return render.table(("figure", "µs>", "spread>", "what it is"), rows)

@@ -18,6 +18,7 @@ from hapticdb.kernels.compiling import NAMES, compile_missing
 from hapticdb.pointshell.shell import fibonacci_sphere
 from installed import toy_is_installed  # noqa: F401 - a fixture
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
+from sharded import sharded_place, sharded_servers  # noqa: F401 - fixtures
 
 
 def pytest_configure(config: pytest.Config) -> None:

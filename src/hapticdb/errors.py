@@ -23,7 +23,7 @@
         ├── ConflictError                     another has written the object meanwhile
         ├── ConnectionLostError (ConnectionError)  the server went away
         │   ├── OutdatedError                 a snapshot that a server could not hold
-        │   └── ShardAwayError                a server that holds a part of the rows
+        │   └── ShardAwayError                one of the servers that hold the rows went away
         ├── BusyError (TimeoutError)          another writer held the database too long
         └── StuckError (TimeoutError)         the database took longer than a frame may
 
@@ -121,7 +121,7 @@ class OutdatedError(ConnectionLostError):
 
 
 class ShardAwayError(ConnectionLostError):
-    """A server that holds a part of the environment's rows went away; the other servers answer."""
+    """One of the servers that hold an environment's rows went away, or was never there."""
 
 
 class StuckError(DatabaseError, TimeoutError):

@@ -2,6 +2,7 @@
 
 import atexit
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -39,12 +40,12 @@ def connected(url: str, *, read_only: bool = False, making: bool = False) -> Ser
     """
     address = parse(url)
     try:
-        return ServerConnection(address, _conninfo(address, making=making), read_only=read_only)
+        return ServerConnection(address, conninfo(address, making=making), read_only=read_only)
     except EnvironmentNotFoundError as error:
         raise error if address.data is None else _not_found(address) from None
 
 
-def _conninfo(address: Address, *, making: bool) -> str:
+def conninfo(address: Address, *, making: bool) -> str:
     """What libpq connects to; with ``data=`` a private server, started if it does not run."""
     if address.data is None:
         return address.conninfo
@@ -195,8 +196,18 @@ def read_environment(connection: ServerConnection) -> Made:
     return Made(grid, layout, believed.wish_of(connection.shown, rows[0][8]), rows[0][7])
 
 
-def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
-    """Make the schema with all tables and the grid, in one transaction."""
+def created(
+    url: str,
+    grid: Grid,
+    layout: Layout,
+    *,
+    distances: bool,
+    also: Callable[[ServerConnection], None] | None = None,
+) -> None:
+    """Make the schema with all tables and the grid, in one transaction.
+
+    `also` makes more tables in it, inside that transaction.
+    """
     with connected(url, making=True) as connection:
         name = connection.address.environment
 
@@ -227,6 +238,8 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
                     distances,
                 ),
             )
+            if also is not None:
+                also(connection)
 
         connection.write(work, lambda: _has_schema(connection))
 

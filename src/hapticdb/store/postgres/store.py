@@ -9,7 +9,8 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.looping import LoopInServer
-from hapticdb.store.postgres.tables.loading import Loading
+from hapticdb.store.postgres.tables.loading import Indexes, IndexesHere, Loading
+from hapticdb.store.postgres.tables.placing import PlacesRows, RowsHere
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.tables.statistics import PostgresStatistics
 from hapticdb.store.postgres.tables.writing import PostgresWriter
@@ -22,11 +23,10 @@ GROUPING_THRESHOLD = 256
 """Least number of distinct keys that `auto` groups on older servers: docs/decisions/0014."""
 
 
-class PostgresStore:
-    """An environment on a PostgreSQL server. Open with `open`, make with `create`.
+class ServerStore:
+    """What all environments on PostgreSQL do: objects, changes, watching; rows are the subclass's.
 
-    Reading, writing, statistics and watching are classes of their own. The store takes over their
-    methods.
+    `_take_over` gives it the methods of those who read and write rows.
     """
 
     def __init__(self, connection: ServerConnection) -> None:
@@ -45,35 +45,22 @@ class PostgresStore:
         self.grid, self.layout, self.wants_distances, self.identity = made
         reader = self._reader = PostgresReader(connection, self.layout)
         self.version, self.revision = reader.version, reader.revision
-        self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
-        self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
-        self.statement, self.statement_hits = reader.statement, reader.statement_hits
         self.objects, self.object = reader.objects, reader.object
         self.removed, self.changes = reader.removed, reader.changes
-        self._loading = Loading(connection, self.layout)
-        writer = PostgresWriter(connection, self.grid, self.layout, reader, self._loading)
-        self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
-        self.add_distances, self._write_wish = writer.add_distances, writer.want_distances
-        known = PostgresStatistics(connection, self.layout, reader)
-        self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
-        self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
         watch = Watch(connection, self.identity)
         self.watch, self.has_changed = watch.begin, watch.has_changed
+
+    def _take_over(self, indexes: Indexes, rows: PlacesRows, known: PostgresStatistics) -> None:
+        """Write and load rows by these, and ask that one for statistics."""
+        connection, layout = self._connection, self.layout
+        loading = self._loading = Loading(connection, indexes)
+        writer = PostgresWriter(connection, self.grid, layout, self._reader, loading, rows)
+        self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
+        self.add_distances, self._write_wish = writer.add_distances, writer.want_distances
+        self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
+        self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
         if not self.is_read_only:
-            self._loading.mend()
-
-    @classmethod
-    def open(cls, url: str, *, read_only: bool = False) -> "PostgresStore":
-        """Open an existing environment."""
-        return cls(schema_of.opened(url, read_only=read_only))
-
-    @classmethod
-    def create(
-        cls, url: str, grid: Grid, layout: Layout = "brick", *, distances: bool = False
-    ) -> "PostgresStore":
-        """Make a new environment with its grid: a schema that appears whole or not at all."""
-        schema_of.created(url, grid, layout, distances=distances)
-        return cls.open(url)
+            loading.mend()
 
     @property
     def connection(self) -> ServerConnection:
@@ -98,10 +85,6 @@ class PostgresStore:
         self._loading.drop_unused()
         self.close()
 
-    def snapshot(self) -> contextlib.AbstractContextManager[None]:
-        """All reads inside see one committed revision. May be nested."""
-        return self._connection.snapshot()
-
     def loading(self) -> contextlib.AbstractContextManager[None]:
         """Inside, an empty table may have no index; the index is made at the end."""
         return self._loading
@@ -111,6 +94,43 @@ class PostgresStore:
         check_distances(self.layout, distances=True)
         self._write_wish()
         self.wants_distances = True
+
+
+class PostgresStore(ServerStore):
+    """An environment on a PostgreSQL server. Open with `open`, make with `create`.
+
+    Reading, writing, statistics and watching are classes of their own. The store takes over their
+    methods.
+    """
+
+    def __init__(self, connection: ServerConnection) -> None:
+        super().__init__(connection)
+        reader = self._reader
+        self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
+        self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
+        self.statement, self.statement_hits = reader.statement, reader.statement_hits
+        self._take_over(
+            IndexesHere(connection, self.layout),
+            RowsHere(connection, self.layout),
+            PostgresStatistics(connection, self.layout, reader),
+        )
+
+    @classmethod
+    def open(cls, url: str, *, read_only: bool = False) -> "PostgresStore":
+        """Open an existing environment."""
+        return cls(schema_of.opened(url, read_only=read_only))
+
+    @classmethod
+    def create(
+        cls, url: str, grid: Grid, layout: Layout = "brick", *, distances: bool = False
+    ) -> "PostgresStore":
+        """Make a new environment with its grid: a schema that appears whole or not at all."""
+        schema_of.created(url, grid, layout, distances=distances)
+        return cls.open(url)
+
+    def snapshot(self) -> contextlib.AbstractContextManager[None]:
+        """All reads inside see one committed revision. May be nested."""
+        return self._connection.snapshot()
 
     def looping(self) -> Store:
         """The same store, but its `scan` loops over the ranges inside the server, one at a time."""

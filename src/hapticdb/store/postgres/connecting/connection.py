@@ -133,6 +133,26 @@ class ServerConnection:
 
         return self.again(read)
 
+    def send(self, text: str, *parameters: Parameter) -> None:
+        """Send a prepared statement without waiting for its answer, and without a second try."""
+        self.check_thread()
+        if self._is_closed:
+            raise DatabaseError(f"{self.shown} has been closed: open it again")
+        if self._link.is_lost:
+            raise ConnectionLostError(f"{self.shown}: the server went away")
+        with failures.named_errors(self.shown):
+            self._link.send(text, parameters)
+
+    def take(self, patience_ms: int | None = None) -> list[bytes | None]:
+        """First row of the statement that was sent, every value in its binary form.
+
+        patience_ms : raise StuckError and close the connection when it takes longer; None for the
+        connection's own limit.
+        """
+        with failures.named_errors(self.shown):
+            result = self._link.take(patience_ms)
+            return [result.get_value(0, column) for column in range(result.nfields)]
+
     def rows(self, text: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """All rows of a statement as Python values: for statements outside frames."""
         return self.again(lambda: self.execute(text, parameters).fetchall())

@@ -156,6 +156,15 @@ class Link:
 
     def run(self, text: str, parameters: Sequence[Parameter]) -> pq.abc.PGresult:
         """Result of a statement, which is prepared when it is first run."""
+        self.send(text, parameters)
+        return self.take()
+
+    def send(self, text: str, parameters: Sequence[Parameter]) -> None:
+        """Send a statement, which is prepared when it is first sent; `take` gives its result.
+
+        Statements on several links are answered at the same time if all are sent before the first
+        result is taken.
+        """
         name = self._prepared.get(text)
         if name is None:
             name = f"hapticdb_{len(self._prepared)}".encode()
@@ -165,7 +174,17 @@ class Link:
             self._prepared[text] = name
         values = [parameter.value for parameter in parameters]
         self._pgconn.send_query_prepared(name, values, [1] * len(values), 1)
-        return self._result()
+        self._pgconn.flush()
+
+    def take(self, patience_ms: int | None = None) -> pq.abc.PGresult:
+        """Result of the statement that was sent; patience_ms : wait no longer for each part."""
+        if patience_ms is None:
+            return self._result()
+        before, self._limit_ms = self._limit_ms, patience_ms
+        try:
+            return self._result()
+        finally:
+            self._limit_ms = before
 
     def hear(self) -> None:
         """Give notifications that have arrived to the notify handlers. Never waits.

@@ -24,16 +24,13 @@ _STRIDE = _INT8S.itemsize
 
 COPY_HEADER = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 COPY_TRAILER = b"\xff\xff"
-_FIELDS = [
-    ("fields", ">i2"),
-    ("z_length", ">i4"),
-    ("z_val", ">i8"),
-    ("id_length", ">i4"),
-    ("id", ">i8"),
-]
-_VOXEL = np.dtype(_FIELDS)
-_BAND = np.dtype([*_FIELDS, ("distances_length", ">i4")])
-_BRICK = np.dtype([*_FIELDS, ("bits_length", ">i4"), ("bits", f"V{BRICK_BYTES}")])
+
+
+def _layout_of(*last: tuple[str, str], versions: bool) -> np.dtype[np.void]:
+    """One row of COPY: key, id, perhaps a version, and the fields that follow them."""
+    version = [("version_length", ">i4"), ("version", ">i8")] if versions else []
+    first = [("fields", ">i2"), ("z_length", ">i4"), ("z_val", ">i8")]
+    return np.dtype([*first, ("id_length", ">i4"), ("id", ">i8"), *version, *last])
 
 
 class Parameter(NamedTuple):
@@ -107,37 +104,46 @@ def read_float8s(value: bytes) -> NDArray[np.float64]:
     return np.ndarray((count,), ">f8", value, HEADER_BYTES + 4, (_STRIDE,)).astype(np.float64)
 
 
-def copy_rows(rows: Rows, object_id: int) -> bytes:
+def copy_rows(rows: Rows, object_id: int, version: int | None = None) -> bytes:
     """Rows of an object in the form of COPY, without header and trailer.
 
-    Rows with distances are rows of the table `band`, others of the index table.
+    Rows with distances are rows of the table `band`, others of the index table. `version` is a
+    column after the id, where the tables have it.
     """
     if rows.distances is not None:
-        return _copy_band(rows.keys, rows.distances, object_id)
-    count = len(rows)
+        return _copy_band(rows.keys, rows.distances, object_id, version)
     has_bits = rows.occupancy.size > 0
-    packed = np.empty(count, _BRICK if has_bits else _VOXEL)
-    packed["fields"] = 3 if has_bits else 2
-    packed["z_length"] = packed["id_length"] = 8
-    packed["z_val"] = rows.keys
-    packed["id"] = object_id
+    bits = (("bits_length", ">i4"), ("bits", f"V{BRICK_BYTES}")) if has_bits else ()
+    packed = _begun(rows.keys, object_id, version, *bits)
     if has_bits:
         packed["bits_length"] = BRICK_BYTES
-        bits = np.ascontiguousarray(rows.occupancy).view(f"V{BRICK_BYTES}")
-        packed["bits"] = bits.reshape(-1)
+        packed["bits"] = np.ascontiguousarray(rows.occupancy).view(f"V{BRICK_BYTES}").reshape(-1)
     return packed.tobytes()
 
 
-def _copy_band(keys: NDArray[np.int64], distances: Band, object_id: int) -> bytes:
+def _begun(
+    keys: NDArray[np.int64], object_id: int, version: int | None, *last: tuple[str, str]
+) -> NDArray[np.void]:
+    """Rows of COPY with key, id and version, but without the fields that follow."""
+    packed = np.empty(len(keys), _layout_of(*last, versions=version is not None))
+    packed["fields"] = 2 + (version is not None) + bool(last)
+    packed["z_length"] = packed["id_length"] = 8
+    packed["z_val"] = keys
+    packed["id"] = object_id
+    if version is not None:
+        packed["version_length"] = 8
+        packed["version"] = version
+    return packed
+
+
+def _copy_band(
+    keys: NDArray[np.int64], distances: Band, object_id: int, version: int | None
+) -> bytes:
     """Rows of the table `band`: what stands before each row's bytes, then these bytes."""
     lengths = distances.lengths
-    heads = np.empty(len(keys), _BAND)
-    heads["fields"] = 3
-    heads["z_length"] = heads["id_length"] = 8
-    heads["z_val"] = keys
-    heads["id"] = object_id
+    heads = _begun(keys, object_id, version, ("distances_length", ">i4"))
     heads["distances_length"] = lengths
-    size = _BAND.itemsize
+    size = heads.itemsize
     starts = distances.ends - lengths + size * np.arange(len(keys))
     is_data = np.ones(len(distances.data) + size * len(keys), dtype=np.bool_)
     is_data[starts[:, None] + np.arange(size)] = False

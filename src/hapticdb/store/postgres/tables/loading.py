@@ -9,6 +9,7 @@ an object that was reported as written is there after a crash, and an import can
 import contextlib
 from collections.abc import Iterator
 from types import TracebackType
+from typing import Protocol
 
 import psycopg
 
@@ -27,12 +28,84 @@ LOADERS, MAKERS = 0x48415054, 0x48415055
 KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
 
+class Indexes(Protocol):
+    """The indexes of an environment's rows, and the tables that they belong to."""
+
+    def are_there(self) -> bool:
+        """Whether no index is missing."""
+
+    def have_no_rows(self) -> bool:
+        """Whether the tables are empty."""
+
+    def drop(self) -> None:
+        """Drop the indexes. If somebody is reading, they stay, and nobody waits."""
+
+    def make(self) -> None:
+        """Make the missing indexes, while readers go on and writers wait."""
+
+    def vacuum(self) -> None:
+        """Let frames read the index only."""
+
+
+class IndexesHere:
+    """Indexes on one server; `key` names the columns of each."""
+
+    def __init__(
+        self, connection: ServerConnection, layout: Layout, key: str = "z_val, id"
+    ) -> None:
+        self._connection = connection
+        self._tables = TABLES[layout]
+        self._key = key
+
+    def are_there(self) -> bool:
+        """Whether no index is missing."""
+        found = self._connection.rows(
+            "SELECT bool_and(to_regclass(name) IS NOT NULL) FROM unnest(%s::text[]) AS name",
+            ([f"{table}_key" for table in self._tables],),
+        )
+        return bool(found[0][0])
+
+    def have_no_rows(self) -> bool:
+        """Whether the tables are empty."""
+        held = " OR ".join(f"EXISTS (SELECT 1 FROM {table})" for table in self._tables)
+        return self._connection.rows(f"SELECT {held}") == [(False,)]
+
+    def drop(self) -> None:
+        """Drop the indexes. If somebody is reading, they stay, and nobody waits."""
+        connection = self._connection
+        with contextlib.suppress(psycopg.errors.LockNotAvailable):
+            connection.command("BEGIN")
+            try:
+                connection.command("SET LOCAL lock_timeout = '50ms'")
+                keys = ", ".join(f"{table}_key" for table in self._tables)
+                connection.command(f"DROP INDEX IF EXISTS {keys}")
+                connection.command("COMMIT")
+            except BaseException:
+                if not connection.driver.closed:
+                    connection.command("ROLLBACK")
+                raise
+
+    def make(self) -> None:
+        """Make the missing indexes, while readers go on and writers wait."""
+        connection = self._connection
+        connection.command("SET maintenance_work_mem = '256MB'")
+        for table in self._tables:
+            connection.command(
+                f"CREATE UNIQUE INDEX IF NOT EXISTS {table}_key ON {table} ({self._key})"
+            )
+        connection.command("RESET maintenance_work_mem")
+
+    def vacuum(self) -> None:
+        """Let frames read the index only."""
+        self._connection.command(f"VACUUM {', '.join(self._tables)}")
+
+
 class Loading:
     """The context in which a connection writes many objects. May be nested."""
 
-    def __init__(self, connection: ServerConnection, layout: Layout) -> None:
+    def __init__(self, connection: ServerConnection, indexes: "Indexes") -> None:
         self._connection = connection
-        self._tables = TABLES[layout]
+        self._indexes = indexes
         self._depth = 0
         self._is_owner = False
         self._has_written = False
@@ -52,8 +125,8 @@ class Loading:
             connection.execute(f"SELECT pg_advisory_lock_shared({KEY})", (LOADERS,))
             try:
                 self._is_owner = connection.is_owner()
-                if self._is_owner and self._is_empty():
-                    self._drop_index()
+                if self._is_owner and self._indexes.have_no_rows():
+                    self._indexes.drop()
             except BaseException:
                 self._unlock("_shared", LOADERS)
                 raise
@@ -79,7 +152,7 @@ class Loading:
                 if self._is_owner:
                     self._make_index()
                     if self._has_written:  # so that frames read the index only
-                        connection.command(f"VACUUM {', '.join(self._tables)}")
+                        self._indexes.vacuum()
             finally:
                 self._unlock("_shared", LOADERS)
 
@@ -98,7 +171,7 @@ class Loading:
     def mend(self) -> None:
         """Make the index that a killed loader left out, unless somebody is loading now."""
         connection = self._connection
-        if not connection.is_owner() or self._has_index():
+        if not connection.is_owner() or self._indexes.are_there():
             return
         with (
             connection.without_limit("statement_timeout", "lock_timeout"),
@@ -107,12 +180,17 @@ class Loading:
             if is_alone:
                 self._make_index()
 
-    def drop_unused(self) -> None:
-        """Delete the environment if nothing was ever written to it and nobody is loading."""
+    def drop_unused(self) -> bool:
+        """Delete the environment if nothing was ever written to it and nobody is loading.
+
+        Returns whether it is deleted.
+        """
         connection = self._connection
         with self._alone() as is_alone:
             if is_alone and not connection.rows("SELECT 1 FROM environment WHERE revision > 0"):
                 schema_of.drop(connection)
+                return True
+        return False
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[bool]:
@@ -130,32 +208,6 @@ class Loading:
             with contextlib.suppress(psycopg.Error):  # the environment itself may be gone
                 self._connection.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
 
-    def _has_index(self) -> bool:
-        found = self._connection.rows(
-            "SELECT bool_and(to_regclass(name) IS NOT NULL) FROM unnest(%s::text[]) AS name",
-            ([f"{table}_key" for table in self._tables],),
-        )
-        return bool(found[0][0])
-
-    def _is_empty(self) -> bool:
-        held = " OR ".join(f"EXISTS (SELECT 1 FROM {table})" for table in self._tables)
-        return self._connection.rows(f"SELECT {held}") == [(False,)]
-
-    def _drop_index(self) -> None:
-        """Drop the indexes. If somebody is reading, they stay, and nobody waits."""
-        connection = self._connection
-        with contextlib.suppress(psycopg.errors.LockNotAvailable):
-            connection.command("BEGIN")
-            try:
-                connection.command("SET LOCAL lock_timeout = '50ms'")
-                keys = ", ".join(f"{table}_key" for table in self._tables)
-                connection.command(f"DROP INDEX IF EXISTS {keys}")
-                connection.command("COMMIT")
-            except BaseException:
-                if not connection.driver.closed:
-                    connection.command("ROLLBACK")
-                raise
-
     def _make_index(self) -> None:
         """Make the indexes, while readers go on and writers wait.
 
@@ -164,11 +216,6 @@ class Loading:
         connection = self._connection
         connection.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
         try:
-            connection.command("SET maintenance_work_mem = '256MB'")
-            for table in self._tables:
-                connection.command(
-                    f"CREATE UNIQUE INDEX IF NOT EXISTS {table}_key ON {table} (z_val, id)"
-                )
-            connection.command("RESET maintenance_work_mem")
+            self._indexes.make()
         finally:
             self._unlock("", MAKERS)

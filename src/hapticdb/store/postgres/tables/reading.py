@@ -47,6 +47,10 @@ class PostgresReader:
         """The revision that the last read has seen."""
         return self._seen
 
+    def note_seen(self, revision: int) -> None:
+        """Note the revision of a read that others have made for this environment."""
+        self._seen = revision
+
     def revision(self) -> int:
         """Number of the last committed write; 0 for an empty environment."""
         rows = self._connection.rows("SELECT revision FROM environment WHERE id = 1")
@@ -67,7 +71,7 @@ class PostgresReader:
         if distances:
             lengths = wire.read_int8s(found[4])
             rows = rows.having(believed.band_of(self._url, found[3] or b"", lengths))
-        return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
+        return rows if is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
 
     def has_band(self) -> bool:
         """Whether there is a table of distances; another may make it while a reader has it open."""
@@ -198,7 +202,7 @@ def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:
     return [wire.int8(low), wire.int8(high), wire.Parameter(wire.BYTEA, bits)]
 
 
-def _is_in_order(rows: Rows) -> bool:
+def is_in_order(rows: Rows) -> bool:
     """Whether rows are ordered by key and id. They are not while a first import has no index."""
     keys, ids = rows.keys, rows.ids
     if len(keys) < 2:

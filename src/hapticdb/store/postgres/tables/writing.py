@@ -13,26 +13,18 @@ from hapticdb.store.base import (
     Layout,
     Object,
     Rows,
-    Table,
     touched_ranges,
 )
-from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.tables import records, statements
+from hapticdb.store.postgres.tables import records
 from hapticdb.store.postgres.tables.loading import Loading
+from hapticdb.store.postgres.tables.placing import PlacesRows
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.watching import channel_of
 from hapticdb.store.refusals import check_unwritten, check_without_distances, present_already
 
 Result = TypeVar("Result")
 
-COPY_CHUNK = 1 << 17
-"""Rows that are packed for COPY at a time. A larger value takes more memory, not less time."""
-COLUMNS: dict[Table, str] = {
-    "voxel": "z_val, id",
-    "brick": "z_val, id, occupancy",
-    "band": "z_val, id, distances",
-}
 # not from a sequence, which also counts rolled-back writes: an import that is run again would
 # give other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
@@ -50,12 +42,14 @@ class PostgresWriter:
         layout: Layout,
         reader: PostgresReader,
         loading: Loading,
+        rows: PlacesRows,
     ) -> None:
         self._connection = connection
         self._grid = grid
         self._layout = layout
         self._reader = reader
         self._loading = loading
+        self._rows = rows
         self._written: tuple[int, str, int, str] = (0, "", 0, "")
         self._highest_id = (0, 0)  # at which revision
 
@@ -69,7 +63,7 @@ class PostgresWriter:
                 object_id = self._execute(records.INSERT_OBJECT, new)[0][0]
             except errors.UniqueViolation as error:
                 raise present_already(record, self._connection.shown) from error
-            self._copy(rows, object_id)
+            self._copy(rows, object_id, revision)
             self._log(revision, "add", object_id, rows.keys)
             return int(object_id)
 
@@ -82,9 +76,9 @@ class PostgresWriter:
             revision = self._next_revision()
             known = self._reader.object(record.id)
             check_unwritten(record, known, self._connection.shown)
-            gone = self._delete(known, covering)
+            gone = self._delete(known, covering, revision)
             self._execute(records.UPDATE_OBJECT, records.contents(record, rows, revision))
-            self._copy(rows, record.id)
+            self._copy(rows, record.id, revision)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
         self._commit(work)
@@ -97,7 +91,7 @@ class PostgresWriter:
             known = self._reader.object(record.id)
             check_without_distances(record, known, self._connection.shown)
             self._execute(records.UPDATE_OBJECT, records.contents(record, rows, revision))
-            self._copy_into("band", rows, record.id)
+            self._rows.put_band(rows, record.id, revision)
             self._log(revision, "move", record.id, rows.keys)
 
         self._commit(work)
@@ -107,7 +101,7 @@ class PostgresWriter:
 
         def work() -> None:
             revision = self._next_revision()
-            gone = self._delete(self._reader.object(object_id), covering)
+            gone = self._delete(self._reader.object(object_id), covering, revision)
             self._execute("DELETE FROM object WHERE id = %s", (object_id,))
             self._log(revision, "remove", object_id, gone)
 
@@ -132,6 +126,7 @@ class PostgresWriter:
 
     def _commit(self, work: Callable[[], Result]) -> Result:
         result = self._connection.write(work, self._is_written)
+        self._rows.committed()
         self._loading.note()
         return result
 
@@ -140,31 +135,11 @@ class PostgresWriter:
         cursor = self._connection.execute(text, parameters)
         return cursor.fetchall() if cursor.description else []
 
-    def _copy(self, rows: Rows, object_id: int) -> None:
-        self._copy_into(self._layout, rows.occupied(), object_id)
-        if rows.distances is not None:
-            self._copy_into("band", rows, object_id)
+    def _copy(self, rows: Rows, object_id: int, revision: int) -> None:
+        self._rows.put(rows, object_id, revision)
 
-    def _copy_into(self, table: Table, rows: Rows, object_id: int) -> None:
-        cursor = self._connection.driver.cursor()
-        with cursor.copy(f"COPY {table} ({COLUMNS[table]}) FROM STDIN (FORMAT binary)") as copy:
-            copy.write(wire.COPY_HEADER)
-            for at in range(0, len(rows), COPY_CHUNK):
-                copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id))
-            copy.write(wire.COPY_TRAILER)
-
-    def _delete(self, known: Object, covering: Covering) -> Keys:
-        """Delete the rows of an object as it is now, from both tables; returns their keys."""
-        ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
-        chosen = wire.int8s(ends[:, 0]), wire.int8s(ends[:, 1]), wire.int8(known.id)
-        tables: list[Table] = [self._layout]
-        if known.has_distances:
-            tables.append("band")
-        gone = []
-        for table in tables:
-            (found,) = self._connection.fetch(statements.DELETE_ROWS[table], *chosen)
-            gone.append(wire.read_int8s(found))
-        return np.concatenate(gone)
+    def _delete(self, known: Object, covering: Covering, revision: int) -> Keys:
+        return self._rows.take(known, covering, revision)
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
         """Record which keys a write touched, and notify those who watch when it is committed."""

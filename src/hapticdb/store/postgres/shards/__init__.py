@@ -1,0 +1,1 @@
+"""An environment on several servers: a coordinator, and shards that hold the rows."""

@@ -1,0 +1,105 @@
+"""Shards that are away: left out by reads that can do without them, and connected again meanwhile.
+
+A thread for each such shard tries to connect, so no read waits for a server that does not answer.
+"""
+
+import contextlib
+import threading
+from collections.abc import Callable, Sequence
+
+from hapticdb.errors import HapticDBError
+from hapticdb.store.postgres.shards.links import Answer, Ask, ShardConnection, Shards
+
+PATIENCE_MS = 500
+"""Milliseconds that a shard may take to answer before it counts as away. A larger value bears
+slower shards; but while one is waited for, the cells of all others wait, too."""
+FIRST_WAIT_S = 1.0
+"""Seconds that the first read waits for the first connection to a shard."""
+PAUSE_S = 0.25
+"""Seconds between two tries to connect. A larger value asks a struggling server less often, and
+notices later that it is back."""
+
+
+class AwayShards:
+    """Which shards of an environment are away, for reads that leave them out."""
+
+    def __init__(self, shards: Shards) -> None:
+        self._shards = shards
+        self._revivals: dict[int, _Revival] = {}
+        self._has_begun = [False] * len(shards)
+
+    def names(self) -> tuple[str, ...]:
+        """Shards that are away, as messages name them; no round trip."""
+        return tuple(self._shards.name(shard) for shard in sorted(self._revivals))
+
+    def ask(self, asks: Sequence[Ask], first: str | None) -> tuple[Answer, list[Answer | None]]:
+        """Answers as of `Shards.ask`; None for a shard that is away."""
+        there = [ask for ask in asks if self._is_there(ask.shard)]
+        found, answers = self._shards.ask_once(there, first, PATIENCE_MS)
+        by_shard = {ask.shard: answer for ask, answer in zip(there, answers, strict=True)}
+        for shard, answer in by_shard.items():
+            if answer is None:
+                self._begin(shard)
+        return found, [by_shard.get(ask.shard) for ask in asks]
+
+    def close(self) -> None:
+        """Give up all shards that are away."""
+        for revival in self._revivals.values():
+            revival.stop()
+        self._revivals.clear()
+
+    def _is_there(self, shard: int) -> bool:
+        """Whether a shard is connected; takes over a connection that a thread has made."""
+        if not self._has_begun[shard]:
+            self._has_begun[shard] = True
+            if not self._shards.is_connected(shard):
+                self._begin(shard)
+                self._revivals[shard].wait(FIRST_WAIT_S)
+        revival = self._revivals.get(shard)
+        if revival is None:
+            return True
+        connection = revival.connection
+        if connection is None:
+            return False
+        self._shards.exchange(shard, connection)
+        del self._revivals[shard]
+        return True
+
+    def _begin(self, shard: int) -> None:
+        self._shards.exchange(shard, None)
+        self._revivals[shard] = _Revival(lambda: self._shards.connected(shard))
+
+
+class _Revival:
+    """A thread that connects to one shard, however long that takes."""
+
+    def __init__(self, connect: Callable[[], ShardConnection]) -> None:
+        self.connection: ShardConnection | None = None
+        self._connect = connect
+        self._lock = threading.Lock()
+        self._is_stopped = threading.Event()
+        self._is_done = threading.Event()
+        threading.Thread(target=self._run, name="hapticdb-away", daemon=True).start()
+
+    def wait(self, seconds: float) -> None:
+        """Wait until connected, or for so many seconds."""
+        self._is_done.wait(seconds)
+
+    def stop(self) -> None:
+        """Stop trying; a connection that is being made is closed when it is there."""
+        self._is_stopped.set()
+        with self._lock:
+            if self.connection is not None:
+                self.connection.close()
+
+    def _run(self) -> None:
+        while not self._is_stopped.is_set():
+            with contextlib.suppress(HapticDBError, OSError):
+                made = self._connect()
+                with self._lock:
+                    if self._is_stopped.is_set():
+                        made.close()
+                    self.connection = made
+                self._is_done.set()
+                return
+            self._is_stopped.wait(PAUSE_S)

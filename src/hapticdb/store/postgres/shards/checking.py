@@ -1,0 +1,50 @@
+"""Checks of an environment on several servers for `hapticdb check`, beside those of every store."""
+
+from collections.abc import Iterator
+
+from hapticdb.errors import ShardAwayError
+from hapticdb.store.base import Rows
+from hapticdb.store.postgres.checking import PostgresChecker
+from hapticdb.store.postgres.shards.links import ShardConnection, Shards
+from hapticdb.store.postgres.shards.reading import ShardedReader
+
+WRITES = "SELECT writes FROM shard ORDER BY number"
+
+
+class ShardedChecker:
+    """Checks the coordinator and all shards."""
+
+    def __init__(self, coordinator: PostgresChecker, shards: Shards, reader: ShardedReader) -> None:
+        self._coordinator = coordinator
+        self._shards = shards
+        self._reader = reader
+
+    def has_page_checksums(self) -> bool:
+        """Whether the pages of all servers carry checksums."""
+        asked = self._shards.each(lambda _, shard: shard.rows("SHOW data_checksums"))
+        return self._coordinator.has_page_checksums() and all(one == [("on",)] for one in asked)
+
+    def findings(self) -> Iterator[str]:
+        """What is wrong with kept statistics, and with whole shards, a line each."""
+        yield from self._coordinator.findings()
+        published = [int(row[0]) for row in self._shards.coordinator.rows(WRITES)]
+        for shard, least in enumerate(published):
+            name = self._shards.name(shard)
+            try:
+                found = self._shards.each(_writes_of, [shard])
+            except ShardAwayError as error:
+                yield f"{name} does not answer: {error}"
+                continue
+            if found[0] < least:
+                yield (
+                    f"{name} has lost writes: it has {found[0]} of {least}; "
+                    "it was put back from a copy older than the coordinator's"
+                )
+
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        """At most that many rows after (key, id), ascending by both."""
+        return self._reader.rows_after(key, object_id, limit, distances=distances)
+
+
+def _writes_of(_: int, shard: ShardConnection) -> int:
+    return int(shard.rows("SELECT writes FROM mark")[0][0])

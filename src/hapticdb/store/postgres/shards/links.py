@@ -1,0 +1,241 @@
+"""Connections to the shards of an environment: all asked at once, each made when first used."""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import NamedTuple, TypeVar
+
+import psycopg
+
+from hapticdb.errors import (
+    ConnectionLostError,
+    DamagedError,
+    OutdatedError,
+    ShardAwayError,
+    StuckError,
+)
+from hapticdb.store.postgres.address import Address
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.wire import Parameter
+
+Result = TypeVar("Result")
+Answer = list[bytes | None]
+MOST_THREADS = 16
+"""Most shards that are written at the same time. A larger value keeps more shards busy."""
+TOKEN = "SELECT token::text FROM mark"  # noqa: S105 - which environment it is, no secret
+
+
+class Place(NamedTuple):
+    """Where a shard is: its number from 1, its host as the user wrote it, libpq's URL of it."""
+
+    number: int
+    host: str
+    conninfo: str
+
+
+class Ask(NamedTuple):
+    """A statement for one shard, whose place among the shards begins at 0."""
+
+    shard: int
+    text: str
+    parameters: tuple[Parameter, ...]
+
+
+class ShardConnection(ServerConnection):
+    """A connection to one shard. Its threads are the store's business."""
+
+    def __init__(self, place: Place, environment: Address, token: str, *, read_only: bool) -> None:
+        shown = f"shard {place.number} ({place.host}) of {environment.shown}"
+        address = Address(place.conninfo, environment.environment, None, shown)
+        self._token = token
+        super().__init__(address, place.conninfo, read_only=read_only)
+        try:
+            self._check_token()
+        except BaseException:
+            self.close()
+            raise
+
+    def check_thread(self) -> None:
+        """Any thread may use it; `Shards` sees to it that one at a time does."""
+
+    def connect(self) -> None:
+        """Connect again, once; a server in the shard's place that is another one is refused."""
+        super().connect()
+        self._check_token()
+
+    def _check_token(self) -> None:
+        found = self.execute(TOKEN).fetchall()
+        if found != [(self._token,)]:
+            raise DamagedError(
+                f"{self.shown} holds rows of another environment: give the server back that held "
+                "these rows, or restore the copies of all servers that belong together"
+            )
+
+
+class Shards:
+    """The shards of one opened environment."""
+
+    def __init__(self, coordinator: ServerConnection, places: Sequence[Place], token: str) -> None:
+        self.coordinator = coordinator
+        self.places = places
+        self.token = token
+        self._made: list[ShardConnection | None] = [None] * len(places)
+        self._threads: ThreadPoolExecutor | None = None
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def name(self, shard: int) -> str:
+        """Number and host of a shard, as messages name it."""
+        place = self.places[shard]
+        return f"shard {place.number} ({place.host})"
+
+    def is_connected(self, shard: int) -> bool:
+        """Whether there is a connection to a shard."""
+        return self._made[shard] is not None
+
+    def connection(self, shard: int) -> ShardConnection:
+        """Connection to a shard, made when it is first asked for."""
+        made = self._made[shard]
+        if made is None:
+            made = self._made[shard] = self.connected(shard)
+        return made
+
+    def connected(self, shard: int) -> ShardConnection:
+        """A new connection to a shard."""
+        coordinator = self.coordinator
+        with named_away():
+            return ShardConnection(
+                self.places[shard], coordinator.address, self.token,
+                read_only=coordinator.is_read_only,
+            )  # fmt: skip
+
+    def exchange(self, shard: int, connection: ShardConnection | None) -> None:
+        """Close a connection and use another one from now on; None makes one when needed."""
+        before, self._made[shard] = self._made[shard], connection
+        if before is not None:
+            before.close()
+
+    def close(self) -> None:
+        """Close all connections."""
+        for shard in range(len(self)):
+            self.exchange(shard, None)
+        if self._threads is not None:
+            self._threads.shutdown()
+            self._threads = None
+
+    @contextlib.contextmanager
+    def unlimited(self) -> Iterator[None]:
+        """Lift the time limits of statements on all shards inside."""
+        with contextlib.ExitStack() as stack, named_away():
+            for shard in range(len(self)):
+                stack.enter_context(self.connection(shard).without_limit())
+            yield
+
+    # -- reading ---------------------------------------------------------------------------------
+
+    def ask(self, asks: Sequence[Ask], first: str | None = None) -> tuple[Answer, list[Answer]]:
+        """Answers of all shards, asked at the same time; before them that of the coordinator.
+
+        A shard whose connection was lost is connected again and asked once more, as for a read on
+        one server.
+
+        Raises
+        ------
+        ShardAwayError
+            When a shard cannot be reached.
+        """
+        for ask in asks:
+            self.connection(ask.shard)
+        found, answers = self.ask_once(asks, first)
+        known = []
+        for ask, answer in zip(asks, answers, strict=True):
+            with named_away():
+                known.append(answer or self.connection(ask.shard).fetch(ask.text, *ask.parameters))
+        return found, known
+
+    def ask_once(
+        self, asks: Sequence[Ask], first: str | None, patience_ms: int | None = None
+    ) -> tuple[Answer, list[Answer | None]]:
+        """Answers as of `ask`, without a second try: None for a shard whose connection is lost.
+
+        patience_ms : how long a shard may take before its connection counts as lost; None for the
+        limit of the connection, after which StuckError is raised.
+        """
+        self.coordinator.check_thread()
+        waiting: list[ServerConnection] = []
+        answers: list[Answer | None] = [None] * len(asks)
+        found: Answer | None = None
+        lost = (ConnectionLostError,) if patience_ms is None else (ConnectionLostError, StuckError)
+        try:
+            # all are sent before the first is taken
+            if first is not None:
+                with contextlib.suppress(ConnectionLostError):
+                    self.coordinator.send(first)
+                    waiting.append(self.coordinator)
+            for ask in asks:
+                with contextlib.suppress(*lost):
+                    connection = self.connection(ask.shard)
+                    connection.send(ask.text, *ask.parameters)
+                    waiting.append(connection)
+            if first is not None and self.coordinator in waiting:
+                with contextlib.suppress(ConnectionLostError):
+                    found = self.coordinator.take()
+                waiting.remove(self.coordinator)
+            for at, ask in enumerate(asks):
+                if (connection := self.connection(ask.shard)) in waiting:
+                    with contextlib.suppress(*lost):
+                        answers[at] = connection.take(patience_ms)
+                    waiting.remove(connection)
+        except BaseException:
+            for one in waiting:  # no later statement may get these answers
+                one.driver.close()
+            raise
+        if first is not None and found is None:
+            found = self.coordinator.fetch(first)
+        return found or [], answers
+
+    # -- writing ---------------------------------------------------------------------------------
+
+    def each(
+        self, work: Callable[[int, ShardConnection], Result], some: Sequence[int] | None = None
+    ) -> list[Result]:
+        """Results of `work` for shards, by default for all; at the same time, each in a thread.
+
+        Raises the first error after all have ended.
+        """
+        chosen = list(range(len(self)) if some is None else some)
+
+        def one(shard: int) -> Result:
+            with named_away():
+                return work(shard, self.connection(shard))
+
+        if len(chosen) == 1:
+            return [one(chosen[0])]
+        if self._threads is None:
+            self._threads = ThreadPoolExecutor(min(len(self), MOST_THREADS), "hapticdb-shard")
+        begun = [self._threads.submit(one, shard) for shard in chosen]
+        try:
+            wait(begun)
+        except BaseException:  # Ctrl-C: no thread may use a connection after this call
+            for shard in chosen:
+                if (connection := self._made[shard]) is not None:
+                    with contextlib.suppress(psycopg.Error):
+                        connection.driver.cancel()
+            wait(begun)
+            raise
+        errors = [error for work_of in begun if (error := work_of.exception()) is not None]
+        if errors:
+            raise errors[0]
+        return [work_of.result() for work_of in begun]
+
+
+@contextlib.contextmanager
+def named_away() -> Iterator[None]:
+    """Turn the loss of a shard's connection into `ShardAwayError`."""
+    try:
+        yield
+    except (ShardAwayError, OutdatedError):
+        raise
+    except ConnectionLostError as error:
+        raise ShardAwayError(*error.args) from error

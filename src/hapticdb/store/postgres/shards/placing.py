@@ -1,0 +1,146 @@
+"""Rows of objects, written to their shards in a version of their own.
+
+A write copies its rows to all shards that they touch, at the same time, and commits there. No
+reader believes them until the coordinator's commit names their version in the table `live`. So the
+rows of an object appear and vanish together, whatever ends in between; what it leaves is swept
+(`hapticdb.store.postgres.shards.sweeping`).
+"""
+
+import secrets
+from collections.abc import Sequence
+
+import numpy as np
+
+from hapticdb.grid import Grid
+from hapticdb.store.base import (
+    CELL_SHIFT,
+    Covering,
+    Keys,
+    Layout,
+    Object,
+    Rows,
+    Table,
+    row_shift,
+    touched_ranges,
+)
+from hapticdb.store.postgres.connecting import wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.shards.links import ShardConnection, Shards
+from hapticdb.store.postgres.shards.pieces import pieces_of_keys
+from hapticdb.store.postgres.shards.schemas import COLUMNS
+from hapticdb.store.postgres.shards.sweeping import Left, Sweeper
+from hapticdb.store.postgres.tables.placing import COPY_CHUNK
+
+VERSION_BITS = 62
+"""Bits of a version, drawn at random for each write. Versions of two writes of one object are equal
+once in 2^62 times; the index refuses the second then, and the write fails."""
+COUNT_WRITE = "UPDATE mark SET writes = writes + 1 RETURNING writes"
+LIST_WRITTEN = "INSERT INTO written VALUES (%s, %s, %s)"
+PUBLISH = """
+INSERT INTO live VALUES (%s, %s, %s, %s)
+ON CONFLICT (id) DO UPDATE SET version = EXCLUDED.version, ranges = EXCLUDED.ranges,
+                               revision = EXCLUDED.revision"""
+# read inside the write: its lock keeps the borders where they are
+BORDERS = "SELECT array_agg(first_key ORDER BY number) FROM shard"
+KNOWN = "SELECT version, ranges FROM live WHERE id = %s"
+
+
+class RowsOnShards:
+    """Writes rows to shards inside a write's transaction on the coordinator."""
+
+    def __init__(
+        self,
+        connection: ServerConnection,
+        shards: Shards,
+        sweeper: Sweeper,
+        shape: tuple[Grid, Layout],
+    ) -> None:
+        self._connection = connection
+        self._shards = shards
+        self._sweeper = sweeper
+        self._grid, self._layout = shape
+        self._left: Left | None = None
+
+    def put(self, rows: Rows, object_id: int, revision: int) -> None:
+        """Write the rows of an object and publish them with the commit of the write."""
+        version = secrets.randbits(VERSION_BITS)
+        ranges = touched_ranges(self._grid, self._layout, rows.keys).reshape(-1).tolist()
+        ((borders,),) = self._connection.execute(BORDERS).fetchall()
+        firsts = np.array(borders, dtype=np.int64) >> row_shift(self._layout)
+        batches: dict[int, list[tuple[Table, Rows]]] = {}
+        tables: list[tuple[Table, Rows]] = [(self._layout, rows.occupied())]
+        if rows.distances is not None:
+            tables.append(("band", rows))
+        for table, some in tables:
+            for shard, where in pieces_of_keys(firsts, some.keys):
+                batches.setdefault(shard, []).append((table, some.part(where.start, where.stop)))
+
+        def copy(shard: int, connection: ShardConnection) -> int:
+            return _copied(connection, batches[shard], (object_id, version, ranges))
+
+        touched = sorted(batches)
+        counts = self._shards.each(copy, touched) if touched else []
+        for shard, count in zip(touched, counts, strict=True):
+            self._connection.execute(
+                "UPDATE shard SET writes = greatest(writes, %s) WHERE number = %s",
+                (count, self._shards.places[shard].number),
+            )
+        self._connection.execute(PUBLISH, (object_id, version, ranges, revision))
+
+    def put_band(self, rows: Rows, object_id: int, revision: int) -> None:
+        """Write an object's rows again, with distances."""
+        self._leave(object_id, revision)
+        self.put(rows, object_id, revision)
+
+    def take(self, known: Object, _covering: Covering, revision: int) -> Keys:
+        """Take an object's rows away with the commit; returns a key in each cell they are in."""
+        ranges = self._leave(known.id, revision)
+        self._connection.execute(PUBLISH, (known.id, None, [], revision))
+        shift = CELL_SHIFT if self._grid.is_hierarchical else 2 * self._grid.bits
+        low, high = ranges.T >> shift
+        cells = [np.arange(first, last + 1) for first, last in zip(low, high, strict=True)]
+        return np.concatenate([np.empty(0, np.int64), *cells]) << (shift - row_shift(self._layout))
+
+    def _leave(self, object_id: int, revision: int) -> Keys:
+        """Note the rows of an object that this write leaves behind; returns their ranges (C, 2)."""
+        found = self._connection.execute(KNOWN, (object_id,)).fetchone()
+        version, ranges = found if found is not None else (None, [])
+        self._left = None
+        if version is not None:
+            self._left = Left(object_id, version, revision, tuple(ranges))
+        return np.array(ranges, dtype=np.int64).reshape(-1, 2)
+
+    def committed(self) -> None:
+        """Sweep what the write has left behind, where nobody reads it any more."""
+        left, self._left = self._left, None
+        if left is not None:
+            self._sweeper.sweep_after_write(left)
+
+
+def _copied(
+    connection: ShardConnection,
+    batches: Sequence[tuple[Table, Rows]],
+    listed: tuple[int, int, list[int]],
+) -> int:
+    """Copy rows to one shard in one transaction; returns the number of its writes."""
+    object_id, version, _ = listed
+
+    def work() -> int:
+        # the row of `mark` is locked until the end: one write at a time on a shard
+        ((count,),) = connection.execute(COUNT_WRITE).fetchall()
+        connection.execute(LIST_WRITTEN, listed)
+        for table, rows in batches:
+            text = f"COPY {table} ({COLUMNS[table]}) FROM STDIN (FORMAT binary)"
+            with connection.driver.cursor().copy(text) as copying:
+                copying.write(wire.COPY_HEADER)
+                for at in range(0, len(rows), COPY_CHUNK):
+                    some = rows.part(at, at + COPY_CHUNK)
+                    copying.write(wire.copy_rows(some, object_id, version))
+                copying.write(wire.COPY_TRAILER)
+        return int(count)
+
+    def is_committed() -> bool:
+        asked = "SELECT 1 FROM written WHERE (id, version) = (%s, %s)"
+        return bool(connection.rows(asked, (object_id, version)))
+
+    return connection.write(work, is_committed)

@@ -1,0 +1,286 @@
+"""Reads of an environment on several servers: the client asks all shards that hold keys at once.
+
+A read sends its statements to the shards and, at the same moment, asks the coordinator for the
+revision. If that is the one that the reader knows, the answers are of that revision: rows that were
+published before the reader knew it are there, and rows in other versions are left out. If it is a
+newer one, the reader learns what has changed and asks again.
+
+Rows of a past revision may have been swept or moved meanwhile; the mark of each answer tells.
+"""
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+
+import numpy as np
+
+from hapticdb.errors import DamagedError, OutdatedError
+from hapticdb.store import believed
+from hapticdb.store.base import NO_KEYS, NO_OCCUPANCY, Keys, Layout, Rows, Table, row_shift
+from hapticdb.store.batches import PartialRows, joined, no_rows
+from hapticdb.store.postgres.connecting import wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.shards import statements
+from hapticdb.store.postgres.shards.away import AwayShards
+from hapticdb.store.postgres.shards.links import Answer, Ask, Shards
+from hapticdb.store.postgres.shards.pieces import pieces_of_keys, pieces_of_ranges
+from hapticdb.store.postgres.shards.view import NEWEST, View, Views
+from hapticdb.store.postgres.tables.reading import PostgresReader, is_in_order
+
+TRIES = 20
+"""Times that a read begins again because others have written. A larger value waits longer where
+writes come faster than reads."""
+LAST = int(np.iinfo(np.int64).max)
+Plan = Callable[[View], Sequence[Ask]]
+Send = Callable[[Sequence[Ask], str | None], tuple[Answer, Sequence[Answer | None]]]
+
+
+class ShardedReader:
+    """Reads of rows; objects and changes are read by `objects`, from the coordinator."""
+
+    def __init__(
+        self, connection: ServerConnection, shards: Shards, layout: Layout, objects: PostgresReader
+    ) -> None:
+        self._connection = connection
+        self._shards = shards
+        self._url = connection.shown
+        self._layout = layout
+        self._objects = objects
+        self._depth = 0
+        self._held: View | None = None
+        self.away = AwayShards(shards)
+        self.views = Views(connection, row_shift(layout))
+
+    # -- at which revision -----------------------------------------------------------------------
+
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All reads inside see one committed revision. May be nested."""
+        with self._connection.snapshot():
+            self._depth += 1
+            try:
+                if self._held is None:  # now: later its rows may have been swept
+                    self._held = self.views.hold()
+                yield
+            finally:
+                self._depth -= 1
+                if not self._depth:
+                    self._held = None
+
+    def ask(self, plan: Plan) -> tuple[View, list[Answer]]:
+        """Answers of shards to the statements that `plan` makes, and the view that they belong to.
+
+        Raises
+        ------
+        OutdatedError
+            Inside a snapshot, when rows that belong to it are gone.
+        ShardAwayError
+            When a shard that is asked cannot be reached.
+        """
+        view, _, answers = self._asked(plan, self._shards.ask)
+        return view, [answer for answer in answers if answer is not None]
+
+    def _asked(self, plan: Plan, send: Send) -> tuple[View, Sequence[Ask], Sequence[Answer | None]]:
+        """View, statements and answers; None for an answer that `send` did not get."""
+        if self._held is not None:
+            asks = plan(self._held)
+            _, answers = send(asks, None)
+            if not self._are_whole(self._held, answers):
+                raise _outdated(self._url)
+            return self._seen(self._held), asks, answers
+        is_renewed = False
+        for _ in range(TRIES):
+            view = self.views.known
+            if view.revision < 0:
+                view, is_renewed = self.views.load(), True
+            asks = plan(view)
+            first, answers = send(asks, None if is_renewed else NEWEST)
+            is_newest = is_renewed or self.views.is_known(first)
+            if is_newest and self._are_whole(view, answers):
+                return self._seen(view), asks, answers
+            self.views.load()
+            is_renewed = True
+        raise _outdated(self._url)
+
+    def _seen(self, view: View) -> View:
+        self._objects.note_seen(view.revision)
+        return view
+
+    def _are_whole(self, view: View, answers: Sequence[Answer | None]) -> bool:
+        """Whether all rows of that view were there when the shards answered."""
+        for answer in answers:
+            if answer is None:
+                continue
+            _, swept, moved = wire.read_int8s(answer[-1]).tolist() if answer[-1] else (0, -1, -1)
+            if swept > view.revision or moved > view.epoch:
+                return False
+        return True
+
+    # -- rows ------------------------------------------------------------------------------------
+
+    def unpacked(self, answer: Answer, *, distances: bool) -> tuple[Rows, Keys]:
+        """Rows of a shard's answer, in any version, and their versions."""
+        if answer[0] is None:
+            return no_rows(distances=distances), NO_KEYS
+        keys, ids = wire.read_int8s(answer[0]), wire.read_int8s(answer[1])
+        has_bits = self._layout == "brick"
+        rows = Rows(
+            keys, ids, np.frombuffer(answer[2] or b"", np.uint8) if has_bits else NO_OCCUPANCY
+        )
+        versions = wire.read_int8s(answer[-2])
+        if distances:
+            lengths = wire.read_int8s(answer[4])
+            rows = rows.having(believed.band_of(self._url, answer[3] or b"", lengths))
+        if not len(keys) == len(ids) == len(versions):
+            raise DamagedError(f"{self._url}: a shard's answer has columns of different lengths")
+        return rows, versions
+
+    def live(self, view: View, answers: Sequence[Answer], *, distances: bool) -> Rows:
+        """The rows of a view among the answers of shards, in the order of the shards."""
+        parts = []
+        for answer in answers:
+            rows, versions = self.unpacked(answer, distances=distances)
+            rows = view.live_of(rows, versions)
+            if not is_in_order(rows):  # a first import has no index yet
+                rows = rows.picked(np.lexsort((rows.ids, rows.keys)))
+            if len(rows):
+                parts.append(rows)
+        if len(parts) == 1:
+            return parts[0]
+        return joined(parts, distances=distances)
+
+    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
+        """Rows of distinct ascending keys (U,), by one statement a shard."""
+        if not keys.size or self._has_no(distances=distances):
+            return no_rows(distances=distances)
+        text = statements.LOOKUP[self._table(distances=distances)]
+
+        def plan(view: View) -> list[Ask]:
+            return [
+                Ask(shard, text, (wire.int8s(keys[some]),))
+                for shard, some in pieces_of_keys(view.firsts, keys)
+            ]
+
+        return self.live(*self.ask(plan), distances=distances)
+
+    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
+        """Rows of distinct ascending keys (U,), one statement a key."""
+        if self._has_no(distances=distances):
+            return no_rows(distances=True)
+        text = statements.LOOKUP_ONE[self._table(distances=distances)]
+        parts = []
+        for at in range(len(keys)):
+            key = keys[at : at + 1]
+
+            def plan(view: View, key: Keys = key) -> list[Ask]:
+                ((shard, _),) = pieces_of_keys(view.firsts, key)
+                return [Ask(shard, text, (wire.int8(int(key[0])),))]
+
+            parts.append(self.live(*self.ask(plan), distances=distances))
+        return joined([part for part in parts if len(part)], distances=distances)
+
+    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        """Rows with a key in any of the closed ranges, ascending and disjoint."""
+        if not lows.size or self._has_no(distances=distances):
+            return no_rows(distances=distances)
+        text = statements.SCAN[self._table(distances=distances)]
+        return self.live(*self.ask(_ranges_plan(text, lows, highs)), distances=distances)
+
+    def scan_partly(self, lows: Keys, highs: Keys, *, distances: bool = False) -> PartialRows:
+        """Rows as of `scan` of the shards that answer, and the ranges of those that are away."""
+        if not lows.size or self._has_no(distances=distances):
+            return PartialRows(no_rows(distances=distances), NO_KEYS.reshape(0, 2))
+        text = statements.SCAN[self._table(distances=distances)]
+        view, asks, answers = self._asked(_ranges_plan(text, lows, highs), self.away.ask)
+        there = [answer for answer in answers if answer is not None]
+        is_away = {ask.shard for ask, answer in zip(asks, answers, strict=True) if answer is None}
+        away = [
+            np.stack([piece.lows, piece.highs], axis=1)
+            for piece in pieces_of_ranges(view.firsts, lows, highs)
+            if piece.shard in is_away
+        ]
+        rows = self.live(view, there, distances=distances)
+        return PartialRows(rows, np.concatenate([NO_KEYS.reshape(0, 2), *away]))
+
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
+        if not lows.size or self._has_no(distances=distances):
+            return no_rows(distances=distances)
+        text = statements.ROWS_OF[self._table(distances=distances)]
+        plan = _ranges_plan(text, lows, highs, wire.int8(object_id))
+        return self.live(*self.ask(plan), distances=distances)
+
+    def count(self, lows: Keys, highs: Keys) -> int:
+        """How many rows `scan` would return, counted on the shards."""
+        if not lows.size:
+            return 0
+        view, answers = self.ask(_ranges_plan(statements.COUNT[self._layout], lows, highs))
+        total = 0
+        for answer in answers:
+            ids, versions, counts = (wire.read_int8s(value) for value in answer[:3])
+            total += int(counts[view.are_live(ids, versions)].sum())
+        return total
+
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        """At most that many rows after (key, id), ascending by both."""
+        if self._has_no(distances=distances):
+            return no_rows(distances=True)
+        after, shard, n_found = (key, object_id, LAST), 0, 0
+        parts: list[Rows] = []
+        while n_found < limit:
+            plan = _After(self._table(distances=distances), after, shard, limit)
+            view, (answer,) = self.ask(plan)
+            shard = plan.shard
+            rows, versions = self.unpacked(answer, distances=distances)
+            end = view.firsts[shard + 1] if shard + 1 < len(view.firsts) else LAST
+            is_own = (rows.keys >= view.firsts[shard]) & (rows.keys < end)
+            chosen = np.flatnonzero(is_own & view.are_live(rows.ids, versions))[: limit - n_found]
+            if len(chosen):
+                parts.append(rows.picked(chosen))
+                n_found += len(chosen)
+            if len(rows):
+                after = int(rows.keys[-1]), int(rows.ids[-1]), int(versions[-1])
+            if len(rows) < limit or rows.keys[-1] >= end:
+                if shard + 1 == len(view.firsts):
+                    break
+                shard += 1
+                after = max(after, (int(view.firsts[shard]) - 1, LAST, LAST))
+        return joined(parts, distances=distances)
+
+    def _has_no(self, *, distances: bool) -> bool:
+        """Whether distances are asked for where no row has any."""
+        return distances and self._layout == "voxel"
+
+    def _table(self, *, distances: bool) -> Table:
+        return "band" if distances else self._layout
+
+
+class _After:
+    """Plan that asks one shard for rows after a place; not one before the shard of that place."""
+
+    def __init__(self, table: Table, after: tuple[int, int, int], shard: int, limit: int) -> None:
+        self._text = statements.AFTER[table]
+        self._parameters = *map(wire.int8, after), wire.int8(limit)
+        self._key = after[0]
+        self.shard = shard
+
+    def __call__(self, view: View) -> list[Ask]:
+        self.shard = max(self.shard, int(np.searchsorted(view.firsts, self._key, "right")) - 1)
+        return [Ask(self.shard, self._text, self._parameters)]
+
+
+def _ranges_plan(text: str, lows: Keys, highs: Keys, *others: wire.Parameter) -> Plan:
+    """Plan that asks each shard for its pieces of ranges."""
+
+    def plan(view: View) -> list[Ask]:
+        return [
+            Ask(piece.shard, text, (wire.int8s(piece.lows), wire.int8s(piece.highs), *others))
+            for piece in pieces_of_ranges(view.firsts, lows, highs)
+        ]
+
+    return plan
+
+
+def _outdated(url: str) -> OutdatedError:
+    return OutdatedError(
+        f"{url} was written by others faster than it could be read at one revision: try again"
+    )

@@ -1,0 +1,104 @@
+"""What a reader knows of the coordinator: the revision, the borders, the live versions."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.store.base import NO_KEYS, Keys, Rows
+from hapticdb.store.postgres.connecting import wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+
+NEWEST = "SELECT environment.revision, epoch FROM environment, distribution"
+# the lock tells those who sweep that somebody still reads this revision (`sweeping`)
+HOLDING = """
+SELECT environment.revision, epoch,
+       pg_advisory_xact_lock_shared(
+         (environment.tableoid::bigint << 32) | (environment.revision & 4294967295))
+  FROM environment, distribution"""
+LOAD = """
+WITH changed AS MATERIALIZED (SELECT id, version FROM live WHERE revision > $1)
+SELECT environment.revision, epoch,
+       (SELECT array_agg(first_key ORDER BY number) FROM shard),
+       (SELECT array_agg(writes ORDER BY number) FROM shard),
+       (SELECT array_agg(id ORDER BY id) FROM changed),
+       (SELECT array_agg(coalesce(version, -1) ORDER BY id) FROM changed)
+  FROM environment, distribution"""
+
+
+class View(NamedTuple):
+    """The environment at one revision.
+
+    revision : of the environment; epoch : number of borders moved so far; firsts (S,) int64: first
+    row key of each shard; writes (S,) int64: writes that each shard had committed, at least;
+    ids (L,) int64: objects that have rows, ascending; versions (L,) int64: the version of the rows
+    of each.
+    """
+
+    revision: int
+    epoch: int
+    firsts: Keys
+    writes: Keys
+    ids: Keys
+    versions: Keys
+
+    def are_live(self, ids: Keys, versions: Keys) -> NDArray[np.bool_]:
+        """Whether rows of these objects in these versions (n,) count."""
+        if not len(self.ids):
+            return np.zeros(len(ids), dtype=np.bool_)
+        at = np.minimum(np.searchsorted(self.ids, ids), len(self.ids) - 1)
+        are_live: NDArray[np.bool_] = (self.ids[at] == ids) & (self.versions[at] == versions)
+        return are_live
+
+    def live_of(self, rows: Rows, versions: Keys) -> Rows:
+        """The rows that count."""
+        are_live = self.are_live(rows.ids, versions)
+        return rows if are_live.all() else rows.picked(np.flatnonzero(are_live))
+
+
+NOTHING = View(-1, -1, NO_KEYS, NO_KEYS, NO_KEYS, NO_KEYS)
+
+
+class Views:
+    """The view that a connection knows; renewed when the coordinator has a newer one."""
+
+    def __init__(self, connection: ServerConnection, row_shift: int) -> None:
+        self._connection = connection
+        self._shift = row_shift
+        self.known = NOTHING
+
+    def is_known(self, answer: list[bytes | None]) -> bool:
+        """Whether `NEWEST` or `HOLDING` has answered with the revision and epoch that are known."""
+        found = wire.read_int8(answer[0] or b""), wire.read_int8(answer[1] or b"")
+        return found == (self.known.revision, self.known.epoch)
+
+    def hold(self) -> View:
+        """View of the snapshot that has begun; its rows are not swept while it lasts."""
+        if not self.is_known(self._connection.fetch(HOLDING)):
+            self.load()
+        return self.known
+
+    def renewed(self) -> View:
+        """View of the newest commit, loaded unless it is known."""
+        if not self.is_known(self._connection.fetch(NEWEST)):
+            self.load()
+        return self.known
+
+    def load(self) -> View:
+        """Read the newest view. Of the versions only those that changed since are read."""
+        before = self.known
+        answer = self._connection.fetch(LOAD, wire.int8(before.revision))
+        revision, epoch = (wire.read_int8(value or b"") for value in answer[:2])
+        if revision < before.revision:  # the coordinator was put back to an older copy
+            self.known = NOTHING
+            return self.load()
+        firsts, writes, ids, versions = map(wire.read_int8s, answer[2:])
+        kept = ~np.isin(before.ids, ids)
+        ids = np.concatenate([before.ids[kept], ids])
+        versions = np.concatenate([before.versions[kept], versions])
+        order = np.argsort(ids)
+        order = order[versions[order] >= 0]
+        self.known = View(
+            revision, epoch, firsts >> self._shift, writes, ids[order], versions[order]
+        )
+        return self.known

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticdb.errors import GridError, HapticDBError, ShardAwayError, UsageError
+from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.realtime.object_names import ObjectAnswers
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.tracking import SessionTracker
 from hapticdb.realtime.wishes import Motion, Wish
 from hapticdb.resident.outages import OutageCounter
+from hapticdb.resident.partial import AnsweringShards
 from hapticdb.resident.pushing import SupportsPush
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
@@ -153,8 +154,7 @@ class Fetcher:
         assert wish is not None  # noqa: S101 - the origin is finite
         self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
         self.residency.warm_up()
-        with contextlib.suppress(ShardAwayError):  # then the first answer loads its kernels
-            self._answers.ids_of(self.store, np.zeros(1, dtype=np.int64))
+        self._answers.ids_of(AnsweringShards(self.store), np.zeros(1, dtype=np.int64))
 
     @property
     def lookahead(self) -> float:

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
         OutsideGridError,
         ProtocolError,
         ReadOnlyError,
+        StaleError,
         StuckError,
         UsageError,
     )
@@ -110,6 +111,7 @@ __all__ = [
     "Report",
     "ResidentCells",
     "Session",
+    "StaleError",
     "StuckError",
     "Swept",
     "TangentPlane",
@@ -144,7 +146,7 @@ _HOMES = {
         "DatabaseError DeviceError EnvironmentExistsError EnvironmentNotFoundError "
         "FileError GeometryChangedError GridError HapticDBError MissingExtraError "
         "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutdatedError "
-        "OutsideGridError ProtocolError ReadOnlyError StuckError UsageError"
+        "OutsideGridError ProtocolError ReadOnlyError StaleError StuckError UsageError"
     ),
     "query.law": "DistanceField TangentPlane",
     "grid": "Grid GridOptions",

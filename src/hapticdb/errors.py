@@ -22,7 +22,8 @@
         ├── AccessError (PermissionError)     the server does not let this user in
         ├── ConflictError                     another has written the object meanwhile
         ├── ConnectionLostError (ConnectionError)  the server went away
-        │   └── OutdatedError                 a snapshot that a server could not hold
+        │   ├── OutdatedError                 a snapshot that a server could not hold
+        │   └── StaleError                    a standby that is behind, or may be
         ├── BusyError (TimeoutError)          another writer held the database too long
         └── StuckError (TimeoutError)         the database took longer than a frame may
 
@@ -117,6 +118,10 @@ class ConnectionLostError(DatabaseError, ConnectionError):
 
 class OutdatedError(ConnectionLostError):
     """A snapshot that a server could not hold: read all of it again."""
+
+
+class StaleError(ConnectionLostError):
+    """The server that answers is a standby: its rows are, or may be, older than allowed."""
 
 
 class StuckError(DatabaseError, TimeoutError):

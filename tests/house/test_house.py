@@ -103,6 +103,7 @@ PUBLIC = [
     "Report",
     "ResidentCells",
     "Session",
+    "StaleError",
     "StuckError",
     "Swept",
     "TangentPlane",

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hapticdb.grid import Grid
     from hapticdb.query.cost_model import CostModel
     from hapticdb.store.base import Freshness, Layout, Object, Size, Store
+    from hapticdb.store.lagging import Lag
 
 MEANINGS = {
     "statement": "a statement of ranges, without what it reads",
@@ -104,12 +105,14 @@ class _Overview(NamedTuple):
     freshness: "Freshness"
     source: str
     has_checksums: bool
+    lag: "Lag | None"
 
     @classmethod
     def of(cls, store: "Store") -> Self:
         """Ask a store."""
         from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
         from hapticdb.store.base import scene_bounds
+        from hapticdb.store.lagging import MayLag
 
         size, objects = store.size(), store.objects()
         return cls(
@@ -126,6 +129,7 @@ class _Overview(NamedTuple):
             freshness=store.freshness(DEFAULT_RESOLUTION),
             source=QuantileVector.of(store, DEFAULT_RESOLUTION).source,
             has_checksums=store.checker().has_page_checksums(),
+            lag=store.lag() if isinstance(store, MayLag) else None,
         )
 
     @property
@@ -170,6 +174,7 @@ class _Overview(NamedTuple):
                 "bytes": self.size.band_bytes,
             },
             "page_checksums": self.has_checksums,
+            "standby": None if self.lag is None else self.lag._asdict(),
             "fit": None if self.fit is None else self.fit._asdict(),
             "statistics": {"source": self.source, **self.freshness._asdict()},
         }
@@ -183,6 +188,7 @@ class _Overview(NamedTuple):
             ("environment", self.url),
             ("name", self.name),
             ("engine", self.engine),
+            *([] if self.lag is None else [("standby", _lag_text(self.lag))]),
             ("voxel size", render.metres(grid.voxel_size)),
             ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
             ("edge", render.metres(grid.edge)),
@@ -199,6 +205,18 @@ class _Overview(NamedTuple):
             ("checksums", "of pages" if self.has_checksums else NO_CHECKSUMS),
             ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),
         ]
+
+
+def _lag_text(lag: "Lag") -> str:
+    """Put in words how far a standby is behind."""
+    text = f"replayed to {lag.replayed}"
+    if lag.bytes is None or lag.writes is None:
+        return f"{text}; how far behind is not known: {lag.unknown}"
+    if not lag.bytes:
+        return f"{text}, all that its primary has written"
+    since = "" if lag.seconds is None else f", {lag.seconds:.3g} s at most"
+    writes = render.counted(lag.writes, "write")
+    return f"{text}, {render.bytes_text(lag.bytes)} behind its primary: {writes}{since}"
 
 
 def objects(

@@ -9,6 +9,7 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.looping import LoopInServer
+from hapticdb.store.postgres.standby.following import Following
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.tables.statistics import PostgresStatistics
@@ -59,6 +60,9 @@ class PostgresStore:
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
         watch = Watch(connection, self.identity)
         self.watch, self.has_changed = watch.begin, watch.has_changed
+        following = self._following = Following(connection, self.identity, reader.revision)
+        self.begin_proofs, self.newest_at = following.begin, following.newest_at
+        self.lag = following.lag
         if not self.is_read_only:
             self._loading.mend()
 
@@ -82,6 +86,7 @@ class PostgresStore:
 
     def close(self) -> None:
         """Close the connection."""
+        self._following.close()
         self._connection.close()
 
     @property

@@ -8,17 +8,22 @@ from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
 import psycopg
+import pytest
 
 from children import finished, until
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer
-from servers import SETTINGS
+from servers import FOUND, named
+from servers import SETTINGS as FAST
+
+SETTINGS = FAST | {"wal_keep_size": "256MB"}
+"""Settings of all servers; a standby that was stopped finds the log that it has missed."""
 
 
 class Pair:
     """A primary and a standby that streams from it.
 
-    folder : where both are; settings : of the standby, beside those of all tests' servers.
+    folder : where all of them are, one folder each; binaries : their version.
     """
 
     def __init__(self, folder: Path, binaries: Binaries) -> None:
@@ -113,3 +118,9 @@ def pair_of(binaries: Binaries) -> Iterator[Pair]:
             pair.close()
     finally:
         shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="module", params=[b for b in FOUND if not isinstance(b, str)], ids=named)
+def pair(request: pytest.FixtureRequest) -> Iterator[Pair]:
+    with pair_of(request.param) as made:
+        yield made

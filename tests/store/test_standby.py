@@ -1,5 +1,7 @@
 """Reads from a standby: which server answers, how old the answer is, and who may write."""
 
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
 import contextlib
 import itertools
 import threading
@@ -21,19 +23,12 @@ from hapticdb.store.postgres.standby.aiming import aimed, at_primary
 from hapticdb.store.postgres.standby.asking import Answer, PrimaryQuestions
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import is_noticed, write_voxels
-from servers import FOUND, named
-from standbys import Pair, pair_of
+from standbys import Pair, pair  # noqa: F401 - a fixture
 
 GRID = Grid(0.005, (0, 0, 0), 7)
 VOXEL = np.array([[1, 2, 3]])
 EVERYWHERE = np.array([0]), np.array([2**62])
 numbers = itertools.count()
-
-
-@pytest.fixture(scope="module", params=[b for b in FOUND if not isinstance(b, str)], ids=named)
-def pair(request: pytest.FixtureRequest) -> Iterator[Pair]:
-    with pair_of(request.param) as made:
-        yield made
 
 
 @pytest.fixture
@@ -149,7 +144,9 @@ def test_one_host_and_other_values_are_left_as_they_are() -> None:
 
 
 def test_the_primary_is_asked_with_a_limit_beside_the_urls_own_options() -> None:
-    found = at_primary("postgresql://h1,h2/x?target_session_attrs=prefer-standby&options=-cjit%3Don")
+    found = at_primary(
+        "postgresql://h1,h2/x?target_session_attrs=prefer-standby&options=-cjit%3Don"
+    )
     assert "target_session_attrs=primary" in found
     assert "-cjit=on -cstatement_timeout=1000" in found
 
@@ -254,9 +251,7 @@ def test_a_standby_alone_proves_nothing_and_says_so(pair: Pair, name: str) -> No
         assert store.revision() == 2
 
 
-def test_after_a_loss_a_standby_that_is_further_behind_is_refused(
-    pair: Pair, name: str
-) -> None:
+def test_after_a_loss_a_standby_that_is_further_behind_is_refused(pair: Pair, name: str) -> None:
     other = pair.add(f"other_{next(numbers)}")
     url = pair.url(name, pair.standby, other, pair.primary)
     try:

@@ -101,6 +101,14 @@ class SupportsGrant(Protocol):
 
 
 @runtime_checkable
+class SupportsStandbys(Protocol):
+    """An engine whose URLs may lead to copies that follow the database later."""
+
+    def at_primary(self, url: str) -> str:
+        """URL of the same environment on the server that is written. Connects to nothing."""
+
+
+@runtime_checkable
 class SupportsBackup(Protocol):
     """An engine that copies a whole environment as of one moment, and puts a copy in its place."""
 

@@ -1,13 +1,14 @@
 """How old the answers of a standby are: proved by the primary, never by the standby alone.
 
-A standby that is cut off, or told to wait, answers its old revision as readily as a new one. Its own
-views do not help: an idle primary and a lost one are equally silent for many seconds, and what they
-show of the primary needs rights and the clocks of two machines. So the primary itself is asked for
-its revision, ten times a second, on a connection of its own. Writes take their revisions under a
-lock that they hold until they are committed. So if the primary, asked at the instant t, had the
-revision R, each write that was committed before t has a revision up to R; and a standby in which R
-is visible has replayed all of them. Cells of the revision R or a later one were up to date at t. Only
-the clock of this machine is read, which never goes back.
+A standby that is cut off, or told to wait, answers its old revision as readily as a new one. Its
+own views do not help: an idle primary and a lost one are equally silent for many seconds, and what
+they show of the primary needs rights and the clocks of two machines. So the primary itself is asked
+for its revision, ten times a second, on a connection of its own.
+
+Writes take their revisions under a lock that they hold until they are committed. So if the primary,
+asked at the instant t, had the revision R, each write that was committed before t has a revision up
+to R; and a standby in which R is visible has replayed all of them. Cells of the revision R or a
+later one were up to date at t. Only the clock of this machine is read, which never goes back.
 
 Assumed: the server that takes writes is the one that says so and that the URL leads to; the standby
 replays the log of that server, or of one that has the same history. A standby that has replayed
@@ -24,8 +25,8 @@ from hapticdb.store.postgres.standby.aiming import at_primary
 from hapticdb.store.postgres.standby.asking import PrimaryQuestions
 
 FIRST_ANSWER_S = 12.0
-"""Longest time to wait for the primary's first answer. It is longer than one host may take to accept
-a connection. A larger value lets the URL name several hosts that do not answer."""
+"""Longest time to wait for the primary's first answer. It is longer than one host may take to
+accept a connection. A larger value lets the URL name several hosts that do not answer."""
 CATCH_UP_S = 0.5
 """Longest time to wait for a standby to replay what the primary had when it was first asked. A
 larger value begins with a standby that is further behind."""
@@ -35,7 +36,8 @@ POSITION = """
 SELECT pg_current_wal_flush_lsn()::text, clock_timestamp()::text,
        (SELECT revision FROM environment WHERE id = 1)"""
 REPLAYED = """
-SELECT pg_last_wal_replay_lsn()::text, pg_wal_lsn_diff(%s::pg_lsn, pg_last_wal_replay_lsn())::bigint,
+SELECT pg_last_wal_replay_lsn()::text,
+       pg_wal_lsn_diff(%s::pg_lsn, pg_last_wal_replay_lsn())::bigint,
        extract(epoch FROM %s::timestamptz - pg_last_xact_replay_timestamp())::float8,
        (SELECT revision FROM environment WHERE id = 1)"""
 

@@ -354,7 +354,7 @@ def test_questions_keep_what_is_still_ahead_of_the_standby(
     monkeypatch.setattr(PrimaryQuestions, "_follow", lambda _: None)
     with opened(pair.at_primary(name)) as store:
         here = store.connection
-        questions = PrimaryQuestions(here.address, here.conninfo, store.identity)  # type: ignore[arg-type]
+        questions = PrimaryQuestions(here.address, here.conninfo, store.identity)
         questions._answers.extend(Answer(10 * n, n) for n in range(1, 6))
         assert [questions.newest_at(n) for n in (0, 1, 1, 3, 3, 9)] == [0, 10, 10, 30, 30, 50]
 
@@ -365,7 +365,7 @@ def test_questions_to_a_primary_that_has_lost_commits_forget_what_was_told(
     monkeypatch.setattr(PrimaryQuestions, "_follow", lambda _: None)
     with opened(pair.at_primary(name)) as store:
         here = store.connection
-        questions = PrimaryQuestions(here.address, here.conninfo, store.identity)  # type: ignore[arg-type]
+        questions = PrimaryQuestions(here.address, here.conninfo, store.identity)
         questions._answers.append(Answer(5, 7))
         questions._newest = 7
         questions._ask(here)

@@ -11,7 +11,7 @@ from hapticdb import Environment
 from hapticdb.realtime.fetching import Fetcher, FetchRequest
 from hapticdb.resident.table import AWAY, HEARTBEAT, LEAST_BUDGET, CellTable
 from hapticdb.store.base import Store
-from hapticdb.store.lagging import Lag, MayLag
+from hapticdb.store.engines import Lag, MayLag
 from hapticdb.testing import write_voxels
 from realtime.worlds import block, make
 

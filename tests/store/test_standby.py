@@ -18,11 +18,11 @@ from hapticdb import Grid
 from hapticdb.server.cells.endpoint import CellsEndpoint
 from hapticdb.store.connect import at_primary as url_at_primary
 from hapticdb.store.connect import create_store, exists, grant, open_store
-from hapticdb.store.lagging import MayLag
+from hapticdb.store.engines import MayLag
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.standby import following
 from hapticdb.store.postgres.standby.aiming import aimed, at_primary
-from hapticdb.store.postgres.standby.asking import Answer, PrimaryQuestions
+from hapticdb.store.postgres.standby.asking import PrimaryQuestions, ToldRevision
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import is_noticed, write_voxels
 from standbys import Pair, pair  # noqa: F401 - a fixture
@@ -355,7 +355,7 @@ def test_questions_keep_what_is_still_ahead_of_the_standby(
     with opened(pair.at_primary(name)) as store:
         here = store.connection
         questions = PrimaryQuestions(here.address, here.conninfo, store.identity)
-        questions._answers.extend(Answer(10 * n, n) for n in range(1, 6))
+        questions._answers.extend(ToldRevision(10 * n, n) for n in range(1, 6))
         assert [questions.newest_at(n) for n in (0, 1, 1, 3, 3, 9)] == [0, 10, 10, 30, 30, 50]
 
 
@@ -366,7 +366,7 @@ def test_questions_to_a_primary_that_has_lost_commits_forget_what_was_told(
     with opened(pair.at_primary(name)) as store:
         here = store.connection
         questions = PrimaryQuestions(here.address, here.conninfo, store.identity)
-        questions._answers.append(Answer(5, 7))
+        questions._answers.append(ToldRevision(5, 7))
         questions._newest = 7
         questions._ask(here)
         assert [answer.revision for answer in questions._answers] == [1]

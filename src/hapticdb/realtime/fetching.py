@@ -29,8 +29,8 @@ from hapticdb.resident.table import (
 )
 from hapticdb.store.base import NO_KEYS, Store, SupportsWatch
 from hapticdb.store.connect import open_store
+from hapticdb.store.engines import MayLag
 from hapticdb.store.filtering import ALL, Filter
-from hapticdb.store.lagging import MayLag
 
 LOOKAHEAD = 0.05
 """Least time (s) that cells are fetched ahead of the hand. Larger: fewer unknown cells, more cells

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hapticdb.grid import Grid
     from hapticdb.query.cost_model import CostModel
     from hapticdb.store.base import Freshness, Layout, Object, Size, Store
-    from hapticdb.store.lagging import Lag
+    from hapticdb.store.engines import Lag
 
 MEANINGS = {
     "statement": "a statement of ranges, without what it reads",
@@ -112,7 +112,7 @@ class _Overview(NamedTuple):
         """Ask a store."""
         from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
         from hapticdb.store.base import scene_bounds
-        from hapticdb.store.lagging import MayLag
+        from hapticdb.store.engines import MayLag
 
         size, objects = store.size(), store.objects()
         return cls(

@@ -20,7 +20,7 @@ MOST_ANSWERS = 1024
 is further behind; it is behind by more than a minute then."""
 
 
-class Answer(NamedTuple):
+class ToldRevision(NamedTuple):
     """At the instant `asked_at` (ns of `time.monotonic_ns`) or later the primary had `revision`."""
 
     asked_at: int
@@ -43,7 +43,7 @@ class PrimaryQuestions:
     def __init__(self, address: Address, conninfo: str, identity: int) -> None:
         self._address, self._conninfo, self._identity = address, conninfo, identity
         self._lock = threading.Lock()
-        self._answers: deque[Answer] = deque(maxlen=MOST_ANSWERS)
+        self._answers: deque[ToldRevision] = deque(maxlen=MOST_ANSWERS)
         self._newest = -1
         self._proved_at = 0
         self.failure: HapticDBError | None = None
@@ -99,7 +99,7 @@ class PrimaryQuestions:
             if row[0] < self._newest:  # commits were lost: earlier answers prove nothing
                 self._answers.clear()
             self._newest = row[0]
-            self._answers.append(Answer(asked_at, row[0]))
+            self._answers.append(ToldRevision(asked_at, row[0]))
             self.failure = None
         self._has_asked.set()
 

@@ -19,7 +19,7 @@ import time
 from collections.abc import Callable
 
 from hapticdb.errors import HapticDBError, StaleError
-from hapticdb.store.lagging import Lag
+from hapticdb.store.engines import Lag
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.standby.aiming import at_primary
 from hapticdb.store.postgres.standby.asking import PrimaryQuestions

@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import LiteralString
 from urllib.parse import quote
 
 import numpy as np
@@ -45,12 +46,12 @@ FLOOR = floor_voxels(GRID, width=96)
 """On all three shards: 12 x 12 x 1 bricks across the grid's middle."""
 
 
-def on(server: PrivateServer, url: str, statement: str) -> list[tuple[object, ...]]:
+def on(server: PrivateServer, url: str, statement: LiteralString) -> list[tuple[object, ...]]:
     """Rows of a statement on one server, in the environment's schema."""
     with psycopg.connect(server.conninfo(), autocommit=True) as connection:
         name = sql.Identifier(parse(url).environment)
         connection.execute(sql.SQL("SET search_path = {}").format(name))
-        found = connection.execute(statement)  # type: ignore[call-overload] - text of this module
+        found = connection.execute(statement)
         return found.fetchall() if found.description else []
 
 

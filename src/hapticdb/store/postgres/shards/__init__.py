@@ -1,0 +1,1 @@
+"""An environment's rows on several servers."""

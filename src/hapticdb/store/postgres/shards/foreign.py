@@ -13,9 +13,10 @@ z_val, id, version). Without a condition on `cell` every shard sends all of its 
 joins are not sent: postgres_fdw considers that only with remote estimates, which cost a round trip
 a plan.
 
-What a shard plans, it plans at each statement. ``z_val = ANY (...)`` there reads the most common
-values and 10,000 bounds of `z_val` for each of its elements: 10 ms and more for 240 keys
-(benchmarks/sharded_frames.py). ``cell = ANY (...)`` reads 100, so statements choose rows by cell.
+A shard plans each statement anew. For ``z_val = ANY (...)`` it compares each element with each of
+the most common values of `z_val`, of which there may be thousands: milliseconds for 240 keys, more
+than the read itself (benchmarks/sharded_frames.py). ``cell`` has 100 of them at most. So statements
+choose rows by cell, and the coordinator picks the keys.
 
 Visibility is a look-up in the local table `live` for each row, not a join. A row counts under three
 conditions: `live` names its version; it comes from the shard that owns its cell, because while a

@@ -1,4 +1,4 @@
-"""A coordinator and three shards for tests: databases of one server, with the tables of the design."""
+"""A coordinator and three shards for tests: databases of one server, filled by hand."""
 
 import os
 import uuid

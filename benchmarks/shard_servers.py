@@ -158,7 +158,7 @@ def filled(url: str, table: str, rows: Scene, where: NDArray[np.bool_], *, versi
 
 def version_of(ids: Keys) -> Keys:
     """Version of each object's rows: any number that differs from object to object."""
-    return (ids * 0x9E3779B97F4A7C15 & (2**62 - 1)).astype(np.int64)
+    return (ids * 0x1E3779B97F4A7C15 & (2**62 - 1)).astype(np.int64)
 
 
 def make_shard(url: str, rows: Scene, number: int) -> None:

@@ -104,11 +104,14 @@ def cluster(database: str) -> Iterator[Cluster]:
             shards.append(psycopg.connect(there, autocommit=True))
             make_shard(shards[-1])
             words = conninfo.conninfo_to_dict(there)
-            user = {key: str(words.pop(key)) for key in ("user", "password") if key in words}
+            user: dict[str, str] = {
+                key: str(words.pop(key)) for key in ("user", "password") if key in words
+            }
             places[n] = Place({key: str(value) for key, value in words.items()}, user)
         yield Cluster(coordinator, shards, places)
-        for connection in (coordinator, *shards):
-            connection.close()
+        coordinator.close()
+        for shard in shards:
+            shard.close()
         for name in names:
             admin.execute(sql.SQL("DROP DATABASE {} WITH (FORCE)").format(sql.Identifier(name)))
 

@@ -172,18 +172,29 @@ def test_a_plan_for_any_cells_asks_every_shard_and_still_sends_the_condition(
     assert without_condition(plans["force_generic_plan"]) == []
 
 
-def test_a_shard_looks_cells_up_in_its_index(filled: Cluster) -> None:
-    """The remote statement, run at the shard with the settings that the coordinator gives it."""
-    (scan,) = foreign_scans(plan_of(filled, BY_CELLS, (ONE_SHARD,)))
+@pytest.mark.parametrize(
+    "condition",
+    [
+        "cell = ANY ('{11,13,19}')",
+        "cell BETWEEN 11 AND 12",
+        "cell BETWEEN 11 AND 12 OR cell BETWEEN 14 AND 15",
+    ],
+)
+def test_a_shard_looks_cells_up_in_its_index(filled: Cluster, condition: str) -> None:
+    """The remote statement as a cursor of a shard, with the settings that the coordinator gives."""
+    text = f"SELECT z_val, id, occupancy FROM brick_live WHERE {condition}"
+    (scan,) = foreign_scans(plan_of(filled, text, ()))
     shard = filled.shards[1]
     with shard.transaction():
         for setting in foreign.SETTINGS_THERE.removeprefix("-c ").split(" -c "):
             shard.execute(f"SET LOCAL {setting}")
-        row = shard.execute("EXPLAIN (FORMAT JSON) " + scan["Remote SQL"]).fetchone()
+        explain = "EXPLAIN (FORMAT JSON) DECLARE rows CURSOR FOR "
+        row = shard.execute(explain + scan["Remote SQL"]).fetchone()
     assert row is not None
-    (node,) = nodes_of(row[0][0]["Plan"])
-    assert (node["Node Type"], node["Index Name"]) == ("Index Scan", "brick_cell")
-    assert "z_val >> 6" in node["Index Cond"]
+    nodes = list(nodes_of(row[0][0]["Plan"]))
+    assert {node["Index Name"] for node in nodes if "Index Name" in node} == {"brick_cell"}
+    assert all("z_val >> 6" in node["Index Cond"] for node in nodes if "Index Name" in node)
+    assert "Seq Scan" not in {node["Node Type"] for node in nodes}
 
 
 # --- rows ---------------------------------------------------------------------------------------

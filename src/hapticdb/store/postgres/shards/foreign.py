@@ -45,10 +45,9 @@ COLUMNS: dict[Table, tuple[tuple[str, str], ...]] = {
 }
 KEYS = (("z_val", "bigint"), ("id", "bigint"), ("version", "bigint"))
 MARKS = (("token", "uuid"), ("writes", "bigint"), ("swept", "bigint"), ("moved", "bigint"))
-SETTINGS_THERE = (
-    "-c enable_seqscan=off -c enable_bitmapscan=off -c jit=off -c max_parallel_workers_per_gather=0"
-)
-"""Settings of the coordinator's sessions at shards; `connecting.link` says why for our own."""
+SETTINGS_THERE = "-c enable_seqscan=off -c jit=off -c max_parallel_workers_per_gather=0"
+"""Settings of the coordinator's sessions at shards; `connecting.link` says why for our own. Bitmap
+scans stay on: only they read ranges that are joined by OR from an index."""
 SERVER_OPTIONS = {
     "async_capable": "true",  # shards are asked at once, not one after the other
     "fetch_size": "100000",  # rows a round trip; the default of 100 takes several a frame

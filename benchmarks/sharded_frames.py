@@ -281,6 +281,8 @@ def on_version(binaries: Binaries, folder: Path, scene: Scene, count: int) -> li
                     "owners_of_frame": n_owners,
                     "task": task,
                     "rows": rows,
+                    "distinct_keys": float(np.median([len(frame.keys) for frame in frames])),
+                    "cells": float(np.median([len(frame.cells) for frame in frames])),
                     "load_before": load,
                     "load_after": os.getloadavg()[0],
                     "ways": times,

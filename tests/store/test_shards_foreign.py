@@ -240,6 +240,14 @@ def test_rows_are_those_of_a_plain_table(
     assert all(bits.hex() == f"{z % 65536:x}".rjust(128, "1") for z, _, bits in found)
 
 
+def test_a_row_that_two_shards_have_counts_once(filled: Cluster) -> None:
+    """While a border moves from cell 10 to 13, the shard before has a copy of the rows."""
+    filled.keep(0, spread(range(13)))
+    assert len(filled.coordinator.rows(BY_CELLS, ([9, 11],))) == 2 * 9
+    from_both = filled.coordinator.rows(BY_CELLS.replace("brick_live", "brick_all"), ([9, 11],))
+    assert len(from_both) == 3 * 9
+
+
 @given(seed=st.integers(0, 2**32 - 1), n_points=st.integers(1, 80))
 def test_figure_3_gives_the_wrench_of_one_server_bit_for_bit(
     cluster: Cluster, seed: int, n_points: int

@@ -14,7 +14,7 @@ from hapticdb.store.postgres.shards.pieces import (
     pieces_of_ranges,
 )
 from hapticdb.store.postgres.shards.statistics import joined_histograms
-from hapticdb.store.postgres.shards.view import View
+from hapticdb.store.postgres.shards.view import View, changed_versions
 
 LAST = 60
 firsts_of = st.lists(st.integers(0, LAST), max_size=5).map(
@@ -121,3 +121,19 @@ def test_rows_count_in_the_live_version_only(
     asked = np.array(rows, dtype=np.int64).reshape(-1, 2)
     found = view.are_live(asked[:, 0], asked[:, 1]).tolist()
     assert found == [live.get(object_id) == version for object_id, version in rows]
+
+
+@given(
+    st.dictionaries(st.integers(1, 9), st.integers(0, 3)),
+    st.dictionaries(st.integers(1, 12), st.integers(-1, 3)),
+)
+def test_versions_change_as_in_a_dictionary(before: dict[int, int], new: dict[int, int]) -> None:
+    arrays = [
+        np.array([list(pair) for pair in sorted(some.items())], dtype=np.int64).reshape(-1, 2)
+        for some in (before, new)
+    ]
+    found = changed_versions(arrays[0][:, 0], arrays[0][:, 1], arrays[1][:, 0], arrays[1][:, 1])
+    wanted = {key: version for key, version in (before | new).items() if version >= 0}
+    assert dict(zip(*(column.tolist() for column in found), strict=True)) == wanted
+    assert (np.diff(found[0]) > 0).all()
+    assert dict(arrays[0].tolist()) == before

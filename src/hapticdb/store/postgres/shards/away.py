@@ -5,6 +5,7 @@ A thread for each such shard tries to connect, so no read waits for a server tha
 
 import contextlib
 import threading
+import time
 from collections.abc import Callable, Sequence
 
 from hapticdb.errors import HapticDBError
@@ -14,7 +15,7 @@ PATIENCE_MS = 500
 """Milliseconds that a shard may take to answer before it counts as away. A larger value bears
 slower shards; but while one is waited for, the cells of all others wait, too."""
 FIRST_WAIT_S = 1.0
-"""Seconds that the first read waits for the first connection to a shard."""
+"""Seconds that the first read waits for its connections."""
 PAUSE_S = 0.25
 """Seconds between two tries to connect. A larger value asks a struggling server less often, and
 notices later that it is back."""
@@ -26,14 +27,19 @@ class AwayShards:
     def __init__(self, shards: Shards) -> None:
         self._shards = shards
         self._revivals: dict[int, _Revival] = {}
-        self._has_begun = [False] * len(shards)
+        self._has_begun = False
 
     def names(self) -> tuple[str, ...]:
         """Shards that are away, as messages name them; no round trip."""
-        return tuple(self._shards.name(shard) for shard in sorted(self._revivals))
+        return tuple(
+            self._shards.name(shard)
+            for shard, revival in sorted(self._revivals.items())
+            if revival.connection is None
+        )
 
     def ask(self, asks: Sequence[Ask], first: str | None) -> tuple[Answer, list[Answer | None]]:
         """Answers as of `Shards.ask`; None for a shard that is away."""
+        self._begin_all()
         there = [ask for ask in asks if self._is_there(ask.shard)]
         found, answers = self._shards.ask_once(there, first, PATIENCE_MS)
         by_shard = {ask.shard: answer for ask, answer in zip(there, answers, strict=True)}
@@ -48,13 +54,20 @@ class AwayShards:
             revival.stop()
         self._revivals.clear()
 
-    def _is_there(self, shard: int) -> bool:
-        """Whether a shard is connected; takes over a connection that a thread has made."""
-        if not self._has_begun[shard]:
-            self._has_begun[shard] = True
+    def _begin_all(self) -> None:
+        """Connect to all shards when the first is asked; later that would hold up others' cells."""
+        if self._has_begun:
+            return
+        self._has_begun = True
+        for shard in range(len(self._shards)):
             if not self._shards.is_connected(shard):
                 self._begin(shard)
-                self._revivals[shard].wait(FIRST_WAIT_S)
+        deadline = time.monotonic() + FIRST_WAIT_S
+        for revival in self._revivals.values():
+            revival.wait(max(deadline - time.monotonic(), 0.0))
+
+    def _is_there(self, shard: int) -> bool:
+        """Whether a shard is connected; takes over a connection that a thread has made."""
         revival = self._revivals.get(shard)
         if revival is None:
             return True

@@ -94,17 +94,28 @@ class ShardedStatistics(PostgresStatistics):
         return bytes_of(shard, self._layout)[0], int(rows)
 
     def quantiles(self, resolution: int) -> Histogram:
-        """Histogram as on one server; an older one that is kept while a shard is away."""
+        """Histogram as on one server; an older one that is kept while a shard is away.
+
+        The shards' own statistics are kept at the coordinator, so that a reader need not ask all
+        shards; like any server's, they may be some writes old.
+        """
+        kept = self._kept(resolution)
+        if kept and resolution == SERVER_RESOLUTION and kept.n_rows >= ENOUGH_ROWS:
+            return Histogram(kept.bounds, kept.n_rows, "server statistics")
         try:
             return super().quantiles(resolution)
         except ShardAwayError:
-            kept = self._connection.rows(
-                "SELECT bounds, n_rows FROM quantile WHERE resolution = %s AND bounds IS NOT NULL",
-                (resolution,),
-            )
-            if not kept:
+            if kept is None:
                 raise
-            return believed.histogram_of(self._connection.shown, *kept[0])
+            return kept
+
+    def _kept(self, resolution: int) -> Histogram | None:
+        """Histogram that is kept at the coordinator, of whatever revision."""
+        kept = self._connection.rows(
+            "SELECT bounds, n_rows FROM quantile WHERE resolution = %s AND bounds IS NOT NULL",
+            (resolution,),
+        )
+        return believed.histogram_of(self._connection.shown, *kept[0]) if kept else None
 
     def analyze(self, resolution: int, *, anew: bool = False) -> None:
         """Renew the statistics, and delete rows on the shards that nobody needs any more."""

@@ -93,12 +93,26 @@ class Views:
             self.known = NOTHING
             return self.load()
         firsts, writes, ids, versions = map(wire.read_int8s, answer[2:])
-        kept = ~np.isin(before.ids, ids)
-        ids = np.concatenate([before.ids[kept], ids])
-        versions = np.concatenate([before.versions[kept], versions])
-        order = np.argsort(ids)
-        order = order[versions[order] >= 0]
-        self.known = View(
-            revision, epoch, firsts >> self._shift, writes, ids[order], versions[order]
-        )
+        live = changed_versions(before.ids, before.versions, ids, versions)
+        self.known = View(revision, epoch, firsts >> self._shift, writes, *live)
         return self.known
+
+
+def changed_versions(ids: Keys, versions: Keys, new_ids: Keys, new: Keys) -> tuple[Keys, Keys]:
+    """Versions by id after some have changed; a version of -1 means that the object is gone.
+
+    ids, new_ids : ascending. The given arrays stay as they are.
+    """
+    at = np.searchsorted(ids, new_ids)
+    is_known = at < len(ids)
+    is_known[is_known] = ids[at[is_known]] == new_ids[is_known]
+    versions = versions.copy()
+    versions[at[is_known]] = new[is_known]
+    if not is_known.all():
+        places = at[~is_known]
+        ids = np.insert(ids, places, new_ids[~is_known])
+        versions = np.insert(versions, places, new[~is_known])
+    if (new < 0).any():
+        is_live = versions >= 0
+        ids, versions = ids[is_live], versions[is_live]
+    return ids, versions

@@ -171,7 +171,7 @@ def align(connection: ServerConnection, layout: Layout, places: Mapping[int, For
     layout : {"voxel", "brick"}
         Which tables of rows there are.
     places : mapping
-        ForeignPlace of each shard, by its number.
+        Place of each shard, by its number.
 
     Raises
     ------

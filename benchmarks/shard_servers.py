@@ -209,7 +209,7 @@ def make_coordinator(url: str, shards: Sequence[str], rows: Scene) -> None:
         first = int(rows.borders[number - 1]) << 15
         connection.execute("INSERT INTO shard VALUES (%s, '', %s, 0)", (number, first))
         words = {key: str(value) for key, value in conninfo.conninfo_to_dict(there).items()}
-        places[number] = foreign.Place(words, {"user": words.pop("user")})
+        places[number] = foreign.ForeignPlace(words, {"user": words.pop("user")})
     connection.write(lambda: foreign.align(connection, "brick", places))
     servers = connection.rows("SELECT srvname FROM pg_foreign_server ORDER BY 1")
     connection.command(

@@ -13,6 +13,8 @@ import argparse
 import contextlib
 import json
 import os
+import signal
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -301,6 +303,8 @@ def main() -> None:
     parser.add_argument("--busy", action="store_true", help="note that other work runs, too")
     parser.add_argument("--out", type=Path, default=Path("results/sharded_frames.json"))
     given = parser.parse_args()
+    # SIGTERM raises an exit, so that servers are stopped and files removed
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     scene = made_scene(given.side)
     lines = []
     with awake(), tempfile.TemporaryDirectory(prefix="hapticdb-shards-") as folder:

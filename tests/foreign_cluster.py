@@ -15,7 +15,7 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import foreign
-from hapticdb.store.postgres.shards.foreign import CELL_SHIFT, Place
+from hapticdb.store.postgres.shards.foreign import CELL_SHIFT, ForeignPlace
 
 GRID = Grid(0.005, (0, 0, 0), 8)
 ENVIRONMENT = "sharded plant"  # a name that needs quotes
@@ -43,7 +43,7 @@ class Cluster(NamedTuple):
 
     coordinator: ServerConnection
     shards: list[psycopg.Connection]
-    places: dict[int, Place]
+    places: dict[int, ForeignPlace]
 
     def align(self, borders: list[int]) -> None:
         """Set the first cell of each shard, and bring the foreign tables in line."""
@@ -104,7 +104,7 @@ def cluster(database: str) -> Iterator[Cluster]:
             user: dict[str, str] = {
                 key: str(words.pop(key)) for key in ("user", "password") if key in words
             }
-            places[n] = Place({key: str(value) for key, value in words.items()}, user)
+            places[n] = ForeignPlace({key: str(value) for key, value in words.items()}, user)
         yield Cluster(coordinator, shards, places)
         coordinator.close()
         for shard in shards:

@@ -28,7 +28,7 @@ from foreign_cluster import (
 from hapticdb import AccessError, UsageError
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.shards import foreign
-from hapticdb.store.postgres.shards.foreign import CELL_SHIFT, Part
+from hapticdb.store.postgres.shards.foreign import CELL_SHIFT, OwnedCells
 from hapticdb.store.postgres.tables import statements
 
 BY_CELLS = "SELECT z_val, id, occupancy FROM brick_live WHERE cell = ANY (%s)"
@@ -410,7 +410,11 @@ def test_a_shard_without_a_place_is_refused(filled: Cluster) -> None:
 
 def test_parts_leave_out_shards_without_cells() -> None:
     shards = [(1, 0), (2, 4 * CELL_KEYS), (3, 4 * CELL_KEYS), (4, 9 * CELL_KEYS)]
-    assert foreign.parts_of(shards) == [Part(1, 0, 4), Part(3, 4, 9), Part(4, 9, None)]
+    assert foreign.parts_of(shards) == [
+        OwnedCells(1, 0, 4),
+        OwnedCells(3, 4, 9),
+        OwnedCells(4, 9, None),
+    ]
 
 
 @pytest.mark.parametrize(

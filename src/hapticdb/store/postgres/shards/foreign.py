@@ -112,7 +112,7 @@ SELECT srvname::text, srvoptions, umoptions
  WHERE starts_with(srvname, %s)"""
 
 
-class Place(NamedTuple):
+class ForeignPlace(NamedTuple):
     """Where the coordinator's server finds a shard.
 
     server : libpq's words for host, port, dbname and the like, as the coordinator reaches the
@@ -124,7 +124,7 @@ class Place(NamedTuple):
     user: Mapping[str, str]
 
 
-class Part(NamedTuple):
+class OwnedCells(NamedTuple):
     """A shard that owns cells: from `first` to before `last`; None: without a limit there."""
 
     number: int
@@ -132,7 +132,7 @@ class Part(NamedTuple):
     last: int | None
 
 
-def parts_of(shards: Sequence[tuple[int, int]]) -> list[Part]:
+def parts_of(shards: Sequence[tuple[int, int]]) -> list[OwnedCells]:
     """Shards that own cells, in the order of their cells.
 
     Parameters
@@ -153,11 +153,11 @@ def parts_of(shards: Sequence[tuple[int, int]]) -> list[Part]:
             f"{1 << CELL_SHIFT} that ascend from 0"
         )
     lasts = [*firsts[1:], None]
-    made = [Part(shards[n][0], firsts[n], lasts[n]) for n in range(len(shards))]
+    made = [OwnedCells(shards[n][0], firsts[n], lasts[n]) for n in range(len(shards))]
     return [part for part in made if part.first != part.last]
 
 
-def align(connection: ServerConnection, layout: Layout, places: Mapping[int, Place]) -> None:
+def align(connection: ServerConnection, layout: Layout, places: Mapping[int, ForeignPlace]) -> None:
     """Bring the foreign tables in line with the table `shard`; make them where there are none.
 
     Run it in the transaction that moves a border or adds a shard: then no statement sees the new
@@ -255,7 +255,7 @@ def _known_servers(connection: ServerConnection) -> dict[str, tuple[set[str], se
     return {name: (set(there or ()), set(user or ())) for name, there, user in rows}
 
 
-def _make_servers(connection: ServerConnection, places: Mapping[int, Place]) -> None:
+def _make_servers(connection: ServerConnection, places: Mapping[int, ForeignPlace]) -> None:
     """Make servers; those that are as wanted stay, and with them the open sessions there."""
     known = _known_servers(connection)
     for number, place in places.items():
@@ -332,7 +332,7 @@ def _drop_parts(connection: ServerConnection) -> None:
         _run(connection, "DROP FOREIGN TABLE {name}", name=name)
 
 
-def _make_part(connection: ServerConnection, table: Table, part: Part) -> None:
+def _make_part(connection: ServerConnection, table: Table, part: OwnedCells) -> None:
     last = "MAXVALUE" if part.last is None else str(part.last)
     _run(
         connection,
@@ -349,7 +349,7 @@ def _there(connection: ServerConnection, table: str) -> sql.Composed:
     return _options({"schema_name": connection.address.environment, "table_name": table})
 
 
-def _show(connection: ServerConnection, table: Table, parts: Sequence[Part]) -> None:
+def _show(connection: ServerConnection, table: Table, parts: Sequence[OwnedCells]) -> None:
     """Make the view show the rows that count.
 
     While a border moves, two shards have the rows of some cells, and a foreign table sends all that

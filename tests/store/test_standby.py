@@ -7,6 +7,7 @@ import itertools
 import threading
 import time
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import psycopg
@@ -19,6 +20,7 @@ from hapticdb.server.cells.endpoint import CellsEndpoint
 from hapticdb.store.connect import at_primary as url_at_primary
 from hapticdb.store.connect import create_store, exists, grant, open_store
 from hapticdb.store.engines import MayLag
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.standby import following
 from hapticdb.store.postgres.standby.aiming import aimed, at_primary
@@ -357,6 +359,30 @@ def test_questions_keep_what_is_still_ahead_of_the_standby(
         questions = PrimaryQuestions(here.address, here.conninfo, store.identity)
         questions._answers.extend(ToldRevision(10 * n, n) for n in range(1, 6))
         assert [questions.newest_at(n) for n in (0, 1, 1, 3, 3, 9)] == [0, 10, 10, 30, 30, 50]
+
+
+class Slow:
+    """Passes a question on, and notes when it was asked."""
+
+    def __init__(self, connection: ServerConnection) -> None:
+        self._connection = connection
+        self.asked_at = 0
+
+    def execute(self, text: str) -> "psycopg.Cursor[tuple[Any, ...]]":
+        self.asked_at = time.monotonic_ns()
+        return self._connection.execute(text)
+
+
+def test_an_answer_counts_from_before_the_question(
+    pair: Pair, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(PrimaryQuestions, "_follow", lambda _: None)
+    with opened(pair.at_primary(name)) as store:
+        here = store.connection
+        questions = PrimaryQuestions(here.address, here.conninfo, store.identity)
+        slow: Any = Slow(here)
+        questions._ask(slow)
+        assert 0 < questions.newest_at(1) <= slow.asked_at
 
 
 def test_questions_to_a_primary_that_has_lost_commits_forget_what_was_told(

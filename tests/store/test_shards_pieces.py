@@ -136,4 +136,4 @@ def test_versions_change_as_in_a_dictionary(before: dict[int, int], new: dict[in
     wanted = {key: version for key, version in (before | new).items() if version >= 0}
     assert dict(zip(*(column.tolist() for column in found), strict=True)) == wanted
     assert (np.diff(found[0]) > 0).all()
-    assert dict(arrays[0].tolist()) == before
+    assert {key: version for key, version in arrays[0].tolist()} == before  # noqa: C416

@@ -120,6 +120,7 @@ PUBLIC = [
     "import_files",
     "open",
     "read_poses",
+    "rebalance_environment",
     "replay",
     "restore_environment",
     "sweep",

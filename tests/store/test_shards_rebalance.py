@@ -1,8 +1,13 @@
 """Borders between shards move while others read and write; what is interrupted is taken up."""
 
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
 import contextlib
+import json
+import re
 import threading
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,19 +18,23 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from psycopg import sql
 
+import hapticdb
 from children import PATIENCE
-from hapticdb import Grid
+from command_line import Run, refused, run  # noqa: F401 - a fixture
+from hapticdb import Grid, PointShell
 from hapticdb.errors import AccessError, BusyError, OutdatedError, ShardAwayError
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.frame import Strategy
 from hapticdb.query.grouping import object_ranges
 from hapticdb.store.base import CELL_SHIFT, Keys, Layout, Rows, row_shift
+from hapticdb.store.postgres.connecting import connection
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards.borders import carrying, moves, rebalancing
 from hapticdb.store.postgres.shards.borders.moves import Move, all_moves, borders_after, part_of
 from hapticdb.store.postgres.shards.pieces import even_borders
 from hapticdb.store.postgres.shards.statistics import joined_histograms
 from hapticdb.store.postgres.shards.store import ShardedStore
-from hapticdb.store.sharding import RebalanceProgress
+from hapticdb.store.sharding import Rebalanced, RebalanceProgress
 from hapticdb.testing.scenes import (
     blob,
     covering,
@@ -196,10 +205,10 @@ def on_shards(servers: ShardedServers, store: ShardedStore, text: str) -> list[A
     """Answers of each shard's server to one statement."""
     found = []
     for server in servers.shards:
-        with psycopg.connect(server.conninfo(), autocommit=True) as connection:
+        with psycopg.connect(server.conninfo(), autocommit=True) as asked:
             name = sql.Identifier(store.name)
-            connection.execute(sql.SQL("SET search_path = {}").format(name))
-            found.append(connection.execute(text.encode()).fetchall())  # type: ignore[arg-type]
+            asked.execute(sql.SQL("SET search_path = {}").format(name))
+            found.append(asked.execute(text.encode()).fetchall())  # type: ignore[arg-type]
     return found
 
 
@@ -334,8 +343,20 @@ STEPS = [
 ]
 
 
+QUICK = {"_moved", "_delete"}
+"""Steps of the quick suite."""
+
+
 @pytest.mark.parametrize(
-    ("owner", "name", "after", "is_done"), STEPS, ids=[f"{s[1]}-{s[2]}-{s[3]}" for s in STEPS]
+    ("owner", "name", "after", "is_done"),
+    [
+        pytest.param(
+            *step,
+            id=f"{step[1]}-{step[2]}-{step[3]}",
+            marks=[] if step[1] in QUICK else [pytest.mark.long],
+        )
+        for step in STEPS
+    ],
 )
 def test_a_rebalance_killed_at_any_step_is_taken_up(
     sharded_place: Place,
@@ -370,13 +391,39 @@ def test_a_rebalance_killed_at_any_step_is_taken_up(
         assert contents(store) == written  # the one that was killed lives
 
 
+@pytest.mark.parametrize("n_pieces", [1, 2])
+def test_a_rebalance_killed_within_a_copy_can_go_on(
+    sharded_place: Place, monkeypatch: pytest.MonkeyPatch, n_pieces: int
+) -> None:
+    with made(sharded_place(), distances=True) as store:
+        before = contents(store)
+        with pytest.MonkeyPatch.context() as patch:
+            sent, n_sent = carrying._sent, 0
+
+            def cut_off(*args: Any) -> Iterator[bytes]:
+                nonlocal n_sent
+                for piece in sent(*args):
+                    yield piece
+                    n_sent += len(piece) > 100  # not the header alone
+                    if n_sent >= n_pieces:
+                        raise Killed
+
+            patch.setattr(carrying, "_sent", cut_off)
+            with pytest.raises(Killed):
+                store.rebalance()
+        assert contents(store) == before  # by the same connections
+        monkeypatch.setattr(rebalancing, "PAUSE_SECONDS", 0.0)
+        assert store.rebalance().moved_rows
+        assert contents(store) == before
+
+
 def test_older_copies_at_the_new_shard_are_replaced(
     sharded_place: Place, sharded_servers: ShardedServers
 ) -> None:
     """An object is replaced after its old rows were copied and before the border moved."""
     with made(sharded_place()) as store:
         with pytest.MonkeyPatch.context() as patch:
-            end = killing(0, is_done=True)
+            end = killing(1, is_done=True)  # the first one moves a range without rows
             patch.setattr(carrying.Carrier, "carry", end(carrying.Carrier.carry))
             patch.setattr(carrying, "BATCH_ROWS", {"voxel": 10**9, "brick": 10**9, "band": 10**9})
             with pytest.raises(Killed):
@@ -393,6 +440,54 @@ def test_older_copies_at_the_new_shard_are_replaced(
         store.sweep()
         held = sum(n for ((n,),) in on_shards(sharded_servers, store, "SELECT count(*) FROM brick"))
         assert held == len(everything(store))
+
+
+@pytest.mark.parametrize("kind", ["array", "points", "maxgap", "cbgroup", "auto"])
+def test_a_frame_feels_the_same(sharded_place: Place, kind: Strategy) -> None:
+    url = sharded_place()
+    rng = np.random.default_rng(1)
+    shell = PointShell(
+        points=(shape(0) + 0.5) * GRID.voxel_size,
+        normals=np.tile([0.0, 0.0, 1.0], (len(shape(0)), 1)),
+        center=np.zeros(3),
+        is_closed=True,
+    )
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[1:, :3, 3] = rng.uniform(-0.03, 0.03, (3, 3))
+    with made(url) as store, hapticdb.open(url, read_only=True) as env:
+        before = [env.touch(shell, pose, kind, law="plane") for pose in poses]
+        store.rebalance()
+        for was, pose in zip(before, poses, strict=True):
+            now = env.touch(shell, pose, kind, law="plane")
+            assert len(now.hits)
+            assert (now.hits == was.hits).all()
+            assert (now.force == was.force).all()
+            assert (now.torque == was.torque).all()
+
+
+# --- the verb -----------------------------------------------------------------------------------
+
+
+def test_the_verb_says_what_has_moved(run: Run, sharded_place: Place) -> None:
+    url = sharded_place()
+    with made(url) as store:
+        code, out, err = run("rebalance", url)
+        assert (code, err) == (0, "")
+        assert re.fullmatch(r"\S+: [\d,]+ rows moved \([\d.]+ MB\); rows of the servers .*\n", out)
+        code, out, _ = run("rebalance", url)
+        assert (code, "balanced already" in out) == (0, True)
+        code, out, _ = run("rebalance", url, "--json")
+        found = json.loads(out)
+        assert list(found) == list(Rebalanced._fields)
+        assert sum(found["rows_after"]) == len(everything(store))
+
+
+def test_an_environment_on_one_server_has_nothing_to_rebalance(
+    run: Run, place: Place, tmp_path: Path
+) -> None:
+    for url in (place(), str(tmp_path / "a.db")):
+        hapticdb.create(url, GRID).close()
+        refused(run("rebalance", url), "has one server: nothing to rebalance")
 
 
 # --- others beside ------------------------------------------------------------------------------
@@ -470,7 +565,6 @@ def test_readers_and_a_writer_beside_it_see_whole_objects(sharded_place: Place) 
 def test_a_snapshot_keeps_its_rows_until_it_ends(sharded_place: Place) -> None:
     url = sharded_place()
     with made(url) as store, contextlib.closing(ShardedStore.open(url, read_only=True)) as other:
-        ended = threading.Thread(target=store.rebalance)
         store.give_to(0)
         with other.snapshot():
             rows = listed(everything(other))
@@ -601,8 +695,6 @@ def test_an_import_into_an_empty_environment_comes_first(sharded_place: Place) -
 def test_it_goes_on_when_a_shard_is_back(
     sharded_place: Place, sharded_servers: ShardedServers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hapticdb.store.postgres.connecting import connection
-
     monkeypatch.setattr(connection, "RECONNECT_SECONDS", 0.1)
     with made(sharded_place()) as store:
         before = contents(store)

@@ -23,6 +23,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import psycopg
 
 from hapticdb.errors import AccessError, BusyError, OutdatedError, ShardAwayError
 from hapticdb.store.base import Keys, Layout, row_shift
@@ -57,6 +58,8 @@ them write more often beside a rebalance."""
 DELETED_ROWS = 1 << 16
 """Rows of a table that a shard deletes in one transaction. While it lasts, writers of that shard
 wait."""
+# a large object may take a writer longer than the usual limit
+WAIT = "SET LOCAL lock_timeout = 0"
 BEGIN = "UPDATE distribution SET rebalance = rebalance + 1 RETURNING rebalance"
 STATE = """
 SELECT epoch, rebalance, (SELECT array_agg(first_key ORDER BY number) FROM shard)
@@ -148,13 +151,15 @@ class Rebalancer:
             yield
         finally:
             # a session that is lost has no lock any more
-            if connection.driver is session and not session.closed:
-                connection.execute(f"SELECT pg_advisory_unlock({KEY})", (REBALANCERS,))
+            if connection.driver is session:
+                with contextlib.suppress(psycopg.Error):
+                    connection.execute(f"SELECT pg_advisory_unlock({KEY})", (REBALANCERS,))
 
     def _begun(self) -> int:
         """Take the next number of a rebalance."""
 
         def work() -> int:
+            self._connection.execute(WAIT)
             self._connection.execute(LOCK)
             ((number,),) = self._connection.execute(BEGIN).fetchall()
             return int(number)
@@ -201,6 +206,7 @@ class Rebalancer:
 
         def work() -> Carried | ShardAwayError | None:
             nonlocal expected
+            connection.execute(WAIT)
             connection.execute(LOCK)
             state = self._state()
             if state.number != number:
@@ -286,6 +292,7 @@ class Rebalancer:
         """
 
         def work() -> int:
+            shard.execute(WAIT)
             if not shard.execute(NOTE_MOVED, (epoch, number, number)).fetchall():
                 raise overtaken(shard.shown)
             n_deleted = 0

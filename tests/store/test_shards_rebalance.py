@@ -1,5 +1,7 @@
 """Borders between shards move, and all rows stay; what is interrupted is taken up."""
 
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
 import contextlib
 import json
 import re

@@ -92,8 +92,12 @@ class RowsOnShards:
         self._leave(object_id, revision)
         self.put(rows, object_id, revision)
 
-    def take(self, known: Object, _covering: Covering, revision: int) -> Keys:
+    def take(self, known: Object, covering: Covering, revision: int) -> Keys:
         """Take an object's rows away with the commit; returns a key in each cell they are in."""
+        for _ in covering(
+            known
+        ):  # `live` knows the ranges; but the caller may refuse the write here
+            break
         ranges = self._leave(known.id, revision)
         self._connection.execute(PUBLISH, (known.id, None, [], revision))
         shift = CELL_SHIFT if self._grid.is_hierarchical else 2 * self._grid.bits

@@ -102,7 +102,7 @@ class ShardedReader:
         raise _outdated(self._url)
 
     def _seen(self, view: View) -> View:
-        self._objects.note_seen(view.revision)
+        self._objects.see(view.revision)
         return view
 
     def _are_whole(self, view: View, answers: Sequence[Answer | None]) -> bool:

@@ -134,7 +134,7 @@ def _copied(
     return cursor.rowcount, n_bytes
 
 
-def _sent(source: ServerConnection, table: Table, rows: Range) -> Generator[bytes]:
+def _sent(source: ServerConnection, table: Table, rows: Range) -> Generator[bytes, None, None]:
     """Rows of a table in the form of COPY, in pieces; errors name the server that sends them."""
     chosen = f"SELECT {COLUMNS[table]} FROM {table} WHERE {IN_RANGE} ORDER BY {KEY}"
     text = f"COPY ({chosen}) TO STDOUT (FORMAT binary)"

@@ -60,7 +60,11 @@ if TYPE_CHECKING:
     from hapticdb.recording.file import Recording
     from hapticdb.recording.replay import Replayed, replay
     from hapticdb.store.base import Object
-    from hapticdb.store.connect import backup_environment, restore_environment
+    from hapticdb.store.connect import (
+        backup_environment,
+        rebalance_environment,
+        restore_environment,
+    )
     from hapticdb.sweeps.result import Swept
     from hapticdb.sweeps.run import sweep
     from hapticdb.transfer import CopyReport, copy_environment
@@ -130,6 +134,7 @@ __all__ = [
     "import_files",
     "open",
     "read_poses",
+    "rebalance_environment",
     "replay",
     "restore_environment",
     "sweep",
@@ -172,7 +177,7 @@ _HOMES = {
     "query.cost_model": "CostModel",
     "query.quantiles": "QuantileVector",
     "store.base": "Object",
-    "store.connect": "backup_environment restore_environment",
+    "store.connect": "backup_environment rebalance_environment restore_environment",
     "query.touches": "Touch Touches",
     "transfer": "CopyReport copy_environment",
     "warm": "warm_up",

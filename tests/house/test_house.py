@@ -121,6 +121,7 @@ PUBLIC = [
     "import_files",
     "open",
     "read_poses",
+    "rebalance_environment",
     "replay",
     "restore_environment",
     "sweep",

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from hapticdb.check import CheckCallback
     from hapticdb.ingest.files import ImportCallback
     from hapticdb.store.engines import BackupCallback
+    from hapticdb.store.sharding import RebalanceCallback
     from hapticdb.transfer import CopyCallback
 
 _UNPRINTABLE = re.compile(
@@ -183,6 +184,12 @@ def file_bar(doing: str) -> "AbstractContextManager[BackupCallback | None]":
 def check_bar(doing: str) -> "AbstractContextManager[CheckCallback | None]":
     """Show how many rows are read; see `_progress_bar`."""
     return _progress_bar(doing, "rows", lambda now: (doing, now.done, now.total, 0))
+
+
+def rebalance_bar() -> "AbstractContextManager[RebalanceCallback | None]":
+    """Show how many rows have moved; see `_progress_bar`."""
+    doing = "moving"
+    return _progress_bar(doing, "rows", lambda now: (doing, now.rows_done, now.rows_total, 0))
 
 
 @contextmanager

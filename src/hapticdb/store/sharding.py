@@ -1,5 +1,6 @@
 """What an engine does for an environment whose rows lie on several servers, its shards."""
 
+from collections.abc import Callable
 from typing import NamedTuple, Protocol, runtime_checkable
 
 from hapticdb.store.base import Keys
@@ -19,6 +20,32 @@ class Shard(NamedTuple):
     trouble: str = ""
 
 
+class RebalanceProgress(NamedTuple):
+    """Rows that have moved so far, and rows that have to."""
+
+    rows_done: int
+    rows_total: int
+
+
+RebalanceCallback = Callable[[RebalanceProgress], object]
+
+
+class Rebalanced(NamedTuple):
+    """Result of a rebalance.
+
+    environment : as messages name it; moved_rows : rows of the index table that went to another
+    shard, with those that wait to be swept; moved_bytes : of these rows and their distances;
+    shards : names of all shards; rows_before, rows_after : rows of the index table on each.
+    """
+
+    environment: str
+    moved_rows: int
+    moved_bytes: int
+    shards: tuple[str, ...]
+    rows_before: tuple[int, ...]
+    rows_after: tuple[int, ...]
+
+
 @runtime_checkable
 class SupportsShards(Protocol):
     """An opened environment whose rows lie on several servers."""
@@ -30,4 +57,19 @@ class SupportsShards(Protocol):
         """Place the borders for rows that are to be written; nothing if any were written before.
 
         bounds (R + 1,) int64: equi-count histogram of the keys of these rows.
+        """
+
+    def rebalance(self, progress: RebalanceCallback | None = None) -> Rebalanced:
+        """Move the borders to where each shard holds equally many rows; others go on meanwhile.
+
+        What was interrupted is taken up where it ended.
+
+        Raises
+        ------
+        AccessError
+            When the user does not own the environment.
+        BusyError
+            When another rebalances it, or imports into it while it is empty.
+        ShardAwayError
+            When a shard cannot be reached. What has moved is moved.
         """

@@ -224,12 +224,12 @@ class ShardedReader:
         """At most that many rows after (key, id), ascending by both."""
         if self._has_no(distances=distances):
             return no_rows(distances=True)
-        after, shard, n_found = (key, object_id, LAST), 0, 0
+        after, n_found = (key, object_id, LAST), 0
         parts: list[Rows] = []
         while n_found < limit:
-            plan = _After(self._table(distances=distances), after, shard, limit)
+            plan = _After(self._table(distances=distances), after, limit)
             view, (answer,) = self.ask(plan)
-            shard = plan.shard
+            shard = plan.shard  # by the view that the answer is of
             rows, versions = self.unpacked(answer, distances=distances)
             end = view.firsts[shard + 1] if shard + 1 < len(view.firsts) else LAST
             is_own = (rows.keys >= view.firsts[shard]) & (rows.keys < end)
@@ -242,8 +242,7 @@ class ShardedReader:
             if len(rows) < limit or rows.keys[-1] >= end:
                 if shard + 1 == len(view.firsts):
                     break
-                shard += 1
-                after = max(after, (int(view.firsts[shard]) - 1, LAST, LAST))
+                after = int(end) - 1, LAST, LAST
         return joined(parts, distances=distances)
 
     def _has_no(self, *, distances: bool) -> bool:
@@ -255,16 +254,16 @@ class ShardedReader:
 
 
 class _After:
-    """Plan that asks one shard for rows after a place; not one before the shard of that place."""
+    """Plan that asks the shard for rows after a place that holds the next of them."""
 
-    def __init__(self, table: Table, after: tuple[int, int, int], shard: int, limit: int) -> None:
+    def __init__(self, table: Table, after: tuple[int, int, int], limit: int) -> None:
         self._text = statements.AFTER[table]
         self._parameters = *map(wire.int8, after), wire.int8(limit)
-        self._key = after[0]
-        self.shard = shard
+        self._key = after[0] + (after[1] == LAST)  # the first that a row may have
+        self.shard = 0
 
     def __call__(self, view: View) -> list[Ask]:
-        self.shard = max(self.shard, int(np.searchsorted(view.firsts, self._key, "right")) - 1)
+        self.shard = max(int(np.searchsorted(view.firsts, self._key, "right")) - 1, 0)
         return [Ask(self.shard, self._text, self._parameters)]
 
 

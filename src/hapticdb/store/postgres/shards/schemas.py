@@ -14,7 +14,8 @@ COORDINATOR = (
 CREATE TABLE distribution (
   id    integer PRIMARY KEY CHECK (id = 1),
   token uuid NOT NULL,
-  epoch bigint NOT NULL
+  epoch bigint NOT NULL,
+  rebalance bigint NOT NULL DEFAULT 0
 )""",
     """
 CREATE TABLE shard (
@@ -39,7 +40,8 @@ CREATE TABLE mark (
   token  uuid NOT NULL,
   writes bigint NOT NULL,
   swept  bigint NOT NULL,
-  moved  bigint NOT NULL
+  moved  bigint NOT NULL,
+  rebalance bigint NOT NULL DEFAULT 0
 )""",
     """
 CREATE TABLE written (

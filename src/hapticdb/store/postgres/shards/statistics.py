@@ -129,6 +129,19 @@ class ShardedStatistics(PostgresStatistics):
                 (found[0].tolist(), resolution),
             )
 
+    def rows_of_shards(self) -> Keys:
+        """Live rows of the index table on each shard (S,), counted."""
+        with self._shards.unlimited(), self._rows.snapshot(), self._connection.without_limit():
+            return self._counts(self._layout)
+
+    def exact_histogram(self, resolution: int) -> tuple[Keys, int]:
+        """Equi-count bounds (R + 1,) of the keys of all live rows, and their number; computed."""
+        return self._exact_histogram(resolution)
+
+    def refresh(self) -> None:
+        """Renew the statistics of all shards' servers."""
+        self._refresh()
+
     def _counts(self, table: str) -> Keys:
         """Live rows of each shard (S,)."""
 
@@ -219,4 +232,5 @@ def joined_histograms(bounds: list[Keys], rows: list[int]) -> tuple[Keys, int]:
     of_shard = np.minimum(np.searchsorted(ends, ranks, "left"), len(rows) - 1)
     shares = (ranks - (ends - rows)[of_shard]) / np.array(rows)[of_shard]
     places = np.round(shares * SERVER_RESOLUTION).astype(np.int64)
-    return np.array([bounds[s][at] for s, at in zip(of_shard, places, strict=True)]), n_rows
+    found = np.array([bounds[s][at] for s, at in zip(of_shard, places, strict=True)])
+    return np.sort(found), n_rows  # statistics can be older than the borders

@@ -8,6 +8,7 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import making
+from hapticdb.store.postgres.shards.borders.rebalancing import Rebalancer
 from hapticdb.store.postgres.shards.checking import ShardedChecker
 from hapticdb.store.postgres.shards.loading import IndexesOnShards
 from hapticdb.store.postgres.shards.pieces import borders_by_rows
@@ -16,6 +17,7 @@ from hapticdb.store.postgres.shards.reading import ShardedReader
 from hapticdb.store.postgres.shards.statistics import ShardedStatistics
 from hapticdb.store.postgres.shards.sweeping import Sweeper, Swept
 from hapticdb.store.postgres.store import ServerStore
+from hapticdb.store.sharding import RebalanceCallback, Rebalanced
 
 
 class ShardedStore(ServerStore):
@@ -37,6 +39,7 @@ class ShardedStore(ServerStore):
             connection, self.layout, self._reader, rows, shards, self._sweeper
         )
         self.shards = known.shards
+        self._rebalancer = Rebalancer(connection, shards, self.layout, known)
         try:
             self._take_over(
                 IndexesOnShards(shards, self.layout),
@@ -96,6 +99,10 @@ class ShardedStore(ServerStore):
             self._connection.execute("UPDATE distribution SET epoch = epoch + 1")
 
         self._connection.write(work)
+
+    def rebalance(self, progress: RebalanceCallback | None = None) -> Rebalanced:
+        """Move the borders to where each shard holds equally many rows; others go on meanwhile."""
+        return self._rebalancer.rebalance(progress)
 
     def sweep(self) -> Swept:
         """Delete rows on the shards that no reader needs any more."""

@@ -1,0 +1,1 @@
+"""Borders between shards, moved while others read and write."""

@@ -14,7 +14,7 @@ from hapticdb.pictures.demo import PAPER, SCENE, SIZE, TOWARDS, mixed
 from hapticdb.pictures.lettering import extent_of, shortened, width_of
 from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat, turned
 from hapticdb.pictures.sweep import compose_sweep
-from hapticdb.store.upward import AXES, up_axis
+from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.units import length_text, readable_unit
 
 LONG = "assembly > sub-assembly 0123456789 > " * 4

@@ -208,7 +208,7 @@ def test_no_password_goes_to_a_shard(coordinator: str) -> None:
 
 def test_a_shard_has_the_coordinators_other_settings() -> None:
     kept = {"sslrootcert": "/ca.pem", "sslcert": "/anna.pem", "options": "-cgeqo=off"}
-    kept |= {"connect_timeout": "3", "passfile": "/home/anna/pw", "channel_binding": "require"}
+    kept |= {"connect_timeout": "3", "passfile": "/anna/passwords", "channel_binding": "require"}
     dropped = "target_session_attrs=read-write&load_balance_hosts=random&gssdelegation=1"
     pairs = "&".join(f"{key}={quote(value, safe='')}" for key, value in kept.items())
     url = f"postgresql://an%40na@c1,c2/pl%2Fant?{pairs}&{dropped}"

@@ -19,7 +19,7 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError
 from hapticdb.pictures.lettering import shortened
 from hapticdb.pictures.splat import Camera, Depths, shade, splat
-from hapticdb.store.upward import up_axis
+from hapticdb.store.attributes import up_axis
 
 if TYPE_CHECKING:
     from hapticdb.demo import Comparison, DemoScene, Trace

@@ -29,8 +29,8 @@ from hapticdb.pictures.demo import (
 from hapticdb.pictures.lettering import extent_of, shortened
 from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat
 from hapticdb.pointshell.shell import PointShell
+from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.store.base import Object
-from hapticdb.store.upward import AXES, up_axis
 from hapticdb.sweeps.result import Moment, Swept
 from hapticdb.units import length_text, readable_unit
 

@@ -1,16 +1,28 @@
-"""Which objects have an attribute of a value: the words ``attribute=value``."""
+"""What attributes of objects say: the words ``attribute=value``, and which axis points up."""
 
 import json
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from fnmatch import translate
 from typing import cast
 
+import numpy as np
+
 from hapticdb.store.base import Object
 
+AXES = ("x", "y", "z")
 MOST_TOLD = 5
 """Most values or names of attributes that an error lists. Larger: longer lines."""
+
+
+def up_axis(objects: Iterable[Object]) -> int:
+    """Axis that points up in a scene, 0 to 2: that of most voxels; z for files that name none."""
+    votes = np.zeros(3)
+    for obj in objects:
+        said = obj.attributes.get("up")
+        votes["xyz".find(said) if isinstance(said, str) and said in AXES else 2] += obj.voxels
+    return 2 - int(np.argmax(votes[::-1]))
 
 
 def having_attribute(objects: Sequence[Object], word: str) -> list[Object]:

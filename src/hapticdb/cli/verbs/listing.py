@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hapticdb.grid import Grid
     from hapticdb.query.cost_model import CostModel
     from hapticdb.store.base import Freshness, Layout, Object, Size, Store
+    from hapticdb.store.sharding import Shard
 
 MEANINGS = {
     "statement": "a statement of ranges, without what it reads",
@@ -88,6 +89,16 @@ def info(url: UrlArgument, *, json: JsonOption = False) -> None:
         render.show(render.facts(looked_at.facts()))
 
 
+CHECKSUMS = {True: "of pages", False: NO_CHECKSUMS, None: "not known while a shard is away"}
+
+
+def _told(shard: "Shard") -> tuple[str, str]:
+    """One shard in words: its name, and what it holds or why it does not answer."""
+    if shard.rows is None or shard.bytes is None:
+        return shard.name, f"away: {shard.trouble}"
+    return shard.name, f"about {shard.rows:,} rows, {render.bytes_text(shard.bytes)}"
+
+
 class _Overview(NamedTuple):
     """What `info` tells of an environment."""
 
@@ -96,36 +107,42 @@ class _Overview(NamedTuple):
     engine: str
     grid: "Grid"
     layout: "Layout"
-    size: "Size"
+    size: "Size | None"
     n_objects: int
     n_with_distances: int
     voxels: int
     scene: "NDArray[np.float64] | None"
     freshness: "Freshness"
     source: str
-    has_checksums: bool
+    has_checksums: bool | None
+    shards: "list[Shard]"
 
     @classmethod
     def of(cls, store: "Store") -> Self:
         """Ask a store."""
         from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
         from hapticdb.store.base import scene_bounds
+        from hapticdb.store.sharding import SupportsShards
 
-        size, objects = store.size(), store.objects()
+        objects = store.objects()
+        shards = store.shards() if isinstance(store, SupportsShards) else []
+        is_whole = not any(shard.trouble for shard in shards)
+        source = QuantileVector.of(store, DEFAULT_RESOLUTION).source if is_whole else "kept"
         return cls(
             url=store.url,
             name=store.name,
             engine=store.engine,
             grid=store.grid,
             layout=store.layout,
-            size=size,
+            size=store.size() if is_whole else None,
             n_objects=len(objects),
             n_with_distances=sum(obj.has_distances for obj in objects),
             voxels=sum(obj.voxels for obj in objects),
             scene=scene_bounds(objects),
             freshness=store.freshness(DEFAULT_RESOLUTION),
-            source=QuantileVector.of(store, DEFAULT_RESOLUTION).source,
-            has_checksums=store.checker().has_page_checksums(),
+            source=source,
+            has_checksums=store.checker().has_page_checksums() if is_whole else None,
+            shards=shards,
         )
 
     @property
@@ -138,11 +155,13 @@ class _Overview(NamedTuple):
         """Put in words which objects have distances, and what these take."""
         if not self.n_with_distances:
             return "none"
-        size = self.size
         whose = "all objects"
         if not self.has_distances:
             whose = f"{self.n_with_distances:,} of {render.counted(self.n_objects, 'object')}"
-        return f"of {whose}: {size.band_rows:,} rows, {render.bytes_text(size.band_bytes)}"
+        if self.size is None:
+            return f"of {whose}"
+        band = self.size.band_bytes
+        return f"of {whose}: {self.size.band_rows:,} rows, {render.bytes_text(band)}"
 
     @property
     def fit(self) -> fitting.Accuracy | None:
@@ -162,23 +181,26 @@ class _Overview(NamedTuple):
             "objects": self.n_objects,
             "scene": render.box_record(self.scene),
             "voxels": self.voxels,
-            "rows": self.size.rows,
-            "bytes": self.size.bytes,
+            "rows": self.size and self.size.rows,
+            "bytes": self.size and self.size.bytes,
             "distances": {
                 "objects": self.n_with_distances,
-                "rows": self.size.band_rows,
-                "bytes": self.size.band_bytes,
+                "rows": self.size and self.size.band_rows,
+                "bytes": self.size and self.size.band_bytes,
             },
             "page_checksums": self.has_checksums,
             "fit": None if self.fit is None else self.fit._asdict(),
             "statistics": {"source": self.source, **self.freshness._asdict()},
+            **({"shards": [shard._asdict() for shard in self.shards]} if self.shards else {}),
         }
 
     def facts(self) -> list[tuple[str, str]]:
         """Put it in words."""
         grid, size = self.grid, self.size
         origin = ", ".join(f"{x:.6g}" for x in grid.origin)
-        a_voxel = f" ({size.bytes / self.voxels:.3g} a voxel)" if self.voxels else ""
+        n_bytes = 0 if size is None else size.bytes
+        a_voxel = f" ({n_bytes / self.voxels:.3g} a voxel)" if self.voxels else ""
+        unknown = "not known while a shard is away"
         return [
             ("environment", self.url),
             ("name", self.name),
@@ -192,11 +214,12 @@ class _Overview(NamedTuple):
             ("objects", f"{self.n_objects:,}"),
             ("scene", "nothing in it" if self.scene is None else render.box(self.scene)),
             ("voxels", f"{self.voxels:,}"),
-            ("rows", f"{size.rows:,}"),
-            ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
+            ("rows", unknown if size is None else f"{size.rows:,}"),
+            ("size", unknown if size is None else f"{render.bytes_text(n_bytes)}{a_voxel}"),
+            *(_told(shard) for shard in self.shards),
             ("distances", self._distances),
             *(self.fit.facts if self.fit is not None else ()),
-            ("checksums", "of pages" if self.has_checksums else NO_CHECKSUMS),
+            ("checksums", CHECKSUMS[self.has_checksums]),
             ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),
         ]
 

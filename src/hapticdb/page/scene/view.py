@@ -23,8 +23,8 @@ from hapticdb.page.scene.names import Branch, found_ids, tree_of
 from hapticdb.page.scene.reading import MayRead, ShapedObject, ShapeReader, centred
 from hapticdb.page.scene.shapes import PartShape
 from hapticdb.page.scene.stage import View, framing, set_stage
+from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
-from hapticdb.store.upward import up_axis
 
 if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer

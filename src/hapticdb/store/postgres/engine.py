@@ -1,5 +1,6 @@
 """PostgreSQL as an engine: ``postgresql://...``, one schema an environment."""
 
+import contextlib
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -8,7 +9,7 @@ from hapticdb.store.base import Layout, Store
 from hapticdb.store.engines import Capability, Right
 from hapticdb.store.postgres import rights, schema_of
 from hapticdb.store.postgres.address import parse, with_environment
-from hapticdb.store.postgres.shards.making import is_sharded
+from hapticdb.store.postgres.shards.making import is_sharded, shards_of
 from hapticdb.store.postgres.shards.store import ShardedStore
 from hapticdb.store.postgres.store import PostgresStore
 
@@ -50,7 +51,13 @@ class PostgresEngine:
         """Give a role of the server one right; see `hapticdb.store.postgres.rights`."""
         with schema_of.connected(url) as connection:
             schema_of.check(connection)
-            rights.grant(connection, role, right)
+            if not is_sharded(connection):
+                rights.grant(connection, role, right)
+                return
+            rights.check_role_and_right(role, right)
+            with contextlib.closing(shards_of(connection)) as shards:
+                shards.each(lambda _, shard: rights.grant_on_shard(shard, role, right))
+                rights.grant(connection, role, right, is_coordinator=True)
 
 
 ENGINE = PostgresEngine()

@@ -1,21 +1,28 @@
 """Statistics of an environment on several servers: those of the shards together."""
 
+import contextlib
+
 import numpy as np
 
-from hapticdb.store.base import Keys, Layout, Size
+from hapticdb.errors import BusyError, ConnectionLostError, ShardAwayError
+from hapticdb.store import believed
+from hapticdb.store.base import Histogram, Keys, Layout, Size
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import statements
 from hapticdb.store.postgres.shards.links import Ask, Shards
 from hapticdb.store.postgres.shards.reading import ShardedReader
+from hapticdb.store.postgres.shards.sweeping import Sweeper
 from hapticdb.store.postgres.shards.view import View
 from hapticdb.store.postgres.tables.histogram import (
+    ENOUGH_ROWS,
     EXACT,
     SERVER_RESOLUTION,
     server_histogram,
 )
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.tables.statistics import PostgresStatistics, bytes_of
+from hapticdb.store.sharding import Shard
 
 COUNT_ALL = {
     table: f"""
@@ -45,10 +52,12 @@ class ShardedStatistics(PostgresStatistics):
         objects: PostgresReader,
         reader: ShardedReader,
         shards: Shards,
+        sweeper: Sweeper,
     ) -> None:
         super().__init__(connection, layout, objects)
         self._rows = reader
         self._shards = shards
+        self._sweeper = sweeper
         self._counted_table = ""  # no server counts the changes on all of them
 
     def size(self) -> Size:
@@ -65,6 +74,49 @@ class ShardedStatistics(PostgresStatistics):
             band_bytes = sum(int(one[0][0]) for one in found)
         total += sum(size for size, _ in sizes)
         return Size(rows, total, max(sum(pages for _, pages in sizes), 1), band, band_bytes)
+
+    def shards(self) -> list[Shard]:
+        """All shards in the order of their keys; those that are away, too."""
+        return [self._shard(at) for at in range(len(self._shards))]
+
+    def _shard(self, at: int) -> Shard:
+        try:
+            ((n_bytes, rows),) = self._shards.each(lambda _, shard: self._looked_at(shard), [at])
+        except ConnectionLostError as error:
+            return Shard(self._shards.name(at), None, None, str(error))
+        return Shard(self._shards.name(at), rows, n_bytes)
+
+    def _looked_at(self, shard: ServerConnection) -> tuple[int, int]:
+        ((rows,),) = shard.rows(
+            "SELECT greatest(reltuples, 0)::bigint FROM pg_class WHERE oid = %s::regclass",
+            (self._layout,),
+        )
+        return bytes_of(shard, self._layout)[0], int(rows)
+
+    def quantiles(self, resolution: int) -> Histogram:
+        """Histogram as on one server; an older one that is kept while a shard is away."""
+        try:
+            return super().quantiles(resolution)
+        except ShardAwayError:
+            kept = self._connection.rows(
+                "SELECT bounds, n_rows FROM quantile WHERE resolution = %s AND bounds IS NOT NULL",
+                (resolution,),
+            )
+            if not kept:
+                raise
+            return believed.histogram_of(self._connection.shown, *kept[0])
+
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
+        """Renew the statistics, and delete rows on the shards that nobody needs any more."""
+        with contextlib.suppress(BusyError):  # somebody is writing: the next one sweeps
+            self._sweeper.sweep()
+        super().analyze(resolution, anew=anew)
+        found = self._server_histogram() if resolution == SERVER_RESOLUTION else None
+        if found is not None and found[1] >= ENOUGH_ROWS:  # for the time when a shard is away
+            self._save(
+                "UPDATE quantile SET bounds = %s WHERE resolution = %s AND bounds IS NULL",
+                (found[0].tolist(), resolution),
+            )
 
     def _counts(self, table: str) -> Keys:
         """Live rows of each shard (S,)."""

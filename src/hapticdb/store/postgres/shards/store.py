@@ -33,11 +33,15 @@ class ShardedStore(ServerStore):
         self.scan, self.count, self.rows_of = rows.scan, rows.count, rows.rows_of
         self.scan_partly, self.shards_away = rows.scan_partly, rows.away.names
         self._sweeper = Sweeper(connection, shards, self.layout)
+        known = ShardedStatistics(
+            connection, self.layout, self._reader, rows, shards, self._sweeper
+        )
+        self.shards = known.shards
         try:
             self._take_over(
                 IndexesOnShards(shards, self.layout),
                 RowsOnShards(connection, shards, self._sweeper, (self.grid, self.layout)),
-                ShardedStatistics(connection, self.layout, self._reader, rows, shards),
+                known,
             )
         except BaseException:
             self.close()

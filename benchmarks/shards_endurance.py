@@ -172,6 +172,7 @@ class Run:
 
     def begin(self) -> None:
         """Make the environment and start all processes."""
+        labelled_rows(1)  # compiled once, before the processes are forked
         with closing(ShardedStore.create(self.url, GRID, "brick", distances=True)) as store:
             for object_id in range(1, 1 + N_WRITERS * N_OBJECTS):
                 made = store.add(labelled_object(3, 0, f"{object_id}"), labelled_rows(3))

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
         ProtocolError,
         ReadOnlyError,
         ShardAwayError,
+        StaleError,
         StuckError,
         UsageError,
     )
@@ -112,6 +113,7 @@ __all__ = [
     "ResidentCells",
     "Session",
     "ShardAwayError",
+    "StaleError",
     "StuckError",
     "Swept",
     "TangentPlane",
@@ -146,7 +148,8 @@ _HOMES = {
         "DatabaseError DeviceError EnvironmentExistsError EnvironmentNotFoundError "
         "FileError GeometryChangedError GridError HapticDBError MissingExtraError "
         "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutdatedError "
-        "OutsideGridError ProtocolError ReadOnlyError ShardAwayError StuckError UsageError"
+        "OutsideGridError ProtocolError ReadOnlyError ShardAwayError StaleError StuckError "
+        "UsageError"
     ),
     "query.law": "DistanceField TangentPlane",
     "grid": "Grid GridOptions",

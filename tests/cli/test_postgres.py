@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from subprocess import Popen
+from urllib.parse import parse_qs, urlsplit
 
 import psycopg
 import pytest
@@ -211,6 +212,14 @@ def test_a_standby_is_read_and_refuses_to_be_written(
         replica.start()
         url = replica.conninfo()
         assert rows_of(url) == rows_of(primary)
+        assert "how far behind is not known" in run("info", url)[1]
+        both = f"{url}&target_session_attrs=prefer-standby".replace(
+            "host=", f"host={parse_qs(urlsplit(primary).query)['host'][0]},"
+        ).replace("port=5432", "port=5432,5432")
+        until(lambda: "all that its primary has written" in run("info", both)[1])
+        told = json.loads(run("info", both, "--json")[1])["standby"]
+        assert (told["bytes"], told["writes"], told["unknown"]) == (0, 0, None)
+        assert json.loads(run("info", primary, "--json")[1])["standby"] is None
         refused(run("import", url, file), "standby")
         refused(run("remove", url, 1), "standby")
         assert run("calibrate", url, "--json")[0] == 0

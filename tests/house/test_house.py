@@ -104,6 +104,7 @@ PUBLIC = [
     "ResidentCells",
     "Session",
     "ShardAwayError",
+    "StaleError",
     "StuckError",
     "Swept",
     "TangentPlane",

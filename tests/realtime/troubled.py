@@ -85,9 +85,9 @@ class Troubled:
             return found
 
         @functools.wraps(found)
-        def travelled(*given: Any) -> Any:  # noqa: ANN401 - whatever it takes
+        def travelled(*given: Any, **named: Any) -> Any:  # noqa: ANN401 - whatever it takes
             self._travel()
-            return found(*given)
+            return found(*given, **named)
 
         return travelled
 

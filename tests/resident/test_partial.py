@@ -22,7 +22,7 @@ from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Keys, Store
 from hapticdb.store.connect import open_store
 from hapticdb.testing import write_voxels
-from realtime.sharded import SHARD, Halved
+from realtime.halved import SHARD, Halved
 from realtime.worlds import block, cells_of, make, move, scatter
 from resident.test_residency import check, voxels_by_cell
 

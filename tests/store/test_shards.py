@@ -6,6 +6,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import LiteralString
 from urllib.parse import quote
 
 import numpy as np
@@ -16,6 +17,7 @@ from psycopg import sql
 import hapticdb
 from hapticdb import (
     AccessError,
+    ConflictError,
     DamagedError,
     EnvironmentExistsError,
     EnvironmentNotFoundError,
@@ -27,10 +29,12 @@ from hapticdb import (
 )
 from hapticdb.check import check_environment
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.cost_model import CostModel
 from hapticdb.query.frame import Strategy
 from hapticdb.store.connect import grant, open_store
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.postgres.shards import sweeping
 from hapticdb.store.postgres.shards.store import ShardedStore
 from hapticdb.testing import floor_voxels, write_voxels
 from hapticdb.testing.scenes import covering, everything, voxel_object
@@ -43,12 +47,12 @@ FLOOR = floor_voxels(GRID, width=96)
 """On all three shards: 12 x 12 x 1 bricks across the grid's middle."""
 
 
-def on(server: PrivateServer, url: str, statement: str) -> list[tuple[object, ...]]:
+def on(server: PrivateServer, url: str, statement: LiteralString) -> list[tuple[object, ...]]:
     """Rows of a statement on one server, in the environment's schema."""
     with psycopg.connect(server.conninfo(), autocommit=True) as connection:
         name = sql.Identifier(parse(url).environment)
         connection.execute(sql.SQL("SET search_path = {}").format(name))
-        found = connection.execute(statement)  # type: ignore[call-overload] - text of this module
+        found = connection.execute(statement)
         return found.fetchall() if found.description else []
 
 
@@ -210,6 +214,30 @@ def test_statement_is_refused_in_one_line(store: ShardedStore) -> None:
         env.touch(shell, np.eye(4), strategy="statement", law="plane")
 
 
+def test_costs_are_fitted_and_kept_without_those_of_statement(store: ShardedStore) -> None:
+    with hapticdb.open(store.url) as env:
+        costs = env.calibrate()
+    assert costs.aggregate == np.inf
+    kept = store.costs(next(iter(store._connection.rows("SELECT machine FROM cost")))[0])
+    assert kept is not None
+    assert "descent" in kept
+    assert "aggregate" not in kept
+    assert CostModel.from_figures(kept) == costs
+
+
+def test_an_edit_of_an_object_that_another_has_written_is_refused(store: ShardedStore) -> None:
+    with hapticdb.open(store.url) as env:
+        (floor,) = env.objects()
+        moved(store, 4)
+        before = everything(store).keys.tolist()
+        with pytest.raises(ConflictError):
+            env.remove(floor.id, revision=floor.revision)
+        assert everything(store).keys.tolist() == before
+        assert env.remove(floor.id).name == "floor"
+        assert not len(everything(store))
+        assert [change.action for change in store.changes()] == ["add", "move", "remove"]
+
+
 # -- swept -----------------------------------------------------------------------------------------
 
 
@@ -247,11 +275,9 @@ def test_a_snapshot_keeps_its_rows_until_it_ends(
 def test_a_snapshot_whose_rows_are_gone_says_so(
     store: ShardedStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticdb.store.postgres.shards.sweeping.HELD", "SELECT NULL::bigint")
-    monkeypatch.setattr(
-        "hapticdb.store.postgres.shards.sweeping.HELD_AND_BORDERS",
-        "SELECT NULL::bigint, array_agg(first_key ORDER BY number) FROM shard",
-    )
+    nobody = "SELECT NULL::bigint"
+    monkeypatch.setattr(sweeping, "NOW", sweeping.NOW.replace(sweeping.HELD, nobody))
+    monkeypatch.setattr(sweeping, "HELD", nobody)
     with contextlib.closing(ShardedStore.open(store.url, read_only=True)) as reader:
         with reader.snapshot():
             moved(store, 4)

@@ -1,5 +1,6 @@
 """The cost model of grouping: what the parts of a query cost (the paper, section 5)."""
 
+import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -108,10 +109,14 @@ class CostModel:
         return self.group + self.group_key * n_keys
 
     def figures(self) -> dict[str, float]:
-        """All figures by name, the spreads as ``name.spread``, as a store keeps them."""
+        """All figures by name, the spreads as ``name.spread``, as a store keeps them.
+
+        Those of strategies that the engine lacks are infinite, and left out.
+        """
         plain = asdict(self)
         spread = plain.pop("spread")
-        return plain | {f"{name}.spread": value for name, value in spread.items()}
+        every = plain | {f"{name}.spread": value for name, value in spread.items()}
+        return {name: value for name, value in every.items() if math.isfinite(value)}
 
     @classmethod
     def of_equal_parts(cls) -> "CostModel":
@@ -120,10 +125,10 @@ class CostModel:
 
     @classmethod
     def from_figures(cls, figures: Mapping[str, float]) -> "CostModel":
-        """Rebuild from `figures`; figures that an older version did not store get defaults."""
+        """Rebuild from `figures`; figures that were not stored get defaults."""
         spread = {k.removesuffix(".spread"): v for k, v in figures.items() if k.endswith(".spread")}
         plain = {k: v for k, v in figures.items() if not k.endswith(".spread")}
-        return cls(**plain, spread=spread)
+        return cls(**{"aggregate": math.inf, "point": math.inf, **plain}, spread=spread)
 
 
 def machine_name() -> str:

@@ -13,13 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hapticdb.errors import GridError, HapticDBError, ShardAwayError, UsageError
+from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.realtime.object_names import ObjectAnswers
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.tracking import SessionTracker
 from hapticdb.realtime.wishes import Motion, Wish
 from hapticdb.resident.outages import OutageCounter
+from hapticdb.resident.partial import AnsweringShards
 from hapticdb.resident.pushing import SupportsPush
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
@@ -31,6 +32,7 @@ from hapticdb.resident.table import (
 )
 from hapticdb.store.base import NO_KEYS, Store, SupportsWatch
 from hapticdb.store.connect import open_store
+from hapticdb.store.engines import MayLag
 from hapticdb.store.filtering import ALL, Filter
 
 LOOKAHEAD = 0.05
@@ -142,8 +144,14 @@ class Fetcher:
             )
         if self.request.wrap:
             store = self.request.wrap(store)
-        if isinstance(store, SupportsWatch):
-            store.watch()
+        try:
+            if isinstance(store, SupportsWatch):
+                store.watch()
+            if isinstance(store, MayLag):
+                store.begin_proofs()
+        except BaseException:
+            store.close()
+            raise
         return store
 
     def warm_up(self) -> None:
@@ -153,8 +161,7 @@ class Fetcher:
         assert wish is not None  # noqa: S101 - the origin is finite
         self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
         self.residency.warm_up()
-        with contextlib.suppress(ShardAwayError):  # then the first answer loads its kernels
-            self._answers.ids_of(self.store, np.zeros(1, dtype=np.int64))
+        self._answers.ids_of(AnsweringShards(self.store), np.zeros(1, dtype=np.int64))
 
     @property
     def lookahead(self) -> float:
@@ -181,13 +188,27 @@ class Fetcher:
             self._released_at = self._now
             self._answers.retry()
             self.table.release_dead()
-        if self._is_confirmed:
-            # Set only here: the database has answered every query of this round, so all resident
-            # cells were up to date when the round began.
-            self._confirmed_at = self._now
-            self.table.cells.control[HEARTBEAT] = begun
-            self.table.cells.control[AWAY] = 0
+        # Only here: the database has answered every query of this round.
+        self._confirm(begun)
         return is_busy
+
+    def _confirm(self, begun: int) -> None:
+        """Note when all resident cells were last up to date: when the round began, in ns.
+
+        A standby's answers do not show it, so there it is the last instant that is proved. Cells of
+        a standby never go back to an earlier revision, so that instant never does.
+        """
+        control = self.table.cells.control
+        proved_at = None
+        if isinstance(self.store, MayLag):
+            proved_at = self.store.newest_at(self.residency.revision)
+        if self._is_confirmed:
+            self._confirmed_at = self._now
+            control[AWAY] = 0
+        if proved_at is not None:
+            control[HEARTBEAT] = max(control[HEARTBEAT], proved_at)
+        elif self._is_confirmed:
+            control[HEARTBEAT] = begun
 
     def _has_changed(self) -> bool:
         """Whether others have written; queries the database only as often as the engine needs."""

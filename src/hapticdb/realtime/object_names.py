@@ -4,13 +4,13 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from hapticdb.errors import ShardAwayError
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.records import MOST_ASKED
+from hapticdb.resident.partial import AnsweringShards
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Keys, Store
-from hapticdb.store.objects_at import ids_near_voxels, ids_of_voxels
+from hapticdb.store.objects_at import LooksUp, ids_near_voxels, ids_of_voxels
 
 NEAR = ONSET + 0.87
 """Voxels within which an object is felt, where cells have distances: the onset of the smooth law,
@@ -36,22 +36,22 @@ class ObjectAnswers:
         self._residency = residency
         self._has_distances = table.has_distances
         self._answered: dict[int, bytes] = {}
-        self._unanswered: set[int] = set()
+        self._short: set[int] = set()
 
     def forget(self) -> None:
         """Forget all answers, so that every request is answered again: the database has changed."""
         self._answered.clear()
 
     def retry(self) -> None:
-        """Answer again the requests that could not be answered because a shard was away."""
-        for row in self._unanswered:
+        """Answer again the requests of whose voxels some were on shards that were away."""
+        for row in self._short:
             self._answered.pop(row, None)
-        self._unanswered.clear()
+        self._short.clear()
 
     def answer(self, store: Store, rows: Iterable[int]) -> None:
         """Answer the sessions in `rows` whose requests have changed since the last answer.
 
-        A request that needs a shard that is away keeps the last answer until `retry`.
+        Objects on shards that are away are named after a `retry`.
         """
         before, self._answered = self._answered, {}
         for row in rows:
@@ -62,16 +62,15 @@ class ObjectAnswers:
             keys = np.unique(self._desk["asked"][row, :n_asked])
             question = keys.tobytes()
             if before.get(row) != question:
-                try:
-                    ids = self.ids_of(store, keys)[:MOST_ASKED]
-                except ShardAwayError:  # the sessions after this one get their answers
-                    self._unanswered.add(row)
-                else:
-                    self._desk["objects"][row, : len(ids)] = ids
-                    self._desk["n_objects"][row] = len(ids)
+                asked = AnsweringShards(store)
+                ids = self.ids_of(asked, keys)[:MOST_ASKED]
+                self._desk["objects"][row, : len(ids)] = ids
+                self._desk["n_objects"][row] = len(ids)
+                if asked.is_short:
+                    self._short.add(row)
             self._answered[row] = question
 
-    def ids_of(self, store: Store, keys: Keys) -> Keys:
+    def ids_of(self, store: LooksUp, keys: Keys) -> Keys:
         """Ids of the objects that are felt in voxels (n,), distinct and ascending."""
         exclude = self._residency.exclude
         if self._has_distances:

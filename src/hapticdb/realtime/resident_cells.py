@@ -199,7 +199,7 @@ class ResidentCells:
 
     @property
     def is_away(self) -> bool:
-        """Whether the database cannot be reached now or does not answer."""
+        """Whether the database does not answer now, or is a standby not proved up to date."""
         control = self.table.cells.control
         return bool(control[AWAY]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
 

@@ -85,7 +85,8 @@ class Session:
         let it fall to zero. "wait": wait for the cells; the frame is exact, but late.
     staleness : float
         Seconds without an answer of the database after which all frames act as if all cells were
-        unknown. With the policy "wait", resident cells are used on.
+        unknown; where cells come from a standby, seconds since they were last proved up to date
+        (docs/postgresql.md, Replicas). With the policy "wait", resident cells are used on.
     budget_bytes : int or None
     where, exclude : iterable of int or str
         As for `ResidentCells`; only with a URL, because sessions that share cells feel the same

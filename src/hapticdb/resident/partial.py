@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import ShardAwayError
-from hapticdb.store.base import NO_KEYS, Keys, Store
+from hapticdb.store.base import NO_KEYS, Keys, Rows, Store
 from hapticdb.store.batches import PartialRows
 
 ASK_AGAIN = (0.05, 0.5)
@@ -33,6 +33,29 @@ class SupportsPartialScan(Protocol):
 def shards_away(store: Store) -> tuple[str, ...]:
     """Names of a store's shards that are away now; () if all its rows are on one server."""
     return store.shards_away() if isinstance(store, SupportsPartialScan) else ()
+
+
+class AnsweringShards:
+    """Lookups in those shards of a store that answer; all rows, if they are on one server.
+
+    Attributes
+    ----------
+    is_short : bool
+        Whether rows that a lookup asked for are on shards that are away.
+    """
+
+    def __init__(self, store: Store) -> None:
+        self._store = store
+        self.grid, self.layout = store.grid, store.layout
+        self.is_short = False
+
+    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
+        """Rows of distinct ascending keys (U,)."""
+        if not isinstance(self._store, SupportsPartialScan):
+            return self._store.lookup(keys, distances=distances)
+        rows, away = self._store.scan_partly(keys, keys, distances=distances)
+        self.is_short = self.is_short or len(away) > 0
+        return rows
 
 
 def meeting(away: NDArray[np.int64], lows: Keys, highs: Keys) -> NDArray[np.bool_]:

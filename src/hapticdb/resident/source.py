@@ -109,9 +109,7 @@ class CellSource:
         """Rows of ranges, and the ranges of the shards that are away."""
         if isinstance(self.store, SupportsPartialScan):
             return self.store.scan_partly(*ranges, distances=distances)
-        if distances:
-            return PartialRows(self.store.scan(*ranges, distances=True), NO_RANGES)
-        return PartialRows(self.store.scan(*ranges), NO_RANGES)
+        return PartialRows(self.store.scan(*ranges, distances=distances), NO_RANGES)
 
     def _pushed_rows(self, on_curve: Keys, *, distances: bool) -> Rows | None:
         """Rows that a server has sent without being asked; None if there are none."""

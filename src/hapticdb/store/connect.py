@@ -17,6 +17,7 @@ from hapticdb.store.engines import (
     SupportsBackup,
     SupportsFirstFindings,
     SupportsGrant,
+    SupportsStandbys,
     Url,
     engine_of,
 )
@@ -24,6 +25,7 @@ from hapticdb.store.refusals import check_distances
 from hapticdb.store.urls import redact
 
 __all__ = [
+    "at_primary",
     "backup_environment",
     "beside",
     "check_curve",
@@ -68,6 +70,13 @@ def findings_before_opening(url: Url) -> list[str]:
     if not isinstance(engine, SupportsFirstFindings):
         return []
     return engine.findings_before_opening(os.fspath(url))
+
+
+def at_primary(url: Url) -> str:
+    """URL whose reads come from the server that is written, never from a standby."""
+    engine = engine_of(url)
+    given = os.fspath(url)
+    return engine.at_primary(given) if isinstance(engine, SupportsStandbys) else given
 
 
 def beside(url: Url, name: str) -> str:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from hapticdb.grid import Grid
     from hapticdb.query.cost_model import CostModel
     from hapticdb.store.base import Freshness, Layout, Object, Size, Store
+    from hapticdb.store.engines import Lag
     from hapticdb.store.sharding import Shard
 
 MEANINGS = {
@@ -116,12 +117,14 @@ class _Overview(NamedTuple):
     source: str
     has_checksums: bool | None
     shards: "list[Shard]"
+    lag: "Lag | None"
 
     @classmethod
     def of(cls, store: "Store") -> Self:
         """Ask a store."""
         from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
         from hapticdb.store.base import scene_bounds
+        from hapticdb.store.engines import MayLag
         from hapticdb.store.sharding import SupportsShards
 
         objects = store.objects()
@@ -143,6 +146,7 @@ class _Overview(NamedTuple):
             source=source,
             has_checksums=store.checker().has_page_checksums() if is_whole else None,
             shards=shards,
+            lag=store.lag() if isinstance(store, MayLag) else None,
         )
 
     @property
@@ -189,6 +193,7 @@ class _Overview(NamedTuple):
                 "bytes": self.size and self.size.band_bytes,
             },
             "page_checksums": self.has_checksums,
+            "standby": None if self.lag is None else self.lag._asdict(),
             "fit": None if self.fit is None else self.fit._asdict(),
             "statistics": {"source": self.source, **self.freshness._asdict()},
             **({"shards": [shard._asdict() for shard in self.shards]} if self.shards else {}),
@@ -205,6 +210,7 @@ class _Overview(NamedTuple):
             ("environment", self.url),
             ("name", self.name),
             ("engine", self.engine),
+            *([] if self.lag is None else [("standby", _lag_text(self.lag))]),
             ("voxel size", render.metres(grid.voxel_size)),
             ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
             ("edge", render.metres(grid.edge)),
@@ -222,6 +228,18 @@ class _Overview(NamedTuple):
             ("checksums", CHECKSUMS[self.has_checksums]),
             ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),
         ]
+
+
+def _lag_text(lag: "Lag") -> str:
+    """Put in words how far a standby is behind."""
+    text = f"replayed to {lag.replayed}"
+    if lag.bytes is None or lag.writes is None:
+        return f"{text}; how far behind is not known: {lag.unknown}"
+    if not lag.bytes:
+        return f"{text}, all that its primary has written"
+    since = "" if lag.seconds is None else f", {lag.seconds:.3g} s at most"
+    writes = render.counted(lag.writes, "write")
+    return f"{text}, {render.bytes_text(lag.bytes)} behind its primary: {writes}{since}"
 
 
 def objects(
@@ -345,7 +363,8 @@ def calibrate(
     if not is_kept:
         render.note(f"{env.url} can only be read: the figures were measured, and not kept")
     if json:
-        figures = {name: getattr(costs, name) for name in (*MEANINGS, *RATIOS)}
+        known = costs.figures()
+        figures = {name: known[name] for name in (*MEANINGS, *RATIOS) if name in known}
         render.say_json({"figures": figures, "spread": dict(costs.spread), "kept": is_kept})
         return
     render.show(_costs_table(costs))
@@ -397,8 +416,9 @@ def _age(freshness: "Freshness") -> str:
 
 def _costs_table(costs: "CostModel") -> Columns:
     rows = []
-    for name, meaning in MEANINGS.items():
+    figures = costs.figures()  # without those of strategies that the engine lacks
+    for name in filter(figures.__contains__, MEANINGS):
         spread = costs.spread.get(name)
         known = "" if spread is None else f"± {100 * spread:.0f} %"
-        rows.append((name, f"{getattr(costs, name):.3f}", known, meaning))
+        rows.append((name, f"{figures[name]:.3f}", known, MEANINGS[name]))
     return render.table(("figure", "µs>", "spread>", "what it is"), rows)

@@ -26,6 +26,7 @@ from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 from hapticdb.store.postgres.migrations import MIGRATIONS
 from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.postgres.standby.aiming import aimed
 from hapticdb.store.schema import FORMAT_VERSION, migrations_after
 
 DEFAULT_DATABASE = "hapticdb"
@@ -33,14 +34,19 @@ SERVER_IS_OURS = re.compile(r"(?:^|&)(?:host|hostaddr|port|user|service)=")
 _servers: dict[Path, PrivateServer] = {}
 
 
-def connected(url: str, *, read_only: bool = False, making: bool = False) -> ServerConnection:
+def connected(
+    url: str, *, read_only: bool = False, making: bool = False, is_to_be_written: bool = False
+) -> ServerConnection:
     """Connect to an environment's database. The environment itself may be missing.
 
-    With `making`, a private server and its database are made if they are missing.
+    With `making`, a private server and its database are made if they are missing. With
+    `is_to_be_written`, a connection that reads goes to the server that is written, too.
     """
     address = parse(url)
     try:
-        return ServerConnection(address, conninfo(address, making=making), read_only=read_only)
+        found = conninfo(address, making=making)
+        found = aimed(found, address.shown, read_only=read_only and not is_to_be_written)
+        return ServerConnection(address, found, read_only=read_only)
     except EnvironmentNotFoundError as error:
         raise error if address.data is None else _not_found(address) from None
 
@@ -79,7 +85,7 @@ def _not_found(address: Address) -> EnvironmentNotFoundError:
 def exists(url: str) -> bool:
     """Whether a schema of that name is there, an environment or not."""
     try:
-        with connected(url, read_only=True) as connection:
+        with connected(url, read_only=True, is_to_be_written=True) as connection:
             return _has_schema(connection)
     except EnvironmentNotFoundError:
         if parse(url).data is None:

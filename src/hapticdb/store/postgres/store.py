@@ -9,6 +9,7 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.looping import LoopInServer
+from hapticdb.store.postgres.standby.following import Following
 from hapticdb.store.postgres.tables.loading import Indexes, IndexesHere, Loading
 from hapticdb.store.postgres.tables.placing import PlacesRows, RowsHere
 from hapticdb.store.postgres.tables.reading import PostgresReader
@@ -49,6 +50,9 @@ class ServerStore:
         self.removed, self.changes = reader.removed, reader.changes
         watch = Watch(connection, self.identity)
         self.watch, self.has_changed = watch.begin, watch.has_changed
+        following = self._following = Following(connection, self.identity, reader.revision)
+        self.begin_proofs, self.newest_at = following.begin, following.newest_at
+        self.lag = following.lag
 
     def _take_over(self, indexes: Indexes, rows: PlacesRows, known: PostgresStatistics) -> None:
         """Write and load rows by these, and ask that one for statistics."""
@@ -69,6 +73,7 @@ class ServerStore:
 
     def close(self) -> None:
         """Close the connection."""
+        self._following.close()
         self._connection.close()
 
     @property

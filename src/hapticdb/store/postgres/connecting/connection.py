@@ -35,6 +35,7 @@ class ServerConnection:
     def __init__(self, address: Address, conninfo: str, *, read_only: bool = False) -> None:
         self.address = address
         self.shown = address.shown
+        self.conninfo = conninfo
         self.is_read_only = read_only
         self._thread = this_thread()
         self._depth = 0
@@ -59,6 +60,11 @@ class ServerConnection:
     def server_version(self) -> int:
         """As libpq counts: 150018 is 15.18."""
         return self._link.server_version
+
+    @property
+    def is_standby(self) -> bool:
+        """Whether the server that answered last is a standby."""
+        return self._link.is_standby
 
     def connect(self) -> None:
         """Connect again, once."""

@@ -21,6 +21,11 @@ from hapticdb.errors import (
 )
 from hapticdb.store.believed import damaged
 
+IS_STANDBY = "server is in hot standby mode"
+"""What libpq says of a standby where it was asked for a primary."""
+MANY = "Multiple connection attempts failed."
+"""What psycopg says before it lists the failure of each host."""
+
 
 @contextlib.contextmanager
 def named_errors(shown: str) -> Iterator[None]:
@@ -98,6 +103,15 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
         cause,
     ):
         return AccessError(f"{shown}: {cause}; check the user, ~/.pgpass and pg_hba.conf")
+    if IS_STANDBY in cause:  # only where a primary was asked for
+        hosts = cause.partition("All failures were:")[2].split(" - host: ") if MANY in cause else []
+        others = [host for host in hosts[1:] if IS_STANDBY not in host]
+        if not others:
+            return ReadOnlyError(f"{shown} is a standby: it can only be read")
+        return ConnectionLostError(
+            f"{shown}: the primary cannot be reached: {'; '.join(others)}; the other hosts are "
+            "standbys, which can only be read"
+        )
     return ConnectionLostError(f"{shown} cannot be reached: {cause}")
 
 

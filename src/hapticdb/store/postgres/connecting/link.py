@@ -123,15 +123,22 @@ class Link:
         )
         known.fetchall()
         row = self.driver.execute(
-            "SELECT setting::int FROM pg_settings WHERE name = 'statement_timeout'"
+            "SELECT setting::int, pg_is_in_recovery() FROM pg_settings"
+            " WHERE name = 'statement_timeout'"
         ).fetchone()
         assert row is not None  # noqa: S101 - the server has this setting
+        self._was_standby: bool = row[1]
         self._limit_ms = row[0] + GRACE_MS if row[0] else None
 
     @property
     def server_version(self) -> int:
         """As libpq counts: 150018 is 15.18."""
         return self._pgconn.server_version
+
+    @property
+    def is_standby(self) -> bool:
+        """Whether the server is a standby; one that is promoted reports so with its next answer."""
+        return self._was_standby and self._pgconn.parameter_status(b"in_hot_standby") != b"off"
 
     def close(self) -> None:
         """Close the connection."""

@@ -129,8 +129,10 @@ class RowsOnShards:
         self._leave(object_id, revision)
         self.put(rows, object_id, revision)
 
-    def take(self, known: Object, _covering: Covering, revision: int) -> Keys:
+    def take(self, known: Object, covering: Covering, revision: int) -> Keys:
         """Take an object's rows away with the commit; returns a key in each cell they are in."""
+for _ in covering(known):  # `live` knows the ranges; but the caller may refuse here
+            break
         self._connection.execute(BEGIN)
         ranges = self._leave(known.id, revision)
         self._connection.execute(PUBLISH, (known.id, None, [], revision))

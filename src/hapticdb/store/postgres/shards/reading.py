@@ -122,7 +122,7 @@ class ShardedReader:
         raise _outdated(self._url)
 
     def _seen(self, view: View) -> View:
-        self._objects.note_seen(view.revision)
+        self._objects.see(view.revision)
         return view
 
     def _marks(self, view: View, asks: Sequence[Ask], answers: Sequence[Answer | None]) -> "_Marks":

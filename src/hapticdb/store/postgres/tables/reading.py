@@ -5,6 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.errors import StaleError
 from hapticdb.store import believed
 from hapticdb.store.base import (
     NO_KEYS,
@@ -31,14 +32,17 @@ HAS_BAND = "SELECT to_regclass('band') IS NOT NULL"
 
 
 class PostgresReader:
-    """Reads of one environment. The reader remembers the revision that its last read has seen."""
+    """Reads of one environment. The reader remembers the revision that its last read has seen.
+
+    Reads from standbys never go back to an earlier revision: they raise StaleError instead.
+    """
 
     def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
         self._url = connection.shown
         self._layout = layout
         self._shift = row_shift(layout)
-        self._seen = -1
+        self._seen = self._newest = -1
         self._has_band = False
         self._excluded = NO_KEYS
         self._excluded_parameters: list[wire.Parameter] = []
@@ -47,22 +51,34 @@ class PostgresReader:
         """The revision that the last read has seen."""
         return self._seen
 
-    def note_seen(self, revision: int) -> None:
-        """Note the revision of a read that others have made for this environment."""
-        self._seen = revision
-
     def revision(self) -> int:
         """Number of the last committed write; 0 for an empty environment."""
         rows = self._connection.rows("SELECT revision FROM environment WHERE id = 1")
-        self._seen = int(rows[0][0])
-        return self._seen
+        return self.see(int(rows[0][0]))
+
+    def see(self, revision: int) -> int:
+        """Note and return the revision of an answer, also of one that others got.
+
+        After a loss the connection may lead to a standby that is further behind. What it has was
+        replaced by what was read before, so its answer is refused.
+        """
+        if not self._connection.is_standby:
+            self._newest = revision
+        elif 0 <= revision < self._newest:
+            raise StaleError(
+                f"{self._url}: the standby that answers now has replayed the revision {revision}, "
+                f"and {self._newest} was read before: try again when it has caught up"
+            )
+        self._newest = max(self._newest, revision)
+        self._seen = revision
+        return revision
 
     # -- rows -----------------------------------------------------------------------------------
 
     def unpacked(self, found: list[bytes | None], *, distances: bool = False) -> Rows:
         """Rows from a statement's one packed row; its last value is the revision that was read."""
         seen = found[-1]
-        self._seen = wire.read_int8(seen) if seen is not None else -1
+        self.see(wire.read_int8(seen) if seen is not None else -1)
         if found[0] is None:
             return no_rows(distances=distances)
         keys, ids = wire.read_int8s(found[0]), wire.read_int8s(found[1])
@@ -142,7 +158,7 @@ class PostgresReader:
         parameters = [wire.int8s(frame.addresses)]
         text, parameters = self._without_excluded(text, parameters, frame.exclude)
         ordinals, ids, seen = self._connection.fetch(text, *parameters)
-        self._seen = wire.read_int8(seen or b"")
+        self.see(wire.read_int8(seen or b""))
         return wire.read_int8s(ordinals) - 1, wire.read_int8s(ids)
 
     def _without_excluded(

@@ -131,7 +131,7 @@ class RowsOnShards:
 
     def take(self, known: Object, covering: Covering, revision: int) -> Keys:
         """Take an object's rows away with the commit; returns a key in each cell they are in."""
-for _ in covering(known):  # `live` knows the ranges; but the caller may refuse here
+        for _ in covering(known):  # `live` knows the ranges; but the caller may refuse here
             break
         self._connection.execute(BEGIN)
         ranges = self._leave(known.id, revision)

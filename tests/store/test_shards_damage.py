@@ -1,8 +1,11 @@
 """Servers that do not belong together, and writes that fail: what is lost is told, never felt."""
 
+import threading
 from collections.abc import Iterator
+from concurrent import futures
 from contextlib import closing
 from typing import Any
+from urllib.parse import quote
 
 import psycopg
 import pytest
@@ -13,14 +16,18 @@ from hapticdb.check import check_environment
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.connecting import connection
+from hapticdb.store.postgres.connecting.link import Link
 from hapticdb.store.postgres.private_server import PrivateServer
-from hapticdb.store.postgres.shards.links import Shards
+from hapticdb.store.postgres.shards import links
+from hapticdb.store.postgres.shards.links import ShardConnection, Shards
 from hapticdb.store.postgres.shards.store import ShardedStore
 from labelled import GRID, contents_of, labelled_object, labelled_rows
 from servers import Place
 from sharded import ShardedServers
 
 BEFORE = {1: 1, 2: 2, 3: 3}
+SETTINGS = "synchronous_commit", "idle_in_transaction_session_timeout"
+CARELESS = "-c synchronous_commit=off -c idle_in_transaction_session_timeout=60000"
 
 
 @pytest.fixture
@@ -136,6 +143,63 @@ def test_an_environment_whose_commit_is_not_confirmed_keeps_its_shards(
             ShardedStore.create(where, GRID)
     with closing(ShardedStore.open(where)) as store:
         assert add(store, 1) == 1
+
+
+def test_commits_wait_for_the_disk_and_the_coordinator_for_the_shards(
+    url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the servers are set to: rows that are named must outlive a crash."""
+    seen: list[tuple[str, str]] = []
+    command = Link.command
+
+    def looking(link: Link, text: str) -> None:
+        if text == "COMMIT":
+            asked = [link.driver.execute(f"SHOW {name}").fetchone() for name in SETTINGS]
+            seen.append((str(asked[0]), str(asked[1])))
+        command(link, text)
+
+    with closing(ShardedStore.open(f"{url}&options={quote(CARELESS)}")) as careless:
+        add(careless, 4)
+        monkeypatch.setattr(Link, "command", looking)
+        add(careless, 5)
+    assert [pair[0] for pair in seen] == ["('local',)"] * 4
+    assert seen[-1][1] == "('0',)"  # the coordinator commits last
+
+
+# --- Ctrl-C -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("is_late", [False, True], ids=["cancelled", "given up"])
+def test_after_ctrl_c_no_thread_uses_a_connection(
+    store: ShardedStore, monkeypatch: pytest.MonkeyPatch, is_late: bool
+) -> None:
+    waits = [futures.wait]
+    may_end = threading.Event()
+    begun = threading.Barrier(4)
+
+    def interrupted(*given: Any) -> object:  # noqa: ANN401 - passed on
+        if waits:
+            begun.wait(60)
+            waits.pop()
+            raise KeyboardInterrupt
+        return futures.wait(*given)
+
+    def work(_: int, shard: ShardConnection) -> None:
+        begun.wait(60)
+        if is_late:
+            assert may_end.wait(60)
+        shard.rows("SELECT pg_sleep(60)")
+
+    shards = store._shards
+    contents_of(store)
+    monkeypatch.setattr(links, "wait", interrupted)
+    monkeypatch.setattr(links, "PARTING_S", 0.2 if is_late else 60.0)
+    with pytest.raises(KeyboardInterrupt):
+        shards.each(work)
+    assert all(shards.is_connected(shard) is not is_late for shard in range(len(shards)))
+    assert contents_of(store) == BEFORE
+    assert add(store, 4) == 4
+    may_end.set()
 
 
 # --- sweeps -------------------------------------------------------------------------------------

@@ -36,6 +36,8 @@ from sharded import ShardedServers
 SOON_S = 0.3
 """Seconds that a writer waits for a server that does not come back."""
 MOST_STEPS = 200
+N_OBJECTS = 5
+"""Objects that the environment has before a kill."""
 KINDS = ["replace", "add", "remove"]
 Killed = Callable[[], object]
 
@@ -77,10 +79,10 @@ class Steps:
 
 @pytest.fixture
 def url(sharded_place: Place) -> str:
-    """An environment with objects 1 to 4 of labels 1 to 4."""
+    """An environment with objects and labels from 1 to `N_OBJECTS`."""
     where = sharded_place()
     with closing(ShardedStore.create(where, GRID, "brick", distances=True)) as store:
-        for label in range(1, 5):
+        for label in range(1, 1 + N_OBJECTS):
             store.add(labelled_object(label), labelled_rows(label))
     return where
 
@@ -136,7 +138,7 @@ def dead_on_shards(servers: ShardedServers, url: str) -> list[tuple[int, int]]:
     return sorted(found - live)
 
 
-def assert_goes_on(servers: ShardedServers, url: str, allowed: list[Labels]) -> Labels:
+def assert_goes_on(servers: ShardedServers, url: str, allowed: list[Labels]) -> None:
     """Assert that the environment is sound, holds one of these, and can be written and swept."""
     with closing(ShardedStore.open(url)) as store:
         found = contents_of(store)
@@ -147,12 +149,14 @@ def assert_goes_on(servers: ShardedServers, url: str, allowed: list[Labels]) -> 
         highest = max([change.id for change in store.changes()])
         new = store.add(labelled_object(9000 + highest), labelled_rows(9000 + highest))
         assert new == highest + 1
-        store.remove(new, lambda _: [])
+        expected = {**found, new: 9000 + highest}
+        if len(expected) > N_OBJECTS:
+            del expected[min(expected)]
+            store.remove(min(found), lambda _: [])
         store.sweep()
         assert dead_on_shards(servers, url) == []
-        assert contents_of(store) == found
+        assert contents_of(store) == expected
     assert check_environment(url).findings == []
-    return found
 
 
 def started(servers: ShardedServers) -> None:

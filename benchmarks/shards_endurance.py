@@ -270,7 +270,7 @@ def dead_rows(servers: ShardedServers, url: str) -> int:
         with psycopg.connect(shard.conninfo(), autocommit=True) as client:
             client.execute(schema)
             for table in ("brick", "band"):
-                rows = client.execute(f"SELECT id, version FROM {table}").fetchall()  # type: ignore[call-overload]
+                rows = client.execute(f"SELECT id, version FROM {table}").fetchall()
                 total += sum(row not in set(live) for row in rows)
     return total
 

@@ -64,7 +64,7 @@ def on(server: PrivateServer, url: str, statement: str) -> list[tuple[Any, ...]]
     with psycopg.connect(server.conninfo(), autocommit=True) as client:
         name = sql.Identifier(parse(url).environment)
         client.execute(sql.SQL("SET search_path = {}").format(name))
-        found = client.execute(statement)  # type: ignore[call-overload]
+        found = client.execute(statement)
         return found.fetchall() if found.description else []
 
 

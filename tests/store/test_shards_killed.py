@@ -26,7 +26,6 @@ from hapticdb.store.postgres.connecting import connection, wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.connecting.link import Link
 from hapticdb.store.postgres.private_server import PrivateServer
-from hapticdb.store.postgres.shards import placing
 from hapticdb.store.postgres.shards.store import ShardedStore
 from hapticdb.testing.scenes import EVERYWHERE
 from labelled import GRID, Labels, contents_of, labelled_object, labelled_rows, labels_of
@@ -47,7 +46,8 @@ class Steps:
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.seen: list[str] = []
-        self._at, self._event = -1, lambda: None
+        self._at = -1
+        self._event: Killed = lambda: None
         self._lock = threading.RLock()
         for owner, name in [
             (Link, "command"),
@@ -55,7 +55,7 @@ class Steps:
             (ServerConnection, "execute"),
         ]:
             patch.setattr(owner, name, self._counted(getattr(owner, name), 1))
-        patch.setattr(placing.wire, "copy_rows", self._counted(wire.copy_rows, -1))
+        patch.setattr(wire, "copy_rows", self._counted(wire.copy_rows, -1))
 
     def _counted(self, method: Callable[..., Any], place: int) -> Callable[..., Any]:
         def called(*args: Any, **keywords: Any) -> Any:  # noqa: ANN401 - any method
@@ -125,7 +125,7 @@ def rows_on(server: PrivateServer, url: str, statement: str) -> list[tuple[Any, 
         client.execute(
             sql.SQL("SET search_path = {}").format(sql.Identifier(parse(url).environment))
         )
-        return client.execute(statement).fetchall()  # type: ignore[call-overload,no-any-return]
+        return client.execute(statement).fetchall()
 
 
 def dead_on_shards(servers: ShardedServers, url: str) -> list[tuple[int, int]]:

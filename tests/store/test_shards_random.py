@@ -62,7 +62,7 @@ def write(url: str, number: int, n_edits: int, seed: int) -> Edits:
     return found
 
 
-def places_of(labels: Labels, lows: np.ndarray, highs: np.ndarray) -> Places:  # type: ignore[type-arg]
+def places_of(labels: Labels, lows: np.ndarray, highs: np.ndarray) -> Places:
     """Key, object and label of the rows of objects in closed ranges."""
     found: Places = set()
     for object_id, label in labels.items():

@@ -34,6 +34,7 @@ from hapticdb.query.frame import Strategy
 from hapticdb.store.connect import grant, open_store
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.postgres.shards import sweeping
 from hapticdb.store.postgres.shards.store import ShardedStore
 from hapticdb.testing import floor_voxels, write_voxels
 from hapticdb.testing.scenes import covering, everything, voxel_object
@@ -274,11 +275,9 @@ def test_a_snapshot_keeps_its_rows_until_it_ends(
 def test_a_snapshot_whose_rows_are_gone_says_so(
     store: ShardedStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("hapticdb.store.postgres.shards.sweeping.HELD", "SELECT NULL::bigint")
-    monkeypatch.setattr(
-        "hapticdb.store.postgres.shards.sweeping.HELD_AND_BORDERS",
-        "SELECT NULL::bigint, array_agg(first_key ORDER BY number) FROM shard",
-    )
+    nobody = "SELECT NULL::bigint"
+    monkeypatch.setattr(sweeping, "NOW", sweeping.NOW.replace(sweeping.HELD, nobody))
+    monkeypatch.setattr(sweeping, "HELD", nobody)
     with contextlib.closing(ShardedStore.open(store.url, read_only=True)) as reader:
         with reader.snapshot():
             moved(store, 4)

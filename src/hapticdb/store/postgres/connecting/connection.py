@@ -8,7 +8,7 @@ from typing import Any, Self, TypeVar
 import psycopg
 from psycopg import sql
 
-from hapticdb.errors import ConnectionLostError, DatabaseError
+from hapticdb.errors import ConnectionLostError, DatabaseError, ShardAwayError
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.link import Link
@@ -200,11 +200,14 @@ class ServerConnection:
         When the connection is lost before the commit was sent, everything is done again. When it is
         lost during the commit, `is_committed` tells, on the new connection, whether the commit was
         done. Without `is_committed`, `work` must be harmless when it is done twice.
+        A `ShardAwayError` of `work` is of another server, which was tried again already.
         """
         self.check_thread()
         for tries_left in reversed(range(WRITE_TRIES)):
             try:
                 result, is_certain = self._write_once(work)
+            except ShardAwayError:
+                raise
             except ConnectionLostError:
                 if not tries_left:
                     raise

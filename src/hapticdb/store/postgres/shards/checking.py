@@ -5,7 +5,12 @@ from collections.abc import Iterator
 from hapticdb.errors import ShardAwayError
 from hapticdb.store.base import Rows
 from hapticdb.store.postgres.checking import PostgresChecker
-from hapticdb.store.postgres.shards.links import ShardConnection, Shards
+from hapticdb.store.postgres.shards.links import (
+    ShardConnection,
+    Shards,
+    lost_writes,
+    older_coordinator,
+)
 from hapticdb.store.postgres.shards.reading import ShardedReader
 
 WRITES = "SELECT writes FROM shard ORDER BY number"
@@ -28,23 +33,25 @@ class ShardedChecker:
         """What is wrong with kept statistics, and with whole shards, a line each."""
         yield from self._coordinator.findings()
         published = [int(row[0]) for row in self._shards.coordinator.rows(WRITES)]
+        revision = self._reader.views.renewed().revision
         for shard, least in enumerate(published):
             name = self._shards.name(shard)
             try:
-                found = self._shards.each(_writes_of, [shard])
+                ((writes, swept),) = self._shards.each(_mark_of, [shard])
             except ShardAwayError as error:
                 yield f"{name} does not answer: {error}"
                 continue
-            if found[0] < least:
-                yield (
-                    f"{name} has lost writes: it has {found[0]} of {least}; "
-                    "it was put back from a copy older than the coordinator's"
-                )
+            if writes < least:
+                yield str(lost_writes(name, writes, least))
+            # newest: another may have written and swept since it was last read
+            if swept > revision and swept > self._reader.views.renewed().revision:
+                yield str(older_coordinator("the coordinator"))
 
     def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
         """At most that many rows after (key, id), ascending by both."""
         return self._reader.rows_after(key, object_id, limit, distances=distances)
 
 
-def _writes_of(_: int, shard: ShardConnection) -> int:
-    return int(shard.rows("SELECT writes FROM mark")[0][0])
+def _mark_of(_: int, shard: ShardConnection) -> tuple[int, int]:
+    ((writes, swept),) = shard.rows("SELECT writes, swept FROM mark")
+    return int(writes), int(swept)

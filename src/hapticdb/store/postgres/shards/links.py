@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import NamedTuple, TypeVar
 
 import psycopg
@@ -15,6 +15,7 @@ from hapticdb.errors import (
     StuckError,
 )
 from hapticdb.store.postgres.address import Address
+from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.connecting.wire import Parameter
 
@@ -22,6 +23,9 @@ Result = TypeVar("Result")
 Answer = list[bytes | None]
 MOST_THREADS = 16
 """Most shards that are written at the same time. A larger value keeps more shards busy."""
+PARTING_S = 20.0
+"""Seconds that Ctrl-C waits for threads that write to shards; then it gives their connections up.
+A larger value gives a shard more time to answer."""
 TOKEN = "SELECT token::text FROM mark"  # noqa: S105 - which environment it is, no secret
 
 
@@ -61,10 +65,15 @@ class ShardConnection(ServerConnection):
     def connect(self) -> None:
         """Connect again, once; a server in the shard's place that is another one is refused."""
         super().connect()
-        self._check_token()
+        try:
+            self._check_token()
+        except BaseException:  # it must not be used for the next statement
+            self._link.close()
+            raise
 
     def _check_token(self) -> None:
-        found = self.execute(TOKEN).fetchall()
+        with failures.named_errors(self.shown):
+            found = self.execute(TOKEN).fetchall()
         if found != [(self._token,)]:
             raise DamagedError(
                 f"{self.shown} holds rows of another environment: give the server back that held "
@@ -164,6 +173,7 @@ class Shards:
         """
         self.coordinator.check_thread()
         waiting: list[ServerConnection] = []
+        asked: dict[int, ShardConnection] = {}
         answers: list[Answer | None] = [None] * len(asks)
         found: Answer | None = None
         lost = (ConnectionLostError,) if patience_ms is None else (ConnectionLostError, StuckError)
@@ -173,20 +183,20 @@ class Shards:
                 with contextlib.suppress(ConnectionLostError):
                     self.coordinator.send(first)
                     waiting.append(self.coordinator)
-            for ask in asks:
+            for at, ask in enumerate(asks):
                 with contextlib.suppress(*lost):
                     connection = self.connection(ask.shard)
                     connection.send(ask.text, *ask.parameters)
                     waiting.append(connection)
+                    asked[at] = connection
             if first is not None and self.coordinator in waiting:
                 with contextlib.suppress(ConnectionLostError):
                     found = self.coordinator.take()
                 waiting.remove(self.coordinator)
-            for at, ask in enumerate(asks):
-                if (connection := self.connection(ask.shard)) in waiting:
-                    with contextlib.suppress(*lost):
-                        answers[at] = connection.take(patience_ms)
-                    waiting.remove(connection)
+            for at, connection in asked.items():
+                with contextlib.suppress(*lost):
+                    answers[at] = connection.take(patience_ms)
+                waiting.remove(connection)
         except BaseException:
             for one in waiting:  # no later statement may get these answers
                 one.driver.close()
@@ -204,6 +214,16 @@ class Shards:
 
         Raises the first error after all have ended.
         """
+        done = self.outcomes(work, some)
+        for one in done:
+            if (error := one.exception()) is not None:
+                raise error
+        return [one.result() for one in done]
+
+    def outcomes(
+        self, work: Callable[[int, ShardConnection], Result], some: Sequence[int] | None = None
+    ) -> list["Future[Result]"]:
+        """Results or errors of `work` for shards, as of `each`; all have ended."""
         chosen = list(range(len(self)) if some is None else some)
 
         def one(shard: int) -> Result:
@@ -211,23 +231,47 @@ class Shards:
                 return work(shard, self.connection(shard))
 
         if len(chosen) == 1:
-            return [one(chosen[0])]
+            return [_done(lambda: one(chosen[0]))]
         if self._threads is None:
             self._threads = ThreadPoolExecutor(min(len(self), MOST_THREADS), "hapticdb-shard")
         begun = [self._threads.submit(one, shard) for shard in chosen]
         try:
             wait(begun)
         except BaseException:  # Ctrl-C: no thread may use a connection after this call
-            for shard in chosen:
-                if (connection := self._made[shard]) is not None:
-                    with contextlib.suppress(psycopg.Error):
-                        connection.driver.cancel()
-            wait(begun)
+            try:
+                self._interrupt(chosen)
+                wait(begun, PARTING_S)
+            finally:
+                self._give_up([n for n, w in zip(chosen, begun, strict=True) if not w.done()])
             raise
-        errors = [error for work_of in begun if (error := work_of.exception()) is not None]
-        if errors:
-            raise errors[0]
-        return [work_of.result() for work_of in begun]
+        return begun
+
+    def _interrupt(self, chosen: Sequence[int]) -> None:
+        """Cancel the statements that threads wait for."""
+        for shard in chosen:
+            if (connection := self._made[shard]) is not None:
+                with contextlib.suppress(psycopg.Error):
+                    connection.driver.cancel_safe(timeout=PARTING_S)
+
+    def _give_up(self, late: Sequence[int]) -> None:
+        """Leave the connections of shards to threads that have not ended, and end these threads."""
+        for shard in late:
+            before, self._made[shard] = self._made[shard], None
+            if before is not None:
+                before.close()
+        if late and self._threads is not None:
+            self._threads.shutdown(wait=False, cancel_futures=True)
+            self._threads = None
+
+
+def _done(work: Callable[[], Result]) -> "Future[Result]":
+    """The outcome of work that is done now, in this thread."""
+    done: Future[Result] = Future()
+    try:
+        done.set_result(work())
+    except Exception as error:  # noqa: BLE001 - the caller raises it
+        done.set_exception(error)
+    return done
 
 
 @contextlib.contextmanager
@@ -239,3 +283,20 @@ def named_away() -> Iterator[None]:
         raise
     except ConnectionLostError as error:
         raise ShardAwayError(*error.args) from error
+
+
+def lost_writes(name: str, found: int, least: int) -> DamagedError:
+    """Error for a shard that has committed fewer writes than the coordinator knows of."""
+    return DamagedError(
+        f"{name} has lost writes: it has {found} of {least}; it was put back from a copy "
+        "older than the coordinator's: put back its newest copy, or the copies of all servers that "
+        "belong together"
+    )
+
+
+def older_coordinator(shown: str) -> DamagedError:
+    """Error for a coordinator that is older than what its shards have deleted."""
+    return DamagedError(
+        f"{shown} is older than its shards, which have deleted rows that it still names: it was "
+        "put back from an old copy; put back the copies of all servers that belong together"
+    )

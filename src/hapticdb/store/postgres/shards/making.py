@@ -1,5 +1,6 @@
 """Environments on several servers: made, found in the coordinator's catalogue, deleted."""
 
+import contextlib
 import secrets
 import uuid
 from collections.abc import Sequence
@@ -8,7 +9,13 @@ from urllib.parse import unquote, urlsplit
 
 from psycopg import errors, sql
 
-from hapticdb.errors import AccessError, DatabaseError, EnvironmentExistsError, UsageError
+from hapticdb.errors import (
+    AccessError,
+    DatabaseError,
+    EnvironmentExistsError,
+    EnvironmentNotFoundError,
+    UsageError,
+)
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import schema_of
@@ -41,12 +48,26 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
 
         schema_of.created(url, grid, layout, distances=distances, also=also)
     except BaseException:
-        for shard in made:
-            _drop_of(shard, token)
+        if not _may_be_made(url, token):
+            for shard in made:
+                _drop_of(shard, token)
         raise
     finally:
         for shard in made:
             shard.close()
+
+
+def _may_be_made(url: str, token: str) -> bool:
+    """Whether the coordinator has an environment on these shards, or does not answer."""
+    try:
+        with schema_of.connected(url) as coordinator:
+            if not is_sharded(coordinator):
+                return False
+            return coordinator.rows("SELECT token::text FROM distribution") == [(token,)]
+    except EnvironmentNotFoundError:
+        return False
+    except DatabaseError:
+        return True  # its commit may have been done although no answer came
 
 
 def _bare_connection(place: Place, address: Address) -> ServerConnection:
@@ -76,7 +97,7 @@ def _make_shard(shard: ServerConnection, layout: Layout, token: str) -> None:
             shard.execute(statement)
         shard.execute("INSERT INTO mark VALUES (1, %s, 0, 0, 0)", (token,))
 
-    shard.write(work)
+    shard.write(work, lambda: _has_token(shard, token))
 
 
 def _list_shards(
@@ -139,8 +160,13 @@ def drop_shards(shards: Shards) -> None:
 
 def _drop_of(shard: ServerConnection, token: str) -> None:
     """Delete a shard's schema if it is that environment's."""
-    try:
-        if shard.rows("SELECT token::text FROM mark") == [(token,)]:
+    with contextlib.suppress(DatabaseError):  # its server is away
+        if _has_token(shard, token):
             schema_of.drop(shard)
-    except DatabaseError:
-        pass  # it was not made, or its server is away
+
+
+def _has_token(shard: ServerConnection, token: str) -> bool:
+    """Whether a shard has been made for the environment of that token."""
+    if shard.rows("SELECT to_regclass('mark') IS NULL") == [(True,)]:
+        return False
+    return shard.rows("SELECT token::text FROM mark") == [(token,)]

@@ -10,6 +10,7 @@ Rows of a past revision may have been swept or moved meanwhile; the mark of each
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -21,7 +22,13 @@ from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import statements
 from hapticdb.store.postgres.shards.away import AwayShards
-from hapticdb.store.postgres.shards.links import Answer, Ask, Shards
+from hapticdb.store.postgres.shards.links import (
+    Answer,
+    Ask,
+    Shards,
+    lost_writes,
+    older_coordinator,
+)
 from hapticdb.store.postgres.shards.pieces import pieces_of_keys, pieces_of_ranges
 from hapticdb.store.postgres.shards.view import NEWEST, View, Views
 from hapticdb.store.postgres.tables.reading import PostgresReader, is_in_order
@@ -32,6 +39,17 @@ writes come faster than reads."""
 LAST = int(np.iinfo(np.int64).max)
 Plan = Callable[[View], Sequence[Ask]]
 Send = Callable[[Sequence[Ask], str | None], tuple[Answer, Sequence[Answer | None]]]
+
+
+class _Marks(NamedTuple):
+    """The latest revision whose dead rows are swept, the latest epoch whose rows are moved."""
+
+    swept: int
+    moved: int
+
+    def are_of(self, view: View) -> bool:
+        """Whether all rows of that view were there when the shards answered."""
+        return self.swept <= view.revision and self.moved <= view.epoch
 
 
 class ShardedReader:
@@ -84,7 +102,7 @@ class ShardedReader:
         if self._held is not None:
             asks = plan(self._held)
             _, answers = send(asks, None)
-            if not self._are_whole(self._held, answers):
+            if not self._marks(self._held, asks, answers).are_of(self._held):
                 raise _outdated(self._url)
             return self._seen(self._held), asks, answers
         is_renewed = False
@@ -95,9 +113,11 @@ class ShardedReader:
             asks = plan(view)
             first, answers = send(asks, None if is_renewed else NEWEST)
             is_newest = is_renewed or self.views.is_known(first)
-            if is_newest and self._are_whole(view, answers):
+            marks = self._marks(view, asks, answers)
+            if is_newest and marks.are_of(view):
                 return self._seen(view), asks, answers
-            self.views.load()
+            if not marks.are_of(self.views.load()) and not self._is_standby(self._connection):
+                raise older_coordinator(self._url)
             is_renewed = True
         raise _outdated(self._url)
 
@@ -105,15 +125,30 @@ class ShardedReader:
         self._objects.see(view.revision)
         return view
 
-    def _are_whole(self, view: View, answers: Sequence[Answer | None]) -> bool:
-        """Whether all rows of that view were there when the shards answered."""
-        for answer in answers:
+    def _marks(self, view: View, asks: Sequence[Ask], answers: Sequence[Answer | None]) -> "_Marks":
+        """The latest marks of shards among their answers.
+
+        Raises
+        ------
+        DamagedError
+            When a shard has lost writes.
+        """
+        swept = moved = 0
+        for ask, answer in zip(asks, answers, strict=True):
             if answer is None:
                 continue
-            _, swept, moved = wire.read_int8s(answer[-1]).tolist() if answer[-1] else (0, -1, -1)
-            if swept > view.revision or moved > view.epoch:
-                return False
-        return True
+            mark = wire.read_int8s(answer[-1]).tolist() if answer[-1] else (0, 0, 0)
+            if mark[0] < view.writes[ask.shard]:
+                if self._is_standby(self._shards.connection(ask.shard)):
+                    raise _outdated(self._url)  # it has not replayed them yet
+                name = f"{self._shards.name(ask.shard)} of {self._url}"
+                raise lost_writes(name, mark[0], int(view.writes[ask.shard]))
+            swept, moved = max(swept, mark[1]), max(moved, mark[2])
+        return _Marks(swept, moved)
+
+    def _is_standby(self, connection: ServerConnection) -> bool:
+        """Whether a server may be behind what others have told of it."""
+        return connection.rows("SELECT pg_is_in_recovery()") == [(True,)]
 
     # -- rows ------------------------------------------------------------------------------------
 

@@ -9,16 +9,17 @@ from hapticdb.store.base import NO_KEYS, Keys, Rows
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 
-NEWEST = "SELECT environment.revision, epoch FROM environment, distribution"
+NEWEST = """
+SELECT environment.revision, epoch, environment.tableoid::bigint FROM environment, distribution"""
 # the lock tells those who sweep that somebody still reads this revision (`sweeping`)
 HOLDING = """
-SELECT environment.revision, epoch,
+SELECT environment.revision, epoch, environment.tableoid::bigint,
        pg_advisory_xact_lock_shared(
          (environment.tableoid::bigint << 32) | (environment.revision & 4294967295))
   FROM environment, distribution"""
 LOAD = """
 WITH changed AS MATERIALIZED (SELECT id, version FROM live WHERE revision > $1)
-SELECT environment.revision, epoch,
+SELECT environment.revision, epoch, environment.tableoid::bigint,
        (SELECT array_agg(first_key ORDER BY number) FROM shard),
        (SELECT array_agg(writes ORDER BY number) FROM shard),
        (SELECT array_agg(id ORDER BY id) FROM changed),
@@ -66,11 +67,19 @@ class Views:
         self._connection = connection
         self._shift = row_shift
         self.known = NOTHING
+        # what `known` is of: the oid of a table, and the connection
+        self._identity = -1
+        self._driver: object = None
 
     def is_known(self, answer: list[bytes | None]) -> bool:
-        """Whether `NEWEST` or `HOLDING` has answered with the revision and epoch that are known."""
-        found = wire.read_int8(answer[0] or b""), wire.read_int8(answer[1] or b"")
-        return found == (self.known.revision, self.known.epoch)
+        """Whether `NEWEST` or `HOLDING` has answered with what is known.
+
+        Behind a new connection the same revision may be another one: the coordinator may have been
+        put back from a copy, and written to since.
+        """
+        found = tuple(wire.read_int8(value or b"") for value in answer[:3])
+        expected = self.known.revision, self.known.epoch, self._identity
+        return found == expected and self._connection.driver is self._driver
 
     def hold(self) -> View:
         """View of the snapshot that has begun; its rows are not swept while it lasts."""
@@ -86,13 +95,17 @@ class Views:
 
     def load(self) -> View:
         """Read the newest view. Of the versions only those that changed since are read."""
-        before = self.known
-        answer = self._connection.fetch(LOAD, wire.int8(before.revision))
-        revision, epoch = (wire.read_int8(value or b"") for value in answer[:2])
-        if revision < before.revision:  # the coordinator was put back to an older copy
+        if self._connection.driver is not self._driver:
             self.known = NOTHING
+        before, driver = self.known, self._connection.driver
+        answer = self._connection.fetch(LOAD, wire.int8(before.revision))
+        revision, epoch, identity = (wire.read_int8(value or b"") for value in answer[:3])
+        is_same = identity == self._identity and self._connection.driver is driver
+        if before is not NOTHING and (not is_same or revision < before.revision):
+            self.known = NOTHING  # the coordinator was put back from a copy
             return self.load()
-        firsts, writes, ids, versions = map(wire.read_int8s, answer[2:])
+        self._identity, self._driver = identity, self._connection.driver
+        firsts, writes, ids, versions = map(wire.read_int8s, answer[3:])
         live = changed_versions(before.ids, before.versions, ids, versions)
         self.known = View(revision, epoch, firsts >> self._shift, writes, *live)
         return self.known

@@ -107,7 +107,7 @@ def on_shards(servers: ShardedServers, store: ShardedStore, text: str) -> list[A
         with psycopg.connect(server.conninfo(), autocommit=True) as asked:
             name = sql.Identifier(store.name)
             asked.execute(sql.SQL("SET search_path = {}").format(name))
-            found.append(asked.execute(text.encode()).fetchall())  # type: ignore[arg-type]
+            found.append(asked.execute(text.encode()).fetchall())
     return found
 
 

@@ -18,8 +18,8 @@ from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.connecting import connection
 from hapticdb.store.postgres.connecting.link import Link
 from hapticdb.store.postgres.private_server import PrivateServer
-from hapticdb.store.postgres.shards import links
-from hapticdb.store.postgres.shards.links import ShardConnection, Shards
+from hapticdb.store.postgres.shards.connecting import links
+from hapticdb.store.postgres.shards.connecting.links import ShardConnection, Shards
 from hapticdb.store.postgres.shards.store import ShardedStore
 from labelled import GRID, contents_of, labelled_object, labelled_rows
 from servers import Place

@@ -19,7 +19,7 @@ from children import finished
 from hapticdb.errors import DatabaseError, UsageError
 from hapticdb.store.postgres.address import host_and_port, parse, with_environment
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer
-from hapticdb.store.postgres.shards.places import private_shards, shard_conninfo
+from hapticdb.store.postgres.shards.connecting.places import private_shards, shard_conninfo
 from hapticdb.store.urls import redact
 from servers import Place, named
 from sharded import N_SHARDS, SHARDED_FOUND, ShardedServers
@@ -290,7 +290,7 @@ import sys
 from pathlib import Path
 import psycopg
 from hapticdb.store.postgres.private_server import PrivateServer
-from hapticdb.store.postgres.shards.places import private_shards
+from hapticdb.store.postgres.shards.connecting.places import private_shards
 
 folder = Path(sys.argv[1])
 for n, making in enumerate((sys.argv[2] == "making", False)):

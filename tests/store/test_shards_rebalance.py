@@ -18,6 +18,7 @@ from hapticdb import Grid, PointShell
 from hapticdb.query.frame import Strategy
 from hapticdb.store.base import CELL_SHIFT, Layout, row_shift
 from hapticdb.store.postgres.shards.borders import carrying, rebalancing
+from hapticdb.store.postgres.shards.loading import IndexesOnShards
 from hapticdb.store.postgres.shards.pieces import even_borders
 from hapticdb.store.postgres.shards.store import ShardedStore
 from hapticdb.store.sharding import Rebalanced, RebalanceProgress
@@ -150,7 +151,7 @@ STEPS = [
     (rebalancing.Rebalancer, "_deleted", 0, False),  # all borders have
     (rebalancing.Rebalancer, "_wait_for_snapshots", 0, True),
     (rebalancing.Rebalancer, "_delete", 0, True),  # some rows are deleted
-    (rebalancing.IndexesOnShards, "vacuum", 0, False),
+    (IndexesOnShards, "vacuum", 0, False),
 ]
 
 
@@ -255,7 +256,7 @@ def test_a_frame_feels_the_same(sharded_place: Place, kind: Strategy) -> None:
     url = sharded_place()
     rng = np.random.default_rng(1)
     shell = PointShell(
-        points=(shape(0) + 0.5) * GRID.voxel_size,
+        points=((shape(0) + 0.5) * GRID.voxel_size).astype(np.float64),
         normals=np.tile([0.0, 0.0, 1.0], (len(shape(0)), 1)),
         center=np.zeros(3),
         is_closed=True,

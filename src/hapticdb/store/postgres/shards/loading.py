@@ -1,7 +1,7 @@
 """The indexes of rows on shards, for loading: dropped, made and cleaned up on all at once."""
 
 from hapticdb.store.base import Layout
-from hapticdb.store.postgres.shards.links import ShardConnection, Shards
+from hapticdb.store.postgres.shards.connecting.links import ShardConnection, Shards
 from hapticdb.store.postgres.shards.schemas import KEY
 from hapticdb.store.postgres.tables.loading import IndexesHere
 

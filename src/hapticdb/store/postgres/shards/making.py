@@ -22,9 +22,9 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.address import Address, parse
 from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 from hapticdb.store.postgres.shards import schemas
-from hapticdb.store.postgres.shards.links import Place, ShardConnection, Shards
+from hapticdb.store.postgres.shards.connecting.links import Place, ShardConnection, Shards
+from hapticdb.store.postgres.shards.connecting.places import private_shards, shard_conninfo
 from hapticdb.store.postgres.shards.pieces import even_borders
-from hapticdb.store.postgres.shards.places import private_shards, shard_conninfo
 
 IS_SHARDED = "SELECT to_regclass('distribution') IS NOT NULL"
 

@@ -27,7 +27,7 @@ from hapticdb.store.base import (
 )
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.shards.links import (
+from hapticdb.store.postgres.shards.connecting.links import (
     ShardConnection,
     Shards,
     lost_writes,

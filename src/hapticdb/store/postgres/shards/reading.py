@@ -21,8 +21,8 @@ from hapticdb.store.batches import PartialRows, joined, no_rows
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import statements
-from hapticdb.store.postgres.shards.away import AwayShards
-from hapticdb.store.postgres.shards.links import (
+from hapticdb.store.postgres.shards.connecting.away import AwayShards
+from hapticdb.store.postgres.shards.connecting.links import (
     Answer,
     Ask,
     Shards,

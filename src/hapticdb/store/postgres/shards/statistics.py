@@ -10,7 +10,7 @@ from hapticdb.store.base import Histogram, Keys, Layout, Size
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import statements
-from hapticdb.store.postgres.shards.links import Ask, Shards
+from hapticdb.store.postgres.shards.connecting.links import Ask, Shards
 from hapticdb.store.postgres.shards.reading import ShardedReader
 from hapticdb.store.postgres.shards.sweeping import Sweeper
 from hapticdb.store.postgres.shards.view import View

@@ -19,7 +19,7 @@ from hapticdb.store.base import Layout, Table, row_shift
 from hapticdb.store.postgres.connecting import failures, wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import statements
-from hapticdb.store.postgres.shards.links import ShardConnection, Shards
+from hapticdb.store.postgres.shards.connecting.links import ShardConnection, Shards
 from hapticdb.store.postgres.shards.pieces import pieces_of_ranges
 
 Result = TypeVar("Result")

@@ -13,7 +13,7 @@ from hapticdb.store.base import Layout, Table
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards.borders.moves import Move
-from hapticdb.store.postgres.shards.links import ShardConnection
+from hapticdb.store.postgres.shards.connecting.links import ShardConnection
 from hapticdb.store.postgres.shards.schemas import COLUMNS, KEY
 from hapticdb.store.postgres.tables.loading import TABLES
 

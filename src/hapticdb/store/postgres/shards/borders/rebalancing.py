@@ -37,7 +37,7 @@ from hapticdb.store.postgres.shards.borders.moves import (
     next_move,
     part_of,
 )
-from hapticdb.store.postgres.shards.links import ShardConnection, Shards, named_away
+from hapticdb.store.postgres.shards.connecting.links import ShardConnection, Shards, named_away
 from hapticdb.store.postgres.shards.loading import IndexesOnShards
 from hapticdb.store.postgres.shards.pieces import borders_by_rows
 from hapticdb.store.postgres.shards.statistics import ShardedStatistics

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from hapticdb.errors import HapticDBError
-from hapticdb.store.postgres.shards.links import Answer, Ask, ShardConnection, Shards
+from hapticdb.store.postgres.shards.connecting.links import Answer, Ask, ShardConnection, Shards
 
 PATIENCE_MS = 500
 """Milliseconds that a shard may take to answer before it counts as away. A larger value bears

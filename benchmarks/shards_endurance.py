@@ -15,6 +15,7 @@ import contextlib
 import json
 import multiprocessing
 import os
+import pickle
 import random
 import tempfile
 import time
@@ -23,7 +24,7 @@ from contextlib import closing
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkProcess
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import psycopg
 from psycopg import sql
@@ -46,6 +47,8 @@ REMOVED, SWEPT = 0.2, 0.02
 """Shares of a writer's steps: removals of objects, and sweeps of all shards."""
 PATIENCE_S = 60.0
 """Seconds that a process may take to end when it is told to."""
+LONGEST_S = 86_400.0
+"""Seconds after which processes end by themselves."""
 FORK = multiprocessing.get_context("fork")
 
 
@@ -64,7 +67,8 @@ def read(url: str, stop: Path, seed: int, said: Connection) -> None:
     frames = outdated = away = 0
     torn: list[str] = []
     store = None
-    while not stop.exists():
+    ends = time.monotonic() + LONGEST_S
+    while not stop.exists() and time.monotonic() < ends:
         try:
             if store is None:
                 store = open_store(url, read_only=True)
@@ -112,13 +116,20 @@ class Book:
         self.n_done += word == "done"
 
 
+def told(said: Connection) -> Any:  # noqa: ANN401 - whatever the process has sent
+    """What a process sends at its end."""
+    assert said.poll(PATIENCE_S), "a reader or writer has ended by itself"
+    return pickle.loads(said.recv_bytes())  # noqa: S301 - of our own process
+
+
 def write(url: str, stop: Path, path: Path, number: int, said: Connection) -> None:
     """Edit until the file `stop` is there; send what was lost, in a line each."""
     rng = random.Random(os.getpid())  # noqa: S311 - no secret
     ids = range(1 + number * N_OBJECTS, 1 + (number + 1) * N_OBJECTS)
     book = Book(path, ids)
     store, lost = None, []
-    while not stop.exists():
+    ends = time.monotonic() + LONGEST_S
+    while not stop.exists() and time.monotonic() < ends:
         try:
             if store is None:
                 store = ShardedStore.open(url)
@@ -221,12 +232,11 @@ class Run:
         self.stop.touch()
         lost: list[str] = []
         for process, said in self.writers.values():
-            lost += said.recv() if said.poll(PATIENCE_S) else ["a writer has ended"]
+            lost += told(said)
             process.join(PATIENCE_S)
         seen = []
         for process, said in self.readers:
-            assert said.poll(PATIENCE_S), "a reader has ended"
-            seen.append(said.recv())
+            seen.append(told(said))
             process.join(PATIENCE_S)
         books = [
             Book(self.folder / f"book{n}", range(1 + n * N_OBJECTS, 1 + (n + 1) * N_OBJECTS))

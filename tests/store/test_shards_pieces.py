@@ -14,7 +14,7 @@ from hapticdb.store.postgres.shards.pieces import (
     pieces_of_ranges,
 )
 from hapticdb.store.postgres.shards.statistics import joined_histograms
-from hapticdb.store.postgres.shards.view import View, changed_versions
+from hapticdb.store.postgres.shards.view import LiveView, changed_versions
 
 LAST = 60
 firsts_of = st.lists(st.integers(0, LAST), max_size=5).map(
@@ -117,7 +117,7 @@ def test_rows_count_in_the_live_version_only(
     ids = np.array(sorted(live), dtype=np.int64)
     versions = np.array([live[key] for key in sorted(live)], dtype=np.int64)
     none = np.empty(0, np.int64)
-    view = View(1, 0, none, none, ids, versions)
+    view = LiveView(1, 0, none, none, ids, versions)
     asked = np.array(rows, dtype=np.int64).reshape(-1, 2)
     found = view.are_live(asked[:, 0], asked[:, 1]).tolist()
     assert found == [live.get(object_id) == version for object_id, version in rows]

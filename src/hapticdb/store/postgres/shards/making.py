@@ -22,7 +22,7 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.address import Address, parse
 from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 from hapticdb.store.postgres.shards import schemas
-from hapticdb.store.postgres.shards.connecting.links import Place, ShardConnection, Shards
+from hapticdb.store.postgres.shards.connecting.links import ShardConnection, ShardPlace, Shards
 from hapticdb.store.postgres.shards.connecting.places import private_shards, shard_conninfo
 from hapticdb.store.postgres.shards.pieces import even_borders
 
@@ -70,7 +70,7 @@ def _may_be_made(url: str, token: str) -> bool:
         return True  # its commit may have been done although no answer came
 
 
-def _bare_connection(place: Place, address: Address) -> ServerConnection:
+def _bare_connection(place: ShardPlace, address: Address) -> ServerConnection:
     """Connection to a shard that may have no schema yet."""
     shown = f"shard {place.number} ({place.host}) of {address.shown}"
     of_shard = Address(place.conninfo, address.environment, None, shown)
@@ -134,7 +134,7 @@ def shards_of(connection: ServerConnection) -> Shards:
     return Shards(connection, places_of(address, hosts, making=False), str(token))
 
 
-def places_of(address: Address, hosts: Sequence[str], *, making: bool) -> list[Place]:
+def places_of(address: Address, hosts: Sequence[str], *, making: bool) -> list[ShardPlace]:
     """Where the shards of an environment are; private servers are started."""
     coordinator = schema_of.conninfo(address, making=making)
     if address.data is not None:
@@ -146,7 +146,7 @@ def places_of(address: Address, hosts: Sequence[str], *, making: bool) -> list[P
         )
     else:
         urls = [shard_conninfo(address, coordinator, host) for host in hosts]
-    return [Place(n, *pair) for n, pair in enumerate(zip(hosts, urls, strict=True), 1)]
+    return [ShardPlace(n, *pair) for n, pair in enumerate(zip(hosts, urls, strict=True), 1)]
 
 
 def drop_shards(shards: Shards) -> None:

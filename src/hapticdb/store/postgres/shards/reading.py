@@ -24,21 +24,21 @@ from hapticdb.store.postgres.shards import statements
 from hapticdb.store.postgres.shards.connecting.away import AwayShards
 from hapticdb.store.postgres.shards.connecting.links import (
     Answer,
-    Ask,
+    ShardQuery,
     Shards,
     lost_writes,
     older_coordinator,
 )
 from hapticdb.store.postgres.shards.pieces import pieces_of_keys, pieces_of_ranges
-from hapticdb.store.postgres.shards.view import NEWEST, View, Views
+from hapticdb.store.postgres.shards.view import NEWEST, LiveView, Views
 from hapticdb.store.postgres.tables.reading import PostgresReader, is_in_order
 
 TRIES = 20
 """Times that a read begins again because others have written. A larger value waits longer where
 writes come faster than reads."""
 LAST = int(np.iinfo(np.int64).max)
-Plan = Callable[[View], Sequence[Ask]]
-Send = Callable[[Sequence[Ask], str | None], tuple[Answer, Sequence[Answer | None]]]
+Plan = Callable[[LiveView], Sequence[ShardQuery]]
+Send = Callable[[Sequence[ShardQuery], str | None], tuple[Answer, Sequence[Answer | None]]]
 
 
 class _Marks(NamedTuple):
@@ -47,7 +47,7 @@ class _Marks(NamedTuple):
     swept: int
     moved: int
 
-    def are_of(self, view: View) -> bool:
+    def are_of(self, view: LiveView) -> bool:
         """Whether all rows of that view were there when the shards answered."""
         return self.swept <= view.revision and self.moved <= view.epoch
 
@@ -64,7 +64,7 @@ class ShardedReader:
         self._layout = layout
         self._objects = objects
         self._depth = 0
-        self._held: View | None = None
+        self._held: LiveView | None = None
         self.away = AwayShards(shards)
         self.views = Views(connection, row_shift(layout))
 
@@ -84,7 +84,7 @@ class ShardedReader:
                 if not self._depth:
                     self._held = None
 
-    def ask(self, plan: Plan) -> tuple[View, list[Answer]]:
+    def ask(self, plan: Plan) -> tuple[LiveView, list[Answer]]:
         """Answers of shards to the statements that `plan` makes, and the view that they belong to.
 
         Raises
@@ -97,8 +97,10 @@ class ShardedReader:
         view, _, answers = self._asked(plan, self._shards.ask)
         return view, [answer for answer in answers if answer is not None]
 
-    def _asked(self, plan: Plan, send: Send) -> tuple[View, Sequence[Ask], Sequence[Answer | None]]:
-        """View, statements and answers; None for an answer that `send` did not get."""
+    def _asked(
+        self, plan: Plan, send: Send
+    ) -> tuple[LiveView, Sequence[ShardQuery], Sequence[Answer | None]]:
+        """LiveView, statements and answers; None for an answer that `send` did not get."""
         if self._held is not None:
             asks = plan(self._held)
             _, answers = send(asks, None)
@@ -121,11 +123,13 @@ class ShardedReader:
             is_renewed = True
         raise _outdated(self._url)
 
-    def _seen(self, view: View) -> View:
+    def _seen(self, view: LiveView) -> LiveView:
         self._objects.see(view.revision)
         return view
 
-    def _marks(self, view: View, asks: Sequence[Ask], answers: Sequence[Answer | None]) -> "_Marks":
+    def _marks(
+        self, view: LiveView, asks: Sequence[ShardQuery], answers: Sequence[Answer | None]
+    ) -> "_Marks":
         """The latest marks of shards among their answers.
 
         Raises
@@ -169,7 +173,7 @@ class ShardedReader:
             raise DamagedError(f"{self._url}: a shard's answer has columns of different lengths")
         return rows, versions
 
-    def live(self, view: View, answers: Sequence[Answer], *, distances: bool) -> Rows:
+    def live(self, view: LiveView, answers: Sequence[Answer], *, distances: bool) -> Rows:
         """The rows of a view among the answers of shards, in the order of the shards."""
         parts = []
         for answer in answers:
@@ -189,9 +193,9 @@ class ShardedReader:
             return no_rows(distances=distances)
         text = statements.LOOKUP[self._table(distances=distances)]
 
-        def plan(view: View) -> list[Ask]:
+        def plan(view: LiveView) -> list[ShardQuery]:
             return [
-                Ask(shard, text, (wire.int8s(keys[some]),))
+                ShardQuery(shard, text, (wire.int8s(keys[some]),))
                 for shard, some in pieces_of_keys(view.firsts, keys)
             ]
 
@@ -206,9 +210,9 @@ class ShardedReader:
         for at in range(len(keys)):
             key = keys[at : at + 1]
 
-            def plan(view: View, key: Keys = key) -> list[Ask]:
+            def plan(view: LiveView, key: Keys = key) -> list[ShardQuery]:
                 ((shard, _),) = pieces_of_keys(view.firsts, key)
-                return [Ask(shard, text, (wire.int8(int(key[0])),))]
+                return [ShardQuery(shard, text, (wire.int8(int(key[0])),))]
 
             parts.append(self.live(*self.ask(plan), distances=distances))
         return joined([part for part in parts if len(part)], distances=distances)
@@ -297,17 +301,19 @@ class _After:
         self._key = after[0] + (after[1] == LAST)  # the first that a row may have
         self.shard = 0
 
-    def __call__(self, view: View) -> list[Ask]:
+    def __call__(self, view: LiveView) -> list[ShardQuery]:
         self.shard = max(int(np.searchsorted(view.firsts, self._key, "right")) - 1, 0)
-        return [Ask(self.shard, self._text, self._parameters)]
+        return [ShardQuery(self.shard, self._text, self._parameters)]
 
 
 def _ranges_plan(text: str, lows: Keys, highs: Keys, *others: wire.Parameter) -> Plan:
     """Plan that asks each shard for its pieces of ranges."""
 
-    def plan(view: View) -> list[Ask]:
+    def plan(view: LiveView) -> list[ShardQuery]:
         return [
-            Ask(piece.shard, text, (wire.int8s(piece.lows), wire.int8s(piece.highs), *others))
+            ShardQuery(
+                piece.shard, text, (wire.int8s(piece.lows), wire.int8s(piece.highs), *others)
+            )
             for piece in pieces_of_ranges(view.firsts, lows, highs)
         ]
 

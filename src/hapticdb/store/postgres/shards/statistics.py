@@ -10,10 +10,10 @@ from hapticdb.store.base import Histogram, Keys, Layout, Size
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import statements
-from hapticdb.store.postgres.shards.connecting.links import Ask, Shards
+from hapticdb.store.postgres.shards.connecting.links import ShardQuery, Shards
 from hapticdb.store.postgres.shards.reading import ShardedReader
 from hapticdb.store.postgres.shards.sweeping import Sweeper
-from hapticdb.store.postgres.shards.view import View
+from hapticdb.store.postgres.shards.view import LiveView
 from hapticdb.store.postgres.tables.histogram import (
     ENOUGH_ROWS,
     EXACT,
@@ -145,9 +145,9 @@ class ShardedStatistics(PostgresStatistics):
     def _counts(self, table: str) -> Keys:
         """Live rows of each shard (S,)."""
 
-        def plan(view: View) -> list[Ask]:
+        def plan(view: LiveView) -> list[ShardQuery]:
             text = COUNT_ALL[table]  # type: ignore[index]
-            return [Ask(shard, text, ends) for shard, ends in enumerate(_own_ranges(view))]
+            return [ShardQuery(shard, text, ends) for shard, ends in enumerate(_own_ranges(view))]
 
         view, answers = self._rows.ask(plan)
         counts = np.zeros(len(answers), np.int64)
@@ -175,11 +175,11 @@ class ShardedStatistics(PostgresStatistics):
             ranks = np.maximum(ranks, 1)
             before = np.cumsum(counts) - counts
 
-            def plan(view: View) -> list[Ask]:
+            def plan(view: LiveView) -> list[ShardQuery]:
                 ranges = _own_ranges(view)
                 live = wire.int8s(view.ids), wire.int8s(view.versions)
                 return [
-                    Ask(
+                    ShardQuery(
                         shard,
                         EXACT_ON_SHARD[self._layout],
                         (
@@ -204,7 +204,7 @@ class ShardedStatistics(PostgresStatistics):
         self._shards.each(refresh)
 
 
-def _own_ranges(view: View) -> list[tuple[wire.Parameter, wire.Parameter]]:
+def _own_ranges(view: LiveView) -> list[tuple[wire.Parameter, wire.Parameter]]:
     """Lowest and highest row key that each shard holds."""
     ends = np.append(view.firsts[1:], LAST).tolist()
     return [

@@ -15,7 +15,7 @@ from hapticdb.store.postgres.shards.pieces import borders_by_rows
 from hapticdb.store.postgres.shards.placing import RowsOnShards
 from hapticdb.store.postgres.shards.reading import ShardedReader
 from hapticdb.store.postgres.shards.statistics import ShardedStatistics
-from hapticdb.store.postgres.shards.sweeping import Sweeper, Swept
+from hapticdb.store.postgres.shards.sweeping import Sweeper, SweptVersions
 from hapticdb.store.postgres.store import ServerStore
 from hapticdb.store.sharding import RebalanceCallback, Rebalanced
 
@@ -104,7 +104,7 @@ class ShardedStore(ServerStore):
         """Move the borders to where each shard holds equally many rows; others go on meanwhile."""
         return self._rebalancer.rebalance(progress)
 
-    def sweep(self) -> Swept:
+    def sweep(self) -> SweptVersions:
         """Delete rows on the shards that no reader needs any more."""
         return self._sweeper.sweep()
 

@@ -65,7 +65,7 @@ class Left(NamedTuple):
     ranges: tuple[int, ...]
 
 
-class Swept(NamedTuple):
+class SweptVersions(NamedTuple):
     """Result of a sweep: versions of objects whose rows were deleted, and those left for later."""
 
     versions: int
@@ -108,7 +108,7 @@ class Sweeper:
         due = [left for left in self._waiting if oldest is None or left.died <= oldest]
         return due[:AT_ONCE], borders
 
-    def sweep(self) -> Swept:
+    def sweep(self) -> SweptVersions:
         """Sweep all shards. Waits for the write that is under way; then writers go on.
 
         Raises
@@ -145,7 +145,7 @@ class Sweeper:
             raise errors[0]
         swept = {left[:2] for lefts in chosen.values() for left in lefts}
         kept = {left[:2] for lefts in found.values() for left in lefts} - swept
-        return Swept(len(swept), len(kept))
+        return SweptVersions(len(swept), len(kept))
 
     def _outcomes(
         self,

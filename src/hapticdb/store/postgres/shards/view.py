@@ -27,7 +27,7 @@ SELECT environment.revision, epoch, environment.tableoid::bigint,
   FROM environment, distribution"""
 
 
-class View(NamedTuple):
+class LiveView(NamedTuple):
     """The environment at one revision.
 
     revision : of the environment; epoch : number of borders moved so far; firsts (S,) int64: first
@@ -57,7 +57,7 @@ class View(NamedTuple):
         return rows if are_live.all() else rows.picked(np.flatnonzero(are_live))
 
 
-NOTHING = View(-1, -1, NO_KEYS, NO_KEYS, NO_KEYS, NO_KEYS)
+NOTHING = LiveView(-1, -1, NO_KEYS, NO_KEYS, NO_KEYS, NO_KEYS)
 
 
 class Views:
@@ -81,19 +81,19 @@ class Views:
         expected = self.known.revision, self.known.epoch, self._identity
         return found == expected and self._connection.driver is self._driver
 
-    def hold(self) -> View:
-        """View of the snapshot that has begun; its rows are not swept while it lasts."""
+    def hold(self) -> LiveView:
+        """LiveView of the snapshot that has begun; its rows are not swept while it lasts."""
         if not self.is_known(self._connection.fetch(HOLDING)):
             self.load()
         return self.known
 
-    def renewed(self) -> View:
-        """View of the newest commit, loaded unless it is known."""
+    def renewed(self) -> LiveView:
+        """LiveView of the newest commit, loaded unless it is known."""
         if not self.is_known(self._connection.fetch(NEWEST)):
             self.load()
         return self.known
 
-    def load(self) -> View:
+    def load(self) -> LiveView:
         """Read the newest view. Of the versions only those that changed since are read."""
         if self._connection.driver is not self._driver:
             self.known = NOTHING
@@ -107,7 +107,7 @@ class Views:
         self._identity, self._driver = identity, self._connection.driver
         firsts, writes, ids, versions = map(wire.read_int8s, answer[3:])
         live = changed_versions(before.ids, before.versions, ids, versions)
-        self.known = View(revision, epoch, firsts >> self._shift, writes, *live)
+        self.known = LiveView(revision, epoch, firsts >> self._shift, writes, *live)
         return self.known
 
 

@@ -9,7 +9,12 @@ import time
 from collections.abc import Callable, Sequence
 
 from hapticdb.errors import HapticDBError
-from hapticdb.store.postgres.shards.connecting.links import Answer, Ask, ShardConnection, Shards
+from hapticdb.store.postgres.shards.connecting.links import (
+    Answer,
+    ShardConnection,
+    ShardQuery,
+    Shards,
+)
 
 PATIENCE_MS = 500
 """Milliseconds that a shard may take to answer before it counts as away. A larger value bears
@@ -37,7 +42,9 @@ class AwayShards:
             if revival.connection is None
         )
 
-    def ask(self, asks: Sequence[Ask], first: str | None) -> tuple[Answer, list[Answer | None]]:
+    def ask(
+        self, asks: Sequence[ShardQuery], first: str | None
+    ) -> tuple[Answer, list[Answer | None]]:
         """Answers as of `Shards.ask`; None for a shard that is away."""
         self._begin_all()
         there = [ask for ask in asks if self._is_there(ask.shard)]

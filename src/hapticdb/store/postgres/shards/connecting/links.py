@@ -29,7 +29,7 @@ A larger value gives a shard more time to answer."""
 TOKEN = "SELECT token::text FROM mark"  # noqa: S105 - which environment it is, no secret
 
 
-class Place(NamedTuple):
+class ShardPlace(NamedTuple):
     """Where a shard is: its number from 1, its host as the user wrote it, libpq's URL of it."""
 
     number: int
@@ -37,7 +37,7 @@ class Place(NamedTuple):
     conninfo: str
 
 
-class Ask(NamedTuple):
+class ShardQuery(NamedTuple):
     """A statement for one shard, whose place among the shards begins at 0."""
 
     shard: int
@@ -48,7 +48,9 @@ class Ask(NamedTuple):
 class ShardConnection(ServerConnection):
     """A connection to one shard. Its threads are the store's business."""
 
-    def __init__(self, place: Place, environment: Address, token: str, *, read_only: bool) -> None:
+    def __init__(
+        self, place: ShardPlace, environment: Address, token: str, *, read_only: bool
+    ) -> None:
         shown = f"shard {place.number} ({place.host}) of {environment.shown}"
         address = Address(place.conninfo, environment.environment, None, shown)
         self._token = token
@@ -84,7 +86,9 @@ class ShardConnection(ServerConnection):
 class Shards:
     """The shards of one opened environment."""
 
-    def __init__(self, coordinator: ServerConnection, places: Sequence[Place], token: str) -> None:
+    def __init__(
+        self, coordinator: ServerConnection, places: Sequence[ShardPlace], token: str
+    ) -> None:
         self.coordinator = coordinator
         self.places = places
         self.token = token
@@ -143,7 +147,9 @@ class Shards:
 
     # -- reading ---------------------------------------------------------------------------------
 
-    def ask(self, asks: Sequence[Ask], first: str | None = None) -> tuple[Answer, list[Answer]]:
+    def ask(
+        self, asks: Sequence[ShardQuery], first: str | None = None
+    ) -> tuple[Answer, list[Answer]]:
         """Answers of all shards, asked at the same time; before them that of the coordinator.
 
         A shard whose connection was lost is connected again and asked once more, as for a read on
@@ -164,7 +170,7 @@ class Shards:
         return found, known
 
     def ask_once(
-        self, asks: Sequence[Ask], first: str | None, patience_ms: int | None = None
+        self, asks: Sequence[ShardQuery], first: str | None, patience_ms: int | None = None
     ) -> tuple[Answer, list[Answer | None]]:
         """Answers as of `ask`, without a second try: None for a shard whose connection is lost.
 

@@ -158,7 +158,7 @@ def edit(
     book.write("done", object_id, new)
 
 
-class Run:
+class Ordeal:
     """The processes, and what happens to them."""
 
     def __init__(self, servers: ShardedServers, folder: Path, seed: int) -> None:
@@ -293,7 +293,7 @@ def servers_in(folder: Path):  # type: ignore[no-untyped-def] # noqa: ANN201 - a
 def endure(folder: Path, seconds: float, seed: int) -> dict[str, object]:
     """Run for so many seconds; figures, and what is wrong."""
     with servers_in(folder) as servers:
-        run = Run(servers, folder, seed)
+        run = Ordeal(servers, folder, seed)
         try:
             run.begin()
             ends = time.monotonic() + seconds

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import psycopg
 from psycopg import sql
 
+from children import received
 from hapticdb import BusyError, ConnectionLostError, OutdatedError
 from hapticdb.check import check_environment
 from hapticdb.store.connect import open_store
@@ -46,6 +47,8 @@ REMOVED, SWEPT = 0.2, 0.02
 """Shares of a writer's steps: removals of objects, and sweeps of all shards."""
 PATIENCE_S = 60.0
 """Seconds that a process may take to end when it is told to."""
+LONGEST_S = 86400.0
+"""Seconds after which a process ends although nobody has told it to."""
 FORK = multiprocessing.get_context("fork")
 
 
@@ -64,7 +67,8 @@ def read(url: str, stop: Path, seed: int, said: Connection) -> None:
     frames = outdated = away = 0
     torn: list[str] = []
     store = None
-    while not stop.exists():
+    ends = time.monotonic() + LONGEST_S
+    while not stop.exists() and time.monotonic() < ends:
         try:
             if store is None:
                 store = open_store(url, read_only=True)
@@ -118,7 +122,8 @@ def write(url: str, stop: Path, path: Path, number: int, said: Connection) -> No
     ids = range(1 + number * N_OBJECTS, 1 + (number + 1) * N_OBJECTS)
     book = Book(path, ids)
     store, lost = None, []
-    while not stop.exists():
+    ends = time.monotonic() + LONGEST_S
+    while not stop.exists() and time.monotonic() < ends:
         try:
             if store is None:
                 store = ShardedStore.open(url)
@@ -221,12 +226,12 @@ class Ordeal:
         self.stop.touch()
         lost: list[str] = []
         for process, said in self.writers.values():
-            lost += said.recv() if said.poll(PATIENCE_S) else ["a writer has ended"]
+            lost += received(said) if said.poll(PATIENCE_S) else ["a writer has ended"]
             process.join(PATIENCE_S)
         seen = []
         for process, said in self.readers:
             assert said.poll(PATIENCE_S), "a reader has ended"
-            seen.append(said.recv())
+            seen.append(received(said))
             process.join(PATIENCE_S)
         books = [
             Book(self.folder / f"book{n}", range(1 + n * N_OBJECTS, 1 + (n + 1) * N_OBJECTS))

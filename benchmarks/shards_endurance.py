@@ -29,6 +29,7 @@ from typing import Any, NamedTuple
 import psycopg
 from psycopg import sql
 
+from children import received
 from hapticdb import BusyError, ConnectionLostError, OutdatedError
 from hapticdb.check import check_environment
 from hapticdb.store.connect import open_store
@@ -47,8 +48,8 @@ REMOVED, SWEPT = 0.2, 0.02
 """Shares of a writer's steps: removals of objects, and sweeps of all shards."""
 PATIENCE_S = 60.0
 """Seconds that a process may take to end when it is told to."""
-LONGEST_S = 86_400.0
-"""Seconds after which processes end by themselves."""
+LONGEST_S = 86400.0
+"""Seconds after which a process ends although nobody has told it to."""
 FORK = multiprocessing.get_context("fork")
 
 
@@ -169,7 +170,7 @@ def edit(
     book.write("done", object_id, new)
 
 
-class Run:
+class Ordeal:
     """The processes, and what happens to them."""
 
     def __init__(self, servers: ShardedServers, folder: Path, seed: int) -> None:
@@ -232,11 +233,12 @@ class Run:
         self.stop.touch()
         lost: list[str] = []
         for process, said in self.writers.values():
-            lost += told(said)
+            lost += received(said) if said.poll(PATIENCE_S) else ["a writer has ended"]
             process.join(PATIENCE_S)
         seen = []
         for process, said in self.readers:
-            seen.append(told(said))
+            assert said.poll(PATIENCE_S), "a reader has ended"
+            seen.append(received(said))
             process.join(PATIENCE_S)
         books = [
             Book(self.folder / f"book{n}", range(1 + n * N_OBJECTS, 1 + (n + 1) * N_OBJECTS))
@@ -303,7 +305,7 @@ def servers_in(folder: Path):  # type: ignore[no-untyped-def] # noqa: ANN201 - a
 def endure(folder: Path, seconds: float, seed: int) -> dict[str, object]:
     """Run for so many seconds; figures, and what is wrong."""
     with servers_in(folder) as servers:
-        run = Run(servers, folder, seed)
+        run = Ordeal(servers, folder, seed)
         try:
             run.begin()
             ends = time.monotonic() + seconds

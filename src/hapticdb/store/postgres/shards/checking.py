@@ -5,7 +5,8 @@ from collections.abc import Iterator
 from hapticdb.errors import ShardAwayError
 from hapticdb.store.base import Rows
 from hapticdb.store.postgres.checking import PostgresChecker
-from hapticdb.store.postgres.shards.connecting.links import (
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.shards.links import (
     ShardConnection,
     Shards,
     lost_writes,
@@ -13,6 +14,7 @@ from hapticdb.store.postgres.shards.connecting.links import (
 )
 from hapticdb.store.postgres.shards.reading import ShardedReader
 
+REVISION = "SELECT revision FROM environment WHERE id = 1"
 WRITES = "SELECT writes FROM shard ORDER BY number"
 
 
@@ -30,10 +32,15 @@ class ShardedChecker:
         return self._coordinator.has_page_checksums() and all(one == [("on",)] for one in asked)
 
     def findings(self) -> Iterator[str]:
-        """What is wrong with kept statistics, and with whole shards, a line each."""
+        """What is wrong with kept statistics, and with whole shards, a line each.
+
+        Raises
+        ------
+        DamagedError
+            When the coordinator is older than its shards, so that no snapshot can be read.
+        """
         yield from self._coordinator.findings()
         published = [int(row[0]) for row in self._shards.coordinator.rows(WRITES)]
-        revision = self._reader.views.renewed().revision
         for shard, least in enumerate(published):
             name = self._shards.name(shard)
             try:
@@ -43,9 +50,17 @@ class ShardedChecker:
                 continue
             if writes < least:
                 yield str(lost_writes(name, writes, least))
-            # newest: another may have written and swept since it was last read
-            if swept > revision and swept > self._reader.views.renewed().revision:
-                yield str(older_coordinator("the coordinator"))
+            if not self._is_reached(swept):
+                raise older_coordinator("the coordinator")
+
+    def _is_reached(self, revision: int) -> bool:
+        """Whether the coordinator has that revision; a snapshot of the store may see an older one.
+
+        A standby may be behind.
+        """
+        known = self._shards.coordinator
+        with ServerConnection(known.address, known.conninfo, read_only=True) as other:
+            return other.is_standby or int(other.rows(REVISION)[0][0]) >= revision
 
     def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
         """At most that many rows after (key, id), ascending by both."""

@@ -15,7 +15,6 @@ import contextlib
 import json
 import multiprocessing
 import os
-import pickle
 import random
 import tempfile
 import time
@@ -24,7 +23,7 @@ from contextlib import closing
 from multiprocessing.connection import Connection
 from multiprocessing.context import ForkProcess
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import psycopg
 from psycopg import sql
@@ -115,12 +114,6 @@ class Book:
         else:
             self.known[object_id] = {label}
         self.n_done += word == "done"
-
-
-def told(said: Connection) -> Any:  # noqa: ANN401 - whatever the process has sent
-    """What a process sends at its end."""
-    assert said.poll(PATIENCE_S), "a reader or writer has ended by itself"
-    return pickle.loads(said.recv_bytes())  # noqa: S301 - of our own process
 
 
 def write(url: str, stop: Path, path: Path, number: int, said: Connection) -> None:

@@ -6,7 +6,7 @@ from hapticdb.errors import ShardAwayError
 from hapticdb.store.base import Rows
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.shards.links import (
+from hapticdb.store.postgres.shards.connecting.links import (
     ShardConnection,
     Shards,
     lost_writes,

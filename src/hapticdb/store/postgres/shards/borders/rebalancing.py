@@ -28,6 +28,7 @@ import psycopg
 from hapticdb.errors import AccessError, BusyError, OutdatedError, ShardAwayError
 from hapticdb.store.base import Keys, Layout, row_shift
 from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.shards import foreign
 from hapticdb.store.postgres.shards.borders.carrying import Carried, Carrier, overtaken
 from hapticdb.store.postgres.shards.borders.moves import (
     LAST,
@@ -219,6 +220,8 @@ class Rebalancer:
             except ShardAwayError as error:  # the coordinator is not: nothing is to be repeated
                 return error
             borders = borders_after(state.borders, move)
+            # tables for SQL have the old borders: none is better than one that lacks rows
+            foreign.withdraw(connection)
             connection.execute(MOVE_BORDERS, (borders.tolist(),))
             connection.execute(
                 COUNT_WRITES, (carried.writes, self._shards.places[move.target].number)

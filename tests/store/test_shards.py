@@ -305,6 +305,26 @@ def test_rows_of_a_write_that_was_never_published_are_not_there_and_are_swept(
     assert everything(store).keys.tolist() == before
 
 
+# -- in SQL ----------------------------------------------------------------------------------------
+
+
+def test_sql_at_the_coordinator_reads_the_rows_that_count(
+    store: ShardedStore, sharded_servers: ShardedServers
+) -> None:
+    in_sql = "SELECT z_val, id, occupancy FROM brick_live WHERE cell >= 0 ORDER BY z_val, id"
+    is_whole = "SELECT is_whole FROM shard_check"
+    store.offer_sql()
+    for by in (0, 4):
+        moved(store, by)
+        found = on(sharded_servers.coordinator, store.url, in_sql)
+        wanted = everything(store)
+        assert [row[0] for row in found] == wanted.keys.tolist()
+        assert b"".join(bytes(row[2]) for row in found) == wanted.occupancy.tobytes()  # type: ignore[call-overload]
+        assert on(sharded_servers.coordinator, store.url, is_whole) == [(True,)]
+    store.offer_sql()
+    assert on(sharded_servers.coordinator, store.url, in_sql) == found
+
+
 # -- away, restored --------------------------------------------------------------------------------
 
 

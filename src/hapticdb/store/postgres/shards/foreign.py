@@ -30,6 +30,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from psycopg import errors, sql
+from psycopg.conninfo import conninfo_to_dict
 
 from hapticdb.errors import AccessError, DatabaseError, UsageError
 from hapticdb.store.base import Layout, Table, row_shift
@@ -130,6 +131,13 @@ class OwnedCells(NamedTuple):
     number: int
     first: int
     last: int | None
+
+
+def place_of(url: str) -> ForeignPlace:
+    """Place of a shard by libpq's URL of it; empty parameters are left out."""
+    words = {key: str(value) for key, value in conninfo_to_dict(url).items() if value}
+    server = {key: value for key, value in words.items() if key != "user"}
+    return ForeignPlace(server, {"user": words["user"]} if "user" in words else {})
 
 
 def parts_of(shards: Sequence[tuple[int, int]]) -> list[OwnedCells]:

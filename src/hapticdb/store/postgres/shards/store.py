@@ -7,9 +7,10 @@ from hapticdb.store.base import Keys, Layout, row_shift
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.shards import making
+from hapticdb.store.postgres.shards import foreign, making
 from hapticdb.store.postgres.shards.borders.rebalancing import Rebalancer
 from hapticdb.store.postgres.shards.checking import ShardedChecker
+from hapticdb.store.postgres.shards.connecting.links import ShardConnection
 from hapticdb.store.postgres.shards.loading import IndexesOnShards
 from hapticdb.store.postgres.shards.pieces import borders_by_rows
 from hapticdb.store.postgres.shards.placing import RowsOnShards
@@ -103,6 +104,30 @@ class ShardedStore(ServerStore):
     def rebalance(self, progress: RebalanceCallback | None = None) -> Rebalanced:
         """Move the borders to where each shard holds equally many rows; others go on meanwhile."""
         return self._rebalancer.rebalance(progress)
+
+    def offer_sql(self) -> None:
+        """Make tables at the coordinator that read the rows of all shards, for use in SQL.
+
+        They are `brick_live`, `band_live` or `voxel_live` (docs/postgresql.md, In SQL). Those that
+        are there are renewed; a rebalance removes them.
+
+        Raises
+        ------
+        AccessError
+            When the user may not make tables of other servers.
+        DatabaseError
+            When the coordinator has no postgres_fdw.
+        """
+        tables = foreign.TABLES_OF[self.layout]
+        texts = [text for table in tables for text in foreign.SHARD_VIEWS[table]]
+
+        def prepare(_: int, shard: ShardConnection) -> None:
+            shard.write(lambda: [shard.execute(text) for text in texts])
+
+        self._shards.each(prepare)
+        places = {place.number: foreign.place_of(place.conninfo) for place in self._shards.places}
+        connection = self._connection
+        connection.write(lambda: foreign.align(connection, self.layout, places))
 
     def sweep(self) -> SweptVersions:
         """Delete rows on the shards that no reader needs any more."""

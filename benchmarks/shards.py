@@ -7,9 +7,11 @@ shown is what several servers cost, not what they bring.
 """
 
 import argparse
+import atexit
 import contextlib
 import json
 import os
+import shutil
 import sys
 import tempfile
 import time
@@ -26,11 +28,12 @@ from hapticdb import Environment
 from hapticdb.bench.measure import Alternative, in_turns, summary
 from hapticdb.bench.workload import SEED, sphere_shell
 from hapticdb.demo import slide_along
+from hapticdb.kernels.resident import cell_table
 from hapticdb.query.frame import Strategy
 from hapticdb.query.grouping import object_ranges
 from hapticdb.resident.source import CellSource
 from hapticdb.resident.table import CellTable
-from hapticdb.store.base import Store
+from hapticdb.store.base import CELL_SHIFT, Store
 from hapticdb.store.connect import open_store
 from hapticdb.transfer import copy_environment
 
@@ -92,7 +95,7 @@ def framed(envs: dict[str, Environment]) -> list[dict[str, Any]]:
     return cells
 
 
-def prefetched(stores: dict[str, Store]) -> list[dict[str, Any]]:
+def prefetched(home: Environment, stores: dict[str, Store]) -> list[dict[str, Any]]:
     """Batches of cells that the fetching process reads, around places on surfaces, in turns."""
     rng = np.random.default_rng(SEED)
     table = CellTable.create(BUDGET)
@@ -100,15 +103,19 @@ def prefetched(stores: dict[str, Store]) -> list[dict[str, Any]]:
         name: CellSource(store, np.empty(0, np.int64), time.perf_counter, may_measure=True)
         for name, store in stores.items()
     }
-    side = next(iter(stores.values())).grid.side >> 5
+    grid = home.grid
+    side = grid.side >> 5
     slots = np.arange(BATCH, dtype=np.int64)
     times: dict[str, list[float]] = {name: [] for name in stores}
     rows = []
-    for n in range(PREFETCHES + 3):
-        corner = rng.integers(0, max(side - 8, 1), 3)
-        ijk = corner + np.stack(np.unravel_index(np.arange(BATCH), (8, 8, 4)), axis=1)
-        ijk = ijk[(ijk < side).all(axis=1)]
-        cells = (ijk[:, 0] * side + ijk[:, 1]) * side + ijk[:, 2]
+    shell = sphere_shell(grid.voxel_size)
+    for n, pose in enumerate(slide_along(home, shell.points, PREFETCHES + 3)):
+        middle = ((pose[:3, 3] - grid.origin) / grid.voxel_size).astype(np.int64) >> 5
+        ijk = middle - [4, 4, 2] + np.stack(np.unravel_index(np.arange(BATCH), (8, 8, 4)), axis=1)
+        ijk = ijk[((ijk >= 0) & (ijk < side)).all(axis=1)]
+        on_curve = grid.encode(32 * ijk) >> CELL_SHIFT
+        cells = np.empty_like(on_curve)
+        cell_table.cells_of_curve_keys(on_curve, grid.bits, grid.curve_code, cells)
         for name in rng.permutation(list(sources)).tolist():
             started = time.perf_counter_ns()
             read = sources[name].read(cells, table, slots[: len(cells)])
@@ -163,8 +170,12 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, help="where the servers are kept")
     parser.add_argument("--out", type=Path, help="file of figures, JSON")
     given = parser.parse_args()
-    with tempfile.TemporaryDirectory() as made, awake(), contextlib.ExitStack() as stack:
-        urls = urls_of(given.folder or Path(made), given.shards)
+    folder = given.folder
+    if folder is None:
+        folder = Path(tempfile.mkdtemp())
+        atexit.register(shutil.rmtree, folder, ignore_errors=True)  # after the servers have ended
+    with awake(), contextlib.ExitStack() as stack:
+        urls = urls_of(folder, given.shards)
         found: dict[str, Any] = {"load_before": os.getloadavg()[0]}
         found["copies"] = copied(given.source, urls)
         envs = {name: stack.enter_context(hapticdb.open(url)) for name, url in urls.items()}
@@ -174,7 +185,8 @@ def main() -> None:
             "points": 300, "poses": POSES, "prefetch_cells": BATCH,
         }  # fmt: skip
         found["frames"] = framed(envs)
-        found["prefetches"] = prefetched({name: env.store for name, env in envs.items()})
+        home = next(iter(envs.values()))
+        found["prefetches"] = prefetched(home, {name: env.store for name, env in envs.items()})
         found["edits"] = edited(envs)
         stack.close()
     if given.out:

@@ -25,6 +25,7 @@ import numpy as np
 import hapticdb
 from awake import awake
 from hapticdb import Environment
+from hapticdb.bench import records
 from hapticdb.bench.measure import Alternative, in_turns, summary
 from hapticdb.bench.workload import SEED, sphere_shell
 from hapticdb.demo import slide_along
@@ -176,7 +177,7 @@ def main() -> None:
         atexit.register(shutil.rmtree, folder, ignore_errors=True)  # after the servers have ended
     with awake(), contextlib.ExitStack() as stack:
         urls = urls_of(folder, given.shards)
-        found: dict[str, Any] = {"load_before": os.getloadavg()[0]}
+        found: dict[str, Any] = {"commit": records.commit(), "load_before": os.getloadavg()[0]}
         found["copies"] = copied(given.source, urls)
         envs = {name: stack.enter_context(hapticdb.open(url)) for name, url in urls.items()}
         found["conditions"] = {

@@ -11,11 +11,12 @@ from psycopg import conninfo, sql
 
 import hapticdb
 from hapticdb import Grid
+from hapticdb.store.base import CELL_SHIFT
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import foreign
-from hapticdb.store.postgres.shards.foreign import CELL_SHIFT, ForeignPlace
+from hapticdb.store.postgres.shards.foreign import ForeignPlace
 
 GRID = Grid(0.005, (0, 0, 0), 8)
 ENVIRONMENT = "sharded plant"  # a name that needs quotes

@@ -26,9 +26,10 @@ from foreign_cluster import (
     spread,
 )
 from hapticdb import AccessError, UsageError
+from hapticdb.store.base import CELL_SHIFT
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.shards import foreign
-from hapticdb.store.postgres.shards.foreign import CELL_SHIFT, OwnedCells
+from hapticdb.store.postgres.shards.foreign import OwnedCells
 from hapticdb.store.postgres.tables import statements
 
 BY_CELLS = "SELECT z_val, id, occupancy FROM brick_live WHERE cell = ANY (%s)"

@@ -33,12 +33,10 @@ from psycopg import errors, sql
 from psycopg.conninfo import conninfo_to_dict
 
 from hapticdb.errors import AccessError, DatabaseError, UsageError
-from hapticdb.store.base import Layout, Table, row_shift
+from hapticdb.store.base import CELL_SHIFT, Layout, Table, row_shift
 from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
+from hapticdb.store.postgres.tables.loading import TABLES
 
-CELL_SHIFT = 15
-"""A cell has 2^15 voxel keys. Borders between shards are multiples of that."""
-TABLES_OF: dict[Layout, tuple[Table, ...]] = {"voxel": ("voxel",), "brick": ("brick", "band")}
 COLUMNS: dict[Table, tuple[tuple[str, str], ...]] = {
     "voxel": (),
     "brick": (("occupancy", "bytea"),),
@@ -71,7 +69,7 @@ SHARD_VIEWS: dict[Table, tuple[str, ...]] = {
             f" z_val >> {CELL_SHIFT - row_shift(layout)} AS cell FROM {table}"
         ),
     )
-    for layout, tables in TABLES_OF.items()
+    for layout, tables in TABLES.items()
     for table in tables
 }
 """What each shard needs for `align`, by table; run it there with the schema as search path."""
@@ -94,7 +92,7 @@ SELECT force(ROW(($2)[n], ($3)[n], ($4)[n], ($5)[n], ($6)[n], ($7)[n],
                  $8, $9, $10, $11, shell.key)::hit ORDER BY n)
   FROM unnest($1) WITH ORDINALITY AS shell(key, n)
  WHERE {_EXISTS[layout]}"""
-    for layout in TABLES_OF
+    for layout in TABLES
 }
 """The paper's Figure 3 at the coordinator: `statements.WRENCH` with one parameter more, $12: the
 cells (bigint[]) of the shell's points. Rows are fetched once, then looked up: the planner would
@@ -196,14 +194,14 @@ def align(connection: ServerConnection, layout: Layout, places: Mapping[int, For
     if missing:
         raise UsageError(f"{connection.shown}: no place for shard {missing[0]}: name its server")
     _make_extension(connection)
-    for table in TABLES_OF[layout]:
+    for table in TABLES[layout]:
         _make_parent(connection, table)
     _drop_parts(connection)
     try:
         _make_servers(connection, {n: places[n] for n, _ in shards})
     except errors.InsufficientPrivilege as error:
         raise _refused(connection) from error
-    for table in TABLES_OF[layout]:
+    for table in TABLES[layout]:
         for part in parts:
             _make_part(connection, table, part)
         _show(connection, table, parts)

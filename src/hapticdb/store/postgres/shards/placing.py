@@ -25,7 +25,6 @@ from hapticdb.store.base import (
     row_shift,
     touched_ranges,
 )
-from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards.connecting.links import (
     ShardConnection,
@@ -36,7 +35,7 @@ from hapticdb.store.postgres.shards.connecting.links import (
 from hapticdb.store.postgres.shards.pieces import pieces_of_keys
 from hapticdb.store.postgres.shards.schemas import COLUMNS
 from hapticdb.store.postgres.shards.sweeping import Left, Sweeper
-from hapticdb.store.postgres.tables.placing import COPY_CHUNK
+from hapticdb.store.postgres.tables.placing import copy_into
 
 VERSION_BITS = 62
 """Bits of a version, drawn at random for each write. Versions of two writes of one object are equal
@@ -178,13 +177,8 @@ class RowsOnShards:
                 raise older_coordinator(self._connection.shown)
             connection.execute(LIST_WRITTEN, (object_id, version, ranges))
             for table, rows in batches:
-                text = f"COPY {table} ({COLUMNS[table]}) FROM STDIN (FORMAT binary)"
-                with connection.driver.cursor().copy(text) as copying:
-                    copying.write(wire.COPY_HEADER)
-                    for at in range(0, len(rows), COPY_CHUNK):
-                        some = rows.part(at, at + COPY_CHUNK)
-                        copying.write(wire.copy_rows(some, object_id, version))
-                    copying.write(wire.COPY_TRAILER)
+                target = f"{table} ({COLUMNS[table]})"
+                copy_into(connection, target, rows, object_id, version)
             return int(count)
 
         def is_committed() -> bool:

@@ -100,7 +100,7 @@ class ShardedReader:
     def _asked(
         self, plan: Plan, send: Send
     ) -> tuple[LiveView, Sequence[ShardQuery], Sequence[Answer | None]]:
-        """LiveView, statements and answers; None for an answer that `send` did not get."""
+        """View, statements and answers; None for an answer that `send` did not get."""
         if self._held is not None:
             asks = plan(self._held)
             _, answers = send(asks, None)
@@ -118,7 +118,7 @@ class ShardedReader:
             marks = self._marks(view, asks, answers)
             if is_newest and marks.are_of(view):
                 return self._seen(view), asks, answers
-            if not marks.are_of(self.views.load()) and not self._is_standby(self._connection):
+            if not marks.are_of(self.views.load()) and not self._connection.is_standby:
                 raise older_coordinator(self._url)
             is_renewed = True
         raise _outdated(self._url)
@@ -143,16 +143,12 @@ class ShardedReader:
                 continue
             mark = wire.read_int8s(answer[-1]).tolist() if answer[-1] else (0, 0, 0)
             if mark[0] < view.writes[ask.shard]:
-                if self._is_standby(self._shards.connection(ask.shard)):
+                if self._shards.connection(ask.shard).is_standby:
                     raise _outdated(self._url)  # it has not replayed them yet
                 name = f"{self._shards.name(ask.shard)} of {self._url}"
                 raise lost_writes(name, mark[0], int(view.writes[ask.shard]))
             swept, moved = max(swept, mark[1]), max(moved, mark[2])
         return _Marks(swept, moved)
-
-    def _is_standby(self, connection: ServerConnection) -> bool:
-        """Whether a server may be behind what others have told of it."""
-        return connection.rows("SELECT pg_is_in_recovery()") == [(True,)]
 
     # -- rows ------------------------------------------------------------------------------------
 

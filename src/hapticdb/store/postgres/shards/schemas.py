@@ -8,6 +8,7 @@ from psycopg import sql
 
 from hapticdb.store.base import Layout, Table
 from hapticdb.store.postgres.migrations import AUTOVACUUM
+from hapticdb.store.postgres.tables.loading import TABLES
 
 COORDINATOR = (
     """
@@ -112,11 +113,7 @@ def shard_statements(schema: sql.Identifier, layout: Layout) -> list[sql.Compose
     texts = (
         *SHARD,
         *ROWS[layout],
-        *(f"CREATE UNIQUE INDEX {t}_key ON {t} ({KEY})" for t in _of(layout)),
+        *(f"CREATE UNIQUE INDEX {t}_key ON {t} ({KEY})" for t in TABLES[layout]),
     )
     made = [sql.SQL(text).format() for text in texts]
     return [*made, sql.SQL(REFRESH[layout]).format(schema=schema)]
-
-
-def _of(layout: Layout) -> tuple[Table, ...]:
-    return ("brick", "band") if layout == "brick" else ("voxel",)

@@ -8,7 +8,11 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import foreign, making
-from hapticdb.store.postgres.shards.borders.rebalancing import Rebalancer
+from hapticdb.store.postgres.shards.borders.rebalancing import (
+    COUNT_EPOCH,
+    MOVE_BORDERS,
+    Rebalancer,
+)
 from hapticdb.store.postgres.shards.checking import ShardedChecker
 from hapticdb.store.postgres.shards.connecting.links import ShardConnection
 from hapticdb.store.postgres.shards.loading import IndexesOnShards
@@ -16,8 +20,9 @@ from hapticdb.store.postgres.shards.pieces import borders_by_rows
 from hapticdb.store.postgres.shards.placing import RowsOnShards
 from hapticdb.store.postgres.shards.reading import ShardedReader
 from hapticdb.store.postgres.shards.statistics import ShardedStatistics
-from hapticdb.store.postgres.shards.sweeping import Sweeper, SweptVersions
+from hapticdb.store.postgres.shards.sweeping import LOCK, Sweeper, SweptVersions
 from hapticdb.store.postgres.store import ServerStore
+from hapticdb.store.postgres.tables.loading import TABLES
 from hapticdb.store.sharding import RebalanceCallback, Rebalanced
 
 
@@ -88,16 +93,10 @@ class ShardedStore(ServerStore):
         borders = borders_by_rows(bounds, row_shift(self.layout), len(self._shards))
 
         def work() -> None:
-            ((revision,),) = self._connection.execute(
-                "SELECT revision FROM environment WHERE id = 1 FOR UPDATE"
-            ).fetchall()
-            if revision:
-                return
-            for number, first in enumerate(borders.tolist(), 1):
-                self._connection.execute(
-                    "UPDATE shard SET first_key = %s WHERE number = %s", (first, number)
-                )
-            self._connection.execute("UPDATE distribution SET epoch = epoch + 1")
+            ((revision,),) = self._connection.execute(LOCK).fetchall()
+            if not revision:
+                self._connection.execute(MOVE_BORDERS, (borders.tolist(),))
+                self._connection.execute(COUNT_EPOCH)
 
         self._connection.write(work)
 
@@ -118,8 +117,7 @@ class ShardedStore(ServerStore):
         DatabaseError
             When the coordinator has no postgres_fdw.
         """
-        tables = foreign.TABLES_OF[self.layout]
-        texts = [text for table in tables for text in foreign.SHARD_VIEWS[table]]
+        texts = [text for table in TABLES[self.layout] for text in foreign.SHARD_VIEWS[table]]
 
         def prepare(_: int, shard: ShardConnection) -> None:
             shard.write(lambda: [shard.execute(text) for text in texts])

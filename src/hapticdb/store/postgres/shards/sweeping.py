@@ -15,12 +15,13 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 
 from hapticdb.errors import DatabaseError
-from hapticdb.store.base import Layout, Table, row_shift
+from hapticdb.store.base import Layout, row_shift
 from hapticdb.store.postgres.connecting import failures, wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.shards import statements
 from hapticdb.store.postgres.shards.connecting.links import ShardConnection, Shards
 from hapticdb.store.postgres.shards.pieces import pieces_of_ranges
+from hapticdb.store.postgres.tables.loading import TABLES
 
 Result = TypeVar("Result")
 
@@ -79,7 +80,7 @@ class Sweeper:
         self._connection = connection
         self._shards = shards
         self._shift = row_shift(layout)
-        self._tables: tuple[Table, ...] = ("brick", "band") if layout == "brick" else ("voxel",)
+        self._tables = TABLES[layout]
         self._waiting: deque[Left] = deque(maxlen=MOST_WAITING)
         self._paused_until = 0.0
 

@@ -82,13 +82,13 @@ class Views:
         return found == expected and self._connection.driver is self._driver
 
     def hold(self) -> LiveView:
-        """LiveView of the snapshot that has begun; its rows are not swept while it lasts."""
+        """View of the snapshot that has begun; its rows are not swept while it lasts."""
         if not self.is_known(self._connection.fetch(HOLDING)):
             self.load()
         return self.known
 
     def renewed(self) -> LiveView:
-        """LiveView of the newest commit, loaded unless it is known."""
+        """View of the newest commit, loaded unless it is known."""
         if not self.is_known(self._connection.fetch(NEWEST)):
             self.load()
         return self.known

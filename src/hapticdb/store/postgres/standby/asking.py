@@ -9,8 +9,8 @@ from hapticdb.errors import HapticDBError
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.watching import REVISION
 
-REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 ASK_EVERY_S = 0.1
 """Seconds between two questions. A larger value costs the primary less, and proofs are older."""
 PAUSES_S = (0.05, 1.0)

@@ -68,9 +68,22 @@ class RowsHere:
         """Nothing is left to do after a commit."""
 
     def _copy_into(self, table: Table, rows: Rows, object_id: int) -> None:
-        cursor = self._connection.driver.cursor()
-        with cursor.copy(f"COPY {table} ({COLUMNS[table]}) FROM STDIN (FORMAT binary)") as copy:
-            copy.write(wire.COPY_HEADER)
-            for at in range(0, len(rows), COPY_CHUNK):
-                copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id))
-            copy.write(wire.COPY_TRAILER)
+        copy_into(self._connection, f"{table} ({COLUMNS[table]})", rows, object_id)
+
+
+def copy_into(
+    connection: ServerConnection,
+    target: str,
+    rows: Rows,
+    object_id: int,
+    version: int | None = None,
+) -> None:
+    """Copy rows of an object into a table, inside a transaction.
+
+    target : the table and its columns; version : see `wire.copy_rows`.
+    """
+    with connection.driver.cursor().copy(f"COPY {target} FROM STDIN (FORMAT binary)") as copy:
+        copy.write(wire.COPY_HEADER)
+        for at in range(0, len(rows), COPY_CHUNK):
+            copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id, version))
+        copy.write(wire.COPY_TRAILER)

@@ -2,6 +2,11 @@
 
     python benchmarks/shards.py car.db --out results/shards.json
 
+Large environments are copied first, and measured when the machine is at rest:
+
+    python benchmarks/shards.py plant.db --shards 4 --folder servers --out plant.json --only-copy
+    python benchmarks/shards.py plant.db --shards 4 --folder servers --out plant.json
+
 All servers are private ones on this machine, so they share its processors and its disk: what is
 shown is what several servers cost, not what they bring.
 """
@@ -60,10 +65,14 @@ def urls_of(folder: Path, counts: Sequence[int]) -> dict[str, str]:
     return found
 
 
-def copied(source: str, urls: dict[str, str]) -> list[dict[str, Any]]:
-    """Copies of the environment to each place, one after another."""
-    cells = []
+def copied(source: str, urls: dict[str, str], known: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Copies of the environment to each place, one after another; `known` ones are there."""
+    cells = list(known)
+    done = {cell["place"] for cell in known}
     for name, url in urls.items():
+        if name in done:
+            continue
+        load = os.getloadavg()[0]
         started = time.perf_counter()
         copy_environment(source, url)
         took = time.perf_counter() - started
@@ -71,7 +80,7 @@ def copied(source: str, urls: dict[str, str]) -> list[dict[str, Any]]:
             size = store.size()
         rows = size.rows + size.band_rows
         cells.append({"place": name, "s": took, "rows": rows, "rows_a_s": rows / took,
-                      "bytes": size.bytes})  # fmt: skip
+                      "bytes": size.bytes, "load_before": load})  # fmt: skip
         print(f"copy, {name:12s} {took:7.1f} s, {rows / took:9,.0f} rows a second", flush=True)
     return cells
 
@@ -170,7 +179,10 @@ def main() -> None:
     parser.add_argument("--shards", type=int, nargs="*", default=list(COUNTS))
     parser.add_argument("--folder", type=Path, help="where the servers are kept")
     parser.add_argument("--out", type=Path, help="file of figures, JSON")
+    parser.add_argument("--only-copy", action="store_true", help="measure nothing else yet")
     given = parser.parse_args()
+    if given.only_copy and not (given.folder and given.out):
+        parser.error("--only-copy needs --folder and --out, where the copies are found again")
     folder = given.folder
     if folder is None:
         folder = Path(tempfile.mkdtemp())
@@ -178,7 +190,13 @@ def main() -> None:
     with awake(), contextlib.ExitStack() as stack:
         urls = urls_of(folder, given.shards)
         found: dict[str, Any] = {"commit": records.commit(), "load_before": os.getloadavg()[0]}
-        found["copies"] = copied(given.source, urls)
+        known = []
+        if given.folder and given.out and given.out.exists():
+            known = json.loads(given.out.read_text())["copies"]
+        found["copies"] = copied(given.source, urls, known)
+        if given.only_copy:
+            given.out.write_text(json.dumps(found, indent=1) + "\n")
+            return
         envs = {name: stack.enter_context(hapticdb.open(url)) for name, url in urls.items()}
         found["conditions"] = {
             "engine": next(iter(envs.values())).engine,

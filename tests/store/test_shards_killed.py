@@ -1,15 +1,16 @@
 """Whatever dies at any step of a write, its object is there whole, before or after, and goes on.
 
-A step is a statement, a COMMIT or a piece of a COPY, on the coordinator or on a shard. Killed are a
-shard, the coordinator (as a crash does) and the writing process itself, before each step.
+Killed are a shard, the coordinator (as a crash does) and the writing process itself, before each
+step (`steps`).
 """
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import multiprocessing
 import os
 import random
 import signal
 import threading
-from collections.abc import Callable, Iterator
 from contextlib import closing, suppress
 from typing import Any
 
@@ -22,8 +23,7 @@ from hapticdb import ConnectionLostError
 from hapticdb.check import check_environment
 from hapticdb.store.base import Store
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.connecting import connection, wire
-from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting import connection
 from hapticdb.store.postgres.connecting.link import Link
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.shards.store import ShardedStore
@@ -31,50 +31,13 @@ from hapticdb.testing.scenes import EVERYWHERE
 from labelled import GRID, Labels, contents_of, labelled_object, labelled_rows, labels_of
 from servers import Place
 from sharded import ShardedServers
+from steps import MOST_STEPS, Steps, steps  # noqa: F401 - a fixture among them
 
 SOON_S = 0.3
 """Seconds that a writer waits for a server that does not come back."""
-MOST_STEPS = 200
 N_OBJECTS = 5
 """Objects that the environment has before a kill."""
 KINDS = ["replace", "add", "remove"]
-Killed = Callable[[], object]
-
-
-class Steps:
-    """Counts the steps of all connections of this process; calls a function before one of them."""
-
-    def __init__(self, patch: pytest.MonkeyPatch) -> None:
-        self.seen: list[str] = []
-        self._at = -1
-        self._event: Killed = lambda: None
-        self._lock = threading.RLock()
-        for owner, name in [
-            (Link, "command"),
-            (Link, "run"),
-            (ServerConnection, "execute"),
-        ]:
-            patch.setattr(owner, name, self._counted(getattr(owner, name), 1))
-        patch.setattr(wire, "copy_rows", self._counted(wire.copy_rows, -1))
-
-    def _counted(self, method: Callable[..., Any], place: int) -> Callable[..., Any]:
-        def called(*args: Any, **keywords: Any) -> Any:  # noqa: ANN401 - any method
-            with self._lock:
-                text = "COPY" if place < 0 else str(args[place])
-                self.seen.append(" ".join(text.split())[:60])
-                if len(self.seen) == self._at:
-                    self._event()
-            return method(*args, **keywords)
-
-        return called
-
-    def before(self, at: int, event: Killed) -> None:
-        """Call a function before step `at`, from 1, counted from now."""
-        self.seen = []
-        self._at, self._event = at, event
-
-    def none(self) -> None:
-        self._at = -1
 
 
 @pytest.fixture
@@ -90,12 +53,6 @@ def url(sharded_place: Place) -> str:
 @pytest.fixture(autouse=True)
 def _impatient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connection, "RECONNECT_SECONDS", SOON_S)
-
-
-@pytest.fixture
-def steps() -> Iterator[Steps]:
-    with pytest.MonkeyPatch.context() as patch:
-        yield Steps(patch)
 
 
 def edit(store: Store, kind: str, label: int, before: Labels) -> Labels:

@@ -135,6 +135,19 @@ def test_an_unused_environment_is_deleted_on_all_servers(sharded_place: Place) -
     ShardedStore.create(url, GRID).close()  # no schema is in the way
 
 
+def test_an_unused_environment_leaves_no_servers_for_sql(
+    sharded_place: Place, sharded_servers: ShardedServers
+) -> None:
+    servers = "SELECT srvname FROM pg_foreign_server"
+    with psycopg.connect(sharded_servers.coordinator.conninfo(), autocommit=True) as coordinator:
+        before = coordinator.execute(servers).fetchall()
+        unused = ShardedStore.create(sharded_place(), GRID)
+        unused.offer_sql()
+        assert len(coordinator.execute(servers).fetchall()) == len(before) + 3
+        unused.discard()
+        assert coordinator.execute(servers).fetchall() == before
+
+
 def test_a_server_with_rows_of_another_environment_is_refused(
     store: ShardedStore, sharded_servers: ShardedServers
 ) -> None:

@@ -6,6 +6,7 @@ leads to the server, in a folder that its owner alone may enter, so it asks for 
 until it is stopped, whatever becomes of the process that started it.
 """
 
+import atexit
 import contextlib
 import fcntl
 import hashlib
@@ -15,6 +16,7 @@ import shutil
 import signal
 import stat
 import tempfile
+import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -35,7 +37,7 @@ from hapticdb.store.postgres.server_binaries import (
 if TYPE_CHECKING:
     from psycopg import Connection
 
-__all__ = ["Binaries", "PrivateServer", "find_binaries"]
+__all__ = ["Binaries", "PrivateServer", "find_binaries", "shared_server"]
 
 USER = "hapticdb"
 """The superuser of a private server."""
@@ -53,6 +55,8 @@ ORPHANS_S = 10.0
 PARTING_S = 0.5
 """Seconds for the server to notice that a client has closed its connection."""
 POLL_S = 0.01
+_shared: "dict[Path, PrivateServer]" = {}
+_shared_lock = threading.Lock()
 
 
 class PrivateServer:
@@ -393,6 +397,21 @@ class PrivateServer:
             if time.monotonic() > deadline:
                 raise DatabaseError(f"the server in {self.folder} does not end: see its log there")
             time.sleep(POLL_S)
+
+
+def shared_server(folder: Path, binaries: Binaries | None = None) -> PrivateServer:
+    """The server in a folder, one object a process; released when the process ends."""
+    place = folder.expanduser().resolve()
+    with _shared_lock:
+        server = _shared.get(place)
+    if server is not None:
+        return server
+    server = PrivateServer.at(place, binaries)  # sets it up, which takes seconds
+    with _shared_lock:
+        if place not in _shared:
+            _shared[place] = server
+            atexit.register(server.release)
+        return _shared[place]
 
 
 def _is_address(folder: Path) -> bool:

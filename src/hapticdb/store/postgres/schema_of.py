@@ -1,6 +1,5 @@
 """The schema of an environment: made, opened, checked, brought up to date, dropped."""
 
-import atexit
 import re
 from collections.abc import Callable
 from pathlib import Path
@@ -25,13 +24,12 @@ from hapticdb.store.postgres.address import Address, parse
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 from hapticdb.store.postgres.migrations import MIGRATIONS
-from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.postgres.private_server import shared_server
 from hapticdb.store.postgres.standby.aiming import aimed
 from hapticdb.store.schema import FORMAT_VERSION, migrations_after
 
 DEFAULT_DATABASE = "hapticdb"
 SERVER_IS_OURS = re.compile(r"(?:^|&)(?:host|hostaddr|port|user|service)=")
-_servers: dict[Path, PrivateServer] = {}
 
 
 def connected(
@@ -63,11 +61,7 @@ def conninfo(address: Address, *, making: bool) -> str:
     folder = Path(address.data).expanduser().absolute()
     if not making and not folder.exists():
         raise _not_found(address)
-    server = _servers.get(folder)
-    if server is None:
-        server = PrivateServer.at(folder)
-        _servers[folder] = server
-        atexit.register(server.release)
+    server = shared_server(folder)
     server.start()
     database = unquote(parts.path.strip("/")) or DEFAULT_DATABASE
     if making:

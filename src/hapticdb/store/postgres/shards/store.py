@@ -77,7 +77,7 @@ class ShardedStore(ServerStore):
 
     def discard(self) -> None:
         """Close and delete an environment without any write, unless another writes to it."""
-        if self._loading.drop_unused():
+        if self._loading.drop_unused(lambda: foreign.withdraw(self._connection)):
             making.drop_shards(self._shards)
         self.close()
 

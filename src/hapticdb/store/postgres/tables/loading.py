@@ -7,7 +7,7 @@ an object that was reported as written is there after a crash, and an import can
 """
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import TracebackType
 from typing import Protocol
 
@@ -180,14 +180,15 @@ class Loading:
             if is_alone:
                 self._make_index()
 
-    def drop_unused(self) -> bool:
+    def drop_unused(self, before: Callable[[], object] = lambda: None) -> bool:
         """Delete the environment if nothing was ever written to it and nobody is loading.
 
-        Returns whether it is deleted.
+        Returns whether it is deleted. `before` is called in a transaction before it is.
         """
         connection = self._connection
         with self._alone() as is_alone:
             if is_alone and not connection.rows("SELECT 1 FROM environment WHERE revision > 0"):
+                connection.write(before)
                 schema_of.drop(connection)
                 return True
         return False

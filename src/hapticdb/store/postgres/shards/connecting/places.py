@@ -5,17 +5,15 @@ that a user gave for the coordinator goes to a shard: the passwords of shards ar
 which has one for each host.
 """
 
-import atexit
 import os
-import threading
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
 from hapticdb.errors import DatabaseError, UsageError
 from hapticdb.store.postgres.address import Address, host_and_port
-from hapticdb.store.postgres.private_server import PrivateServer
-from hapticdb.store.postgres.server_binaries import Binaries, fitting
+from hapticdb.store.postgres.private_server import shared_server
+from hapticdb.store.postgres.server_binaries import fitting
 
 REPLACED = {"host", "hostaddr", "port", "target_session_attrs", "load_balance_hosts"}
 """Parameters of the coordinator's address, which lead to no shard."""
@@ -29,8 +27,6 @@ SECRETS = {
 """Parameters that would show or lend the user's right to another server."""
 STARTS = 8
 """Private servers that start at the same time."""
-_servers: dict[Path, PrivateServer] = {}
-_servers_lock = threading.Lock()
 
 
 def shard_conninfo(address: Address, coordinator: str, host: str) -> str:
@@ -113,7 +109,7 @@ def private_shards(folder: Path, count: int, *, making: bool, database: str) -> 
         _make_like(folder, place)
 
     def started(place: Path) -> str:
-        server = _server(place, binaries)
+        server = shared_server(place, binaries)
         server.start()
         if making:
             server.create_database(database)
@@ -134,17 +130,3 @@ def _make_like(folder: Path, place: Path) -> None:
     if os.geteuid() == 0:
         owner = folder.stat()
         os.chown(place, owner.st_uid, owner.st_gid)
-
-
-def _server(place: Path, binaries: Binaries) -> PrivateServer:
-    """The server in a folder, one object a process; released when the process ends."""
-    with _servers_lock:
-        server = _servers.get(place)
-    if server is not None:
-        return server
-    server = PrivateServer.at(place, binaries)  # sets it up, which takes seconds
-    with _servers_lock:
-        if place not in _servers:
-            _servers[place] = server
-            atexit.register(server.release)
-        return _servers[place]

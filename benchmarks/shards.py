@@ -148,7 +148,7 @@ def edited(envs: dict[str, Environment]) -> list[dict[str, Any]]:
     times: dict[str, list[float]] = {name: [] for name in envs}
     for _ in range(EDITS):
         for name, env in envs.items():
-            arguments = _again(env, moved.id)
+            arguments = again(env, moved.id)
             started = time.perf_counter_ns()
             env.store.replace(*arguments)
             times[name].append((time.perf_counter_ns() - started) / 1000)
@@ -160,7 +160,7 @@ def edited(envs: dict[str, Environment]) -> list[dict[str, Any]]:
     return found
 
 
-def _again(env: Environment, object_id: int) -> tuple[Any, Any, Callable[..., Any]]:
+def again(env: Environment, object_id: int) -> tuple[Any, Any, Callable[..., Any]]:
     """Arguments that write an object's rows anew, where they are."""
     store = env.store
     known = store.object(object_id)

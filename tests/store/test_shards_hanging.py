@@ -27,7 +27,6 @@ from sharded import ShardedServers
 from store.test_shards_killed import (  # noqa: F401 - fixtures
     KINDS,
     MOST_STEPS,
-    N_OBJECTS,
     Steps,
     after_edit,
     assert_goes_on,
@@ -70,7 +69,6 @@ def test_a_read_names_the_shard_that_hangs_and_goes_on_when_it_answers(
                 everything(store)
             assert_hangs(told.value)
             assert len(store.lookup(np.unique(elsewhere)))
-    assert everything(store).same_as(before) if hasattr(before, "same_as") else True
     assert everything(store).keys.tolist() == before.keys.tolist()
 
 
@@ -111,7 +109,11 @@ def test_partial_reads_leave_out_all_shards_that_hang_at_once(
 
 
 def hung_at(
-    servers: ShardedServers, where: str, steps: Steps, at: int, victim: PrivateServer  # noqa: F811
+    servers: ShardedServers,
+    where: str,
+    steps: Steps,
+    at: int,
+    victim: PrivateServer,  # noqa: F811
 ) -> bool:
     """Freeze a server before step `at` of an edit, check all; whether there was such a step."""
     kind = KINDS[at % len(KINDS)]
@@ -119,18 +121,20 @@ def hung_at(
         before = contents_of(store)
         highest = max(change.id for change in store.changes())
         steps.before(at, lambda: freeze(victim))
-        done = None
+        done, told = None, ""
         try:
             with impatient():
                 done = edit(store, kind, 400 + at, before)
         except (ConnectionLostError, StuckError) as error:
-            assert "\n" not in str(error)
-            if victim is not servers.coordinator:
-                assert f"shard {1 + servers.shards.index(victim)} (" in str(error)
+            told = str(error)
         finally:
             thaw(victim)
         n_seen = len(steps.seen)
         steps.none()
+    if told:
+        assert "\n" not in told
+        whose = [f"shard {n} (" for n, one in enumerate(servers.shards, 1) if one is victim]
+        assert all(name in told for name in whose)
     after = after_edit(kind, 400 + at, before, highest + 1)
     assert done in (None, after)
     assert_goes_on(servers, where, [before, after] if done is None else [after])
@@ -139,16 +143,21 @@ def hung_at(
 
 @pytest.mark.parametrize("which", [0, 1], ids=["shard", "coordinator"])
 def test_a_server_that_hangs_at_a_step_leaves_an_object_whole(
-    sharded_servers: ShardedServers, url: str, steps: Steps, which: int  # noqa: F811
+    sharded_servers: ShardedServers,
+    url: str,
+    steps: Steps,
+    which: int,  # noqa: F811
 ) -> None:
-    for at in (6, 16):
-        assert hung_at(sharded_servers, url, steps, at, victims(sharded_servers)[which])
+    assert hung_at(sharded_servers, url, steps, 16, victims(sharded_servers)[which])
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("which", [0, 1], ids=["shard", "coordinator"])
 def test_a_server_that_hangs_at_any_step_leaves_an_object_whole(
-    sharded_servers: ShardedServers, url: str, steps: Steps, which: int  # noqa: F811
+    sharded_servers: ShardedServers,
+    url: str,
+    steps: Steps,
+    which: int,  # noqa: F811
 ) -> None:
     n_without = 0
     for at in range(1, MOST_STEPS):
@@ -223,7 +232,6 @@ def test_a_statement_that_takes_long_is_not_given_up_while_its_server_answers_ot
 def test_touch_ends_soon_and_info_names_the_shard(
     sharded_place: Place,
     sharded_servers: ShardedServers,
-    sphere: PointShell,
     run: Run,  # noqa: F811 - a fixture
 ) -> None:
     where = sharded_place()
@@ -251,4 +259,3 @@ def test_touch_ends_soon_and_info_names_the_shard(
             assert "away" in out
             refused(run("check", where), "shard 3")
         assert env.touch(everywhere, np.eye(4)).hits.tolist() == expected
-    assert N_OBJECTS

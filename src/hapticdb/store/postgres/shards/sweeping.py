@@ -172,9 +172,7 @@ class Sweeper:
     def _delete(self, left: Left, _: int, shard: ShardConnection) -> None:
         """Delete the rows of one version from one shard."""
         if shard.driver.closed:
-            shard.connect(
-                CONNECT_S
-            )  # once: a writer who sweeps does not wait for a shard that is away
+            shard.connect(CONNECT_S)  # once: a writer does not wait for a shard that is away
         with failures.named_errors(shard.shown):
             # committed before: the deletes may take long, and writers wait for the row of `mark`
             shard.execute(MARK, (left.died, left.died))

@@ -1,4 +1,4 @@
-"""Servers that hang: all of their processes are stopped, so connections stay and nothing answers."""
+"""Servers that hang: all their processes are stopped, so connections stay and nothing answers."""
 
 import contextlib
 import os

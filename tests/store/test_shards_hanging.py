@@ -111,9 +111,9 @@ def test_partial_reads_leave_out_all_shards_that_hang_at_once(
 def hung_at(
     servers: ShardedServers,
     where: str,
-    steps: Steps,
+    steps: Steps,  # noqa: F811
     at: int,
-    victim: PrivateServer,  # noqa: F811
+    victim: PrivateServer,
 ) -> bool:
     """Freeze a server before step `at` of an edit, check all; whether there was such a step."""
     kind = KINDS[at % len(KINDS)]
@@ -144,9 +144,9 @@ def hung_at(
 @pytest.mark.parametrize("which", [0, 1], ids=["shard", "coordinator"])
 def test_a_server_that_hangs_at_a_step_leaves_an_object_whole(
     sharded_servers: ShardedServers,
-    url: str,
-    steps: Steps,
-    which: int,  # noqa: F811
+    url: str,  # noqa: F811
+    steps: Steps,  # noqa: F811
+    which: int,
 ) -> None:
     assert hung_at(sharded_servers, url, steps, 16, victims(sharded_servers)[which])
 
@@ -155,9 +155,9 @@ def test_a_server_that_hangs_at_a_step_leaves_an_object_whole(
 @pytest.mark.parametrize("which", [0, 1], ids=["shard", "coordinator"])
 def test_a_server_that_hangs_at_any_step_leaves_an_object_whole(
     sharded_servers: ShardedServers,
-    url: str,
-    steps: Steps,
-    which: int,  # noqa: F811
+    url: str,  # noqa: F811
+    steps: Steps,  # noqa: F811
+    which: int,
 ) -> None:
     n_without = 0
     for at in range(1, MOST_STEPS):

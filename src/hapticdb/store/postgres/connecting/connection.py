@@ -118,9 +118,9 @@ class ServerConnection:
         self.check_thread()
         if self._is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
+        if self._link.is_lost and not self._depth:
+            self._reconnect()
         try:
-            if self._link.is_lost and not self._depth:
-                self._reconnect()
             with failures.named_errors(self.shown):
                 return read()
         except ConnectionLostError:

@@ -1,17 +1,20 @@
 """Sessions on real servers, one of which is killed and started again, or hangs and goes on."""
 
+import threading
 from typing import Any
 
 import numpy as np
+import psycopg
 import pytest
 
 import hapticdb
-from children import until
+from children import joined, until
 from frozen import frozen
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.scripted import Player
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
+from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.testing import write_voxels
 from realtime import sessions
 from realtime.hands import at
@@ -126,6 +129,64 @@ def test_a_session_goes_on_while_a_server_elsewhere_hangs(
         assert (report.cache.losses, report.cache.restarts) == (0, 0)
         (shard,) = report.cache.shards
         assert (shard.times, shard.is_away) == (1, False)
+
+
+def clients_of(server: PrivateServer) -> set[int]:
+    """Process ids of a server that serve connections of hapticdb."""
+    with psycopg.connect(server.conninfo(), autocommit=True) as asking:
+        found = asking.execute(
+            "SELECT pid FROM pg_stat_activity WHERE application_name = 'hapticdb'"
+        )
+        return {int(pid) for (pid,) in found}
+
+
+@pytest.mark.long
+def test_an_opened_store_has_one_connection_to_each_server_at_most(
+    sharded_place: Place, sharded_servers: ShardedServers, sphere: PointShell
+) -> None:
+    """A session, a sweep, reads and writes; one after another and at the same time."""
+    url = sharded_place()
+    servers = (sharded_servers.coordinator, *sharded_servers.shards)
+    before = [clients_of(server) for server in servers]
+
+    def counts() -> list[int]:
+        pairs = zip(servers, before, strict=True)
+        return [len(clients_of(server) - others) for server, others in pairs]
+
+    seen: list[list[int]] = []
+    is_over = threading.Event()
+
+    def watch() -> None:
+        while not is_over.is_set():
+            seen.append(counts())
+            is_over.wait(0.01)
+
+    poses = [at(x, x, 0.02 - abs(x) / 8) for x in np.linspace(-0.09, 0.09, 400)]
+    with hapticdb.create(url, GRID, layout="brick") as env:
+        write_blocks(env)
+        until(lambda: counts() == [1, 1, 1, 1])  # a server takes a moment to notice a goodbye
+        with (
+            ResidentCells(env.url, budget_bytes=4 << 20) as cells,
+            Session(cells, sphere, over(-0.064), **BY_DEFAULT) as session,
+        ):
+            sessions.until(lambda: meets(session, "contacts"), session)
+            until(lambda: counts() == [2, 2, 2, 2])
+            watching = threading.Thread(target=watch)
+            watching.start()
+            try:
+                assert hapticdb.sweep(env, sphere, poses).hits
+                move(env.store, 1, FIRST - np.array([0, 0, 1]))
+                env.touch(sphere, at(0.064, 0.064, 0.01))
+                env.size()
+                sessions.until(lambda: cells.table.revision == env.store.revision(), session)
+            finally:
+                is_over.set()
+                joined(watching)
+            session.stop()
+        until(lambda: counts() == [1, 1, 1, 1])
+    until(lambda: counts() == [0, 0, 0, 0])
+    assert len(seen) > 3
+    assert max(max(some) for some in seen) == 2
 
 
 @pytest.mark.long

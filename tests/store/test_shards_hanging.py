@@ -239,7 +239,7 @@ def test_touch_ends_soon_and_info_names_the_shard(
         rows = rows_of_voxels(EVERY_BRICK, GRID, "brick")
         store.add(voxel_object(GRID, EVERY_BRICK, "every brick"), rows)
     everywhere = PointShell(
-        points=(EVERY_BRICK[::16] + 0.5) * GRID.voxel_size,
+        points=((EVERY_BRICK[::16] + 0.5) * GRID.voxel_size).astype(np.float64),
         normals=np.tile([0.0, 0.0, 1.0], (len(EVERY_BRICK[::16]), 1)),
         center=np.zeros(3),
     )

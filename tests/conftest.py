@@ -17,7 +17,7 @@ from hapticdb import PointShell
 from hapticdb.kernels.compiling import NAMES, compile_missing
 from hapticdb.pointshell.shell import fibonacci_sphere
 from installed import toy_is_installed  # noqa: F401 - a fixture
-from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
+from servers import FOUND, admin, citus_line, database, named, place  # noqa: F401 - fixtures
 from sharded import sharded_place, sharded_servers  # noqa: F401 - fixtures
 
 
@@ -54,6 +54,7 @@ def pytest_report_header() -> list[str]:
     servers = ", ".join(map(named, FOUND))
     return [
         f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, {servers}, JIT {jit}",
+        citus_line(),
         *capabilities.header(),
     ]
 

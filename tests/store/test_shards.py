@@ -33,6 +33,7 @@ from hapticdb.query.cost_model import CostModel
 from hapticdb.query.frame import Strategy
 from hapticdb.store.connect import grant, open_store
 from hapticdb.store.postgres.address import parse
+from hapticdb.store.postgres.connecting import connection
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.shards import sweeping
 from hapticdb.store.postgres.shards.store import ShardedStore
@@ -423,6 +424,25 @@ def test_an_editor_edits_and_a_viewer_reads(store: ShardedStore, role: str) -> N
     grant(store.url, role, "nobody")
     with pytest.raises((AccessError, ReadOnlyError, DamagedError)):
         ShardedStore.open(url, read_only=True)
+
+
+def test_a_shard_without_a_free_connection_is_named(
+    store: ShardedStore, sharded_servers: ShardedServers, role: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connection, "RECONNECT_SECONDS", 0.2)
+    grant(store.url, role, "viewer")
+    url = store.url.replace("user=hapticdb", f"user={quote(role)}")
+    limit = sql.SQL("ALTER ROLE {} CONNECTION LIMIT {}")
+    with psycopg.connect(sharded_servers.shards[1].conninfo(), autocommit=True) as admin:
+        admin.execute(limit.format(sql.Identifier(role), sql.Literal(0)))
+        with contextlib.closing(ShardedStore.open(url, read_only=True)) as viewer:
+            for _ in range(2):
+                with pytest.raises(ShardAwayError, match=r"shard 2 \(.* has no free conn") as told:
+                    everything(viewer)
+                assert "raise max_connections" in str(told.value)
+                assert "\n" not in str(told.value)
+            admin.execute(limit.format(sql.Identifier(role), sql.Literal(-1)))
+            everything_equal(viewer, store)
 
 
 def test_only_an_owner_grants(store: ShardedStore, role: str) -> None:

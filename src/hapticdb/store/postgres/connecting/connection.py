@@ -11,7 +11,8 @@ from psycopg import sql
 from hapticdb.errors import ConnectionLostError, DatabaseError, ShardAwayError
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
-from hapticdb.store.postgres.connecting.link import Link
+from hapticdb.store.postgres.connecting.answering import SilentServerError
+from hapticdb.store.postgres.connecting.link import CONNECT_SECONDS, Link
 from hapticdb.store.postgres.connecting.wire import Parameter
 from hapticdb.store.refusals import check_outside
 from hapticdb.store.threads import check_thread, this_thread
@@ -66,9 +67,9 @@ class ServerConnection:
         """Whether the server that answered last is a standby."""
         return self._link.is_standby
 
-    def connect(self) -> None:
-        """Connect again, once."""
-        self._link.connect()
+    def connect(self, seconds: float = CONNECT_SECONDS) -> None:
+        """Connect again, once; seconds : see `Link.connect`."""
+        self._link.connect(seconds)
 
     def close(self) -> None:
         """Close the connection."""
@@ -81,8 +82,9 @@ class ServerConnection:
         deadline = time.monotonic() + RECONNECT_SECONDS
         pause = FIRST_PAUSE_SECONDS
         while True:
+            left = max(deadline - time.monotonic(), FIRST_PAUSE_SECONDS)
             try:
-                self.connect()
+                self.connect(min(left, CONNECT_SECONDS))
             except ConnectionLostError:
                 if time.monotonic() + pause > deadline:
                     raise
@@ -116,9 +118,9 @@ class ServerConnection:
         self.check_thread()
         if self._is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
+        if self._link.is_lost and not self._depth:
+            self._reconnect()
         try:
-            if self._link.is_lost and not self._depth:
-                self._reconnect()
             with failures.named_errors(self.shown):
                 return read()
         except ConnectionLostError:
@@ -148,6 +150,22 @@ class ServerConnection:
             raise ConnectionLostError(f"{self.shown}: the server went away")
         with failures.named_errors(self.shown):
             self._link.send(text, parameters)
+
+    @property
+    def awaited(self) -> tuple[int, int]:
+        """Socket and events after which `take` goes on, as `select.poll` takes them."""
+        return self._link.awaited
+
+    @contextlib.contextmanager
+    def patient_for(self, patience_ms: int | None) -> Iterator[None]:
+        """Wait no longer for each part of an answer inside; None for the usual limit."""
+        with self._link.patient_for(patience_ms):
+            yield
+
+    def prepare(self, text: str, oids: Sequence[int]) -> None:
+        """Prepare a statement before it is first needed; oids : types of its parameters."""
+        with failures.named_errors(self.shown):
+            self._link.prepare(text, oids)
 
     def take(self, patience_ms: int | None = None) -> list[bytes | None]:
         """First row of the statement that was sent, every value in its binary form.
@@ -204,14 +222,16 @@ class ServerConnection:
         """
         self.check_thread()
         for tries_left in reversed(range(WRITE_TRIES)):
+            if self._link.is_lost and not self._is_closed:
+                self._reconnect()
             try:
                 result, is_certain = self._write_once(work)
             except ShardAwayError:
                 raise
             except ConnectionLostError:
+                self._link.close()
                 if not tries_left:
                     raise
-                self._reconnect()
             else:
                 if is_certain or (is_committed is not None and self._finds(is_committed)):
                     return result
@@ -235,8 +255,6 @@ class ServerConnection:
         """Result of `work`, and whether the server confirmed the commit."""
         if self._is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
-        if self._link.is_lost:
-            self._reconnect()
         with failures.named_errors(self.shown), self._link.unhurried():
             self.command("BEGIN ISOLATION LEVEL READ COMMITTED")
             self._depth += 1
@@ -252,6 +270,8 @@ class ServerConnection:
                 self._depth -= 1
             try:
                 self.command("COMMIT")
+            except SilentServerError:  # it may still be done when the server goes on
+                return result, False
             except psycopg.Error as error:
                 if not failures.is_lost(error):
                     raise
@@ -275,9 +295,9 @@ class ServerConnection:
     def without_limit(self, *limits: str) -> Iterator[None]:
         """Lift the named time limits inside; `statement_timeout` if none is named."""
         names = limits or ("statement_timeout",)
+        # the connection may have been lost since it was last used
+        before = self.again(lambda: [self._shown_setting(name) for name in names])
         with failures.named_errors(self.shown), self._link.unhurried():
-            # the connection may have been lost since it was last used
-            before = self.again(lambda: [self._shown_setting(name) for name in names])
             for name in names:
                 self.command(f"SET {name} = 0")
             try:

@@ -23,8 +23,17 @@ from hapticdb.store.believed import damaged
 
 IS_STANDBY = "server is in hot standby mode"
 """What libpq says of a standby where it was asked for a primary."""
-MANY = "Multiple connection attempts failed."
+EACH_HOST = "All failures were:"
 """What psycopg says before it lists the failure of each host."""
+OF_HOST = re.compile(r"- host: (None|'.*?'), port: (None|'.*?'), hostaddr: (?:None|'.*?'): ")
+ATTEMPT = re.compile(
+    r"(?:connection (?:failed|is bad): )?"
+    r'(?:connection to server (?:on socket "(?P<socket>[^"]*)"'
+    r'|at "(?P<address>[^"]*)"(?: \([^)]*\))?, port (?P<port>\d+)) failed: )?'
+    r"(?:FATAL: +)?"
+)
+"""What libpq and psycopg say before the reason why one attempt has failed."""
+FULL = "too many clients|too many connections|slots are reserved|no more connections allowed"
 
 
 @contextlib.contextmanager
@@ -92,9 +101,10 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
 
     libpq gives no code here, only text. The text tells the usual causes apart.
     """
-    cause = _line(error)
-    if cause.startswith("connection is bad: invalid"):  # a parameter that libpq does not know
+    if _line(error).startswith("connection is bad: invalid"):  # what libpq does not know
         return unusable(error, shown)
+    hosts = _reasons(str(error))
+    cause = "; ".join(hosts)
     if re.search(r'database ".*" does not exist', cause):
         return EnvironmentNotFoundError(f"{shown}: {cause}; make it first with 'createdb'")
     if re.search(
@@ -103,9 +113,13 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
         cause,
     ):
         return AccessError(f"{shown}: {cause}; check the user, ~/.pgpass and pg_hba.conf")
+    if re.search(FULL, cause):
+        return ConnectionLostError(
+            f"{shown} has no free connection ({cause}): end programs that use this server, or "
+            "raise max_connections there"
+        )
     if IS_STANDBY in cause:  # only where a primary was asked for
-        hosts = cause.partition("All failures were:")[2].split(" - host: ") if MANY in cause else []
-        others = [host for host in hosts[1:] if IS_STANDBY not in host]
+        others = [host for host in hosts if IS_STANDBY not in host]
         if not others:
             return ReadOnlyError(f"{shown} is a standby: it can only be read")
         return ConnectionLostError(
@@ -113,6 +127,33 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
             "standbys, which can only be read"
         )
     return ConnectionLostError(f"{shown} cannot be reached: {cause}")
+
+
+def _reasons(text: str) -> list[str]:
+    """Why a connection could not be made, in short: a text for each host of the URL.
+
+    A host may have several reasons, one for each of its addresses.
+    """
+    found: dict[str, dict[str, None]] = {}  # in order, each once
+    where = ""
+    is_listed = EACH_HOST in text
+    for line in text.rpartition(EACH_HOST)[2].splitlines():
+        if is_listed and (named := OF_HOST.match(line)):
+            host, port = (word.strip("'") for word in named.groups())
+            where = host if port == "None" else f"{host}:{port}"
+            line = line[named.end() :]  # noqa: PLW2901 - the rest of it
+        if not line.strip() or line.startswith("\t"):  # libpq's advice
+            continue
+        attempt = ATTEMPT.match(line)
+        assert attempt is not None  # noqa: S101 - it matches any text
+        if not is_listed:
+            address = f"{attempt['address']}:{attempt['port']}" if attempt["port"] else ""
+            where = attempt["socket"] or address or where
+        found.setdefault(where, {})[" ".join(line[attempt.end() :].split())] = None
+    return [
+        f"{where}: {' and '.join(reasons)}" if where else " and ".join(reasons)
+        for where, reasons in found.items()
+    ]
 
 
 def unusable(error: psycopg.Error, shown: str) -> UsageError:

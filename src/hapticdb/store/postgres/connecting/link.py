@@ -2,10 +2,12 @@
 
 The hot path uses libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
 statement. It waits by polling the socket. So Ctrl-C interrupts the wait, and a server that stops
-answering causes an error instead of a hang.
+answering causes an error instead of a hang, also during statements that may take long
+(`hapticdb.store.postgres.connecting.answering`).
 """
 
 import contextlib
+import math
 import re
 import select
 import time
@@ -16,9 +18,9 @@ import psycopg
 from psycopg import pq
 from psycopg.errors import error_from_result
 
-from hapticdb.errors import StuckError
 from hapticdb.store.postgres.address import Address
-from hapticdb.store.postgres.connecting import failures
+from hapticdb.store.postgres.connecting import answering, failures
+from hapticdb.store.postgres.connecting.answering import Peer, SilentServerError
 from hapticdb.store.postgres.connecting.wire import Parameter
 
 Result = TypeVar("Result")
@@ -54,9 +56,12 @@ class _Connection(psycopg.Connection[tuple[Any, ...]]):
 
     def wait(self, gen: Generator[Any, Any, Result], *args: Any, **options: Any) -> Result:  # noqa: ANN401 - psycopg's own
         """Let a statement run to its end. Closes the connection when it takes too long."""
+        if self.link.given_up is not None:  # the end of a COPY that was given up
+            raise self.link.given_up
         try:
             return super().wait(self.link.until_out_of_patience(gen), *args, **options)
-        except StuckError:
+        except SilentServerError as error:
+            self.link.given_up = error
             self.close()
             raise
 
@@ -64,7 +69,8 @@ class _Connection(psycopg.Connection[tuple[Any, ...]]):
 class Link:
     """Holds one psycopg connection at a time; `connect` makes a new one.
 
-    driver : psycopg's connection, autocommit, for statements that no frame waits on.
+    driver : psycopg's connection, autocommit, for statements that no frame waits on; given_up : why
+    this connection was given up while psycopg waited for a statement, else None.
     """
 
     def __init__(self, address: Address, conninfo: str, *, read_only: bool) -> None:
@@ -72,19 +78,24 @@ class Link:
         self._conninfo = conninfo
         self._is_read_only = read_only
         self._leisure = 0
+        self.given_up: SilentServerError | None = None
         self.connect()
 
     # -- connecting --------------------------------------------------------------------------
 
-    def connect(self) -> None:
-        """Connect once, with `SETTINGS`; settings in the URL's `options` override them."""
+    def connect(self, seconds: float = CONNECT_SECONDS) -> None:
+        """Connect once, with `SETTINGS`; settings in the URL's `options` override them.
+
+        seconds : that the server may take to accept the connection, unless the URL says otherwise.
+        """
+        given = "connect_timeout=" in self._conninfo
         try:
             made = _Connection.connect(
                 self._conninfo,
                 autocommit=True,
                 client_encoding="utf8",
                 fallback_application_name="hapticdb",
-                connect_timeout=None if "connect_timeout=" in self._conninfo else CONNECT_SECONDS,
+                connect_timeout=None if given else math.ceil(seconds),
             )
         # from None: psycopg's message, which a traceback would show, may hold the password
         except psycopg.OperationalError as error:
@@ -92,11 +103,13 @@ class Link:
         except psycopg.Error as error:
             raise failures.unusable(error, self._address.shown) from None
         made.link = self
+        self.given_up = None
         self.driver: psycopg.Connection[tuple[Any, ...]] = made
         self.driver.prepare_threshold = None
         self._prepared: dict[str, bytes] = {}
         self._pgconn = made.pgconn
         self._limit_ms: int | None = 1000 * CONNECT_SECONDS
+        self._peer = Peer.of(made.pgconn)
         self._poller = select.poll()
         self._poller.register(self._pgconn.socket, select.POLLIN | select.POLLERR | select.POLLHUP)
         try:
@@ -166,32 +179,40 @@ class Link:
         self.send(text, parameters)
         return self.take()
 
+    def prepare(self, text: str, oids: Sequence[int]) -> bytes:
+        """Prepare a statement with parameters of these types, once; returns its name."""
+        name = self._prepared.get(text)
+        if name is None:
+            name = f"hapticdb_{len(self._prepared)}".encode()
+            self._pgconn.send_prepare(name, text.encode(), oids)
+            self._result()
+            self._prepared[text] = name
+        return name
+
     def send(self, text: str, parameters: Sequence[Parameter]) -> None:
         """Send a statement, which is prepared when it is first sent; `take` gives its result.
 
         Statements on several links are answered at the same time if all are sent before the first
         result is taken.
         """
-        name = self._prepared.get(text)
-        if name is None:
-            name = f"hapticdb_{len(self._prepared)}".encode()
-            oids = [parameter.oid for parameter in parameters]
-            self._pgconn.send_prepare(name, text.encode(), oids)
-            self._result()
-            self._prepared[text] = name
+        name = self.prepare(text, [parameter.oid for parameter in parameters])
         values = [parameter.value for parameter in parameters]
         self._pgconn.send_query_prepared(name, values, [1] * len(values), 1)
         self._pgconn.flush()
 
     def take(self, patience_ms: int | None = None) -> pq.abc.PGresult:
         """Result of the statement that was sent; patience_ms : wait no longer for each part."""
-        if patience_ms is None:
+        with self.patient_for(patience_ms):
             return self._result()
-        before, self._limit_ms = self._limit_ms, patience_ms
+
+    @property
+    def awaited(self) -> tuple[int, int]:
+        """The socket and the events, as `select.poll` takes them, after which `take` goes on."""
         try:
-            return self._result()
-        finally:
-            self._limit_ms = before
+            unsent = self._pgconn.flush() > 0
+        except psycopg.Error:  # the connection is lost, as `take` will tell
+            unsent = True
+        return self._pgconn.socket, select.POLLIN | (select.POLLOUT if unsent else 0)
 
     def hear(self) -> None:
         """Give notifications that have arrived to the notify handlers. Never waits.
@@ -211,8 +232,19 @@ class Link:
         return None if self._leisure else self._limit_ms
 
     @contextlib.contextmanager
+    def patient_for(self, patience_ms: int | None) -> Iterator[None]:
+        """Wait no longer for each part of an answer inside; None for the usual limit."""
+        before = self._limit_ms
+        if patience_ms is not None:
+            self._limit_ms = patience_ms
+        try:
+            yield
+        finally:
+            self._limit_ms = before
+
+    @contextlib.contextmanager
     def unhurried(self) -> Iterator[None]:
-        """Wait without a limit inside: for statements that may take long."""
+        """Wait as long as the server answers others inside: for statements that may take long."""
         self._leisure += 1
         try:
             yield
@@ -254,27 +286,51 @@ class Link:
         return found
 
     def _wait(self) -> None:
-        if not self._poller.poll(self._patience_ms):
-            raise self._stuck()
+        """Wait until the socket can be read or written."""
+        left_ms = self._patience_ms
+        silence_ms = int(1000 * answering.SILENCE_S)
+        while True:
+            step_ms = silence_ms if left_ms is None else min(left_ms, silence_ms)
+            if self._poller.poll(step_ms):
+                return
+            if left_ms is not None:
+                left_ms -= step_ms
+                if left_ms <= 0:
+                    raise self._stuck()
+            self._check_answers()
 
     def until_out_of_patience(
         self, waiting: Generator[Any, Any, Result]
     ) -> Generator[Any, Any, Result]:
-        """Run psycopg's own waiting for a statement, but no longer than `_patience_ms`."""
-        started = time.monotonic()
+        """Run psycopg's own waiting for a statement, but no longer than `_wait` would."""
+        started = heard = time.monotonic()
         try:
             wanted = next(waiting)
             while True:
                 ready = yield wanted
-                waited_ms = 1000 * (time.monotonic() - started)
-                if not ready and self._patience_ms is not None and waited_ms > self._patience_ms:
+                now = time.monotonic()
+                if ready:
+                    heard = now
+                elif self._patience_ms is not None and 1000 * (now - started) > self._patience_ms:
                     raise self._stuck()
+                elif now - heard > answering.SILENCE_S:
+                    self._check_answers()
+                    heard = time.monotonic()
                 wanted = waiting.send(ready)
         except StopIteration as end:
             return cast("Result", end.value)
 
-    def _stuck(self) -> StuckError:
-        return StuckError(
+    def _check_answers(self) -> None:
+        """Give the statement up if the server does not answer a new client either."""
+        if self._peer is not None and not self._peer.answers():
+            raise SilentServerError(
+                f"{self._address.shown} sends nothing and did not answer a new client within "
+                f"{answering.ANSWER_S:.3g} s: the server, or the way to it, hangs; try again when "
+                "it answers"
+            )
+
+    def _stuck(self) -> SilentServerError:
+        return SilentServerError(
             f"{self._address.shown} did not answer within {self._patience_ms} ms: "
             "the server, or the way to it, hangs"
         )

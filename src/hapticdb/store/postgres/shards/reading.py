@@ -31,6 +31,7 @@ from hapticdb.store.postgres.shards.connecting.links import (
 )
 from hapticdb.store.postgres.shards.pieces import pieces_of_keys, pieces_of_ranges
 from hapticdb.store.postgres.shards.view import NEWEST, LiveView, Views
+from hapticdb.store.postgres.tables.loading import TABLES
 from hapticdb.store.postgres.tables.reading import PostgresReader, is_in_order
 
 TRIES = 20
@@ -65,7 +66,8 @@ class ShardedReader:
         self._objects = objects
         self._depth = 0
         self._held: LiveView | None = None
-        self.away = AwayShards(shards)
+        scans = [statements.SCAN[table] for table in TABLES[layout]]
+        self.away = AwayShards(shards, [(text, [wire.INT8_ARRAY] * 2) for text in scans])
         self.views = Views(connection, row_shift(layout))
 
     # -- at which revision -----------------------------------------------------------------------

@@ -49,6 +49,9 @@ writer longer."""
 PAUSE_S = 5.0
 """Seconds without sweeps after writes when a shard could not be swept. A larger value delays
 writers less often while a shard is away."""
+CONNECT_S = 2.0
+"""Seconds that a writer waits for a new connection of a shard that is to be swept. A larger value
+bears slower servers, but delays writers while one hangs."""
 NEVER = 0
 """Revision at which rows died that no revision ever had."""
 
@@ -169,7 +172,7 @@ class Sweeper:
     def _delete(self, left: Left, _: int, shard: ShardConnection) -> None:
         """Delete the rows of one version from one shard."""
         if shard.driver.closed:
-            shard.connect()  # once: a writer who sweeps does not wait for a shard that is away
+            shard.connect(CONNECT_S)  # once: a writer does not wait for a shard that is away
         with failures.named_errors(shard.shown):
             # committed before: the deletes may take long, and writers wait for the row of `mark`
             shard.execute(MARK, (left.died, left.died))

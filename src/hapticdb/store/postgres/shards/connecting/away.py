@@ -17,8 +17,9 @@ from hapticdb.store.postgres.shards.connecting.links import (
 )
 
 PATIENCE_MS = 500
-"""Milliseconds that a shard may take to answer before it counts as away. A larger value bears
-slower shards; but while one is waited for, the cells of all others wait, too."""
+"""Milliseconds that shards may take to answer before they count as away. A larger value bears
+slower shards; but while one is waited for, the cells of all others wait, too, and no cell is proved
+to be up to date: it must be well below a session's staleness, 1 s unless the user gives another."""
 FIRST_WAIT_S = 1.0
 """Seconds that the first read waits for its connections."""
 PAUSE_S = 0.25
@@ -27,10 +28,15 @@ notices later that it is back."""
 
 
 class AwayShards:
-    """Which shards of an environment are away, for reads that leave them out."""
+    """Which shards of an environment are away, for reads that leave them out.
 
-    def __init__(self, shards: Shards) -> None:
+    prepared : statements of these reads, and the types of their parameters. They are prepared while
+    the threads connect, so that no read waits for that.
+    """
+
+    def __init__(self, shards: Shards, prepared: Sequence[tuple[str, Sequence[int]]]) -> None:
         self._shards = shards
+        self._prepared = prepared
         self._revivals: dict[int, _Revival] = {}
         self._has_begun = False
 
@@ -86,8 +92,18 @@ class AwayShards:
         return True
 
     def _begin(self, shard: int) -> None:
+        def connect() -> ShardConnection:
+            made = self._shards.connected(shard)
+            try:
+                for text, oids in self._prepared:
+                    made.prepare(text, oids)
+            except BaseException:
+                made.close()
+                raise
+            return made
+
         self._shards.exchange(shard, None)
-        self._revivals[shard] = _Revival(lambda: self._shards.connected(shard))
+        self._revivals[shard] = _Revival(connect)
 
 
 class _Revival:

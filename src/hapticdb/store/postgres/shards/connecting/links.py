@@ -1,6 +1,8 @@
 """Connections to the shards of an environment: all asked at once, each made when first used."""
 
 import contextlib
+import select
+import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import NamedTuple, TypeVar
@@ -16,7 +18,9 @@ from hapticdb.errors import (
 )
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
+from hapticdb.store.postgres.connecting.answering import SilentServerError
 from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.link import CONNECT_SECONDS
 from hapticdb.store.postgres.connecting.wire import Parameter
 
 Result = TypeVar("Result")
@@ -26,6 +30,9 @@ MOST_THREADS = 16
 PARTING_S = 20.0
 """Seconds that Ctrl-C waits for threads that write to shards; then it gives their connections up.
 A larger value gives a shard more time to answer."""
+LEAST_MS = 100
+"""Milliseconds that each further part of an answer may take, however late it begins. A larger value
+bears servers that pause within an answer, and waits longer for one that hangs there."""
 TOKEN = "SELECT token::text FROM mark"  # noqa: S105 - which environment it is, no secret
 
 
@@ -64,9 +71,9 @@ class ShardConnection(ServerConnection):
     def check_thread(self) -> None:
         """Any thread may use it; `Shards` sees to it that one at a time does."""
 
-    def connect(self) -> None:
+    def connect(self, seconds: float = CONNECT_SECONDS) -> None:
         """Connect again, once; a server in the shard's place that is another one is refused."""
-        super().connect()
+        super().connect(seconds)
         try:
             self._check_token()
         except BaseException:  # it must not be used for the next statement
@@ -174,8 +181,8 @@ class Shards:
     ) -> tuple[Answer, list[Answer | None]]:
         """Answers as of `ask`, without a second try: None for a shard whose connection is lost.
 
-        patience_ms : how long a shard may take before its connection counts as lost; None for the
-        limit of the connection, after which StuckError is raised.
+        patience_ms : how long the shards together may take; after that those that have sent nothing
+        count as lost. None for the limit of each connection, after which ShardAwayError is raised.
         """
         self.coordinator.check_thread()
         waiting: list[ServerConnection] = []
@@ -190,19 +197,21 @@ class Shards:
                     self.coordinator.send(first)
                     waiting.append(self.coordinator)
             for at, ask in enumerate(asks):
-                with contextlib.suppress(*lost):
+                with named_away(), contextlib.suppress(*lost):
                     connection = self.connection(ask.shard)
-                    connection.send(ask.text, *ask.parameters)
+                    with connection.patient_for(patience_ms):
+                        connection.send(ask.text, *ask.parameters)
                     waiting.append(connection)
                     asked[at] = connection
+            sent_at = time.monotonic()
             if first is not None and self.coordinator in waiting:
                 with contextlib.suppress(ConnectionLostError):
                     found = self.coordinator.take()
                 waiting.remove(self.coordinator)
-            for at, connection in asked.items():
-                with contextlib.suppress(*lost):
-                    answers[at] = connection.take(patience_ms)
-                waiting.remove(connection)
+            for at, left_ms in _as_they_come(asked, sent_at, patience_ms):
+                with named_away(), contextlib.suppress(*lost):
+                    answers[at] = asked[at].take(left_ms)
+                waiting.remove(asked[at])
         except BaseException:
             for one in waiting:  # no later statement may get these answers
                 one.driver.close()
@@ -280,14 +289,38 @@ def _done(work: Callable[[], Result]) -> "Future[Result]":
     return done
 
 
+def _as_they_come(
+    asked: dict[int, ShardConnection], sent_at: float, patience_ms: int | None
+) -> Iterator[tuple[int, int | None]]:
+    """Places of shards as their answers begin to come, and the patience for the rest of each.
+
+    Shards that have sent nothing by the end of the patience come last, with a patience of 0. So
+    several that hang take no longer than one, and no answer waits behind them.
+    """
+    if patience_ms is None:
+        yield from ((at, None) for at in asked)
+        return
+    poller, left = select.poll(), {}
+    for at, connection in asked.items():
+        descriptor, events = connection.awaited
+        poller.register(descriptor, events)
+        left[descriptor] = at
+    while left:
+        left_ms = max(int(patience_ms - 1000 * (time.monotonic() - sent_at)), 0)
+        ready = [descriptor for descriptor, _ in poller.poll(left_ms)]
+        for descriptor in ready or list(left):
+            poller.unregister(descriptor)
+            yield left.pop(descriptor), max(left_ms, LEAST_MS) if ready else 0
+
+
 @contextlib.contextmanager
 def named_away() -> Iterator[None]:
-    """Turn the loss of a shard's connection into `ShardAwayError`."""
+    """Turn the loss or the silence of a shard's connection into `ShardAwayError`."""
     try:
         yield
     except (ShardAwayError, OutdatedError):
         raise
-    except ConnectionLostError as error:
+    except (ConnectionLostError, SilentServerError) as error:
         raise ShardAwayError(*error.args) from error
 
 

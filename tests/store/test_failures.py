@@ -1,0 +1,93 @@
+"""What is said of servers that cannot be reached: one short line, each host once."""
+
+import socket
+from pathlib import Path
+
+import psycopg
+import pytest
+
+import hapticdb
+from hapticdb import ConnectionLostError, HapticDBError, ReadOnlyError
+from hapticdb.store.postgres.connecting import failures
+
+ADVICE = "\n\tIs the server running on that host and accepting TCP/IP connections?"
+MANY = "\nMultiple connection attempts failed. All failures were:\n"
+
+
+def attempt(host: str, port: int, reason: str, address: str = "127.0.0.1") -> str:
+    """What psycopg says of one attempt among several."""
+    where = f'connection to server at "{address}", port {port} failed: '
+    place = f"- host: '{host}', port: '{port}', hostaddr: '{address}'"
+    return f"{place}: connection failed: {where}{reason}"
+
+
+def told(*attempts: str) -> HapticDBError:
+    """Error for a connection after these attempts."""
+    last = attempts[-1].partition("': connection failed: ")[2]
+    text = f"connection failed: {last}{MANY}" + "\n".join(attempts)
+    return failures.refused(psycopg.OperationalError(text), "postgresql://many/x")
+
+
+def test_each_host_is_named_once_with_its_reasons() -> None:
+    error = told(
+        attempt("one", 5432, f"Connection refused{ADVICE}", "::1"),
+        attempt("one", 5432, f"Connection refused{ADVICE}"),
+        attempt("two", 5433, f"No route to host{ADVICE}"),
+        "- host: 'three', port: '5432', hostaddr: '10.0.0.1': connection timeout expired",
+    )
+    assert isinstance(error, ConnectionLostError)
+    assert str(error) == (
+        "postgresql://many/x cannot be reached: one:5432: Connection refused; "
+        "two:5433: No route to host; three:5432: connection timeout expired"
+    )
+
+
+def test_hosts_that_are_no_primary_are_left_out() -> None:
+    standby = attempt("standby", 5432, "server is in hot standby mode")
+    error = told(standby, attempt("primary", 5432, f"Connection refused{ADVICE}"))
+    assert isinstance(error, ConnectionLostError)
+    assert "standby:5432" not in str(error)
+    assert "the primary cannot be reached: primary:5432: Connection refused; " in str(error)
+    assert isinstance(told(standby, standby), ReadOnlyError)
+
+
+def test_two_ways_to_one_host_are_two_reasons() -> None:
+    where = 'connection to server at "db" (10.0.0.1), port 5432 failed: '
+    text = f"connection failed: {where}SSL error: bad\n{where}FATAL:  no encryption"
+    error = failures.refused(psycopg.OperationalError(text), "URL")
+    assert str(error) == "URL cannot be reached: db:5432: SSL error: bad and no encryption"
+
+
+@pytest.mark.parametrize(
+    "reason",
+    [
+        "sorry, too many clients already",
+        'too many connections for role "anna"',
+        "remaining connection slots are reserved for roles with the SUPERUSER attribute",
+        "no more connections allowed (max_client_conn)",
+    ],
+)
+def test_a_full_server_is_named_and_what_to_do(reason: str) -> None:
+    where = 'connection failed: connection to server on socket "/run/.s.PGSQL.5432" failed: '
+    text = f"{where}FATAL:  {reason}"
+    error = failures.refused(psycopg.OperationalError(text), "shard 2 (/run) of URL")
+    assert isinstance(error, ConnectionLostError)
+    assert str(error) == (
+        f"shard 2 (/run) of URL has no free connection (/run/.s.PGSQL.5432: {reason}): end "
+        "programs that use this server, or raise max_connections there"
+    )
+
+
+def test_hosts_without_a_server_are_told_in_one_short_line(tmp_path: Path) -> None:
+    with socket.socket() as unused:  # bound, and nobody listens
+        unused.bind(("127.0.0.1", 0))
+        port = unused.getsockname()[1]
+        url = f"postgresql://127.0.0.1:{port},127.0.0.1:{port}/x"
+        with pytest.raises(ConnectionLostError) as error:
+            hapticdb.open(url)
+    assert str(error.value) == f"{url} cannot be reached: 127.0.0.1:{port}: Connection refused"
+    with pytest.raises(ConnectionLostError) as error:
+        hapticdb.open(f"postgresql:///x?host={tmp_path},{tmp_path}/b")
+    assert str(error.value).count(".s.PGSQL") == 0
+    assert str(error.value).count("No such file or directory") == 2
+    assert "\n" not in str(error.value)

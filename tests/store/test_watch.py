@@ -247,10 +247,10 @@ def test_a_server_that_comes_back_is_found_within_half_a_second(
     pauses: list[float] = []
     connect = ServerConnection.connect
 
-    def refused_at_first(connection: ServerConnection) -> None:
+    def refused_at_first(connection: ServerConnection, seconds: float) -> None:
         if len(pauses) < 8:
             raise hapticdb.ConnectionLostError("refused")
-        connect(connection)
+        connect(connection, seconds)
 
     monkeypatch.setattr(ServerConnection, "connect", refused_at_first)
     monkeypatch.setattr(time, "sleep", pauses.append)

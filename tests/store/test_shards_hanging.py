@@ -24,14 +24,12 @@ from hapticdb.testing.scenes import everything, voxel_object
 from labelled import GRID, contents_of, labelled_object, labelled_rows
 from servers import Place
 from sharded import ShardedServers
-from store.test_shards_killed import (  # noqa: F401 - fixtures
+from steps import MOST_STEPS, Steps, steps  # noqa: F401 - a fixture among them
+from store.test_shards_killed import (  # noqa: F401 - a fixture among them
     KINDS,
-    MOST_STEPS,
-    Steps,
     after_edit,
     assert_goes_on,
     edit,
-    steps,
     url,
     victims,
 )

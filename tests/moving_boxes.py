@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 CORNERS = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=float)
-EDGES = np.array([[a, b] for a in range(8) for b in range(a) if bin(a ^ b).count("1") == 1])
+EDGES = np.array([[a, b] for a in range(8) for b in range(a) if (a ^ b).bit_count() == 1])
 
 
 class Boxes(NamedTuple):

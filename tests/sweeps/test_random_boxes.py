@@ -90,7 +90,8 @@ def scene(folder: Path, objects: Boxes, *, stored: bool) -> Iterator[Environment
     grid = hapticdb.GridOptions(voxel_size=SIZE)
     url = folder / f"boxes{stored}.db"
     hapticdb.import_files(url, [file], hapticdb.ImportOptions(grid=grid, distances=stored))
-    with hapticdb.open(url, read_only=True) as env:
+    with hapticdb.open(url) as env:
+        env.calibrate()  # once, and not at the start of each sweep
         yield env
 
 

@@ -33,9 +33,9 @@ ROUNDS = 9
 """Greatest number of times that tight parts and pieces are halved."""
 SHORTEST = 1.0 / 64.0
 """Steps: a shorter part of the path is not halved. Larger: less is decided where it is tight."""
-MOST_PIECES = 200_000
+MOST_PIECES = 100_000
 """Greatest number of pieces of a refined shell. Larger: more is decided, with more memory."""
-MOST_PAIRS = 2e8
+MOST_PAIRS = 3e7
 """Greatest number of pairs of a piece and a part in one round. Larger: more is decided, later."""
 BLOCK = 1024
 """Poses looked at in one call of the kernel. Larger: more memory."""
@@ -209,23 +209,22 @@ class Decider:
         if is_long.any():
             places, spans = _halved_parts(places, spans, float(self.path.starts[-1]))
         pieces: tuple[Floats, Floats, Floats | None] | None = work.points, work.radii, None
-        if self.refines and isinstance(self.shell.surface, Surface):
-            pieces = self._halved_pieces()
+        surface = self.shell.surface
+        if self.refines and isinstance(surface, Surface):
+            pieces = self._halved_pieces(surface)
         if pieces is None or not (is_long.any() or self.refines):
             return None
         if pieces[2] is None and not is_long.any():
             return None
         return _Work(*pieces, places, spans)
 
-    def _halved_pieces(self) -> tuple[Floats, Floats, Floats] | None:
-        """Pieces of half the radius, on triangles near the tight ones; None if they are too many."""
+    def _halved_pieces(self, surface: Surface) -> tuple[Floats, Floats, Floats] | None:
+        """Pieces of half the radius near the tight ones; None if they are too many."""
         from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
 
         work = self.work
         if work.triangles is not None:
             return _cut(work.triangles, 0.5 * float(work.radii.max()))
-        surface = self.shell.surface
-        assert isinstance(surface, Surface)
         tree = cKDTree(work.points)
         triangles, goal = surface.triangles, 0.5 * self.cover
         done = []

@@ -201,7 +201,9 @@ class _Run:
     def _hit_at_start(self, felt: Filter, budget_bytes: int) -> Ints:
         """Ids of the objects in whose voxels the tool has a point at the first pose, ascending."""
         with CellTable.create(budget_bytes) as table:
-            residency = Residency(self.store, table, felt.exclude, where=felt.where)
+            residency = Residency(
+                self.store, table, felt.exclude, where=felt.where, may_measure=False
+            )
             frames = ResidentFrames(residency, self.shell)
             try:
                 first = self.path.poses[:1]
@@ -274,7 +276,9 @@ class _Run:
     def _closer(self, decider: Decider, felt: Filter, budget_bytes: int) -> int:
         """Look at what is tight by distances, if there are any; returns the cells fetched."""
         with CellTable.create(budget_bytes, distances=self._have_distances) as table:
-            residency = Residency(self.store, table, felt.exclude, where=felt.where)
+            residency = Residency(
+                self.store, table, felt.exclude, where=felt.where, may_measure=False
+            )
             with suppress(UsageError):  # the budget is too small for more: it stays undecided
                 decider.look_closer(residency)
             return residency.n_loaded

@@ -47,7 +47,7 @@ def distances(one: Boxes, other: Boxes) -> tuple[Floats, NDArray[np.bool_]]:
     found[_overlap(one, other)] = 0.0
     found[holds] = -to_one.max(axis=(1, 2))[holds]
     found[is_held] = -to_other.max(axis=(1, 2))[is_held]
-    return found, holds
+    return np.asarray(found), np.asarray(holds)
 
 
 def _overlap(one: Boxes, other: Boxes) -> NDArray[np.bool_]:

@@ -158,7 +158,7 @@ def test_the_oracle_agrees_with_points_spread_over_both_boxes() -> None:
             made = mesh(boxes.halves[n])
             vertices, _ = trimesh.remesh.subdivide_to_size(made.vertices, made.faces, fine)
             clouds.append(trimesh.transform_points(vertices, boxes.poses[n]))
-        sampled = float(cKDTree(clouds[0]).query(clouds[1])[0].min())
+        sampled = float(np.min(cKDTree(clouds[0]).query(clouds[1])[0]))
         assert exact[n] - ROUND <= sampled <= exact[n] + 2.0 * fine
 
 

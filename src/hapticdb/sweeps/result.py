@@ -216,8 +216,8 @@ class Swept:
     proportions : Proportions
         Sizes and places of tool, path and scene; if there is a misfit, "no hit" has no meaning.
     looked : int
-        Number of poses at which points were looked at: at all others, bounds of earlier poses prove
-        that no point is in a voxel.
+        How often points were looked up at a pose, for hits, clearance or the proof. Where bounds of
+        earlier poses prove that nothing is near, a pose is not looked at.
     left_at_start : tuple of Object
         Objects left out because the tool hits them at the path's first pose, if that was requested.
     decision : Decision or None

@@ -147,12 +147,12 @@ def sweep_cases(folder: Path, seed: int, count: int, *, stored: bool) -> Counter
 
 def test_the_oracle_agrees_with_points_spread_over_both_boxes() -> None:
     rng = np.random.default_rng(5)
-    one, other = random_boxes(rng, 40), random_boxes(rng, 40)
+    one, other = random_boxes(rng, 24), random_boxes(rng, 24)
     exact, _ = distances(one, other)
     assert (exact == 0.0).any()
-    assert (exact > 0.0).sum() > 20
-    fine = 0.25 * SIZE
-    for n in range(40):
+    assert (exact > 0.0).sum() > 10
+    fine = 0.5 * SIZE
+    for n in range(24):
         clouds = []
         for boxes in (one, other):
             made = mesh(boxes.halves[n])

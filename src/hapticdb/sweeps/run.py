@@ -32,7 +32,7 @@ from hapticdb.store.finding import Words
 from hapticdb.sweeps.clearance import ClearanceSearch
 from hapticdb.sweeps.deciding import Decider
 from hapticdb.sweeps.inside import enclosed_ids
-from hapticdb.sweeps.objects import Met, Runs, pairs_in_voxels, pairs_of_hits, tally
+from hapticdb.sweeps.objects import Met, Runs, find_hits, pairs_in_voxels, pairs_of_hits, tally
 from hapticdb.sweeps.path import SweepPath
 from hapticdb.sweeps.result import (
     Clearance,
@@ -484,28 +484,3 @@ class _Run:
             self.known.values(), self.grid.voxel_size, self.shell, self.path.poses,
             exclude=exclude.tolist(),
         )  # fmt: skip
-
-
-def find_hits(frames: ResidentFrames, poses: Floats, n_hits: Ints) -> kernels.Found:
-    """Hits at poses (B, 4, 4), in the order of the poses; n_hits (B,) are their numbers."""
-    samples = np.flatnonzero(n_hits)
-    total = int(n_hits.sum())
-    room = 1 << (2 * total).bit_length()
-    found = kernels.Found(
-        np.empty(total, dtype=np.int64),
-        np.empty(total, dtype=np.int64),
-        np.empty(total, dtype=np.int64),
-        np.empty(total),
-        np.full(room, -1, dtype=np.int64),
-    )
-    table = frames.residency.table
-    done = count = 0
-    while True:
-        with table.reading() as row:
-            done, count = kernels.find_hits(
-                table.cells, row, frames.clusters, poses, samples, frames.residency.place,
-                done, count, found,
-            )  # fmt: skip
-        if done == len(samples):
-            return found
-        frames.feel(poses[samples[done] : samples[done] + 1])  # fetches evicted cells again

@@ -86,9 +86,8 @@ def sweep(
     env : Environment
         An environment whose order is not lexicographic. The sweep reads one revision of it.
     shell : PointShell
-        The tool. "Comes out" can be proved only if the covering radius is about as small as a
-        voxel: `PointShell.from_file(path, spacing=0.5 * env.grid.voxel_size)`. The radius is known
-        for shells of a mesh or sphere; it is computed here if necessary.
+        The tool. "Comes out" needs a covering radius of about a voxel or less, as of a shell made
+        with `spacing=0.5 * env.grid.voxel_size`. It is computed here if necessary.
     poses : (M, 4, 4) array
         `world_from_tool`, rigid, metres; at least one. Between two poses the middle of the tool's
         bounding box moves on a line, and the tool turns about it by the smaller angle.
@@ -102,18 +101,15 @@ def sweep(
     profile : bool
         Compute the clearance along the path, too, and not only the least one.
     proportions : Proportions or None
-        Result of `compare_proportions` for the same tool, path and scene, with their units. Unless
-        given, they are compared here, in metres.
+        Of the same tool, path and scene, with their units; compared here in metres unless given.
     progress : callable or None
         Called after each block with the samples done and their total.
-    leave_start : bool
-        Leave out the objects that the tool hits at the first pose.
+    leave_start, refine : bool
+        Leave out the objects that the tool hits at the first pose; draw a finer shell where the
+        verdict is open.
     tolerance : float or None
-        Metres. "Hits" is said only if surfaces are proved to come so near to one another; hits that
-        prove less are grazes, and then the verdict is "not decided". None, and the greatest value:
-        a voxel's diagonal, which each hit proves.
-    refine : bool
-        Where neither is proved, draw a finer shell by itself on the part of the tool that matters.
+        Metres, a voxel's diagonal at most and if None. "Hits" is said only if surfaces are proved
+        to come so near to one another; where hits prove less, the verdict is "not decided".
 
     Raises
     ------
@@ -127,15 +123,9 @@ def sweep(
     limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
     if not (np.isfinite(limit) and limit >= 0.0):
         raise UsageError(f"clearance up to {limit} m: give a finite length, 0 or more")
-    if tolerance is not None and not (np.isfinite(tolerance) and tolerance > 0.0):
-        raise UsageError(f"tolerance {tolerance} m: give a finite length above 0")
-    felt = Filter(where, exclude)
     asked = _Asked(leave_start, tolerance, refine)
     run = _Run(env, shell, path, limit, profile, proportions, progress, asked)
-    try:
-        return run.swept(felt, budget_bytes)
-    except ConnectionLostError:  # a lost snapshot: repeat all of it once
-        return run.swept(felt, budget_bytes)
+    return run.swept_once(Filter(where, exclude), budget_bytes)
 
 
 class _Asked(NamedTuple):
@@ -160,6 +150,8 @@ class _Run:
         progress: SampleCallback | None,
         asked: _Asked,
     ) -> None:
+        if asked.tolerance is not None and not 0.0 < asked.tolerance < np.inf:
+            raise UsageError(f"tolerance {asked.tolerance} m: give a finite length above 0")
         self.asked = asked
         self.store = env.store
         self.grid = env.grid
@@ -174,6 +166,13 @@ class _Run:
         self.progress = progress
         self.n_windows = min(len(path), WINDOWS)
         self.begins = -(-np.arange(self.n_windows) * len(path) // self.n_windows)
+
+    def swept_once(self, felt: Filter, budget_bytes: int) -> Swept:
+        """Sweep; all of it is repeated once if a snapshot is lost."""
+        try:
+            return self.swept(felt, budget_bytes)
+        except ConnectionLostError:
+            return self.swept(felt, budget_bytes)
 
     def swept(self, felt: Filter, budget_bytes: int) -> Swept:
         """Sweep from the start, in one snapshot."""

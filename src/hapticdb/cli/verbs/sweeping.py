@@ -151,14 +151,10 @@ def sweep(
     from hapticdb.sweeps.run import sweep as sweep_path
 
     _check(tool, part, tool_unit, picture)
-    if json and csv == STDOUT:
-        raise UsageError("--csv - and --json: only one may be standard output")
+    _check_output(csv, is_json=json)
     n_bytes = budget_bytes(budget)
     poses = read_poses(path, unit=path_unit or "m")
-    with (
-        open_csv(csv, "--csv", SWEPT) as table,
-        hapticdb.open(url, read_only=True) as env,
-    ):
+    with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
         parts = ids_of(env, part, "--part")
         felt = felt_objects(env, where, exclude, parts)
         render.compile_kernels("sweep", files=[tool] if tool else [])
@@ -174,8 +170,7 @@ def sweep(
                 proportions=fit, progress=progress, leave_start=leave_start,
                 tolerance=None if tolerance is None else 1e-3 * tolerance, refine=refine,
             )  # fmt: skip
-        if env.store.revision() != found.revision:
-            render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
+        _note_writes(env, found)
         if table is not None:
             table.write(rows_of_sweep(found))
         try:
@@ -188,10 +183,27 @@ def sweep(
                 _draw(picture, env, shell, found, felt.left_out, up)
     if not json and csv != STDOUT and picture is not None:
         render.say(f"picture: {picture}")
+    _exit(found, is_doubtful=bool(fit.misfits) and not as_given)
+
+
+def _exit(found: "Swept", *, is_doubtful: bool) -> None:
+    """End with the verdict's exit code."""
     if found.verdict != "comes out":
         raise typer.Exit(EXIT_CODES[found.verdict])
-    if fit.misfits and not as_given:
+    if is_doubtful:
         raise typer.Exit(DOUBTFUL)
+
+
+def _note_writes(env: "Environment", found: "Swept") -> None:
+    """Say that others have written since the sweep began, if they have."""
+    if env.store.revision() != found.revision:
+        render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
+
+
+def _check_output(csv: str | None, *, is_json: bool) -> None:
+    """Refuse two results on standard output."""
+    if is_json and csv == STDOUT:
+        raise UsageError("--csv - and --json: only one may be standard output")
 
 
 def _check(

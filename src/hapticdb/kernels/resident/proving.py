@@ -97,7 +97,7 @@ def prove(cells, reader, pieces, poses, travels, offs, place, slack, wanted, fir
     travels (B,), ascending: bound on any point's way from the path's start to each pose, to which
     `slack` is added once; offs (B,): the part of the path that each pose stands for; wanted: gap
     below which a piece is tight at a pose; is_tight (B,) uint8: set for a pose with a tight piece.
-    All in voxels. Returns the number of poses done: fewer than B when a cell was not resident.
+    All in voxels. Returns the number of poses done, fewer than B when a cell was not resident.
     """
     _, _, keys, slots, words, masks, used, payload, _ = cells
     points, radii, expiry, nearest, tight, state, where = pieces
@@ -129,9 +129,8 @@ def prove(cells, reader, pieces, poses, travels, offs, place, slack, wanted, fir
                     end_frame(cells, reader)
                     return n
                 nearest[p] = voxel
-                distance, within = math.sqrt(square), np.inf
-                if voxel >= 0:
-                    within = farthest_in(x, y, z, voxel)
+                distance = math.sqrt(square)
+                within = farthest_in(x, y, z, voxel) if voxel >= 0 else np.inf
                 if is_inside:
                     low, high = stored_bounds(payload, slot, x, y, z)
                     distance, within = max(distance, low), min(within, high)

@@ -13,6 +13,7 @@ import pytest
 import hapticdb
 from children import finished
 from command_line import Run, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
+from hapticdb.cli.csv_files import SWEPT
 from hapticdb.sweeps import run as sweeping
 
 TOOL = ("--tool", "tool.stl")
@@ -122,6 +123,7 @@ def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
         "verdict", "comes_out", "line", "proof", "poses", "samples", "hits", "contacts",
         "first_hit", "first_contact", "deepest", "objects", "enclosed", "hit_intervals",
         "contact_intervals", "clearance", "tool", "revision", "elapsed", "cells", "proportions",
+        "at_least", "looked", "left_at_start", "decision",
     ]  # fmt: skip
     assert list(found["first_contact"]) == ["sample", "fraction", "segment", "pose", "objects"]
     assert list(found["deepest"]) == ["depth", "point", "moment"]
@@ -144,6 +146,62 @@ def test_sweep_json_of_a_free_path_has_the_same_keys(run: Run, scene: Path) -> N
     assert code == 0
     assert [found[name] for name in caught] == [None, None, None]
     assert (found["clearance"]["at_most"], found["clearance"]["is_beyond"]) == (None, True)
+
+
+@pytest.mark.usefixtures("scene")
+def test_what_the_tool_touches_at_its_start_is_left_out_and_named(run: Run, scene: Path) -> None:
+    poses(scene.parent / "up.csv", (0.0, 0.0, 0.055), (0.0, 0.0, 0.2))
+    up = ("sweep", scene, *TOOL, "--path", "up.csv", "--leave-start")
+    code, out, _ = run(*up)
+    assert code == 0
+    assert out.splitlines()[0].endswith("; left out, since touched at the start: box0")
+    found = json.loads(run(*up, "--json")[1])
+    assert [one["name"] for one in found["left_at_start"]] == ["box0"]
+    assert found["tool"]["excluded"] == []
+
+
+@pytest.mark.usefixtures("through")
+def test_a_hit_is_told_only_within_the_tolerance(run: Run, scene: Path) -> None:
+    sweep = ("sweep", scene, *TOOL, "--path", "through.csv", "--json", "--tolerance")
+    code, out, _ = run(*sweep, 10)
+    decision = json.loads(out)["decision"]
+    assert (code, decision["is_near"]) == (1, True)
+    assert decision["within"] <= decision["tolerance"] == 0.01
+    code, out, _ = run(*sweep, 1e-6)
+    found = json.loads(out)
+    assert (code, found["verdict"], found["decision"]["is_near"]) == (3, "not decided", False)
+    assert found["line"].startswith("not decided below ")
+    assert "grazes box0" in found["line"]
+
+
+def test_a_finer_shell_decides_by_itself(run: Run, scene: Path) -> None:
+    """Few points at first, and the tool starts 5 mm above a box's voxels."""
+    poses(scene.parent / "near.csv", (0.0, 0.0, 0.0775), (0.0, 0.0, 0.2))
+    near = ("sweep", scene, *TOOL, "--path", "near.csv", "--points", 6)
+    assert run(*near)[0] == 3
+    code, out, _ = run(*near, "--refine")
+    assert (code, out[:24]) == (0, "comes out with at least ")
+    decision = json.loads(run(*near, "--refine", "--json")[1])["decision"]
+    assert decision["is_clear"]
+    assert 0.0 < decision["at_least"] <= 0.0175 + 1e-9  # the boxes' surfaces are so far apart
+
+
+@pytest.mark.usefixtures("through")
+def test_a_sweep_is_written_as_csv(run: Run, scene: Path) -> None:
+    sweep = ("sweep", scene, *TOOL, "--path", "through.csv")
+    found = json.loads(run(*sweep, "--json")[1])
+    assert run(*sweep, "--csv", "hit.csv")[0] == 1
+    text = scene.with_name("hit.csv").read_text()
+    header, *rows = [line.split(",") for line in text.splitlines()]
+    assert tuple(header) == SWEPT
+    assert [(row[1], float(row[2]), float(row[3])) for row in rows] == [
+        (one["name"], *interval) for one in found["objects"] for interval in one["intervals"]
+    ]
+    code, out, err = run(*sweep, "--csv", "-")
+    assert (code, out, err) == (1, text, "")
+    refused(run(*sweep, "--csv", "-", "--json"), "only one")
+    refused(run(*sweep, "--csv", "hit.csv"), "--csv")
+    refused(run(*sweep, "--tolerance", 0), "tolerance")
 
 
 def test_a_part_moves_by_displacements_from_where_it_sits(run: Run, scene: Path) -> None:

@@ -62,6 +62,17 @@ def test_every_block_of_the_realtime_page_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+def test_every_block_of_the_page_of_paths_runs(tmp_path: Path) -> None:
+    """In one session of the shell: each line needs what those before it have made."""
+    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    bash = ["bash", "-euo", "pipefail", "-c", "\n".join(blocks("sh", "docs/paths.md"))]
+    done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "hood.png").stat().st_size > 10_000
+    assert (tmp_path / "hood.csv").read_text().startswith("object_id,")
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("binaries", [b for b in FOUND if not isinstance(b, str)], ids=named)
 def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
     """The blocks use a private server, named by libpq's environment variables, and its pg_dump."""

@@ -105,7 +105,9 @@ def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
     assert set(found) == set(NAMES)
     assert {name: both for name, both in found.items() if both[0] != both[1]} == {}
     several = {name for name, (_, declared) in found.items() if len(declared) > 1}
-    assert several == {"query.refining.refine_kernel", "resident.feeling.feel_kernel"}
+    assert several == {
+        "query.refining.refine_kernel", "resident.feeling.feel_kernel", "resident.proving.prove",
+    }  # fmt: skip
 
 
 def test_a_purpose_names_entries_that_exist() -> None:

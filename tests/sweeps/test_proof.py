@@ -113,6 +113,42 @@ def test_what_would_decide_does(tmp_path: Path) -> None:
         assert sweep(env, box_shell(n_points), poses).verdict == "comes out"
 
 
+def test_a_finer_shell_is_drawn_where_it_is_tight(tmp_path: Path) -> None:
+    """The coarse shell of `test_what_would_decide_does`, on a path that leads out."""
+    with scene(tmp_path / "s.db", dot=[(64, 64, 64)]) as env:
+        over = MIDDLE + 0.5 * SIZE
+        poses = at((over, over, MIDDLE + 2.5 * SIZE + 0.04), (over, over, MIDDLE + 0.3))
+        assert sweep(env, box_shell(60), poses).verdict == "not decided"
+        found = sweep(env, box_shell(60), poses, refine=True)
+        assert found.verdict == "comes out"
+        assert found.decision is not None
+        assert 0.0 < found.at_least <= 1.5 * SIZE
+        assert found.decision.finest < 0.5 * (box_shell(60).with_cover().cover or 0.0) * 1.001
+        assert found.decision.by == "voxels"
+
+
+def test_a_part_in_a_closed_tool_is_found_although_the_proof_is_fine(tmp_path: Path) -> None:
+    """A nut close to the tool's wall: the surfaces never meet, and it does not come out."""
+    below = round((MIDDLE - 0.5 * EDGES[2]) / SIZE)  # the layer of voxels above the tool's floor
+    nut = [(i, 64, below + 1) for i in range(60, 68)]
+    shell = box_shell(spacing=0.5 * SIZE)
+    with scene(tmp_path / "s.db", nut=nut) as env:
+        for end in ((MIDDLE, MIDDLE, MIDDLE), (MIDDLE, MIDDLE, MIDDLE - 0.004)):
+            found = sweep(env, shell, at((MIDDLE, MIDDLE, MIDDLE), end), refine=True)
+            assert found.verdict != "comes out"
+            assert [one.object.name for one in found.objects] == []
+
+
+def test_bounds_of_earlier_poses_spare_looking(tmp_path: Path) -> None:
+    """Far from everything, steps are as long as the clearance allows."""
+    with scene(tmp_path / "s.db", dot=[(64, 64, 64)]) as env:
+        far = sweep(env, box_shell(300), at((0.2, 0.2, 0.2), (0.2, 1.0, 0.2)))
+        assert (far.hits, far.samples) == (0, 161)
+        assert far.looked < far.samples / 4
+        through = sweep(env, box_shell(3000), at((0.2, MIDDLE, MIDDLE), (1.0, MIDDLE, MIDDLE)))
+        assert 0 < through.hits < through.looked < 2 * through.samples
+
+
 def test_a_shell_of_unknown_cover_comes_out_nowhere(tmp_path: Path) -> None:
     shell = PointShell(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros(3), is_closed=False)
     with scene(tmp_path / "s.db", dot=[(5, 5, 5)]) as env:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.query.touches import Touch
     from hapticdb.recording.frame import Frames
+    from hapticdb.sweeps.result import Swept
 
 STDOUT = "-"
 FORMULAS = ("=", "+", "-", "@")
@@ -34,6 +35,12 @@ TOUCHED = ("pose", *WRENCH, "hits", "contacts", "deepest_m", "object_ids", "obje
 """Columns of `touch --csv`: a row for each pose."""
 CONTACTS = ("pose", "point", "x_m", "y_m", "z_m", "depth_m", "object_id", "object_name")
 """Columns of `touch --contacts-csv`: a row for each contact with each object that it touches."""
+SWEPT = (
+    "object_id", "object_name", "from_fraction", "to_fraction", "enclosed", "samples",
+    "contact_samples", "points", "tangent_depth_m", "verdict",
+)  # fmt: skip
+"""Columns of `sweep --csv`: a row for each interval in which an object is hit; counts and depth are
+those of all intervals of the object."""
 _PLACE = (*(f"{axis}_m" for axis in AXES), "qw", "qx", "qy", "qz")
 _SPEED = (*(f"v{axis}_m_per_s" for axis in AXES), *(f"w{axis}_rad_per_s" for axis in AXES))
 FRAME_COLUMNS: dict[str, tuple[str, ...]] = {
@@ -156,6 +163,20 @@ def rows_of_contacts(
     for point, i in touched.contact_pairs.tolist():
         place = pose[:3, :3] @ shell.points[point] + pose[:3, 3]
         yield [index, point, *place.tolist(), depths[point], i, names[i]]
+
+
+def rows_of_sweep(found: "Swept") -> Iterator[list[object]]:
+    """Rows of `SWEPT`, in the order in which the tool meets the objects; those inside it last."""
+    inside = {obj.id for obj in found.enclosed}
+    for one in found.objects:
+        who = [one.object.id, text_cell(one.object.name)]
+        counts = [one.samples, one.contacts, one.points, one.deepest, found.verdict]
+        for begin, end in one.intervals.tolist():
+            yield [*who, begin, end, int(one.object.id in inside), *counts]
+    met = {one.object.id for one in found.objects}
+    for obj in found.enclosed:
+        if obj.id not in met:
+            yield [obj.id, text_cell(obj.name), 0.0, 1.0, 1, 0, 0, 0, 0.0, found.verdict]
 
 
 def rows_of_frames(frames: "Frames") -> Iterator[list[object]]:

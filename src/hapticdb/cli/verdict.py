@@ -1,5 +1,6 @@
 """What a sweep found, printed for people."""
 
+import math
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
@@ -8,7 +9,7 @@ from hapticdb.cli import render
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.sweeps.result import Clearance, Deepest, Swept
+    from hapticdb.sweeps.result import Clearance, Decision, Deepest, Swept
 
 MOST_OBJECTS = 20
 """Rows of the table; the other objects are counted below it."""
@@ -56,9 +57,24 @@ def _facts(env: "Environment", found: "Swept", shell: "PointShell") -> list[tupl
         rows.append(("tangent depth", _deepest_text(found.deepest, size)))
     if found.clearance is not None and not found.hits:
         rows.append(("clearance", _clearance_text(found.clearance)))
+    if found.decision is not None:
+        rows.append(("decision", _decision_text(found.decision)))
+    rows.append(("looked", f"{found.looked:,} times at the points of a pose"))
     rate = f"{found.samples / max(found.elapsed, 1e-9):,.0f} poses a second"
     rows.append(("took", f"{found.elapsed:.2f} s, {rate}, {found.cells:,} cells fetched"))
     return rows
+
+
+def _decision_text(decision: "Decision") -> str:
+    """What a closer look has shown, and how close it was."""
+    if decision.is_clear:
+        text = f"surfaces keep at least {render.metres(decision.at_least)} apart"
+    elif math.isfinite(decision.within):
+        text = f"a surface comes within {render.metres(decision.within)}"
+    else:
+        text = "neither is proved"
+    size = render.metres(decision.finest)
+    return f"{text}, by {decision.by}, last on {decision.pieces:,} pieces within {size} of a point"
 
 
 def _deepest_text(deepest: "Deepest", size: float) -> str:

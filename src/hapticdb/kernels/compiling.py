@@ -34,6 +34,7 @@ ENTRIES = {
     "surfaces.distances": "find_blocks rows_of_blocks",
     "surfaces.voxelize": "voxelize_kernel",
     "resident.clearance": "find_clearance cells_near",
+    "resident.proving": "prove",
     "resident.feeling": "feel_kernel bounding_spheres",
     "query.refining": (
         "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
@@ -129,6 +130,8 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "resident.feeling.*",
         "resident.sweep.*",
         "resident.clearance.*",
+        "resident.proving.*",
+        "field.packing.unpack_kernel",
         *_RANGES,
     ),
     "proxies": (

@@ -66,7 +66,7 @@ class ClearanceSearch:
             np.full(len(frames.shell), -1, dtype=np.int64),
             self.least,
             np.array([-np.inf, limit]),
-            np.array([-1, 0, -1, 0, 0], dtype=np.int64),
+            np.array([-1, 0, -1, 0, 0, 0], dtype=np.int64),
         )
 
     def look(self, first: int, poses: Floats, travels: Floats, windows: Ints) -> None:
@@ -91,6 +91,11 @@ class ClearanceSearch:
     def distance(self) -> float:
         """Least distance so far, voxels; the limit if nothing was nearer."""
         return float(self._bounds.state[kernels.LEAST])
+
+    @property
+    def looked(self) -> int:
+        """Number of poses at which any point was looked at."""
+        return int(self._bounds.where[kernels.LOOKED])
 
     @property
     def nearest(self) -> tuple[int, int, int]:

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.resident import sweep as kernels
+from hapticdb.resident.frames import ResidentFrames
 from hapticdb.store.base import NO_KEYS, Keys, Store, row_shift
 from hapticdb.store.objects_at import pairs_of_voxels
 
@@ -96,6 +97,31 @@ def pairs_in_voxels(store: Store, ijk: Ints, exclude: Keys) -> Pairs:
     hits = np.concatenate(which)
     by_hit = np.argsort(hits, kind="stable")
     return Pairs(hits[by_hit], np.concatenate(ids)[by_hit])
+
+
+def find_hits(frames: ResidentFrames, poses: Floats, n_hits: Ints) -> kernels.Found:
+    """Hits at poses (B, 4, 4), in the order of the poses; n_hits (B,) are their numbers."""
+    samples = np.flatnonzero(n_hits)
+    total = int(n_hits.sum())
+    room = 1 << (2 * total).bit_length()
+    found = kernels.Found(
+        np.empty(total, dtype=np.int64),
+        np.empty(total, dtype=np.int64),
+        np.empty(total, dtype=np.int64),
+        np.empty(total),
+        np.full(room, -1, dtype=np.int64),
+    )
+    table = frames.residency.table
+    done = count = 0
+    while True:
+        with table.reading() as row:
+            done, count = kernels.find_hits(
+                table.cells, row, frames.clusters, poses, samples, frames.residency.place,
+                done, count, found,
+            )  # fmt: skip
+        if done == len(samples):
+            return found
+        frames.feel(poses[samples[done] : samples[done] + 1])  # fetches evicted cells again
 
 
 def pairs_of_hits(places: Ints, voxel_table: Ints, store: Store, exclude: Keys) -> Pairs:

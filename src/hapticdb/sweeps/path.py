@@ -15,6 +15,8 @@ Ints = NDArray[np.int64]
 
 MOST_SAMPLES = 1e9
 """Greatest number of samples; a longer path is in a wrong unit, or would take days."""
+FINEST = 1 << 10
+"""Parts of a step at which `SweepPath.at` gives poses. Larger: shorter parts can be looked at."""
 RIGID = 1e-6
 """Greatest deviation of a rotation's columns from orthonormal ones; the same as for a frame."""
 
@@ -52,6 +54,7 @@ class SweepPath:
     _quaternions: Floats
     _turns: Floats
     _travels: Floats
+    _slacks: Floats
 
     @classmethod
     def of(cls, poses: ArrayLike, shell: PointShell, voxel_size: float) -> "SweepPath":
@@ -93,6 +96,7 @@ class SweepPath:
         return cls(
             given, motion, starts, off, center, centers, quaternions, turns,
             np.stack([np.concatenate([[0.0], np.cumsum(travels * counts)])[:-1], travels]),
+            slack / voxel_size,
         )  # fmt: skip
 
     def __len__(self) -> int:
@@ -107,6 +111,38 @@ class SweepPath:
             first, out,
         )  # fmt: skip
         return out
+
+    def at(self, places: Floats) -> Floats:
+        """Poses (n, 4, 4) at places (n,) between samples: multiples of 1 / `FINEST` of a step."""
+        out = np.empty((len(places), 4, 4))
+        starts = self.starts * FINEST
+        for n, place in enumerate(np.rint(places * FINEST).astype(np.int64).tolist()):
+            kernels.poses_between(
+                self.poses, self._centers, self._quaternions, self._turns, starts, self._center,
+                place, out[n : n + 1],
+            )  # fmt: skip
+        return out
+
+    def reaches(self, places: Floats, halves: Floats) -> tuple[Floats, Floats]:
+        """Bounds on movement at places (n,) between samples, voxels.
+
+        The first (n,) is that of any point from the path's start to each place; the second (n,)
+        from each place to those up to `halves` (n,) steps before and after it.
+        """
+        if not len(self.motion):
+            return np.zeros(len(places)), np.zeros(len(places))
+        last = float(self.starts[-1])
+        at = self.segments(np.floor(places))
+        spent = self._travels[0, at] + (places - self.starts[at]) * self._travels[1, at]
+        ends = [np.clip(places + sign * halves, 0.0, last) for sign in (-1.0, 1.0)]
+        steps = [self._travels[1, self.segments(np.floor(end))] for end in ends]
+        longest = np.maximum(steps[0], steps[1])  # the steps around a given pose may differ
+        return spent, np.where(halves > 0.0, halves * longest + self.slack, 0.0)
+
+    @property
+    def slack(self) -> float:
+        """Voxels by which the given poses may deviate from the motion between them."""
+        return float(self._slacks.max(initial=0.0)) + kernels.CAUTION
 
     def segments(self, samples: ArrayLike) -> Ints:
         """Segments (n,) of samples (n,), 0 .. M - 2: index of the last given pose before each."""

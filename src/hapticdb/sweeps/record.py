@@ -1,12 +1,13 @@
 """A sweep's result for JSON: metres, fractions of the path, world frame."""
 
+import math
 from typing import Any
 
 import numpy as np
 
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import MetObject, Moment, Swept
+from hapticdb.sweeps.result import Decision, MetObject, Moment, Swept
 from hapticdb.sweeps.verdict import verdict_line
 
 
@@ -64,6 +65,21 @@ def sweep_record(
         "elapsed": found.elapsed,
         "cells": found.cells,
         "proportions": found.proportions.record(),
+        "at_least": found.at_least,
+        "looked": found.looked,
+        "left_at_start": [_named(obj) for obj in found.left_at_start],
+        "decision": found.decision and _decision(found.decision),
+    }
+
+
+def _decision(decision: Decision) -> dict[str, object]:
+    """Convert a decision; a distance that is not known is None, since JSON has no infinity."""
+    within = decision.within if math.isfinite(decision.within) else None
+    return {
+        **decision._asdict(),
+        "within": within,
+        "near": _moment(decision.near),
+        "is_near": decision.is_near,
     }
 
 

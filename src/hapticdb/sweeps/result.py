@@ -100,6 +100,33 @@ class Proof(NamedTuple):
         return max(self.nearest - self.off, 0.0)
 
 
+class Decision(NamedTuple):
+    """What the proof has shown beyond the samples, metres.
+
+    is_clear : whether no surface meets the tool's, on the whole path; at_least : the proved
+    distance of the surfaces, 0 unless `is_clear`; within : a surface comes at least so near to the
+    tool's, or infinity; near : where that is so, with the objects in the nearest voxel, or None;
+    tolerance : as requested, but a voxel's diagonal at most, or None; looked : number of poses at
+    which points were looked at; pieces : number of pieces of the last round; finest : greatest
+    radius of a piece of the last round; by : what bounded the distances, "voxels" or "distances".
+    """
+
+    is_clear: bool
+    at_least: float
+    within: float
+    near: Moment | None
+    tolerance: float | None
+    looked: int
+    pieces: int
+    finest: float
+    by: str
+
+    @property
+    def is_near(self) -> bool:
+        """Whether it is proved that surfaces come within the tolerance."""
+        return self.tolerance is not None and self.within <= self.tolerance
+
+
 class MetObject(NamedTuple):
     """An object that the tool hits.
 
@@ -188,6 +215,14 @@ class Swept:
         Number of cells fetched from the database.
     proportions : Proportions
         Sizes and places of tool, path and scene; if there is a misfit, "no hit" has no meaning.
+    looked : int
+        How often points were looked up at a pose, for hits, clearance or the proof. Where bounds of
+        earlier poses prove that nothing is near, a pose is not looked at.
+    left_at_start : tuple of Object
+        Objects left out because the tool hits them at the path's first pose, if that was requested.
+    decision : Decision or None
+        A closer look at what the samples leave open; None where they decide, or nothing more is
+        requested about a hit.
     """
 
     path: SweepPath
@@ -209,6 +244,9 @@ class Swept:
     elapsed: float
     cells: int
     proportions: Proportions
+    looked: int = 0
+    left_at_start: tuple[Object, ...] = ()
+    decision: Decision | None = None
 
     @property
     def caught(self) -> Moment | None:
@@ -220,11 +258,28 @@ class Swept:
     @property
     def verdict(self) -> Verdict:
         """Proved result: the tool hits something, it comes out, or neither is proved."""
-        if self.hits or self.enclosed:
+        if self.enclosed:
+            return "hits"
+        if self.decision is not None:
+            if self.decision.is_clear and self.proof.is_inside_known:
+                return "comes out"
+            if self.decision.tolerance is not None:
+                return "hits" if self.decision.is_near else "not decided"
+        if self.hits:
             return "hits"
         if self.proof.is_clear and self.proof.is_inside_known:
             return "comes out"
         return "not decided"
+
+    @property
+    def at_least(self) -> float:
+        """Proved distance, metres, between the tool's surface and any other on the whole path."""
+        if self.verdict != "comes out":
+            return 0.0
+        if self.decision is not None:
+            return self.decision.at_least
+        proof = self.proof
+        return max(proof.nearest - proof.off - (proof.cover or 0.0), 0.0)
 
     @property
     def comes_out(self) -> bool:

@@ -7,6 +7,9 @@ need. A bound covers the space between samples and between points (`result.Proof
 
 import time
 from collections.abc import Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,19 +20,30 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.kernels.resident import sweep as kernels
+from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
-from hapticdb.store.base import Keys, Object
+from hapticdb.store.base import NO_KEYS, Keys, Object
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.clearance import ClearanceSearch
+from hapticdb.sweeps.deciding import Decider
 from hapticdb.sweeps.inside import enclosed_ids
-from hapticdb.sweeps.objects import Met, Runs, pairs_in_voxels, pairs_of_hits, tally
+from hapticdb.sweeps.objects import Met, Runs, find_hits, pairs_in_voxels, pairs_of_hits, tally
 from hapticdb.sweeps.path import SweepPath
-from hapticdb.sweeps.result import Clearance, Deepest, MetObject, Moment, Profile, Proof, Swept
+from hapticdb.sweeps.result import (
+    Clearance,
+    Decision,
+    Deepest,
+    MetObject,
+    Moment,
+    Profile,
+    Proof,
+    Swept,
+)
 
 DEFAULT_LIMIT = 32
 """Default limit of the clearance, voxels. Larger: more cells are fetched around the tool."""
@@ -61,6 +75,9 @@ def sweep(
     profile: bool = False,
     proportions: Proportions | None = None,
     progress: SampleCallback | None = None,
+    leave_start: bool = False,
+    tolerance: float | None = None,
+    refine: bool = False,
 ) -> Swept:
     """Move a tool along a path and report what it hits, in an environment of any size.
 
@@ -69,9 +86,8 @@ def sweep(
     env : Environment
         An environment whose order is not lexicographic. The sweep reads one revision of it.
     shell : PointShell
-        The tool. "Comes out" can be proved only if the covering radius is about as small as a
-        voxel: `PointShell.from_file(path, spacing=0.5 * env.grid.voxel_size)`. The radius is known
-        for shells of a mesh or sphere; it is computed here if necessary.
+        The tool. "Comes out" needs a covering radius of about a voxel or less, as of a shell made
+        with `spacing=0.5 * env.grid.voxel_size`. It is computed here if necessary.
     poses : (M, 4, 4) array
         `world_from_tool`, rigid, metres; at least one. Between two poses the middle of the tool's
         bounding box moves on a line, and the tool turns about it by the smaller angle.
@@ -85,10 +101,15 @@ def sweep(
     profile : bool
         Compute the clearance along the path, too, and not only the least one.
     proportions : Proportions or None
-        Result of `compare_proportions` for the same tool, path and scene, with their units. Unless
-        given, they are compared here, in metres.
+        Of the same tool, path and scene, with their units; compared here in metres unless given.
     progress : callable or None
         Called after each block with the samples done and their total.
+    leave_start, refine : bool
+        Leave out the objects that the tool hits at the first pose; draw a finer shell where the
+        verdict is open.
+    tolerance : float or None
+        Metres, a voxel's diagonal at most and if None. "Hits" is said only if surfaces are proved
+        to come so near to one another; where hits prove less, the verdict is "not decided".
 
     Raises
     ------
@@ -102,12 +123,17 @@ def sweep(
     limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
     if not (np.isfinite(limit) and limit >= 0.0):
         raise UsageError(f"clearance up to {limit} m: give a finite length, 0 or more")
-    felt = Filter(where, exclude)
-    run = _Run(env, shell, path, limit, profile, proportions, progress)
-    try:
-        return run.swept(felt, budget_bytes)
-    except ConnectionLostError:  # a lost snapshot: repeat all of it once
-        return run.swept(felt, budget_bytes)
+    asked = _Asked(leave_start, tolerance, refine)
+    run = _Run(env, shell, path, limit, profile, proportions, progress, asked)
+    return run.swept_once(Filter(where, exclude), budget_bytes)
+
+
+class _Asked(NamedTuple):
+    """What is asked beyond the samples, as for `sweep`."""
+
+    leave_start: bool
+    tolerance: float | None
+    refine: bool
 
 
 class _Run:
@@ -122,7 +148,11 @@ class _Run:
         profile: bool,  # noqa: FBT001 - private
         proportions: Proportions | None,
         progress: SampleCallback | None,
+        asked: _Asked,
     ) -> None:
+        if asked.tolerance is not None and not 0.0 < asked.tolerance < np.inf:
+            raise UsageError(f"tolerance {asked.tolerance} m: give a finite length above 0")
+        self.asked = asked
         self.store = env.store
         self.grid = env.grid
         self.shell = shell
@@ -137,21 +167,139 @@ class _Run:
         self.n_windows = min(len(path), WINDOWS)
         self.begins = -(-np.arange(self.n_windows) * len(path) // self.n_windows)
 
+    def swept_once(self, felt: Filter, budget_bytes: int) -> Swept:
+        """Sweep; all of it is repeated once if a snapshot is lost."""
+        try:
+            return self.swept(felt, budget_bytes)
+        except ConnectionLostError:
+            return self.swept(felt, budget_bytes)
+
     def swept(self, felt: Filter, budget_bytes: int) -> Swept:
         """Sweep from the start, in one snapshot."""
+        with self.store.snapshot():
+            started = time.perf_counter()
+            left: Ints = NO_KEYS
+            if self.asked.leave_start:
+                left = self._hit_at_start(felt, budget_bytes)
+                felt = Filter(felt.where, (*felt.exclude, *left.tolist()))
+            found, decider = self._by_voxels(felt, budget_bytes)
+            self.search = self.along = None  # their table is another's place
+            if decider is not None:
+                cells = 0
+                if not decider.is_decided:
+                    cells = self._closer(decider, felt, budget_bytes)
+                found = replace(
+                    found, decision=self._decision(decider), cells=found.cells + cells,
+                    looked=found.looked + decider.looked,
+                )  # fmt: skip
+            return replace(
+                found, left_at_start=tuple(self.known[i] for i in left.tolist()),
+                elapsed=time.perf_counter() - started,
+            )  # fmt: skip
+
+    def _hit_at_start(self, felt: Filter, budget_bytes: int) -> Ints:
+        """Ids of the objects in whose voxels the tool has a point at the first pose, ascending."""
+        with CellTable.create(budget_bytes) as table:
+            residency = Residency(
+                self.store, table, felt.exclude, where=felt.where, may_measure=False
+            )
+            frames = ResidentFrames(residency, self.shell)
+            try:
+                first = self.path.poses[:1]
+                found = find_hits(frames, first, frames.feel(first).hits)
+                exclude = residency.exclude
+                return np.unique(pairs_of_hits(found.places, found.voxels, self.store, exclude).ids)
+            finally:
+                frames.close()
+
+    def _by_voxels(self, felt: Filter, budget_bytes: int) -> tuple[Swept, Decider | None]:
+        """Sweep by voxels; the decider has what they leave open, if it is to be looked at."""
         with CellTable.create(budget_bytes) as table:
             residency = Residency(self.store, table, felt.exclude, where=felt.where)
             frames = ResidentFrames(residency, self.shell)
             try:
-                with self.store.snapshot():
-                    started = time.perf_counter()
-                    residency.refresh()
-                    self._begin(frames, felt)
-                    self.enclosed = enclosed_ids(residency, self.shell, self.path.poses[0])
-                    self._sweep(frames)
-                    return self._result(frames, time.perf_counter() - started)
+                started = time.perf_counter()
+                residency.refresh()
+                self._begin(frames, felt)
+                self.exclude = residency.exclude
+                self.enclosed = enclosed_ids(residency, self.shell, self.path.poses[0])
+                self._sweep(frames)
+                found = self._result(frames, time.perf_counter() - started)
+                if not self._is_open(found):
+                    return found, None
+                decider = Decider(
+                    self.shell, self.path, self.grid.voxel_size, self._tolerance,
+                    refines=self.asked.refine,
+                )  # fmt: skip
+                decider.look_by_voxels(residency, has_distances=self._have_distances)
+                return self._enclosed_later(found, decider, residency), decider
             finally:
                 frames.close()
+
+    def _is_open(self, found: Swept) -> bool:
+        """Whether a closer look is to decide; a hit is looked at on request only."""
+        if found.enclosed or self.shell.cover is None or found.proof.is_clear:
+            return False
+        is_asked = self.asked.tolerance is not None or self.asked.refine
+        return is_asked or not found.hits
+
+    @property
+    def _tolerance(self) -> float | None:
+        asked = self.asked.tolerance
+        return None if asked is None else min(asked, np.sqrt(3.0) * self.grid.voxel_size)
+
+    @property
+    def _have_distances(self) -> bool:
+        """Whether all objects that are felt have distances to their surfaces."""
+        left_out = set(self.exclude.tolist())
+        return all(obj.has_distances for i, obj in self.known.items() if i not in left_out)
+
+    def _enclosed_later(self, found: Swept, decider: Decider, residency: Residency) -> Swept:
+        """Look again what lies in a closed tool: at a pose with no voxel near its surface.
+
+        Where no surfaces meet, an object that is inside once is inside always. At other poses a
+        voxel across the tool's surface does not tell on which side its object lies.
+        """
+        known = Interior(self.shell.surface) if self.shell.surface is not None else None
+        if not (self.shell.is_closed if known is None else known):
+            return found
+        ids = None
+        if decider.clear_sample is not None:
+            sample = decider.clear_sample
+            pose = self.path.sample(sample, sample + 1)[0]
+            ids = enclosed_ids(residency, self.shell, pose)
+        proof = found.proof._replace(is_inside_known=ids is not None)
+        inside = () if ids is None else tuple(self.known[i] for i in ids.tolist())
+        return replace(found, proof=proof, enclosed=found.enclosed + inside)
+
+    def _closer(self, decider: Decider, felt: Filter, budget_bytes: int) -> int:
+        """Look at what is tight by distances, if there are any; returns the cells fetched."""
+        with CellTable.create(budget_bytes, distances=self._have_distances) as table:
+            residency = Residency(
+                self.store, table, felt.exclude, where=felt.where, may_measure=False
+            )
+            with suppress(UsageError):  # the budget is too small for more: it stays undecided
+                decider.look_closer(residency)
+            return residency.n_loaded
+
+    def _decision(self, decider: Decider) -> Decision:
+        """Sum up, with the place where a surface is proved to be near."""
+        if decider.near is None:
+            return decider.decision(None)
+        place, voxel = decider.near
+        ids: Ints = NO_KEYS
+        if voxel >= 0:
+            ijk = np.empty((1, 3), dtype=np.int64)
+            kernels.unpack(np.array([voxel]), ijk)
+            ids = np.unique(pairs_in_voxels(self.store, ijk, self.exclude).ids)
+        near = Moment(
+            round(place),
+            float(self.path.fractions(place)),
+            int(self.path.segments(place)),
+            self.path.at(np.array([place]))[0],
+            tuple(self.known[i] for i in ids.tolist()),
+        )
+        return decider.decision(near)
 
     def _begin(self, frames: ResidentFrames, felt: Filter) -> None:
         self.known = {obj.id: obj for obj in self.store.objects()}
@@ -162,6 +310,7 @@ class _Run:
         self.along = ClearanceSearch(frames, voxels, self.n_windows) if self.is_profiled else None
         self.met: dict[int, Met] = {}
         self.hit_runs, self.contact_runs = Runs(), Runs()
+        self.looked = 0
         self.hits_in = np.zeros(self.n_windows, dtype=np.int64)
         self.depth_in = np.zeros(self.n_windows)
         self.first_hit: Moment | None = None
@@ -175,28 +324,46 @@ class _Run:
             last = min(first + block, total)
             poses = self.path.sample(first, last)
             windows = np.arange(first, last) * self.n_windows // total
-            felt = frames.feel(poses)
-            np.maximum.at(self.hits_in, windows, felt.hits)
-            np.maximum.at(self.depth_in, windows, felt.deepest)
-            is_hit = felt.hits > 0
-            if is_hit.any():
-                self._note_hits(frames, first, poses, felt)
-            self._note_clearance(first, poses, is_hit)
+            is_hit = np.zeros(last - first, dtype=np.bool_)
+            begin = self._first_to_feel(first, poses)
+            if begin < last:
+                felt = frames.feel(poses[begin - first :])
+                self.looked += last - begin
+                np.maximum.at(self.hits_in, windows[begin - first :], felt.hits)
+                np.maximum.at(self.depth_in, windows[begin - first :], felt.deepest)
+                is_hit[begin - first :] = felt.hits > 0
+                if is_hit.any():
+                    self._note_hits(frames, begin, poses[begin - first :], felt)
+            self._note_profile(first, poses, is_hit)
             if self.progress is not None:
                 self.progress(last, total)
 
-    def _note_clearance(self, first: int, poses: Floats, is_hit: NDArray[np.bool_]) -> None:
-        """Measure the clearance at a block's samples; it is 0 for samples with a hit (B,)."""
+    def _first_to_feel(self, first: int, poses: Floats) -> int:
+        """Search the clearance in a block; returns the first sample that may hit anything.
+
+        Before the first hit, bounds that are kept from pose to pose show which samples hit nothing,
+        so these are not felt: the farther away everything is, the fewer poses are looked at.
+        """
+        if self.search is None or self.first_hit is not None:
+            return first
+        travels = self.path.travels(first, first + len(poses))
+        before = self.search.looked
+        self.search.look(first, poses, travels, np.zeros(len(poses), dtype=np.int64))
+        self.looked += self.search.looked - before
+        is_free = self.search.distance > 0.0
+        return first + len(poses) if is_free else max(self.search.nearest[0], first)
+
+    def _note_profile(self, first: int, poses: Floats, is_hit: NDArray[np.bool_]) -> None:
+        """Measure the clearance at a block's sections; it is 0 for samples with a hit (B,)."""
+        if self.along is None:
+            return
         last = first + len(poses)
         travels = self.path.travels(first, last)
-        if self.search is not None and self.first_hit is None:
-            self.search.look(first, poses, travels, np.zeros(len(poses), dtype=np.int64))
-        if self.along is not None:
-            windows = np.flatnonzero((self.begins >= first) & (self.begins < last))
-            at = self.begins[windows] - first
-            self.along.least[windows[is_hit[at]]] = 0.0
-            at, windows = at[~is_hit[at]], windows[~is_hit[at]]
-            self.along.look(first, poses[at], travels[at], windows)
+        windows = np.flatnonzero((self.begins >= first) & (self.begins < last))
+        at = self.begins[windows] - first
+        self.along.least[windows[is_hit[at]]] = 0.0
+        at, windows = at[~is_hit[at]], windows[~is_hit[at]]
+        self.along.look(first, poses[at], travels[at], windows)
 
     def _note_hits(
         self, frames: ResidentFrames, first: int, poses: Floats, felt: FeltFrames
@@ -305,6 +472,7 @@ class _Run:
             elapsed=elapsed,
             cells=frames.residency.n_loaded,
             proportions=self._compared(frames.residency.exclude),
+            looked=self.looked,
         )
 
     def _compared(self, exclude: Keys) -> Proportions:
@@ -315,28 +483,3 @@ class _Run:
             self.known.values(), self.grid.voxel_size, self.shell, self.path.poses,
             exclude=exclude.tolist(),
         )  # fmt: skip
-
-
-def find_hits(frames: ResidentFrames, poses: Floats, n_hits: Ints) -> kernels.Found:
-    """Hits at poses (B, 4, 4), in the order of the poses; n_hits (B,) are their numbers."""
-    samples = np.flatnonzero(n_hits)
-    total = int(n_hits.sum())
-    room = 1 << (2 * total).bit_length()
-    found = kernels.Found(
-        np.empty(total, dtype=np.int64),
-        np.empty(total, dtype=np.int64),
-        np.empty(total, dtype=np.int64),
-        np.empty(total),
-        np.full(room, -1, dtype=np.int64),
-    )
-    table = frames.residency.table
-    done = count = 0
-    while True:
-        with table.reading() as row:
-            done, count = kernels.find_hits(
-                table.cells, row, frames.clusters, poses, samples, frames.residency.place,
-                done, count, found,
-            )  # fmt: skip
-        if done == len(samples):
-            return found
-        frames.feel(poses[samples[done] : samples[done] + 1])  # fetches evicted cells again

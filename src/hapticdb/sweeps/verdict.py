@@ -1,5 +1,6 @@
 """The verdict of a sweep in one line."""
 
+import math
 from collections.abc import Sequence
 
 from hapticdb.pointshell.coverage import COVER_OF_SPACING, points_for
@@ -30,11 +31,25 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
 
     shell : the tool of the sweep, with its covering radius if that is known.
     """
+    line = _line(found, shell)
+    if found.left_at_start:
+        line += f"; left out, since touched at the start: {names_of(found.left_at_start)}"
+    return line
+
+
+def _line(found: Swept, shell: PointShell) -> str:
+    """`verdict_line` without what was left out."""
     samples = f"{found.samples:,} sample{'s' * (found.samples > 1)}"
     if found.verdict == "comes out":
+        if found.decision is not None:
+            return f"comes out with at least {length_text(found.at_least)}{_closer_clause(found)}"
         return f"comes out: no hit in {samples}{_clearance_clause(found.clearance)}"
     if found.verdict == "not decided":
-        return f"not decided: no hit in {samples}, but {_doubt(found, shell)}"
+        if found.hits:
+            return _graze(found)
+        return f"not decided: no hit in {samples}{_near_clause(found)}, but {_doubt(found, shell)}"
+    if not found.hits and not found.enclosed:
+        return _near(found)
     left = [one for one in found.objects if one.is_left_at_once]
     obstacles = [one for one in found.objects if not one.is_left_at_once]
     within = [
@@ -56,6 +71,47 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
         if len(said) == 1:
             said = [f"hits {said[0]}"]
     return "; ".join(said)
+
+
+def _closer_clause(found: Swept) -> str:
+    """Say that the samples alone would not show it."""
+    if not found.hits:
+        return ": proved between samples and points"
+    return ", although points are in voxels of " + names_of([one.object for one in found.objects])
+
+
+def _near_clause(found: Swept) -> str:
+    """Say below which distance nothing is decided, as a clause of a line."""
+    below = _below(found)
+    return f", not decided{below}" if below else ""
+
+
+def _below(found: Swept) -> str:
+    """Say below which distance it is open how far surfaces are apart, if it is known."""
+    decision = found.decision
+    if decision is None or decision.is_clear or not math.isfinite(decision.within):
+        return ""
+    return f" below {length_text(decision.within)}"
+
+
+def _graze(found: Swept) -> str:
+    """Say that points are in voxels, but that surfaces are not proved near enough for a hit."""
+    who = names_of([one.object for one in found.objects])
+    size = length_text(0.5 * found.voxel_size)
+    return (
+        f"not decided{_below(found)}: grazes {who}, points are in voxels there, but no surface is "
+        f"proved to come within the tolerance; voxels of {size} may decide it"
+    )
+
+
+def _near(found: Swept) -> str:
+    """Say where surfaces are proved to be within the tolerance, though no point is in a voxel."""
+    decision = found.decision
+    if decision is None or decision.near is None:
+        return "hits"
+    who = names_of(decision.near.objects) or "an object"
+    where = percent(decision.near.fraction)
+    return f"hits {who} at {where} of the path: within {length_text(decision.within)}"
 
 
 def _obstacle_clause(found: Swept, obstacles: Sequence[MetObject]) -> str:
@@ -87,6 +143,11 @@ def _doubt(found: Swept, shell: PointShell) -> str:
             "it is not known what lies inside the closed tool where it starts: give its mesh"
             if shell.surface is None
             else "its closed tool is too large to see what lies inside it where it starts"
+        )
+    if found.decision is not None and found.decision.is_clear and proof.cover_needed == 0.0:
+        return (
+            "the tool is closed and near voxels on its whole path, so it is not known what lies "
+            "inside it: let the path end where the tool is free"
         )
     moment = None if found.clearance is None else found.clearance.moment
     who = "a voxel" if moment is None else f"a voxel of {names_of(moment.objects)}"

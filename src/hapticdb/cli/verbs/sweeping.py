@@ -9,8 +9,10 @@ import typer
 
 from hapticdb.cli import fitting, render
 from hapticdb.cli.choosing import felt_objects, ids_of
+from hapticdb.cli.csv_files import STDOUT, SWEPT, open_csv, rows_of_sweep
 from hapticdb.cli.options import (
     BudgetOption,
+    CsvOption,
     ExcludeOption,
     JsonOption,
     OptionalToolOption,
@@ -64,6 +66,24 @@ AsGivenOption = Annotated[
         "--as-given", help="The sizes and places are right: exit code 0 when it comes out."
     ),
 ]
+LeaveStartOption = Annotated[
+    bool,
+    typer.Option(
+        "--leave-start", help="Leave out the objects that are hit at the first pose, and name them."
+    ),
+]
+ToleranceOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="MM",
+        help="Say hits only where surfaces are proved to come so near; other hits are grazes.",
+        show_default="a voxel's diagonal",
+    ),
+]
+RefineOption = Annotated[
+    bool,
+    typer.Option("--refine", help="Where it is not decided, look at finer points by itself."),
+]
 PictureOption = Annotated[
     str | None, typer.Option(metavar="PNG", help="Draw the path, its hits and clearance.")
 ]
@@ -86,6 +106,9 @@ With --part, objects of the environment are the tool: all of them together are
 one rigid body, which is not felt. The poses are displacements from where the
 objects are: x,y,z 0 and qw 1 is their present place. A sub-assembly's name means
 all that is below it; 'hapticdb objects --help' says how names choose objects.
+
+Where distances are stored, they decide what voxels leave open. A proved verdict
+says how far the surfaces keep apart (docs/paths.md).
 
 The points are half a voxel apart, 200,000 at most, unless --points are given.
 
@@ -113,6 +136,10 @@ def sweep(
     points: DensePointsOption = None,
     seed: SeedOption = None,
     as_given: AsGivenOption = False,
+    leave_start: LeaveStartOption = False,
+    tolerance: ToleranceOption = None,
+    refine: RefineOption = False,
+    csv: CsvOption = None,
     picture: PictureOption = None,
     up: UpOption = None,
     json: JsonOption = False,
@@ -124,9 +151,10 @@ def sweep(
     from hapticdb.sweeps.run import sweep as sweep_path
 
     _check(tool, part, tool_unit, picture)
+    _check_output(csv, is_json=json)
     n_bytes = budget_bytes(budget)
     poses = read_poses(path, unit=path_unit or "m")
-    with hapticdb.open(url, read_only=True) as env:
+    with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
         parts = ids_of(env, part, "--part")
         felt = felt_objects(env, where, exclude, parts)
         render.compile_kernels("sweep", files=[tool] if tool else [])
@@ -139,24 +167,43 @@ def sweep(
             found = sweep_path(
                 env, shell, poses, where=felt.where, exclude=felt.exclude,
                 budget_bytes=n_bytes, clearance_limit=clearance, profile=picture is not None,
-                proportions=fit, progress=progress,
+                proportions=fit, progress=progress, leave_start=leave_start,
+                tolerance=None if tolerance is None else 1e-3 * tolerance, refine=refine,
             )  # fmt: skip
-        if env.store.revision() != found.revision:
-            render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
+        _note_writes(env, found)
+        if table is not None:
+            table.write(rows_of_sweep(found))
         try:
             if json:
                 render.say_json(sweep_record(found, shell, parts, felt.left_out))
-            else:
+            elif csv != STDOUT:
                 show(env, found, shell)
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
                 _draw(picture, env, shell, found, felt.left_out, up)
-    if not json and picture is not None:
+    if not json and csv != STDOUT and picture is not None:
         render.say(f"picture: {picture}")
+    _exit(found, is_doubtful=bool(fit.misfits) and not as_given)
+
+
+def _exit(found: "Swept", *, is_doubtful: bool) -> None:
+    """End with the verdict's exit code."""
     if found.verdict != "comes out":
         raise typer.Exit(EXIT_CODES[found.verdict])
-    if fit.misfits and not as_given:
+    if is_doubtful:
         raise typer.Exit(DOUBTFUL)
+
+
+def _note_writes(env: "Environment", found: "Swept") -> None:
+    """Say that others have written since the sweep began, if they have."""
+    if env.store.revision() != found.revision:
+        render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
+
+
+def _check_output(csv: str | None, *, is_json: bool) -> None:
+    """Refuse two results on standard output."""
+    if is_json and csv == STDOUT:
+        raise UsageError("--csv - and --json: only one may be standard output")
 
 
 def _check(

@@ -13,6 +13,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.field.lattice import (
+    BEYOND,
     CELL_SIDE,
     HALF_WIDTH,
     STEPS,
@@ -140,6 +141,32 @@ def lower_bound(payload, slot, x, y, z):
         u = float(min(payload[slot, index], STEPS)) * VOXELS_A_STEP
         best = max(best, u - math.sqrt(square))
     return max(best - 0.5 * VOXELS_A_STEP, 0.0)
+
+
+@inlined
+def upper_bound(payload, slot, x, y, z):
+    """Voxels: a surface is as near to a point of the slot's cell, by the 8 centres around it.
+
+    Infinite if all of them are farther than h from every surface.
+    """
+    tx, ty, tz = from_center(x), from_center(y), from_center(z)
+    at = cell_place(
+        (np.int64(x) & 31) - np.int64(tx < 0.0),
+        (np.int64(y) & 31) - np.int64(ty < 0.0),
+        (np.int64(z) & 31) - np.int64(tz < 0.0),
+    )
+    lx, ly, lz = tx + np.int64(tx < 0.0), ty + np.int64(ty < 0.0), tz + np.int64(tz < 0.0)
+    best = np.inf
+    for corner in range(8):
+        dx = 1.0 - lx if corner & 4 else lx
+        dy = 1.0 - ly if corner & 2 else ly
+        dz = 1.0 - lz if corner & 1 else lz
+        step = payload[
+            slot, at + (corner >> 2) * ALONG_I + ((corner >> 1) & 1) * ALONG_J + (corner & 1)
+        ]
+        if step < BEYOND:
+            best = min(best, step * VOXELS_A_STEP + math.sqrt(dx * dx + dy * dy + dz * dz))
+    return best + 0.5 * VOXELS_A_STEP
 
 
 @inlined

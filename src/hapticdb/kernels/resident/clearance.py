@@ -48,7 +48,7 @@ class Bounds(NamedTuple):
     went straight there: its distance now is at least expiry - travel; of_runs (C,): the earliest
     expiry of the points of each run; nearest (N,) int64: the voxel, packed, that was nearest to
     each point in its last search, or -1; least (W,): least distance so far in each window of the
-    path; state (2,): indices `SOONEST`, `LEAST`; where (5,) int64: indices `SAMPLE` to `STOPPED`.
+    path; state (2,): indices `SOONEST`, `LEAST`; where (6,) int64: indices `SAMPLE` to `LOOKED`.
     """
 
     expiry: NDArray[np.float64]
@@ -64,9 +64,10 @@ BOUNDS = fields_of(Bounds, FLOATS, FLOATS, INTS, FLOATS, FLOATS, INTS)
 
 SOONEST, LEAST = 0, 1
 """Indices into `Bounds.state`: the least expiry of all points, and the least distance, voxels."""
-SAMPLE, POINT, VOXEL, NEAREST, STOPPED = 0, 1, 2, 3, 4
+SAMPLE, POINT, VOXEL, NEAREST, STOPPED, LOOKED = 0, 1, 2, 3, 4, 5
 """Indices into `Bounds.where`: sample, point and voxel of the least distance; the point that was
-nearest last; the point, or first point of a run, at which the search stopped."""
+nearest last; the point, or first point of a run, at which the search stopped; the number of poses
+at which any point was looked at, because bounds of earlier poses did not reach so far."""
 
 
 @leaf
@@ -291,6 +292,7 @@ def find_clearance(
                 soonest = min(soonest, of_runs[at])
         least[window] = cap
         state[SOONEST] = soonest
+        where[LOOKED] += 1
     end_frame(cells, reader)
     return poses.shape[0]
 

@@ -35,7 +35,7 @@ FLOORS: list[set[str]] = [
     {"client", "hosting"},
     {"edits", "realtime", "sweeps"},
     {"recording", "devices"},
-    {"environment", "resident", "sample", "testing"},
+    {"batches", "environment", "resident", "sample", "testing"},
     {"check", "difference", "ingest", "proportions", "transfer"},
     {"query"},
     {"pointshell", "mesh", "poses"},

@@ -78,11 +78,9 @@ class Queries:
         pose : (4, 4) array
             world_from_tool, rigid, metres. A `Touch` is returned.
         poses : (B, 4, 4) array
-            Many of them instead, for which a `TouchBatch` is returned, the same bit for bit: cells
-            of the environment are read into memory, and all processors compute. `feeler` keeps them
-            in memory for the next batch, and sets the memory and the number of threads.
-        objects, progress
-            For many poses, as for `Feeler.touch`.
+            Many of them instead, for a `TouchBatch`, the same bit for bit. All processors compute,
+            on cells in memory; `feeler` keeps these, and sets the memory and the threads.
+        objects, progress : for many poses, as for `Feeler.touch`
         strategy : str
             For one pose, form of the query: ``statement``, ``array``, ``points``, ``maxgap``,
             ``cbgroup``, or ``auto``: ``cbgroup`` for a frame with many keys in few ranges, else
@@ -92,8 +90,7 @@ class Queries:
             `exclude`: a part that is taken out must not hit itself. Ids, names, patterns and
             ``attribute=value``, as for `find`; read again whenever others have written.
         maxgap : int
-            For the strategy ``maxgap``: greatest distance, in voxel keys, of neighbours that share
-            a range.
+            For the strategy ``maxgap``: greatest distance, in keys, of neighbours in one range.
         law : TangentPlane, DistanceField, "plane", "smooth" or None
             By default ``smooth`` (`DistanceField`) where `has_distances`, else ``plane``, with 1000
             N/m. The strategy ``statement`` computes ``plane`` alone.
@@ -115,9 +112,7 @@ class Queries:
             felt = self._filters.of(where, exclude)
             return self._touching.touch(shell, pose, strategy, maxgap, felt, as_law(law))
         if strategy != "auto":
-            raise UsageError(
-                f"strategy {strategy!r} for many poses: leave it out, or ask touch_many"
-            )
+            raise UsageError(f"strategy {strategy!r} for many poses: leave it out, or touch_many")
         with self.feeler(shell, where=where, exclude=exclude, law=law) as feeler:
             return feeler.touch(poses, objects=objects, progress=progress)  # type: ignore[arg-type]
 

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS3, INT, INTS, entry, inlined
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS3, INT, INTS, entry, inlined, leaf
 from hapticdb.kernels.resident.cells import CELLS, CLUSTERS, GROUP, PLACE, begin_frame, end_frame
 from hapticdb.kernels.resident.clearance import nearest_voxel, square_to
 from hapticdb.kernels.rigid import moved, transform_of
@@ -43,6 +43,13 @@ def ball_at(points, spheres, groups, run, point, level):
     return groups[n, 0], groups[n, 1], groups[n, 2], groups[n, 3]
 
 
+@leaf
+def in_voxels(transform, place, x, y, z):
+    """A point of the tool, metres, placed by a pose, in voxels from the grid's origin."""
+    x, y, z = moved(transform, x, y, z)
+    return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
+
+
 @entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, FLOAT, FLOATS, INTS, INTS)
 def find_nearest(cells, reader, shell, poses, place, largest, squares, nearest, done):
     """Least squared distance from the points to an occupied voxel's box at each of poses (B, 4, 4).
@@ -58,8 +65,7 @@ def find_nearest(cells, reader, shell, poses, place, largest, squares, nearest, 
     """
     _, _, keys, slots, words, masks, used, _, _ = cells
     points, _, spheres, groups, run, _, _ = shell
-    ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
-    total = points.shape[0]
+    size, total = place.size, points.shape[0]
     seed, hot = np.int64(-1), np.int64(-1)
     which = begin_frame(cells, reader)
     for n in range(poses.shape[0]):
@@ -68,15 +74,14 @@ def find_nearest(cells, reader, shell, poses, place, largest, squares, nearest, 
         transform = transform_of(poses[n])
         square, best, at = squares[n], nearest[n], done[n]
         if seed >= 0 and hot >= 0:
-            x, y, z = moved(transform, points[hot, 0], points[hot, 1], points[hot, 2])
-            bound = square_to((x - ox) / size, (y - oy) / size, (z - oz) / size, seed)
+            x, y, z = in_voxels(transform, place, points[hot, 0], points[hot, 1], points[hot, 2])
+            bound = square_to(x, y, z, seed)
             if bound < square:
                 square, best = bound, hot
         level = level_at(spheres, groups, run, at, largest)
         while at < total and square > 0.0:
             x, y, z, radius = ball_at(points, spheres, groups, run, at, level)
-            x, y, z = moved(transform, x, y, z)
-            x, y, z = (x - ox) / size, (y - oy) / size, (z - oz) / size
+            x, y, z = in_voxels(transform, place, x, y, z)
             limit, voxel = square, np.int64(-1)
             if level != POINT:
                 limit = (math.sqrt(square) + radius / size) ** 2
@@ -86,7 +91,7 @@ def find_nearest(cells, reader, shell, poses, place, largest, squares, nearest, 
                     limit, voxel = bound, seed
             if level == POINT or voxel < 0:
                 limit, voxel = nearest_voxel(
-                    keys, slots, words, masks, used, which, x, y, z, limit, voxel, side
+                    keys, slots, words, masks, used, which, x, y, z, limit, voxel, place.side
                 )
             if voxel == -2 and level == POINT:
                 break

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import hapticdb
-from hapticdb import ConnectionLostError, ObjectNotFoundError
+from hapticdb import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.resident.residency import Residency
 from hapticdb.store.base import Keys
 from hapticdb.testing import write_voxels
@@ -23,6 +23,16 @@ def test_cells_stay_in_memory_between_calls(tmp_path: Path) -> None:
             again = feeler.touch(poses[::-1])
             assert feeler.n_loaded == n_loaded
         assert again.forces[::-1].tobytes() == first.forces.tobytes()
+
+
+def test_a_closed_feeler_says_so(tmp_path: Path) -> None:
+    with make(tmp_path, 6) as env:
+        feeler = env.feeler(cloud(5), jobs=2)
+        feeler.close()
+        feeler.close()
+        for ask in (feeler.touch, feeler.clearance):
+            with pytest.raises(UsageError, match="closed"):
+                ask(poses_in(env.grid, 3))
 
 
 @pytest.mark.parametrize("by", ["itself", "another"])

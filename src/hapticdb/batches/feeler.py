@@ -66,6 +66,7 @@ class Feeler:
         self._store = store
         self._felt = felt
         self._is_torn = False
+        self._is_closed = False
         self._checked_revision: int | None = None
         self._query = HapticQuery(store, QueryFigures(store).both)
         has_distances = reads_distances(law.for_kernels)
@@ -94,6 +95,9 @@ class Feeler:
 
     def close(self) -> None:
         """End the threads and free the memory; the environment stays open."""
+        if self._is_closed:
+            return
+        self._is_closed = True
         self._threads.close()
         self._frames.close()
         self._table.close()
@@ -186,6 +190,8 @@ class Feeler:
             return self._in_snapshot(work)
 
     def _in_snapshot(self, work: Callable[[], _Answer]) -> _Answer:
+        if self._is_closed:
+            raise UsageError("this feeler is closed: make another by env.feeler")
         if self._is_torn:  # an error or Ctrl-C came while cells were read
             self._residency.reopened(self._store)
         self._is_torn = True

@@ -15,6 +15,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -178,8 +179,8 @@ def measure_tool(
         touch: dict[str, Side] = {OWN: touched(all_of), OWN_ONE: touched(one)}
         distance: dict[str, Side] = {OWN: far(all_of), OWN_ONE: far(one)}
         for peer in peers:
-            touch[peer.name] = lambda poses, peer=peer: peer.touches(points, poses)
-            distance[peer.name] = lambda poses, peer=peer: peer.distances(points, poses)
+            touch[peer.name] = partial(peer.touches, points)
+            distance[peer.name] = partial(peer.distances, points)
 
         def agree_on_distance(own: Floats, other: Floats) -> float:
             """Share of poses that differ by less than two voxels' diagonals, within reach."""

@@ -108,6 +108,7 @@ class CoalBatch:
         coal = self._coal
         found = np.zeros(len(poses), dtype=np.bool_)
         request, result = coal.CollisionRequest(), coal.CollisionResult()
+        request.enable_contact = False
         for n, pose in enumerate(poses):
             result.clear()
             there = coal.Transform3s(pose[:3, :3].copy(), pose[:3, 3].copy())

@@ -7,7 +7,7 @@ READY := .venv/ready
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 PYTEST := $(BIN)/pytest tests --numprocesses=auto --dist=worksteal
 
-.PHONY: demo test test-long test-all test-plain lint types bench figures peers realtime feel scale wheel pins clean
+.PHONY: demo test test-long test-all test-plain lint types bench figures peers realtime feel scale paths wheel pins clean
 
 demo: $(USER)
 	$(BIN)/hapticdb demo demo
@@ -52,6 +52,12 @@ scale: $(READY)
 # Frames in memory beside a dense bitmap, and sessions beside an empty loop: three minutes.
 realtime: $(READY)
 	$(BIN)/python benchmarks/in_real_time.py $(ARGS)
+
+# Poses a second, by batches, beside python-fcl, coal and Open3D: a quarter of an hour. The scene is the
+# vintage car where HAPTICDB_TEST_DATA has it, else the sample.
+paths: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
+paths: $(READY) .venv/figures
+	$(BIN)/python benchmarks/batches.py $(ARGS)
 
 # How good the forces feel, under both laws (docs/feel.md): a quarter of an hour; ARGS=--quick for two
 # minutes. The walk is over the vintage car where HAPTICDB_TEST_DATA has it, else over the sample.

@@ -49,7 +49,7 @@ def test_exclude_takes_any_collection_and_no_single_id(
     for floor in ([1], (1,), np.array([1, 1]), {1}, iter([1])):
         assert not len(env.touch(sphere, np.eye(4), exclude=floor).hits)
     with pytest.raises(hapticdb.UsageError, match="give ids, names and patterns in a list"):
-        env.touch(sphere, np.eye(4), exclude=1)  # type: ignore[arg-type]
+        env.touch(sphere, np.eye(4), exclude=1)  # type: ignore[call-overload]
 
 
 def test_maxgap_is_checked_whatever_the_strategy(env: Environment, sphere: PointShell) -> None:

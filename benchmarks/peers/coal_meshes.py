@@ -21,8 +21,8 @@ class CoalMeshes:
     def build(self, work: PeerWork) -> None:
         before = resident_bytes()
         corners = work.triangles.reshape(-1, 3)
-        self._car = _tree(corners, np.arange(len(corners)).reshape(-1, 3))
-        self._tool = _tree(*work.tool_mesh)
+        self._car = tree_of_boxes(corners, np.arange(len(corners)).reshape(-1, 3))
+        self._tool = tree_of_boxes(*work.tool_mesh)
         self._request = coal.CollisionRequest()
         self._request.enable_contact = True
         self._request.num_max_contacts = MOST_CONTACTS
@@ -43,7 +43,7 @@ class CoalMeshes:
         del self._car, self._tool
 
 
-def _tree(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Any:  # noqa: ANN401 - coal has no types
+def tree_of_boxes(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> Any:  # noqa: ANN401 - coal has no types
     """A tree of boxes around the triangles."""
     model = coal.BVHModelOBBRSS()
     model.beginModel(len(faces), len(vertices))

@@ -10,6 +10,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from hapticdb.batches.feeler import Feeler
+    from hapticdb.batches.result import ClearanceBatch, TouchBatch
     from hapticdb.check import CheckReport, check_environment
     from hapticdb.difference import Difference, diff_environments
     from hapticdb.environment import Environment, create, open  # noqa: A004 - as in tarfile.open
@@ -74,6 +76,7 @@ __all__ = [
     "AccessError",
     "BusyError",
     "CheckReport",
+    "ClearanceBatch",
     "ConflictError",
     "ConnectionLostError",
     "CopyReport",
@@ -88,6 +91,7 @@ __all__ = [
     "Environment",
     "EnvironmentExistsError",
     "EnvironmentNotFoundError",
+    "Feeler",
     "FileError",
     "FileReport",
     "GeometryChangedError",
@@ -122,6 +126,7 @@ __all__ = [
     "Swept",
     "TangentPlane",
     "Touch",
+    "TouchBatch",
     "Touches",
     "UpgradeReport",
     "UsageError",
@@ -145,6 +150,8 @@ __all__ = [
 __version__ = "0.1.0"
 
 _HOMES = {
+    "batches.feeler": "Feeler",
+    "batches.result": "ClearanceBatch TouchBatch",
     "check": "CheckReport check_environment",
     "difference": "Difference diff_environments",
     "environment": "Environment create open",

@@ -8,6 +8,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.batches.queries import Queries
 from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
@@ -18,30 +19,25 @@ from hapticdb.mesh import read_file
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.figures import QueryFigures
-from hapticdb.query.frame import Strategy, as_id
-from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, object_ranges
-from hapticdb.query.law import ForceLaw, LawName, as_law
+from hapticdb.query.frame import as_id
+from hapticdb.query.grouping import Ranges, object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
-from hapticdb.query.touches import Touch, Touches
-from hapticdb.query.touching import Touching
 from hapticdb.store.base import Freshness, Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
-from hapticdb.store.filtering import Filter, FiltersOfWords
+from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.refusals import check_unwritten, wants_distances
 
 
-class Environment:
+class Environment(Queries):
     """An opened database with a static scene. Only the thread that opened it may use it.
 
     Use `hapticdb.open` and `hapticdb.create` to make one. It is also a context manager.
     """
 
     def __init__(self, store: Store) -> None:
-        self._store = store
         self._figures = QueryFigures(store)
-        self._touching = Touching(store, self._figures)
-        self._filters = FiltersOfWords()
+        super().__init__(store, self._figures)
 
     def __repr__(self) -> str:
         return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
@@ -317,92 +313,6 @@ class Environment:
             obj = self.object(object_id)
             rows = self._store.rows_of(obj.id, *self._ranges_of(obj))
         return voxels_of_rows(rows, self.grid, self.layout)
-
-    # -- the haptic query --------------------------------------------------------------------
-
-    def touch(
-        self,
-        shell: PointShell,
-        pose: ArrayLike,
-        strategy: Strategy = "auto",
-        *,
-        where: Words = (),
-        exclude: Words = (),
-        maxgap: int = DEFAULT_MAXGAP,
-        law: ForceLaw | LawName | None = None,
-    ) -> Touch:
-        """Force and torque that the environment exerts on the tool at one pose.
-
-        Parameters
-        ----------
-        shell : PointShell
-            Points in metres and inward unit normals, tool frame.
-        pose : (4, 4) array
-            world_from_tool, rigid, metres.
-        strategy : str
-            Form of the query: ``statement``, ``array``, ``points``, ``maxgap``, ``cbgroup``, or
-            ``auto``: ``cbgroup`` for a frame with many keys in few ranges, else ``array``. All
-            strategies find the same hits, ids and wrench, bit for bit.
-        where, exclude : iterable of int or str
-            Felt are the objects that `where` chooses, all if it is empty, without those of
-            `exclude`: a part that is taken out must not hit itself. Ids, names, patterns and
-            ``attribute=value``, as for `find`; read again whenever others have written.
-        maxgap : int
-            For the strategy ``maxgap``: greatest distance, in voxel keys, of neighbours that share
-            a range.
-        law : TangentPlane, DistanceField, "plane", "smooth" or None
-            By default ``smooth`` (`DistanceField`) where `has_distances`, else ``plane``, with 1000
-            N/m. The strategy ``statement`` computes ``plane`` alone.
-
-        Raises
-        ------
-        UsageError
-            If the pose is not rigid, the strategy unknown, or objects lack what the law reads.
-        ObjectNotFoundError
-            If a word of `where` or `exclude` chooses no object.
-
-        Notes
-        -----
-        Points outside the grid miss. All statements of a touch read one committed revision.
-        """
-        felt = self._filters.of(where, exclude)
-        return self._touching.touch(shell, pose, strategy, maxgap, felt, as_law(law))
-
-    def touch_many(
-        self,
-        shell: PointShell,
-        poses: ArrayLike,
-        strategy: Strategy = "auto",
-        *,
-        where: Words = (),
-        exclude: Words = (),
-        maxgap: int = DEFAULT_MAXGAP,
-        law: ForceLaw | LawName | None = None,
-        contacts: bool = False,
-    ) -> Touches:
-        """Force and torque at many poses; the same as `touch` for each pose, bit for bit.
-
-        Parameters
-        ----------
-        poses : (n, 4, 4) array
-            world_from_tool for each frame, rigid, metres.
-        strategy : str
-            ``auto`` reads the rows of neighbouring poses in one statement; any other strategy
-            queries pose by pose, as `touch` does.
-        contacts : bool
-            Whether to list every contact, too.
-        shell, where, exclude, maxgap, law
-            As for `touch`.
-
-        Raises
-        ------
-        UsageError, ObjectNotFoundError
-            As for `touch`; nothing is returned then.
-        """
-        felt = self._filters.of(where, exclude)
-        return self._touching.touch_many(
-            shell, poses, strategy, maxgap, felt, as_law(law), contacts=contacts
-        )
 
     # -- statistics --------------------------------------------------------------------------
 

@@ -73,6 +73,20 @@ def test_every_block_of_the_page_of_paths_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+def test_every_block_of_the_page_of_batches_runs(tmp_path: Path) -> None:
+    """The shell makes the sample; then all Python blocks run in one session."""
+    page = "docs/batches.md"
+    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for block in blocks("sh", page):
+        bash = ["bash", "-euo", "pipefail", "-c", block]
+        done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
+        assert done.returncode == 0, done.stderr
+    session = "\n".join(blocks("python", page))
+    done = finished([sys.executable, "-c", session], cwd=tmp_path, patience=LONG)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("binaries", [b for b in FOUND if not isinstance(b, str)], ids=named)
 def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
     """The blocks use a private server, named by libpq's environment variables, and its pg_dump."""

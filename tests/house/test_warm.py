@@ -74,6 +74,10 @@ for n, (layout, curve) in enumerate(KINDS):
                 frames = ResidentFrames(Residency(env.store, table), shell, run=4)
                 frames.feel(np.eye(4)[None])
                 frames.close()
+            point = hapticdb.PointShell(shell.points[:1], shell.normals[:1], shell.center)
+            for each in (shell, loaded, point):
+                env.touch(each, poses=[np.eye(4)], objects=True)
+                env.clearance(each, [np.eye(4)])
 hand = Line(np.zeros(3), np.ones(3), 0.1)
 smooth = folder / "smooth.db"
 hapticdb.import_files(smooth, [stl], hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6)))

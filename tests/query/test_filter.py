@@ -196,7 +196,7 @@ def test_a_word_that_chooses_nothing_is_one_line(
 def test_words_are_a_list_of_ids_and_texts(env: Environment, words: object) -> None:
     for name in ("where", "exclude"):
         with pytest.raises(UsageError, match=f"^{name}"):
-            env.touch(random_shell(1, 3), np.eye(4), **{name: words})  # type: ignore[arg-type]
+            env.touch(random_shell(1, 3), np.eye(4), **{name: words})  # type: ignore[call-overload]
 
 
 def test_the_last_words_do_not_stay(env: Environment) -> None:

@@ -232,7 +232,7 @@ def test_a_pose_that_is_not_rigid_is_refused(env: Environment, pose: NDArray[Any
 
 def test_an_unknown_strategy_is_refused(env: Environment) -> None:
     with pytest.raises(hapticdb.UsageError, match="choose one of auto"):
-        env.touch(random_shell(1, 3), np.eye(4), "fastest")  # type: ignore[arg-type]
+        env.touch(random_shell(1, 3), np.eye(4), "fastest")  # type: ignore[call-overload]
     with pytest.raises(hapticdb.UsageError, match="MAXGAP -1"):
         env.touch(random_shell(1, 3), np.eye(4), "maxgap", maxgap=-1)
 

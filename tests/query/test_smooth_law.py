@@ -120,4 +120,4 @@ def test_the_default_law_follows_the_objects(env: Environment) -> None:
     with pytest.raises(UsageError, match=r"1 of 6 objects .* 'hapticdb upgrade"):
         env.touch_many(shell, [pose], law="smooth")
     with pytest.raises(UsageError, match="choose one of plane, smooth"):
-        env.touch(shell, pose, law="soft")  # type: ignore[arg-type]
+        env.touch(shell, pose, law="soft")  # type: ignore[call-overload]

@@ -84,6 +84,15 @@ def cells_of(grid: Grid) -> Voxels:
     return (ijk[:, 0] << 32) | (ijk[:, 1] << 16) | ijk[:, 2]
 
 
+def cloud(n_points: int, seed: int = 0, extent: float = 0.02) -> PointShell:
+    """A shell of random points about the tool's origin, with random normals."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(n_points, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = rng.normal(0, extent, (n_points, 3))
+    return PointShell(points[np.argsort(points[:, 0])], normals, np.array([0.001, 0.002, -0.003]))
+
+
 def turned(rng: np.random.Generator, place: NDArray[np.float64]) -> NDArray[np.float64]:
     """A pose (4, 4) at a place (3,), with a random rotation."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))

@@ -35,6 +35,7 @@ ENTRIES = {
     "surfaces.voxelize": "voxelize_kernel",
     "resident.clearance": "find_clearance cells_near",
     "resident.proving": "prove",
+    "resident.nearest": "find_nearest",
     "resident.feeling": "feel_kernel bounding_spheres",
     "query.refining": (
         "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
@@ -55,7 +56,7 @@ ENTRIES = {
     "surfaces.sampling": "eliminate_kernel",
     "hand.servo": "tell name_voxels note",
     "curves": "encode_kernel decode_kernel",
-    "rigid": "poses_of",
+    "rigid": "poses_of first_not_rigid",
     "surfaces.bricks": "z_keys_kernel mark_points_kernel count_kernel brick_voxels_kernel",
     "hand.handle": "is_somewhere grip carry",
     "proxy.evaluate": "evaluate",

@@ -36,6 +36,15 @@ def is_rigid(pose):
     return det > 0.0
 
 
+@entry(FLOATS3)
+def first_not_rigid(poses):
+    """Index of the first of poses (B, 4, 4) that is not rigid; B if all are."""
+    for n in range(poses.shape[0]):
+        if not is_rigid(poses[n]):
+            return n
+    return poses.shape[0]
+
+
 @inlined
 def transform_of(pose):
     """Upper three rows of a pose as twelve numbers, row by row.

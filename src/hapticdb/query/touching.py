@@ -41,6 +41,15 @@ class Touching:
                 self._store.revision()  # `version` then tells of this snapshot
                 self.known.learn()
 
+    def law_now(self, law: ForceLaw | None) -> ForceLaw:
+        """The law of a frame at the newest revision, whose objects are loaded."""
+
+        def chosen() -> ForceLaw:
+            with self._store.snapshot():
+                return self._law_of_snapshot(law)
+
+        return _twice(chosen)
+
     def touch(
         self,
         shell: PointShell,

@@ -79,7 +79,7 @@ def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) ->
         bounding_spheres(points, run, 1e-3 * voxel_size, spheres)
         bounding_spheres(points, GROUP * run, 1e-3 * voxel_size, groups)
     run = run or min(len(points), FLAT_RUN)
-    columns = np.ascontiguousarray(shell.points.T)
+    columns = np.array(shell.points.T, order="C")  # a view of one point would be read-only
     scratch = np.empty((SCRATCH_ROWS, run))
     return Clusters(points, np.array(shell.center), spheres, groups, run, columns, scratch)
 
@@ -192,7 +192,7 @@ class ResidentFrames:
         out = np.zeros((len(matrices), RESULTS))
         done = 0
         while done < len(matrices):
-            n_poses = self._fetch(matrices[done:])
+            n_poses = self.fetch(matrices[done:])
             self._run(matrices, out, done, n_poses)
             done += n_poses
         return FeltFrames(
@@ -208,7 +208,7 @@ class ResidentFrames:
         felt = self.feel(poses)
         return felt.wrenches, felt.hits
 
-    def _fetch(self, poses: Floats) -> int:
+    def fetch(self, poses: Floats) -> int:
         """Make the cells of the first poses resident; returns the number of these poses."""
         residency = self.residency
         most = (residency.table.n_slots - 1) // 2

@@ -1,0 +1,282 @@
+"""Batches of poses: poses a second beside python-fcl, coal and Open3D, on the same questions.
+
+    make paths                                                # the vintage car, or the sample car
+    python benchmarks/batches.py --model FILE --seconds 5 --out results/batches.json
+
+A tool is far from all parts (free), within a few voxels of one (near), or in contact (touching).
+Every side says of each pose whether the tool touches, and how far it is from the nearest part. All
+sides are built and warmed up first, and take turns in one run. hapticdb answers the first question
+by the force and the hits of the points, in all threads and in one; others by what they compare.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, GridOptions, ImportOptions, PointShell
+from hapticdb.batches.feeler import Feeler
+from hapticdb.bench import records
+from hapticdb.demo import write_along
+from hapticdb.mesh import read_file
+from hapticdb.poses import read_poses
+from hapticdb.sample import write_sample
+from peers import PeerMissingError
+from peers.batched import batch_peers
+
+Floats = NDArray[np.float64]
+CAR = "demo_vintage_car/vintage_car.glb"
+BITS, EXTENT = 11, 1.6
+"""Grid: bits an axis, and its edge as a multiple of the model's longest side."""
+POINTS = (300, 10_000, 100_000)
+SITUATIONS = ("free", "near", "touching")
+NEAR = 8.0
+"""Voxels: a tool is near if it is no farther away and does not touch."""
+REACH = 32.0
+"""Greatest distance that hapticdb searches, voxels. A farther tool is that far away at least."""
+MOST_POSES = 4096
+"""Poses of each situation."""
+PATH_FRAMES = 400
+"""Poses of the path that a tool slides along, where poses are chosen around it."""
+FIRST_POSES = 4
+"""Poses with which each side begins; the number is doubled until a turn lasts long enough."""
+ROUNDS = 3
+"""Turns of each side. The result is the median of its rates."""
+OWN, OWN_ONE = "hapticdb", "hapticdb, one thread"
+
+Answers = NDArray[Any]
+Side = Callable[[Floats], Answers]
+
+
+class Tool(NamedTuple):
+    """A tool: its shell of points, and its triangles for those that compare triangles."""
+
+    shell: PointShell
+    mesh: tuple[Floats, NDArray[np.int64]]
+
+
+class Settings(NamedTuple):
+    """seconds : the least length of a turn; most_poses : of a situation; points : of the shells."""
+
+    seconds: float
+    most_poses: int = MOST_POSES
+    points: tuple[int, ...] = POINTS
+
+
+def poses_by_situation(
+    env: Environment, shell: PointShell, path: Floats, most: int
+) -> dict[str, Floats]:
+    """Poses of each situation, (B, 4, 4), `most` at most: around a path and all over the scene.
+
+    Each is a pose of the path that was turned and shifted at random, by a voxel or by metres.
+    """
+    rng = np.random.default_rng(0)
+    n_tried = 8 * most
+    poses = path[rng.integers(0, len(path), n_tried)].copy()
+    far = 10.0 ** rng.uniform(0.0, 2.5, n_tried) * env.grid.voxel_size
+    poses[:, :3, 3] += rng.normal(size=(n_tried, 3)) * far[:, None]
+    turns = rng.uniform(-np.pi, np.pi, n_tried)
+    about_z = np.tile(np.eye(4), (n_tried, 1, 1))
+    about_z[:, 0, 0], about_z[:, 1, 1] = np.cos(turns), np.cos(turns)
+    about_z[:, 1, 0], about_z[:, 0, 1] = np.sin(turns), -np.sin(turns)
+    poses = poses @ about_z
+    distances = env.clearance(shell, poses, REACH * env.grid.voxel_size).distances
+    near = NEAR * env.grid.voxel_size
+    chosen = {
+        "free": distances > near,
+        "near": (distances > 0.0) & (distances <= near),
+        "touching": distances == 0.0,
+    }
+    return {name: poses[which][:most] for name, which in chosen.items()}
+
+
+def turn(side: Side, poses: Floats, n_poses: int) -> tuple[float, float, Answers]:
+    """Poses a second of wall time and of processor time, and the answers, of one turn."""
+    part = poses[:n_poses]
+    wall, busy = time.perf_counter(), time.process_time()
+    answers = side(part)
+    busy, wall = time.process_time() - busy, time.perf_counter() - wall
+    return n_poses / wall, n_poses / max(busy, 1e-9), answers
+
+
+def poses_for(side: Side, poses: Floats, seconds: float) -> int:
+    """Number of poses with which a turn lasts about so long; warms the side up."""
+    n_poses = min(FIRST_POSES, len(poses))
+    side(poses[:n_poses])
+    while n_poses < len(poses):
+        rate, _, _ = turn(side, poses, n_poses)
+        if n_poses / rate >= 0.5 * seconds:
+            break
+        n_poses = min(2 * n_poses, len(poses))
+    side(poses[:n_poses])
+    return n_poses
+
+
+def compare(
+    sides: Mapping[str, Side], poses: Floats, seconds: float, agree: Callable[..., float]
+) -> dict[str, Any]:
+    """Rates of all sides, in turns, and how far each agrees with hapticdb."""
+    counts = {name: poses_for(side, poses, seconds) for name, side in sides.items()}
+    rates: dict[str, list[tuple[float, float]]] = {name: [] for name in sides}
+    answers: dict[str, Answers] = {}
+    for _ in range(ROUNDS):
+        for name, side in sides.items():
+            wall, busy, answers[name] = turn(side, poses, counts[name])
+            rates[name].append((wall, busy))
+    cells = {}
+    for name, pairs in rates.items():
+        wall, busy = np.median(np.array(pairs), axis=0).tolist()
+        n_both = min(counts[name], counts[OWN])
+        cells[name] = {
+            "poses": counts[name],
+            "poses_per_s": wall,
+            "poses_per_processor_s": busy,
+            "agree": agree(answers[OWN][:n_both], answers[name][:n_both]),
+        }
+    best = max((c["poses_per_s"] for n, c in cells.items() if n not in {OWN, OWN_ONE}), default=0.0)
+    return {
+        "sides": cells,
+        "times_best_peer": cells[OWN]["poses_per_s"] / best if best else None,
+        "times_best_peer_one_thread": cells[OWN_ONE]["poses_per_s"] / best if best else None,
+    }
+
+
+def measure_tool(
+    env: Environment, tool: Tool, triangles: Floats, path: Floats, settings: Settings
+) -> tuple[list[dict[str, Any]], list[str]]:
+    """Cells of one shell, for each situation and question, and notes of the peers not measured."""
+    size, points = env.grid.voxel_size, tool.shell.points
+    reach = REACH * size
+    peers, notes = [], []
+    for peer in batch_peers(0.5 * size):
+        try:
+            peer.build(triangles, tool.mesh)
+            peers.append(peer)
+        except PeerMissingError as error:
+            notes.append(f"{peer.name}: {error}")
+    cells: list[dict[str, Any]] = []
+    with (
+        env.feeler(tool.shell, law="plane") as all_of,
+        env.feeler(tool.shell, law="plane", jobs=1) as one,
+    ):
+
+        def touched(feeler: Feeler) -> Side:
+            return lambda poses: feeler.touch(poses).hits > 0
+
+        def far(feeler: Feeler) -> Side:
+            return lambda poses: feeler.clearance(poses, reach).distances
+
+        touch: dict[str, Side] = {OWN: touched(all_of), OWN_ONE: touched(one)}
+        distance: dict[str, Side] = {OWN: far(all_of), OWN_ONE: far(one)}
+        for peer in peers:
+            touch[peer.name] = partial(peer.touches, points)
+            distance[peer.name] = partial(peer.distances, points)
+
+        def agree_on_distance(own: Floats, other: Floats) -> float:
+            """Share of poses that differ by less than two voxels' diagonals, within reach."""
+            gap = np.minimum(np.maximum(other, 0.0), reach) - own
+            return float((np.abs(gap) <= 2.0 * np.sqrt(3.0) * size).mean())
+
+        for situation, poses in poses_by_situation(
+            env, tool.shell, path, settings.most_poses
+        ).items():
+            if not len(poses):
+                notes.append(f"no pose is {situation} with {len(points)} points")
+                continue
+            about = {"points": len(points), "situation": situation, "poses": len(poses)}
+            cells.append(
+                about
+                | {"question": "touch"}
+                | compare(touch, poses, settings.seconds, lambda a, b: float((a == b).mean()))
+            )
+            cells.append(
+                about
+                | {"question": "clearance"}
+                | compare(distance, poses, settings.seconds, agree_on_distance)
+            )
+    return cells, notes
+
+
+def measure(folder: Path, model: Path | None, bits: int, settings: Settings) -> dict[str, Any]:
+    """Measure all shells; results as records for JSON."""
+    sample = write_sample(folder)
+    car = model or sample.car
+    options = ImportOptions(grid=GridOptions(bits=bits, extent=EXTENT), distances=False)
+    hapticdb.import_files(folder / "car.db", [car], options)
+    hapticdb.warm_up()
+    load = os.getloadavg()
+    parts = read_file(car).parts
+    triangles = np.concatenate([part.triangles() for part in parts])
+    cells: list[dict[str, Any]] = []
+    notes: list[str] = []
+    with hapticdb.open(folder / "car.db", read_only=True) as env:
+        along = sample.wrench, sample.path
+        if model is not None:
+            along = write_along(folder / "along", folder / "car.db", PATH_FRAMES)
+        path = read_poses(along[1])
+        wrench = trimesh.load_mesh(along[0])
+        mesh = np.asarray(wrench.vertices, np.float64), np.asarray(wrench.faces, np.int64)
+        for n_points in settings.points:
+            shell = PointShell.from_file(along[0], points=n_points)
+            found, missing = measure_tool(env, Tool(shell, mesh), triangles, path, settings)
+            cells += found
+            notes += [note for note in missing if note not in notes]
+        scene = {
+            "model": car.name,
+            "parts": len(parts),
+            "triangles": len(triangles),
+            "tool_triangles": len(mesh[1]),
+            "object_voxels": sum(obj.voxels for obj in env.objects()),
+            "voxel_size": env.grid.voxel_size,
+        }
+    loads = {"load_before": load[0], "load_after": os.getloadavg()[0]}
+    return records.conditions() | loads | {"scene": scene, "cells": cells, "notes": notes}
+
+
+def table(results: Mapping[str, Any]) -> str:
+    """The figures as Markdown."""
+    lines = [
+        "| question | points | tool is | side | poses a second | a processor second | agree |",
+        "| --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for cell in results["cells"]:
+        for name, side in cell["sides"].items():
+            lines.append(
+                f"| {cell['question']} | {cell['points']:,} | {cell['situation']} | {name} | "
+                f"{side['poses_per_s']:,.0f} | {side['poses_per_processor_s']:,.0f} | "
+                f"{100.0 * side['agree']:.1f} % |"
+            )
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Measure, print the figures, and write them to a file."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
+    parser.add_argument("--model", type=Path, help="a car or another model")
+    parser.add_argument("--seconds", type=float, default=2.0, help="of each turn of a side")
+    parser.add_argument("--bits", type=int, default=BITS, help="of the grid on each axis")
+    parser.add_argument("--points", default=",".join(map(str, POINTS)), help="of the shells")
+    parser.add_argument("--out", type=Path, default=Path("results/batches.json"))
+    given = parser.parse_args()
+    found = Path(os.environ.get("HAPTICDB_TEST_DATA", "")) / CAR
+    model = given.model or (found if found.is_file() else None)
+    settings = Settings(given.seconds, points=tuple(int(n) for n in given.points.split(",")))
+    with tempfile.TemporaryDirectory(prefix="hapticdb-batches-") as folder:
+        results = measure(Path(folder), model, given.bits, settings)
+    print(table(results))
+    print(*results["notes"], sep="\n")
+    given.out.write_text(json.dumps(results, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,280 @@
+"""Feeler: a tool whose cells stay in memory, asked at batches of poses."""
+
+from collections.abc import Callable, Iterator
+from typing import Self, TypeVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.batches.nearest import DEFAULT_REACH, NearestSearch
+from hapticdb.batches.order import order_of
+from hapticdb.batches.result import ClearanceBatch, Named, TouchBatch
+from hapticdb.batches.threads import BatchThreads, ThreadMemory, available_jobs
+from hapticdb.errors import ConnectionLostError, UsageError
+from hapticdb.kernels.law import reads_distances
+from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS, WRENCH
+from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.figures import QueryFigures
+from hapticdb.query.frame import HapticQuery, as_poses
+from hapticdb.query.grouping import DEFAULT_MAXGAP
+from hapticdb.query.law import ForceLaw
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
+from hapticdb.store.base import Store
+from hapticdb.store.filtering import Filter
+
+PIECE_CHUNKS = 32
+"""Chunks of poses, for each thread, in a piece: cells are fetched between pieces, and `progress` is
+called. A larger value takes more memory and fetches more cells by one statement."""
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+PoseCallback = Callable[[int, int], None]
+"""Called after each piece with the poses done and their total."""
+_Answer = TypeVar("_Answer")
+
+
+class Feeler:
+    """A tool in an environment, with the cells around it in memory, for batches of poses.
+
+    `Environment.feeler` makes one. It uses the environment's connection, so only the thread that
+    opened the environment may use it. It is also a context manager. Its cells stay in memory
+    between calls. Each call reads one committed revision, the newest.
+
+    Attributes
+    ----------
+    shell : PointShell
+        The tool.
+    law : ForceLaw
+        Law of every touch.
+    """
+
+    def __init__(
+        self,
+        store: Store,
+        shell: PointShell,
+        felt: Filter,
+        law: ForceLaw,
+        budget_bytes: int | None = None,
+        jobs: int | None = None,
+    ) -> None:
+        n_jobs = available_jobs(jobs)
+        self.shell = shell
+        self.law = law
+        self._store = store
+        self._felt = felt
+        self._is_torn = False
+        self._is_closed = False
+        self._checked_revision: int | None = None
+        self._query = HapticQuery(store, QueryFigures(store).both)
+        has_distances = reads_distances(law.for_kernels)
+        budget = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
+        self._table = CellTable.create(budget, distances=has_distances)
+        try:
+            self._residency = Residency(store, self._table, felt.exclude, where=felt.where)
+            self._frames = ResidentFrames(self._residency, shell, law)
+            self._threads = BatchThreads(self._frames, n_jobs)
+        except BaseException:
+            self._table.close()
+            raise
+        self._piece = PIECE_CHUNKS * n_jobs * self._threads.chunk
+
+    def __repr__(self) -> str:
+        return (
+            f"Feeler({self._store.url!r}, {len(self.shell)} points, {self._threads.jobs} threads, "
+            f"{self.n_loaded} cells read)"
+        )
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the threads and free the memory; the environment stays open."""
+        if self._is_closed:
+            return
+        self._is_closed = True
+        self._threads.close()
+        self._frames.close()
+        self._table.close()
+
+    @property
+    def n_loaded(self) -> int:
+        """Number of cells that were read from the database so far, repeated ones included."""
+        return self._residency.n_loaded
+
+    @property
+    def size_bytes(self) -> int:
+        """Size of the memory for cells, bytes: never more than the budget."""
+        return self._table.size_bytes
+
+    def touch(
+        self, poses: ArrayLike, *, objects: bool = False, progress: PoseCallback | None = None
+    ) -> TouchBatch:
+        """Force and torque at many poses; bit for bit those of `Environment.touch` at each pose.
+
+        Parameters
+        ----------
+        poses : (B, 4, 4) array
+            world_from_tool, rigid, metres, in any order. An array in a file that is mapped into
+            memory is read piece by piece.
+        objects : bool
+            Whether to name the objects that each pose touches. They are looked up in the database
+            for each pose in contact, which takes many times as long as the force.
+        progress : callable or None
+            Called after each piece with the poses done and their total.
+
+        Raises
+        ------
+        UsageError
+            If the poses have another shape, one is not rigid, or the cells that one pose needs do
+            not fit into the budget.
+        ObjectNotFoundError
+            If a word of `where` or `exclude` chooses no object.
+        """
+        places = as_poses(poses)
+        order = order_of(places, self.shell.center, self._residency.grid)
+        return self._at_one_revision(lambda: self._touch(places, order, objects, progress))
+
+    def clearance(
+        self,
+        poses: ArrayLike,
+        reach: float | None = None,
+        *,
+        progress: PoseCallback | None = None,
+    ) -> ClearanceBatch:
+        """Distance from the shell's points to the nearest occupied voxel at many poses.
+
+        Parameters
+        ----------
+        poses : (B, 4, 4) array
+            As for `touch`.
+        reach : float or None
+            Greatest distance that is searched, metres; 32 voxels unless given.
+        progress : callable or None
+            As for `touch`.
+
+        Raises
+        ------
+        UsageError, ObjectNotFoundError
+            As for `touch`; also if the reach is not a positive number, or needs too many cells.
+        """
+        size = self._residency.grid.voxel_size
+        limit = DEFAULT_REACH * size if reach is None else reach
+        if not (np.isfinite(limit) and limit > 0.0):
+            raise UsageError(f"clearance up to {limit} m: give a finite length above 0")
+        places = as_poses(poses)
+        order = order_of(places, self.shell.center, self._residency.grid)
+        search = NearestSearch(self._frames, self._threads, limit / size)
+
+        def searched() -> ClearanceBatch:
+            found = ClearanceBatch(len(places), float(limit), self.shell.cover)
+            found.revision = self._residency.revision
+            for chosen in self._pieces(order, progress):
+                voxels, points = search.search(places[chosen])
+                found.distances[chosen] = np.where(points < 0, limit, voxels * size)
+                found.points[chosen] = points
+            return found
+
+        return self._at_one_revision(searched)
+
+    def _at_one_revision(self, work: Callable[[], _Answer]) -> _Answer:
+        """Result of `work` in a snapshot of the newest revision; once more after a lost one."""
+        try:
+            return self._in_snapshot(work)
+        except ConnectionLostError:
+            return self._in_snapshot(work)
+
+    def _in_snapshot(self, work: Callable[[], _Answer]) -> _Answer:
+        if self._is_closed:
+            raise UsageError("this feeler is closed: make another by env.feeler")
+        if self._is_torn:  # an error or Ctrl-C came while cells were read
+            self._residency.reopened(self._store)
+        self._is_torn = True
+        with self._store.snapshot():
+            self._residency.refresh()
+            self._check_words()
+            answer = work()
+        self._is_torn = False
+        return answer
+
+    def _check_words(self) -> None:
+        """Refuse words that choose no object of the revision."""
+        if self._felt.is_empty or self._checked_revision == self._residency.revision:
+            return
+        for error in self._felt.left_out(self._store.objects(), self._store.url).missing:
+            raise error
+        self._checked_revision = self._residency.revision
+
+    def _pieces(self, order: Ints, progress: PoseCallback | None) -> Iterator[Ints]:
+        """Indices of the poses of each piece, in the order of computation."""
+        for start in range(0, len(order), self._piece):
+            yield order[start : start + self._piece]
+            if progress is not None:
+                progress(min(start + self._piece, len(order)), len(order))
+
+    def _touch(
+        self,
+        places: Floats,
+        order: Ints,
+        objects: bool,  # noqa: FBT001 - private
+        progress: PoseCallback | None,
+    ) -> TouchBatch:
+        felt = TouchBatch(len(places), self.law)
+        felt.revision = self._residency.revision
+        ids: list[list[int]] = [[] for _ in places] if objects else []
+        for chosen in self._pieces(order, progress):
+            poses = places[chosen]
+            out = self._feel(poses)
+            felt.forces[chosen] = out[:, WRENCH : WRENCH + 3]
+            felt.torques[chosen] = out[:, WRENCH + 3 : WRENCH + 6]
+            felt.hits[chosen], felt.n_contacts[chosen] = out[:, HITS], out[:, CONTACTS]
+            felt.deepest[chosen] = out[:, DEEPEST]
+            if objects:
+                is_felt = (out[:, HITS] > 0) | (out[:, CONTACTS] > 0)
+                for n, found in zip(
+                    chosen[is_felt].tolist(), self._ids_at(poses[is_felt]), strict=True
+                ):
+                    ids[n] = found
+        if objects:
+            offsets = np.cumsum([0, *map(len, ids)])
+            flat = np.array([one for found in ids for one in found], dtype=np.int64)
+            felt.named = Named(offsets, flat, {obj.id: obj for obj in self._store.objects()})
+        return felt
+
+    def _feel(self, poses: Floats) -> Floats:
+        """Results (B, RESULTS) of frames at poses; first where all cells are in memory."""
+        out = np.zeros((len(poses), RESULTS))
+        self._run(poses, out)
+        pending = np.flatnonzero(out[:, UNKNOWNS] > 0.0)
+        while len(pending):
+            n_poses = self._frames.fetch(poses[pending])
+            now, pending = pending[:n_poses], pending[n_poses:]
+            felt = np.zeros((n_poses, RESULTS))
+            self._run(poses[now], felt)
+            out[now] = felt
+        return out
+
+    def _run(self, poses: Floats, out: Floats) -> None:
+        """Frames at poses into out (B, RESULTS), in all threads."""
+        cells, place, law = self._frames.cells, self._residency.place, self._frames.law
+
+        def work(memory: ThreadMemory, one: slice) -> None:
+            feel_kernel(
+                cells, memory.row, memory.clusters, poses[one], place, law, memory.met,
+                memory.missed, out[one],
+            )  # fmt: skip
+
+        self._threads.run(work, len(poses))
+
+    def _ids_at(self, poses: Floats) -> Iterator[list[int]]:
+        """Ids of the objects at each of poses, as a touch names them."""
+        exclude = self._residency.exclude
+        for answer in self._query.run_many(
+            self.shell, poses, "auto", DEFAULT_MAXGAP, exclude, self.law
+        ):
+            yield answer.ids

@@ -1,0 +1,96 @@
+"""Distances at many poses: kernels search resident cells, and name those that they miss."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.batches.threads import BatchThreads, ThreadMemory
+from hapticdb.errors import UsageError
+from hapticdb.kernels.resident import clearance
+from hapticdb.kernels.resident import nearest as kernels
+from hapticdb.kernels.resident.cells import UNKNOWN
+from hapticdb.resident.frames import ResidentFrames
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+DEFAULT_REACH = 32
+"""Distance that is searched unless another is given, voxels. Larger: more cells are fetched."""
+CELL = 32
+"""Voxels of a cell on each axis."""
+
+
+class NearestSearch:
+    """Searches the voxels nearest to a shell, within a reach.
+
+    Parameters
+    ----------
+    frames : ResidentFrames
+        Frames of the shell; cells around its points are fetched into their table.
+    threads : BatchThreads
+        Threads of the same frames.
+    reach : float
+        Voxels; greater distances are not searched.
+
+    Raises
+    ------
+    UsageError
+        If the cells within reach of one point are more than the table can hold.
+    """
+
+    def __init__(self, frames: ResidentFrames, threads: BatchThreads, reach: float) -> None:
+        self._frames = frames
+        self._threads = threads
+        self._reach = reach
+        self._cells = frames.residency.table.cells.without_distances()
+        self._around = reach + 1.0 + frames.surroundings.reach
+        self._most = (frames.residency.table.n_slots - 1) // 2
+        across = 2.0 * self._around / CELL
+        if across > self._most or (int(across) + 2) ** 3 > self._most:
+            raise UsageError(
+                f"clearance up to {reach * frames.residency.grid.voxel_size:.4g} m needs more "
+                "cells around a point than fit into "
+                f"{frames.residency.table.size_bytes} bytes: give less, or a larger budget"
+            )
+
+    def search(self, poses: Floats) -> tuple[Floats, Ints]:
+        """Distances (B,) in voxels and nearest points (B,), -1 for none, at rigid poses (B, 4, 4).
+
+        A pose that lacks a cell goes on after the cells around its points have been fetched.
+        """
+        n_poses, n_points = len(poses), len(self._frames.shell)
+        squares = np.full(n_poses, self._reach**2)
+        nearest = np.full(n_poses, -1, dtype=np.int64)
+        done = np.zeros(n_poses, dtype=np.int64)
+        pending = np.arange(n_poses)
+        while len(pending):
+            part = poses[pending]
+            found = squares[pending], nearest[pending], done[pending]
+            self._run(part, *found)
+            squares[pending], nearest[pending], done[pending] = found
+            is_left = found[2] < n_points
+            pending = pending[is_left]
+            if len(pending):
+                self._fetch(part[is_left], int(done[pending[0]]))
+        return np.sqrt(squares), nearest
+
+    def _run(self, poses: Floats, squares: Floats, nearest: Ints, done: Ints) -> None:
+        place = self._frames.residency.place
+        largest = self._frames.surroundings.reach * place.size
+
+        def work(memory: ThreadMemory, one: slice) -> None:
+            kernels.find_nearest(
+                self._cells, memory.row, memory.clusters, poses[one], place, largest,
+                squares[one], nearest[one], done[one],
+            )  # fmt: skip
+
+        self._threads.run(work, len(poses))
+
+    def _fetch(self, poses: Floats, point: int) -> None:
+        """Fetch the cells within reach of the shell, from a point at the first of poses on."""
+        residency, around = self._frames.residency, self._frames.surroundings
+        found = np.full(1 << (2 * self._most).bit_length(), UNKNOWN, dtype=np.int64)
+        clearance.cells_near(
+            around.places, poses, residency.place, around.place_of(point), 1,
+            self._around * residency.grid.voxel_size, found, self._most,
+        )  # fmt: skip
+        residency.make_resident(np.sort(found[found >= 0]))

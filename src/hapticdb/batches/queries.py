@@ -1,0 +1,219 @@
+"""What an opened environment is asked about a tool: at one pose, or at many."""
+
+from typing import TYPE_CHECKING, overload
+
+from numpy.typing import ArrayLike
+
+from hapticdb.errors import UsageError
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.figures import QueryFigures
+from hapticdb.query.frame import Strategy
+from hapticdb.query.grouping import DEFAULT_MAXGAP
+from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law
+from hapticdb.query.touches import Touch, Touches
+from hapticdb.query.touching import Touching
+from hapticdb.store.base import Store
+from hapticdb.store.filtering import FiltersOfWords
+from hapticdb.store.finding import Words
+
+if TYPE_CHECKING:
+    from hapticdb.batches.feeler import Feeler, PoseCallback
+    from hapticdb.batches.result import ClearanceBatch, TouchBatch
+
+
+class Queries:
+    """The haptic queries of `hapticdb.environment.Environment`, which is one of these."""
+
+    def __init__(self, store: Store, figures: QueryFigures) -> None:
+        self._store = store
+        self._touching = Touching(store, figures)
+        self._filters = FiltersOfWords()
+
+    @overload
+    def touch(
+        self,
+        shell: PointShell,
+        pose: ArrayLike,
+        strategy: Strategy = "auto",
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        maxgap: int = DEFAULT_MAXGAP,
+        law: ForceLaw | LawName | None = None,
+    ) -> Touch: ...
+
+    @overload
+    def touch(
+        self,
+        shell: PointShell,
+        *,
+        poses: ArrayLike,
+        where: Words = (),
+        exclude: Words = (),
+        law: ForceLaw | LawName | None = None,
+        objects: bool = False,
+        progress: "PoseCallback | None" = None,
+    ) -> "TouchBatch": ...
+
+    def touch(
+        self,
+        shell: PointShell,
+        pose: ArrayLike | None = None,
+        strategy: Strategy = "auto",
+        *,
+        poses: ArrayLike | None = None,
+        where: Words = (),
+        exclude: Words = (),
+        maxgap: int = DEFAULT_MAXGAP,
+        law: ForceLaw | LawName | None = None,
+        objects: bool = False,
+        progress: "PoseCallback | None" = None,
+    ) -> "Touch | TouchBatch":
+        """Force and torque that the environment exerts on the tool at one pose, or at many.
+
+        Parameters
+        ----------
+        shell : PointShell
+            Points in metres and inward unit normals, tool frame.
+        pose : (4, 4) array
+            world_from_tool, rigid, metres. A `Touch` is returned.
+        poses : (B, 4, 4) array
+            Many of them instead, for a `TouchBatch`, the same bit for bit. All processors compute,
+            on cells in memory; `feeler` keeps these, and sets the memory and the threads.
+        objects, progress : for many poses, as for `Feeler.touch`
+        strategy : str
+            For one pose, form of the query: ``statement``, ``array``, ``points``, ``maxgap``,
+            ``cbgroup``, or ``auto``: ``cbgroup`` for a frame with many keys in few ranges, else
+            ``array``. All strategies find the same hits, ids and wrench, bit for bit.
+        where, exclude : iterable of int or str
+            Felt are the objects that `where` chooses, all if it is empty, without those of
+            `exclude`: a part that is taken out must not hit itself. Ids, names, patterns and
+            ``attribute=value``, as for `find`; read again whenever others have written.
+        maxgap : int
+            For the strategy ``maxgap``: greatest distance, in keys, of neighbours in one range.
+        law : TangentPlane, DistanceField, "plane", "smooth" or None
+            By default ``smooth`` (`DistanceField`) where `has_distances`, else ``plane``, with 1000
+            N/m. The strategy ``statement`` computes ``plane`` alone.
+
+        Raises
+        ------
+        UsageError
+            If a pose is not rigid, the strategy unknown, or objects lack what the law reads.
+        ObjectNotFoundError
+            If a word of `where` or `exclude` chooses no object.
+
+        Notes
+        -----
+        Points outside the grid miss. All statements of a touch read one committed revision.
+        """
+        if (pose is None) == (poses is None):
+            raise UsageError("touch: give either one pose, or poses=...")
+        if pose is not None:
+            felt = self._filters.of(where, exclude)
+            return self._touching.touch(shell, pose, strategy, maxgap, felt, as_law(law))
+        if strategy != "auto":
+            raise UsageError(f"strategy {strategy!r} for many poses: leave it out, or touch_many")
+        with self.feeler(shell, where=where, exclude=exclude, law=law) as feeler:
+            return feeler.touch(poses, objects=objects, progress=progress)  # type: ignore[arg-type]
+
+    def touch_many(
+        self,
+        shell: PointShell,
+        poses: ArrayLike,
+        strategy: Strategy = "auto",
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        maxgap: int = DEFAULT_MAXGAP,
+        law: ForceLaw | LawName | None = None,
+        contacts: bool = False,
+    ) -> Touches:
+        """Force and torque at many poses; the same as `touch` for each pose, bit for bit.
+
+        Parameters
+        ----------
+        poses : (n, 4, 4) array
+            world_from_tool for each frame, rigid, metres.
+        strategy : str
+            ``auto`` reads the rows of neighbouring poses in one statement; any other strategy
+            queries pose by pose, as `touch` does.
+        contacts : bool
+            Whether to list every contact, too.
+        shell, where, exclude, maxgap, law
+            As for `touch`.
+
+        Raises
+        ------
+        UsageError, ObjectNotFoundError
+            As for `touch`; nothing is returned then.
+        """
+        felt = self._filters.of(where, exclude)
+        return self._touching.touch_many(
+            shell, poses, strategy, maxgap, felt, as_law(law), contacts=contacts
+        )
+
+    def clearance(
+        self,
+        shell: PointShell,
+        poses: ArrayLike,
+        reach: float | None = None,
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        progress: "PoseCallback | None" = None,
+    ) -> "ClearanceBatch":
+        """Distance from the shell's points to the nearest occupied voxel at many poses.
+
+        Parameters
+        ----------
+        poses : (B, 4, 4) array
+            world_from_tool, rigid, metres, in any order.
+        reach : float or None
+            Greatest distance that is searched, metres; 32 voxels unless given.
+        shell, where, exclude
+            As for `touch`.
+        progress
+            As for `Feeler.clearance`.
+
+        Raises
+        ------
+        UsageError
+            If a pose is not rigid, the reach not positive, or the memory too small for it.
+        ObjectNotFoundError
+            As for `touch`.
+        """
+        with self.feeler(shell, where=where, exclude=exclude, law=PLANE) as feeler:
+            return feeler.clearance(poses, reach, progress=progress)
+
+    def feeler(
+        self,
+        shell: PointShell,
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        law: ForceLaw | LawName | None = None,
+        budget_bytes: int | None = None,
+        jobs: int | None = None,
+    ) -> "Feeler":
+        """Make a tool that keeps cells in memory from one batch of poses to the next.
+
+        Parameters
+        ----------
+        shell, where, exclude, law
+            As for `touch`. The law stays the one that fits the objects now.
+        budget_bytes : int or None
+            Memory for cells, never exceeded; 256 MiB unless given.
+        jobs : int or None
+            Threads; one for each processor unless given.
+
+        Raises
+        ------
+        UsageError
+            If the environment is in lexicographic order, which has no cells; if the budget is too
+            small, or larger than this machine's memory; if objects lack what the law reads.
+        """
+        from hapticdb.batches.feeler import Feeler  # noqa: PLC0415 - loads numba
+
+        felt = self._filters.of(where, exclude)
+        chosen = self._touching.law_now(as_law(law))
+        return Feeler(self._store, shell, felt, chosen, budget_bytes, jobs)

@@ -1,0 +1,150 @@
+"""Results of batches: an entry for each pose, in the order in which the poses were given."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.query.law import ForceLaw
+from hapticdb.store.base import Object
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+
+class Named(NamedTuple):
+    """Objects that the poses of a batch touch.
+
+    offsets (B + 1,) int64; ids (P,) int64: those of pose n are ids[offsets[n]:offsets[n + 1]],
+    ascending; known : the environment's objects by id, at the batch's revision.
+    """
+
+    offsets: Ints
+    ids: Ints
+    known: Mapping[int, Object]
+
+
+class TouchBatch:
+    """What a tool felt at B poses, all of them at one committed revision.
+
+    Attributes
+    ----------
+    forces : (B, 3) float64
+        N, world frame, on the tool.
+    torques : (B, 3) float64
+        N m about the tool's centre of mass, world frame.
+    hits, n_contacts : (B,) int64
+        Number of the shell's points inside a voxel, and number of the points that the law feels.
+        Under `DistanceField` a contact need not be a hit.
+    deepest : (B,) float64
+        Depth of the deepest contact in metres, 0 without contacts.
+    law : ForceLaw
+        The force law that was felt.
+    revision : int
+        Revision of the environment that was felt.
+    """
+
+    def __init__(self, n_poses: int, law: ForceLaw) -> None:
+        self.forces: Floats = np.zeros((n_poses, 3))
+        self.torques: Floats = np.zeros((n_poses, 3))
+        self.hits: Ints = np.zeros(n_poses, dtype=np.int64)
+        self.n_contacts: Ints = np.zeros(n_poses, dtype=np.int64)
+        self.deepest: Floats = np.zeros(n_poses)
+        self.law = law
+        self.revision = 0
+        self.named: Named | None = None
+
+    def __len__(self) -> int:
+        return len(self.forces)
+
+    def __repr__(self) -> str:
+        return (
+            f"TouchBatch({len(self)} poses, {np.count_nonzero(self.hits)} hit, "
+            f"{np.count_nonzero(self.n_contacts)} in contact, revision {self.revision})"
+        )
+
+    @property
+    def offsets(self) -> Ints:
+        """Where each pose's ids begin in `ids`, and the end of the last ones, (B + 1,)."""
+        return self._named().offsets
+
+    @property
+    def ids(self) -> Ints:
+        """Ids (P,) of the objects that each pose touches, pose after pose, ascending for each.
+
+        They are those of the pose's hits and, under `DistanceField`, those that contacts touch.
+
+        Raises
+        ------
+        UsageError
+            If objects were not asked for.
+        """
+        return self._named().ids
+
+    def ids_at(self, pose: int) -> list[int]:
+        """Ids of the objects that one pose touches, ascending."""
+        named = self._named()
+        pose = range(len(self))[pose]  # raises IndexError; a negative one counts from the end
+        found: list[int] = named.ids[named.offsets[pose] : named.offsets[pose + 1]].tolist()
+        return found
+
+    @property
+    def objects(self) -> list[Object]:
+        """Objects that any of the poses touches, ordered by id."""
+        named = self._named()
+        return [named.known[i] for i in np.unique(named.ids).tolist()]
+
+    def _named(self) -> Named:
+        if self.named is None:
+            raise UsageError("this batch was felt without objects: ask for it with objects=True")
+        return self.named
+
+
+class ClearanceBatch:
+    """Distances of a tool's points from the environment at B poses, at one committed revision.
+
+    Attributes
+    ----------
+    distances : (B,) float64
+        Metres from the nearest of the shell's points to the nearest occupied voxel's box: 0 for a
+        pose with a hit, `reach` where nothing is nearer. No surface of the environment is nearer to
+        a point, because each lies in occupied voxels.
+    points : (B,) int64
+        Index of a nearest point, -1 where nothing is within reach.
+    reach : float
+        Greatest distance that was searched, metres.
+    cover : float or None
+        Covering radius of the shell, metres, if it is known: no place of the tool's surface is
+        farther from the nearest point.
+    revision : int
+        Revision of the environment that was searched.
+    """
+
+    def __init__(self, n_poses: int, reach: float, cover: float | None) -> None:
+        self.distances: Floats = np.full(n_poses, reach)
+        self.points: Ints = np.full(n_poses, -1, dtype=np.int64)
+        self.reach = reach
+        self.cover = cover
+        self.revision = 0
+
+    def __len__(self) -> int:
+        return len(self.distances)
+
+    def __repr__(self) -> str:
+        least = f"least {self.distances.min():.4g} m, " if len(self) else ""
+        return (
+            f"ClearanceBatch({len(self)} poses, {np.count_nonzero(self.is_beyond)} with nothing "
+            f"within {self.reach:.4g} m, {least}revision {self.revision})"
+        )
+
+    @property
+    def is_beyond(self) -> NDArray[np.bool_]:
+        """Whether nothing is within reach of each pose, (B,)."""
+        return np.asarray(self.points < 0)
+
+    @property
+    def at_least(self) -> Floats | None:
+        """Distance that the tool's surface has at least, metres, (B,); None without `cover`."""
+        return None if self.cover is None else np.maximum(self.distances - self.cover, 0.0)

@@ -1,0 +1,121 @@
+"""Threads that share the poses of a batch: each reads the same cells, with memory of its own."""
+
+import os
+import queue
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.records import MOST_MISSED
+from hapticdb.kernels.resident.cells import Clusters
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.table import MOST_READERS
+
+CHUNK_POINTS = 1 << 18
+"""Points placed by one call of a kernel, but at least one pose. A larger value makes fewer calls;
+Ctrl-C then waits longer."""
+CHUNK_POSES = 1024
+"""Most poses of one call of a kernel. A larger value makes fewer calls, which share less evenly."""
+MOST_JOBS = MOST_READERS - 2
+"""Most threads: each is a reader of the table, beside the shell's own and one more."""
+
+
+class ThreadMemory(NamedTuple):
+    """What a kernel that runs in a thread writes to: its row of the table, and its scratch."""
+
+    row: int
+    clusters: Clusters
+    met: NDArray[np.int64]
+    missed: NDArray[np.int64]
+
+
+ChunkWork = Callable[[ThreadMemory, slice], None]
+"""Computes the poses of a slice; runs in a thread, and spends its time in a kernel."""
+
+
+def available_jobs(jobs: int | None) -> int:
+    """Number of threads: as given, or one for each processor that this process may use.
+
+    Raises
+    ------
+    UsageError
+        If it is less than 1, or more than `MOST_JOBS`.
+    """
+    if jobs is None:
+        able = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        return min(able or 1, MOST_JOBS)
+    if not 1 <= jobs <= MOST_JOBS:
+        raise UsageError(f"{jobs} jobs: give 1 to {MOST_JOBS} threads")
+    return jobs
+
+
+class BatchThreads:
+    """Runs kernels on slices of a batch, in as many threads as there are jobs.
+
+    Parameters
+    ----------
+    frames : ResidentFrames
+        Frames of the shell; its table is joined once for each thread.
+    jobs : int
+        Threads.
+    """
+
+    def __init__(self, frames: ResidentFrames, jobs: int) -> None:
+        self.jobs = jobs
+        self._table = frames.residency.table
+        self._rows: list[int] = []
+        self._free: queue.SimpleQueue[ThreadMemory] = queue.SimpleQueue()
+        self._pool = ThreadPoolExecutor(jobs, thread_name_prefix="batch")
+        self.chunk = max(1, min(CHUNK_POSES, CHUNK_POINTS // len(frames.shell)))
+        try:
+            for _ in range(jobs):
+                self._rows.append(self._table.join())
+                self._free.put(
+                    ThreadMemory(
+                        self._rows[-1],
+                        frames.clusters._replace(scratch=np.empty_like(frames.clusters.scratch)),
+                        np.empty(len(frames.shell), dtype=np.int64),
+                        np.zeros(1 + MOST_MISSED, dtype=np.int64),
+                    )
+                )
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """End the threads, and free their rows of the table."""
+        self._pool.shutdown()
+        for row in self._rows:
+            self._table.leave(row)
+        self._rows = []
+
+    def run(self, work: ChunkWork, n_poses: int) -> None:
+        """Run `work` on slices that cover all poses, and return when all are done.
+
+        After an error, or Ctrl-C, no further slice is begun, and the running ones end first.
+        """
+        slices = [slice(at, at + self.chunk) for at in range(0, n_poses, self.chunk)]
+        if self.jobs == 1 or len(slices) == 1:
+            for one in slices:
+                self._do(work, one)
+            return
+        running = [self._pool.submit(self._do, work, one) for one in slices]
+        try:
+            for done in running:
+                done.result()
+        except BaseException:
+            for one_more in running:
+                one_more.cancel()
+            wait(running)
+            raise
+
+    def _do(self, work: ChunkWork, one: slice) -> None:
+        memory = self._free.get()
+        try:
+            work(memory, one)
+        finally:
+            self._free.put(memory)

@@ -1,0 +1,120 @@
+"""Clearances of a batch against brute force over all points and all voxels."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from hapticdb import Environment, PointShell, UsageError
+from hapticdb.batches import threads
+from hapticdb.resident.table import LEAST_BUDGET
+from hapticdb.testing import write_voxels
+from realtime.worlds import HIERARCHICAL, SIZE, block, cloud, ids_by_voxel, make, poses_in, scatter
+
+Floats = NDArray[np.float64]
+ROUNDING = 1e-9
+"""Voxels by which two computations of a distance may differ."""
+
+
+def distances_by_hand(
+    env: Environment, shell: PointShell, poses: Floats, exclude: list[int]
+) -> Floats:
+    """Least distance (B, N) of each placed point to any voxel's closed box, voxels."""
+    voxels = np.array(
+        [ijk for ijk, ids in ids_by_voxel(env).items() if not set(ids) <= set(exclude)]
+    )
+    least = []
+    for pose in poses:
+        points = env.grid.to_voxel_units(shell.points @ pose[:3, :3].T + pose[:3, 3])[:, None]
+        gaps = np.maximum(np.maximum(voxels - points, points - voxels - 1.0), 0.0)
+        least.append(np.sqrt((gaps**2).sum(axis=2).min(axis=1)))
+    return np.array(least)
+
+
+def assert_is_right(
+    env: Environment, shell: PointShell, poses: Floats, reach: float, exclude: list[int]
+) -> None:
+    found = env.clearance(shell, poses, reach * SIZE, exclude=exclude)
+    by_hand = distances_by_hand(env, shell, poses, exclude)
+    expected = np.minimum(by_hand.min(axis=1), reach)
+    assert np.abs(found.distances / SIZE - expected).max() < ROUNDING
+    assert (found.distances <= found.reach).all()
+    assert found.is_beyond.tolist() == (found.distances == found.reach).tolist()
+    near = ~found.is_beyond
+    at_point = by_hand[near, found.points[near]]
+    assert np.abs(at_point - expected[near]).max(initial=0.0) < ROUNDING
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.7, 5.0, 40.0]))
+@settings(max_examples=10)
+def test_clearance_is_that_of_brute_force(
+    tmp_path_factory: pytest.TempPathFactory, seed: int, reach: float
+) -> None:
+    """In each layout and curve, in and outside the grid, for tools of any size."""
+    rng = np.random.default_rng(seed)
+    layout, curve = HIERARCHICAL[seed % 4]
+    with make(tmp_path_factory.mktemp("near"), 6, layout, curve) as env:
+        scatter(env, n_voxels=int(rng.integers(5, 200)), seed=seed)
+        shell = cloud(int(rng.integers(1, 300)), seed, float(rng.choice([0.002, 0.01, 0.03])))
+        for exclude in ([], [2]):
+            assert_is_right(env, shell, poses_in(env.grid, 12, seed), reach, exclude)
+
+
+def test_many_threads_and_little_memory_find_the_same_distances(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The cells within reach of all poses do not fit into the table together."""
+    monkeypatch.setattr(threads, "CHUNK_POSES", 3)
+    with make(tmp_path, 8) as env:
+        ijk = np.unique(np.random.default_rng(0).integers(0, 256, (3000, 3)), axis=0)
+        write_voxels(env.store, ijk)
+        shell, poses = cloud(90, extent=0.02), poses_in(env.grid, 40, beyond=0.05)
+        expected = np.minimum(distances_by_hand(env, shell, poses, []).min(axis=1), 16.0)
+        for jobs in (1, 4):
+            told: list[tuple[int, int]] = []
+            with env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=jobs, law="plane") as feeler:
+                found = feeler.clearance(
+                    poses, 16.0 * SIZE, progress=lambda *done, told=told: told.append(done)
+                )
+                assert feeler.n_loaded > 200
+            assert np.abs(found.distances / SIZE - expected).max() < ROUNDING
+            assert told[-1] == (40, 40)
+
+
+def test_the_clearance_of_a_point_above_a_floor_is_its_height(tmp_path: Path) -> None:
+    with make(tmp_path, 7) as env:
+        write_voxels(env.store, block((0, 0, 0), (127, 127, 63)), "floor")  # its top is z = 0
+        shell = PointShell(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros(3), cover=0.001)
+        heights = np.array([0.05, 0.0003, -0.001, 0.02, 0.041, 0.0])
+        poses = np.tile(np.eye(4), (6, 1, 1))
+        poses[:, 2, 3] = heights
+        found = env.clearance(shell, poses, 0.04)
+        assert np.allclose(found.distances, np.clip(heights, 0.0, 0.04), rtol=0.0, atol=1e-12)
+        assert found.points.tolist() == [-1, 0, 0, 0, -1, 0]
+        assert found.at_least is not None
+        assert np.allclose(found.at_least, np.clip(heights - 0.001, 0.0, 0.039), atol=1e-12)
+        assert env.clearance(cloud(3), poses).at_least is None
+
+
+def test_nothing_is_within_reach_of_an_empty_environment(tmp_path: Path) -> None:
+    with make(tmp_path, 6) as env:
+        found = env.clearance(cloud(50), poses_in(env.grid, 5))
+        assert found.is_beyond.all()
+        assert found.distances.tolist() == [32 * SIZE] * 5
+
+
+def test_a_reach_that_is_none_is_refused(tmp_path: Path) -> None:
+    with make(tmp_path, 10) as env:
+        scatter(env)
+        poses = poses_in(env.grid, 2)
+        for reach in (0.0, -1.0, np.nan, np.inf):
+            with pytest.raises(UsageError, match="finite length above 0"):
+                env.clearance(cloud(5), poses, reach)
+        with (
+            env.feeler(cloud(5), budget_bytes=LEAST_BUDGET) as feeler,
+            pytest.raises(UsageError, match="more cells around a point"),
+        ):
+            feeler.clearance(poses, 400 * SIZE)

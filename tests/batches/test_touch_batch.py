@@ -1,0 +1,190 @@
+"""A batch equals the single touches of its poses, bit for bit, whatever fits into memory."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from banded import write_points
+from hapticdb import Environment, Grid, ObjectNotFoundError, PointShell, UsageError
+from hapticdb import create as create_environment
+from hapticdb.batches import threads
+from hapticdb.batches.result import TouchBatch
+from hapticdb.resident.table import LEAST_BUDGET
+from hapticdb.testing import write_voxels
+from realtime.worlds import HIERARCHICAL, block, cloud, make, poses_in, scatter
+
+Floats = NDArray[np.float64]
+
+
+def assert_equals_touches(
+    felt: TouchBatch, env: Environment, shell: PointShell, poses: Floats, exclude: list[int]
+) -> None:
+    """Each pose's wrench, counts and objects are those of `Environment.touch`."""
+    for n, pose in enumerate(poses):
+        touch = env.touch(shell, pose, exclude=exclude)
+        assert (felt.forces[n] + 0.0).tobytes() == (touch.force + 0.0).tobytes()
+        assert (felt.torques[n] + 0.0).tobytes() == (touch.torque + 0.0).tobytes()
+        assert felt.hits[n] == len(touch.hits)
+        assert felt.n_contacts[n] == len(touch.contacts)
+        assert felt.deepest[n] == touch.contact_depths.max(initial=0.0)
+        assert felt.ids_at(n) == [obj.id for obj in touch.objects]
+
+
+@given(st.integers(0, 10_000))
+@settings(max_examples=6)
+def test_a_batch_equals_single_touches(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
+    """In each layout and curve, in and outside the grid, for tools of any size."""
+    rng = np.random.default_rng(seed)
+    layout, curve = HIERARCHICAL[seed % 4]
+    with make(tmp_path_factory.mktemp("batch"), 6, layout, curve) as env:
+        scatter(env, n_voxels=1500, seed=seed)
+        shell = cloud(int(rng.integers(1, 300)), seed, float(rng.choice([0.002, 0.01, 0.04])))
+        poses = poses_in(env.grid, 12, seed)
+        for exclude in ([], [2]):
+            felt = env.touch(shell, poses=poses, exclude=exclude, objects=True)
+            assert_equals_touches(felt, env, shell, poses, exclude)
+
+
+def test_a_batch_equals_single_touches_under_the_smooth_law(tmp_path: Path) -> None:
+    with create_environment(tmp_path / "s.db", Grid(0.002, (-0.06,) * 3, 6)) as env:
+        sheet = np.argwhere(np.ones((40, 40))) / 3.0 - 7.0
+        for axis in range(2):
+            points = np.insert(sheet, axis, 0.3, axis=1) + 32.0 + 2.0 * axis
+            write_points(env.store, points, f"sheet {axis}")
+        assert env.has_distances
+        shell, poses = cloud(200, extent=0.012), poses_in(env.grid, 16, beyond=-0.35)
+        felt = env.touch(shell, poses=poses, objects=True)
+        assert felt.law.stiffness == 1000.0
+        assert felt.n_contacts.any()
+        assert_equals_touches(felt, env, shell, poses, [])
+        plane = env.touch(shell, poses=poses, law="plane")
+        for n, pose in enumerate(poses):
+            touch = env.touch(shell, pose, law="plane")
+            assert (plane.forces[n] + 0.0).tobytes() == (touch.force + 0.0).tobytes()
+
+
+def test_many_threads_and_little_memory_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """512 cells, nearly all with voxels, in a table with fewer slots; poses in random order."""
+    monkeypatch.setattr(threads, "CHUNK_POSES", 3)
+    with make(tmp_path, 8) as env:
+        rng = np.random.default_rng(0)
+        write_voxels(env.store, np.unique(rng.integers(0, 256, (60_000, 3)), axis=0))
+        shell, poses = cloud(90, extent=0.03), poses_in(env.grid, 300, beyond=0.0)
+        plenty = env.touch(shell, poses=poses)
+        told: list[tuple[int, int]] = []
+        for jobs in (1, 4):
+            with env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=jobs) as feeler:
+                assert feeler.size_bytes <= LEAST_BUDGET
+                told.clear()
+                scarce = feeler.touch(poses, progress=lambda *done: told.append(done))
+                assert feeler.n_loaded > 512  # cells left, and were read again
+            assert (scarce.forces + 0.0).tobytes() == (plenty.forces + 0.0).tobytes()
+            assert (scarce.torques + 0.0).tobytes() == (plenty.torques + 0.0).tobytes()
+            assert scarce.hits.tolist() == plenty.hits.tolist()
+            assert [total for _, total in told] == [300] * len(told)
+            assert [done for done, _ in told] == sorted({done for done, _ in told})
+            assert told[-1] == (300, 300)
+        assert plenty.hits.any()
+        touch = env.touch(shell, poses[7])
+        assert (plenty.forces[7] + 0.0).tobytes() == (touch.force + 0.0).tobytes()
+
+
+def test_poses_may_lie_in_a_file_or_in_memory_that_is_read_only(tmp_path: Path) -> None:
+    with make(tmp_path, 6) as env:
+        scatter(env)
+        shell, poses = cloud(1), poses_in(env.grid, 9)
+        expected = env.touch(shell, poses=poses)
+        np.save(tmp_path / "poses.npy", poses)
+        frozen = poses.copy()
+        frozen.flags.writeable = False
+        for given_poses in (np.load(tmp_path / "poses.npy", mmap_mode="r"), frozen, poses.tolist()):
+            felt = env.touch(shell, poses=given_poses)
+            assert felt.forces.tobytes() == expected.forces.tobytes()
+
+
+def test_no_poses_are_an_empty_batch(tmp_path: Path) -> None:
+    with make(tmp_path, 6) as env:
+        scatter(env)
+        nothing: list[Floats | list[int]] = [[], np.empty((0, 4, 4))]
+        for none in nothing:
+            felt = env.touch(cloud(5), poses=none, objects=True)
+            assert len(felt) == 0
+            assert felt.forces.shape == (0, 3)
+            assert felt.offsets.tolist() == [0]
+            assert felt.objects == []
+            assert len(env.clearance(cloud(5), none)) == 0
+
+
+def test_the_objects_of_a_batch_are_those_of_its_poses(tmp_path: Path) -> None:
+    with make(tmp_path, 6) as env:
+        write_voxels(env.store, block((0, 0, 0), (63, 63, 3)), "floor")
+        write_voxels(env.store, block((0, 0, 60), (63, 63, 63)), "lid")
+        write_voxels(env.store, block((30, 30, 30), (31, 31, 31)), "nut")
+        shell = PointShell(np.zeros((1, 3)), np.array([[0.0, 0.0, 1.0]]), np.zeros(3))
+        poses = np.tile(np.eye(4), (3, 1, 1))
+        poses[:, 2, 3] = env.grid.centers(np.array([[0, 0, 61], [0, 0, 20], [0, 0, 1]]))[:, 2]
+        felt = env.touch(shell, poses=poses, objects=True)
+        assert [felt.ids_at(n) for n in range(3)] == [[2], [], [1]]
+        assert felt.ids_at(-1) == [1]
+        assert felt.ids.tolist() == [2, 1]
+        assert [obj.name for obj in felt.objects] == ["floor", "lid"]
+        with pytest.raises(IndexError):
+            felt.ids_at(3)
+        with pytest.raises(UsageError, match="objects=True"):
+            _ = env.touch(shell, poses=poses).ids
+
+
+def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
+    with make(tmp_path, 6) as env:
+        scatter(env)
+        shell, poses = cloud(5), poses_in(env.grid, 4)
+        bent, lost = poses.copy(), poses.copy()
+        bent[2, 0, 0] += 0.5
+        lost[3, 1, 3] = np.nan
+        for wrong, told in ((bent, "pose 2: .*rotation"), (lost, "pose 3: .*finite")):
+            with pytest.raises(UsageError, match=told) as caught:
+                env.touch(shell, poses=wrong)
+            assert "\n" not in str(caught.value)
+            with pytest.raises(UsageError, match=told):
+                env.clearance(shell, wrong)
+        for shape in ((4, 4), (3, 4), (2, 3, 3), (1, 2, 4, 4)):
+            with pytest.raises(UsageError, match="shape"):
+                env.touch(shell, poses=np.zeros(shape))
+        with pytest.raises(UsageError, match="real numbers"):
+            env.touch(shell, poses=poses.astype(complex))
+        with pytest.raises(UsageError, match="one pose, or poses"):
+            env.touch(shell)  # type: ignore[call-overload]
+        with pytest.raises(UsageError, match="one pose, or poses"):
+            env.touch(shell, poses[0], poses=poses)  # type: ignore[call-overload]
+        with pytest.raises(UsageError, match="touch_many"):
+            env.touch(shell, strategy="array", poses=poses)  # type: ignore[call-overload]
+        with pytest.raises(ObjectNotFoundError, match="exclude"):
+            env.touch(shell, poses=poses, exclude=["no such part"])
+        for jobs in (0, -1, 1000):
+            with pytest.raises(UsageError, match="jobs"):
+                env.feeler(shell, jobs=jobs)
+        with pytest.raises(UsageError, match="budget"):
+            env.feeler(shell, budget_bytes=1000)
+    with (
+        make(tmp_path, 6, curve="lexicographic", layout="voxel") as plain,
+        pytest.raises(UsageError, match="lexicographic"),
+    ):
+        plain.touch(shell, poses=poses)
+
+
+def test_a_tool_larger_than_the_memory_is_told_so(tmp_path: Path) -> None:
+    with make(tmp_path, 8) as env:
+        rng = np.random.default_rng(0)
+        write_voxels(env.store, np.unique(rng.integers(0, 256, (60_000, 3)), axis=0))
+        shell = cloud(5000, extent=0.1)
+        with (
+            env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=2) as feeler,
+            pytest.raises(UsageError, match="larger budget"),
+        ):
+            feeler.touch(np.eye(4)[None])

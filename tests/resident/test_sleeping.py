@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 from banded import move_points, write_points
 from hapticdb import Environment, PointShell, UsageError
 from hapticdb.kernels.field.law import DistanceFieldLaw
-from hapticdb.kernels.resident.sleeping import BLOCK, OF_BLOCK, OF_RUNS
+from hapticdb.kernels.resident.sleeping import BLOCK, REST, way_of_box
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
-from hapticdb.resident.sleepers import block_spheres
+from hapticdb.resident.sleepers import boxes_of_blocks
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.connect import open_store
 from realtime.worlds import block, make, move, scatter, turned
@@ -223,34 +223,42 @@ def test_no_sleeping_point_comes_near_a_voxel(
         version = table.version
         placed = shell.points @ poses[-1, :3, :3].T + poses[-1, :3, 3]
         places = (placed - env.grid.origin) / env.grid.voxel_size
-        below = np.maximum(voxels.min(axis=0) - places, places - voxels.max(axis=0) - 1.0)
-        asleep = np.zeros(len(shell), dtype=bool)
-        for b in range(len(kept.blocks)):
-            rests = kept.run_rests[b * BLOCK : (b + 1) * BLOCK, 3] >= 0.0
-            is_block_asleep = kept.versions[OF_BLOCK, b] == version and kept.block_rests[b, 3] > 0.0
-            awake = not is_block_asleep and kept.versions[OF_RUNS, b] == version
-            for n, rests_here in enumerate(rests):
-                start = (b * BLOCK + n) * run
-                asleep[start : start + run] = is_block_asleep or (awake and rests_here)
-        for point in np.flatnonzero(asleep & (below.max(axis=1) <= 0.0)):
-            inside = (voxels <= places[point]) & (places[point] < voxels + 1.0)
-            assert not inside.all(axis=1).any()
-        assert asleep.any()
+        inside = np.zeros(len(shell), dtype=bool)
+        for voxel in voxels:
+            inside |= ((voxel <= places) & (places < voxel + 1.0)).all(axis=1)
+        is_asleep = np.repeat(kept.run_rests[:, 3] >= 0.0, run)[: len(shell)]
+        for b in range(len(kept.boxes)):
+            assert kept.versions[b] == version
+            if kept.block_rests[b, REST] > 0.0:
+                assert is_asleep[b * BLOCK * run : (b + 1) * BLOCK * run].all()
+        assert is_asleep.any()
+        assert not inside[is_asleep].any()
     env.close()
 
 
 @given(st.integers(0, 10_000))
 @settings(deadline=None, max_examples=20)
-def test_a_block_contains_the_boxes_of_its_runs_however_it_turns(seed: int) -> None:
+def test_no_run_goes_further_than_its_block_however_the_tool_turns(seed: int) -> None:
+    """The bound holds for the naive way of each centre on each axis, and is reached by a corner."""
     rng = np.random.default_rng(seed)
     spheres = np.column_stack([rng.normal(0, 0.1, (150, 3)), rng.uniform(0, 0.02, 150)])
-    blocks = block_spheres(spheres, 0.001)
-    assert len(blocks) == 3
-    pose = turned(rng, np.zeros(3))
-    runs, whole = spheres[:, :3] @ pose[:3, :3].T, blocks[:, :3] @ pose[:3, :3].T
-    for n in range(len(spheres)):
-        away = np.abs(runs[n] - whole[n // BLOCK]).max()
-        assert away + spheres[n, 3] <= blocks[n // BLOCK, 3]
+    boxes = boxes_of_blocks(spheres)
+    assert len(boxes) == 3
+    before, after = (turned(rng, rng.normal(0, 0.1, 3)) for _ in range(2))
+    if rng.random() < 0.5:
+        after = before.copy()
+        after[:3, 3] += rng.normal(0, 1e-3, 3)
+    rests = np.zeros((3, REST + 1))
+    rests[:, :REST] = before[:3].ravel()
+    change = after - before
+    ways = np.abs(spheres[:, :3] @ change[:3, :3].T + change[:3, 3]).max(axis=1)
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+    for n in range(3):
+        bound = way_of_box(boxes, rests, n, tuple(after[:3].ravel()))
+        assert ways[n * BLOCK : (n + 1) * BLOCK].max() <= bound + 1e-12
+        corners = boxes[n, :3] + signs * boxes[n, 3:]
+        furthest = np.abs(corners @ change[:3, :3].T + change[:3, 3]).max()
+        assert abs(furthest - bound) <= 1e-12
 
 
 def test_a_budget_of_nothing_is_refused(tmp_path: Path) -> None:

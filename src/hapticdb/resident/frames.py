@@ -185,7 +185,7 @@ class ResidentFrames:
         size = residency.grid.voxel_size
         sleeps = sleeps or budget_points is not None
         self.clusters = clusters_of(shell, size, run or RUN if sleeps else run)
-        self.sleepers = sleepers_of(self.clusters, size, budget_points) if sleeps else None
+        self.sleepers = sleepers_of(self.clusters, budget_points) if sleeps else None
         self.budget = len(shell) if budget_points is None else budget_points
         self.met = np.empty(len(shell), dtype=np.int64)
         self.surroundings = surroundings_of(self.clusters, size, felt_within(self.law))

@@ -5,26 +5,21 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.resident.cells import Clusters
-from hapticdb.kernels.resident.sleeping import BLOCK, COUNTS, Sleepers
-
-SLACK = 1e-3
-"""Voxels by which a block's sphere is larger: more than rounding errors."""
-STRETCH = 1e-5
-"""Part by which a block's sphere is larger: a pose that is just accepted may stretch the tool."""
+from hapticdb.kernels.resident.sleeping import BLOCK, COUNTS, REST, Sleepers
 
 
-def block_spheres(spheres: NDArray[np.float64], voxel_size: float) -> NDArray[np.float64]:
-    """Spheres (B, 4), metres, that contain those of each `BLOCK` runs (C, 4), in the tool frame."""
+def boxes_of_blocks(spheres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Boxes (B, 6) around the centres of the spheres (C, 4) of each `BLOCK` runs, tool frame.
+
+    A box is its centre and half its sides, metres.
+    """
     starts = np.arange(0, len(spheres), BLOCK)
     low = np.minimum.reduceat(spheres[:, :3], starts, axis=0)
     high = np.maximum.reduceat(spheres[:, :3], starts, axis=0)
-    middles = 0.5 * (low + high)
-    away = spheres[:, :3] - np.repeat(middles, BLOCK, axis=0)[: len(spheres)]
-    radii = np.maximum.reduceat(np.linalg.norm(away, axis=1) + spheres[:, 3], starts)
-    return np.column_stack([middles, radii * (1.0 + STRETCH) + SLACK * voxel_size])
+    return np.hstack([0.5 * (low + high), 0.5 * (high - low)])
 
 
-def sleepers_of(clusters: Clusters, voxel_size: float, budget: int | None) -> Sleepers:
+def sleepers_of(clusters: Clusters, budget: int | None) -> Sleepers:
     """All clusters of a shell, awake.
 
     budget : most points near something that a frame looks at; None for all.
@@ -38,12 +33,12 @@ def sleepers_of(clusters: Clusters, voxel_size: float, budget: int | None) -> Sl
         raise UsageError(f"a budget of {budget} points leaves nothing to feel: give 1 or more")
     n_runs = len(clusters.spheres)
     n_chosen = min(budget or 0, len(clusters.points))
-    blocks = block_spheres(clusters.spheres, voxel_size)
+    boxes = boxes_of_blocks(clusters.spheres)
     return Sleepers(
-        blocks,
-        np.zeros((len(blocks), 4)),
+        boxes,
+        np.zeros((len(boxes), REST + 1)),
         np.zeros((n_runs, 4)),
-        np.zeros((2, len(blocks)), dtype=np.int64),
+        np.zeros(len(boxes), dtype=np.int64),
         np.zeros(n_runs, dtype=np.int64),
         np.zeros((n_runs, 1)),
         np.zeros((0, 4)),

@@ -1,12 +1,14 @@
 """Clusters of a large shell that sleep: they are not looked at until they may touch something.
 
-A shell has clusters of two levels: runs of points, and blocks of `BLOCK` runs. A cluster that is
-far from all voxels gets a *rest*: where its sphere's centre was, and how far the centre may go from
-there, on each axis, before anything can be near. While the centre stays within the rest, the
-cluster sleeps: a sphere looks the same however the tool turns, so three subtractions prove that
-none of its points meets a voxel. This is the idea of dead reckoning (McNeely, Puterbaugh and Troy
-2006), with the way measured instead of foretold, so that no largest speed is assumed. The nesting
-follows Barbic and James 2008.
+A shell has clusters of two levels: runs of points, and blocks of `BLOCK` runs. A run that is far
+from all voxels gets a *rest*: where its sphere's centre was, and how far the centre may go from
+there, on each axis, before anything can be near. While the centre stays within the rest, the run
+sleeps: a sphere looks the same however the tool turns, so three subtractions prove that none of its
+points meets a voxel. A block whose runs all sleep rests as long as the first of them: the largest
+way of a corner of the box around their centres bounds the way of each centre, turns included,
+because the difference of two poses is affine. This is the idea of dead reckoning (McNeely,
+Puterbaugh and Troy 2006), with the way measured instead of foretold, so that no largest speed is
+assumed. The nesting follows Barbic and James 2008.
 
 Rests hold for one version of the cells' directory, because cells never change within a version.
 
@@ -50,18 +52,17 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.resident.clearance import gap
 from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.resident.runs import is_sphere_free
-from hapticdb.kernels.rigid import is_rigid, moved, transform_of
+from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turn
 
 BLOCK = 64
 """Runs of a block. A larger value tests fewer blocks and wakes more runs at once."""
-REST_OF_BLOCK = 32.0
-"""Largest rest of a block, voxels. A larger value lasts longer, and more cells are read for it."""
-REST_OF_RUN = 16.0
-"""Largest rest of a run, voxels; likewise."""
+SHORTEST, LONGEST = 8.0, 16.0
+"""Largest rests of runs, voxels, from block to block. Longer rests read more cells when they end;
+equal ones would end in one frame when a tool moves without turning."""
+GOLDEN = 0.6180339887498949
+"""Golden ratio: its multiples, without their whole parts, spread evenly (Knuth, volume 3, 6.4)."""
 REST_BETWEEN_BRICKS = 2.0
 """Rest of a run, voxels, that is tested voxel by voxel because an occupied brick is near."""
-AWAKE_FOR = -4.0
-"""Rest of a block that is awake: so many voxels, less than zero, its runs are tested at once."""
 ROUNDING = 1e-6
 """Voxels taken off each rest: far more than the rounding errors of a placed centre."""
 MOST_IN_TWO_CELLS = 16.0
@@ -71,16 +72,18 @@ MOST_IN_TWO_CELLS = 16.0
 class Sleepers(NamedTuple):
     """What frames keep of a shell with sleeping clusters.
 
-    blocks (B, 4): centre and radius, metres, tool frame, of spheres around the spheres of each
-    block's runs. block_rests (B, 4), run_rests (C, 4): the place of a sphere's centre and how far
-    it may go from there on each axis, voxels; below zero for a block that is awake. versions (2, B)
-    int64: of the directory for which the rest of a block (row 0) and those of its runs (row 1)
-    hold. listed (C,) int64: the runs that are near something. skips (C, 1): the number of runs that
-    a frame skips from each run on. nothing (0, 4): the spheres of a shell that has none. chosen
-    (K, 6), columns (3, K), indices (K,) int64: points of a frame beyond its budget.
+    boxes (B, 6): centre and half the sides, metres, tool frame, of the box around the centres of
+    each block's runs. block_rests (B, 13): the pose at which a block's rest began (`transform_of`),
+    and how far a centre may go, voxels; below zero for a block that is awake. run_rests (C, 4): the
+    place of a sphere's centre and how far it may go from there on each axis, voxels; below zero for
+    a run that is near something. versions (B,) int64: of the directory for which the rests of a
+    block and of its runs hold. listed (C,) int64: the runs that are near something. skips (C, 1):
+    the number of runs that a frame skips from each run on. nothing (0, 4): the spheres of a shell
+    that has none. chosen (K, 6), columns (3, K), indices (K,) int64: points of a frame beyond its
+    budget.
     """
 
-    blocks: NDArray[np.float64]
+    boxes: NDArray[np.float64]
     block_rests: NDArray[np.float64]
     run_rests: NDArray[np.float64]
     versions: NDArray[np.int64]
@@ -93,10 +96,10 @@ class Sleepers(NamedTuple):
 
 
 SLEEPERS = fields_of(
-    Sleepers, FLOATS2, FLOATS2, FLOATS2, INTS2, INTS, FLOATS2, FLOATS2, FLOATS2, FLOATS2, INTS
+    Sleepers, FLOATS2, FLOATS2, FLOATS2, INTS, INTS, FLOATS2, FLOATS2, FLOATS2, FLOATS2, INTS
 )
-OF_BLOCK, OF_RUNS = 0, 1
-"""Rows of `Sleepers.versions`."""
+REST = 12
+"""Column of `Sleepers.block_rests` after the pose."""
 LOOKED_AT, LEFT_OUT, COUNTS = 0, 1, 2
 """Columns of the counts of frames: points near something that a frame looked at, and that its
 budget left out."""
@@ -194,19 +197,66 @@ def placed_center(spheres, n, transform, place):
     return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
 
 
+@leaf
+def way_on_axis(a, b, c, u, x, y, z, half_x, half_y, half_z):
+    """Largest way on one axis of a point of a box, when that row of the pose changes by a, b, c, u.
+
+    (x, y, z), half_x, half_y, half_z: the box's centre and half its sides.
+    """
+    turning = abs(a) * half_x + abs(b) * half_y + abs(c) * half_z
+    return abs(turn(a, b, c, x, y, z) + u) + turning
+
+
 @inlined
-def is_within(rests, n, x, y, z, rest):
-    """Whether (x, y, z) is within `rest` voxels, on each axis, of where rest n began."""
-    return (
-        abs(x - rests[n, 0]) <= rest
-        and abs(y - rests[n, 1]) <= rest
-        and abs(z - rests[n, 2]) <= rest
-    )
+def way_of_box(boxes, rests, block, transform):
+    """Largest way on an axis, metres, of a point of a block's box since the block's rest began."""
+    a, b, c, u, d, e, f, v, g, h, m, w = transform
+    x, y, z = boxes[block, 0], boxes[block, 1], boxes[block, 2]
+    half_x, half_y, half_z = boxes[block, 3], boxes[block, 4], boxes[block, 5]
+    along_x = way_on_axis(
+        a - rests[block, 0], b - rests[block, 1], c - rests[block, 2], u - rests[block, 3],
+        x, y, z, half_x, half_y, half_z,
+    )  # fmt: skip
+    along_y = way_on_axis(
+        d - rests[block, 4], e - rests[block, 5], f - rests[block, 6], v - rests[block, 7],
+        x, y, z, half_x, half_y, half_z,
+    )  # fmt: skip
+    along_z = way_on_axis(
+        g - rests[block, 8], h - rests[block, 9], m - rests[block, 10], w - rests[block, 11],
+        x, y, z, half_x, half_y, half_z,
+    )  # fmt: skip
+    return max(along_x, along_y, along_z)
+
+
+@inlined
+def begin_block_rest(rests, block, transform, rest):
+    """Enter the rest of a block from this pose on."""
+    a, b, c, u, d, e, f, v, g, h, m, w = transform
+    rests[block, 0] = a
+    rests[block, 1] = b
+    rests[block, 2] = c
+    rests[block, 3] = u
+    rests[block, 4] = d
+    rests[block, 5] = e
+    rests[block, 6] = f
+    rests[block, 7] = v
+    rests[block, 8] = g
+    rests[block, 9] = h
+    rests[block, 10] = m
+    rests[block, 11] = w
+    rests[block, REST] = rest
+
+
+@inlined
+def left_of_rest(rests, n, x, y, z):
+    """How far the centre of run n, now at (x, y, z), may still go on each axis; all in voxels."""
+    way = max(abs(x - rests[n, 0]), abs(y - rests[n, 1]), abs(z - rests[n, 2]))
+    return rests[n, 3] - way
 
 
 @inlined
 def begin_rest(rests, n, x, y, z, rest):
-    """Enter the rest of cluster n, whose centre is at (x, y, z)."""
+    """Enter the rest of run n, whose centre is at (x, y, z)."""
     rests[n, 0] = x
     rests[n, 1] = y
     rests[n, 2] = z
@@ -215,8 +265,8 @@ def begin_rest(rests, n, x, y, z, rest):
 
 @inlined
 def rest_of_run(
-    keys, slots, words, masks, used, which, spheres, n, x, y, z, transform, place, margin
-):
+    keys, slots, words, masks, used, which, spheres, n, x, y, z, transform, place, margin, longest
+):  # fmt: skip
     """Rest of run n, whose centre is at (x, y, z): zero if it is free only here, -1 if it is near.
 
     A run is near unless its box is free of voxels, or of occupied bricks. What is free in a larger
@@ -228,7 +278,7 @@ def rest_of_run(
     )
     if not is_free and half <= MOST_IN_TWO_CELLS:
         return -1.0
-    rest = room_around(keys, slots, masks, used, which, x, y, z, half, REST_OF_RUN, place.side)
+    rest = room_around(keys, slots, masks, used, which, x, y, z, half, longest, place.side)
     if rest > REST_BETWEEN_BRICKS:
         return rest - ROUNDING
     if is_free and is_sphere_free(
@@ -246,41 +296,32 @@ def list_near_runs(cells, which, version, shell, sleepers, transform, place, law
     """List the runs of a placed shell that are near something; returns their number."""
     _, _, keys, slots, words, masks, used, _, near = cells
     spheres = shell.spheres
-    blocks, block_rests, run_rests, versions, listed, _, _, _, _, _ = sleepers
-    felt, margin, side = felt_words(law, words, near), felt_margin(law), place.side
+    boxes, block_rests, run_rests, versions, listed, _, _, _, _, _ = sleepers
+    felt, margin = felt_words(law, words, near), felt_margin(law)
     count = 0
-    for block in range(blocks.shape[0]):
-        x, y, z = placed_center(blocks, block, transform, place)
-        rest = block_rests[block, 3]
-        if versions[OF_BLOCK, block] != version or not is_within(
-            block_rests, block, x, y, z, abs(rest)
-        ):
-            half = blocks[block, 3] / place.size + margin
-            rest = room_around(
-                keys, slots, masks, used, which, x, y, z, half, REST_OF_BLOCK, side
-            ) - ROUNDING  # fmt: skip
-            if rest <= 0.0:
-                rest = AWAKE_FOR
-            begin_rest(block_rests, block, x, y, z, rest)
-            versions[OF_BLOCK, block] = version
-        if rest > 0.0:
-            continue
-        first, end = block * BLOCK, min((block + 1) * BLOCK, spheres.shape[0])
-        if versions[OF_RUNS, block] != version:
-            versions[OF_RUNS, block] = version
-            for n in range(first, end):
-                run_rests[n, 3] = -1.0
-        for n in range(first, end):
-            x, y, z = placed_center(spheres, n, transform, place)
-            if is_within(run_rests, n, x, y, z, run_rests[n, 3]):
+    for block in range(boxes.shape[0]):
+        is_known = versions[block] == version
+        if is_known and block_rests[block, REST] > 0.0:
+            way = way_of_box(boxes, block_rests, block, transform) / place.size
+            if way < block_rests[block, REST]:
                 continue
-            rest = rest_of_run(
-                keys, slots, felt, masks, used, which, spheres, n, x, y, z, transform, place, margin
-            )
-            begin_rest(run_rests, n, x, y, z, rest)
-            if rest < 0.0:
-                listed[count] = n
-                count += 1
+        longest = SHORTEST + (LONGEST - SHORTEST) * (block * GOLDEN % 1.0)
+        least = LONGEST
+        for n in range(block * BLOCK, min((block + 1) * BLOCK, spheres.shape[0])):
+            x, y, z = placed_center(spheres, n, transform, place)
+            left = left_of_rest(run_rests, n, x, y, z) if is_known else -1.0
+            if left < 0.0:
+                left = rest_of_run(
+                    keys, slots, felt, masks, used, which, spheres, n, x, y, z, transform, place,
+                    margin, longest,
+                )  # fmt: skip
+                begin_rest(run_rests, n, x, y, z, left)
+                if left < 0.0:
+                    listed[count] = n
+                    count += 1
+            least = min(least, left)
+        begin_block_rest(block_rests, block, transform, least - ROUNDING)
+        versions[block] = version
     return count
 
 

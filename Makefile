@@ -7,7 +7,7 @@ READY := .venv/ready
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 PYTEST := $(BIN)/pytest tests --numprocesses=auto --dist=worksteal
 
-.PHONY: demo test test-long test-all test-plain lint types bench figures peers realtime feel scale wheel pins clean
+.PHONY: demo test test-long test-all test-plain lint types bench figures peers realtime feel scale paths wheel pins clean
 
 demo: $(USER)
 	$(BIN)/hapticdb demo demo
@@ -52,6 +52,10 @@ scale: $(READY)
 # Frames in memory beside a dense bitmap, and sessions beside an empty loop: three minutes.
 realtime: $(READY)
 	$(BIN)/python benchmarks/in_real_time.py $(ARGS)
+
+# Many poses and large tools over cells in memory: results/large_shells.json.
+paths: $(READY)
+	$(BIN)/python benchmarks/large_shells.py $(ARGS)
 
 # How good the forces feel, under both laws (docs/feel.md): a quarter of an hour; ARGS=--quick for two
 # minutes. The walk is over the vintage car where HAPTICDB_TEST_DATA has it, else over the sample.

@@ -53,11 +53,13 @@ scale: $(READY)
 realtime: $(READY)
 	$(BIN)/python benchmarks/in_real_time.py $(ARGS)
 
-# Poses a second, by batches, beside python-fcl, coal and Open3D: a quarter of an hour. The scene is the
-# vintage car where HAPTICDB_TEST_DATA has it, else the sample.
+# Poses a second, by batches, beside python-fcl, coal and Open3D, over the vintage car where
+# HAPTICDB_TEST_DATA has it, else over the sample; and large tools beside the flat loop. A quarter of an
+# hour.
 paths: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
 paths: $(READY) .venv/figures
 	$(BIN)/python benchmarks/batches.py $(ARGS)
+	$(BIN)/python benchmarks/large_shells.py $(ARGS)
 
 # How good the forces feel, under both laws (docs/feel.md): a quarter of an hour; ARGS=--quick for two
 # minutes. The walk is over the vintage car where HAPTICDB_TEST_DATA has it, else over the sample.

@@ -37,6 +37,7 @@ ENTRIES = {
     "resident.proving": "prove",
     "resident.nearest": "find_nearest",
     "resident.feeling": "feel_kernel bounding_spheres",
+    "resident.sleeping": "feel_sleeping",
     "query.refining": (
         "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
         "depths_of_hits"
@@ -64,7 +65,11 @@ ENTRIES = {
 """Entries of each module; modules that take longest to compile come first. The names are listed
 here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
-TOGETHER = {"resident.feeling": "hand.coupling", "hosting.loop": "hand.quasistatic"}
+TOGETHER = {
+    "resident.feeling": "hand.coupling",
+    "resident.sleeping": "hand.coupling",
+    "hosting.loop": "hand.quasistatic",
+}
 """Modules that are compiled after another module in the same process: they share its leaves."""
 LONGEST_S = 600.0
 """Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
@@ -144,6 +149,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "rigid.*",
     ),
     "proxy": ("proxy.evaluate.*", "hand.handle.*"),
+    "large": (*_RESIDENT, "field.packing.unpack_kernel", "resident.sleeping.*"),
     "everything": ("*",),
 }
 """Entries that each purpose calls; ``*`` is any name (checked by `tests/house/test_warm.py`)."""

@@ -9,6 +9,7 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.law import felt_within, reads_distances
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident import sleeping
 from hapticdb.kernels.resident.cells import (
     CONTACTS,
     DEEPEST,
@@ -26,6 +27,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
 from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.resident.residency import Residency
+from hapticdb.resident.sleepers import counts_of, sleepers_of
 
 RUN = 64
 """Points of a cluster. A larger value tests fewer spheres and skips fewer points."""
@@ -47,7 +49,9 @@ class FeltFrames(NamedTuple):
     wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
     int64: numbers of points that hit (in a voxel or, with distances, near a surface), that touch
     (below their tangent plane or the onset), in a cell that is not resident; deepest (M,): depth of
-    the deepest contact, metres.
+    the deepest contact, metres; looked_at, left_out (M,) int64: with sleeping clusters, numbers of
+    points near something that the frame looked at, and that its budget left out; otherwise all and
+    none.
     """
 
     wrenches: Floats
@@ -55,6 +59,8 @@ class FeltFrames(NamedTuple):
     contacts: NDArray[np.int64]
     unknown: NDArray[np.int64]
     deepest: Floats
+    looked_at: NDArray[np.int64]
+    left_out: NDArray[np.int64]
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
@@ -141,11 +147,17 @@ class ResidentFrames:
         Force law; the tangent plane with 1000 N/m unless given.
     run : int or None
         As for `clusters_of`.
+    sleeps : bool
+        Whether clusters far from everything are not looked at while they stay there. The results
+        are the same, bit for bit; large shells are felt sooner.
+    budget_points : int or None
+        Most points near something that a frame looks at; then clusters sleep. A frame with more
+        looks at every 2nd, 4th, 8th ... of them. `FeltFrames.left_out` counts the others.
 
     Raises
     ------
     UsageError
-        If the law reads distances, and the cells have none.
+        If the law reads distances, and the cells have none; if the budget is below one point.
     """
 
     def __init__(
@@ -155,6 +167,8 @@ class ResidentFrames:
         law: ForceLaw | None = None,
         *,
         run: int | None = None,
+        sleeps: bool = False,
+        budget_points: int | None = None,
     ) -> None:
         self.residency = residency
         self.shell = shell
@@ -168,11 +182,13 @@ class ResidentFrames:
         self.cells = table.cells
         if not reads_distances(self.law):  # kernels are compiled for the plane without a payload
             self.cells = table.cells.without_distances()
-        self.clusters = clusters_of(shell, residency.grid.voxel_size, run)
+        size = residency.grid.voxel_size
+        sleeps = sleeps or budget_points is not None
+        self.clusters = clusters_of(shell, size, run or RUN if sleeps else run)
+        self.sleepers = sleepers_of(self.clusters, budget_points) if sleeps else None
+        self.budget = len(shell) if budget_points is None else budget_points
         self.met = np.empty(len(shell), dtype=np.int64)
-        self.surroundings = surroundings_of(
-            self.clusters, residency.grid.voxel_size, felt_within(self.law)
-        )
+        self.surroundings = surroundings_of(self.clusters, size, felt_within(self.law))
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._row = table.join()
 
@@ -190,10 +206,12 @@ class ResidentFrames:
         """
         matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
         out = np.zeros((len(matrices), RESULTS))
+        counts = counts_of(len(matrices))
+        counts[:, sleeping.LOOKED_AT] = len(self.shell)
         done = 0
         while done < len(matrices):
             n_poses = self.fetch(matrices[done:])
-            self._run(matrices, out, done, n_poses)
+            self._run(matrices, out, counts, done, n_poses)
             done += n_poses
         return FeltFrames(
             out[:, WRENCH : WRENCH + 6],
@@ -201,6 +219,8 @@ class ResidentFrames:
             out[:, CONTACTS].astype(np.int64),
             out[:, UNKNOWNS].astype(np.int64),
             out[:, DEEPEST],
+            counts[:, sleeping.LOOKED_AT],
+            counts[:, sleeping.LEFT_OUT],
         )
 
     def wrenches(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
@@ -224,12 +244,21 @@ class ResidentFrames:
         residency.make_resident(cells)
         return int(n_poses)
 
-    def _run(self, poses: Floats, out: Floats, start: int, n_poses: int) -> None:
+    def _run(
+        self, poses: Floats, out: Floats, counts: NDArray[np.int64], start: int, n_poses: int
+    ) -> None:
         """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
         part = slice(start, start + n_poses)
-        done = feel_kernel(
-            self.cells, self._row, self.clusters, poses[part],
-            self.residency.place, self.law, self.met, self.missed, out[part],
-        )  # fmt: skip
+        place = self.residency.place
+        if self.sleepers is not None:
+            done = sleeping.feel_sleeping(
+                self.cells, self._row, self.clusters, poses[part], place, self.law, self.met,
+                self.missed, out[part], self.sleepers, self.budget, counts[part],
+            )  # fmt: skip
+        else:
+            done = feel_kernel(
+                self.cells, self._row, self.clusters, poses[part], place, self.law, self.met,
+                self.missed, out[part],
+            )  # fmt: skip
         if done < n_poses:
             raise UsageError(f"pose {start + done} is no rigid transform: give a rotation")

@@ -117,9 +117,10 @@ class Clusters(NamedTuple):
 
     points (N, 6): metres and inward normals, tool frame, in the order of the shell; center (3,);
     spheres (C, 4): centre and radius, metres, of each run of `run` points, or (0, 4) for none;
-    groups (G, 4): the same of each group of `GROUP` runs; columns (3, N): the points again, one
-    row for each axis; scratch (SCRATCH_ROWS, run): memory for one placed run. Each thread needs its
-    own scratch.
+    groups (G, 4): the same of each group of `GROUP` runs, or in a frame of sleeping clusters, which
+    has no spheres, (C, 1) runs to skip (`sleeping`); columns (3, N): the points again, one row for
+    each axis; scratch (SCRATCH_ROWS, run): memory for one placed run. Each thread needs its own
+    scratch.
     """
 
     points: Floats

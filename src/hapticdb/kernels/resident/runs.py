@@ -106,10 +106,11 @@ def free_runs(
 ):
     """Number of runs, from run `cluster` on, that are far from all voxels: GROUP, 1 or 0.
 
-    Far means farther away than `reached` voxels. It is 0 for a shell without spheres.
+    Far means farther away than `reached` voxels. A shell without spheres says in `groups` what to
+    skip (`sleeping.Sleepers.skips`), or has no groups: then it is 0.
     """
     if spheres.shape[0] == 0:
-        return 0
+        return np.int64(groups[cluster, 0]) if groups.shape[0] > 0 else np.int64(0)
     if cluster % GROUP == 0 and is_sphere_free(
         keys, slots, words, masks, used, which, groups, cluster // GROUP, transform, place, reached
     ):

@@ -1,0 +1,205 @@
+"""Large tools: sleeping clusters beside the flat loop, at 10^5 and 10^6 points.
+
+    make paths
+    python benchmarks/large_shells.py --out results/large_shells.json
+
+A sheet of points slides over a box as a hand moves it, at 0.5 m/s and 1 kHz, up and down and with
+small turns. The box lies below a given share of the sheet. The flat loop, runs that are tested in
+every frame, and sleeping clusters take turns on the same poses, and give the same wrenches bit for
+bit. Cells are resident; one processor computes.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+import hapticdb
+from awake import awake
+from hapticdb import DistanceField, GridOptions, ImportOptions, PointShell, TangentPlane
+from hapticdb.bench import records
+from hapticdb.kernels.resident.cells import RESULTS
+from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.resident.sleeping import LEFT_OUT, LOOKED_AT, feel_sleeping
+from hapticdb.query.law import ForceLaw
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.sleepers import counts_of
+from hapticdb.resident.table import CellTable
+
+Floats = NDArray[np.float64]
+LAWS: dict[str, ForceLaw] = {"plane": TangentPlane(), "smooth": DistanceField()}
+EDGE = 1.0
+"""Edge of the sheet, metres."""
+SPEED, RATE = 0.5, 1000.0
+"""Of the hand: metres a second, and frames a second."""
+ROUNDS = 5
+"""Timed passes over all poses; a frame's time is the least of them, without what others cost."""
+TABLE = 512 << 20
+"""Bytes for cells."""
+
+
+def sheet(n_points: int, edge: float = EDGE) -> PointShell:
+    """A square sheet of points in Z-order, whose normals point up into the tool."""
+    side = round(n_points**0.5)
+    ij = np.argwhere(np.ones((side, side), dtype=bool))
+    codes = sum(((ij[:, a] >> b) & 1) << (2 * b + a) for a in range(2) for b in range(12))
+    ij = ij[np.argsort(codes)]
+    points = np.column_stack([(ij + 0.5) / side * edge, np.zeros(len(ij))])
+    return PointShell(points, np.tile((0.0, 0.0, 1.0), (len(ij), 1)), np.array([edge / 2] * 3))
+
+
+def slide(count: int, voxel_size: float) -> Floats:
+    """Poses (count, 4, 4) of a hand at `SPEED` along the box, up and down, with small turns."""
+    seconds = np.arange(count) / RATE
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, 1, 3] = SPEED * seconds
+    poses[:, 2, 3] = voxel_size * (1.0 + 2.0 * np.sin(2.0 * np.pi * seconds * 4.0))
+    angle = 1e-3 * np.sin(2.0 * np.pi * seconds * 3.0)
+    poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angle)
+    poses[:, 0, 1], poses[:, 1, 0] = -np.sin(angle), np.sin(angle)
+    return poses
+
+
+def write_box(path: Path, share: float, length: float, edge: float = EDGE) -> None:
+    """An STL file of a box below a share of the sheet, `length` along the way of the hand."""
+    low, high = np.array([0.0, -0.1 * edge, -0.02]), np.array([share * edge, length, 0.0])
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    corners = low + corners * (high - low)
+    quads = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+    lines = ["solid box"]
+    for a, b, c, d in quads:
+        for three in ((a, b, c), (a, c, d)):
+            lines += ["facet normal 0 0 0", "outer loop"]
+            lines += ["vertex {} {} {}".format(*corners[n]) for n in three]
+            lines += ["endloop", "endfacet"]
+    path.write_text("\n".join([*lines, "endsolid box", ""]))
+
+
+def frame_times(frame: Callable[[Floats], object], poses: Floats) -> Floats:
+    """Seconds of each frame (M,)."""
+    spent = np.empty(len(poses))
+    for n in range(len(poses)):
+        started = time.perf_counter()
+        frame(poses[n : n + 1])
+        spent[n] = time.perf_counter() - started
+    return spent
+
+
+def measure(
+    database: Path, law: str, shell: PointShell, poses: Floats, rounds: int = ROUNDS
+) -> dict[str, Any]:
+    """Times of a frame, us, by three ways that take turns; the results are compared bit for bit."""
+    distances = law == "smooth"
+    with (
+        hapticdb.open(database, read_only=True) as env,
+        CellTable.create(TABLE, distances=distances) as table,
+    ):
+        residency = Residency(env.store, table)
+        ways = {
+            "flat": ResidentFrames(residency, shell, LAWS[law], run=0),
+            "tested": ResidentFrames(residency, shell, LAWS[law]),
+            "sleeping": ResidentFrames(residency, shell, LAWS[law], sleeps=True),
+        }
+        felt = {name: one.feel(poses) for name, one in ways.items()}
+        wrenches = {(one.wrenches + 0.0).tobytes() for one in felt.values()}
+        if len(wrenches) != 1:
+            raise SystemExit("the wrenches differ")
+        out, counts = np.zeros((1, RESULTS)), counts_of(1)
+        looked: list[int] = []
+        with table.reading() as row, awake():
+
+            def plain(one: ResidentFrames) -> Callable[[Floats], object]:
+                return lambda pose: feel_kernel(
+                    one.cells, row, one.clusters, pose, residency.place, one.law, one.met,
+                    one.missed, out,
+                )  # fmt: skip
+
+            def asleep(one: ResidentFrames) -> Callable[[Floats], object]:
+                def frame(pose: Floats) -> None:
+                    feel_sleeping(
+                        one.cells, row, one.clusters, pose, residency.place, one.law, one.met,
+                        one.missed, out, one.sleepers, one.budget, counts,
+                    )  # fmt: skip
+                    looked.append(int(counts[0, LOOKED_AT]) + int(counts[0, LEFT_OUT]))
+
+                return frame
+
+            frames = {
+                name: asleep(one) if name == "sleeping" else plain(one)
+                for name, one in ways.items()
+            }
+            least: dict[str, Floats] = {}
+            for _ in range(rounds):
+                for name, frame in frames.items():
+                    spent = frame_times(frame, poses)
+                    least[name] = np.minimum(least.get(name, np.inf), spent)
+        shares = np.array(looked) / len(shell)
+        us = {
+            name: {f"p{p}": float(np.percentile(spent * 1e6, p)) for p in (50, 99, 100)}
+            for name, spent in least.items()
+        }
+        return {
+            "points": len(shell),
+            "law": law,
+            "near_share": float(shares.mean()),
+            "contacts": float(felt["flat"].contacts.mean()),
+            "us": us,
+            "ratio": {name: us[name]["p50"] / us["flat"]["p50"] for name in us},
+            "bytes_a_point": bytes_of(ways["sleeping"]) / len(shell),
+        }
+
+
+def bytes_of(frames: ResidentFrames) -> int:
+    """Memory of a shell's arrays, bytes."""
+    arrays = [*frames.clusters, *(frames.sleepers or ()), frames.met]
+    return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
+
+
+def compare(
+    folder: Path, sizes: Sequence[int], shares: Sequence[float], count: int, bits: int
+) -> list[dict[str, Any]]:
+    """Every size, share and law."""
+    voxel_size = 2.0 * EDGE / (1 << bits)
+    poses = slide(count, voxel_size)
+    lines = []
+    for share in shares:
+        part, database = folder / f"box-{share}.stl", folder / f"box-{share}.db"
+        write_box(part, share, 1.5 * EDGE)
+        options = GridOptions(bits=bits, voxel_size=voxel_size, origin=(-0.5, -0.25, -1.0))
+        hapticdb.import_files(database, [part], ImportOptions(grid=options))
+        for size in sizes:
+            for law in LAWS:
+                line = {"wanted_share": share} | measure(database, law, sheet(size), poses)
+                print(json.dumps(line), flush=True)
+                lines.append(line)
+    return lines
+
+
+def main() -> None:
+    """Measure, print the figures, and write them to a file."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--points", default="1e5,1e6", help="sizes of the sheet")
+    parser.add_argument("--shares", default="0.05,0.25", help="of the sheet that the box is below")
+    parser.add_argument("--frames", type=int, default=500)
+    parser.add_argument("--bits", type=int, default=11, help="of the grid on each axis")
+    parser.add_argument("--out", type=Path, default=Path("results/large_shells.json"))
+    given = parser.parse_args()
+    os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+    sizes = [int(float(word)) for word in given.points.split(",")]
+    shares = [float(word) for word in given.shares.split(",")]
+    with tempfile.TemporaryDirectory(prefix="hapticdb-large-") as folder:
+        lines = compare(Path(folder), sizes, shares, given.frames, given.bits)
+    found = {"lines": lines, "conditions": records.conditions()}
+    given.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,411 @@
+"""Clusters of a large shell that sleep: they are not looked at until they may touch something.
+
+A shell has clusters of two levels: runs of points, and blocks of `BLOCK` runs. A run that is far
+from all voxels gets a *rest*: where its sphere's centre was, and how far the centre may go from
+there, on each axis, before anything can be near. While the centre stays within the rest, the run
+sleeps: a sphere looks the same however the tool turns, so three subtractions prove that none of its
+points meets a voxel. A block whose runs all sleep rests as long as the first of them: the largest
+way of a corner of the box around their centres bounds the way of each centre, turns included,
+because the difference of two poses is affine. This is the idea of dead reckoning (McNeely,
+Puterbaugh and Troy 2006), with the way measured instead of foretold, so that no largest speed is
+assumed. The nesting follows Barbic and James 2008.
+
+Rests hold for one version of the cells' directory, because cells never change within a version.
+
+Whether a run is *near* depends only on the pose and the cells, not on what slept before. So the
+number of points near something, which the budget bounds, is the same in every replay.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import (
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    INTS2,
+    chosen_by_type,
+    entry,
+    fields_of,
+    inlined,
+    leaf,
+)
+from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
+from hapticdb.kernels.law import TANGENT_PLANE, felt_within
+from hapticdb.kernels.resident.cells import (
+    CELLS,
+    CELLS_WITH_DISTANCES,
+    CLUSTERS,
+    EMPTY_SLOT,
+    HITS,
+    PLACE,
+    READER_STRIDE,
+    Clusters,
+    begin_frame,
+    end_frame,
+    key_of_cell,
+    slot_of,
+)
+from hapticdb.kernels.resident.clearance import gap
+from hapticdb.kernels.resident.feeling import frame_of
+from hapticdb.kernels.resident.runs import is_sphere_free
+from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turn
+
+BLOCK = 64
+"""Runs of a block. A larger value tests fewer blocks and wakes more runs at once."""
+SHORTEST, LONGEST = 8.0, 16.0
+"""Largest rests of runs, voxels, from block to block. Longer rests read more cells when they end;
+equal ones would end in one frame when a tool moves without turning."""
+GOLDEN = 0.6180339887498949
+"""Golden ratio: its multiples, without their whole parts, spread evenly (Knuth, volume 3, 6.4)."""
+REST_BETWEEN_BRICKS = 2.0
+"""Rest of a run, voxels, that is tested voxel by voxel because an occupied brick is near."""
+ROUNDING = 1e-6
+"""Voxels taken off each rest: far more than the rounding errors of a placed centre."""
+MOST_IN_TWO_CELLS = 16.0
+"""Half the side of a box that spans at most two cells on an axis, voxels."""
+
+
+class Sleepers(NamedTuple):
+    """What frames keep of a shell with sleeping clusters.
+
+    boxes (B, 6): centre and half the sides, metres, tool frame, of the box around the centres of
+    each block's runs. block_rests (B, 13): the pose at which a block's rest began (`transform_of`),
+    and how far a centre may go, voxels; below zero for a block that is awake. run_rests (C, 4): the
+    place of a sphere's centre and how far it may go from there on each axis, voxels; below zero for
+    a run that is near something. versions (B,) int64: of the directory for which the rests of a
+    block and of its runs hold. listed (C,) int64: the runs that are near something. skips (C, 1):
+    the number of runs that a frame skips from each run on. nothing (0, 4): the spheres of a shell
+    that has none. chosen (K, 6), columns (3, K), indices (K,) int64: points of a frame beyond its
+    budget.
+    """
+
+    boxes: NDArray[np.float64]
+    block_rests: NDArray[np.float64]
+    run_rests: NDArray[np.float64]
+    versions: NDArray[np.int64]
+    listed: NDArray[np.int64]
+    skips: NDArray[np.float64]
+    nothing: NDArray[np.float64]
+    chosen: NDArray[np.float64]
+    columns: NDArray[np.float64]
+    indices: NDArray[np.int64]
+
+
+SLEEPERS = fields_of(
+    Sleepers, FLOATS2, FLOATS2, FLOATS2, INTS, INTS, FLOATS2, FLOATS2, FLOATS2, FLOATS2, INTS
+)
+REST = 12
+"""Column of `Sleepers.block_rests` after the pose."""
+LOOKED_AT, LEFT_OUT, COUNTS = 0, 1, 2
+"""Columns of the counts of frames: points near something that a frame looked at, and that its
+budget left out."""
+
+
+def _voxels(law, words, near):  # noqa: ARG001 - the arguments of each choice
+    """Words of the voxels that a law may feel: the occupied ones."""
+    return words
+
+
+def _near_voxels(law, words, near):  # noqa: ARG001 - likewise
+    """Words of the voxels that the distance law may feel."""
+    return near
+
+
+def _no_margin(law):  # noqa: ARG001 - likewise
+    """Voxels that are added to the near ones: none."""
+    return 0.0
+
+
+def _margin(law):
+    """Voxels around an occupied one in which another law may feel a point."""
+    return felt_within(law)
+
+
+felt_words = chosen_by_type(lambda law: _near_voxels if law is DistanceFieldLaw else _voxels)
+felt_margin = chosen_by_type(lambda law: _no_margin if law is DistanceFieldLaw else _margin)
+
+
+@inlined
+def room_around(keys, slots, masks, used, which, x, y, z, half, most, side):
+    """How far a cube may grow on each side before it meets an occupied brick or an unknown cell.
+
+    (x, y, z), half: the cube's centre and half its side, voxels. The result is at most `most`, and
+    not above zero if the cube meets one already.
+    """
+    reach, top = half + most, side - 1.0
+    least = reach
+    for ci in range(np.int64(max(x - reach, 0.0)) >> 5, (np.int64(min(x + reach, top)) >> 5) + 1):
+        di = gap(x, 32.0 * ci, 32.0 * ci + 32.0)
+        for cj in range(
+            np.int64(max(y - reach, 0.0)) >> 5, (np.int64(min(y + reach, top)) >> 5) + 1
+        ):
+            dj = max(di, gap(y, 32.0 * cj, 32.0 * cj + 32.0))
+            if dj >= least:
+                continue
+            for ck in range(
+                np.int64(max(z - reach, 0.0)) >> 5, (np.int64(min(z + reach, top)) >> 5) + 1
+            ):
+                dk = max(dj, gap(z, 32.0 * ck, 32.0 * ck + 32.0))
+                if dk >= least:
+                    continue
+                slot = slot_of(keys, slots, which, key_of_cell(ci, cj, ck))
+                if slot == EMPTY_SLOT:
+                    continue
+                if slot < 0:
+                    least = dk
+                else:
+                    used[slot] = 1
+                    least = nearest_brick(
+                        masks[slot], 32.0 * ci, 32.0 * cj, 32.0 * ck, x, y, z, least
+                    )
+                if least <= half:
+                    return least - half
+    return least - half
+
+
+@leaf
+def nearest_brick(mask, i, j, k, x, y, z, least):
+    """Distance on the axis where it is largest, from (x, y, z) to the nearest brick of a cell.
+
+    mask: of the cell, whose lowest corner is (i, j, k); all in voxels. `least` if none is nearer.
+    """
+    for bi in range(4):
+        if not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
+            continue
+        di = gap(x, i + 8.0 * bi, i + 8.0 * bi + 8.0)
+        if di >= least:
+            continue
+        for bj in range(4):
+            four = (mask >> np.uint64((bi << 4) | (bj << 2))) & np.uint64(0xF)
+            dj = max(di, gap(y, j + 8.0 * bj, j + 8.0 * bj + 8.0))
+            if not four or dj >= least:
+                continue
+            for bk in range(4):
+                if (four >> np.uint64(bk)) & np.uint64(1):
+                    least = min(least, max(dj, gap(z, k + 8.0 * bk, k + 8.0 * bk + 8.0)))
+    return least
+
+
+@inlined
+def placed_center(spheres, n, transform, place):
+    """Centre of sphere n of a placed shell, voxels."""
+    x, y, z = moved(transform, spheres[n, 0], spheres[n, 1], spheres[n, 2])
+    return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
+
+
+@leaf
+def way_on_axis(a, b, c, u, x, y, z, half_x, half_y, half_z):
+    """Largest way on one axis of a point of a box, when that row of the pose changes by a, b, c, u.
+
+    (x, y, z), half_x, half_y, half_z: the box's centre and half its sides.
+    """
+    turning = abs(a) * half_x + abs(b) * half_y + abs(c) * half_z
+    return abs(turn(a, b, c, x, y, z) + u) + turning
+
+
+@inlined
+def way_of_box(boxes, rests, block, transform):
+    """Largest way on an axis, metres, of a point of a block's box since the block's rest began."""
+    a, b, c, u, d, e, f, v, g, h, m, w = transform
+    x, y, z = boxes[block, 0], boxes[block, 1], boxes[block, 2]
+    half_x, half_y, half_z = boxes[block, 3], boxes[block, 4], boxes[block, 5]
+    along_x = way_on_axis(
+        a - rests[block, 0], b - rests[block, 1], c - rests[block, 2], u - rests[block, 3],
+        x, y, z, half_x, half_y, half_z,
+    )  # fmt: skip
+    along_y = way_on_axis(
+        d - rests[block, 4], e - rests[block, 5], f - rests[block, 6], v - rests[block, 7],
+        x, y, z, half_x, half_y, half_z,
+    )  # fmt: skip
+    along_z = way_on_axis(
+        g - rests[block, 8], h - rests[block, 9], m - rests[block, 10], w - rests[block, 11],
+        x, y, z, half_x, half_y, half_z,
+    )  # fmt: skip
+    return max(along_x, along_y, along_z)
+
+
+@inlined
+def begin_block_rest(rests, block, transform, rest):
+    """Enter the rest of a block from this pose on."""
+    a, b, c, u, d, e, f, v, g, h, m, w = transform
+    rests[block, 0] = a
+    rests[block, 1] = b
+    rests[block, 2] = c
+    rests[block, 3] = u
+    rests[block, 4] = d
+    rests[block, 5] = e
+    rests[block, 6] = f
+    rests[block, 7] = v
+    rests[block, 8] = g
+    rests[block, 9] = h
+    rests[block, 10] = m
+    rests[block, 11] = w
+    rests[block, REST] = rest
+
+
+@inlined
+def left_of_rest(rests, n, x, y, z):
+    """How far the centre of run n, now at (x, y, z), may still go on each axis; all in voxels."""
+    way = max(abs(x - rests[n, 0]), abs(y - rests[n, 1]), abs(z - rests[n, 2]))
+    return rests[n, 3] - way
+
+
+@inlined
+def begin_rest(rests, n, x, y, z, rest):
+    """Enter the rest of run n, whose centre is at (x, y, z)."""
+    rests[n, 0] = x
+    rests[n, 1] = y
+    rests[n, 2] = z
+    rests[n, 3] = rest
+
+
+@inlined
+def rest_of_run(
+    keys, slots, words, masks, used, which, spheres, n, x, y, z, transform, place, margin, longest
+):  # fmt: skip
+    """Rest of run n, whose centre is at (x, y, z): zero if it is free only here, -1 if it is near.
+
+    A run is near unless its box is free of voxels, or of occupied bricks. What is free in a larger
+    box is free in each smaller one, so rests change nothing.
+    """
+    half = spheres[n, 3] / place.size + margin
+    is_free = is_sphere_free(
+        keys, slots, words, masks, used, which, spheres, n, transform, place, margin
+    )
+    if not is_free and half <= MOST_IN_TWO_CELLS:
+        return -1.0
+    rest = room_around(keys, slots, masks, used, which, x, y, z, half, longest, place.side)
+    if rest > REST_BETWEEN_BRICKS:
+        return rest - ROUNDING
+    if is_free and is_sphere_free(
+        keys, slots, words, masks, used, which, spheres, n, transform, place,
+        margin + REST_BETWEEN_BRICKS,
+    ):  # fmt: skip
+        return REST_BETWEEN_BRICKS - ROUNDING
+    if rest > ROUNDING:
+        return rest - ROUNDING
+    return 0.0 if is_free else -1.0
+
+
+@leaf
+def list_near_runs(cells, which, version, shell, sleepers, transform, place, law):
+    """List the runs of a placed shell that are near something; returns their number."""
+    _, _, keys, slots, words, masks, used, _, near = cells
+    spheres = shell.spheres
+    boxes, block_rests, run_rests, versions, listed, _, _, _, _, _ = sleepers
+    felt, margin = felt_words(law, words, near), felt_margin(law)
+    count = 0
+    for block in range(boxes.shape[0]):
+        is_known = versions[block] == version
+        if is_known and block_rests[block, REST] > 0.0:
+            way = way_of_box(boxes, block_rests, block, transform) / place.size
+            if way < block_rests[block, REST]:
+                continue
+        longest = SHORTEST + (LONGEST - SHORTEST) * (block * GOLDEN % 1.0)
+        least = LONGEST
+        for n in range(block * BLOCK, min((block + 1) * BLOCK, spheres.shape[0])):
+            x, y, z = placed_center(spheres, n, transform, place)
+            left = left_of_rest(run_rests, n, x, y, z) if is_known else -1.0
+            if left < 0.0:
+                left = rest_of_run(
+                    keys, slots, felt, masks, used, which, spheres, n, x, y, z, transform, place,
+                    margin, longest,
+                )  # fmt: skip
+                begin_rest(run_rests, n, x, y, z, left)
+                if left < 0.0:
+                    listed[count] = n
+                    count += 1
+            least = min(least, left)
+        begin_block_rest(block_rests, block, transform, least - ROUNDING)
+        versions[block] = version
+    return count
+
+
+@inlined
+def points_listed(listed, count, run, n_points):
+    """Number of points of the listed runs; only the last run of a shell may be shorter."""
+    last = (n_points - 1) // run
+    short = (last + 1) * run - n_points
+    return count * run - (short if count > 0 and listed[count - 1] == last else 0)
+
+
+@inlined
+def skip_between(listed, count, skips):
+    """Write the number of runs that a frame skips, from each run on that it comes to."""
+    at = 0
+    for n in range(count):
+        if listed[n] > at:
+            skips[at, 0] = listed[n] - at
+        at = listed[n] + 1
+        skips[at - 1, 0] = 0.0
+    if at < skips.shape[0]:
+        skips[at, 0] = skips.shape[0] - at
+
+
+@inlined
+def choose_points(listed, count, points, columns, run, stride, chosen, chosen_columns, indices):
+    """Copy every stride-th point of the listed runs, in their order; returns the number."""
+    n_chosen = past = 0
+    for n in range(count):
+        start = listed[n] * run
+        n_run = min(run, points.shape[0] - start)
+        for at in range(-past % stride, n_run, stride):
+            for axis in range(3):
+                chosen[n_chosen, 3 + axis] = points[start + at, 3 + axis]
+                chosen_columns[axis, n_chosen] = columns[axis, start + at]
+            indices[n_chosen] = start + at
+            n_chosen += 1
+        past += n_run
+    return n_chosen
+
+
+@entry(
+    CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, INTS, FLOATS2, SLEEPERS, INT, INTS2,
+    also={CELLS: CELLS_WITH_DISTANCES, TANGENT_PLANE: DISTANCE_FIELD},
+)  # fmt: skip
+def feel_sleeping(
+    cells, reader, shell, poses, place, law, met, missed, out, sleepers, budget, counts
+):
+    """`feeling.feel_kernel` with sleeping clusters, at most `budget` points a frame.
+
+    counts (M, COUNTS) int64 takes the numbers of points near something. Where there are more than
+    the budget, a frame looks at every 2nd, 4th, 8th ... of them, in the order of the shell, so
+    that every cluster keeps its share. Returns the number of poses done.
+    """
+    points, center, _, _, run, columns, scratch = shell
+    _, _, _, _, listed, skips, nothing, chosen, chosen_columns, indices = sleepers
+    whole = Clusters(points, center, nothing, skips, run, columns, scratch)
+    for n in range(poses.shape[0]):
+        if not is_rigid(poses[n]):
+            return n
+        which = begin_frame(cells, reader)
+        version = cells.readers[reader * READER_STRIDE]
+        transform = transform_of(poses[n])
+        count = list_near_runs(cells, which, version, shell, sleepers, transform, place, law)
+        n_near = points_listed(listed, count, run, points.shape[0])
+        n_looked = n_near
+        felt = whole
+        if n_near <= budget:
+            skip_between(listed, count, skips)
+        else:
+            stride = 1
+            while (n_near + stride - 1) // stride > budget:
+                stride *= 2
+            n_looked = choose_points(
+                listed, count, points, columns, run, stride, chosen, chosen_columns, indices
+            )
+            felt = Clusters(
+                chosen[:n_looked], center, nothing, nothing, run, chosen_columns, scratch
+            )
+        frame_of(law, cells, which, felt, poses[n], place, met, missed, out[n])
+        if n_near > budget:
+            for hit in range(np.int64(out[n, HITS])):
+                met[hit] = indices[met[hit]]
+        end_frame(cells, reader)
+        counts[n, LOOKED_AT] = n_looked
+        counts[n, LEFT_OUT] = n_near - n_looked
+    return poses.shape[0]

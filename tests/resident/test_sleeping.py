@@ -1,0 +1,269 @@
+"""Clusters that sleep change nothing; a budget of points gives the same in each replay."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from banded import move_points, write_points
+from hapticdb import Environment, PointShell, UsageError
+from hapticdb.kernels.field.law import DistanceFieldLaw
+from hapticdb.kernels.resident.sleeping import BLOCK, REST, way_of_box
+from hapticdb.resident.frames import FeltFrames, ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.sleepers import boxes_of_blocks
+from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.store.connect import open_store
+from realtime.worlds import block, make, move, scatter, turned
+
+Poses = NDArray[np.float64]
+
+
+class Smooth:
+    """The distance law of 1000 N/m."""
+
+    stiffness = 1000.0
+    for_kernels = DistanceFieldLaw(stiffness)
+
+
+def rod(n_points: int, seed: int, length: float) -> PointShell:
+    """A shell of random points along a rod, sorted along the rod, with random normals."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(n_points, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = rng.uniform(-0.5, 0.5, (n_points, 3)) * (length, 0.004, 0.004)
+    return PointShell(points[np.argsort(points[:, 0])], normals, np.array([0.001, 0.002, -0.003]))
+
+
+def walk(count: int, seed: int, step: float, reach: float) -> Poses:
+    """Poses (count, 4, 4) of a hand that moves in steps, turns, and now and then jumps."""
+    rng = np.random.default_rng(seed)
+    place, axis = rng.uniform(-reach, reach, 3), turned(rng, np.zeros(3))
+    poses = np.empty((count, 4, 4))
+    for n in range(count):
+        if rng.random() < 0.05:
+            place = rng.uniform(-reach, reach, 3)
+        place = np.clip(place + rng.normal(0.0, step, 3), -reach, reach)
+        angle = rng.normal(0.0, 0.03)
+        about = np.eye(4)
+        about[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        axis = axis @ about
+        poses[n] = axis
+        poses[n, :3, 3] = place
+    return poses
+
+
+def same(one: FeltFrames, other: FeltFrames) -> bool:
+    """Whether two results have the same bits, but for the number of points looked at."""
+    return all(
+        (getattr(one, name) + 0.0).tobytes() == (getattr(other, name) + 0.0).tobytes()
+        for name in ("wrenches", "hits", "contacts", "unknown", "deepest")
+    )
+
+
+def in_parts(frames: ResidentFrames, poses: Poses, size: int) -> FeltFrames:
+    """The frames at all poses, a few at a time, as a session asks for them."""
+    parts = [frames.feel(poses[at : at + size]) for at in range(0, len(poses), size)]
+    return FeltFrames(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+@given(st.integers(0, 10_000))
+@settings(deadline=None, max_examples=8)
+def test_sleeping_clusters_change_nothing(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    """Slow and fast hands that turn and jump, small and large runs, one pose or many at once."""
+    env = make(tmp_path_factory.mktemp("sleeping"))
+    scatter(env, n_objects=2, n_voxels=600, seed=seed)
+    rng = np.random.default_rng(seed)
+    shell = rod(int(rng.integers(1, 3000)), seed, float(rng.choice([0.01, 0.1, 0.25])))
+    poses = walk(60, seed, float(rng.choice([1e-5, 1e-3, 1e-2])), 0.15)
+    with CellTable.create(LEAST_BUDGET) as table:
+        residency = Residency(env.store, table)
+        flat = ResidentFrames(residency, shell, run=0).feel(poses)
+        for run in (1, int(rng.integers(2, 64)), 64, None):
+            sleeping = ResidentFrames(residency, shell, run=run, sleeps=True)
+            assert same(in_parts(sleeping, poses, int(rng.integers(1, 20))), flat)
+            assert same(sleeping.feel(poses), flat)
+            sleeping.close()
+    env.close()
+
+
+def test_a_tool_far_from_everything_looks_at_no_point(tmp_path: Path) -> None:
+    """And one that comes near with a tip looks at few."""
+    env = make(tmp_path)
+    scatter(env, n_objects=1, n_voxels=10)
+    move(env.store, 1, block((64, 64, 64), (66, 66, 66)))
+    shell = rod(8000, 0, 0.1)
+    poses = np.tile(np.eye(4), (100, 1, 1))
+    poses[:, 0, 3] = np.linspace(0.1, 0.05, 100)
+    with CellTable.create(LEAST_BUDGET) as table:
+        felt = ResidentFrames(Residency(env.store, table), shell, sleeps=True).feel(poses)
+    assert not felt.looked_at[:40].any()
+    assert 0 < felt.looked_at[-1] < 2000
+    assert felt.hits[-1] > 0
+
+
+def scenes(folder: Path) -> Iterator[tuple[Environment, Any, Any]]:
+    """For each law, an environment with an object near the middle, and what moves the object."""
+    env = make(folder)
+    scatter(env, n_objects=1, n_voxels=300)
+
+    def place_block(at: int) -> None:
+        move(env.store, 1, block((at, 60, 60), (at + 6, 68, 68)))
+
+    yield env, None, place_block
+    env.close()
+    env = make(folder, bits=6)
+    points = np.argwhere(np.ones((8, 8, 8))) / 1.5 + 30.0
+    write_points(env.store, points)
+
+    def place_points(at: int) -> None:
+        move_points(env.store, 1, points + np.array([at - 62.0, 0.0, 0.0]))
+
+    yield env, Smooth(), place_points
+    env.close()
+
+
+@pytest.mark.parametrize("which", ["plane", "distance"])
+def test_an_edit_wakes_the_clusters_that_it_comes_near(tmp_path: Path, which: str) -> None:
+    """An object is moved along a tool that rests, by another connection, again and again."""
+    for env, law, place in scenes(tmp_path):
+        if (law is None) != (which == "plane"):
+            continue
+        shell = rod(4000, 1, 0.12)
+        poses = walk(6, 2, 1e-4, 0.002)
+        with CellTable.create(8 << 20, distances=law is not None) as table:
+            residency = Residency(open_store(env.url, read_only=True), table)
+            flat = ResidentFrames(residency, shell, law, run=0)
+            sleeping = ResidentFrames(residency, shell, law, run=16, sleeps=True)
+            touched = 0
+            for at in (62, 40, 62, 75, 50):
+                place(at)
+                residency.refresh()
+                expected = flat.feel(poses)
+                assert same(sleeping.feel(poses), expected)
+                touched += int(expected.contacts.sum())
+            assert touched > 0
+
+
+@pytest.mark.parametrize("which", ["plane", "distance"])
+def test_a_budget_is_kept_and_is_the_same_whatever_slept_before(tmp_path: Path, which: str) -> None:
+    """Within it nothing changes. The order and number of poses asked at once do not matter."""
+    for env, law, place in scenes(tmp_path):
+        if (law is None) != (which == "plane"):
+            continue
+        place(62)
+        shell = rod(5000, 3, 0.08)
+        poses = walk(40, 4, 5e-4, 0.02)
+        with CellTable.create(8 << 20, distances=law is not None) as table:
+            residency = Residency(env.store, table)
+            full = ResidentFrames(residency, shell, law, sleeps=True).feel(poses)
+            assert not full.left_out.any()
+            budget = int(np.median(full.looked_at[full.looked_at > 0]))
+            first = ResidentFrames(residency, shell, law, budget_points=budget)
+            felt = first.feel(poses)
+            assert (felt.looked_at <= budget).all()
+            assert ((felt.looked_at + felt.left_out) == full.looked_at).all()
+            within = full.looked_at <= budget
+            assert within.any()
+            assert not within.all()
+            assert (felt.left_out[within] == 0).all()
+            assert felt.wrenches[within].tobytes() == full.wrenches[within].tobytes()
+            assert (felt.looked_at[~within] > budget // 2).all()
+            second = ResidentFrames(residency, shell, law, budget_points=budget)
+            order = np.random.default_rng(0).permutation(len(poses))
+            again = in_parts(second, poses[order], 3)
+            for one, other in zip(felt, again, strict=True):
+                assert one[order].tobytes() == other.tobytes()
+
+
+def test_beyond_the_budget_the_indices_of_hits_are_those_of_the_shell(tmp_path: Path) -> None:
+    env = make(tmp_path)
+    move_to = block((50, 50, 50), (78, 78, 78))
+    scatter(env, n_objects=1, n_voxels=10)
+    move(env.store, 1, move_to)
+    shell = rod(3000, 0, 0.05)
+    with CellTable.create(LEAST_BUDGET) as table:
+        residency = Residency(env.store, table)
+        full = ResidentFrames(residency, shell, run=0)
+        hit = set(full.met[: full.feel(np.eye(4)).hits[0]].tolist())
+        part = ResidentFrames(residency, shell, budget_points=200)
+        felt = part.feel(np.eye(4))
+        found = part.met[: felt.hits[0]].tolist()
+        assert 0 < len(found) <= 200
+        assert found == sorted(set(found))
+        assert set(found) <= hit
+
+
+@given(st.integers(0, 10_000))
+@settings(deadline=None, max_examples=8)
+def test_no_sleeping_point_comes_near_a_voxel(
+    tmp_path_factory: pytest.TempPathFactory, seed: int
+) -> None:
+    """After any walk with turns, by the distance of every point to every voxel."""
+    env = make(tmp_path_factory.mktemp("rests"))
+    scatter(env, n_objects=1, n_voxels=300, seed=seed)
+    voxels = env.voxels(1)
+    rng = np.random.default_rng(seed)
+    shell = rod(2500, seed, 0.2)
+    run = int(rng.integers(4, 40))
+    with CellTable.create(LEAST_BUDGET) as table:
+        frames = ResidentFrames(Residency(env.store, table), shell, run=run, sleeps=True)
+        poses = walk(30, seed, float(rng.choice([1e-4, 2e-3])), 0.12)
+        frames.feel(poses)  # so that every cell is there
+        frames.feel(poses)
+        kept = frames.sleepers
+        assert kept is not None
+        version = table.version
+        placed = shell.points @ poses[-1, :3, :3].T + poses[-1, :3, 3]
+        places = (placed - env.grid.origin) / env.grid.voxel_size
+        inside = np.zeros(len(shell), dtype=bool)
+        for voxel in voxels:
+            inside |= ((voxel <= places) & (places < voxel + 1.0)).all(axis=1)
+        is_asleep = np.repeat(kept.run_rests[:, 3] >= 0.0, run)[: len(shell)]
+        for b in range(len(kept.boxes)):
+            assert kept.versions[b] == version
+            if kept.block_rests[b, REST] > 0.0:
+                assert is_asleep[b * BLOCK * run : (b + 1) * BLOCK * run].all()
+        assert is_asleep.any()
+        assert not inside[is_asleep].any()
+    env.close()
+
+
+@given(st.integers(0, 10_000))
+@settings(deadline=None, max_examples=20)
+def test_no_run_goes_further_than_its_block_however_the_tool_turns(seed: int) -> None:
+    """The bound holds for the naive way of each centre on each axis, and is reached by a corner."""
+    rng = np.random.default_rng(seed)
+    spheres = np.column_stack([rng.normal(0, 0.1, (150, 3)), rng.uniform(0, 0.02, 150)])
+    boxes = boxes_of_blocks(spheres)
+    assert len(boxes) == 3
+    before, after = (turned(rng, rng.normal(0, 0.1, 3)) for _ in range(2))
+    if rng.random() < 0.5:
+        after = before.copy()
+        after[:3, 3] += rng.normal(0, 1e-3, 3)
+    rests = np.zeros((3, REST + 1))
+    rests[:, :REST] = before[:3].ravel()
+    change = after - before
+    ways = np.abs(spheres[:, :3] @ change[:3, :3].T + change[:3, 3]).max(axis=1)
+    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
+    for n in range(3):
+        bound = way_of_box(boxes, rests, n, tuple(after[:3].ravel()))
+        assert ways[n * BLOCK : (n + 1) * BLOCK].max() <= bound + 1e-12
+        corners = boxes[n, :3] + signs * boxes[n, 3:]
+        furthest = np.abs(corners @ change[:3, :3].T + change[:3, 3]).max()
+        assert abs(furthest - bound) <= 1e-12
+
+
+def test_a_budget_of_nothing_is_refused(tmp_path: Path) -> None:
+    env = make(tmp_path)
+    with CellTable.create(LEAST_BUDGET) as table:
+        residency = Residency(env.store, table)
+        with pytest.raises(UsageError, match="a budget of 0 points leaves nothing to feel"):
+            ResidentFrames(residency, rod(10, 0, 0.01), budget_points=0)

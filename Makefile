@@ -58,8 +58,8 @@ realtime: $(READY)
 # hour.
 paths: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
 paths: $(READY) .venv/figures
-	$(BIN)/python benchmarks/batches.py $(ARGS)
-	$(BIN)/python benchmarks/large_shells.py $(ARGS)
+	$(BIN)/python benchmarks/batches.py
+	$(BIN)/python benchmarks/large_shells.py
 
 # How good the forces feel, under both laws (docs/feel.md): a quarter of an hour; ARGS=--quick for two
 # minutes. The walk is over the vintage car where HAPTICDB_TEST_DATA has it, else over the sample.

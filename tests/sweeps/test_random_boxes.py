@@ -149,7 +149,7 @@ def sweep_cases(folder: Path, seed: int, count: int, *, stored: bool) -> Counter
 
 
 def test_the_oracle_agrees_with_points_spread_over_both_boxes() -> None:
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(8)
     one, other = random_boxes(rng, 24), random_boxes(rng, 24)
     exact, _ = distances(one, other)
     assert (exact == 0.0).any()

@@ -163,10 +163,10 @@ def sweep(
         )  # fmt: skip
         with _bar("sweeping") as progress:
             found = sweep_path(
-                env, shell, poses, where=felt.where, exclude=felt.exclude,
-                budget_bytes=budget_bytes(budget), clearance_limit=clearance, profile=picture is not None,
-                proportions=fit, progress=progress, leave_start=leave_start,
-                tolerance=None if tolerance is None else 1e-3 * tolerance, refine=refine,
+                env, shell, poses, where=felt.where, exclude=felt.exclude, proportions=fit,
+                budget_bytes=budget_bytes(budget), clearance_limit=clearance, refine=refine,
+                profile=picture is not None, progress=progress, leave_start=leave_start,
+                tolerance=None if tolerance is None else 1e-3 * tolerance,
             )  # fmt: skip
         _note_writes(env, found)
         if table is not None:
@@ -179,7 +179,7 @@ def sweep(
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
                 _draw(picture, env, shell, found, felt.left_out, up)
-    if not json and csv != STDOUT and picture is not None:
+    if picture is not None and not json and csv != STDOUT:
         render.say(f"picture: {picture}")
     _exit(found, is_doubtful=bool(fit.misfits) and not as_given)
 

@@ -169,7 +169,7 @@ def sweep(
                 tolerance=None if tolerance is None else 1e-3 * tolerance,
             )  # fmt: skip
         _note_writes(env, found)
-        if table is not None:
+        if table:
             table.write(rows_of_sweep(found))
         try:
             if json:
@@ -179,13 +179,13 @@ def sweep(
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
                 _draw(picture, env, shell, found, felt.left_out, up)
-    if picture is not None and not json and csv != STDOUT:
+    _exit(found, None if json or csv == STDOUT else picture, bool(fit.misfits) and not as_given)
+
+
+def _exit(found: "Swept", picture: str | None, is_doubtful: bool) -> None:  # noqa: FBT001
+    """Name the picture, if any, and end with the verdict's exit code."""
+    if picture is not None:
         render.say(f"picture: {picture}")
-    _exit(found, is_doubtful=bool(fit.misfits) and not as_given)
-
-
-def _exit(found: "Swept", *, is_doubtful: bool) -> None:
-    """End with the verdict's exit code."""
     if found.verdict != "comes out":
         raise typer.Exit(EXIT_CODES[found.verdict])
     if is_doubtful:

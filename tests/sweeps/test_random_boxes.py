@@ -172,7 +172,7 @@ def test_random_boxes_never_come_out_or_hit_falsely(tmp_path: Path, *, stored: b
     for seed in range(2):
         told += sweep_cases(tmp_path, seed, 25, stored=stored)
     assert min(told["comes out"], told["hits"]) >= 5
-    assert told["not decided"] <= 20
+    assert told["not decided"] <= 30
 
 
 @pytest.mark.long

@@ -89,8 +89,7 @@ def sweep(
         The tool. "Comes out" needs a covering radius of about a voxel or less, as of a shell made
         with `spacing=0.5 * env.grid.voxel_size`. It is computed here if necessary.
     poses : (M, 4, 4) array
-        `world_from_tool`, rigid, metres; at least one. Between two poses the middle of the tool's
-        bounding box moves on a line, and the tool turns about it by the smaller angle.
+        `world_from_tool`, rigid, metres; at least one. Motion between two: as for `SweepPath`.
     where, exclude : iterable of int or str
         Felt are the objects that `where` chooses, all if it is empty, without those of `exclude`: a
         part that is taken out must not hit itself. Words as for `Environment.find`.
@@ -99,7 +98,7 @@ def sweep(
     clearance_limit : float or None
         Greatest clearance that is searched, metres; 32 voxels unless given; 0: no search.
     profile : bool
-        Compute the clearance along the path, too, and not only the least one.
+        Compute the clearance along the path, too.
     proportions : Proportions or None
         Of the same tool, path and scene, with their units; compared here in metres unless given.
     progress : callable or None
@@ -121,8 +120,6 @@ def sweep(
     shell = shell.with_cover()
     path = SweepPath.of(poses, shell, env.grid.voxel_size)
     limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
-    if not (np.isfinite(limit) and limit >= 0.0):
-        raise UsageError(f"clearance up to {limit} m: give a finite length, 0 or more")
     asked = _Asked(leave_start, tolerance, refine)
     run = _Run(env, shell, path, limit, profile, proportions, progress, asked)
     return run.swept_once(Filter(where, exclude), budget_bytes)
@@ -150,6 +147,8 @@ class _Run:
         progress: SampleCallback | None,
         asked: _Asked,
     ) -> None:
+        if not (np.isfinite(limit) and limit >= 0.0):
+            raise UsageError(f"clearance up to {limit} m: give a finite length, 0 or more")
         if asked.tolerance is not None and not 0.0 < asked.tolerance < np.inf:
             raise UsageError(f"tolerance {asked.tolerance} m: give a finite length above 0")
         self.asked = asked

@@ -150,9 +150,7 @@ def sweep(
     from hapticdb.sweeps.record import sweep_record
     from hapticdb.sweeps.run import sweep as sweep_path
 
-    _check(tool, part, tool_unit, picture)
-    _check_output(csv, is_json=json)
-    n_bytes = budget_bytes(budget)
+    _check(tool, part, tool_unit, picture, csv if json else None)
     poses = read_poses(path, unit=path_unit or "m")
     with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
         parts = ids_of(env, part, "--part")
@@ -165,13 +163,13 @@ def sweep(
         )  # fmt: skip
         with _bar("sweeping") as progress:
             found = sweep_path(
-                env, shell, poses, where=felt.where, exclude=felt.exclude,
-                budget_bytes=n_bytes, clearance_limit=clearance, profile=picture is not None,
-                proportions=fit, progress=progress, leave_start=leave_start,
-                tolerance=None if tolerance is None else 1e-3 * tolerance, refine=refine,
+                env, shell, poses, where=felt.where, exclude=felt.exclude, proportions=fit,
+                budget_bytes=budget_bytes(budget), clearance_limit=clearance, refine=refine,
+                profile=picture is not None, progress=progress, leave_start=leave_start,
+                tolerance=None if tolerance is None else 1e-3 * tolerance,
             )  # fmt: skip
         _note_writes(env, found)
-        if table is not None:
+        if table:
             table.write(rows_of_sweep(found))
         try:
             if json:
@@ -181,13 +179,13 @@ def sweep(
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
                 _draw(picture, env, shell, found, felt.left_out, up)
-    if not json and csv != STDOUT and picture is not None:
+    _exit(found, None if json or csv == STDOUT else picture, bool(fit.misfits) and not as_given)
+
+
+def _exit(found: "Swept", picture: str | None, is_doubtful: bool) -> None:  # noqa: FBT001
+    """Name the picture, if any, and end with the verdict's exit code."""
+    if picture is not None:
         render.say(f"picture: {picture}")
-    _exit(found, is_doubtful=bool(fit.misfits) and not as_given)
-
-
-def _exit(found: "Swept", *, is_doubtful: bool) -> None:
-    """End with the verdict's exit code."""
     if found.verdict != "comes out":
         raise typer.Exit(EXIT_CODES[found.verdict])
     if is_doubtful:
@@ -200,16 +198,16 @@ def _note_writes(env: "Environment", found: "Swept") -> None:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
 
 
-def _check_output(csv: str | None, *, is_json: bool) -> None:
-    """Refuse two results on standard output."""
-    if is_json and csv == STDOUT:
-        raise UsageError("--csv - and --json: only one may be standard output")
-
-
 def _check(
-    tool: str | None, part: list[str] | None, tool_unit: str | None, picture: str | None
+    tool: str | None,
+    part: list[str] | None,
+    tool_unit: str | None,
+    picture: str | None,
+    csv_beside_json: str | None,
 ) -> None:
     """Refuse options that contradict one another."""
+    if csv_beside_json == STDOUT:
+        raise UsageError("--csv - and --json: only one may be standard output")
     if (tool is None) == (not part):
         raise UsageError("give one of --tool and --part")
     if part and tool_unit is not None:

@@ -16,7 +16,6 @@ import json
 import multiprocessing
 import os
 import shutil
-import sys
 import tempfile
 import threading
 import time
@@ -27,6 +26,7 @@ from typing import Any
 
 import hapticdb
 from awake import awake
+from children import received
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.bench import records
 from hapticdb.bench.measure import summary
@@ -39,7 +39,6 @@ from shards import again
 POSES = 400
 BEFORE_S = 10.0
 """Seconds for which reader and writer work alone first."""
-PATIENCE_S = 120.0
 SPAWN = multiprocessing.get_context("spawn")
 Times = list[tuple[float, float]]
 """Begin of each call, on the clock of all processes, and the microseconds that it took."""
@@ -86,17 +85,11 @@ def beside(url: str) -> Iterator[dict[str, Times]]:
         ours, theirs = SPAWN.Pipe()
         SPAWN.Process(target=work, args=(url, theirs), daemon=True).start()
         lines[name] = ours
-        _received(ours)
+        received(ours)
     yield found
     for name, line in lines.items():
         line.send("end")
-        found[name] = _received(line)
-
-
-def _received(line: Connection) -> Any:  # noqa: ANN401 - what the process sends
-    if not line.poll(PATIENCE_S):
-        sys.exit("a reader or a writer does not answer")
-    return line.recv()
+        found[name] = received(line)
 
 
 def rebalanced(url: str) -> dict[str, Any]:

@@ -85,7 +85,7 @@ pins:
 	.venv-pins/bin/pip install .
 	head -1 requirements/user.txt > .venv-pins/user.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb >> .venv-pins/user.txt
-	.venv-pins/bin/pip install ".[step,pointcloud,postgres,view]" --group dev
+	.venv-pins/bin/pip install ".[step,pointcloud,postgres,view,extract]" --group dev
 	head -1 requirements/dev.txt > .venv-pins/dev.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb | grep -vxFf .venv-pins/user.txt >> .venv-pins/dev.txt
 	mv .venv-pins/user.txt .venv-pins/dev.txt requirements/

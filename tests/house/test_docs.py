@@ -87,6 +87,16 @@ def test_every_block_of_the_page_of_batches_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
+def test_every_block_of_the_page_of_the_way_out_runs(tmp_path: Path) -> None:
+    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    for block in blocks("sh", "docs/extract.md"):
+        bash = ["bash", "-euo", "pipefail", "-c", block]
+        done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
+        assert done.returncode == 0, done.stderr
+    assert (tmp_path / "out.csv").exists()
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("binaries", [b for b in FOUND if not isinstance(b, str)], ids=named)
 def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
     """The blocks use a private server, named by libpq's environment variables, and its pg_dump."""

@@ -33,7 +33,7 @@ FLOORS: list[set[str]] = [
     {"bench", "demo", "pictures"},
     {"pool", "warm"},
     {"client", "hosting"},
-    {"edits", "realtime", "sweeps"},
+    {"edits", "extraction", "realtime", "sweeps"},
     {"recording", "devices"},
     {"batches", "environment", "resident", "sample", "testing"},
     {"check", "difference", "ingest", "proportions", "transfer"},

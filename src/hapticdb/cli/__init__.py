@@ -23,6 +23,8 @@ from hapticdb.cli.verbs.importing import import_
 from hapticdb.cli.verbs.keeping import backup, rebalance, restore
 from hapticdb.cli.verbs.listing import analyze, calibrate, info, objects
 from hapticdb.cli.verbs.moving import copy, diff
+from hapticdb.cli.verbs.paths.extracting import HELP as EXTRACT_HELP
+from hapticdb.cli.verbs.paths.extracting import extract
 from hapticdb.cli.verbs.replaying import replay
 from hapticdb.cli.verbs.sampling import demo, sample, warm
 from hapticdb.cli.verbs.serving import serve, view
@@ -49,6 +51,7 @@ VERBS: dict[Callable[..., None], str] = {
     serve: "Let others see and feel, in browsers and with devices.",
     replay: "Compute a recorded session's wrenches again.",
     sweep: "Say whether a tool or part comes out along a path.",
+    extract: "Search a path on which parts come out.",
     move: "Place an object anew.",
     remove: "Remove objects.",
     copy: "Copy to another engine, layout or curve.",
@@ -67,7 +70,7 @@ VERBS: dict[Callable[..., None], str] = {
     warm: "Compile every kernel now, so that no verb has to.",
 }
 """The verbs, and the line about each in the list of verbs."""
-HELP = {sweep: SWEEP_HELP}
+HELP = {sweep: SWEEP_HELP, extract: EXTRACT_HELP}
 """Help texts that are too long for a docstring, so that no function is over 60 lines."""
 for verb, summary in VERBS.items():
     app.command(verb.__name__.rstrip("_"), short_help=summary, help=HELP.get(verb))(verb)

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hapticdb.check import CheckCallback
+    from hapticdb.extraction.pulls import SearchCallback
     from hapticdb.ingest.files import ImportCallback
     from hapticdb.store.engines import BackupCallback
     from hapticdb.store.sharding import RebalanceCallback
@@ -184,6 +185,11 @@ def file_bar(doing: str) -> "AbstractContextManager[BackupCallback | None]":
 def check_bar(doing: str) -> "AbstractContextManager[CheckCallback | None]":
     """Show how many rows are read; see `_progress_bar`."""
     return _progress_bar(doing, "rows", lambda now: (doing, now.done, now.total, 0))
+
+
+def pull_bar() -> "AbstractContextManager[SearchCallback | None]":
+    """Show how many straight pulls are tried; see `_progress_bar`."""
+    return _progress_bar("pulling", "pulls", lambda now: ("pulling", now.done, now.total, 0))
 
 
 def rebalance_bar() -> "AbstractContextManager[RebalanceCallback | None]":

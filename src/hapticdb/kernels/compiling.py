@@ -140,6 +140,16 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "field.packing.unpack_kernel",
         *_RANGES,
     ),
+    "extract": (
+        *_SHELL,
+        *_RESIDENT,
+        "resident.feeling.*",
+        "resident.sweep.*",
+        "resident.clearance.*",
+        *_RANGES,
+        "query.contact.*",
+        "query.refining.*",
+    ),
     "proxies": (
         *_RESIDENT,
         "field.packing.unpack_kernel",

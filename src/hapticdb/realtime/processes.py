@@ -123,6 +123,13 @@ class Process:
         assert isinstance(message, Message)  # noqa: S101 - nothing else is sent
         return message
 
+    def send(self, content: object) -> None:
+        """Send an object, which the process takes by `receive_from_parent`; nothing if it ended."""
+        assert self._popen.stdin is not None  # noqa: S101 - asked for above
+        with contextlib.suppress(OSError, ValueError):  # `receive` reports that
+            self._popen.stdin.write(pickle.dumps(content))
+            self._popen.stdin.flush()
+
     def wait(self, seconds: float) -> bool:
         """Wait for the end of the process; returns whether it ended in `seconds`."""
         try:
@@ -211,6 +218,14 @@ def _load() -> Any:  # noqa: ANN401 - whatever was sent
         return pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
     except (EOFError, pickle.UnpicklingError):  # the parent ended while it was sending
         raise _EndQuietly(0) from None
+
+
+def receive_from_parent() -> Any:  # noqa: ANN401 - whatever was sent
+    """Next object that the parent has sent by `Process.send`; a SystemExit if the parent ended.
+
+    A process that waits for objects cannot ask `parent_is_gone`.
+    """
+    return _load()
 
 
 def _request() -> object:

@@ -1,0 +1,90 @@
+"""Whether poses are free, many at once, against resident cells.
+
+A pose is free if no point of the shell lies in an occupied voxel. With the guard, no point a voxel
+outside the surface does either. The search believes this; the proof is that of a sweep.
+"""
+
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.extraction.problem import Problem, guarded_shell, searched_shell
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
+from hapticdb.sweeps.path import SweepPath
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+AT_ONCE = 32
+"""Poses of a motion that are looked at together. Larger: fewer calls; more poses of motions that
+turn out blocked."""
+
+
+class FreeSpace:
+    """Numbers of hits of a problem's parts at any poses. It is also a context manager.
+
+    Attributes
+    ----------
+    n_poses : int
+        Number of poses looked at so far.
+    """
+
+    def __init__(self, problem: Problem, budget_bytes: int) -> None:
+        self.voxel_size = problem.voxel_size
+        self.shell = searched_shell(problem.shell)
+        self.n_poses = 0
+        self._table = CellTable.create(budget_bytes)
+        try:
+            residency = Residency(
+                problem.env.store, self._table, problem.exclude, where=problem.where
+            )
+            self._frames = [
+                ResidentFrames(residency, shell)
+                for shell in (self.shell, guarded_shell(self.shell, self.voxel_size))
+            ]
+        except BaseException:
+            self._table.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for frames in self._frames:
+            frames.close()
+        self._table.close()
+
+    def hits(self, poses: Floats, *, is_guarded: bool = False) -> Ints:
+        """Numbers of points (n,) in occupied voxels at poses (n, 4, 4)."""
+        self.n_poses += len(poses)
+        return self._frames[is_guarded].feel(poses).hits
+
+    def is_motion_free(self, ends: Floats, *, is_guarded: bool) -> bool:
+        """Whether all poses between two poses (2, 4, 4) are free, in steps of half a voxel.
+
+        The samples are those of a sweep. The end comes first, then samples far apart: a blocked
+        motion is mostly refused by few of them.
+        """
+        path = SweepPath.of(ends, self.shell, self.voxel_size)
+        poses = path.sample(0, len(path))
+        for some in _from_coarse_to_fine(len(poses)):
+            if self.hits(poses[some], is_guarded=is_guarded).any():
+                return False
+        return True
+
+
+def _from_coarse_to_fine(n: int) -> list[Ints]:
+    """Indices 0 .. n - 1 in blocks, each once: the last one, then those that are far apart."""
+    order: list[int] = [n - 1]
+    seen = {n - 1}
+    stride = 1 << max(n - 1, 1).bit_length()
+    while stride >= 1:
+        fresh = [i for i in range(0, n, stride) if i not in seen]
+        order += fresh
+        seen.update(fresh)
+        stride //= 2
+    at = np.array(order)
+    return [at[:1], *(at[k : k + AT_ONCE] for k in range(1, n, AT_ONCE))]

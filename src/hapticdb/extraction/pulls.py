@@ -1,0 +1,166 @@
+"""Straight pulls: how far a part goes in each direction before something is in the way."""
+
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.extraction.directions import AGAINST, candidate_directions, opposed_shares
+from hapticdb.extraction.free_space import FreeSpace
+from hapticdb.extraction.leaving import Exit
+from hapticdb.extraction.problem import Problem
+from hapticdb.query.touches import Touch
+
+Floats = NDArray[np.float64]
+
+MOST_OPPOSED = 0.1
+"""Greatest share of the contacts at the start that a pull may press against. Larger: pulls through
+thin walls are tried, too; the proof does not take them for proved."""
+GROWTH = 1.2
+"""A part slides along what it touches at its start while it has at most so many times the hits of
+its start. Larger: more pulls that the proof refuses."""
+BLOCK = 64
+"""Samples, half a voxel apart, that are looked at together."""
+
+
+class SearchProgress(NamedTuple):
+    """Straight pulls tried, of so many."""
+
+    done: int
+    total: int
+
+
+SearchCallback = Callable[[SearchProgress], None]
+"""Called after each straight pull."""
+
+
+class Pull(NamedTuple):
+    """A straight pull.
+
+    direction (3,) : unit vector; length : metres until the part is out; touching : metres in
+    contact with what it touches at its start; free : metres until the first other hit, `length` if
+    there is none; guarded : metres from `touching` on with the guard free, as an interval (2,), or
+    None; blockers : ids of the objects at the first hit in the way.
+    """
+
+    direction: Floats
+    length: float
+    touching: float
+    free: float
+    guarded: tuple[float, float] | None
+    blockers: tuple[int, ...]
+
+    @property
+    def is_out(self) -> bool:
+        """Whether nothing is in the way until the part is out."""
+        return self.free >= self.length
+
+    def pose(self, way: float) -> Floats:
+        """Displacement (4, 4) after so many metres."""
+        return shifted(self.direction * way)
+
+
+def shifted(shift: Floats) -> Floats:
+    """Pose (4, 4) that shifts by (3,) metres."""
+    pose = np.eye(4)
+    pose[:3, 3] = shift
+    return pose
+
+
+class Pulls:
+    """Pulls in all candidate directions, until a deadline.
+
+    Attributes
+    ----------
+    done : list of Pull
+        In the order in which they were tried.
+    touched : tuple of int
+        Ids of the objects that the part touches where it starts.
+    """
+
+    def __init__(self, problem: Problem, space: FreeSpace, leaving: Exit, seed: int) -> None:
+        self.done: list[Pull] = []
+        self._problem, self._space = problem, space
+        start = self._touch(np.eye(4))
+        self.touched = tuple(obj.id for obj in start.objects)
+        self._normals = start.contact_normals
+        self._pairs, self._contacts = start.contact_pairs, start.contacts
+        self._directions = candidate_directions(self._normals, seed)
+        self._lengths = np.maximum(leaving.distances(self._directions), problem.voxel_size)
+        self._opposed = opposed_shares(self._directions, self._normals)
+
+    def run(self, until: float, progress: SearchCallback | None) -> None:
+        """Try each direction; stops at a time of `time.monotonic`, but tries the first one."""
+        total = len(self._directions)
+        for n in range(total):
+            if self.done and time.monotonic() > until:
+                return
+            self.done.append(self._pull(n))
+            if progress is not None:
+                progress(SearchProgress(n + 1, total))
+
+    def _touch(self, pose: Floats) -> Touch:
+        problem = self._problem
+        return problem.env.touch(
+            self._space.shell, pose, where=problem.where, exclude=problem.exclude, law="plane"
+        )
+
+    def _pull(self, n: int) -> Pull:
+        direction, length = self._directions[n], float(self._lengths[n])
+        if self._opposed[n] > MOST_OPPOSED:
+            return Pull(direction, length, 0.0, 0.0, None, self._opposing(direction))
+        ways = np.linspace(0.0, length, int(np.ceil(2.0 * length / self._problem.voxel_size)) + 1)
+        contact = 0  # samples in contact from the start on
+        most = -1.0
+        for first in range(0, len(ways), BLOCK):
+            block = ways[first : first + BLOCK]
+            hits = self._space.hits(_poses_along(direction, block))
+            most = GROWTH * float(hits[0]) if most < 0.0 else most
+            for at, count in enumerate(hits.tolist(), start=first):
+                if count and contact == at and count <= most:
+                    contact += 1
+                elif count:
+                    found = self._touch(shifted(direction * ways[at])).objects
+                    blockers = tuple(obj.id for obj in found)
+                    return self._ended(direction, ways, contact, at, blockers)
+        if contact == len(ways):  # still in contact where it should be out
+            return Pull(direction, length, length, 0.0, None, self.touched)
+        return self._ended(direction, ways, contact, len(ways), ())
+
+    def _ended(
+        self, direction: Floats, ways: Floats, contact: int, end: int, blockers: tuple[int, ...]
+    ) -> Pull:
+        """Describe a pull that is free from sample `contact` to the one before `end`."""
+        length = float(ways[-1])
+        touching = float(ways[contact]) if contact < end else 0.0
+        free = length if end == len(ways) else float(ways[end - 1]) * (end > contact)
+        guarded = None
+        if end > contact:
+            poses = _poses_along(direction, ways[contact:end])
+            first, last = first_run(self._space.hits(poses, is_guarded=True) == 0)
+            if first < last:
+                guarded = (float(ways[contact + first]), float(ways[contact + last - 1]))
+        return Pull(direction, length, touching, free, guarded, blockers)
+
+    def _opposing(self, direction: Floats) -> tuple[int, ...]:
+        """Ids of the objects whose contacts at the start a direction presses against."""
+        against = self._contacts[self._normals @ direction < AGAINST]
+        pairs = self._pairs[np.isin(self._pairs[:, 0], against)]
+        return tuple(np.unique(pairs[:, 1]).tolist())
+
+
+def first_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
+    """First and last + 1 index of the first run of true flags (n,); equal if there is none."""
+    if not flags.any():
+        return 0, 0
+    first = int(np.argmax(flags))
+    length = int(np.argmin(np.append(flags[first:], False)))
+    return first, first + length
+
+
+def _poses_along(direction: Floats, ways: Floats) -> Floats:
+    poses = np.tile(np.eye(4), (len(ways), 1, 1))
+    poses[:, :3, 3] = ways[:, None] * direction
+    return poses

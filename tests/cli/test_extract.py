@@ -1,0 +1,79 @@
+"""The verb extract, with right and wrong arguments."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
+from extraction_scenes import enclosed, lid
+
+
+def test_the_path_is_written_and_a_sweep_agrees(run: Run, scene: Path) -> None:
+    """Three boxes in a row, 0.1 m apart: the middle one comes out to the side."""
+    words = ("--motions", 0, "--out", 0.1)
+    code, out, err = run("extract", scene, "box1", *words, "--path", "out.csv")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0].startswith("comes out straight, 0.1 m, surfaces ")
+    assert lines[-1].split() == ["path", "out.csv"]
+    poses = hapticdb.read_poses("out.csv")
+    assert np.array_equal(poses[0], np.eye(4))
+    assert np.linalg.norm(poses[-1][:3, 3]) == pytest.approx(0.1)
+    code, out, _ = run("sweep", scene, "--part", "box1", "--path", "out.csv")
+    assert (code, out[:9]) == (0, "comes out")
+
+
+def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
+    code, out, err = run("extract", lid(tmp_path, 0.0), "lid", "--motions", 0, "--json")
+    assert (code, err) == (3, "")
+    found = json.loads(out)
+    assert list(found) == [
+        "verdict", "line", "parts", "way", "touched", "blockers", "pulls", "motions", "poses",
+        "is_planned", "seconds", "seed",
+    ]  # fmt: skip
+    assert list(found["way"]) == [
+        "how", "poses", "length", "clearance", "rest_from", "proof", "rest",
+    ]  # fmt: skip
+    assert (found["verdict"], found["way"]["how"]) == ("comes out of contact", "pull")
+    assert found["way"]["proof"]["verdict"] == "hits"
+    assert found["way"]["rest"]["verdict"] == "comes out"
+    assert [obj["name"] for obj in found["touched"]] == ["pot"]
+
+
+def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
+    url = enclosed(tmp_path)
+    words = ("--motions", 0, "--path", "out.csv", "--picture", "out.png")
+    code, out, err = run("extract", url, "block", *words)
+    assert (code, err) == (1, "")
+    first, heading, _, row, *_ = [line for line in out.splitlines() if line]
+    assert first.startswith("no way found in ")
+    assert "cage blocks" in first
+    assert heading.split() == ["id", "in", "the", "way", "of", "pulls"]
+    assert row.split()[1] == "cage"
+    assert not Path("out.csv").exists()
+    assert not Path("out.png").exists()
+    found = json.loads(run("extract", url, "block", "--motions", 0, "--json")[1])
+    assert (found["way"], found["blockers"][0]["name"]) == (None, "cage")
+
+
+@pytest.mark.long
+def test_the_picture_is_drawn(run: Run, scene: Path) -> None:
+    code, out, _ = run("extract", scene, "box0", "--motions", 0, "--picture", "out.png")
+    assert code == 0
+    assert out.splitlines()[-1].split() == ["picture", "out.png"]
+    assert Path("out.png").stat().st_size > 10_000
+
+
+def test_wrong_arguments_are_refused(run: Run, scene: Path) -> None:
+    refused(run("extract", scene, "nut"), "PART: no object 'nut'")
+    refused(run("extract", scene), "WORDS")
+    refused(run("extract", scene, "box0", "--seconds", 0), "seconds")
+    refused(run("extract", scene, "box0", "--seed", -1), "seed -1")
+    refused(run("extract", scene, "box*"), "nothing stands")
+    refused(run("extract", scene, "box0", "--picture", "a.jpg"), ".png")
+    refused(run("extract", "missing.db", "box0"), "missing.db")

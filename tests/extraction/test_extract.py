@@ -1,0 +1,205 @@
+"""Ways out of scenes made of boxes, whose ways are known by construction."""
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import hapticdb
+from extraction_scenes import corner, drawer, enclosed, lid
+from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
+from hapticdb.extraction.directions import candidate_directions, opposed_shares
+from hapticdb.extraction.leaving import Exit
+from hapticdb.extraction.result import Extraction
+from hapticdb.extraction.run import extract
+from hapticdb.extraction.verdict import extraction_line
+
+
+def found_in(url: Path, part: str, **options: float) -> Extraction:
+    with hapticdb.open(url, read_only=True) as env:
+        return extract(env, part, **options)  # type: ignore[arg-type]
+
+
+def is_out(found: Extraction, url: Path) -> bool:
+    """Whether the part's box has left the box of all else at the end of the path."""
+    assert found.way is not None
+    with hapticdb.open(url, read_only=True) as env:
+        others = np.array([o.bounds for o in env.objects() if o.id != found.parts[0].id])
+    placed = found.shell.points @ found.way.poses[-1][:3, :3].T + found.way.poses[-1][:3, 3]
+    low, high = others[:, 0].min(axis=0), others[:, 1].max(axis=0)
+    return bool((placed.min(axis=0) > high).any() or (placed.max(axis=0) < low).any())
+
+
+# --- straight pulls ------------------------------------------------------------------------------
+
+
+def test_a_lid_above_its_pot_lifts_off_proved(tmp_path: Path) -> None:
+    url = lid(tmp_path, 0.03)
+    found = found_in(url, "lid", motions=0)
+    assert found.way is not None
+    assert (found.verdict, found.way.how, found.touched) == ("comes out", "pull", ())
+    assert is_out(found, url)
+    assert found.way.clearance is not None
+    assert 0.0 < found.way.clearance <= 0.03
+    assert extraction_line(found).startswith("comes out straight, ")
+
+
+def test_a_lid_on_its_pot_leaves_contact_and_the_rest_is_proved(tmp_path: Path) -> None:
+    url = lid(tmp_path, 0.0)
+    found = found_in(url, "lid", motions=0)
+    assert found.way is not None
+    assert (found.verdict, found.way.swept.verdict) == ("comes out of contact", "hits")
+    assert [obj.name for obj in found.touched] == ["pot"]
+    assert found.way.rest is not None
+    assert found.way.rest.comes_out
+    assert 0.0 < found.way.rest_from < 0.1
+    direction = found.way.poses[-1][:3, 3]
+    assert direction[2] > 0.0  # not through the pot
+    assert is_out(found, url)
+    assert "once it has left pot" in extraction_line(found)
+
+
+def test_a_drawer_comes_out_the_open_way_only(tmp_path: Path) -> None:
+    url = drawer(tmp_path)
+    found = found_in(url, "drawer", motions=0)
+    assert found.way is not None
+    assert (found.verdict, found.way.how) == ("comes out", "pull")
+    way = found.way.poses[-1][:3, 3]
+    assert way[1] > 0.9 * np.linalg.norm(way)
+    assert is_out(found, url)
+    assert [(one.object.name, one.pulls > 0) for one in found.blockers] == [("shaft", True)]
+
+
+def test_what_counts_as_out_may_be_near(tmp_path: Path) -> None:
+    found = found_in(drawer(tmp_path), "drawer", motions=0, out=0.1)
+    assert found.way is not None
+    assert np.linalg.norm(found.way.poses[-1][:3, 3]) == pytest.approx(0.1)
+
+
+# --- the planner ---------------------------------------------------------------------------------
+
+
+def test_a_way_round_a_corner_is_planned_and_proved(tmp_path: Path) -> None:
+    url = corner(tmp_path)
+    found = found_in(url, "block", seed=3)
+    assert found.way is not None
+    assert (found.verdict, found.way.how) == ("comes out", "plan")
+    assert is_out(found, url)
+    assert len(found.way.poses) > 2
+    assert [one.object.name for one in found.blockers] == ["channel"]
+    assert found.blockers[0].pulls == found.pulls  # none leads out straight
+
+
+@pytest.mark.long
+def test_the_same_seed_gives_the_same_path(tmp_path: Path) -> None:
+    url = corner(tmp_path)
+    found = found_in(url, "block", seed=3)
+    assert found.way is not None
+    again = found_in(url, "block", seed=3)
+    assert again.way is not None
+    assert np.array_equal(found.way.poses, again.way.poses)
+    assert again.motions == found.motions
+
+
+def test_what_is_enclosed_has_no_way_and_its_cage_is_named(tmp_path: Path) -> None:
+    found = found_in(enclosed(tmp_path), "block", motions=60)
+    assert (found.verdict, found.way, found.is_planned) == ("no way found", None, True)
+    assert [one.object.name for one in found.blockers] == ["cage"]
+    assert found.blockers[0].pulls == found.pulls
+    assert "cage blocks" in extraction_line(found)
+    assert found.motions <= 2 * 60
+
+
+def test_the_time_ends_the_planner(tmp_path: Path) -> None:
+    """Without its end, ten million motions would take hours."""
+    began = time.monotonic()
+    found = found_in(enclosed(tmp_path), "block", motions=10_000_000, seconds=3.0)
+    assert found.way is None
+    assert time.monotonic() - began < 200.0
+
+
+def test_a_missing_planner_is_said_with_what_is_in_the_way(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shadow = tmp_path / "shadow" / "ompl"
+    shadow.mkdir(parents=True)
+    (shadow / "__init__.py").write_text("raise ImportError('no planner')")
+    monkeypatch.syspath_prepend(str(shadow.parent))  # the child has the path of its parent
+    url = enclosed(tmp_path)
+    with pytest.raises(MissingExtraError, match=r"cage is in the way.*hapticdb\[extract\]"):
+        found_in(url, "block")
+    assert found_in(url, "block", motions=0).verdict == "no way found"
+
+
+def test_a_planner_that_dies_is_an_error_and_no_wait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shadow = tmp_path / "shadow" / "ompl"
+    shadow.mkdir(parents=True)
+    (shadow / "__init__.py").write_text("import os\nos.kill(os.getpid(), 9)")
+    monkeypatch.syspath_prepend(str(shadow.parent))
+    with pytest.raises(hapticdb.HapticDBError, match="planner's process has ended"):
+        found_in(enclosed(tmp_path), "block")
+
+
+# --- wrong arguments -----------------------------------------------------------------------------
+
+
+def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
+    url = enclosed(tmp_path)
+    with pytest.raises(ObjectNotFoundError, match="no object 'nut'"):
+        found_in(url, "nut")
+    for options, words in (
+        ({"seconds": 0.0}, "seconds"),
+        ({"seconds": float("nan")}, "seconds"),
+        ({"seed": -1}, "seed -1"),
+        ({"motions": -1}, "-1 motions"),
+        ({"out": 0.0}, "out at"),
+    ):
+        with pytest.raises(UsageError, match=words):
+            found_in(url, "block", **options)
+    with hapticdb.open(url, read_only=True) as env:
+        with pytest.raises(UsageError, match="nothing stands"):
+            extract(env, "*")
+        with pytest.raises(UsageError, match="at least one"):
+            extract(env)
+
+
+# --- geometry ------------------------------------------------------------------------------------
+
+numbers = st.floats(-1.0, 1.0)
+units = st.tuples(numbers, numbers, numbers).filter(lambda v: sum(x * x for x in v) > 0.01)
+
+
+@given(units, units, st.floats(0.01, 1.0))
+def test_a_part_is_out_at_the_given_distance_and_not_before(
+    way: tuple[float, float, float], center: tuple[float, float, float], radius: float
+) -> None:
+    """Out: the sphere is beyond a side of the box, [-1, 1] on each axis."""
+    direction = np.array(way) / np.linalg.norm(way)
+    leaving = Exit(-np.ones(3), np.ones(3), np.array(center), radius, None)
+    length = float(leaving.distances(direction[None])[0])
+    for share, is_out_there in ((1.0, True), (0.999, False)):
+        middle = np.array(center) + share * length * direction
+        gap = float((np.abs(middle) - 1.0).max())
+        assert (gap >= radius - 1e-9) == is_out_there
+        assert bool(leaving.is_out(share * length * direction[None])[0]) == is_out_there
+
+
+@given(st.lists(units, max_size=12), st.integers(0, 100))
+def test_directions_are_unit_distinct_and_the_free_ones_come_first(
+    normals: list[tuple[float, float, float]], seed: int
+) -> None:
+    given_normals = np.array(normals).reshape(-1, 3)
+    given_normals /= np.linalg.norm(given_normals, axis=1, keepdims=True)
+    found = candidate_directions(given_normals, seed)
+    assert np.allclose(np.linalg.norm(found, axis=1), 1.0)
+    assert (found @ found.T - 2.0 * np.eye(len(found)) < 0.999).all()
+    shares = np.round(opposed_shares(found, given_normals), 2)
+    assert (np.diff(shares) >= 0.0).all()
+    assert np.array_equal(found, candidate_directions(given_normals, seed))
+    for axis in np.concatenate([np.eye(3), -np.eye(3)]):
+        assert (found @ axis).max() > 0.99

@@ -1,0 +1,105 @@
+"""Assemblies of boxes with a part that comes out, or does not, by construction."""
+
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+import hapticdb
+
+Floats = NDArray[np.float64]
+
+SIZE = 0.005
+"""Edge of the voxels, metres; the pot and the drawer take twice as much."""
+
+
+def box(low: tuple[float, float, float], high: tuple[float, float, float]) -> trimesh.Trimesh:
+    """A box between two corners, metres."""
+    return trimesh.creation.box(bounds=np.array([low, high]))
+
+
+def joined(*boxes: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Boxes that make one part."""
+    return trimesh.util.concatenate(boxes)
+
+
+def imported(folder: Path, size: float = SIZE, **parts: trimesh.Trimesh) -> Path:
+    """An environment of named parts with voxels of `size` metres."""
+    scene = trimesh.Scene()
+    for name, mesh in parts.items():
+        scene.add_geometry(mesh, node_name=name, geom_name=name)
+    (folder / "parts.glb").write_bytes(scene.export(file_type="glb"))
+    options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(voxel_size=size))
+    hapticdb.import_files(folder / "parts.db", [folder / "parts.glb"], options)
+    return folder / "parts.db"
+
+
+def walls(
+    low: tuple[float, float, float],
+    high: tuple[float, float, float],
+    thick: float,
+    open_side: str = "",
+) -> trimesh.Trimesh:
+    """A hollow box around a room between two corners; one side may be open: ``+z``, ``-y``."""
+    room = np.array([low, high])
+    outer = room + np.array([[-thick] * 3, [thick] * 3])
+    if open_side:
+        end, axis = "-+".index(open_side[0]), "xyz".index(open_side[1])
+        outer[end, axis] = room[end, axis]
+    plates = []
+    for axis, name in enumerate("xyz"):
+        for end, sign in ((0, "-"), (1, "+")):
+            if sign + name == open_side:
+                continue
+            corners = outer.copy()
+            corners[1 - end, axis] = room[end, axis]
+            plates.append(trimesh.creation.box(bounds=corners))
+    return joined(*plates)
+
+
+def lid(folder: Path, gap: float) -> Path:
+    """A flat lid above a pot that is open at its top."""
+    pot = walls((0.0, 0.0, 0.0), (0.2, 0.2, 0.1), 0.02, "+z")
+    top = 0.1 + gap
+    return imported(
+        folder, 2.0 * SIZE, pot=pot, lid=box((-0.02, -0.02, top), (0.22, 0.22, top + 0.02))
+    )
+
+
+def drawer(folder: Path) -> Path:
+    """A drawer in a shaft that is open in one direction, +y; 3 voxels of room on all sides."""
+    shaft = walls((0.0, 0.0, 0.0), (0.2, 0.3, 0.1), 0.02, "+y")
+    inside = box((0.03, 0.03, 0.03), (0.17, 0.27, 0.07))
+    return imported(folder, 2.0 * SIZE, shaft=shaft, drawer=inside)
+
+
+def corner(folder: Path) -> Path:
+    """A block in a channel with a corner: up, and then along +x. No straight pull leads out.
+
+    The channel is 0.08 m wide, the block 0.04 m. It stands at the lower end of the upright part.
+    """
+    upright = [
+        box((-0.06, -0.06, -0.06), (-0.04, 0.06, 0.34)),  # the left side
+        box((0.04, -0.06, -0.06), (0.06, 0.06, 0.22)),  # the right side, up to the opening
+        box((-0.06, -0.06, -0.06), (0.06, 0.06, -0.04)),  # the bottom
+        box((-0.06, -0.06, 0.32), (0.24, 0.06, 0.34)),  # the roof of both parts
+        box((0.04, -0.06, 0.2), (0.24, 0.06, 0.22)),  # the floor of the part along x
+    ]
+    sides = [box((-0.06, y - 0.01, -0.06), (0.24, y + 0.01, 0.34)) for y in (-0.05, 0.05)]
+    return imported(
+        folder,
+        1.6 * SIZE,
+        channel=joined(*upright, *sides),
+        block=box((-0.02, -0.02, -0.02), (0.02, 0.02, 0.02)),
+    )
+
+
+def enclosed(folder: Path) -> Path:
+    """A block in a closed box, with an object beside the box that blocks nothing."""
+    return imported(
+        folder,
+        cage=walls((0.0, 0.0, 0.0), (0.1, 0.1, 0.1), 0.02),
+        block=box((0.04, 0.04, 0.04), (0.06, 0.06, 0.06)),
+        beside=box((0.3, 0.0, 0.0), (0.32, 0.02, 0.02)),
+    )

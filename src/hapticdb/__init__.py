@@ -42,6 +42,8 @@ if TYPE_CHECKING:
         StuckError,
         UsageError,
     )
+    from hapticdb.extraction.result import Extraction
+    from hapticdb.extraction.run import extract
     from hapticdb.grid import Grid, GridOptions
     from hapticdb.ingest.files import FileReport, ImportOptions, import_files
     from hapticdb.ingest.upgrading import UpgradeReport, upgrade_environment
@@ -91,6 +93,7 @@ __all__ = [
     "Environment",
     "EnvironmentExistsError",
     "EnvironmentNotFoundError",
+    "Extraction",
     "Feeler",
     "FileError",
     "FileReport",
@@ -136,6 +139,7 @@ __all__ = [
     "copy_environment",
     "create",
     "diff_environments",
+    "extract",
     "import_files",
     "open",
     "read_poses",
@@ -163,6 +167,8 @@ _HOMES = {
         "OutsideGridError ProtocolError ReadOnlyError ShardAwayError StaleError StuckError "
         "UsageError"
     ),
+    "extraction.result": "Extraction",
+    "extraction.run": "extract",
     "query.law": "DistanceField TangentPlane",
     "grid": "Grid GridOptions",
     "ingest.files": "FileReport ImportOptions import_files",

@@ -10,11 +10,10 @@ from hypothesis import strategies as st
 
 import hapticdb
 from extraction_scenes import corner, drawer, enclosed, lid
+from hapticdb import Extraction, extract
 from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
 from hapticdb.extraction.directions import candidate_directions, opposed_shares
 from hapticdb.extraction.leaving import Exit
-from hapticdb.extraction.result import Extraction
-from hapticdb.extraction.run import extract
 from hapticdb.extraction.verdict import extraction_line
 
 

@@ -15,7 +15,7 @@ from hapticdb.query.touches import Touch
 
 Floats = NDArray[np.float64]
 
-MOST_OPPOSED = 0.02
+MOST_OPPOSED = 0.1
 """Greatest share of the contacts at the start that a pull may press against. Larger: pulls through
 thin walls are tried, too; the proof does not take them for proved."""
 GROWTH = 1.2

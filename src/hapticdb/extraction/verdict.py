@@ -21,7 +21,7 @@ def extraction_line(found: Extraction) -> str:
         return f"comes out {how}, {length_text(way.length)}{clearance}"
     return (
         f"comes out {how}, {length_text(way.length)}, once it has left {_touched(way)}, which it "
-        f"touches at its start: proved from {length_text(way.rest_from)} on{clearance}"
+        f"touches at its start: proved from {length_text(way.rest_from)} on, not before{clearance}"
     )
 
 

@@ -1,0 +1,45 @@
+"""Parts of the sample car come out, or are held, as they were built; exact meshes agree."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("coal", reason="make peers installs it")
+
+from ways_out import BITS, SAMPLE, SECONDS, measure
+
+
+@pytest.fixture(scope="module")
+def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
+    folder: Path = tmp_path_factory.mktemp("ways")
+    found = measure(folder, None, BITS, SAMPLE, SECONDS)
+    return {row["parts"]: row for row in found["rows"]}
+
+
+OUT = {"wheels/wheel_bolt_front_left_1", "body/hood", SAMPLE[1].name}
+HELD_BY = {
+    "wheels/tyre_front_left, wheels/rim_front_left": "wheels/wheel_bolt",
+    "supply/battery": "supply/wiring_harness",
+}
+
+
+def test_what_is_free_comes_out_and_what_is_held_does_not(
+    rows: dict[str, dict[str, object]],
+) -> None:
+    verdicts = {name: row["verdict"] for name, row in rows.items()}
+    assert {name for name, said in verdicts.items() if said != "no way found"} == OUT
+    for name in OUT:
+        assert verdicts[name] in {"comes out", "comes out of contact"}
+
+
+def test_what_holds_a_part_is_named_first(rows: dict[str, dict]) -> None:  # type: ignore[type-arg]
+    for name, holder in HELD_BY.items():
+        assert rows[name]["blockers"][0][0].startswith(holder)
+
+
+def test_exact_meshes_keep_the_proved_distance(rows: dict[str, dict]) -> None:  # type: ignore[type-arg]
+    for name in OUT:
+        row = rows[name]
+        assert row["clearance_m"] > 0.0
+        assert row["mesh_distance_m"] >= row["clearance_m"]
+        assert row["mesh_poses"] > 20

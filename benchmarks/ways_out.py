@@ -1,0 +1,167 @@
+"""Ways out: which parts are found to come out, how soon, and what exact meshes say of the paths.
+
+    python benchmarks/ways_out.py                      # seven questions of the sample car
+    python benchmarks/ways_out.py --model FILE --bits 10 --parts 40,57,140 --out ways_out.json
+
+coal compares the triangles of the part with those of all that stands, at each found path's poses at
+half the steps of its sweep. So no voxels, points or bounds of hapticdb take part in its answer.
+"""
+
+import argparse
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import coal
+import numpy as np
+from numpy.typing import NDArray
+
+import hapticdb
+from hapticdb import Environment, Extraction, GridOptions, ImportOptions
+from hapticdb.bench import records
+from hapticdb.ingest.originals import parts_of
+from hapticdb.pointshell.orientation import Surface
+from hapticdb.sample import write_sample
+from peers.coal_meshes import tree_of_boxes
+
+Floats = NDArray[np.float64]
+BITS = 11
+SECONDS = 60.0
+MOST_POSES = 4000
+"""Greatest number of poses of a path that coal looks at; of a longer one, every n-th."""
+
+
+class Question(NamedTuple):
+    """Which parts are to come out, and what was taken off before."""
+
+    words: tuple[str, ...]
+    exclude: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        return ", ".join(self.words) + (f" without {', '.join(self.exclude)}" * bool(self.exclude))
+
+
+WHEEL = ("wheels/tyre_front_left", "wheels/rim_front_left")
+BOLTS = ("wheels/wheel_bolt_front_left_*",)
+SAMPLE = (
+    Question(("wheels/wheel_bolt_front_left_1",)),
+    Question(WHEEL, BOLTS),
+    Question(WHEEL),
+    Question(("body/hood",)),
+    Question(("body/door_front_left",)),
+    Question(("seats/seat_*_left",)),
+    Question(("supply/battery",)),
+)
+"""Of the sample car: the first, the second and the hood come out; bolts hold the wheel, pillars and
+hinges the door, the floor's rails the seat, and the harness the battery."""
+
+
+def measured(env: Environment, question: Question, seconds: float) -> dict[str, Any]:
+    """Search a way out; for a path that is found, ask coal, too."""
+    found = hapticdb.extract(env, *question.words, exclude=question.exclude, seconds=seconds)
+    row: dict[str, Any] = {
+        "parts": question.name,
+        "verdict": found.verdict,
+        "s": found.seconds,
+        "pulls": found.pulls,
+        "motions": found.motions,
+        "poses": found.poses,
+        "blockers": [[one.object.name, one.pulls] for one in found.blockers[:3]],
+    }
+    if found.way is not None:
+        row |= {
+            "how": found.way.how,
+            "length_m": found.way.length,
+            "clearance_m": found.way.clearance,
+            "proved_from_m": found.way.rest_from,
+        }
+        if found.way.clearance is not None:
+            standing = env.felt((), (*(obj.id for obj in found.parts), *question.exclude))
+            row |= by_meshes(found, standing)
+    return row
+
+
+def by_meshes(found: Extraction, standing: Sequence[hapticdb.Object]) -> dict[str, Any]:
+    """Least distance of the exact meshes on the proved part of the path, at half the steps."""
+    way, surface = found.way, found.shell.surface
+    assert way is not None
+    assert isinstance(surface, Surface)
+    path = (way.rest or way.swept).path
+    places = np.arange(0.0, len(path) - 0.75, 0.5)
+    places = places[:: max(1, -(-len(places) // MOST_POSES))]
+    others = [
+        part.triangles(obj.transform) for obj, part in parts_of(standing, "compared", "import it")
+    ]
+    tool, scene = _tree(surface.triangles), _tree(np.concatenate(others))
+    here, request = coal.Transform3s(), coal.DistanceRequest()
+    least = np.inf
+    for pose in path.at(places):
+        there = coal.Transform3s(pose[:3, :3].copy(), pose[:3, 3].copy())
+        result = coal.DistanceResult()
+        least = min(least, coal.distance(scene, here, tool, there, request, result))
+    return {"mesh_distance_m": float(least), "mesh_poses": len(places)}
+
+
+def _tree(triangles: Floats) -> Any:  # noqa: ANN401 - coal has no types
+    corners = triangles.reshape(-1, 3)
+    return tree_of_boxes(corners, np.arange(len(corners)).reshape(-1, 3))
+
+
+def measure(
+    folder: Path, model: Path | None, bits: int, questions: Sequence[Question], seconds: float
+) -> dict[str, Any]:
+    """Import the model, the sample car unless one is given, and ask all questions."""
+    file = model or write_sample(folder / "sample").car
+    url = folder / "scene.db"
+    hapticdb.import_files(url, [file], ImportOptions(grid=GridOptions(bits=bits)))
+    found: dict[str, Any] = {
+        "commit": records.commit(),
+        "load_before": os.getloadavg()[0],
+        "conditions": {"model": file.name, "bits": bits, "seconds": seconds},
+        "rows": [],
+    }
+    with hapticdb.open(url, read_only=True) as env:
+        found["conditions"]["voxel_m"] = env.grid.voxel_size
+        for question in questions:
+            row = measured(env, question, seconds)
+            found["rows"].append(row)
+            print(_line(row), flush=True)
+    return found
+
+
+def _line(row: dict[str, Any]) -> str:
+    said = f"{row['parts']}: {row['verdict']}, {row['s']:.1f} s"
+    if "length_m" in row:
+        said += f", {1000 * row['length_m']:.0f} mm"
+    if "mesh_distance_m" in row:
+        said += (
+            f", proved from {1000 * row['proved_from_m']:.1f} mm on with "
+            f"{1000 * row['clearance_m']:.2f} mm; meshes {1000 * row['mesh_distance_m']:.2f} mm"
+        )
+    return said + "".join(f"; {name} stops {pulls}" for name, pulls in row["blockers"][:1])
+
+
+def main() -> None:
+    """Measure, print, and write the figures."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--model", type=Path, help="a model in place of the sample car")
+    parser.add_argument("--bits", type=int, default=BITS, help="of the grid on each axis")
+    parser.add_argument("--parts", help="names or ids, by commas; each is a question of its own")
+    parser.add_argument("--seconds", type=float, default=SECONDS, help="of each search")
+    parser.add_argument("--out", type=Path, help="file of figures, JSON")
+    given = parser.parse_args()
+    questions: Sequence[Question] = SAMPLE
+    if given.parts:
+        questions = [Question((word,)) for word in given.parts.split(",")]
+    with tempfile.TemporaryDirectory() as folder:
+        found = measure(Path(folder), given.model, given.bits, questions, given.seconds)
+    if given.out:
+        given.out.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -25,11 +25,11 @@ from hapticdb.cli.verbs.listing import analyze, calibrate, info, objects
 from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.paths.extracting import HELP as EXTRACT_HELP
 from hapticdb.cli.verbs.paths.extracting import extract
+from hapticdb.cli.verbs.paths.sweeping import HELP as SWEEP_HELP
+from hapticdb.cli.verbs.paths.sweeping import sweep
 from hapticdb.cli.verbs.replaying import replay
 from hapticdb.cli.verbs.sampling import demo, sample, warm
 from hapticdb.cli.verbs.serving import serve, view
-from hapticdb.cli.verbs.sweeping import HELP as SWEEP_HELP
-from hapticdb.cli.verbs.sweeping import sweep
 from hapticdb.cli.verbs.touching import touch
 from hapticdb.cli.verbs.upgrading import upgrade
 from hapticdb.errors import HapticDBError

@@ -16,7 +16,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.values import budget_bytes
-from hapticdb.cli.verbs.sweeping import PictureOption, UpName, UpOption
+from hapticdb.cli.verbs.paths.sweeping import PictureOption, UpName, UpOption
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:

@@ -26,6 +26,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 import hapticdb
 from awake import awake
@@ -33,12 +34,12 @@ from hapticdb import Environment
 from hapticdb.bench import records
 from hapticdb.bench.measure import Alternative, in_turns, summary
 from hapticdb.bench.workload import SEED, sphere_shell
-from hapticdb.demo import slide_along
 from hapticdb.kernels.resident import cell_table
 from hapticdb.query.frame import Strategy
 from hapticdb.query.grouping import object_ranges
 from hapticdb.resident.source import CellSource
 from hapticdb.resident.table import CellTable
+from hapticdb.sample.path import slide_over_voxels
 from hapticdb.store.base import CELL_SHIFT, Store
 from hapticdb.store.connect import open_store
 from hapticdb.transfer import copy_environment
@@ -52,6 +53,9 @@ BATCH = 256
 PREFETCHES = 60
 EDITS = 40
 LIMIT_S = 60.0
+MAP_CELLS = 512
+"""Cells of the map of heights that a path follows, along its longest side."""
+Poses = NDArray[np.float64]
 BUDGET = 256 << 20
 """Bytes of the table of cells."""
 
@@ -85,11 +89,26 @@ def copied(source: str, urls: dict[str, str], known: list[dict[str, Any]]) -> li
     return cells
 
 
+def sliding(env: Environment, tool_points: NDArray[np.float64], frames: int) -> Poses:
+    """Poses (frames, 4, 4) over the largest object and its neighbours, in a scene of any size."""
+    largest = max(env.objects(), key=lambda obj: (obj.voxels, -obj.id))
+    low, high = largest.bounds
+    near = [
+        obj
+        for obj in env.objects()
+        if (obj.bounds[1] >= low).all() and (obj.bounds[0] <= high).all()
+    ]
+    centers = np.concatenate([env.grid.centers(env.voxels(obj.id)) for obj in near])
+    span = float((centers.max(axis=0) - centers.min(axis=0)).max())
+    step = env.grid.voxel_size * max(1, round(span / (env.grid.voxel_size * MAP_CELLS)))
+    return slide_over_voxels(centers, step, tool_points, frames)
+
+
 def framed(envs: dict[str, Environment]) -> list[dict[str, Any]]:
     """Frames of a sliding sphere by every strategy in every place, in turns."""
     home = next(iter(envs.values()))
     shell = sphere_shell(home.grid.voxel_size)
-    poses = slide_along(home, shell.points, POSES)
+    poses = sliding(home, shell.points, POSES)
     ways = []
     for strategy in STRATEGIES:
         for name, env in envs.items():
@@ -119,7 +138,7 @@ def prefetched(home: Environment, stores: dict[str, Store]) -> list[dict[str, An
     times: dict[str, list[float]] = {name: [] for name in stores}
     rows = []
     shell = sphere_shell(grid.voxel_size)
-    for n, pose in enumerate(slide_along(home, shell.points, PREFETCHES + 3)):
+    for n, pose in enumerate(sliding(home, shell.points, PREFETCHES + 3)):
         middle = ((pose[:3, 3] - grid.origin) / grid.voxel_size).astype(np.int64) >> 5
         ijk = middle - [4, 4, 2] + np.stack(np.unravel_index(np.arange(BATCH), (8, 8, 4)), axis=1)
         ijk = ijk[((ijk >= 0) & (ijk < side)).all(axis=1)]

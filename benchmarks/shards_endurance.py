@@ -16,6 +16,7 @@ import json
 import multiprocessing
 import os
 import random
+import sys
 import tempfile
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +29,6 @@ from typing import NamedTuple
 import psycopg
 from psycopg import sql
 
-from children import received
 from hapticdb import BusyError, ConnectionLostError, OutdatedError
 from hapticdb.check import check_environment
 from hapticdb.store.connect import open_store
@@ -36,8 +36,13 @@ from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.shards.store import ShardedStore
 from hapticdb.testing.scenes import EVERYWHERE
-from labelled import GRID, TornError, contents_of, labelled_object, labelled_rows, labels_of
-from sharded import N_SHARDS, SHARD_SETTINGS, ShardedServers
+
+TESTS = Path(__file__).parent.parent / "tests"
+sys.path.insert(0, str(TESTS))
+
+from children import received  # noqa: E402 - of the tests' folder
+from labelled import GRID, TornError, contents_of, labelled_object, labelled_rows, labels_of  # noqa: E402 - of the tests' folder
+from sharded import N_SHARDS, SHARD_SETTINGS, ShardedServers  # noqa: E402 - of the tests' folder
 
 N_WRITERS, N_READERS, N_OBJECTS = 2, 8, 10
 """Processes, and objects of each writer."""

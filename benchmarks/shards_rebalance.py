@@ -16,6 +16,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import sys
 import tempfile
 import threading
 import time
@@ -26,7 +27,6 @@ from typing import Any
 
 import hapticdb
 from awake import awake
-from children import received
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.bench import records
 from hapticdb.bench.measure import summary
@@ -35,6 +35,11 @@ from hapticdb.demo import slide_along
 from hapticdb.store.connect import open_store
 from hapticdb.store.sharding import RebalanceProgress
 from shards import again
+
+TESTS = Path(__file__).parent.parent / "tests"
+sys.path.insert(0, str(TESTS))
+
+from children import received  # noqa: E402 - of the tests' folder
 
 POSES = 400
 BEFORE_S = 10.0

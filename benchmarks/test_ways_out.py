@@ -1,10 +1,12 @@
 """Parts of the sample car come out, or are held, as they were built; exact meshes agree."""
 
+import os
 from pathlib import Path
 
 import pytest
 
-pytest.importorskip("coal", reason="make peers installs it")
+if "CI" not in os.environ:
+    pytest.importorskip("coal", reason="make peers installs it")
 
 from ways_out import BITS, SAMPLE, SECONDS, measure
 

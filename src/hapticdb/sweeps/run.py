@@ -288,9 +288,7 @@ class _Run:
         place, voxel = decider.near
         ids: Ints = NO_KEYS
         if voxel >= 0:
-            ijk = np.empty((1, 3), dtype=np.int64)
-            kernels.unpack(np.array([voxel]), ijk)
-            ids = np.unique(pairs_in_voxels(self.store, ijk, self.exclude).ids)
+            ids = np.unique(pairs_in_voxels(self.store, _unpacked(voxel), self.exclude).ids)
         near = Moment(
             round(place),
             float(self.path.fractions(place)),
@@ -416,8 +414,7 @@ class _Run:
         sample, point, voxel = self.search.nearest
         if sample < 0:
             return Clearance(self.limit, at_least, np.inf, is_beyond=True)
-        ijk = np.empty((1, 3), dtype=np.int64)
-        kernels.unpack(np.array([voxel]), ijk)
+        ijk = _unpacked(voxel)
         moment = self._moment(sample, pairs_in_voxels(self.store, ijk, exclude).ids)
         return Clearance(
             distance, at_least, distance + diagonal, is_beyond=False, moment=moment,
@@ -482,3 +479,10 @@ class _Run:
             self.known.values(), self.grid.voxel_size, self.shell, self.path.poses,
             exclude=exclude.tolist(),
         )  # fmt: skip
+
+
+def _unpacked(voxel: int) -> Ints:
+    """Indices (1, 3) of a packed voxel."""
+    ijk = np.empty((1, 3), dtype=np.int64)
+    kernels.unpack(np.array([voxel]), ijk)
+    return ijk

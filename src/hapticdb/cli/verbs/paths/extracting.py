@@ -1,6 +1,5 @@
 """The verb extract."""
 
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -16,8 +15,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.values import budget_bytes
-from hapticdb.cli.verbs.paths.sweeping import PictureOption, UpName, UpOption
-from hapticdb.errors import UsageError
+from hapticdb.cli.verbs.paths.sweeping import PictureOption, UpName, UpOption, check_picture
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
@@ -91,8 +89,7 @@ def extract(
     from hapticdb.extraction.run import extract as search
     from hapticdb.poses import write_poses
 
-    if picture is not None and Path(picture).suffix.lower() != ".png":
-        raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
+    check_picture(picture)
     n_bytes = budget_bytes(budget)
     with hapticdb.open(url, read_only=True) as env:
         ids = ids_of(env, parts, "PART")

@@ -214,6 +214,11 @@ def _check(
         raise UsageError(
             "--tool-unit belongs to --tool: a part has the unit that it was imported in"
         )
+    check_picture(picture)
+
+
+def check_picture(picture: str | None) -> None:
+    """Refuse a name that is no PNG's."""
     if picture is not None and Path(picture).suffix.lower() != ".png":
         raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
 

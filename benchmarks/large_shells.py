@@ -197,7 +197,7 @@ def main() -> None:
     shares = [float(word) for word in given.shares.split(",")]
     with tempfile.TemporaryDirectory(prefix="hapticdb-large-") as folder:
         lines = compare(Path(folder), sizes, shares, given.frames, given.bits)
-    found = {"lines": lines, "conditions": records.conditions()}
+    found = records.conditions() | {"lines": lines}
     given.out.write_text(json.dumps(found, indent=1) + "\n")
 
 

@@ -1,0 +1,86 @@
+"""What the pages give of the results of `make paths` and benchmarks/ways_out.py, word for word."""
+
+from collections.abc import Mapping
+from typing import Any
+
+BATCH_SIDES = ["hapticdb, one thread", "python-fcl", "coal", "Open3D"]
+BATCH_HEAD = """\
+| tool is | points | hapticdb | python-fcl | coal | Open3D |
+| --- | ---: | ---: | ---: | ---: | ---: |"""
+WAY_HEAD = """\
+| part | answer | seconds | path, mm | proved from, mm | proved gap, mm | gap of the triangles, mm |
+| --- | --- | ---: | ---: | ---: | ---: | ---: |"""
+SHELL_HEAD = """\
+| points | near | law | flat loop, us | sleeping, us | p99 | of the flat loop |
+| ---: | ---: | --- | ---: | ---: | ---: | ---: |"""
+
+
+def batch_table(results: Mapping[str, Any]) -> str:
+    """Poses a second of processor time: does the tool touch, and how far is the nearest part."""
+    rates: dict[tuple[int, str], dict[str, dict[str, float]]] = {}
+    for cell in results["cells"]:
+        row = rates.setdefault((cell["points"], cell["situation"]), {})
+        row[cell["question"]] = {
+            side: one["poses_per_processor_s"] for side, one in cell["sides"].items()
+        }
+    lines = [BATCH_HEAD]
+    for (points, situation), row in rates.items():
+        sides = [
+            f"{row['touch'][side]:,.0f}, {row['clearance'][side]:,.0f}" for side in BATCH_SIDES
+        ]
+        lines.append(f"| {' | '.join([situation, f'{points:,}', *sides])} |")
+    return "\n".join(lines)
+
+
+def batch_words(results: Mapping[str, Any]) -> list[str]:
+    """The scene and the tool."""
+    scene = results["scene"]
+    return [
+        f"{scene['parts']} parts, {scene['triangles']:,} triangles",
+        f"{scene['tool_triangles']:,} triangles",
+    ]
+
+
+def shell_table(results: Mapping[str, Any]) -> str:
+    """Medians of both loops and p99 of the sleeping one, in microseconds."""
+    lines = [SHELL_HEAD]
+    for one in results["lines"]:
+        times = one["us"]
+        near = 100 * one["near_share"]
+        columns = [
+            f"{one['points']:,}",
+            f"{near:.1f} %" if near < 10 else f"{near:.0f} %",
+            one["law"],
+            f"{times['flat']['p50']:,.0f}",
+            f"{times['sleeping']['p50']:,.0f}",
+            f"{times['sleeping']['p99']:,.0f}",
+            f"{one['ratio']['sleeping']:.2f}",
+        ]
+        lines.append(f"| {' | '.join(columns)} |")
+    return "\n".join(lines)
+
+
+def shell_words(results: Mapping[str, Any]) -> list[str]:
+    """Sizes of the sheet, as the results have them."""
+    assert {one["points"] for one in results["lines"]} == {99_856, 1_000_000}
+    return ["`make paths`", "500 frames"]
+
+
+def way_table(results: Mapping[str, Any]) -> str:
+    """Answer, seconds and lengths of each question; what blocks first where no way was found."""
+    lines = [WAY_HEAD]
+    for one in results["rows"]:
+        answer, lengths = one["verdict"], ["-"] * 4
+        if "length_m" in one:
+            keys = ["length_m", "proved_from_m", "clearance_m", "mesh_distance_m"]
+            lengths = [f"{1e3 * one[key]:,.{0 if key == 'length_m' else 2}f}" for key in keys]
+        elif one["blockers"]:
+            answer += f", {_name(one['blockers'][0][0])} named first"
+        columns = [one["parts"], answer, f"{one['s']:.1f}", *lengths]
+        lines.append(f"| {' | '.join(columns)} |")
+    return "\n".join(lines)
+
+
+def _name(path: str) -> str:
+    """The last part of an object's name, which stands well in a table."""
+    return " ".join(path.rpartition("|")[2].split())

@@ -108,6 +108,10 @@ def test_a_shard_has_a_host_and_a_port(shard: str, place: tuple[str, int]) -> No
         "server1,server1:5432",
         "server1,SERVER1",
         "/run/pg,/run/pg/",
+        "server1|",
+        "server1||server2",
+        "server1|server1",
+        "server1|server2,server2",
         "[::1],[::1]:5432",
         ",".join(f"server{n}" for n in range(1, 1001)),
     ],
@@ -116,6 +120,37 @@ def test_what_names_no_servers_is_refused_in_one_line(value: str) -> None:
     with pytest.raises(UsageError, match="shard") as caught:
         parse(f"{BASE}?shards={value}")
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("attrs", "wanted"),
+    [
+        ("", "any"),
+        ("target_session_attrs=any", "any"),
+        ("target_session_attrs=prefer-standby", "prefer-standby"),
+        ("target_session_attrs=standby", "prefer-standby"),
+        ("target_session_attrs=read-write", "primary"),
+    ],
+)
+def test_of_a_shard_with_standbys_that_server_is_taken_which_the_url_wants(
+    attrs: str, wanted: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("PGTARGETSESSIONATTRS", raising=False)
+    url = (
+        f"{BASE}?{attrs}&shards=server1:5433|[::1],%2Frun%2Fpg|server3"
+        if attrs
+        else (f"{BASE}?shards=server1:5433|[::1],%2Frun%2Fpg|server3")
+    )
+    address = parse(url)
+    assert address.shards == ("server1:5433|[::1]", "/run/pg|server3")
+    known = [
+        psycopg.conninfo.conninfo_to_dict(shard_conninfo(address, address.conninfo, host))
+        for host in address.shards
+    ]
+    places = [(one["host"], one["port"], one["target_session_attrs"]) for one in known]
+    assert places == [
+        ("server1,::1", "5433,5432", wanted), ("/run/pg,server3", "5432,5432", wanted)
+    ]  # fmt: skip
 
 
 def test_999_shards_are_taken() -> None:

@@ -11,13 +11,15 @@ class Shard(NamedTuple):
 
     name : its number and host, as messages name it; rows : how many it has, as the server last
     estimated it; bytes : of its tables and indexes; trouble : why it does not answer, empty if it
-    does; rows and bytes are None then.
+    does; rows and bytes are None then; behind : writes that the standby which answers has not
+    replayed, None where no standby answers.
     """
 
     name: str
     rows: int | None
     bytes: int | None
     trouble: str = ""
+    behind: int | None = None
 
 
 class RebalanceProgress(NamedTuple):

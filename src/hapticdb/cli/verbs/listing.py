@@ -97,7 +97,8 @@ def _told(shard: "Shard") -> tuple[str, str]:
     """One shard in words: its name, and what it holds or why it does not answer."""
     if shard.rows is None or shard.bytes is None:
         return shard.name, f"away: {shard.trouble}"
-    return shard.name, f"about {shard.rows:,} rows, {render.bytes_text(shard.bytes)}"
+    standby = "" if shard.behind is None else f", standby, {shard.behind:,} writes behind"
+    return shard.name, f"about {shard.rows:,} rows, {render.bytes_text(shard.bytes)}{standby}"
 
 
 class _Overview(NamedTuple):

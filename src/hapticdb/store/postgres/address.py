@@ -6,8 +6,9 @@ libpq's own way, ``?options=-csearch_path=NAME``, names it, too. ``?data=FOLDER`
 server in a folder (see `hapticdb.store.postgres.private_server`).
 
 ``?shards=server1,server2:5433,[::1]:5434,%2Frun%2Fpg4`` names the servers that hold the rows of a
-new environment: hosts with or without a port, or folders of sockets, each percent-encoded. With
-``data=``, ``shards=3`` asks for three more private servers.
+new environment: hosts with or without a port, or folders of sockets, each percent-encoded. A shard
+with standbys names its servers with ``|`` between, as in ``server1|standby1``. With ``data=``,
+``shards=3`` asks for three more private servers.
 """
 
 import re
@@ -23,7 +24,7 @@ LONE_PERCENT = re.compile(r"%(?![0-9a-fA-F]{2})|%00")
 LONGEST_NAME = 63
 PORT = 5432
 """Port of a shard whose address names none."""
-HOST = re.compile(r"(?P<host>/[^,]*?|\[[\w:.%]+\]|[\w.-]+)(?::(?P<port>[0-9]{1,5}))?")
+HOST = re.compile(r"(?P<host>/[^,|]*?|\[[\w:.%]+\]|[\w.-]+)(?::(?P<port>[0-9]{1,5}))?")
 MOST_SHARDS, MOST_PRIVATE_SHARDS = 999, 99
 
 
@@ -32,7 +33,7 @@ class Address(NamedTuple):
 
     conninfo : for libpq, without hapticdb's own parameters; environment : the schema; data : folder
     of the private server, if one is meant; shown : the whole URL as messages may show it;
-    shards : where the rows of a new environment go, each as `host_and_port` reads it, or with
+    shards : where the rows of a new environment go, each as `servers_of` reads it, or with
     `data` the numbers of the private shards from "1"; () when the URL names none.
     """
 
@@ -108,27 +109,38 @@ def _shards(value: str, shown: str, *, are_private: bool) -> tuple[str, ...]:
         )
     seen: set[tuple[str, int]] = set()
     for n, host in enumerate(hosts, 1):
-        found = host_and_port(host)
-        if found is None:
+        found = servers_of(host)
+        if not found:
             raise UsageError(
                 f"{shown}: shard {n} of shards= is no server: write a name, name:port, "
-                "[IPv6 address]:port, or the folder of a socket, with @ : , % in it percent-encoded"
+                "[IPv6 address]:port, or the folder of a socket, with @ : , % in it "
+                "percent-encoded; its standbys behind it, with | between"
             )
-        if found in seen:
+        if seen & set(found) or len(set(found)) < len(found):
             raise UsageError(f"{shown}: shard {n} of shards= is named twice: name each server once")
-        seen.add(found)
+        seen |= set(found)
     if len(hosts) > MOST_SHARDS:
         raise UsageError(f"{shown}: {len(hosts)} shards are too many: name {MOST_SHARDS} at most")
     return tuple(hosts)
 
 
-def host_and_port(shard: str) -> tuple[str, int] | None:
-    """Host and port of a shard as `Address.shards` has it; None if it is no address of a server.
+def servers_of(shard: str) -> list[tuple[str, int]]:
+    """Hosts and ports of a shard and its standbys; empty if one of them is no address of a server.
+
+    shard : as `Address.shards` and the catalogue have it, servers with ``|`` between.
+    """
+    found = [host_and_port(server) for server in shard.split("|")]
+    known = [server for server in found if server is not None]
+    return known if len(known) == len(found) else []
+
+
+def host_and_port(server: str) -> tuple[str, int] | None:
+    """Host and port of one server of a shard; None if it is no address of a server.
 
     A text that begins with / is the folder of a socket. An address of IPv6 stands in brackets.
     """
-    match = HOST.fullmatch(shard)
-    if match is None or not shard.isprintable() or re.fullmatch("[0-9]+", match["host"]):
+    match = HOST.fullmatch(server)
+    if match is None or not server.isprintable() or re.fullmatch("[0-9]+", match["host"]):
         return None
     port = int(match["port"] or PORT)
     if not 0 < port < 1 << 16:

@@ -25,6 +25,7 @@ from hapticdb.store.postgres.shards import schemas
 from hapticdb.store.postgres.shards.connecting.links import ShardConnection, ShardPlace, Shards
 from hapticdb.store.postgres.shards.connecting.places import private_shards, shard_conninfo
 from hapticdb.store.postgres.shards.pieces import even_borders
+from hapticdb.store.postgres.standby.aiming import aimed
 
 IS_SHARDED = "SELECT to_regclass('distribution') IS NOT NULL"
 
@@ -74,7 +75,7 @@ def _bare_connection(place: ShardPlace, address: Address) -> ServerConnection:
     """Connection to a shard that may have no schema yet."""
     shown = f"shard {place.number} ({place.host}) of {address.shown}"
     of_shard = Address(place.conninfo, address.environment, None, shown)
-    return ServerConnection(of_shard, place.conninfo)
+    return ServerConnection(of_shard, aimed(place.conninfo, shown, read_only=False))
 
 
 def _make_shard(shard: ServerConnection, layout: Layout, token: str) -> None:

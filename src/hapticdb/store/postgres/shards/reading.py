@@ -10,7 +10,7 @@ Rows of a past revision may have been swept or moved meanwhile; the mark of each
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -39,7 +39,6 @@ TRIES = 20
 writes come faster than reads."""
 LAST = int(np.iinfo(np.int64).max)
 Plan = Callable[[LiveView], Sequence[ShardQuery]]
-Send = Callable[[Sequence[ShardQuery], str | None], tuple[Answer, Sequence[Answer | None]]]
 
 
 class _Marks(NamedTuple):
@@ -51,6 +50,18 @@ class _Marks(NamedTuple):
     def are_of(self, view: LiveView) -> bool:
         """Whether all rows of that view were there when the shards answered."""
         return self.swept <= view.revision and self.moved <= view.epoch
+
+
+class _Asker(Protocol):
+    """How shards are asked: all have to answer (`Shards`), or some may be away (`AwayShards`)."""
+
+    def ask(
+        self, asks: Sequence[ShardQuery], first: str | None
+    ) -> tuple[Answer, Sequence[Answer | None]]:
+        """Answer of the coordinator to `first`, and those of the shards; None if one is away."""
+
+    def catch_up(self, shard: int, writes: int) -> None:
+        """Have a shard whose standby was behind answer with so many writes next time."""
 
 
 class ShardedReader:
@@ -96,17 +107,16 @@ class ShardedReader:
         ShardAwayError
             When a shard that is asked cannot be reached.
         """
-        view, _, answers = self._asked(plan, self._shards.ask)
+        view, _, answers = self._asked(plan, self._shards)
         return view, [answer for answer in answers if answer is not None]
 
     def _asked(
-        self, plan: Plan, send: Send
+        self, plan: Plan, asker: _Asker
     ) -> tuple[LiveView, Sequence[ShardQuery], Sequence[Answer | None]]:
-        """View, statements and answers; None for an answer that `send` did not get."""
+        """View, statements and answers; None for an answer that did not come."""
         if self._held is not None:
-            asks = plan(self._held)
-            _, answers = send(asks, None)
-            if not self._marks(self._held, asks, answers).are_of(self._held):
+            asks, _, answers = self._answered(plan, self._held, asker, None)
+            if not _marks_of(answers).are_of(self._held):
                 raise _outdated(self._url)
             return self._seen(self._held), asks, answers
         is_renewed = False
@@ -114,10 +124,9 @@ class ShardedReader:
             view = self.views.known
             if view.revision < 0:
                 view, is_renewed = self.views.load(), True
-            asks = plan(view)
-            first, answers = send(asks, None if is_renewed else NEWEST)
+            asks, first, answers = self._answered(plan, view, asker, None if is_renewed else NEWEST)
             is_newest = is_renewed or self.views.is_known(first)
-            marks = self._marks(view, asks, answers)
+            marks = _marks_of(answers)
             if is_newest and marks.are_of(view):
                 return self._seen(view), asks, answers
             if not marks.are_of(self.views.load()) and not self._connection.is_standby:
@@ -129,28 +138,42 @@ class ShardedReader:
         self._objects.see(view.revision)
         return view
 
-    def _marks(
-        self, view: LiveView, asks: Sequence[ShardQuery], answers: Sequence[Answer | None]
-    ) -> "_Marks":
-        """The latest marks of shards among their answers.
+    def _answered(
+        self, plan: Plan, view: LiveView, asker: _Asker, first: str | None
+    ) -> tuple[Sequence[ShardQuery], Answer, Sequence[Answer | None]]:
+        """Statements, the coordinator's answer to `first`, and answers with all writes of a view.
 
         Raises
         ------
         DamagedError
             When a shard has lost writes.
         """
-        swept = moved = 0
+        asks = plan(view)
+        for _ in range(TRIES):
+            found, answers = asker.ask(asks, first)
+            behind = self._behind(view, asks, answers)
+            if not behind:
+                return asks, found, answers
+            for shard in behind:  # standbys that have not replayed them
+                asker.catch_up(shard, int(view.writes[shard]))
+        raise _outdated(self._url)
+
+    def _behind(
+        self, view: LiveView, asks: Sequence[ShardQuery], answers: Sequence[Answer | None]
+    ) -> list[int]:
+        """Shards whose standbys have answered, without all writes that the view knows of."""
+        behind = []
         for ask, answer in zip(asks, answers, strict=True):
             if answer is None:
                 continue
-            mark = wire.read_int8s(answer[-1]).tolist() if answer[-1] else (0, 0, 0)
-            if mark[0] < view.writes[ask.shard]:
-                if self._shards.connection(ask.shard).is_standby:
-                    raise _outdated(self._url)  # it has not replayed them yet
+            writes = _mark(answer)[0]
+            if writes >= view.writes[ask.shard]:
+                continue
+            if not self._shards.connection(ask.shard).is_standby:
                 name = f"{self._shards.name(ask.shard)} of {self._url}"
-                raise lost_writes(name, mark[0], int(view.writes[ask.shard]))
-            swept, moved = max(swept, mark[1]), max(moved, mark[2])
-        return _Marks(swept, moved)
+                raise lost_writes(name, writes, int(view.writes[ask.shard]))
+            behind.append(ask.shard)
+        return behind
 
     # -- rows ------------------------------------------------------------------------------------
 
@@ -227,7 +250,7 @@ class ShardedReader:
         if not lows.size or self._has_no(distances=distances):
             return PartialRows(no_rows(distances=distances), NO_KEYS.reshape(0, 2))
         text = statements.SCAN[self._table(distances=distances)]
-        view, asks, answers = self._asked(_ranges_plan(text, lows, highs), self.away.ask)
+        view, asks, answers = self._asked(_ranges_plan(text, lows, highs), self.away)
         there = [answer for answer in answers if answer is not None]
         is_away = {ask.shard for ask, answer in zip(asks, answers, strict=True) if answer is None}
         away = [
@@ -288,6 +311,20 @@ class ShardedReader:
 
     def _table(self, *, distances: bool) -> Table:
         return "band" if distances else self._layout
+
+
+def _mark(answer: Answer) -> list[int]:
+    """Writes, swept revision and moved epoch of the shard that has answered."""
+    return wire.read_int8s(answer[-1]).tolist() if answer[-1] else [0, 0, 0]
+
+
+def _marks_of(answers: Sequence[Answer | None]) -> _Marks:
+    """The latest marks of shards among their answers."""
+    marks = [_Marks(*_mark(answer)[1:]) for answer in answers if answer is not None]
+    return _Marks(
+        max((mark.swept for mark in marks), default=0),
+        max((mark.moved for mark in marks), default=0),
+    )
 
 
 class _After:

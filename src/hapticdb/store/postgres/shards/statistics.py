@@ -41,6 +41,11 @@ EXACT_ON_SHARD = {
 }
 LAST = np.iinfo(np.int64).max
 
+PUBLISHED = "SELECT writes FROM shard WHERE number = %s"
+LOOK = """
+SELECT greatest(reltuples, 0)::bigint, writes
+  FROM pg_class, mark WHERE pg_class.oid = %s::regclass"""
+
 
 class ShardedStatistics(PostgresStatistics):
     """Sizes and statistics of the rows on all shards; kept figures are the coordinator's."""
@@ -80,18 +85,19 @@ class ShardedStatistics(PostgresStatistics):
         return [self._shard(at) for at in range(len(self._shards))]
 
     def _shard(self, at: int) -> Shard:
+        name, number = self._shards.name(at), self._shards.places[at].number
+        ((known,),) = self._connection.rows(PUBLISHED, (number,))
         try:
-            ((n_bytes, rows),) = self._shards.each(lambda _, shard: self._looked_at(shard), [at])
+            (found,) = self._shards.each(lambda _, shard: self._looked_at(shard), [at])
         except ConnectionLostError as error:
-            return Shard(self._shards.name(at), None, None, str(error))
-        return Shard(self._shards.name(at), rows, n_bytes)
+            return Shard(name, None, None, str(error))
+        rows, writes, n_bytes, is_standby = found
+        return Shard(name, rows, n_bytes, behind=max(known - writes, 0) if is_standby else None)
 
-    def _looked_at(self, shard: ServerConnection) -> tuple[int, int]:
-        ((rows,),) = shard.rows(
-            "SELECT greatest(reltuples, 0)::bigint FROM pg_class WHERE oid = %s::regclass",
-            (self._layout,),
-        )
-        return bytes_of(shard, self._layout)[0], int(rows)
+    def _looked_at(self, shard: ServerConnection) -> tuple[int, int, int, bool]:
+        """Rows, writes and bytes of a shard, and whether a standby has answered."""
+        ((rows, writes),) = shard.rows(LOOK, (self._layout,))
+        return int(rows), int(writes), bytes_of(shard, self._layout)[0], shard.is_standby
 
     def quantiles(self, resolution: int) -> Histogram:
         """Histogram as on one server; an older one that is kept while a shard is away.

@@ -31,7 +31,7 @@ def aimed(conninfo: str, shown: str, *, read_only: bool) -> str:
         given = conninfo_to_dict(conninfo)
     except psycopg.Error:  # the connection refuses it in better words
         return conninfo
-    attrs = given.get("target_session_attrs") or os.environ.get("PGTARGETSESSIONATTRS") or "any"
+    attrs = wanted_server(conninfo)
     if attrs in READ_ONLY:
         raise ReadOnlyError(
             f"{shown} asks for a server that can only be read, by target_session_attrs={attrs}: "
@@ -42,6 +42,17 @@ def aimed(conninfo: str, shown: str, *, read_only: bool) -> str:
     if attrs == "prefer-standby" or (attrs == "any" and any("," in host for host in hosts)):
         return make_conninfo(conninfo, target_session_attrs="primary")
     return conninfo
+
+
+def wanted_server(conninfo: str) -> str:
+    """Which of several servers a conninfo asks for, or else the process's environment."""
+    given = conninfo_to_dict(conninfo).get("target_session_attrs")
+    return str(given or os.environ.get("PGTARGETSESSIONATTRS") or "any")
+
+
+def of_primary(conninfo: str) -> str:
+    """Conninfo that leads to the primary among the same hosts."""
+    return make_conninfo(conninfo, target_session_attrs="primary")
 
 
 def at_primary(conninfo: str) -> str:

@@ -45,7 +45,7 @@ class AwayShards:
         return tuple(
             self._shards.name(shard)
             for shard, revival in sorted(self._revivals.items())
-            if revival.connection is None
+            if revival.connection is None and not self._shards.is_connected(shard)
         )
 
     def ask(
@@ -53,6 +53,9 @@ class AwayShards:
     ) -> tuple[Answer, list[Answer | None]]:
         """Answers as of `Shards.ask`; None for a shard that is away."""
         self._begin_all()
+        for ask in asks:
+            if self._shards.is_to_leave_primary(ask.shard) and ask.shard not in self._revivals:
+                self._revive(ask.shard)  # the primary goes on until the standby is connected
         there = [ask for ask in asks if self._is_there(ask.shard)]
         found, answers = self._shards.ask_once(there, first, PATIENCE_MS)
         by_shard = {ask.shard: answer for ask, answer in zip(there, answers, strict=True)}
@@ -60,6 +63,12 @@ class AwayShards:
             if answer is None:
                 self._begin(shard)
         return found, [by_shard.get(ask.shard) for ask in asks]
+
+    def catch_up(self, shard: int, writes: int) -> None:
+        """Have a shard whose standby was behind answer with so many writes, or count as away."""
+        if not self._shards.has_replayed(shard, writes, PATIENCE_MS):
+            self._shards.turn_to_primary(shard)
+            self._begin(shard)
 
     def close(self) -> None:
         """Give up all shards that are away."""
@@ -86,12 +95,21 @@ class AwayShards:
             return True
         connection = revival.connection
         if connection is None:
-            return False
+            return self._shards.is_connected(shard)
         self._shards.exchange(shard, connection)
         del self._revivals[shard]
         return True
 
     def _begin(self, shard: int) -> None:
+        """Leave a shard out until a thread has connected to it."""
+        self._shards.exchange(shard, None)
+        if (before := self._revivals.pop(shard, None)) is not None:
+            before.stop()
+        self._revive(shard)
+
+    def _revive(self, shard: int) -> None:
+        """Begin a thread that connects to a shard."""
+
         def connect() -> ShardConnection:
             made = self._shards.connected(shard)
             try:
@@ -102,7 +120,6 @@ class AwayShards:
                 raise
             return made
 
-        self._shards.exchange(shard, None)
         self._revivals[shard] = _Revival(connect)
 
 

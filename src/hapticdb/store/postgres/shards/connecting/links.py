@@ -1,6 +1,7 @@
 """Connections to the shards of an environment: all asked at once, each made when first used."""
 
 import contextlib
+import math
 import select
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -17,11 +18,12 @@ from hapticdb.errors import (
     StuckError,
 )
 from hapticdb.store.postgres.address import Address
-from hapticdb.store.postgres.connecting import failures
+from hapticdb.store.postgres.connecting import failures, wire
 from hapticdb.store.postgres.connecting.answering import SilentServerError
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.connecting.link import CONNECT_SECONDS
 from hapticdb.store.postgres.connecting.wire import Parameter
+from hapticdb.store.postgres.standby.aiming import aimed, of_primary
 
 Result = TypeVar("Result")
 Answer = list[bytes | None]
@@ -33,6 +35,14 @@ A larger value gives a shard more time to answer."""
 LEAST_MS = 100
 """Milliseconds that each further part of an answer may take, however late it begins. A larger value
 bears servers that pause within an answer, and waits longer for one that hangs there."""
+CATCH_UP_S = 0.05
+"""Seconds that a read waits for a shard's standby to replay what the coordinator names. A larger
+value leaves more reads to standbys; a session's cells wait as long. Then the primary is read."""
+LOOK_EVERY_S = 0.002
+"""Seconds between looks at the standby meanwhile."""
+AT_PRIMARY_S = 30.0
+"""Seconds until a shard whose standby was too far behind is read from the standby again."""
+WRITES = "SELECT writes FROM mark"
 TOKEN = "SELECT token::text FROM mark"  # noqa: S105 - which environment it is, no secret
 
 
@@ -61,7 +71,8 @@ class ShardConnection(ServerConnection):
         shown = f"shard {place.number} ({place.host}) of {environment.shown}"
         address = Address(place.conninfo, environment.environment, None, shown)
         self._token = token
-        super().__init__(address, place.conninfo, read_only=read_only)
+        conninfo = aimed(place.conninfo, shown, read_only=read_only)
+        super().__init__(address, conninfo, read_only=read_only)
         try:
             self._check_token()
         except BaseException:
@@ -100,6 +111,7 @@ class Shards:
         self.places = places
         self.token = token
         self._made: list[ShardConnection | None] = [None] * len(places)
+        self._back_at: dict[int, float] = {}  # when to leave the primary of a shard again
         self._threads: ThreadPoolExecutor | None = None
 
     def __len__(self) -> int:
@@ -123,12 +135,13 @@ class Shards:
 
     def connected(self, shard: int) -> ShardConnection:
         """A new connection to a shard."""
-        coordinator = self.coordinator
+        coordinator, place = self.coordinator, self.places[shard]
+        if shard in self._back_at:
+            place = place._replace(conninfo=of_primary(place.conninfo))
         with named_away():
             return ShardConnection(
-                self.places[shard], coordinator.address, self.token,
-                read_only=coordinator.is_read_only,
-            )  # fmt: skip
+                place, coordinator.address, self.token, read_only=coordinator.is_read_only
+            )
 
     def exchange(self, shard: int, connection: ShardConnection | None) -> None:
         """Close a connection and use another one from now on; None makes one when needed."""
@@ -168,6 +181,8 @@ class Shards:
             When a shard cannot be reached.
         """
         for ask in asks:
+            if self.is_to_leave_primary(ask.shard):
+                self.exchange(ask.shard, None)
             self.connection(ask.shard)
         found, answers = self.ask_once(asks, first)
         known = []
@@ -175,6 +190,39 @@ class Shards:
             with named_away():
                 known.append(answer or self.connection(ask.shard).fetch(ask.text, *ask.parameters))
         return found, known
+
+    def catch_up(self, shard: int, writes: int) -> None:
+        """Have a shard whose standby was behind answer with so many writes at the next question."""
+        if not self.has_replayed(shard, writes):
+            self.turn_to_primary(shard)
+
+    def has_replayed(self, shard: int, writes: int, patience_ms: int | None = None) -> bool:
+        """Whether a shard's standby has replayed so many writes; waits for it for a moment.
+
+        False if it is lost; patience_ms : see `ask_once`.
+        """
+        until = time.monotonic() + CATCH_UP_S
+        while True:
+            _, (answer,) = self.ask_once([ShardQuery(shard, WRITES, ())], None, patience_ms)
+            if answer is None:
+                return False
+            if wire.read_int8(answer[0] or b"") >= writes:
+                return True
+            if time.monotonic() > until:
+                return False
+            time.sleep(LOOK_EVERY_S)
+
+    def turn_to_primary(self, shard: int) -> None:
+        """Read a shard from its primary from now on, for `AT_PRIMARY_S`."""
+        self._back_at[shard] = time.monotonic() + AT_PRIMARY_S
+        self.exchange(shard, None)
+
+    def is_to_leave_primary(self, shard: int) -> bool:
+        """Whether a shard is to be read from its standby again; said once."""
+        if self._back_at.get(shard, math.inf) > time.monotonic():
+            return False
+        del self._back_at[shard]
+        return True
 
     def ask_once(
         self, asks: Sequence[ShardQuery], first: str | None, patience_ms: int | None = None

@@ -11,9 +11,10 @@ from pathlib import Path
 from urllib.parse import quote, unquote, urlsplit
 
 from hapticdb.errors import DatabaseError, UsageError
-from hapticdb.store.postgres.address import Address, host_and_port
+from hapticdb.store.postgres.address import Address, servers_of
 from hapticdb.store.postgres.private_server import shared_server
 from hapticdb.store.postgres.server_binaries import fitting
+from hapticdb.store.postgres.standby.aiming import wanted_server
 
 REPLACED = {"host", "hostaddr", "port", "target_session_attrs", "load_balance_hosts"}
 """Parameters of the coordinator's address, which lead to no shard."""
@@ -25,6 +26,14 @@ SECRETS = {
     "gssdelegation",
 }
 """Parameters that would show or lend the user's right to another server."""
+WANTED = {
+    "primary": "primary",
+    "read-write": "primary",
+    "prefer-standby": "prefer-standby",
+    "standby": "prefer-standby",
+    "read-only": "prefer-standby",
+}
+"""Which server of a shard is read, by ``target_session_attrs`` of the coordinator's address."""
 STARTS = 8
 """Private servers that start at the same time."""
 
@@ -39,23 +48,26 @@ def shard_conninfo(address: Address, coordinator: str, host: str) -> str:
     coordinator : str
         URL that libpq connects to for the coordinator.
     host : str
-        The shard, as `Address.shards` and the catalogue have it.
+        The shard, as `Address.shards` and the catalogue have it; with standbys several servers.
 
     Raises
     ------
     UsageError
-        `host` is no address of one server.
+        `host` is no address of a server.
 
     Notes
     -----
     The empty ``password=`` and ``hostaddr=`` keep libpq from taking the coordinator's out of
     PGPASSWORD, PGHOSTADDR or a service; it still looks into the file of passwords.
+
+    A shard without standbys is taken as it is. Of several servers the one is taken that the
+    coordinator's ``target_session_attrs`` wants, where a shard may lack what that one names.
     """
-    place = host_and_port(host)
-    if place is None:
+    servers = servers_of(host)
+    if not servers:
         raise UsageError(
             f"{address.shown}: {host!r} is no address of a shard: write a name, name:port, "
-            "[IPv6 address]:port, or the folder of a socket"
+            "[IPv6 address]:port, or the folder of a socket; its standbys behind it, with | between"
         )
     parts = urlsplit(coordinator)
     user = parts.netloc.rpartition("@")[0].partition(":")[0]
@@ -64,8 +76,10 @@ def shard_conninfo(address: Address, coordinator: str, host: str) -> str:
         for pair in parts.query.split("&")
         if pair and unquote(pair.partition("=")[0]) not in REPLACED | SECRETS
     ]
-    pairs += [f"host={quote(place[0], safe='/')}", f"port={place[1]}"]
-    pairs += ["hostaddr=", "password=", "target_session_attrs=any"]
+    wanted = WANTED.get(wanted_server(coordinator), "any") if len(servers) > 1 else "any"
+    pairs += [f"host={','.join(quote(name, safe='/') for name, _ in servers)}"]
+    pairs += [f"port={','.join(str(port) for _, port in servers)}"]
+    pairs += ["hostaddr=", "password=", f"target_session_attrs={wanted}"]
     login = f"{user}@" if user else ""
     return f"{parts.scheme}://{login}{parts.path or '/'}?{'&'.join(pairs)}"
 

@@ -11,6 +11,7 @@ from typing import cast
 import numpy as np
 import pytest
 
+from frozen import frozen
 from hapticdb.errors import ShardAwayError
 from hapticdb.store.connect import open_store
 from hapticdb.store.postgres.shards.store import ShardedStore
@@ -126,6 +127,16 @@ def test_partial_reads_turn_to_the_primary_and_back(
             assert time.monotonic() < end
             partial = store.scan_partly(*EVERYWHERE)
             assert sorted(partial.rows.ids.tolist()) == [1, 2, 3]
+
+
+def test_partial_reads_do_not_wait_for_a_standby_that_hangs(spread: Spread) -> None:
+    with reading(f"{spread.url_of_standbys}&connect_timeout=600") as store:
+        until_whole(store, [1, 2])
+        assert answers_from_a_standby(store) == [False, True]
+        with frozen(spread.pair.standby):
+            assert len(store.scan_partly(*EVERYWHERE).away)
+            until_whole(store, [1, 2])
+            assert answers_from_a_standby(store) == [False, False]
 
 
 def until_whole(store: ShardedStore, ids: list[int]) -> None:

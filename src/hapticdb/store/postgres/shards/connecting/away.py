@@ -61,6 +61,7 @@ class AwayShards:
         by_shard = {ask.shard: answer for ask, answer in zip(there, answers, strict=True)}
         for shard, answer in by_shard.items():
             if answer is None:
+                self._shards.try_another_server(shard)
                 self._begin(shard)
         return found, [by_shard.get(ask.shard) for ask in asks]
 
@@ -111,7 +112,11 @@ class AwayShards:
         """Begin a thread that connects to a shard."""
 
         def connect() -> ShardConnection:
-            made = self._shards.connected(shard)
+            try:
+                made = self._shards.connected(shard)
+            except BaseException:
+                self._shards.try_another_server(shard)
+                raise
             try:
                 for text, oids in self._prepared:
                     made.prepare(text, oids)

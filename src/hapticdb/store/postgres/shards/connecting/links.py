@@ -217,11 +217,19 @@ class Shards:
         self._back_at[shard] = time.monotonic() + AT_PRIMARY_S
         self.exchange(shard, None)
 
+    def try_another_server(self, shard: int) -> None:
+        """Connect to the primary of a shard with standbys next, or else where the URL says.
+
+        One that hangs would hold up each try for as long as a server may take to answer.
+        """
+        if "|" in self.places[shard].host and self._back_at.pop(shard, None) is None:
+            self._back_at[shard] = time.monotonic() + AT_PRIMARY_S
+
     def is_to_leave_primary(self, shard: int) -> bool:
         """Whether a shard is to be read from its standby again; said once."""
         if self._back_at.get(shard, math.inf) > time.monotonic():
             return False
-        del self._back_at[shard]
+        self._back_at.pop(shard, None)
         return True
 
     def ask_once(

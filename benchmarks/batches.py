@@ -1,12 +1,13 @@
 """Batches of poses: poses a second beside python-fcl, coal and Open3D, on the same questions.
 
-    make paths                                                # the vintage car, or the sample car
+    make paths                        # 200 and 1,428 parts of real assemblies, or the sample car
     python benchmarks/batches.py --model FILE --seconds 5 --out results/batches.json
 
 A tool is far from all parts (free), within a few voxels of one (near), or in contact (touching).
 Every side says of each pose whether the tool touches, and how far it is from the nearest part. All
-sides are built and warmed up first, and take turns in one run. hapticdb answers the first question
-by the force and the hits of the points, in all threads and in one; others by what they compare.
+sides are built and warmed up first, and take turns in one run. hapticdb answers by the points of a
+shell, in all threads and in one. "Does it touch?" is answered by the first hit, as others answer
+it, and beside that by the force; only the first hit is compared with the best of the others.
 """
 
 import argparse
@@ -35,7 +36,11 @@ from peers import PeerMissingError
 from peers.batched import batch_peers
 
 Floats = NDArray[np.float64]
-CAR = "demo_vintage_car/vintage_car.glb"
+MODELS = {
+    "batches.json": "demo_vintage_car/vintage_car.glb",
+    "batches_1400.json": "assembly_vw_t1/vw_t1.glb",
+}
+"""Results, and the files below HAPTICDB_TEST_DATA that they are of: 200 parts, and 1,428."""
 BITS, EXTENT = 11, 1.6
 """Grid: bits an axis, and its edge as a multiple of the model's longest side."""
 POINTS = (300, 10_000, 100_000)
@@ -53,6 +58,8 @@ FIRST_POSES = 4
 ROUNDS = 3
 """Turns of each side. The result is the median of its rates."""
 OWN, OWN_ONE = "hapticdb", "hapticdb, one thread"
+FORCE, FORCE_ONE = "hapticdb, with force", "hapticdb, with force, one thread"
+ALL_OWN = frozenset({OWN, OWN_ONE, FORCE, FORCE_ONE})
 
 Answers = NDArray[Any]
 Side = Callable[[Floats], Answers]
@@ -143,7 +150,7 @@ def compare(
             "poses_per_processor_s": busy,
             "agree": agree(answers[OWN][:n_both], answers[name][:n_both]),
         }
-    best = max((c["poses_per_s"] for n, c in cells.items() if n not in {OWN, OWN_ONE}), default=0.0)
+    best = max((c["poses_per_s"] for n, c in cells.items() if n not in ALL_OWN), default=0.0)
     return {
         "sides": cells,
         "times_best_peer": cells[OWN]["poses_per_s"] / best if best else None,
@@ -152,7 +159,7 @@ def compare(
 
 
 def measure_tool(
-    env: Environment, tool: Tool, triangles: Floats, path: Floats, settings: Settings
+    env: Environment, tool: Tool, parts: list[Floats], path: Floats, settings: Settings
 ) -> tuple[list[dict[str, Any]], list[str]]:
     """Cells of one shell, for each situation and question, and notes of the peers not measured."""
     size, points = env.grid.voxel_size, tool.shell.points
@@ -160,7 +167,7 @@ def measure_tool(
     peers, notes = [], []
     for peer in batch_peers(0.5 * size):
         try:
-            peer.build(triangles, tool.mesh)
+            peer.build(parts, tool.mesh)
             peers.append(peer)
         except PeerMissingError as error:
             notes.append(f"{peer.name}: {error}")
@@ -170,13 +177,15 @@ def measure_tool(
         env.feeler(tool.shell, law="plane", jobs=1) as one,
     ):
 
-        def touched(feeler: Feeler) -> Side:
+        def felt(feeler: Feeler) -> Side:
             return lambda poses: feeler.touch(poses).hits > 0
 
         def far(feeler: Feeler) -> Side:
             return lambda poses: feeler.clearance(poses, reach).distances
 
-        touch: dict[str, Side] = {OWN: touched(all_of), OWN_ONE: touched(one)}
+        touch: dict[str, Side] = {
+            OWN: all_of.collides, OWN_ONE: one.collides, FORCE: felt(all_of), FORCE_ONE: felt(one)
+        }  # fmt: skip
         distance: dict[str, Side] = {OWN: far(all_of), OWN_ONE: far(one)}
         for peer in peers:
             touch[peer.name] = partial(peer.touches, points)
@@ -215,8 +224,7 @@ def measure(folder: Path, model: Path | None, bits: int, settings: Settings) -> 
     hapticdb.import_files(folder / "car.db", [car], options)
     hapticdb.warm_up()
     load = os.getloadavg()
-    parts = read_file(car).parts
-    triangles = np.concatenate([part.triangles() for part in parts])
+    parts = [part.triangles() for part in read_file(car).parts]
     cells: list[dict[str, Any]] = []
     notes: list[str] = []
     with hapticdb.open(folder / "car.db", read_only=True) as env:
@@ -228,13 +236,13 @@ def measure(folder: Path, model: Path | None, bits: int, settings: Settings) -> 
         mesh = np.asarray(wrench.vertices, np.float64), np.asarray(wrench.faces, np.int64)
         for n_points in settings.points:
             shell = PointShell.from_file(along[0], points=n_points)
-            found, missing = measure_tool(env, Tool(shell, mesh), triangles, path, settings)
+            found, missing = measure_tool(env, Tool(shell, mesh), parts, path, settings)
             cells += found
             notes += [note for note in missing if note not in notes]
         scene = {
             "model": car.name,
             "parts": len(parts),
-            "triangles": len(triangles),
+            "triangles": sum(map(len, parts)),
             "tool_triangles": len(mesh[1]),
             "object_voxels": sum(obj.voxels for obj in env.objects()),
             "voxel_size": env.grid.voxel_size,
@@ -266,16 +274,22 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=2.0, help="of each turn of a side")
     parser.add_argument("--bits", type=int, default=BITS, help="of the grid on each axis")
     parser.add_argument("--points", default=",".join(map(str, POINTS)), help="of the shells")
-    parser.add_argument("--out", type=Path, default=Path("results/batches.json"))
+    parser.add_argument("--out", type=Path, help="of that model, or of the sample car")
     given = parser.parse_args()
-    found = Path(os.environ.get("HAPTICDB_TEST_DATA", "")) / CAR
-    model = given.model or (found if found.is_file() else None)
+    data, results = Path(os.environ.get("HAPTICDB_TEST_DATA", "")), Path("results")
+    found = {
+        results / name: data / file for name, file in MODELS.items() if (data / file).is_file()
+    }
+    models: Mapping[Path, Path | None] = found
+    if given.model or given.out or not found:
+        models = {given.out or results / "batches.json": given.model}
     settings = Settings(given.seconds, points=tuple(int(n) for n in given.points.split(",")))
-    with tempfile.TemporaryDirectory(prefix="hapticdb-batches-") as folder:
-        results = measure(Path(folder), model, given.bits, settings)
-    print(table(results))
-    print(*results["notes"], sep="\n")
-    given.out.write_text(json.dumps(results, indent=1) + "\n")
+    for out, model in models.items():
+        with tempfile.TemporaryDirectory(prefix="hapticdb-batches-") as folder:
+            figures = measure(Path(folder), model, given.bits, settings)
+        print(table(figures))
+        print(*figures["notes"], sep="\n")
+        out.write_text(json.dumps(figures, indent=1) + "\n")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,8 @@
 """Peers that answer many poses of a tool: whether it touches the car, and how far it is from it.
 
 Each has all of the car's triangles in memory. python-fcl and coal compare them with the tool's
-triangles, a pose at a time; Open3D looks for the triangle nearest to each of the shell's points.
+triangles, a pose at a time: with one tree of boxes around all of the car, and with a tree for each
+part below a tree of the parts. Open3D looks for the triangle nearest to each of the shell's points.
 """
 
 from collections.abc import Sequence
@@ -27,8 +28,8 @@ class BatchPeer(Protocol):
     name: str
     compares: str
 
-    def build(self, triangles: Floats, tool: tuple[Floats, NDArray[np.int64]]) -> None:
-        """Take in the car's corners (T, 3, 3), and vertices and faces of the tool, metres.
+    def build(self, parts: Sequence[Floats], tool: tuple[Floats, NDArray[np.int64]]) -> None:
+        """Take in the corners (T, 3, 3) of each part, and vertices and faces of the tool, metres.
 
         Raises
         ------
@@ -50,25 +51,29 @@ def _loaded(name: str) -> Any:  # noqa: ANN401 - modules without types
         raise PeerMissingError(INSTALL) from error
 
 
+def _vertices_and_faces(triangles: Floats) -> tuple[Floats, NDArray[np.int64]]:
+    """Vertices (3 T, 3) and faces (T, 3) of corners (T, 3, 3)."""
+    return triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3)
+
+
 class FclBatch:
     """python-fcl: mesh against mesh, in trees of boxes around the triangles of both."""
 
     name = "python-fcl"
     compares = "the tool's triangles"
 
-    def build(self, triangles: Floats, tool: tuple[Floats, NDArray[np.int64]]) -> None:
+    def build(self, parts: Sequence[Floats], tool: tuple[Floats, NDArray[np.int64]]) -> None:
         self._fcl = _loaded("fcl")
-        corners = triangles.reshape(-1, 3)
-        faces = np.arange(len(corners)).reshape(-1, 3)
-        self._car = self._fcl.CollisionObject(self._tree(corners, faces), self._fcl.Transform())
-        self._tool = self._fcl.CollisionObject(self._tree(*tool), self._fcl.Transform())
+        self._car = self._object(*_vertices_and_faces(np.concatenate(parts)))
+        self._tool = self._object(*tool)
 
-    def _tree(self, vertices: Floats, faces: NDArray[np.int64]) -> Any:  # noqa: ANN401
+    def _object(self, vertices: Floats, faces: NDArray[np.int64]) -> Any:  # noqa: ANN401
+        """A tree of boxes around triangles, at rest."""
         model = self._fcl.BVHModel()
         model.beginModel(len(faces), len(vertices))
         model.addSubModel(vertices, faces)
         model.endModel()
-        return model
+        return self._fcl.CollisionObject(model, self._fcl.Transform())
 
     def touches(self, points: Floats, poses: Floats) -> NDArray[np.bool_]:  # noqa: ARG002
         found = np.zeros(len(poses), dtype=np.bool_)
@@ -89,18 +94,52 @@ class FclBatch:
         return found
 
 
+class FclPartsBatch(FclBatch):
+    """python-fcl with a tree of boxes for each part, below a tree of the parts."""
+
+    name = "python-fcl, parts"
+
+    def build(self, parts: Sequence[Floats], tool: tuple[Floats, NDArray[np.int64]]) -> None:
+        self._fcl = _loaded("fcl")
+        self._all = [self._object(*_vertices_and_faces(part)) for part in parts]
+        self._parts = self._fcl.DynamicAABBTreeCollisionManager()
+        self._parts.registerObjects(self._all)
+        self._parts.setup()
+        self._tool = self._object(*tool)
+
+    def touches(self, points: Floats, poses: Floats) -> NDArray[np.bool_]:  # noqa: ARG002
+        fcl = self._fcl
+        found = np.zeros(len(poses), dtype=np.bool_)
+        request = fcl.CollisionRequest(num_max_contacts=1)
+        for n, pose in enumerate(poses):
+            self._tool.setTransform(fcl.Transform(pose[:3, :3], pose[:3, 3]))
+            asked = fcl.CollisionData(request=request)
+            self._parts.collide(self._tool, asked, fcl.defaultCollisionCallback)
+            found[n] = asked.result.is_collision
+        return found
+
+    def distances(self, points: Floats, poses: Floats) -> Floats:  # noqa: ARG002
+        fcl = self._fcl
+        found = np.zeros(len(poses))
+        for n, pose in enumerate(poses):
+            self._tool.setTransform(fcl.Transform(pose[:3, :3], pose[:3, 3]))
+            asked = fcl.DistanceData()
+            self._parts.distance(self._tool, asked, fcl.defaultDistanceCallback)
+            found[n] = asked.result.min_distance
+        return found
+
+
 class CoalBatch:
     """coal: the same, in a newer library."""
 
     name = "coal"
     compares = "the tool's triangles"
 
-    def build(self, triangles: Floats, tool: tuple[Floats, NDArray[np.int64]]) -> None:
+    def build(self, parts: Sequence[Floats], tool: tuple[Floats, NDArray[np.int64]]) -> None:
         self._coal = _loaded("coal")
         from peers.coal_meshes import tree_of_boxes  # noqa: PLC0415 - loads coal
 
-        corners = triangles.reshape(-1, 3)
-        self._car = tree_of_boxes(corners, np.arange(len(corners)).reshape(-1, 3))
+        self._car = tree_of_boxes(*_vertices_and_faces(np.concatenate(parts)))
         self._tool = tree_of_boxes(*tool)
         self._here = self._coal.Transform3s()
 
@@ -126,6 +165,52 @@ class CoalBatch:
         return found
 
 
+class CoalPartsBatch:
+    """coal with a tree of boxes for each part, below a tree of the parts."""
+
+    name = "coal, parts"
+    compares = "the tool's triangles"
+
+    def build(self, parts: Sequence[Floats], tool: tuple[Floats, NDArray[np.int64]]) -> None:
+        self._coal = coal = _loaded("coal")
+        from peers.coal_meshes import tree_of_boxes  # noqa: PLC0415 - loads coal
+
+        self._all = [
+            coal.CollisionObject(tree_of_boxes(*_vertices_and_faces(part))) for part in parts
+        ]
+        self._parts = coal.DynamicAABBTreeCollisionManager()
+        for part in self._all:
+            self._parts.registerObject(part)
+        self._parts.setup()
+        self._tool = coal.CollisionObject(tree_of_boxes(*tool))
+
+    def _move(self, pose: Floats) -> None:
+        there = self._coal.Transform3s(pose[:3, :3].copy(), pose[:3, 3].copy())
+        self._tool.setTransform(there)
+        self._tool.computeAABB()
+
+    def touches(self, points: Floats, poses: Floats) -> NDArray[np.bool_]:  # noqa: ARG002
+        found = np.zeros(len(poses), dtype=np.bool_)
+        asked = self._coal.CollisionCallBackDefault()
+        asked.data.request.enable_contact = False
+        for n, pose in enumerate(poses):
+            self._move(pose)
+            asked.init()
+            self._parts.collide(self._tool, asked)
+            found[n] = asked.data.result.isCollision()
+        return found
+
+    def distances(self, points: Floats, poses: Floats) -> Floats:  # noqa: ARG002
+        found = np.zeros(len(poses))
+        asked = self._coal.DistanceCallBackDefault()
+        for n, pose in enumerate(poses):
+            self._move(pose)
+            asked.init()
+            self._parts.distance(self._tool, asked)
+            found[n] = asked.data.result.min_distance
+        return found
+
+
 class Open3DBatch:
     """Open3D: the nearest triangle of each point, many poses at once, on all processors."""
 
@@ -135,10 +220,10 @@ class Open3DBatch:
     def __init__(self, close: float) -> None:
         self._close = close
 
-    def build(self, triangles: Floats, tool: tuple[Floats, NDArray[np.int64]]) -> None:  # noqa: ARG002
+    def build(self, parts: Sequence[Floats], tool: tuple[Floats, NDArray[np.int64]]) -> None:  # noqa: ARG002
         self._open3d = _loaded("open3d")
-        corners = triangles.reshape(-1, 3).astype(np.float32)
-        faces = np.arange(len(corners), dtype=np.uint32).reshape(-1, 3)
+        vertices, triangles = _vertices_and_faces(np.concatenate(parts))
+        corners, faces = vertices.astype(np.float32), triangles.astype(np.uint32)
         self._scene = self._open3d.t.geometry.RaycastingScene()
         tensor = self._open3d.core.Tensor.from_numpy
         self._scene.add_triangles(tensor(corners), tensor(faces))
@@ -159,4 +244,4 @@ class Open3DBatch:
 
 def batch_peers(close: float) -> Sequence[BatchPeer]:
     """All of them, not yet built. close: metres within which a point on a surface touches it."""
-    return (FclBatch(), CoalBatch(), Open3DBatch(close))
+    return (FclBatch(), FclPartsBatch(), CoalBatch(), CoalPartsBatch(), Open3DBatch(close))

@@ -3,10 +3,16 @@
 from collections.abc import Mapping
 from typing import Any
 
-BATCH_SIDES = ["hapticdb, one thread", "python-fcl", "coal", "Open3D"]
-BATCH_HEAD = """\
-| tool is | points | hapticdb | python-fcl | coal | Open3D |
-| --- | ---: | ---: | ---: | ---: | ---: |"""
+BATCH_SIDES = {
+    "hapticdb, one thread": "hapticdb",
+    "hapticdb, with force, one thread": "with force",
+    "python-fcl": "python-fcl",
+    "python-fcl, parts": "fcl, parts",
+    "coal": "coal",
+    "coal, parts": "coal, parts",
+    "Open3D": "Open3D",
+}
+"""Sides of the table, if they were measured, and the heads of their columns."""
 WAY_HEAD = """\
 | part | answer | seconds | path, mm | proved from, mm | proved gap, mm | gap of the triangles, mm |
 | --- | --- | ---: | ---: | ---: | ---: | ---: |"""
@@ -16,17 +22,23 @@ SHELL_HEAD = """\
 
 
 def batch_table(results: Mapping[str, Any]) -> str:
-    """Poses a second of processor time: does the tool touch, and how far is the nearest part."""
+    """Poses a second of processor time: does the tool touch, and how far is the nearest part.
+
+    The force answers the first question alone.
+    """
     rates: dict[tuple[int, str], dict[str, dict[str, float]]] = {}
     for cell in results["cells"]:
         row = rates.setdefault((cell["points"], cell["situation"]), {})
         row[cell["question"]] = {
             side: one["poses_per_processor_s"] for side, one in cell["sides"].items()
         }
-    lines = [BATCH_HEAD]
+    measured = [side for side in BATCH_SIDES if any(side in row["touch"] for row in rates.values())]
+    heads = ["tool is", "points", *(BATCH_SIDES[side] for side in measured)]
+    lines = [f"| {' | '.join(heads)} |", f"| ---{' | ---:' * (len(heads) - 1)} |"]
     for (points, situation), row in rates.items():
         sides = [
-            f"{row['touch'][side]:,.0f}, {row['clearance'][side]:,.0f}" for side in BATCH_SIDES
+            ", ".join(f"{row[question][side]:,.0f}" for question in row if side in row[question])
+            for side in measured
         ]
         lines.append(f"| {' | '.join([situation, f'{points:,}', *sides])} |")
     return "\n".join(lines)

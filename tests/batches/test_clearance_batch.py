@@ -63,6 +63,26 @@ def test_clearance_is_that_of_brute_force(
             assert_is_right(env, shell, poses_in(env.grid, 12, seed), reach, exclude)
 
 
+@pytest.mark.parametrize("n_points", [70, 1000, 8000])
+def test_what_is_known_of_cubes_changes_no_distance(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, n_points: int
+) -> None:
+    """Dense and sparse shells along a curve, asked again, with a table of any size."""
+    with make(tmp_path, 6) as env:
+        scatter(env, n_voxels=40)
+        along = np.linspace(0.0, 1.0, n_points)
+        line = np.stack([along, np.sin(9.0 * along), np.cos(9.0 * along)], axis=1)
+        shell = PointShell(0.01 * line, np.tile([0.0, 0.0, 1.0], (n_points, 1)), np.zeros(3))
+        poses = poses_in(env.grid, 12)
+        expected = np.minimum(distances_by_hand(env, shell, poses, []).min(axis=1), 9.0)
+        for n_cubes in (4, threads.CUBES):
+            monkeypatch.setattr(threads, "CUBES", n_cubes)
+            with env.feeler(shell, jobs=1, law="plane") as feeler:
+                for reach in (9.0, 3.0, 9.0):
+                    found = feeler.clearance(poses, reach * SIZE).distances / SIZE
+                    assert np.abs(found - np.minimum(expected, reach)).max() < ROUNDING
+
+
 def test_many_threads_and_little_memory_find_the_same_distances(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

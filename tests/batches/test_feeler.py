@@ -30,7 +30,7 @@ def test_a_closed_feeler_says_so(tmp_path: Path) -> None:
         feeler = env.feeler(cloud(5), jobs=2)
         feeler.close()
         feeler.close()
-        for ask in (feeler.touch, feeler.clearance):
+        for ask in (feeler.touch, feeler.clearance, feeler.collides):
             with pytest.raises(UsageError, match="closed"):
                 ask(poses_in(env.grid, 3))
 
@@ -48,10 +48,12 @@ def test_edits_between_calls_are_felt(tmp_path: Path, by: str) -> None:
             if other is not env:
                 other.close()
             after, near = feeler.touch(poses), feeler.clearance(poses)
+            assert feeler.collides(poses).tolist() == (after.hits > 0).tolist()
         assert after.revision > before.revision
         assert near.revision == after.revision
         assert (after.forces != before.forces).any()
         assert after.forces.tobytes() == env.touch(shell, poses=poses).forces.tobytes()
+        assert (near.distances != far.distances).any()
         assert near.distances == pytest.approx(env.clearance(shell, poses).distances, abs=1e-12)
 
 

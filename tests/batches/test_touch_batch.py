@@ -47,6 +47,8 @@ def test_a_batch_equals_single_touches(tmp_path_factory: pytest.TempPathFactory,
         for exclude in ([], [2]):
             felt = env.touch(shell, poses=poses, exclude=exclude, objects=True)
             assert_equals_touches(felt, env, shell, poses, exclude)
+            collides = env.collides(shell, poses, exclude=exclude)
+            assert collides.tolist() == (felt.hits > 0).tolist()
 
 
 def test_a_batch_equals_single_touches_under_the_smooth_law(tmp_path: Path) -> None:
@@ -61,6 +63,8 @@ def test_a_batch_equals_single_touches_under_the_smooth_law(tmp_path: Path) -> N
         assert felt.law.stiffness == 1000.0
         assert felt.n_contacts.any()
         assert_equals_touches(felt, env, shell, poses, [])
+        with env.feeler(shell) as feeler:  # hits are of voxels, whatever the law
+            assert feeler.collides(poses).tolist() == (felt.hits > 0).tolist()
         plane = env.touch(shell, poses=poses, law="plane")
         for n, pose in enumerate(poses):
             touch = env.touch(shell, pose, law="plane")
@@ -87,6 +91,9 @@ def test_many_threads_and_little_memory_change_nothing(
             assert (scarce.forces + 0.0).tobytes() == (plenty.forces + 0.0).tobytes()
             assert (scarce.torques + 0.0).tobytes() == (plenty.torques + 0.0).tobytes()
             assert scarce.hits.tolist() == plenty.hits.tolist()
+            with env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=jobs) as feeler:
+                assert feeler.collides(poses).tolist() == (plenty.hits > 0).tolist()
+                assert feeler.n_loaded > 512
             assert [total for _, total in told] == [300] * len(told)
             assert [done for done, _ in told] == sorted({done for done, _ in told})
             assert told[-1] == (300, 300)
@@ -119,6 +126,7 @@ def test_no_poses_are_an_empty_batch(tmp_path: Path) -> None:
             assert felt.offsets.tolist() == [0]
             assert felt.objects == []
             assert len(env.clearance(cloud(5), none)) == 0
+            assert env.collides(cloud(5), none).shape == (0,)
 
 
 def test_the_objects_of_a_batch_are_those_of_its_poses(tmp_path: Path) -> None:
@@ -151,8 +159,9 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
             with pytest.raises(UsageError, match=told) as caught:
                 env.touch(shell, poses=wrong)
             assert "\n" not in str(caught.value)
-            with pytest.raises(UsageError, match=told):
-                env.clearance(shell, wrong)
+            for ask in (env.clearance, env.collides):
+                with pytest.raises(UsageError, match=told):
+                    ask(shell, wrong)
         for shape in ((4, 4), (3, 4), (2, 3, 3), (1, 2, 4, 4)):
             with pytest.raises(UsageError, match="shape"):
                 env.touch(shell, poses=np.zeros(shape))

@@ -78,6 +78,7 @@ for n, (layout, curve) in enumerate(KINDS):
             for each in (shell, loaded, point):
                 env.touch(each, poses=[np.eye(4)], objects=True)
                 env.clearance(each, [np.eye(4)])
+                env.collides(each, [np.eye(4)])
 hand = Line(np.zeros(3), np.ones(3), 0.1)
 smooth = folder / "smooth.db"
 hapticdb.import_files(smooth, [stl], hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6)))

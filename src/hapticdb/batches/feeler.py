@@ -6,7 +6,7 @@ from typing import Self, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.batches.nearest import DEFAULT_REACH, NearestSearch
+from hapticdb.batches.nearest import DEFAULT_REACH, NearestSearch, run_first_hits
 from hapticdb.batches.order import order_of
 from hapticdb.batches.result import ClearanceBatch, Named, TouchBatch
 from hapticdb.batches.threads import BatchThreads, ThreadMemory, available_jobs
@@ -14,6 +14,7 @@ from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.kernels.law import reads_distances
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS, WRENCH
 from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.resident.first_hits import UNDECIDED
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import HapticQuery, as_poses
@@ -31,6 +32,7 @@ called. A larger value takes more memory and fetches more cells by one statement
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
 PoseCallback = Callable[[int, int], None]
 """Called after each piece with the poses done and their total."""
 _Answer = TypeVar("_Answer")
@@ -68,6 +70,7 @@ class Feeler:
         self._is_torn = False
         self._is_closed = False
         self._checked_revision: int | None = None
+        self._known_revision: int | None = None
         self._query = HapticQuery(store, QueryFigures(store).both)
         has_distances = reads_distances(law.for_kernels)
         budget = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
@@ -174,11 +177,44 @@ class Feeler:
         def searched() -> ClearanceBatch:
             found = ClearanceBatch(len(places), float(limit), self.shell.cover)
             found.revision = self._residency.revision
+            if self._known_revision != found.revision:
+                self._threads.forget()
+                self._known_revision = found.revision
             for chosen in self._pieces(order, progress):
                 voxels, points = search.search(places[chosen])
                 found.distances[chosen] = np.where(points < 0, limit, voxels * size)
                 found.points[chosen] = points
             return found
+
+        return self._at_one_revision(searched)
+
+    def collides(self, poses: ArrayLike, *, progress: PoseCallback | None = None) -> Bools:
+        """Whether any of the shell's points is in a voxel at many poses: `touch` has hits there.
+
+        The search of a pose ends at the first hit, so it takes less time than the force.
+
+        Parameters
+        ----------
+        poses, progress
+            As for `touch`.
+
+        Returns
+        -------
+        (B,) array of bool
+
+        Raises
+        ------
+        UsageError, ObjectNotFoundError
+            As for `touch`.
+        """
+        places = as_poses(poses)
+        order = order_of(places, self.shell.center, self._residency.grid)
+
+        def searched() -> Bools:
+            collides = np.zeros(len(places), dtype=np.bool_)
+            for chosen in self._pieces(order, progress):
+                collides[chosen] = self._collides(places[chosen])
+            return collides
 
         return self._at_one_revision(searched)
 
@@ -194,6 +230,7 @@ class Feeler:
             raise UsageError("this feeler is closed: make another by env.feeler")
         if self._is_torn:  # an error or Ctrl-C came while cells were read
             self._residency.reopened(self._store)
+            self._known_revision = None
         self._is_torn = True
         with self._store.snapshot():
             self._residency.refresh()
@@ -258,6 +295,19 @@ class Feeler:
             self._run(poses[now], felt)
             out[now] = felt
         return out
+
+    def _collides(self, poses: Floats) -> Bools:
+        """Whether a point hits at each of poses (B,); first where all cells are in memory."""
+        found = np.empty(len(poses), dtype=np.int64)
+        run_first_hits(self._frames, self._threads, poses, found)
+        pending = np.flatnonzero(found == UNDECIDED)
+        while len(pending):
+            n_poses = self._frames.fetch(poses[pending])
+            now, pending = pending[:n_poses], pending[n_poses:]
+            decided = np.empty(n_poses, dtype=np.int64)
+            run_first_hits(self._frames, self._threads, poses[now], decided)
+            found[now] = decided
+        return np.asarray(found >= 0)
 
     def _run(self, poses: Floats, out: Floats) -> None:
         """Frames at poses into out (B, RESULTS), in all threads."""

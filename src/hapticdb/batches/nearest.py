@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from hapticdb.batches.threads import BatchThreads, ThreadMemory
 from hapticdb.errors import UsageError
-from hapticdb.kernels.resident import clearance
+from hapticdb.kernels.resident import clearance, first_hits
 from hapticdb.kernels.resident import nearest as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
 from hapticdb.resident.frames import ResidentFrames
@@ -15,8 +15,24 @@ Ints = NDArray[np.int64]
 
 DEFAULT_REACH = 32
 """Distance that is searched unless another is given, voxels. Larger: more cells are fetched."""
+CLOSE = 1.5, 4.0
+"""Radii of runs, voxels, up to which points are in cubes of 1 and of 2 voxels, otherwise of 4."""
 CELL = 32
 """Voxels of a cell on each axis."""
+
+
+def run_first_hits(
+    frames: ResidentFrames, threads: BatchThreads, poses: Floats, found: Ints
+) -> None:
+    """Find a point that hits at each of poses, in cells that are in memory, into found (B,)."""
+    cells, place = frames.residency.table.cells.without_distances(), frames.residency.place
+
+    def work(memory: ThreadMemory, one: slice) -> None:
+        first_hits.find_first_hits(
+            cells, memory.row, memory.clusters, poses[one], place, found[one]
+        )
+
+    threads.run(work, len(poses))
 
 
 class NearestSearch:
@@ -42,6 +58,8 @@ class NearestSearch:
         self._threads = threads
         self._reach = reach
         self._cells = frames.residency.table.cells.without_distances()
+        radii = frames.clusters.spheres[:, 3] / frames.residency.grid.voxel_size
+        self._fine = int(np.searchsorted(CLOSE, np.median(radii))) if len(radii) else len(CLOSE)
         self._around = reach + 1.0 + frames.surroundings.reach
         self._most = (frames.residency.table.n_slots - 1) // 2
         across = 2.0 * self._around / CELL
@@ -61,7 +79,10 @@ class NearestSearch:
         squares = np.full(n_poses, self._reach**2)
         nearest = np.full(n_poses, -1, dtype=np.int64)
         done = np.zeros(n_poses, dtype=np.int64)
-        pending = np.arange(n_poses)
+        hits = self._first_hits(poses)
+        is_hit = hits >= 0
+        squares[is_hit], nearest[is_hit], done[is_hit] = 0.0, hits[is_hit], n_points
+        pending = np.flatnonzero(~is_hit)
         while len(pending):
             part = poses[pending]
             found = squares[pending], nearest[pending], done[pending]
@@ -73,6 +94,12 @@ class NearestSearch:
                 self._fetch(part[is_left], int(done[pending[0]]))
         return np.sqrt(squares), nearest
 
+    def _first_hits(self, poses: Floats) -> Ints:
+        """Points (B,) that hit, below 0 where none is known to: no cell is fetched."""
+        found = np.empty(len(poses), dtype=np.int64)
+        run_first_hits(self._frames, self._threads, poses, found)
+        return found
+
     def _run(self, poses: Floats, squares: Floats, nearest: Ints, done: Ints) -> None:
         place = self._frames.residency.place
         largest = self._frames.surroundings.reach * place.size
@@ -80,7 +107,7 @@ class NearestSearch:
         def work(memory: ThreadMemory, one: slice) -> None:
             kernels.find_nearest(
                 self._cells, memory.row, memory.clusters, poses[one], place, largest,
-                squares[one], nearest[one], done[one],
+                self._fine, memory.cubes, squares[one], nearest[one], done[one],
             )  # fmt: skip
 
         self._threads.run(work, len(poses))

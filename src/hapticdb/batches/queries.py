@@ -2,7 +2,8 @@
 
 from typing import TYPE_CHECKING, overload
 
-from numpy.typing import ArrayLike
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.pointshell.shell import PointShell
@@ -151,6 +152,34 @@ class Queries:
         return self._touching.touch_many(
             shell, poses, strategy, maxgap, felt, as_law(law), contacts=contacts
         )
+
+    def collides(
+        self,
+        shell: PointShell,
+        poses: ArrayLike,
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        progress: "PoseCallback | None" = None,
+    ) -> NDArray[np.bool_]:
+        """Whether the tool hits anything at many poses, (B,): `touch` has hits there.
+
+        Parameters
+        ----------
+        poses : (B, 4, 4) array
+            world_from_tool, rigid, metres, in any order.
+        shell, where, exclude
+            As for `touch`.
+        progress
+            As for `Feeler.touch`.
+
+        Raises
+        ------
+        UsageError, ObjectNotFoundError
+            As for `touch`.
+        """
+        with self.feeler(shell, where=where, exclude=exclude, law=PLANE) as feeler:
+            return feeler.collides(poses, progress=progress)
 
     def clearance(
         self,

@@ -36,6 +36,7 @@ ENTRIES = {
     "resident.clearance": "find_clearance cells_near",
     "resident.proving": "prove",
     "resident.nearest": "find_nearest",
+    "resident.first_hits": "find_first_hits",
     "resident.feeling": "feel_kernel bounding_spheres",
     "resident.sleeping": "feel_sleeping",
     "query.refining": (

@@ -76,6 +76,23 @@ def gap(x, low, high):
     return max(low - x, x - high, 0.0)
 
 
+@leaf
+def highest_bit(word):
+    """Index of the highest bit set in a word of 32 bits, which is not 0."""
+    at = np.int64(0)
+    for shift in (16, 8, 4, 2, 1):
+        if word >> shift:
+            word >>= shift
+            at += shift
+    return at
+
+
+@leaf
+def lowest_bit(word):
+    """Index of the lowest bit set in a word of 32 bits, which is not 0."""
+    return highest_bit(word & -word)
+
+
 @inlined
 def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
     """Least squared distance from (x, y, z) to a voxel of one cell, and that voxel, packed.
@@ -83,47 +100,58 @@ def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
     Returns `square` and `voxel` as given if no voxel is nearer. All lengths in voxels.
     """
     radius = math.sqrt(square)
+    k0 = ck << 5
+    # columns are read as far up and down as matters at first, and begin at the place's own height
+    low = np.int64(min(max(math.floor(z - radius) - k0, 0), 31))
+    high = np.int64(min(max(math.floor(z + radius) - k0, 0), 31))
+    middle = np.int64(min(max(math.floor(z) - k0, 0), 31))
+    window = (np.int64(2) << high) - (np.int64(1) << low)
     for bi in range(4):
-        if not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
-            continue
         i0 = (ci << 5) + (bi << 3)
         di = gap(x, i0, i0 + 8.0)
-        if di >= radius:
+        if di * di >= square or not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
             continue
         for bj in range(4):
-            if not (mask >> np.uint64((bi << 4) | (bj << 2))) & np.uint64(0xF):
-                continue
+            bricks = np.int64((mask >> np.uint64((bi << 4) | (bj << 2))) & np.uint64(0xF))
             j0 = (cj << 5) + (bj << 3)
             dj = gap(y, j0, j0 + 8.0)
-            if di * di + dj * dj >= square:
+            if not bricks or di * di + dj * dj >= square:
                 continue
+            height, kept = np.inf, np.int64(0)  # squared gap to the bricks that may be near
             for bk in range(4):
-                if not (mask >> np.uint64((bi << 4) | (bj << 2) | bk)) & np.uint64(1):
+                if (bricks >> bk) & 1:
+                    dk = gap(z, k0 + (bk << 3), k0 + (bk << 3) + 8.0)
+                    if di * di + dj * dj + dk * dk < square:
+                        height = min(height, dk * dk)
+                        kept |= np.int64(0xFF) << (bk << 3)
+            kept &= window
+            if not kept:
+                continue
+            for i in range(i0, i0 + 8):
+                dx = gap(x, i, i + 1.0)
+                if dx * dx + dj * dj + height >= square:
                     continue
-                k0 = (ck << 5) + (bk << 3)
-                dk = gap(z, k0, k0 + 8.0)
-                if di * di + dj * dj + dk * dk >= square:
-                    continue
-                for i in range(i0, i0 + 8):
-                    dx = gap(x, i, i + 1.0)
-                    if dx * dx >= square:
+                for j in range(j0, j0 + 8):
+                    dy = gap(y, j, j + 1.0)
+                    column = dx * dx + dy * dy
+                    if column + height >= square:
                         continue
-                    for j in range(j0, j0 + 8):
-                        dy = gap(y, j, j + 1.0)
-                        column = dx * dx + dy * dy
-                        if column >= square:
-                            continue
-                        word = words[slot, ((i & 31) << 5) | (j & 31)]
-                        byte = (np.int64(word) >> (k0 & 31)) & 255
-                        k = k0
-                        while byte:
-                            if byte & 1:
-                                dz = gap(z, k, k + 1.0)
-                                if column + dz * dz < square:
-                                    square = column + dz * dz
-                                    voxel = packed(i, j, k)
-                            byte >>= 1
-                            k += 1
+                    met = np.int64(words[slot, ((i & 31) << 5) | (j & 31)]) & kept
+                    if not met:
+                        continue
+                    above, below = met >> middle, met & ((np.int64(1) << middle) - 1)
+                    if above:
+                        k = k0 + middle + lowest_bit(above)
+                        dz = gap(z, k, k + 1.0)
+                        if column + dz * dz < square:
+                            square = column + dz * dz
+                            voxel = packed(i, j, k)
+                    if below:
+                        k = k0 + highest_bit(below)
+                        dz = gap(z, k, k + 1.0)
+                        if column + dz * dz < square:
+                            square = column + dz * dz
+                            voxel = packed(i, j, k)
     return square, voxel
 
 

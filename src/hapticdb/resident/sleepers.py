@@ -4,8 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.resident.cells import Clusters
+from hapticdb.kernels.resident.cells import CHANGES_KEPT, Clusters
 from hapticdb.kernels.resident.sleeping import BLOCK, COUNTS, REST, Sleepers
+from hapticdb.kernels.resident.waking import AWAKE, FOLLOWED, STATE
 
 
 def boxes_of_blocks(spheres: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -34,11 +35,16 @@ def sleepers_of(clusters: Clusters, budget: int | None) -> Sleepers:
     n_runs = len(clusters.spheres)
     n_chosen = min(budget or 0, len(clusters.points))
     boxes = boxes_of_blocks(clusters.spheres)
+    rests = np.zeros((n_runs, 4))
+    rests[:, 3] = AWAKE
+    state = np.zeros(STATE, dtype=np.int64)
+    state[FOLLOWED] = -1
     return Sleepers(
         boxes,
         np.zeros((len(boxes), REST + 1)),
-        np.zeros((n_runs, 4)),
-        np.zeros(len(boxes), dtype=np.int64),
+        rests,
+        state,
+        np.zeros((CHANGES_KEPT, 3)),
         np.zeros(n_runs, dtype=np.int64),
         np.zeros((n_runs, 1)),
         np.zeros((0, 4)),

@@ -254,7 +254,7 @@ def test_no_run_goes_further_than_its_block_however_the_tool_turns(seed: int) ->
     for n in range(3):
         bound = way_of_box(boxes, rests, n, tuple(after[:3].ravel()))
         assert ways[n * BLOCK : (n + 1) * BLOCK].max() <= bound + 1e-12
-        corners = boxes[n, :3] + signs * boxes[n, 3:]
+        corners = boxes[n, :3] + signs * boxes[n, 3:6]
         furthest = np.abs(corners @ change[:3, :3].T + change[:3, 3]).max()
         assert abs(furthest - bound) <= 1e-12
 

@@ -10,14 +10,20 @@ from hapticdb.kernels.resident.waking import AWAKE, FOLLOWED, STATE
 
 
 def boxes_of_blocks(spheres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Boxes (B, 6) around the centres of the spheres (C, 4) of each `BLOCK` runs, tool frame.
+    """Boxes (B, 7) around the centres of the spheres (C, 4) of each `BLOCK` runs, tool frame.
 
-    A box is its centre and half its sides, metres.
+    A box is its centre, half its sides, and the radius of a sphere at its centre around the
+    spheres, metres; the radius has room for the stretch of a pose that `is_rigid` just accepts.
     """
     starts = np.arange(0, len(spheres), BLOCK)
     low = np.minimum.reduceat(spheres[:, :3], starts, axis=0)
     high = np.maximum.reduceat(spheres[:, :3], starts, axis=0)
-    return np.hstack([0.5 * (low + high), 0.5 * (high - low)])
+    centers = 0.5 * (low + high)
+    ways = np.linalg.norm(
+        spheres[:, :3] - np.repeat(centers, BLOCK, axis=0)[: len(spheres)], axis=1
+    )
+    radii = np.maximum.reduceat(ways * (1.0 + 1e-5) + spheres[:, 3], starts)
+    return np.hstack([centers, 0.5 * (high - low), radii[:, None]])
 
 
 def sleepers_of(clusters: Clusters, budget: int | None) -> Sleepers:

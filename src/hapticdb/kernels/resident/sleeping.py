@@ -52,7 +52,7 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.resident.clearance import gap
 from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.resident.runs import is_sphere_free
-from hapticdb.kernels.resident.waking import wake_changed
+from hapticdb.kernels.resident.waking import AWAKE, wake_changed
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turn
 
 BLOCK = 64
@@ -66,6 +66,9 @@ REST_BETWEEN_BRICKS = 2.0
 """Rest of a run, voxels, that is tested voxel by voxel because an occupied brick is near."""
 ROUNDING = 1e-6
 """Voxels taken off each rest: far more than the rounding errors of a placed centre."""
+LARGEST_BLOCK = 128.0
+"""Half the side of the largest cube around a block's runs that is tested as a whole, voxels.
+Larger: more cells to read at once."""
 MOST_IN_TWO_CELLS = 16.0
 """Half the side of a box that spans at most two cells on an axis, voxels."""
 
@@ -73,11 +76,12 @@ MOST_IN_TWO_CELLS = 16.0
 class Sleepers(NamedTuple):
     """What frames keep of a shell with sleeping clusters.
 
-    boxes (B, 6): centre and half the sides, metres, tool frame, of the box around the centres of
-    each block's runs. block_rests (B, 13): the pose at which a block's rest began (`transform_of`),
-    and how far a centre may go, voxels; below zero for a block that is awake. run_rests (C, 4): the
-    place of a sphere's centre and how far it may go from there on each axis, voxels; below zero for
-    a run that is near something. state (STATE,) int64: which changes of cells are followed, and how
+    boxes (B, 7): centre and half the sides, metres, tool frame, of the box around the centres of
+    each block's runs, and the radius of a sphere at its centre around the runs. block_rests (B,
+    13): the pose at which a block's rest began (`transform_of`), and how far a centre may go,
+    voxels; below zero for a block that is awake. run_rests (C, 4): the place of a sphere's centre
+    and how far it may go from there on each axis, voxels; below zero for a run that is near
+    something. state (STATE,) int64: which changes of cells are followed, and how
     many runs they have woken (`waking`). changed (CHANGES_KEPT, 3): lowest corners of the cells
     changed since the last frame, voxels. listed (C,) int64: the runs near something. skips (C, 1):
     the number of runs that a frame skips from each run on. nothing (0, 4): the spheres of a shell
@@ -102,6 +106,8 @@ SLEEPERS = fields_of(
     Sleepers, FLOATS2, FLOATS2, FLOATS2, INTS, FLOATS2, INTS, FLOATS2, FLOATS2, FLOATS2, FLOATS2,
     INTS,
 )  # fmt: skip
+RADIUS = 6
+"""Column of `Sleepers.boxes` after the box."""
 REST = 12
 """Column of `Sleepers.block_rests` after the pose."""
 LOOKED_AT, LEFT_OUT, COUNTS = 0, 1, 2
@@ -295,6 +301,19 @@ def rest_of_run(
     return 0.0 if is_free else -1.0
 
 
+@inlined
+def rest_of_block(
+    keys, slots, masks, used, which, boxes, block, transform, place, margin, longest
+):  # fmt: skip
+    """Rest of all runs of a block that are far from all bricks; zero if they must be tested."""
+    half = boxes[block, RADIUS] / place.size + margin
+    if half > LARGEST_BLOCK:
+        return 0.0
+    x, y, z = placed_center(boxes, block, transform, place)
+    rest = room_around(keys, slots, masks, used, which, x, y, z, half, longest, place.side)
+    return rest - ROUNDING if rest > REST_BETWEEN_BRICKS else 0.0
+
+
 @leaf
 def list_near_runs(cells, which, shell, sleepers, transform, place, law):
     """List the runs of a placed shell that are near something; returns their number."""
@@ -314,10 +333,18 @@ def list_near_runs(cells, which, shell, sleepers, transform, place, law):
                 continue
         longest = SHORTEST + (LONGEST - SHORTEST) * (block * GOLDEN % 1.0)
         least = LONGEST
+        rest = 0.0
+        if block_rests[block, REST] >= AWAKE:  # it slept, or is to be tested anew
+            rest = rest_of_block(
+                keys, slots, masks, used, which, boxes, block, transform, place, margin, longest
+            )
         for n in range(block * BLOCK, min((block + 1) * BLOCK, spheres.shape[0])):
             x, y, z = placed_center(spheres, n, transform, place)
             left = left_of_rest(run_rests, n, x, y, z)
-            if left < 0.0:
+            if rest > 0.0:
+                left = rest
+                begin_rest(run_rests, n, x, y, z, left)
+            elif left < 0.0:
                 left = rest_of_run(
                     keys, slots, felt, masks, used, which, spheres, n, x, y, z, transform, place,
                     margin, longest,

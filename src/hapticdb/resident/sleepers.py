@@ -4,19 +4,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.resident.cells import Clusters
+from hapticdb.kernels.resident.cells import CHANGES_KEPT, Clusters
 from hapticdb.kernels.resident.sleeping import BLOCK, COUNTS, REST, Sleepers
+from hapticdb.kernels.resident.waking import AWAKE, FOLLOWED, STATE
 
 
 def boxes_of_blocks(spheres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Boxes (B, 6) around the centres of the spheres (C, 4) of each `BLOCK` runs, tool frame.
+    """Boxes (B, 7) around the centres of the spheres (C, 4) of each `BLOCK` runs, tool frame.
 
-    A box is its centre and half its sides, metres.
+    A box is its centre, half its sides, and the radius of a sphere at its centre around the
+    spheres, metres; the radius has room for the stretch of a pose that `is_rigid` just accepts.
     """
     starts = np.arange(0, len(spheres), BLOCK)
     low = np.minimum.reduceat(spheres[:, :3], starts, axis=0)
     high = np.maximum.reduceat(spheres[:, :3], starts, axis=0)
-    return np.hstack([0.5 * (low + high), 0.5 * (high - low)])
+    centers = 0.5 * (low + high)
+    ways = np.linalg.norm(
+        spheres[:, :3] - np.repeat(centers, BLOCK, axis=0)[: len(spheres)], axis=1
+    )
+    radii = np.maximum.reduceat(ways * (1.0 + 1e-5) + spheres[:, 3], starts)
+    return np.hstack([centers, 0.5 * (high - low), radii[:, None]])
 
 
 def sleepers_of(clusters: Clusters, budget: int | None) -> Sleepers:
@@ -34,11 +41,16 @@ def sleepers_of(clusters: Clusters, budget: int | None) -> Sleepers:
     n_runs = len(clusters.spheres)
     n_chosen = min(budget or 0, len(clusters.points))
     boxes = boxes_of_blocks(clusters.spheres)
+    rests = np.zeros((n_runs, 4))
+    rests[:, 3] = AWAKE
+    state = np.zeros(STATE, dtype=np.int64)
+    state[FOLLOWED] = -1
     return Sleepers(
         boxes,
         np.zeros((len(boxes), REST + 1)),
-        np.zeros((n_runs, 4)),
-        np.zeros(len(boxes), dtype=np.int64),
+        rests,
+        state,
+        np.zeros((CHANGES_KEPT, 3)),
         np.zeros(n_runs, dtype=np.int64),
         np.zeros((n_runs, 1)),
         np.zeros((0, 4)),

@@ -31,7 +31,7 @@ FIRST_VERSION = 1
 MOST_READERS = 80
 """Greatest number of readers of a table at the same time: the 64 sessions of a host, and others.
 Larger: 2.5 KiB of the table for each, and eviction looks at more of them."""
-CONTROL_WORDS = 16
+CONTROL_WORDS = kernels.CHANGED + kernels.CHANGES_KEPT
 """Number of int64 words in the control block."""
 HEARTBEAT, AWAY, LOADING, STOP = 8, 9, 10, 11
 """Indices in the control block, after those of `kernels.cells`: time of the database's last answer

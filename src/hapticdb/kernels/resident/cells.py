@@ -53,6 +53,16 @@ VERSION = 0
 """Index into `Cells.control`: the number of the published version."""
 REVISION = 1
 """First index into `Cells.control` of the database's revisions, one for each buffer."""
+CHANGES = 4
+"""First index into `Cells.control` of the numbers of changed cells, one for each buffer: how many
+cells that were known have changed or left, up to the version in that buffer."""
+CHANGES_BEGUN = 7
+"""Index into `Cells.control`: the number of changed cells, with those that are being written."""
+CHANGED = 16
+"""First index into `Cells.control` of the keys of the changed cells, a ring."""
+CHANGES_KEPT = 2048
+"""Length of that ring. If more cells change from one frame to the next, all sleeping clusters wake
+(`waking`). Larger: seldomer, and 8 bytes more for each."""
 READER_STRIDE = 8
 """Numbers from one reader to the next: a cache line, so readers do not slow one another down."""
 LISTED = 0
@@ -66,7 +76,8 @@ WRENCH, HITS, CONTACTS, UNKNOWNS, DEEPEST, RESULTS = 0, 6, 7, 8, 9, 10
 class Cells(NamedTuple):
     """A table of cells, as `hapticdb.resident.table.CellTable` lays it out in shared memory.
 
-    control (16,) int64; readers (16 x 8,) int64, the version that each reader reads, 0 for none;
+    control (CHANGED + CHANGES_KEPT,) int64, whose last part is the ring of changed cells; readers
+    (R x 8,) int64, the version that each reader reads, 0 for none;
     keys (3, capacity) int64 and slots (3, capacity) int32, the directories; words (slots, 1024)
     uint32; masks (slots,) uint64; used (slots,) uint8, set by a frame that reads the slot; payload
     (slots, 34^3) uint8: stored distances, all BEYOND in slot 0; near (slots, 1024) uint32: voxels
@@ -107,9 +118,9 @@ class Place(NamedTuple):
 PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
 
 
-SCRATCH_ROWS = 19
-"""Rows of `Clusters.scratch`: 0-2 have the placed points in metres, 3-5 in voxels; the others
-belong to the frames of the distance law (`distance_frames`)."""
+SCRATCH_ROWS = 21
+"""Rows of `Clusters.scratch`: 0-2 have the placed points in metres, 3-5 in voxels, the last two the
+cells that the run meets (`runs.cells_of_run`); the others belong to frames (`distance_frames`)."""
 
 
 class Clusters(NamedTuple):

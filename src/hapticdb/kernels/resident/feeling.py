@@ -8,6 +8,7 @@ from hapticdb.kernels._jit import FLOAT, FLOATS2, FLOATS3, INT, INTS, chosen_by_
 from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
 from hapticdb.kernels.law import (
     TANGENT_PLANE,
+    TangentPlaneLaw,
     accumulate,
     average_into,
     felt_within,
@@ -37,6 +38,7 @@ from hapticdb.kernels.resident.cells import (
     enter_cell,
 )
 from hapticdb.kernels.resident.distance_frames import felt_by_distance
+from hapticdb.kernels.resident.plane_frames import felt_by_plane
 from hapticdb.kernels.resident.runs import free_runs, place_run
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
@@ -131,7 +133,8 @@ def felt_plainly(law, cells, which, shell, pose, place, met, missed, out):
 
 def _frame_of(law_type: type) -> Any:  # noqa: ANN401 - numba's functions are untyped
     """What computes frames under that type of law."""
-    return felt_by_distance if law_type is DistanceFieldLaw else felt_plainly
+    of_laws: dict[type, Any] = {DistanceFieldLaw: felt_by_distance, TangentPlaneLaw: felt_by_plane}
+    return of_laws.get(law_type, felt_plainly)
 
 
 frame_of = chosen_by_type(_frame_of)

@@ -4,13 +4,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import inlined
-from hapticdb.kernels.resident.cells import EMPTY_SLOT, GROUP, key_of_cell, slot_of
+from hapticdb.kernels.field.lattice import CELL_VALUES, cell_place, place_before
+from hapticdb.kernels.resident.cells import (
+    EMPTY_SLOT,
+    GROUP,
+    UNKNOWN,
+    key_of_cell,
+    slot_of,
+)
 from hapticdb.kernels.rigid import moved
 
 MOST_COLUMNS = 64
 """Most columns (i, j) of a box that are read. In a larger box an occupied brick counts as near."""
 MOST_CELLS = 8
 """Most cells of a box that are read. A larger box counts as near, and its points are looked up."""
+
+
+SLOT_OF, BASE_OF = 19, 20
+"""Rows of the scratch: slots of the cells that a run meets, and where their distances begin."""
+FURTHEST = float(1 << 22)
+"""Voxels: beyond every grid, and within 32 bits."""
 
 
 def _masks_of_runs(stride: int) -> NDArray[np.uint64]:
@@ -142,3 +155,51 @@ def place_run(columns, start, count, transform, place, scratch):
         scratch[4, at] = (scratch[1, at] - oy) / size
     for at in range(count):
         scratch[5, at] = (scratch[2, at] - oz) / size
+
+
+@inlined
+def voxel_on_axis(x):
+    """Voxel of a coordinate, 32 bits, so that the compiler converts several at once."""
+    return np.int32(min(max(np.floor(x), -1.0), FURTHEST))
+
+
+@inlined
+def cells_of_run(keys, slots, masks, used, which, count, side, scratch):
+    """Slots of the cells that a placed run meets, into the scratch -> cells, and where they begin.
+
+    The cells are those of the box around the run's voxels, k fastest, then j; `BASE_OF` takes where
+    the distances of each begin, less the way to the cell's first centre. Returns their number, the
+    numbers along j and k, and the first cell. The number is 0 if none holds anything, and below 0
+    if the run must be looked up point by point: a part of it is outside the grid or in a cell that
+    is unknown, or it meets more than `MOST_CELLS`. The loop over points is plain, so that the
+    compiler vectorizes it.
+    """
+    i0 = i1 = voxel_on_axis(scratch[3, 0])
+    j0 = j1 = voxel_on_axis(scratch[4, 0])
+    k0 = k1 = voxel_on_axis(scratch[5, 0])
+    for at in range(count):
+        i = voxel_on_axis(scratch[3, at])
+        j = voxel_on_axis(scratch[4, at])
+        k = voxel_on_axis(scratch[5, at])
+        i0, i1 = min(i0, i), max(i1, i)
+        j0, j1 = min(j0, j), max(j1, j)
+        k0, k1 = min(k0, k), max(k1, k)
+    ci, cj, ck = np.int64(i0 >> 5), np.int64(j0 >> 5), np.int64(k0 >> 5)
+    n_i, n_j, n_k = (i1 >> 5) - ci + 1, (j1 >> 5) - cj + 1, (k1 >> 5) - ck + 1
+    n_cells = n_i * n_j * n_k
+    is_inside = min(i0, j0, k0) >= 0 and max(i1, j1, k1) < side
+    if not is_inside or n_cells > min(MOST_CELLS, count):
+        return np.int64(UNKNOWN), n_j, n_k, ci, cj, ck
+    met = np.uint64(0)
+    for n in range(n_cells):
+        i, j, k = ci + n // (n_j * n_k), cj + n // n_k % n_j, ck + n % n_k
+        slot = slot_of(keys, slots, which, key_of_cell(i, j, k))
+        if slot < 0:
+            return np.int64(UNKNOWN), n_j, n_k, ci, cj, ck
+        if slot > EMPTY_SLOT:
+            used[slot] = 1
+            met |= masks[slot]
+        scratch[SLOT_OF, n] = slot
+        first = cell_place(np.int64(0), np.int64(0), np.int64(0)) + slot * CELL_VALUES
+        scratch[BASE_OF, n] = float(first - place_before(i << 5, j << 5, k << 5))
+    return n_cells if met else np.int64(0), n_j, n_k, ci, cj, ck

@@ -10,7 +10,8 @@ because the difference of two poses is affine. This is the idea of dead reckonin
 Puterbaugh and Troy 2006), with the way measured instead of foretold, so that no largest speed is
 assumed. The nesting follows Barbic and James 2008.
 
-Rests hold for one version of the cells' directory, because cells never change within a version.
+Cells never change within a version of their directory. Between versions, changed cells end the
+rests that they concern (`waking`).
 
 Whether a run is *near* depends only on the pose and the cells, not on what slept before. So the
 number of points near something, which the budget bounds, is the same in every replay.
@@ -42,7 +43,6 @@ from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     HITS,
     PLACE,
-    READER_STRIDE,
     Clusters,
     begin_frame,
     end_frame,
@@ -52,6 +52,7 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.resident.clearance import gap
 from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.resident.runs import is_sphere_free
+from hapticdb.kernels.resident.waking import AWAKE, wake_changed
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turn
 
 BLOCK = 64
@@ -65,6 +66,9 @@ REST_BETWEEN_BRICKS = 2.0
 """Rest of a run, voxels, that is tested voxel by voxel because an occupied brick is near."""
 ROUNDING = 1e-6
 """Voxels taken off each rest: far more than the rounding errors of a placed centre."""
+LARGEST_BLOCK = 128.0
+"""Half the side of the largest cube around a block's runs that is tested as a whole, voxels.
+Larger: more cells to read at once."""
 MOST_IN_TWO_CELLS = 16.0
 """Half the side of a box that spans at most two cells on an axis, voxels."""
 
@@ -72,12 +76,14 @@ MOST_IN_TWO_CELLS = 16.0
 class Sleepers(NamedTuple):
     """What frames keep of a shell with sleeping clusters.
 
-    boxes (B, 6): centre and half the sides, metres, tool frame, of the box around the centres of
-    each block's runs. block_rests (B, 13): the pose at which a block's rest began (`transform_of`),
-    and how far a centre may go, voxels; below zero for a block that is awake. run_rests (C, 4): the
-    place of a sphere's centre and how far it may go from there on each axis, voxels; below zero for
-    a run that is near something. versions (B,) int64: of the directory for which the rests of a
-    block and of its runs hold. listed (C,) int64: the runs that are near something. skips (C, 1):
+    boxes (B, 7): centre and half the sides, metres, tool frame, of the box around the centres of
+    each block's runs, and the radius of a sphere at its centre around the runs. block_rests (B,
+    13): the pose at which a block's rest began (`transform_of`), and how far a centre may go,
+    voxels; below zero for a block that is awake. run_rests (C, 4): the place of a sphere's centre
+    and how far it may go from there on each axis, voxels; below zero for a run that is near
+    something. state (STATE,) int64: which changes of cells are followed, and how
+    many runs they have woken (`waking`). changed (CHANGES_KEPT, 3): lowest corners of the cells
+    changed since the last frame, voxels. listed (C,) int64: the runs near something. skips (C, 1):
     the number of runs that a frame skips from each run on. nothing (0, 4): the spheres of a shell
     that has none. chosen (K, 6), columns (3, K), indices (K,) int64: points of a frame beyond its
     budget.
@@ -86,7 +92,8 @@ class Sleepers(NamedTuple):
     boxes: NDArray[np.float64]
     block_rests: NDArray[np.float64]
     run_rests: NDArray[np.float64]
-    versions: NDArray[np.int64]
+    state: NDArray[np.int64]
+    changed: NDArray[np.float64]
     listed: NDArray[np.int64]
     skips: NDArray[np.float64]
     nothing: NDArray[np.float64]
@@ -96,8 +103,11 @@ class Sleepers(NamedTuple):
 
 
 SLEEPERS = fields_of(
-    Sleepers, FLOATS2, FLOATS2, FLOATS2, INTS, INTS, FLOATS2, FLOATS2, FLOATS2, FLOATS2, INTS
-)
+    Sleepers, FLOATS2, FLOATS2, FLOATS2, INTS, FLOATS2, INTS, FLOATS2, FLOATS2, FLOATS2, FLOATS2,
+    INTS,
+)  # fmt: skip
+RADIUS = 6
+"""Column of `Sleepers.boxes` after the box."""
 REST = 12
 """Column of `Sleepers.block_rests` after the pose."""
 LOOKED_AT, LEFT_OUT, COUNTS = 0, 1, 2
@@ -291,26 +301,50 @@ def rest_of_run(
     return 0.0 if is_free else -1.0
 
 
+@inlined
+def rest_of_block(
+    keys, slots, masks, used, which, boxes, block, transform, place, margin, longest
+):  # fmt: skip
+    """Rest of all runs of a block that are far from all bricks; zero if they must be tested."""
+    half = boxes[block, RADIUS] / place.size + margin
+    if half > LARGEST_BLOCK:
+        return 0.0
+    x, y, z = placed_center(boxes, block, transform, place)
+    rest = room_around(keys, slots, masks, used, which, x, y, z, half, longest, place.side)
+    return rest - ROUNDING if rest > REST_BETWEEN_BRICKS else 0.0
+
+
 @leaf
-def list_near_runs(cells, which, version, shell, sleepers, transform, place, law):
+def list_near_runs(cells, which, shell, sleepers, transform, place, law):
     """List the runs of a placed shell that are near something; returns their number."""
-    _, _, keys, slots, words, masks, used, _, near = cells
+    control, _, keys, slots, words, masks, used, _, near = cells
     spheres = shell.spheres
-    boxes, block_rests, run_rests, versions, listed, _, _, _, _, _ = sleepers
+    boxes, block_rests, run_rests, state, changed, listed, _, _, _, _, _ = sleepers
     felt, margin = felt_words(law, words, near), felt_margin(law)
+    wake_changed(
+        control, which, spheres, run_rests, block_rests, REST, BLOCK, state, changed, margin,
+        place.size,
+    )  # fmt: skip
     count = 0
     for block in range(boxes.shape[0]):
-        is_known = versions[block] == version
-        if is_known and block_rests[block, REST] > 0.0:
+        if block_rests[block, REST] > 0.0:
             way = way_of_box(boxes, block_rests, block, transform) / place.size
             if way < block_rests[block, REST]:
                 continue
         longest = SHORTEST + (LONGEST - SHORTEST) * (block * GOLDEN % 1.0)
         least = LONGEST
+        rest = 0.0
+        if block_rests[block, REST] >= AWAKE:  # it slept, or is to be tested anew
+            rest = rest_of_block(
+                keys, slots, masks, used, which, boxes, block, transform, place, margin, longest
+            )
         for n in range(block * BLOCK, min((block + 1) * BLOCK, spheres.shape[0])):
             x, y, z = placed_center(spheres, n, transform, place)
-            left = left_of_rest(run_rests, n, x, y, z) if is_known else -1.0
-            if left < 0.0:
+            left = left_of_rest(run_rests, n, x, y, z)
+            if rest > 0.0:
+                left = rest
+                begin_rest(run_rests, n, x, y, z, left)
+            elif left < 0.0:
                 left = rest_of_run(
                     keys, slots, felt, masks, used, which, spheres, n, x, y, z, transform, place,
                     margin, longest,
@@ -321,7 +355,6 @@ def list_near_runs(cells, which, version, shell, sleepers, transform, place, law
                     count += 1
             least = min(least, left)
         begin_block_rest(block_rests, block, transform, least - ROUNDING)
-        versions[block] = version
     return count
 
 
@@ -377,15 +410,14 @@ def feel_sleeping(
     that every cluster keeps its share. Returns the number of poses done.
     """
     points, center, _, _, run, columns, scratch = shell
-    _, _, _, _, listed, skips, nothing, chosen, chosen_columns, indices = sleepers
+    _, _, _, _, _, listed, skips, nothing, chosen, chosen_columns, indices = sleepers
     whole = Clusters(points, center, nothing, skips, run, columns, scratch)
     for n in range(poses.shape[0]):
         if not is_rigid(poses[n]):
             return n
         which = begin_frame(cells, reader)
-        version = cells.readers[reader * READER_STRIDE]
         transform = transform_of(poses[n])
-        count = list_near_runs(cells, which, version, shell, sleepers, transform, place, law)
+        count = list_near_runs(cells, which, shell, sleepers, transform, place, law)
         n_near = points_listed(listed, count, run, points.shape[0])
         n_looked = n_near
         felt = whole

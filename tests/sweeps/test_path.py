@@ -87,8 +87,8 @@ def test_poses_between_samples_are_those_of_plain_formulas(
         nearly_pi = moved[m][2] > np.pi - 1e-6  # either way round is a smallest turn
         if not nearly_pi:
             assert np.allclose(found, expected, atol=1e-8)
-        assert np.allclose(found[:, :3, :3] @ middle + found[:, :3, 3],
-                           expected[:, :3, :3] @ middle + expected[:, :3, 3], atol=1e-9)  # fmt: skip
+        here, there = (placed(poses, middle[None]) for poses in (found, expected))
+        assert np.allclose(here, there, atol=1e-9)
 
 
 @settings(max_examples=30, deadline=None)
@@ -119,7 +119,9 @@ def test_equal_poses_rest(shell: PointShell) -> None:
 @example(move=(0.0, (1, 0, 0), np.pi, (0, 0, 1)), seed=0, shell=ROD)
 @example(move=(0.2, (1, 0, 0), 3.0, (1, 0, 0)), seed=0, shell=BALL)
 def test_no_point_goes_farther_than_the_motion_and_some_point_goes_half_of_it(
-    move: Any, seed: int, shell: PointShell  # noqa: ANN401
+    move: Any,  # noqa: ANN401
+    seed: int,
+    shell: PointShell,
 ) -> None:
     """Of two opposite points far from the axis, one goes as far as the middle, and as the turn."""
     middle = middle_of(shell.points)
@@ -162,10 +164,11 @@ def test_reaches_bound_the_way_to_a_place_and_around_it(
     spent, around = path.reaches(np.array([place]), np.array([half]))
     before = path.at(np.unique(np.append(np.linspace(0.0, place, 100), place)))
     ends = np.clip([place - half, place + half], 0.0, last)
-    beside = path.at(np.linspace(*ends, 65))
+    beside = path.at(np.linspace(ends[0], ends[1], 65))
     here = path.at(np.array([place]))
-    from_start = np.linalg.norm(placed(before, shell.points)[0] - placed(here, shell.points), axis=2)
-    from_place = np.linalg.norm(placed(beside, shell.points) - placed(here, shell.points), axis=2)
+    there = placed(here, shell.points)
+    from_start = np.linalg.norm(placed(before, shell.points)[0] - there, axis=2)
+    from_place = np.linalg.norm(placed(beside, shell.points) - there, axis=2)
     assert from_start.max() <= (spent[0] + path.slack) * SIZE + ROUND
     assert from_place.max() <= around[0] * SIZE + ROUND
     if half == 0.5:  # what the first look stands for: a quarter of a voxel, or little more

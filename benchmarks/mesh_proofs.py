@@ -18,6 +18,7 @@ import coal
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import hapticdb
 from hapticdb.sweeps.run import sweep
@@ -25,13 +26,16 @@ from peers.coal_meshes import tree_of_boxes
 from tight_scenes import (
     ORIGIN,
     SIZE,
+    TightScene,
     Trial,
-    around_nut,
     box,
     check,
     hole,
     past_edge,
+    pose_with,
     rod,
+    shell_of,
+    shifted,
     through,
     tight_scene,
 )
@@ -72,6 +76,20 @@ def clamp(rng: np.random.Generator, *, slim: bool = False) -> trimesh.Trimesh:
     return prism(outline, U_FACES, high)
 
 
+def clamp_at_nut(rng: np.random.Generator, scene: TightScene) -> Trial:
+    """A thick clamp with a small object inside one leg, or free between both."""
+    t, wide = rng.uniform(3.5, 5.0), rng.uniform(6.0, 9.0)
+    w, h = 2.0 * t + wide, t + rng.uniform(6.0, 9.0)
+    outline = [(0, 0), (w, 0), (w, h), (w - t, h), (w - t, t), (t, t), (t, h), (0, h)]
+    tool = prism(outline, U_FACES, rng.uniform(3.5, 6.0))
+    shell = shell_of(tool, int(rng.integers(99)), spacing=0.6 * SIZE)
+    local = SIZE * np.array([rng.choice([0.0, 0.5 * (t + wide)]), 0.5 * t + rng.uniform(-1, 1), 0])
+    place = np.asarray(scene.objects[rng.choice(scene.nuts)].bounds.mean(axis=0))
+    pose = pose_with(Rotation.random(rng=rng).as_matrix(), local, place)
+    end = shifted(pose, SIZE * rng.uniform(-0.4, 0.4, 3))
+    return Trial("clamp at nut", tool, shell, np.array([pose, end]))
+
+
 class ExactMeshes:
     """An oracle of tests/tight_scenes.py: coal's distance, and solid angles for what is inside."""
 
@@ -109,7 +127,7 @@ def _tree(mesh: trimesh.Trimesh) -> Any:  # noqa: ANN401 - coal has no types
     return tree_of_boxes(np.asarray(mesh.vertices, dtype=float), np.asarray(mesh.faces))
 
 
-def trial_of_meshes(rng: np.random.Generator, scene: Any, n: int) -> Trial:  # noqa: ANN401
+def trial_of_meshes(rng: np.random.Generator, scene: TightScene, n: int) -> Trial:
     """The n-th trial: slim shapes pass edges, others are pierced, or fly through objects."""
     shape = (bracket, clamp)[rng.integers(2)]
     slim = rod(rng) if rng.random() < 0.3 else shape(rng, slim=True)
@@ -119,7 +137,7 @@ def trial_of_meshes(rng: np.random.Generator, scene: Any, n: int) -> Trial:  # n
         lambda: past_edge(rng, scene, slim),
         lambda: through(rng, scene, block),
         lambda: past_edge(rng, scene, slim),
-        lambda: around_nut(rng, scene, block),
+        lambda: clamp_at_nut(rng, scene),
     ]
     return kinds[n % len(kinds)]()
 

@@ -1,0 +1,132 @@
+"""A closed surface: whether it holds places, and bounds of their distances from its triangles.
+
+Any place of the surface bounds a distance from above. The balls around pieces of the surface bound
+it from below.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.pointshell.coverage import Interior
+from hapticdb.pointshell.orientation import Surface
+from hapticdb.sweeps.pieces import Cut, cut
+
+Floats = NDArray[np.float64]
+
+MOST_PIECES = 150_000
+"""Greatest number of pieces that a surface is cut into, or twice its triangles. Larger: depths are
+known more closely where triangles are large, with more memory."""
+NEAREST = 6
+"""Pieces around a place whose triangles are measured exactly. Larger: closer bounds, more time."""
+AT_ONCE = 1 << 14
+"""Places measured together. Larger: more memory."""
+PROBES = 8
+"""Places looked at along a way into the solid, to see how thick it is there."""
+OUTSIDE = 1e-3
+"""Distance from the surface, as a share of the pieces' radius, at which it is seen whether another
+body of the same object holds a piece."""
+
+
+class Solid:
+    """A surface with its inside, if all of it is closed.
+
+    Parameters
+    ----------
+    surface : Surface
+        Triangles, metres, as `orient` returns them.
+    goal : float
+        Radius of its pieces, metres; larger where there would be too many.
+
+    Attributes
+    ----------
+    is_closed : bool
+        Whether every triangle belongs to a closed body; otherwise there are no depths.
+    pieces : Cut
+        All of the surface.
+    """
+
+    def __init__(self, surface: Surface, goal: float) -> None:
+        from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
+
+        self.surface = surface
+        self.is_closed = bool((surface.bodies > 0).all())
+        most = max(MOST_PIECES, 2 * len(surface.triangles))
+        while (pieces := cut(surface.triangles, goal, most)) is None:
+            goal *= 2.0
+        self.pieces: Cut = pieces
+        self._radius = float(pieces.radii.max())
+        self._tree = cKDTree(pieces.middles)
+        self._interior = Interior(surface) if self.is_closed else None
+        self._outer = None
+        if self.is_closed and surface.bodies.max() > 1:
+            # where bodies overlap, the surface of one inside another is no border of the solid
+            out = pieces.middles - OUTSIDE * self._radius * surface.normals[pieces.sources]
+            is_border = ~self.holds(out)
+            self._outer = cKDTree(pieces.middles[is_border]) if is_border.any() else None
+            self.is_closed = self._outer is not None
+
+    def distances(self, places: Floats) -> tuple[Floats, Floats]:
+        """Least and greatest distance (n,) of places (n, 3) from the border of the solid."""
+        least, most = np.empty(len(places)), np.empty(len(places))
+        for at in range(0, len(places), AT_ONCE):
+            some = slice(at, at + AT_ONCE)
+            least[some], most[some] = self._distances(places[some])
+        return least, most
+
+    def holds(self, places: Floats) -> NDArray[np.bool_]:
+        """Whether places (n, 3) are inside, (n,); on the surface either answer may come."""
+        if self._interior is None or not len(places):
+            return np.zeros(len(places), dtype=bool)
+        return self._interior.holds(np.ascontiguousarray(places))
+
+    def is_thick(self, pieces: Cut, depth: float) -> bool:
+        """Whether the ways from the middles of pieces into the solid, so deep, stay inside it."""
+        inward = self.surface.normals[pieces.sources]
+        steps = depth / PROBES * np.arange(1, PROBES + 1)
+        return all(bool(self.holds(pieces.middles + step * inward).all()) for step in steps)
+
+    def _distances(self, places: Floats) -> tuple[Floats, Floats]:
+        count = min(NEAREST, len(self.pieces.middles))
+        far, which = (
+            np.asarray(found).reshape(len(places), count)
+            for found in self._tree.query(places, k=count)
+        )
+        exact = distances_to(places[:, None], self.pieces.triangles[which]).min(axis=1)
+        least = exact
+        if count < len(self.pieces.middles):  # the others are at least so far
+            least = np.minimum(exact, np.maximum(far[:, -1] - self._radius, 0.0))
+        if self._outer is None:
+            return least, exact
+        return least, np.asarray(self._outer.query(places)[0])
+
+
+def distances_to(places: Floats, triangles: Floats) -> Floats:
+    """Distances (...) of places (..., 3) to triangles (..., 3, 3): to the plane or to an edge."""
+    a, b, c = triangles[..., 0, :], triangles[..., 1, :], triangles[..., 2, :]
+    squares = np.minimum(
+        np.minimum(_edge_squares(places, a, b), _edge_squares(places, b, c)),
+        _edge_squares(places, c, a),
+    )
+    normals = np.cross(b - a, c - a)
+    area = _dot(normals, normals)
+    offset = places - a
+    over = _dot(normals, offset)
+    # shares of the corners at the place's image in the plane; all positive inside
+    v = _dot(np.cross(offset, c - a), normals)
+    w = _dot(np.cross(b - a, offset), normals)
+    is_over = (v >= 0.0) & (w >= 0.0) & (v + w <= area) & (area > 0.0)
+    planes = over * over / np.where(area > 0.0, area, 1.0)
+    return np.sqrt(np.where(is_over, np.minimum(planes, squares), squares))
+
+
+def _edge_squares(places: Floats, a: Floats, b: Floats) -> Floats:
+    """Squares of the distances of places to the edges from a to b, all (..., 3)."""
+    way, offset = b - a, places - a
+    length = _dot(way, way)
+    share = np.clip(_dot(offset, way) / np.where(length > 0.0, length, 1.0), 0.0, 1.0)
+    rest = offset - share[..., None] * way
+    return _dot(rest, rest)
+
+
+def _dot(one: Floats, other: Floats) -> Floats:
+    return np.asarray((one * other).sum(axis=-1))

@@ -150,10 +150,10 @@ class _Search:
         most = max(into.most[1], back.most[1]) + more + (1.0 + STRETCH) * self._path.off
         found = ContactDepth(
             object=obj,
-            at_start=max(into.start[0], back.start[0], 0.0),
-            at_start_most=max(into.start[1] + more, back.start[1] + more, 0.0),
-            deepest=max(deeper.most[0], 0.0),
-            deepest_most=max(most, 0.0),
+            at_start=max(0.0, into.start[0], back.start[0]),
+            at_start_most=max(0.0, into.start[1] + more, back.start[1] + more),
+            deepest=max(0.0, deeper.most[0]),
+            deepest_most=max(0.0, most),
             fraction=float(self._path.fractions(deeper.sample)),
             allowed=self._allowed,
             why="",
@@ -212,6 +212,9 @@ class _Search:
             high[far] = np.where(is_inside, farthest[far], -least[far])
             low[far] = np.where(is_inside, least[far], -farthest[far])
             bound[active], when[active] = high, travel
+            highest = int(high.argmax())
+            if high[highest] > floor:  # the deepest one so far: worth to be known exactly
+                low[highest] = max(low[highest], solid.exact(places[highest]))
             here = float(low.max()), float(high.max())
             start = here if n == 0 else start
             sample = n if here[0] > most[0] else sample

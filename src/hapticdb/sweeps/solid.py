@@ -13,10 +13,13 @@ from hapticdb.sweeps.pieces import Cut, cut
 
 Floats = NDArray[np.float64]
 
+FINER = 0.3
+"""Radius of the pieces of an object of several bodies, as a share of those of others: there only the
+middles of pieces bound distances from above. Smaller: closer bounds, more memory."""
 MOST_PIECES = 150_000
 """Greatest number of pieces that a surface is cut into, or twice its triangles. Larger: depths are
 known more closely where triangles are large, with more memory."""
-NEAREST = 6
+NEAREST = 4
 """Pieces around a place whose triangles are measured exactly. Larger: closer bounds, more time."""
 AT_ONCE = 1 << 14
 """Places measured together. Larger: more memory."""
@@ -51,6 +54,8 @@ class Solid:
         self.surface = surface
         self.is_closed = bool((surface.bodies > 0).all())
         most = max(MOST_PIECES, 2 * len(surface.triangles))
+        is_several = self.is_closed and int(surface.bodies.max()) > 1
+        goal *= FINER if is_several else 1.0
         while (pieces := cut(surface.triangles, goal, most)) is None:
             goal *= 2.0
         self.pieces: Cut = pieces
@@ -58,7 +63,7 @@ class Solid:
         self._tree = cKDTree(pieces.middles)
         self._interior = Interior(surface) if self.is_closed else None
         self._outer = None
-        if self.is_closed and surface.bodies.max() > 1:
+        if is_several:
             # where bodies overlap, the surface of one inside another is no border of the solid
             out = pieces.middles - OUTSIDE * self._radius * surface.normals[pieces.sources]
             is_border = ~self.holds(out)
@@ -72,6 +77,12 @@ class Solid:
             some = slice(at, at + AT_ONCE)
             least[some], most[some] = self._distances(places[some])
         return least, most
+
+    def exact(self, place: Floats) -> float:
+        """Distance of a place (3,) from the nearest triangle, from whatever body it is."""
+        triangles = self.surface.triangles
+        some = (triangles[at : at + AT_ONCE] for at in range(0, len(triangles), AT_ONCE))
+        return min(float(distances_to(place, few).min()) for few in some)
 
     def holds(self, places: Floats) -> NDArray[np.bool_]:
         """Whether places (n, 3) are inside, (n,); on the surface either answer may come."""
@@ -129,4 +140,4 @@ def _edge_squares(places: Floats, a: Floats, b: Floats) -> Floats:
 
 
 def _dot(one: Floats, other: Floats) -> Floats:
-    return np.asarray((one * other).sum(axis=-1))
+    return np.asarray(np.einsum("...k,...k->...", *np.broadcast_arrays(one, other)))

@@ -94,7 +94,7 @@ def depths_along(
     end = len(path) if last is None else min(last + 1, len(path))
     poses = path.sample(0, end)
     travels = path.travels(0, end) * voxel_size
-    search = _Search(path, poses, travels, voxel_size, allowed)
+    search = DepthSearch(path, poses, travels, voxel_size, allowed)
     found = {}
     for obj, surface in _surfaces(objects):
         if isinstance(surface, str):
@@ -123,7 +123,7 @@ def _unknown(obj: Object, allowed: float, why: str) -> ContactDepth:
     return ContactDepth(obj, 0.0, np.inf, 0.0, np.inf, 0.0, allowed, why)
 
 
-class _Search:
+class DepthSearch:
     """Searches the greatest depths along one path."""
 
     def __init__(
@@ -187,7 +187,7 @@ class _Search:
             if not len(active):
                 continue
             places = to(pieces.middles[active], n)
-            apart[active], when[active] = self._measured(solid, places)[0], travel
+            apart[active], when[active] = self._measured(solid, places, reach)[0], travel
             is_near[active] = apart[active] <= reach
             if n == 0:
                 is_near[active] |= solid.holds(places)
@@ -205,7 +205,7 @@ class _Search:
             if not len(active):
                 continue
             places = to(middles[active], n)
-            least, farthest = self._measured(solid, places)
+            least, farthest = self._measured(solid, places, floor)
             low, high = -farthest, farthest.copy()  # on whichever side, it is no deeper than that
             far = np.flatnonzero(farthest > floor)
             is_inside = solid.holds(places[far])
@@ -222,12 +222,12 @@ class _Search:
             floor = max(floor, here[1])
         return _Greatest(start, most, sample)
 
-    def _measured(self, solid: Solid, places: Floats) -> tuple[Floats, Floats]:
+    def _measured(self, solid: Solid, places: Floats, enough: float) -> tuple[Floats, Floats]:
         """Least and greatest distance (n,) of places (n, 3) from a surface; they are counted."""
         self._looks += len(places)
         if self._looks > MOST_LOOKS:
             raise _TooMuchError
-        return solid.distances(places)
+        return solid.distances(places, enough)
 
     def _to_world(self, places: Floats, n: int) -> Floats:
         """Places (n, 3) of the tool, in the world."""

@@ -14,8 +14,8 @@ from hapticdb.sweeps.pieces import Cut, cut
 Floats = NDArray[np.float64]
 
 FINER = 0.3
-"""Radius of the pieces of an object of several bodies, as a share of those of others: there only the
-middles of pieces bound distances from above. Smaller: closer bounds, more memory."""
+"""Radius of the pieces of an object of several bodies, as a share of those of others: only middles of
+pieces bound distances there from above. Smaller: closer bounds, more memory."""
 MOST_PIECES = 150_000
 """Greatest number of pieces that a surface is cut into, or twice its triangles. Larger: depths are
 known more closely where triangles are large, with more memory."""
@@ -70,12 +70,20 @@ class Solid:
             self._outer = cKDTree(pieces.middles[is_border]) if is_border.any() else None
             self.is_closed = self._outer is not None
 
-    def distances(self, places: Floats) -> tuple[Floats, Floats]:
-        """Least and greatest distance (n,) of places (n, 3) from the border of the solid."""
-        least, most = np.empty(len(places)), np.empty(len(places))
+    def distances(self, places: Floats, enough: float) -> tuple[Floats, Floats]:
+        """Least and greatest distance (n,) of places (n, 3) from the border of the solid.
+
+        Where the greatest one is at most `enough`, the least one is not looked for: it is 0.
+        """
+        least, most = np.zeros(len(places)), np.empty(len(places))
         for at in range(0, len(places), AT_ONCE):
-            some = slice(at, at + AT_ONCE)
-            least[some], most[some] = self._distances(places[some])
+            some = places[at : at + AT_ONCE]
+            most[at : at + AT_ONCE] = self._most(some)
+            rest = at + np.flatnonzero(most[at : at + AT_ONCE] > enough)
+            if len(rest):
+                least[rest], exact = self._least(places[rest])
+                if self._outer is None:
+                    most[rest] = exact
         return least, most
 
     def exact(self, place: Floats) -> float:
@@ -96,19 +104,25 @@ class Solid:
         steps = depth / PROBES * np.arange(1, PROBES + 1)
         return all(bool(self.holds(pieces.middles + step * inward).all()) for step in steps)
 
-    def _distances(self, places: Floats) -> tuple[Floats, Floats]:
+    def _most(self, places: Floats) -> Floats:
+        """Distances (n,) to a place of the border that is near."""
+        if self._outer is not None:
+            return np.asarray(self._outer.query(places)[0])
+        which = np.asarray(self._tree.query(places)[1])
+        return distances_to(places, self.pieces.triangles[which])
+
+    def _least(self, places: Floats) -> tuple[Floats, Floats]:
+        """Lower bounds (n,) of the distances to all triangles, and distances (n,) to near ones."""
         count = min(NEAREST, len(self.pieces.middles))
         far, which = (
             np.asarray(found).reshape(len(places), count)
             for found in self._tree.query(places, k=count)
         )
         exact = distances_to(places[:, None], self.pieces.triangles[which]).min(axis=1)
-        least = exact
-        if count < len(self.pieces.middles):  # the others are at least so far
-            least = np.minimum(exact, np.maximum(far[:, -1] - self._radius, 0.0))
-        if self._outer is None:
-            return least, exact
-        return least, np.asarray(self._outer.query(places)[0])
+        if count == len(self.pieces.middles):
+            return exact, exact
+        others = np.maximum(far[:, -1] - self._radius, 0.0)  # the other pieces are so far
+        return np.minimum(exact, others), exact
 
 
 def distances_to(places: Floats, triangles: Floats) -> Floats:

@@ -14,8 +14,8 @@ from hapticdb.sweeps.pieces import Cut, cut
 Floats = NDArray[np.float64]
 
 FINER = 0.3
-"""Radius of the pieces of an object of several bodies, as a share of those of others: only middles of
-pieces bound distances there from above. Smaller: closer bounds, more memory."""
+"""Radius of the pieces of an object of several bodies, as a share of those of others: only middles
+of pieces bound distances there from above. Smaller: closer bounds, more memory."""
 MOST_PIECES = 150_000
 """Greatest number of pieces that a surface is cut into, or twice its triangles. Larger: depths are
 known more closely where triangles are large, with more memory."""

@@ -150,7 +150,9 @@ edges = st.tuples(*[st.floats(0.01, 0.06)] * 3).map(np.array)
 vectors = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 
 
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=8, deadline=None)
+@settings(
+    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=8, deadline=None
+)
 @given(tool=edges, other=edges, turn=vectors, at=vectors, way=vectors)
 def test_depths_hold_between_boxes_at_every_pose(
     tool: Floats, other: Floats, turn: Floats, at: Floats, way: Floats

@@ -82,10 +82,10 @@ def test_a_peg_pulled_across_its_hole_cuts_as_deep_as_the_way(tmp_path: Path, wa
 
 
 def test_the_tolerance_is_how_much_deeper_it_may_get(tmp_path: Path) -> None:
-    found = swept(peg(tmp_path), "peg", moved((0.009, 0.0, 0.0)), tolerance=0.03)
+    found = swept(peg(tmp_path), "peg", moved((0.009, 0.0, 0.0)), tolerance=0.015)
     (depth,) = found.depths
-    assert (found.verdict, depth.is_bounded, depth.allowed) == ("not decided", False, 0.03)
-    assert "thinner there than twice" in depth.why
+    assert (found.verdict, depth.is_bounded, depth.allowed) == ("comes out", True, 0.015)
+    assert 0.009 - ROUND <= depth.deepest_most <= 0.015
 
 
 def test_two_thin_sheets_that_pass_each_other_are_not_taken_for_sliding(tmp_path: Path) -> None:
@@ -95,7 +95,7 @@ def test_two_thin_sheets_that_pass_each_other_are_not_taken_for_sliding(tmp_path
         tmp_path, SIZE, lying=box((-0.1, -0.1, 0.0), (0.1, 0.1, thin)),
         standing=box((-0.05, 0.0, thin), (0.05, thin, 0.1)),
     )  # fmt: skip
-    (depth,) = swept(url, "standing", moved((0.0, 0.0, -0.3))).depths
+    (depth,) = swept(url, "standing", moved((0.0, 0.0, -0.3)), tolerance=SIZE).depths
     assert depth.deepest_most <= SIZE
     assert not depth.is_bounded
     assert "thinner" in depth.why

@@ -19,7 +19,7 @@ of pieces bound distances there from above. Smaller: closer bounds, more memory.
 MOST_PIECES = 150_000
 """Greatest number of pieces that a surface is cut into, or twice its triangles. Larger: depths are
 known more closely where triangles are large, with more memory."""
-NEAREST = 4
+NEAREST = 8
 """Pieces around a place whose triangles are measured exactly. Larger: closer bounds, more time."""
 AT_ONCE = 1 << 14
 """Places measured together. Larger: more memory."""

@@ -75,6 +75,7 @@ def test_a_lid_on_its_pot_slides_off_no_deeper_than_it_is(tmp_path: Path) -> Non
     assert all(one.is_bounded for one in found.way.depths)
 
 
+@pytest.mark.long
 def test_bricks_with_a_stud_come_apart_along_the_stud_only(tmp_path: Path) -> None:
     """Pulled across, the walls of the upper one pass through the stud of the lower one."""
     url = studded(tmp_path)
@@ -94,6 +95,7 @@ def test_bricks_with_a_stud_come_apart_along_the_stud_only(tmp_path: Path) -> No
     assert depth.deepest <= HALF_STUD + 1e-6 <= depth.deepest_most + 2e-6
 
 
+@pytest.mark.long
 def test_what_is_open_has_no_depth_and_stays_proved_after_its_contact_only(tmp_path: Path) -> None:
     open_pot = walls((0.0, 0.0, 0.0), (0.2, 0.2, 0.1), 0.02, "+z")
     open_pot.update_faces(np.arange(len(open_pot.faces)) > 1)

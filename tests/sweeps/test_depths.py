@@ -68,7 +68,7 @@ def test_a_peg_pulled_along_its_hole_gets_no_deeper(tmp_path: Path) -> None:
     assert depth.deepest_most <= 0.5 * SIZE
 
 
-@pytest.mark.parametrize("way", [0.009, 0.016])
+@pytest.mark.parametrize("way", [pytest.param(0.009, marks=pytest.mark.long), 0.016])
 def test_a_peg_pulled_across_its_hole_cuts_as_deep_as_the_way(tmp_path: Path, way: float) -> None:
     """Half the peg's width at most: there the other side of the peg is nearer."""
     found = swept(peg(tmp_path), "peg", moved((way, 0.0, 0.0)))
@@ -81,6 +81,7 @@ def test_a_peg_pulled_across_its_hole_cuts_as_deep_as_the_way(tmp_path: Path, wa
     assert verdict_line(found, DOT).startswith("cuts into block; ")
 
 
+@pytest.mark.long
 def test_the_tolerance_is_how_much_deeper_it_may_get(tmp_path: Path) -> None:
     found = swept(peg(tmp_path), "peg", moved((0.009, 0.0, 0.0)), tolerance=0.015)
     (depth,) = found.depths
@@ -88,6 +89,7 @@ def test_the_tolerance_is_how_much_deeper_it_may_get(tmp_path: Path) -> None:
     assert 0.009 - ROUND <= depth.deepest_most <= 0.015
 
 
+@pytest.mark.long
 def test_two_thin_sheets_that_pass_each_other_are_not_taken_for_sliding(tmp_path: Path) -> None:
     """No place is ever deeper than a tenth of a voxel, yet one goes right through the other."""
     thin = 0.2 * SIZE
@@ -151,7 +153,7 @@ vectors = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 
 
 @settings(
-    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=8, deadline=None
+    suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=4, deadline=None
 )
 @given(tool=edges, other=edges, turn=vectors, at=vectors, way=vectors)
 def test_depths_hold_between_boxes_at_every_pose(

@@ -8,6 +8,7 @@ become the deepest one.
 """
 
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
 from hapticdb.sweeps.path import SweepPath
 from hapticdb.sweeps.pieces import Cut, cut
-from hapticdb.sweeps.result import STRETCH, ContactDepth
+from hapticdb.sweeps.result import STRETCH, ContactDepth, Swept
 from hapticdb.sweeps.solid import Solid
 
 Floats = NDArray[np.float64]
@@ -60,6 +61,16 @@ class _Greatest(NamedTuple):
     start: tuple[float, float]
     most: tuple[float, float]
     sample: int
+
+
+def with_depths(found: Swept, shell: PointShell, tolerance: float | None) -> Swept:
+    """Add how deep the tool goes into what a sweep left out; tolerance : metres, or the default."""
+    size = found.voxel_size
+    depths = depths_along(
+        shell, found.path, found.left_at_start, voxel_size=size,
+        allowed=ALLOWED * size if tolerance is None else tolerance,
+    )  # fmt: skip
+    return replace(found, depths=depths)
 
 
 def depths_along(

@@ -108,7 +108,7 @@ def sweep(
         Leave out the objects that the tool hits at the first pose, and bound how deep it goes into
         them; draw a finer shell where the verdict is open.
     tolerance : float or None
-        Metres, a voxel's diagonal at most and if None. "Hits" is said only if surfaces come so near;
+        Metres, a voxel's diagonal at most and if None. "Hits" is said only if surfaces come near;
         where hits prove less, it is "not decided". What is left out may be entered so much deeper.
 
     Raises

@@ -31,7 +31,7 @@ def test_what_is_free_comes_out_and_what_is_held_does_not(
     verdicts = {name: row["verdict"] for name, row in rows.items()}
     assert {name for name, said in verdicts.items() if said != "no way found"} == OUT
     for name in OUT:
-        assert verdicts[name] in {"comes out", "comes out of contact"}
+        assert verdicts[name] in {"comes out", "slides out", "comes out of contact"}
 
 
 def test_what_holds_a_part_is_named_first(rows: dict[str, dict]) -> None:  # type: ignore[type-arg]

@@ -25,6 +25,7 @@ from hapticdb.bench import records
 from hapticdb.ingest.originals import parts_of
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.sample import write_sample
+from hapticdb.sweeps.record import depth_record
 from peers.coal_meshes import tree_of_boxes
 
 Floats = NDArray[np.float64]
@@ -78,6 +79,7 @@ def measured(env: Environment, question: Question, seconds: float) -> dict[str, 
             "length_m": found.way.length,
             "clearance_m": found.way.clearance,
             "proved_from_m": found.way.rest_from,
+            "depths": [depth_record(one) for one in found.way.depths],
         }
         if found.way.clearance is not None:
             standing = env.felt((), (*(obj.id for obj in found.parts), *question.exclude))

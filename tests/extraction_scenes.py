@@ -67,6 +67,20 @@ def lid(folder: Path, gap: float) -> Path:
     )
 
 
+HALF_STUD = 0.01
+"""Half the edge of the stud of `studded`, metres: the depth of its middle."""
+
+
+def studded(folder: Path) -> Path:
+    """Two bricks: the stud of the lower one fills a hole in the upper one."""
+    stud = box((-HALF_STUD, -HALF_STUD, 0.0), (HALF_STUD, HALF_STUD, 0.03))
+    return imported(
+        folder,
+        lower=joined(box((-0.05, -0.05, -0.05), (0.05, 0.05, 0.005)), stud),
+        upper=walls((-HALF_STUD, -HALF_STUD, 0.005), (HALF_STUD, HALF_STUD, 0.03), 0.03, "-z"),
+    )
+
+
 def drawer(folder: Path) -> Path:
     """A drawer in a shaft that is open in one direction, +y; 3 voxels of room on all sides."""
     shaft = walls((0.0, 0.0, 0.0), (0.2, 0.3, 0.1), 0.02, "+y")

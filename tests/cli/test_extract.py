@@ -30,18 +30,22 @@ def test_the_path_is_written_and_a_sweep_agrees(run: Run, scene: Path) -> None:
 
 def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
     code, out, err = run("extract", lid(tmp_path, 0.0), "lid", "--motions", 0, "--json")
-    assert (code, err) == (3, "")
+    assert (code, err) == (0, "")
     found = json.loads(out)
     assert list(found) == [
         "verdict", "line", "parts", "way", "touched", "blockers", "pulls", "motions", "poses",
         "is_planned", "seconds", "seed",
     ]  # fmt: skip
     assert list(found["way"]) == [
-        "how", "poses", "length", "clearance", "rest_from", "proof", "rest",
+        "how", "poses", "length", "clearance", "rest_from", "proof", "rest", "depths",
+        "beside",
     ]  # fmt: skip
-    assert (found["verdict"], found["way"]["how"]) == ("comes out of contact", "pull")
+    assert (found["verdict"], found["way"]["how"]) == ("slides out", "pull")
     assert found["way"]["proof"]["verdict"] == "hits"
-    assert found["way"]["rest"]["verdict"] == "comes out"
+    assert found["way"]["rest"]["verdict"] == found["way"]["beside"]["verdict"] == "comes out"
+    (depth,) = found["way"]["depths"]
+    assert (depth["name"], depth["is_bounded"], depth["is_cut"]) == ("pot", True, False)
+    assert depth["deepest_most"] <= depth["at_start"] + depth["allowed"]
     assert [obj["name"] for obj in found["touched"]] == ["pot"]
 
 

@@ -154,8 +154,9 @@ def test_what_the_tool_touches_at_its_start_is_left_out_and_named(run: Run, scen
     up = ("sweep", scene, *TOOL, "--path", "up.csv", "--leave-start")
     code, out, _ = run(*up)
     assert code == 0
-    assert out.splitlines()[0].endswith("; left out, since touched at the start: box0")
+    assert "; left out, since touched at the start: box0; in box0 " in out.splitlines()[0]
     found = json.loads(run(*up, "--json")[1])
+    assert [one["name"] for one in found["depths"]] == ["box0"]
     assert [one["name"] for one in found["left_at_start"]] == ["box0"]
     assert found["tool"]["excluded"] == []
 

@@ -9,11 +9,24 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import hapticdb
-from extraction_scenes import corner, drawer, enclosed, lid
+from extraction_scenes import (
+    HALF_STUD,
+    box,
+    corner,
+    drawer,
+    enclosed,
+    imported,
+    lid,
+    studded,
+    walls,
+)
 from hapticdb import Extraction, extract
 from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
 from hapticdb.extraction.directions import candidate_directions, opposed_shares
+from hapticdb.extraction.judge import judge
 from hapticdb.extraction.leaving import Exit
+from hapticdb.extraction.problem import problem_of
+from hapticdb.extraction.pulls import shifted
 from hapticdb.extraction.verdict import extraction_line
 
 
@@ -46,19 +59,53 @@ def test_a_lid_above_its_pot_lifts_off_proved(tmp_path: Path) -> None:
     assert extraction_line(found).startswith("comes out straight, ")
 
 
-def test_a_lid_on_its_pot_leaves_contact_and_the_rest_is_proved(tmp_path: Path) -> None:
+def test_a_lid_on_its_pot_slides_off_no_deeper_than_it_is(tmp_path: Path) -> None:
     url = lid(tmp_path, 0.0)
     found = found_in(url, "lid", motions=0)
     assert found.way is not None
-    assert (found.verdict, found.way.swept.verdict) == ("comes out of contact", "hits")
+    assert (found.verdict, found.way.swept.verdict) == ("slides out", "hits")
     assert [obj.name for obj in found.touched] == ["pot"]
     assert found.way.rest is not None
     assert found.way.rest.comes_out
     assert 0.0 < found.way.rest_from < 0.1
     direction = found.way.poses[-1][:3, 3]
-    assert direction[2] > 0.0  # not through the pot
+    assert direction[2] >= 0.0  # not through the pot
     assert is_out(found, url)
+    assert "in pot no deeper than " in extraction_line(found)
+    assert all(one.is_bounded for one in found.way.depths)
+
+
+@pytest.mark.long
+def test_bricks_with_a_stud_come_apart_along_the_stud_only(tmp_path: Path) -> None:
+    """Pulled across, the walls of the upper one pass through the stud of the lower one."""
+    url = studded(tmp_path)
+    found = found_in(url, "upper", motions=0)
+    assert found.way is not None
+    assert found.verdict == "slides out"
+    way = found.way.poses[-1][:3, 3]
+    assert way[2] > 0.9 * np.linalg.norm(way)
+    with hapticdb.open(url, read_only=True) as env:
+        problem = problem_of(env, ("upper",), (), (), seed=0)
+        across = judge(
+            problem, np.stack([np.eye(4), shifted(np.array([0.3, 0.0, 0.0]))]), "pull", 2**28
+        )
+    assert (across.verdict, [obj.name for obj in across.in_way]) == ("not decided", ["lower"])
+    (depth,) = across.depths
+    assert depth.is_cut
+    assert depth.deepest <= HALF_STUD + 1e-6 <= depth.deepest_most + 2e-6
+
+
+@pytest.mark.long
+def test_what_is_open_has_no_depth_and_stays_proved_after_its_contact_only(tmp_path: Path) -> None:
+    open_pot = walls((0.0, 0.0, 0.0), (0.2, 0.2, 0.1), 0.02, "+z")
+    open_pot.update_faces(np.arange(len(open_pot.faces)) > 1)
+    cap = box((-0.02, -0.02, 0.1), (0.22, 0.22, 0.12))
+    cap.update_faces(np.arange(len(cap.faces)) > 1)
+    found = found_in(imported(tmp_path, 0.01, pot=open_pot, lid=cap), "lid", motions=0)
+    assert found.way is not None
+    assert found.verdict == "comes out of contact"
     assert "once it has left pot" in extraction_line(found)
+    assert ["nothing has an inside" in one.why for one in found.way.depths] == [True]
 
 
 def test_a_drawer_comes_out_the_open_way_only(tmp_path: Path) -> None:

@@ -37,10 +37,12 @@ CONTACTS = ("pose", "point", "x_m", "y_m", "z_m", "depth_m", "object_id", "objec
 """Columns of `touch --contacts-csv`: a row for each contact with each object that it touches."""
 SWEPT = (
     "object_id", "object_name", "from_fraction", "to_fraction", "enclosed", "samples",
-    "contact_samples", "points", "tangent_depth_m", "verdict",
+    "contact_samples", "points", "tangent_depth_m", "verdict", "start_depth_at_most_m",
+    "depth_at_least_m", "depth_at_most_m",
 )  # fmt: skip
 """Columns of `sweep --csv`: a row for each interval in which an object is hit; counts and depth are
-those of all intervals of the object."""
+those of all intervals of the object. Objects that are left out at the start have a row each, with
+bounds of depths; other rows have none."""
 _PLACE = (*(f"{axis}_m" for axis in AXES), "qw", "qx", "qy", "qz")
 _SPEED = (*(f"v{axis}_m_per_s" for axis in AXES), *(f"w{axis}_rad_per_s" for axis in AXES))
 FRAME_COLUMNS: dict[str, tuple[str, ...]] = {
@@ -167,16 +169,31 @@ def rows_of_contacts(
 
 def rows_of_sweep(found: "Swept") -> Iterator[list[object]]:
     """Rows of `SWEPT`, in the order in which the tool meets the objects; those inside it last."""
-    inside = {obj.id for obj in found.enclosed}
+    inside, none = {obj.id for obj in found.enclosed}, ["", "", ""]
     for one in found.objects:
         who = [one.object.id, text_cell(one.object.name)]
-        counts = [one.samples, one.contacts, one.points, one.deepest, found.verdict]
+        counts = [one.samples, one.contacts, one.points, one.deepest, found.verdict, *none]
         for begin, end in one.intervals.tolist():
             yield [*who, begin, end, int(one.object.id in inside), *counts]
     met = {one.object.id for one in found.objects}
     for obj in found.enclosed:
         if obj.id not in met:
-            yield [obj.id, text_cell(obj.name), 0.0, 1.0, 1, 0, 0, 0, 0.0, found.verdict]
+            yield [obj.id, text_cell(obj.name), 0.0, 1.0, 1, 0, 0, 0, 0.0, found.verdict, *none]
+    for left in found.depths:
+        who = [left.object.id, text_cell(left.object.name)]
+        depths = [left.at_start_most, left.deepest, left.deepest_most]
+        yield [
+            *who,
+            0.0,
+            "",
+            0,
+            "",
+            "",
+            "",
+            "",
+            found.verdict,
+            *("" if left.why else d for d in depths),
+        ]
 
 
 def rows_of_frames(frames: "Frames") -> Iterator[list[object]]:

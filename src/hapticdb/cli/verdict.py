@@ -42,6 +42,7 @@ def show(env: "Environment", found: "Swept", shell: "PointShell") -> None:
 
 def _facts(env: "Environment", found: "Swept", shell: "PointShell") -> list[tuple[str, str]]:
     from hapticdb.sweeps.record import median_spacing
+    from hapticdb.sweeps.verdict import depth_text
 
     size = env.grid.voxel_size
     way = f"{len(found.path.poses):,} poses given, {found.samples:,} samples"
@@ -57,6 +58,7 @@ def _facts(env: "Environment", found: "Swept", shell: "PointShell") -> list[tupl
         rows.append(("tangent depth", _deepest_text(found.deepest, size)))
     if found.clearance is not None and not found.hits:
         rows.append(("clearance", _clearance_text(found.clearance)))
+    rows += [(f"in {one.object.name}", depth_text(one)) for one in found.depths[:MOST_OBJECTS]]
     if found.decision is not None:
         rows.append(("decision", _decision_text(found.decision)))
     rows.append(("looked", f"{found.looked:,} times at the points of a pose"))

@@ -6,7 +6,7 @@ from hapticdb.extraction.result import Extraction, WayOut
 from hapticdb.extraction.verdict import extraction_line
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.record import sweep_record
+from hapticdb.sweeps.record import depth_record, sweep_record
 from hapticdb.sweeps.result import Swept
 
 
@@ -44,6 +44,8 @@ def _way(way: WayOut, shell: PointShell, parts: list[int], excluded: list[int]) 
         "rest_from": way.rest_from,
         "proof": proof(way.swept),
         "rest": way.rest and proof(way.rest),
+        "depths": [depth_record(one) for one in way.depths],
+        "beside": way.beside and proof(way.beside),
     }
 
 

@@ -8,11 +8,13 @@ from numpy.typing import NDArray
 
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import Swept
+from hapticdb.sweeps.result import ContactDepth, Swept
 
 Floats = NDArray[np.float64]
 
-WayOutVerdict = Literal["comes out", "comes out of contact", "not decided", "no way found"]
+WayOutVerdict = Literal[
+    "comes out", "slides out", "comes out of contact", "not decided", "no way found"
+]
 
 
 class Blocker(NamedTuple):
@@ -38,6 +40,10 @@ class WayOut:
         If the parts only leave what they touch at their start: the sweep of the path after that.
     rest_from : float
         Metres of the path's motion before `rest` begins; 0 without it.
+    depths : tuple of ContactDepth
+        How deep the parts go into what they touch at their start, while they leave it.
+    beside : Swept or None
+        If they go no deeper than is allowed: the sweep of the whole path without these objects.
     """
 
     poses: Floats
@@ -45,27 +51,49 @@ class WayOut:
     swept: Swept
     rest: Swept | None
     rest_from: float
+    depths: tuple[ContactDepth, ...] = ()
+    beside: Swept | None = None
+
+    @property
+    def cuts(self) -> tuple[ContactDepth, ...]:
+        """Those of `depths` that are proved to grow by more than is allowed."""
+        return tuple(one for one in self.depths if one.is_cut)
 
     @property
     def verdict(self) -> WayOutVerdict:
         """What is proved.
 
-        "comes out": the parts meet nothing on the whole path. "comes out of contact": at the start
-        they touch objects, which they leave; from `rest_from` on they meet nothing. Voxels do not
-        tell whether they slide along what they touch or cut into it. "not decided": neither.
+        "comes out": the parts meet nothing on the whole path. "slides out": at the start they touch
+        objects, which they leave, and on the way never get deeper into them than there, by more
+        than is allowed; they meet nothing else, and from `rest_from` on nothing at all. "comes out
+        of contact": the same, but how deep they get is not proved. "not decided": neither.
         """
         if self.swept.comes_out:
             return "comes out"
+        if self.cuts:
+            return "not decided"
+        if self.rest is not None and self.rest.comes_out and self._is_sliding:
+            return "slides out"
         if self.rest is not None and self.rest.comes_out:
             return "comes out of contact"
         return "not decided"
 
     @property
+    def _is_sliding(self) -> bool:
+        """Whether all depths are bounded, and nothing else is met on the whole path."""
+        is_bounded = bool(self.depths) and all(one.is_bounded for one in self.depths)
+        return is_bounded and self.beside is not None and self.beside.comes_out
+
+    @property
     def in_way(self) -> tuple[Object, ...]:
-        """Objects that refute the path: it hits them, and not only by leaving them at its start."""
+        """Objects that refute the path.
+
+        It hits them, and not only by leaving them at its start, or it cuts into them.
+        """
         if self.verdict != "not decided":
             return ()
-        return tuple(one.object for one in self.swept.objects if not one.is_left_at_once)
+        hit = tuple(one.object for one in self.swept.objects if not one.is_left_at_once)
+        return hit + tuple(one.object for one in self.cuts)
 
     @property
     def length(self) -> float:

@@ -35,7 +35,9 @@ MOST_JUDGED = 4
 """Greatest number of straight pulls that are proved, one after another, until one is. Larger: a
 proof is found more often, at the price of a sweep each."""
 MOST_SEED = 1 << 31
-RANK: dict[WayOutVerdict, int] = {"comes out": 0, "comes out of contact": 1, "not decided": 2}
+RANK: dict[WayOutVerdict, int] = {
+    "comes out": 0, "slides out": 1, "comes out of contact": 2, "not decided": 3,
+}  # fmt: skip
 
 
 def extract(

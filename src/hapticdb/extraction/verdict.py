@@ -1,7 +1,7 @@
 """The result of a search for a way out in one line."""
 
 from hapticdb.extraction.result import Extraction, WayOut
-from hapticdb.sweeps.verdict import names_of, verdict_line
+from hapticdb.sweeps.verdict import depth_text, names_of, verdict_line
 from hapticdb.units import length_text
 
 
@@ -11,6 +11,9 @@ def extraction_line(found: Extraction) -> str:
     if way is None:
         return _no_way(found)
     how = "straight" if way.how == "pull" else f"by {len(way.poses)} poses"
+    if way.cuts:
+        depths = "; ".join(f"in {one.object.name} {depth_text(one)}" for one in way.cuts)
+        return f"not decided: a path {how}, {length_text(way.length)} long, is refuted: {depths}"
     if way.verdict == "not decided":
         return (
             f"not decided: a path {how}, {length_text(way.length)} long, is not proved: "
@@ -19,6 +22,11 @@ def extraction_line(found: Extraction) -> str:
     clearance = f", surfaces {length_text(way.clearance)} or more apart" if way.clearance else ""
     if way.verdict == "comes out":
         return f"comes out {how}, {length_text(way.length)}{clearance}"
+    if way.verdict == "slides out":
+        depths = "; ".join(f"in {one.object.name} {depth_text(one)}" for one in way.depths)
+        return (
+            f"comes out {how}, {length_text(way.length)}; while it leaves what it touches: {depths}"
+        )
     return (
         f"comes out {how}, {length_text(way.length)}, once it has left {_touched(way)}, which it "
         f"touches at its start: proved from {length_text(way.rest_from)} on, not before{clearance}"

@@ -20,6 +20,7 @@ from hapticdb.pointshell.orientation import Surface
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.resident.residency import Residency
 from hapticdb.sweeps.path import SweepPath
+from hapticdb.sweeps.pieces import cut, radii_of
 from hapticdb.sweeps.result import STRETCH, Decision, Moment
 
 Floats = NDArray[np.float64]
@@ -230,7 +231,7 @@ class Decider:
         done = []
         while len(triangles):
             middles = triangles.mean(axis=1)
-            radii = _radii(triangles, middles)
+            radii = radii_of(triangles, middles)
             near = np.asarray(tree.query(middles)[0]) <= (1.0 + STRETCH) * (radii + self.cover)
             triangles, radii = triangles[near], radii[near]
             done.append(triangles[radii <= goal])
@@ -240,22 +241,10 @@ class Decider:
         return _cut(np.concatenate(done) if done else np.empty((0, 3, 3)), goal)
 
 
-def _radii(triangles: Floats, middles: Floats) -> Floats:
-    """Radii (P,) of the balls around the middles (P, 3) that hold triangles (P, 3, 3)."""
-    return np.asarray(np.linalg.norm(triangles - middles[:, None], axis=2).max(axis=1))
-
-
 def _cut(triangles: Floats, goal: float) -> tuple[Floats, Floats, Floats] | None:
     """Middles, radii and triangles of pieces with a radius of at most `goal`; None: too many."""
-    while True:
-        middles = triangles.mean(axis=1)
-        radii = _radii(triangles, middles)
-        is_large = radii > goal
-        if not is_large.any():
-            return middles, radii, triangles
-        triangles = np.concatenate([triangles[~is_large], halves(triangles[is_large])])
-        if len(triangles) > MOST_PIECES:
-            return None
+    found = cut(triangles, goal, MOST_PIECES)
+    return None if found is None else (found.middles, found.radii, found.triangles)
 
 
 def _halved_parts(places: Floats, spans: Floats, last: float) -> tuple[Floats, Floats]:

@@ -7,7 +7,7 @@ import numpy as np
 
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import Decision, MetObject, Moment, Swept
+from hapticdb.sweeps.result import ContactDepth, Decision, MetObject, Moment, Swept
 from hapticdb.sweeps.verdict import verdict_line
 
 
@@ -69,6 +69,27 @@ def sweep_record(
         "looked": found.looked,
         "left_at_start": [_named(obj) for obj in found.left_at_start],
         "decision": found.decision and _decision(found.decision),
+        "depths": [depth_record(one) for one in found.depths],
+    }
+
+
+def depth_record(one: ContactDepth) -> dict[str, object]:
+    """Convert bounds of a depth; one that is not known is None, since JSON has no infinity."""
+
+    def known(depth: float) -> float | None:
+        return depth if math.isfinite(depth) else None
+
+    return {
+        **_named(one.object),
+        "at_start": one.at_start,
+        "at_start_most": known(one.at_start_most),
+        "deepest": one.deepest,
+        "deepest_most": known(one.deepest_most),
+        "fraction": one.fraction,
+        "allowed": one.allowed,
+        "is_bounded": one.is_bounded,
+        "is_cut": one.is_cut,
+        "why": one.why,
     }
 
 

@@ -127,6 +127,39 @@ class Decision(NamedTuple):
         return self.tolerance is not None and self.within <= self.tolerance
 
 
+class ContactDepth(NamedTuple):
+    """Bounds on how deep the tool and an object that it touches at its start go into one another.
+
+    The depth at a pose is the greatest distance from the object's surface of a place of the tool's
+    surface that is inside the object, or the same with the two exchanged; 0 if there is none. An
+    open surface has no inside, and counts for one of the two only.
+
+    at_start, at_start_most : bounds of the depth at the first pose, metres; deepest, deepest_most :
+    of the greatest depth on the path, between samples, too; fraction : share of the path's motion
+    before the sample with `deepest`; allowed : metres by which the depth may grow; why : the reason
+    why nothing is proved, or empty.
+    """
+
+    object: Object
+    at_start: float
+    at_start_most: float
+    deepest: float
+    deepest_most: float
+    fraction: float
+    allowed: float
+    why: str
+
+    @property
+    def is_bounded(self) -> bool:
+        """Whether it is proved that the depth never grows by more than `allowed`."""
+        return not self.why and self.deepest_most <= self.at_start + self.allowed
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether it is proved that the depth grows by more than `allowed`."""
+        return self.deepest > self.at_start_most + self.allowed
+
+
 class MetObject(NamedTuple):
     """An object that the tool hits.
 
@@ -223,6 +256,8 @@ class Swept:
     decision : Decision or None
         A closer look at what the samples leave open; None where they decide, or nothing more is
         requested about a hit.
+    depths : tuple of ContactDepth
+        Of the objects in `left_at_start`: how deep the tool goes into them on the whole path.
     """
 
     path: SweepPath
@@ -247,6 +282,12 @@ class Swept:
     looked: int = 0
     left_at_start: tuple[Object, ...] = ()
     decision: Decision | None = None
+    depths: tuple[ContactDepth, ...] = ()
+
+    @property
+    def cuts(self) -> tuple[ContactDepth, ...]:
+        """Those of `depths` that are proved to grow by more than is allowed."""
+        return tuple(one for one in self.depths if one.is_cut)
 
     @property
     def caught(self) -> Moment | None:
@@ -258,7 +299,7 @@ class Swept:
     @property
     def verdict(self) -> Verdict:
         """Proved result: the tool hits something, it comes out, or neither is proved."""
-        if self.enclosed:
+        if self.enclosed or self.cuts:
             return "hits"
         if self.decision is not None:
             if self.decision.is_clear and self.proof.is_inside_known:

@@ -31,6 +31,7 @@ from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.clearance import ClearanceSearch
 from hapticdb.sweeps.deciding import Decider
+from hapticdb.sweeps.depths import with_depths
 from hapticdb.sweeps.inside import enclosed_ids
 from hapticdb.sweeps.objects import Met, Runs, find_hits, pairs_in_voxels, pairs_of_hits, tally
 from hapticdb.sweeps.path import SweepPath
@@ -104,11 +105,11 @@ def sweep(
     progress : callable or None
         Called after each block with the samples done and their total.
     leave_start, refine : bool
-        Leave out the objects that the tool hits at the first pose; draw a finer shell where the
-        verdict is open.
+        Leave out the objects that the tool hits at the first pose, and bound how deep it goes into
+        them; draw a finer shell where the verdict is open.
     tolerance : float or None
-        Metres, a voxel's diagonal at most and if None. "Hits" is said only if surfaces are proved
-        to come so near to one another; where hits prove less, the verdict is "not decided".
+        Metres, a voxel's diagonal at most and if None. "Hits" is said only if surfaces come near;
+        where hits prove less, it is "not decided". What is left out may be entered so much deeper.
 
     Raises
     ------
@@ -122,7 +123,7 @@ def sweep(
     limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
     asked = _Asked(leave_start, tolerance, refine)
     run = _Run(env, shell, path, limit, profile, proportions, progress, asked)
-    return run.swept_once(Filter(where, exclude), budget_bytes)
+    return with_depths(run.swept_once(Filter(where, exclude), budget_bytes), shell, tolerance)
 
 
 class _Asked(NamedTuple):

@@ -7,7 +7,7 @@ from hapticdb.pointshell.coverage import COVER_OF_SPACING, points_for
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import Clearance, MetObject, Moment, Swept
+from hapticdb.sweeps.result import Clearance, ContactDepth, MetObject, Moment, Swept
 from hapticdb.units import length_text
 
 MOST_NAMED = 3
@@ -34,7 +34,29 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
     line = _line(found, shell)
     if found.left_at_start:
         line += f"; left out, since touched at the start: {names_of(found.left_at_start)}"
+        line += "".join(f"; in {one.object.name} {depth_text(one)}" for one in _told(found.depths))
     return line
+
+
+def _told(depths: Sequence[ContactDepth]) -> Sequence[ContactDepth]:
+    """Those that a line tells: cuts first, `MOST_NAMED` at most."""
+    return sorted(depths, key=lambda one: (not one.is_cut, one.is_bounded))[:MOST_NAMED]
+
+
+def depth_text(one: ContactDepth) -> str:
+    """Say how deep a tool gets into an object that it touches at its start."""
+    start, most = length_text(one.at_start_most), length_text(one.deepest_most)
+    if one.is_cut:
+        least = length_text(one.deepest)
+        return f"it cuts {least} deep or more (at the start {start} at most)"
+    if one.is_bounded:
+        return f"no deeper than {most} (at the start {start} at most)"
+    if one.why:
+        return f"the depth is not decided: {one.why}"
+    return (
+        f"the depth is not decided: between {length_text(one.deepest)} and {most} (at the start "
+        f"{start} at most)"
+    )
 
 
 def _line(found: Swept, shell: PointShell) -> str:
@@ -48,6 +70,8 @@ def _line(found: Swept, shell: PointShell) -> str:
         if found.hits:
             return _graze(found)
         return f"not decided: no hit in {samples}{_near_clause(found)}, but {_doubt(found, shell)}"
+    if found.cuts and not found.objects and not found.enclosed:
+        return f"cuts into {names_of([one.object for one in found.cuts])}"
     if not found.hits and not found.enclosed:
         return _near(found)
     left = [one for one in found.objects if one.is_left_at_once]

@@ -21,7 +21,9 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.extraction.result import Extraction
 
-EXIT_CODES = {"comes out": 0, "comes out of contact": 3, "not decided": 3, "no way found": 1}
+EXIT_CODES = {
+    "comes out": 0, "slides out": 0, "comes out of contact": 3, "not decided": 3, "no way found": 1,
+}  # fmt: skip
 MOST_BLOCKERS = 10
 """Rows of the table of what is in the way."""
 
@@ -55,8 +57,9 @@ The path is written by --path as displacements from the present place, as
 --seconds end the search.
 
 Comes out: a sweep proves it for the whole surface and the whole path. Comes out,
-once it has left what it touches: proved from a stated place on; before, voxels do
-not tell touching from cutting. Not decided: a path, but no proof. No way found:
+no deeper than so much in what it touches at its start: proved, too, on the whole
+path. Comes out, once it has left what it touches: proved from a stated place on
+only; how deep it gets before is not known. Not decided: a path, but no proof. No way found:
 what blocks most of the straight pulls is named; this is no proof that there is none.
 
 The exit code is 0 when all of the path is proved, 3 when a path is found and not
@@ -115,7 +118,7 @@ def extract(
 def _show(found: "Extraction", path: str | None, picture: str | None) -> None:
     """Print the verdict, what is in the way, and the figures of the search."""
     from hapticdb.extraction.verdict import extraction_line
-    from hapticdb.sweeps.verdict import names_of
+    from hapticdb.sweeps.verdict import depth_text, names_of
 
     render.say(extraction_line(found))
     if found.way is None and found.blockers:
@@ -131,6 +134,7 @@ def _show(found: "Extraction", path: str | None, picture: str | None) -> None:
         ("took", f"{found.seconds:.1f} s"),
     ]
     if found.way is not None:
+        facts += [(f"depth in {one.object.name}", depth_text(one)) for one in found.way.depths]
         for name, file in (("path", path), ("picture", picture)):
             if file is not None:
                 facts.append((name, file))

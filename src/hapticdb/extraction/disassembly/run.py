@@ -224,10 +224,11 @@ class _OrderSearch:
             failed = FailedSearch(parts, n_gone, None, (), str(error))
         else:
             left_out = tuple(sorted({*ids, *excluded}))
-            failed = self._failed(found, left_out)
-            if failed is None:
+            refused = self._failed(found, left_out)
+            if refused is None:
                 self.steps.append(Removal(found, left_out))
                 return None
+            failed = refused
             met |= {*ids_of([one.object for one in failed.blockers]), *ids_of(found.touched)}
         self._known[ids] = _Known(n_gone, motions, met, failed)
         self.failed.append(failed)

@@ -66,6 +66,7 @@ def test_what_lies_above_goes_first_in_a_stack(tmp_path: Path) -> None:
     assert step_line(found, 0).startswith("weight: comes out straight, ")
 
 
+@pytest.mark.long
 def test_what_stands_on_nothing_may_go_first(tmp_path: Path) -> None:
     """No object is the ground: taking off the pot frees its content, too."""
     found = found_in(made(tmp_path, STACK), "content")
@@ -73,6 +74,7 @@ def test_what_stands_on_nothing_may_go_first(tmp_path: Path) -> None:
     assert_free(STACK, found)
 
 
+@pytest.mark.long
 def test_the_bolts_go_before_the_cover(tmp_path: Path) -> None:
     url = made(tmp_path, BOLTED)
     found = found_in(url, "cover", keep=["base"])
@@ -109,6 +111,7 @@ def test_what_comes_out_at_once_needs_no_steps(tmp_path: Path) -> None:
     assert disassembly_line(found).startswith("nothing has to come out before: comes out straight")
 
 
+@pytest.mark.long
 def test_a_step_that_does_not_help_is_dropped(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, WINDOW), "content", keep=["pot"])
     assert max(one.n_gone for one in found.failed) == 1  # the rod was off, and that did not help
@@ -116,6 +119,7 @@ def test_a_step_that_does_not_help_is_dropped(tmp_path: Path) -> None:
     assert_free(WINDOW, found)
 
 
+@pytest.mark.long
 def test_chains_end_at_the_depth(tmp_path: Path) -> None:
     url = made(tmp_path, STACK)
     assert order(found_in(url, "content", depth=2, keep=["pot"]))[0] == "weight"
@@ -146,6 +150,7 @@ def test_the_last_object_that_stands_is_not_taken_off(tmp_path: Path) -> None:
     assert "last object" in failed_line(found.failed[1])
 
 
+@pytest.mark.long
 def test_without_a_planner_straight_orders_are_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

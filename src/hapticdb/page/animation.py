@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from hapticdb.environment import Environment
 from hapticdb.errors import FileError, MissingExtraError
 from hapticdb.extraction.result import Extraction
-from hapticdb.extraction.verdict import extraction_line
 from hapticdb.ingest.originals import found_parts
 from hapticdb.mesh import Part
 from hapticdb.page import colours
@@ -44,7 +43,7 @@ MOST_TRIANGLES = 400_000
 MOST_BLOCKS = 20_000
 """Blocks for an object whose file is gone, at most."""
 STANDING: colours.Colour = (186, 193, 201)
-SEEN_THROUGH = 0.35
+SEEN_THROUGH = 0.45
 """Opacity of what stands: the parts are seen behind it. Larger: solid, and hides more."""
 
 
@@ -153,27 +152,26 @@ def _move(
         f"/part_{number}", facets.vertices, facets.faces, color=colours.of_object(number),
         side="double", cast_shadow=False, receive_shadow=False,
     )  # fmt: skip
-    words = f"{number + 1}. {names_of(found.parts)}: {extraction_line(found)}"
-    label = server.scene.add_label(
-        f"/words_{number}", words, position=tuple(top), visible=number == 0
-    )
+    words = f"{number + 1}. {names_of(found.parts)}: {found.verdict}"
+    label = server.scene.add_label(f"/words_{number}", words, position=tuple(top), visible=False)
     return _Move(node, poses, label)
 
 
 def _played(server: "ViserServer", moves: Sequence[_Move]) -> str:
     recording = server.get_scene_serializer()
-    for move in moves:  # the player begins again with these
+    for move in moves:  # the player begins again with these; viser sends only what changes
+        _place(move.node, move.poses[-1])
         _place(move.node, move.poses[0])
+        move.node.visible = False
         move.node.visible = True
-    for n, move in enumerate(moves):
-        for k, other in enumerate(moves):
-            other.words.visible = k == n
+    for move in moves:
+        move.words.visible = True
         recording.insert_sleep(PAUSE)
         for pose in move.poses:
             _place(move.node, pose)
             recording.insert_sleep(1.0 / PICTURES)
         recording.insert_sleep(PAUSE)
-        move.node.visible = False
+        move.node.visible = move.words.visible = False
     recording.insert_sleep(1.0 / PICTURES)
     return str(recording.as_html())
 

@@ -86,28 +86,34 @@ def disassemble(
     MissingExtraError
         If straight pulls lead to no order, and the planner is not installed.
     """
+    began = time.monotonic()
     if not (math.isfinite(seconds) and seconds > 0.0):
         raise UsageError(f"a search of {seconds} seconds: give more than 0")
     if depth < 0:
         raise UsageError(f"depth {depth}: give 0 or more")
-    began = time.monotonic()
     parts = tuple(env.find(*words))
     stays = {*ids_of(parts), *ids_of(env.felt(where, exclude))}
     left_out = tuple(obj.id for obj in env.objects() if obj.id not in stays)
     kept = frozenset(ids_of(env.find(*keep)) if keep else ())
     asked = _Asked(parts, left_out, kept, seconds, seed, motions, out, budget_bytes, progress)
-    search = _OrderSearch(env, asked, began + seconds)
-    for motions_of_others in dict.fromkeys((0, motions)):
-        search.motions_of_others = motions_of_others
-        is_found = search.clear(parts, depth, frozenset())
+    return replace(_ordered(env, asked, depth), seconds=time.monotonic() - began)
+
+
+def _ordered(env: Environment, asked: "_Asked", depth: int) -> Disassembly:
+    """Search by straight pulls of what blocks, then with the planner; without the time it took."""
+    search = _OrderSearch(env, asked, time.monotonic() + asked.seconds)
+    is_found = False
+    for motions in dict.fromkeys((0, asked.motions)):
+        search.motions_of_others = motions
+        is_found = search.clear(asked.parts, depth, frozenset())
         if is_found:
             search.drop_needless()
             break
     if not is_found and search.missing is not None:
         raise search.missing
     return Disassembly(
-        parts, tuple(search.steps), tuple(search.failed), not is_found and search.is_spent,
-        time.monotonic() - began, seed,
+        asked.parts, tuple(search.steps), tuple(search.failed),
+        not is_found and search.is_spent, 0.0, asked.seed,
     )  # fmt: skip
 
 

@@ -89,6 +89,7 @@ def test_the_bolts_go_before_the_cover(tmp_path: Path) -> None:
         assert np.array_equal(one.found.way.poses, other.found.way.poses)
 
 
+@pytest.mark.long
 def test_what_was_left_out_is_not_taken_off(tmp_path: Path) -> None:
     url = made(tmp_path, BOLTED)
     found = found_in(url, "cover", exclude=["bolt_1"], keep=["base"])

@@ -2,23 +2,29 @@
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 if "CI" not in os.environ:
     pytest.importorskip("coal", reason="make peers installs it")
 
-from ways_out import BITS, SAMPLE, SECONDS, measure
+from ways_out import BITS, SAMPLE, SECONDS, WHEEL, measure
 
 
 @pytest.fixture(scope="module")
-def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
+def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder: Path = tmp_path_factory.mktemp("ways")
-    found = measure(folder, None, BITS, SAMPLE, SECONDS)
+    return measure(folder, None, BITS, SAMPLE, SECONDS)
+
+
+@pytest.fixture(scope="module")
+def rows(found: dict[str, Any]) -> dict[str, dict[str, object]]:
     return {row["parts"]: row for row in found["rows"]}
 
 
-OUT = {"wheels/wheel_bolt_front_left_1", "body/hood", SAMPLE[1].name}
+PLUG = SAMPLE[-1].name
+OUT = {"wheels/wheel_bolt_front_left_1", "body/hood", SAMPLE[1].name, PLUG}
 HELD_BY = {
     "wheels/tyre_front_left, wheels/rim_front_left": "wheels/wheel_bolt",
     "supply/battery": "supply/wiring_harness",
@@ -45,3 +51,24 @@ def test_exact_meshes_keep_the_proved_distance(rows: dict[str, dict]) -> None:  
         assert row["clearance_m"] > 0.0
         assert row["mesh_distance_m"] >= row["clearance_m"]
         assert row["mesh_poses"] > 20
+
+
+def test_the_spark_plug_comes_out_along_its_bore(rows: dict[str, dict[str, Any]]) -> None:
+    """The bore is 3.6 voxels wider than the plug: nothing is touched, all of the way is proved."""
+    row = rows[PLUG]
+    x, y, z = row["end_m"]
+    assert (row["verdict"], row["how"]) == ("comes out", "pull")
+    assert z > 0.0
+    assert max(abs(x), abs(y)) < 0.5 * z  # the bore's rim lets it lean so far, no farther
+
+
+def test_the_wheel_comes_out_after_its_bolts_by_itself(found: dict[str, Any]) -> None:
+    order = found["order"]
+    *bolts, wheel = order["steps"]
+    names = {f"wheels/wheel_bolt_front_left_{n}" for n in range(1, 6)}
+    assert {step["parts"] for step in bolts} == names
+    assert wheel["parts"] == ", ".join(WHEEL)
+    for step in order["steps"]:
+        assert step["verdict"] in {"comes out", "comes out of contact"}
+        assert step["clearance_m"] > 0.0
+        assert step["mesh_distance_m"] >= step["clearance_m"]

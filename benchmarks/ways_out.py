@@ -1,6 +1,6 @@
 """Ways out: which parts are found to come out, how soon, and what exact meshes say of the paths.
 
-    python benchmarks/ways_out.py                      # seven questions of the sample car
+    python benchmarks/ways_out.py                      # the sample car: eight questions, an order
     python benchmarks/ways_out.py --model FILE --bits 10 --parts 40,57,140 --out ways_out.json
 
 coal compares the triangles of the part with those of all that stands, at each found path's poses at
@@ -24,13 +24,18 @@ from hapticdb import Environment, Extraction, GridOptions, ImportOptions
 from hapticdb.bench import records
 from hapticdb.ingest.originals import parts_of
 from hapticdb.pointshell.orientation import Surface
-from hapticdb.sample import write_sample
+from hapticdb.sample import SamplePart, write_sample
+from hapticdb.sample import shapes as s
+from hapticdb.sample.parts import CAST, CHROME
+from hapticdb.sample.write import car_scene
 from hapticdb.sweeps.record import depth_record
 from peers.coal_meshes import tree_of_boxes
 
 Floats = NDArray[np.float64]
 BITS = 11
 SECONDS = 60.0
+ORDER_SECONDS = 1200.0
+"""Time of the search for an order."""
 MOST_POSES = 4000
 """Greatest number of poses of a path that coal looks at; of a longer one, every n-th."""
 
@@ -56,9 +61,31 @@ SAMPLE = (
     Question(("body/door_front_left",)),
     Question(("seats/seat_*_left",)),
     Question(("supply/battery",)),
+    Question(("engine/spark_plug",), ("body/hood*",)),
 )
 """Of the sample car: the first, the second and the hood come out; bolts hold the wheel, pillars and
-hinges the door, the floor's rails the seat, and the harness the battery."""
+hinges the door, the floor's rails the seat, and the harness the battery. The spark plug, which is
+added to the car, comes out along the bore of its seat."""
+SEAT = (1.15, 0.40, 0.80)
+"""Middle of the spark plug's seat in the engine bay, metres."""
+BORE, PLUG = 0.024, 0.012
+"""Radii of the seat's bore, which is closed below, and of the plug, metres: 3.6 voxels between."""
+
+
+def plug_parts() -> list[SamplePart]:
+    """A spark plug in a seat whose bore is along z and open at the top only."""
+    x, y, z = SEAT
+    seat = s.join(
+        [
+            s.bored_block(0.09, 0.09, 0.05, BORE),
+            s.moved(s.box(0.09, 0.09, 0.01, 0.001), s.shift(z=-0.03)),
+        ]
+    )
+    plug = s.turned([(0.008, 0.0), (PLUG, 0.002), (PLUG, 0.05), (0.006, 0.055), (0.005, 0.09)], 24)
+    return [
+        SamplePart("engine/spark_plug_seat", seat, s.shift(x, y, z), CAST),
+        SamplePart("engine/spark_plug", plug, s.shift(x, y, z - 0.012), CHROME),
+    ]
 
 
 def measured(env: Environment, question: Question, seconds: float) -> dict[str, Any]:
@@ -77,6 +104,7 @@ def measured(env: Environment, question: Question, seconds: float) -> dict[str, 
         row |= {
             "how": found.way.how,
             "length_m": found.way.length,
+            "end_m": found.way.poses[-1][:3, 3].tolist(),
             "clearance_m": found.way.clearance,
             "proved_from_m": found.way.rest_from,
             "depths": [depth_record(one) for one in found.way.depths],
@@ -85,6 +113,30 @@ def measured(env: Environment, question: Question, seconds: float) -> dict[str, 
             standing = env.felt((), (*(obj.id for obj in found.parts), *question.exclude))
             row |= by_meshes(found, standing)
     return row
+
+
+def measured_order(env: Environment, words: Sequence[str], seconds: float) -> dict[str, Any]:
+    """Search an order in which parts come out, and ask coal about each step."""
+    found = hapticdb.disassemble(env, *words, seconds=seconds)
+    steps: list[dict[str, Any]] = []
+    for step in found.steps:
+        way = step.found.way
+        assert way is not None
+        row = {
+            "parts": ", ".join(obj.name for obj in step.found.parts),
+            "verdict": step.found.verdict,
+            "length_m": way.length,
+            "clearance_m": way.clearance,
+            "proved_from_m": way.rest_from,
+        }
+        steps.append(row | by_meshes(step.found, env.felt((), step.excluded)))
+    return {
+        "parts": ", ".join(words),
+        "verdict": found.verdict,
+        "s": found.seconds,
+        "steps": steps,
+        "failed": len(found.failed),
+    }
 
 
 def by_meshes(found: Extraction, standing: Sequence[hapticdb.Object]) -> dict[str, Any]:
@@ -116,10 +168,14 @@ def _tree(triangles: Floats) -> Any:  # noqa: ANN401 - coal has no types
 def measure(
     folder: Path, model: Path | None, bits: int, questions: Sequence[Question], seconds: float
 ) -> dict[str, Any]:
-    """Import the model, the sample car unless one is given, and ask all questions."""
+    """Import the model, the sample car with a spark plug unless one is given, and ask all."""
     file = model or write_sample(folder / "sample").car
+    files = [file]
+    if model is None:
+        files.append(folder / "plug.glb")
+        files[1].write_bytes(car_scene(plug_parts()).export(file_type="glb"))
     url = folder / "scene.db"
-    hapticdb.import_files(url, [file], ImportOptions(grid=GridOptions(bits=bits)))
+    hapticdb.import_files(url, files, ImportOptions(grid=GridOptions(bits=bits)))
     found: dict[str, Any] = {
         "commit": records.commit(),
         "load_before": os.getloadavg()[0],
@@ -132,6 +188,9 @@ def measure(
             row = measured(env, question, seconds)
             found["rows"].append(row)
             print(_line(row), flush=True)
+        if model is None:
+            found["order"] = measured_order(env, WHEEL, ORDER_SECONDS)
+            print(f"order for {', '.join(WHEEL)}: {found['order']['verdict']}", flush=True)
     return found
 
 

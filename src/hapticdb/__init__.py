@@ -42,6 +42,8 @@ if TYPE_CHECKING:
         StuckError,
         UsageError,
     )
+    from hapticdb.extraction.disassembly.result import Disassembly
+    from hapticdb.extraction.disassembly.run import disassemble
     from hapticdb.extraction.result import Extraction
     from hapticdb.extraction.run import extract
     from hapticdb.grid import Grid, GridOptions
@@ -89,6 +91,7 @@ __all__ = [
     "DeviceCoupling",
     "DeviceError",
     "Difference",
+    "Disassembly",
     "DistanceField",
     "Environment",
     "EnvironmentExistsError",
@@ -139,6 +142,7 @@ __all__ = [
     "copy_environment",
     "create",
     "diff_environments",
+    "disassemble",
     "extract",
     "import_files",
     "open",
@@ -167,6 +171,8 @@ _HOMES = {
         "OutsideGridError ProtocolError ReadOnlyError ShardAwayError StaleError StuckError "
         "UsageError"
     ),
+    "extraction.disassembly.result": "Disassembly",
+    "extraction.disassembly.run": "disassemble",
     "extraction.result": "Extraction",
     "extraction.run": "extract",
     "query.law": "DistanceField TangentPlane",

@@ -10,6 +10,8 @@ import pytest
 
 import hapticdb
 from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
+from disassembly_scenes import CHAIN, STACK
+from disassembly_scenes import made as made_of
 from extraction_scenes import enclosed, lid
 
 
@@ -81,3 +83,57 @@ def test_wrong_arguments_are_refused(run: Run, scene: Path) -> None:
     refused(run("extract", scene, "box*"), "nothing stands")
     refused(run("extract", scene, "box0", "--picture", "a.jpg"), ".png")
     refused(run("extract", "missing.db", "box0"), "missing.db")
+
+
+@pytest.mark.long
+def test_an_order_is_printed_and_each_step_is_written(run: Run, tmp_path: Path) -> None:
+    url = made_of(tmp_path, STACK)
+    words = ("--disassemble", "--keep", "pot", "--motions", 0)
+    code, out, err = run("extract", url, "lid", *words, "--path", "off.csv")
+    assert (code, err) == (0, "")
+    lines = out.splitlines()
+    assert lines[0].startswith("comes out after weight, each step proved: comes out straight, ")
+    assert [line.partition(":")[0] for line in lines[1:3]] == ["1. weight", "2. lid"]
+    assert "off-1.csv ... off-2.csv" in out
+    assert run("sweep", url, "--part", "weight", "--path", "off-1.csv")[0] == 0
+    assert run("sweep", url, "--part", "lid", "--path", "off-2.csv")[0] == 1  # meets the weight
+    left_out = ("--exclude", "weight")
+    assert run("sweep", url, "--part", "lid", "--path", "off-2.csv", *left_out)[0] == 0
+
+
+def test_json_of_an_order_has_a_proof_a_step(run: Run, tmp_path: Path) -> None:
+    url = made_of(tmp_path, STACK)
+    words = ("--disassemble", "--keep", "pot", "--motions", 0, "--json")
+    code, out, _ = run("extract", url, "lid", *words)
+    found = json.loads(out)
+    assert code == 0
+    assert list(found) == [
+        "verdict", "line", "parts", "steps", "failed", "is_out_of_time", "seconds", "seed",
+    ]  # fmt: skip
+    assert [step["parts"][0]["name"] for step in found["steps"]] == ["weight", "lid"]
+    assert [step["way"]["proof"]["verdict"] for step in found["steps"]] == ["comes out"] * 2
+    assert [len(step["excluded"]) for step in found["steps"]] == [1, 2]
+    assert found["failed"][0]["blockers"][0].keys() == {"id", "name", "pulls"}
+
+
+def test_no_order_is_a_table_of_what_was_tried(run: Run, tmp_path: Path) -> None:
+    url = made_of(tmp_path, CHAIN)
+    words = ("--disassemble", "--motions", 0, "--path", "off.csv", "--animation", "off.html")
+    code, out, err = run("extract", url, "left", *words)
+    assert (code, err) == (1, "")
+    first, heading, _, *rows = [line for line in out.splitlines() if line]
+    assert first == "no order found in 2 searches: blocked by right"
+    assert heading.split() == ["tried", "after", "steps", "result"]
+    assert [row.split()[:2] for row in rows[:2]] == [["left", "0"], ["right", "0"]]
+    assert not list(Path().glob("off*"))
+
+
+def test_wrong_arguments_of_an_order_are_refused(
+    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    refused(run("extract", scene, "box0", "--depth", 2), "--disassemble")
+    refused(run("extract", scene, "box0", "--disassemble", "--depth", -1), "depth -1")
+    refused(run("extract", scene, "box0", "--disassemble", "--keep", "nut"), "--keep: no object")
+    refused(run("extract", scene, "box0", "--animation", "a.gif"), ".html")
+    monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
+    refused(run("extract", scene, "box0", "--animation", "a.html"), "hapticdb[view]")

@@ -1,6 +1,6 @@
 """The verb extract."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, TypedDict
 
 import typer
 
@@ -15,10 +15,14 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.values import budget_bytes
+from hapticdb.cli.verbs.paths.disassembling import EXIT_CODES as ORDER_EXIT_CODES
+from hapticdb.cli.verbs.paths.disassembling import Outputs, report
 from hapticdb.cli.verbs.paths.sweeping import PictureOption, UpName, UpOption, check_picture
+from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
+    from hapticdb.extraction.pulls import SearchCallback
     from hapticdb.extraction.result import Extraction
 
 EXIT_CODES = {
@@ -27,7 +31,12 @@ EXIT_CODES = {
 MOST_BLOCKERS = 10
 """Rows of the table of what is in the way."""
 
-SecondsOption = Annotated[float, typer.Option(metavar="S", help="Time of the search.")]
+SecondsOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="S", help="Time of the search.", show_default="60; 600 with --disassemble"
+    ),
+]
 SeedOption = Annotated[int, typer.Option(metavar="N", help="Seed of the search.")]
 MotionsOption = Annotated[
     int, typer.Option(metavar="N", help="Motions that the planner tries; 0: straight pulls only.")
@@ -42,6 +51,27 @@ OutOption = Annotated[
 ]
 WayOption = Annotated[
     str | None, typer.Option("--path", metavar="CSV", help="Write the path that was found.")
+]
+
+DisassembleOption = Annotated[
+    bool,
+    typer.Option("--disassemble", help="Take off what blocks the parts first, step by step."),
+]
+DepthOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        help="Most objects that wait for one another, beside the parts.",
+        show_default="3",
+    ),
+]
+KeepOption = Annotated[
+    list[str] | None,
+    typer.Option(metavar="WORDS", help="Objects that are never taken off; as for --exclude."),
+]
+AnimationOption = Annotated[
+    str | None,
+    typer.Option(metavar="HTML", help="Write a page that shows how the parts come out."),
 ]
 
 HELP = """Search a path on which parts come out, and prove it by a sweep.
@@ -62,6 +92,14 @@ path. Comes out, once it has left what it touches: proved from a stated place on
 only; how deep it gets before is not known. Not decided: a path, but no proof. No way found:
 what blocks most of the straight pulls is named; this is no proof that there is none.
 
+With --disassemble, what blocks the parts is taken off first, each object alone
+and on a path that is proved; --keep names what stays. Each step has a file of its
+own: --path out.csv writes out-1.csv and so on. The order may be longer than
+necessary.
+
+--animation writes a page for any browser, with all that it needs in one file (pip
+install 'hapticdb[view]').
+
 The exit code is 0 when all of the path is proved, 3 when a path is found and not
 all of it is proved, 1 when no path is found.
 
@@ -74,7 +112,10 @@ def extract(
     url: UrlArgument,
     parts: ObjectsArgument,
     *,
-    seconds: SecondsOption = 60.0,
+    disassemble: DisassembleOption = False,
+    depth: DepthOption = None,
+    keep: KeepOption = None,
+    seconds: SecondsOption = None,
     seed: SeedOption = 0,
     motions: MotionsOption = 20_000,
     out: OutOption = None,
@@ -83,39 +124,92 @@ def extract(
     budget: BudgetOption = 256.0,
     path: WayOption = None,
     picture: PictureOption = None,
+    animation: AnimationOption = None,
     up: UpOption = None,
     json: JsonOption = False,
 ) -> None:
     """Search a path on which parts come out; the help text is `HELP`."""
     import hapticdb
-    from hapticdb.extraction.record import extraction_record
-    from hapticdb.extraction.run import extract as search
-    from hapticdb.poses import write_poses
+    from hapticdb.extraction import run
+    from hapticdb.extraction.disassembly import run as orders
 
     check_picture(picture)
+    check_animation(animation)
+    if not disassemble and (depth is not None or keep):
+        raise UsageError("--depth and --keep go with --disassemble")
+    asked = Outputs(path, picture, animation, up, json)
     n_bytes = budget_bytes(budget)
     with hapticdb.open(url, read_only=True) as env:
         ids = ids_of(env, parts, "PART")
         felt = felt_objects(env, where, exclude, ids)
+        kept = ids_of(env, keep, "--keep") if keep else []
         render.compile_kernels("extract")
         with render.pull_bar() as progress:
-            found = search(
-                env, *ids, where=felt.where, exclude=felt.exclude, seconds=seconds, seed=seed,
-                motions=motions, out=out, budget_bytes=n_bytes, progress=progress,
-            )  # fmt: skip
-        if found.way is not None and path is not None:
-            write_poses(path, found.way.poses)
-        if json:
-            render.say_json(extraction_record(found, felt.left_out))
+            options: _Options = {
+                "where": felt.where, "seed": seed, "motions": motions, "out": out,
+                "budget_bytes": n_bytes, "progress": progress,
+            }  # fmt: skip
+            if disassemble:
+                order = orders.disassemble(
+                    env, *ids, exclude=exclude or (), keep=kept,
+                    depth=orders.DEFAULT_DEPTH if depth is None else depth,
+                    seconds=orders.DEFAULT_ORDER_SECONDS if seconds is None else seconds, **options,
+                )  # fmt: skip
+            else:
+                seconds = run.DEFAULT_SECONDS if seconds is None else seconds
+                found = run.extract(env, *ids, exclude=felt.exclude, seconds=seconds, **options)
+        if disassemble:
+            report(env, order, asked)
+            code = ORDER_EXIT_CODES[order.verdict]
         else:
-            _show(found, path, picture)
-        if found.way is not None and picture is not None:
-            _draw(picture, env, found, felt.left_out, up)
-    if found.verdict != "comes out":
-        raise typer.Exit(EXIT_CODES[found.verdict])
+            _report(env, found, felt.left_out, asked)
+            code = EXIT_CODES[found.verdict]
+    if code:
+        raise typer.Exit(code)
 
 
-def _show(found: "Extraction", path: str | None, picture: str | None) -> None:
+class _Options(TypedDict):
+    """Options of both searches."""
+
+    where: "list[str]"
+    seed: int
+    motions: int
+    out: float | None
+    budget_bytes: int
+    progress: "SearchCallback | None"
+
+
+def check_animation(animation: str | None) -> None:
+    """Refuse, before anything is searched, an animation that could not be written."""
+    if animation is None:
+        return
+    if not animation.lower().endswith(".html"):
+        raise UsageError(f"--animation {animation}: it is a page, give a name that ends in .html")
+    from hapticdb.page.animation import check_view
+
+    check_view()
+
+
+def _report(env: "Environment", found: "Extraction", left_out: list[int], asked: Outputs) -> None:
+    """Print the verdict; write path, picture and animation of a path that was found."""
+    from hapticdb.extraction.record import extraction_record
+    from hapticdb.poses import write_poses
+
+    if found.way is not None and asked.path is not None:
+        write_poses(asked.path, found.way.poses)
+    if asked.json:
+        render.say_json(extraction_record(found, left_out))
+    else:
+        _show(found, asked)
+    if found.way is not None and asked.picture is not None:
+        _draw(asked.picture, env, found, left_out, asked.up)
+    if found.way is not None and asked.animation is not None:
+        from hapticdb.page.animation import animate
+
+        animate(asked.animation, env, [found], exclude=left_out, up=asked.up)
+
+
+def _show(found: "Extraction", asked: Outputs) -> None:
     """Print the verdict, what is in the way, and the figures of the search."""
     from hapticdb.extraction.verdict import extraction_line
     from hapticdb.sweeps.verdict import depth_text, names_of
@@ -135,7 +229,8 @@ def _show(found: "Extraction", path: str | None, picture: str | None) -> None:
     ]
     if found.way is not None:
         facts += [(f"depth in {one.object.name}", depth_text(one)) for one in found.way.depths]
-        for name, file in (("path", path), ("picture", picture)):
+        files = (("path", asked.path), ("picture", asked.picture), ("animation", asked.animation))
+        for name, file in files:
             if file is not None:
                 facts.append((name, file))
     render.show(render.facts(facts))

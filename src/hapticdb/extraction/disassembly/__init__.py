@@ -1,0 +1,1 @@
+"""Disassembly: in which order parts come out, so that others can."""

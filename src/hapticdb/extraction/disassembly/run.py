@@ -1,0 +1,335 @@
+"""Searches an order in which parts come out: what blocks them first, each step proved.
+
+An object is taken off once sweeps prove its path, with what was taken off before left out. A step
+that no later step needs is dropped at the end. No order is claimed to be the shortest.
+"""
+
+import math
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+from hapticdb.environment import Environment
+from hapticdb.errors import GeometryChangedError, MissingExtraError, UsageError
+from hapticdb.extraction.disassembly.pressing import pressed_objects
+from hapticdb.extraction.disassembly.result import (
+    PROVED,
+    Disassembly,
+    FailedSearch,
+    Removal,
+    ids_of,
+)
+from hapticdb.extraction.judge import judge
+from hapticdb.extraction.problem import problem_of
+from hapticdb.extraction.pulls import SearchCallback
+from hapticdb.extraction.result import Blocker, Extraction
+from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
+from hapticdb.resident.table import DEFAULT_BUDGET
+from hapticdb.store.base import Object
+from hapticdb.store.finding import Words
+from hapticdb.sweeps.run import sweep
+from hapticdb.sweeps.verdict import names_of
+
+DEFAULT_ORDER_SECONDS = 600.0
+"""Default time of the search for an order."""
+DEFAULT_DEPTH = 3
+"""Default number of objects in a chain of which each has to go before the one before it."""
+MOST_BLOCKERS = 12
+"""Greatest number of objects tried that block one part. Larger: more orders are found, and more
+time is spent where there is none."""
+LEAST = 0.1
+"""Seconds of a search for which no time is left: it tries one pull."""
+SHARE = 0.25
+"""Greatest share of the whole time for one search. Larger: fewer searches, each more thorough."""
+
+
+def disassemble(
+    env: Environment,
+    *words: int | str,
+    where: Words = (),
+    exclude: Words = (),
+    seconds: float = DEFAULT_ORDER_SECONDS,
+    seed: int = 0,
+    motions: int = DEFAULT_MOTIONS,
+    out: float | None = None,
+    depth: int = DEFAULT_DEPTH,
+    keep: Words = (),
+    budget_bytes: int = DEFAULT_BUDGET,
+    progress: SearchCallback | None = None,
+) -> Disassembly:
+    """Search an order in which objects are taken off so that parts come out.
+
+    If the parts have no proved way out, the objects that block them are tried, those that stop most
+    pulls first, and what blocks these. Each object goes alone, and only on a path that is proved as
+    `extract` proves it. Then the parts are tried again.
+
+    Parameters
+    ----------
+    env, words, where, exclude, seed, out, budget_bytes, progress
+        As for `extract`.
+    seconds : float
+        Time of all searches together; one search has a quarter of it at most. Proofs of what is
+        found may take longer.
+    motions : int
+        Motions that the planner may ask about in one search; 0: straight pulls only. Objects that
+        block are first tried by straight pulls alone.
+    depth : int
+        Length of the longest chain of objects that block one another; 0: as `extract`.
+    keep : iterable of int or str
+        Objects that are never taken off, but are felt: what stands on the ground, for example.
+
+    Raises
+    ------
+    ObjectNotFoundError, GeometryChangedError, UsageError
+        As for `extract`, about the parts. Other objects whose files are gone are not taken off.
+    MissingExtraError
+        If straight pulls lead to no order, and the planner is not installed.
+    """
+    began = time.monotonic()
+    if not (math.isfinite(seconds) and seconds > 0.0):
+        raise UsageError(f"a search of {seconds} seconds: give more than 0")
+    if depth < 0:
+        raise UsageError(f"depth {depth}: give 0 or more")
+    parts = tuple(env.find(*words))
+    stays = {*ids_of(parts), *ids_of(env.felt(where, exclude))}
+    left_out = tuple(obj.id for obj in env.objects() if obj.id not in stays)
+    kept = frozenset(ids_of(env.find(*keep)) if keep else ())
+    asked = _Asked(parts, left_out, kept, seconds, seed, motions, out, budget_bytes, progress)
+    return replace(_ordered(env, asked, depth), seconds=time.monotonic() - began)
+
+
+def _ordered(env: Environment, asked: "_Asked", depth: int) -> Disassembly:
+    """Search by straight pulls of what blocks, then with the planner; without the time it took."""
+    search = _OrderSearch(env, asked, time.monotonic() + asked.seconds)
+    is_found = False
+    for motions in dict.fromkeys((0, asked.motions)):
+        search.motions_of_others = motions
+        is_found = search.clear(asked.parts, depth, frozenset())
+        if is_found:
+            search.drop_needless()
+            break
+    if not is_found and search.missing is not None:
+        raise search.missing
+    return Disassembly(
+        asked.parts, tuple(search.steps), tuple(search.failed),
+        not is_found and search.is_spent, 0.0, asked.seed,
+    )  # fmt: skip
+
+
+class _Asked(NamedTuple):
+    """Options of all searches.
+
+    parts : what is to come out in the end; exclude : ids of what the caller does not feel, none of
+    `parts`, which block what comes out before them; keep : ids of what is never taken off.
+    """
+
+    parts: tuple[Object, ...]
+    exclude: tuple[int, ...]
+    keep: frozenset[int]
+    seconds: float
+    seed: int
+    motions: int
+    out: float | None
+    budget_bytes: int
+    progress: SearchCallback | None
+
+
+class _Known(NamedTuple):
+    """A failed search: steps before it, motions of its planner, ids that its pulls depend on."""
+
+    n_gone: int
+    motions: int
+    met: frozenset[int]
+    failed: FailedSearch
+
+
+class _OrderSearch:
+    """One search for an order.
+
+    Attributes
+    ----------
+    steps : list of Removal
+        What was taken off so far.
+    failed : list of FailedSearch
+        Searches that proved no path.
+    motions_of_others : int
+        Motions of the planner for objects that block.
+    missing : MissingExtraError or None
+        The planner's, if it was wanted and is not installed: then there are straight pulls only.
+    is_spent : bool
+        Whether a search was left out because the time was over.
+    """
+
+    def __init__(self, env: Environment, asked: _Asked, until: float) -> None:
+        self.steps: list[Removal] = []
+        self.failed: list[FailedSearch] = []
+        self.motions_of_others = 0
+        self.missing: MissingExtraError | None = None
+        self.is_spent = False
+        self._env, self._asked, self._until = env, asked, until
+        self._known: dict[tuple[int, ...], _Known] = {}
+
+    def clear(self, parts: tuple[Object, ...], depth: int, waiting: frozenset[int]) -> bool:
+        """Take parts off, if necessary after what blocks them; returns whether they are off.
+
+        depth : length of the chains of other objects that may go first; waiting : ids of what is to
+        come out after these parts, which are not tried again.
+        """
+        waiting |= {*ids_of(parts)}
+        while True:
+            failed = self._take_off(parts)
+            if failed is None:
+                return True
+            if not self._clear_one_of(failed, depth, waiting):
+                return False
+
+    def _clear_one_of(self, failed: FailedSearch, depth: int, waiting: frozenset[int]) -> bool:
+        """Take off something of what blocks; what comes out at once goes first."""
+        before = len(self.steps)
+        for less in range(depth):
+            for obj in self._candidates(failed, waiting):
+                self.clear((obj,), less, waiting)
+                if len(self.steps) > before:
+                    return True
+        return False
+
+    def _candidates(self, failed: FailedSearch, waiting: frozenset[int]) -> Iterator[Object]:
+        left_out = waiting | self._gone() | self._asked.keep
+        blockers = [one.object for one in failed.blockers if one.object.id not in left_out]
+        for obj in blockers[:MOST_BLOCKERS]:
+            if self._is_over():
+                return
+            yield obj
+
+    def _is_over(self) -> bool:
+        self.is_spent |= time.monotonic() > self._until
+        return self.is_spent
+
+    def _gone(self) -> frozenset[int]:
+        """Ids of what was taken off so far."""
+        return frozenset(i for step in self.steps for i in step.ids)
+
+    def _take_off(self, parts: tuple[Object, ...]) -> FailedSearch | None:
+        """Search a way out, and take the parts off if it is proved; else say what failed."""
+        ids = ids_of(parts)
+        is_wanted = ids == ids_of(self._asked.parts)
+        motions = self._asked.motions if is_wanted else self.motions_of_others
+        known = self._known.get(ids)
+        if known is not None and self._still_holds(known, motions):
+            return known.failed
+        n_gone, met = len(self.steps), frozenset[int]()
+        excluded = (*self._asked.exclude, *sorted(self._gone()))
+        try:
+            if not is_wanted:
+                self._check_something_stands({*excluded, *ids})
+            found = self._searched(ids, excluded, motions)
+        except (GeometryChangedError, UsageError) as error:
+            if is_wanted:
+                raise
+            failed = FailedSearch(parts, n_gone, None, (), str(error))
+        else:
+            left_out = tuple(sorted({*ids, *excluded}))
+            refused = self._failed(found, left_out)
+            if refused is None:
+                self.steps.append(Removal(found, left_out))
+                return None
+            failed = refused
+            met |= {*ids_of([one.object for one in failed.blockers]), *ids_of(found.touched)}
+        self._known[ids] = _Known(n_gone, motions, met, failed)
+        self.failed.append(failed)
+        return failed
+
+    def _failed(self, found: Extraction, left_out: tuple[int, ...]) -> FailedSearch | None:
+        """Say why a search does not do for a step; None if it does."""
+        n_gone = len(self.steps)
+        if found.verdict not in PROVED:
+            return FailedSearch(found.parts, n_gone, found.verdict, found.blockers)
+        if found.verdict == "comes out":
+            return None
+        pressed = pressed_objects(self._env, found, left_out)
+        if not pressed:
+            return None
+        pulls = {one.object.id: one.pulls for one in found.blockers}
+        first = [Blocker(obj, pulls.get(obj.id, 0)) for obj in pressed]
+        rest = [one for one in found.blockers if one.object.id not in ids_of(pressed)]
+        reason = f"the path found presses against {names_of(pressed)} at its start"
+        return FailedSearch(found.parts, n_gone, found.verdict, (*first, *rest), reason)
+
+    def _still_holds(self, known: _Known, motions: int) -> bool:
+        """Whether a search would fail again, with what was taken off since.
+
+        A pull ends at the first object in its way. So if none of these objects is gone, pulls end
+        where they ended before. A plan may depend on any object.
+        """
+        if known.failed.verdict is None:
+            return True
+        if motions > known.motions:
+            return False
+        if motions:
+            return known.n_gone == len(self.steps)
+        return not any(known.met & {*step.ids} for step in self.steps[known.n_gone :])
+
+    def _check_something_stands(self, excluded: set[int]) -> None:
+        """Refuse to take off the last object beside the parts that are wanted.
+
+        Then two bodies are left, and each comes out of the other or neither does.
+        """
+        excluded |= {*ids_of(self._asked.parts)}
+        if all(obj.id in excluded for obj in self._env.objects()):
+            raise UsageError("it is the last object that stands beside what is to come out")
+
+    def _searched(
+        self, ids: tuple[int, ...], excluded: tuple[int, ...], motions: int
+    ) -> Extraction:
+        asked = self._asked
+        left = min(self._until - time.monotonic(), SHARE * asked.seconds)
+
+        def search(motions: int) -> Extraction:
+            return extract(
+                self._env, *ids, exclude=excluded, seconds=max(left, LEAST), seed=asked.seed,
+                motions=motions, out=asked.out, budget_bytes=asked.budget_bytes,
+                progress=asked.progress,
+            )  # fmt: skip
+
+        if self.missing is None:
+            try:
+                return search(motions)
+            except MissingExtraError as error:
+                self.missing = error
+        return search(0)
+
+    def drop_needless(self) -> None:
+        """Drop steps without which all later steps are proved as well, the latest ones first."""
+        for n in range(len(self.steps) - 2, -1, -1):
+            if time.monotonic() > self._until:
+                return
+            kept = self._proved_with(n)
+            if kept is not None:
+                self.steps[n:] = kept
+
+    def _proved_with(self, n: int) -> list[Removal] | None:
+        """Steps after step n, proved anew with what it takes off in its place; None if not all are.
+
+        What the last step meets is looked at first: it is mostly the reason why step n was made.
+        """
+        stays = self.steps[n].ids
+        later = self.steps[n + 1 :]
+        for step in reversed(later):
+            assert step.found.way is not None  # noqa: S101 - steps are proved
+            poses = step.found.way.poses
+            if not sweep(self._env, step.found.shell, poses, where=stays).comes_out:
+                return None
+        proved = [self._proved(step, stays) for step in later]
+        return None if None in proved else [step for step in proved if step is not None]
+
+    def _proved(self, step: Removal, stays: tuple[int, ...]) -> Removal | None:
+        """Prove the path of a step with some objects back in their places; None if that fails."""
+        found, way = step.found, step.found.way
+        assert way is not None  # noqa: S101 - steps are proved
+        excluded = tuple(i for i in step.excluded if i not in stays)
+        problem = problem_of(self._env, step.ids, (), excluded, seed=found.seed)
+        again = judge(problem, way.poses, way.how, self._asked.budget_bytes)
+        if again.verdict != way.verdict:
+            return None
+        return Removal(replace(found, way=again), excluded)

@@ -1,0 +1,253 @@
+"""A page in one file that plays how parts come out: the scene, the paths, viser's own player."""
+
+import contextlib
+import importlib.util
+import io
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.environment import Environment
+from hapticdb.errors import FileError, MissingExtraError
+from hapticdb.extraction.result import Extraction
+from hapticdb.ingest.originals import found_parts
+from hapticdb.mesh import Part
+from hapticdb.page import colours
+from hapticdb.page.scene.facets import Facets, block_facets, coarsened, sharpened
+from hapticdb.page.scene.stage import set_stage
+from hapticdb.pointshell.orientation import Surface
+from hapticdb.poses import quaternion_of
+from hapticdb.store.attributes import AXES, up_axis
+from hapticdb.store.base import Object
+from hapticdb.sweeps.verdict import names_of
+
+if TYPE_CHECKING:
+    from viser import SceneNodeHandle, ViserServer
+
+Floats = NDArray[np.float64]
+
+PLACES = 72
+"""Places that are shown of each path. More: smoother, and a larger file."""
+PICTURES = 24.0
+"""Places shown a second."""
+PAUSE = 0.8
+"""Seconds of rest before and after each path."""
+AROUND = 0.6
+"""Surroundings that are shown on each side, in lengths of the box that the paths fill."""
+MOST_TRIANGLES = 400_000
+"""Triangles of all that stands; of more, the largest objects are left out. More: a larger file."""
+MOST_BLOCKS = 20_000
+"""Blocks for an object whose file is gone, at most."""
+STANDING: colours.Colour = (186, 193, 201)
+SEEN_THROUGH = 0.45
+"""Opacity of what stands: the parts are seen behind it. Larger: solid, and hides more."""
+
+
+class _Move(NamedTuple):
+    """Parts that come out: node, poses (n, 4, 4) of their displacements, and the words of it."""
+
+    node: "SceneNodeHandle"
+    poses: Floats
+    words: "SceneNodeHandle"
+
+
+def check_view() -> None:
+    """Refuse in one line where what writes the page is not installed.
+
+    Raises
+    ------
+    MissingExtraError
+        Without the extra `view`.
+    """
+    if importlib.util.find_spec("viser") is None:
+        raise MissingExtraError("an animation needs the extra 'view': pip install 'hapticdb[view]'")
+
+
+def animate(
+    path: str | os.PathLike[str],
+    env: Environment,
+    steps: Sequence[Extraction],
+    *,
+    exclude: Iterable[int] = (),
+    up: str | None = None,
+) -> None:
+    """Write a page that shows parts on their paths, one step after another, again and again.
+
+    The page needs no server: any browser opens the file.
+
+    Parameters
+    ----------
+    path : path
+        The file; one that is there is replaced.
+    env : Environment
+        What the paths were found in.
+    steps : sequence of Extraction
+        Each with a path, in the order in which parts come out. What has come out is not shown in
+        later steps.
+    exclude : iterable of int
+        Ids of objects that are not shown at all, unless they come out.
+    up : {'x', 'y', 'z'} or None
+        Axis that points up; what most of the objects' files say unless given.
+
+    Raises
+    ------
+    MissingExtraError
+        Without the extra `view`.
+    FileError
+        If the file cannot be written.
+    """
+    check_view()
+    from hapticdb.page.process import new_server  # noqa: PLC0415 - the extra `view`
+
+    server = new_server()
+    try:
+        page = _recorded(server, env, steps, {*exclude}, up)
+    finally:
+        with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
+            server.stop()
+    try:
+        Path(path).write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise FileError(f"cannot write {path}: {error.strerror}") from error
+
+
+def _recorded(
+    server: "ViserServer", env: Environment, steps: Sequence[Extraction], exclude: set[int],
+    up: str | None,
+) -> str:  # fmt: skip
+    """Put the scene up, play all steps, and return the page."""
+    axis = up_axis(env.objects()) if up is None else AXES.index(up)
+    paths = [_shown_poses(found) for found in steps]
+    box = _box_of(steps, paths)
+    set_stage(server, box, axis)
+    server.scene.world_axes.visible = False
+    exclude |= {obj.id for found in steps for obj in found.parts}
+    facets = _standing(env, box, exclude)
+    if len(facets.faces):
+        server.scene.add_mesh_simple(
+            "/standing", facets.vertices, facets.faces, color=STANDING, opacity=SEEN_THROUGH,
+            side="double", cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+    top = box.mean(axis=0)
+    top[axis] = box[1, axis]
+    moves = [
+        _move(server, n, found, poses, top)
+        for n, (found, poses) in enumerate(zip(steps, paths, strict=True))
+    ]
+    return _played(server, moves)
+
+
+def _move(
+    server: "ViserServer", number: int, found: Extraction, poses: Floats, top: Floats
+) -> _Move:
+    """Add the parts of a step in a colour of their own, and the words about it."""
+    surface = found.shell.surface
+    assert isinstance(surface, Surface)  # noqa: S101 - parts have a surface
+    facets = _of_triangles(surface.triangles)
+    node = server.scene.add_mesh_simple(
+        f"/part_{number}", facets.vertices, facets.faces, color=colours.of_object(number),
+        side="double", cast_shadow=False, receive_shadow=False,
+    )  # fmt: skip
+    words = f"{number + 1}. {names_of(found.parts)}: {found.verdict}"
+    label = server.scene.add_label(f"/words_{number}", words, position=tuple(top), visible=False)
+    return _Move(node, poses, label)
+
+
+def _played(server: "ViserServer", moves: Sequence[_Move]) -> str:
+    recording = server.get_scene_serializer()
+    for move in moves:  # the player begins again with these; viser sends only what changes
+        _place(move.node, move.poses[-1])
+        _place(move.node, move.poses[0])
+        move.node.visible = False
+        move.node.visible = True
+    for move in moves:
+        move.words.visible = True
+        recording.insert_sleep(PAUSE)
+        for pose in move.poses:
+            _place(move.node, pose)
+            recording.insert_sleep(1.0 / PICTURES)
+        recording.insert_sleep(PAUSE)
+        move.node.visible = move.words.visible = False
+    recording.insert_sleep(1.0 / PICTURES)
+    return str(recording.as_html())
+
+
+def _place(node: "SceneNodeHandle", pose: Floats) -> None:
+    node.position = pose[:3, 3]
+    node.wxyz = quaternion_of(pose[None, :3, :3])[0]
+
+
+def _shown_poses(found: Extraction) -> Floats:
+    """Displacements (n, 4, 4) evenly along a path; the last one is its end."""
+    assert found.way is not None  # noqa: S101 - each step has a path
+    path = found.way.swept.path
+    samples = np.linspace(0, len(path) - 1, min(PLACES, len(path))).round().astype(np.int64)
+    return np.concatenate([path.sample(n, n + 1) for n in samples.tolist()])
+
+
+def _box_of(steps: Sequence[Extraction], paths: Sequence[Floats]) -> Floats:
+    """Box (2, 3) of all parts on all of their paths."""
+    corners = []
+    for found, poses in zip(steps, paths, strict=True):
+        low, high = found.shell.points.min(axis=0), found.shell.points.max(axis=0)
+        which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
+        own = np.stack([low, high])[which, np.arange(3)]
+        corners.append(
+            (own @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
+        )
+    every = np.concatenate(corners)
+    return np.stack([every.min(axis=0), every.max(axis=0)])
+
+
+def _standing(env: Environment, box: Floats, exclude: set[int]) -> Facets:
+    """Triangles of what stands in the surroundings of a box (2, 3), the smallest objects first."""
+    reach = AROUND * float((box[1] - box[0]).max())
+    near = [
+        obj
+        for obj in env.objects()
+        if obj.id not in exclude
+        and (obj.bounds[1] > box[0] - reach).all()
+        and (obj.bounds[0] < box[1] + reach).all()
+    ]
+    shapes: dict[int, Facets] = {}
+    for some, part in found_parts(near, "shown", "it is shown by its voxels"):
+        for obj in some:
+            if isinstance(part, Part) and not part.is_cloud:
+                shapes[obj.id] = _of_triangles(part.triangles(obj.transform))
+            else:
+                shapes[obj.id] = _of_voxels(env, obj)
+    kept, total = [], 0
+    for facets in sorted(shapes.values(), key=lambda one: len(one.faces)):
+        total += len(facets.faces)
+        if total > MOST_TRIANGLES:
+            break
+        kept.append(facets)
+    return _joined(kept)
+
+
+def _of_triangles(triangles: Floats) -> Facets:
+    """Triangles (F, 3, 3) as they are drawn."""
+    faces = np.arange(3 * len(triangles), dtype=np.int64).reshape(-1, 3)
+    return _joined([sharpened(Facets(triangles.reshape(-1, 3), faces))])
+
+
+def _of_voxels(env: Environment, obj: Object) -> Facets:
+    blocks = block_facets(coarsened(env.voxels(obj.id), MOST_BLOCKS))
+    corners = np.asarray(env.grid.origin) + env.grid.voxel_size * blocks.vertices
+    return _joined([Facets(corners, blocks.faces)])
+
+
+def _joined(several: Sequence[Facets]) -> Facets:
+    """All triangles in one mesh, as it is sent: float32 and uint32."""
+    if not several:
+        return Facets(np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint32))
+    first = np.cumsum([0, *(len(facets.vertices) for facets in several)])
+    faces = [one.faces + start for one, start in zip(several, first.tolist(), strict=False)]
+    return Facets(
+        np.concatenate([one.vertices for one in several]).astype(np.float32),
+        np.concatenate(faces).astype(np.uint32),
+    )

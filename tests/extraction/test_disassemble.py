@@ -1,0 +1,200 @@
+"""Orders of disassembly of boxes, known by construction; exact boxes say that paths are free."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import hapticdb
+from disassembly_scenes import (
+    BOLTED,
+    CHAIN,
+    STACK,
+    WINDOW,
+    Scene,
+    held_by_a_head,
+    least_gap,
+    made,
+)
+from extraction_scenes import corner, lid
+from hapticdb import Disassembly, disassemble
+from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
+from hapticdb.extraction.directions import AGAINST
+from hapticdb.extraction.disassembly.pressing import opposed
+from hapticdb.extraction.disassembly.verdict import disassembly_line, failed_line, step_line
+
+numbers = st.floats(-1.0, 1.0)
+vectors = st.tuples(numbers, numbers, numbers).filter(lambda v: sum(x * x for x in v) > 0.01)
+
+
+def found_in(url: Path, *parts: str, motions: int = 0, **options: Any) -> Disassembly:  # noqa: ANN401
+    with hapticdb.open(url, read_only=True) as env:
+        return disassemble(env, *parts, motions=motions, **options)
+
+
+def order(found: Disassembly) -> list[str]:
+    return [obj.name for step in found.steps for obj in step.found.parts]
+
+
+def assert_free(scene: Scene, found: Disassembly, gone: tuple[str, ...] = ()) -> None:
+    """Each step's boxes meet no box of what stands, and the steps leave the right things out."""
+    left = {name: boxes for name, boxes in scene.items() if name not in gone}
+    ids = {name: n for n, name in enumerate(sorted(scene))}
+    assert len(ids) == len(scene)
+    for step in found.steps:
+        way, (part,) = step.found.way, step.found.parts
+        assert way is not None
+        assert step.found.verdict == "comes out"
+        assert np.allclose(way.poses[:, :3, :3], np.eye(3))
+        boxes = left.pop(part.name)
+        shifts = np.concatenate(
+            [np.linspace(a, b, 300) for a, b in zip(way.poses, way.poses[1:], strict=False)]
+        )[:, :3, 3]
+        assert least_gap(boxes, [one for some in left.values() for one in some], shifts) > 0.0
+        assert len(step.excluded) == len(scene) - len(left)
+
+
+def test_what_lies_above_goes_first_in_a_stack(tmp_path: Path) -> None:
+    found = found_in(made(tmp_path, STACK), "content", keep=["pot"])
+    assert order(found) == ["weight", "lid", "content"]
+    assert (found.is_found, found.verdict, found.is_out_of_time) == (True, "comes out", False)
+    assert_free(STACK, found)
+    assert disassembly_line(found).startswith("comes out after weight, lid, each step proved: ")
+    assert step_line(found, 0).startswith("weight: comes out straight, ")
+
+
+@pytest.mark.long
+def test_what_stands_on_nothing_may_go_first(tmp_path: Path) -> None:
+    """No object is the ground: taking off the pot frees its content, too."""
+    found = found_in(made(tmp_path, STACK), "content")
+    assert order(found) == ["pot", "content"]
+    assert_free(STACK, found)
+
+
+@pytest.mark.long
+def test_the_bolts_go_before_the_cover(tmp_path: Path) -> None:
+    url = made(tmp_path, BOLTED)
+    found = found_in(url, "cover", keep=["base"])
+    assert sorted(order(found)[:-1]) == ["bolt_1", "bolt_2"]
+    assert order(found)[-1] == "cover"
+    assert_free(BOLTED, found)
+    again = found_in(url, "cover", keep=["base"])
+    assert order(again) == order(found)
+    for one, other in zip(found.steps, again.steps, strict=True):
+        assert one.found.way is not None
+        assert other.found.way is not None
+        assert np.array_equal(one.found.way.poses, other.found.way.poses)
+
+
+@pytest.mark.long
+def test_what_was_left_out_is_not_taken_off(tmp_path: Path) -> None:
+    url = made(tmp_path, BOLTED)
+    found = found_in(url, "cover", exclude=["bolt_1"], keep=["base"])
+    assert order(found) == ["bolt_2", "cover"]
+    assert_free(BOLTED, found, gone=("bolt_1",))
+
+
+def test_links_of_a_chain_have_no_order(tmp_path: Path) -> None:
+    found = found_in(made(tmp_path, CHAIN), "left")
+    assert (found.is_found, found.verdict, found.steps) == (False, "no order found", ())
+    assert [one.object.name for one in found.blockers] == ["right"]
+    assert [[obj.name for obj in one.parts] for one in found.failed] == [["left"], ["right"]]
+    assert disassembly_line(found) == "no order found in 2 searches: blocked by right"
+    assert failed_line(found.failed[1]) == "no way found: blocked by left"
+
+
+def test_what_comes_out_at_once_needs_no_steps(tmp_path: Path) -> None:
+    found = found_in(made(tmp_path, STACK), "weight")
+    assert (order(found), found.failed) == (["weight"], ())
+    assert disassembly_line(found).startswith("nothing has to come out before: comes out straight")
+
+
+@pytest.mark.long
+def test_a_step_that_does_not_help_is_dropped(tmp_path: Path) -> None:
+    found = found_in(made(tmp_path, WINDOW), "content", keep=["pot"])
+    assert max(one.n_gone for one in found.failed) == 1  # the rod was off, and that did not help
+    assert order(found) == ["lid", "content"]
+    assert_free(WINDOW, found)
+
+
+@pytest.mark.long
+def test_chains_end_at_the_depth(tmp_path: Path) -> None:
+    url = made(tmp_path, STACK)
+    assert order(found_in(url, "content", depth=2, keep=["pot"]))[0] == "weight"
+    short = found_in(url, "content", depth=1, keep=["pot"])
+    assert not short.is_found
+    assert "weight" not in {obj.name for one in short.failed for obj in one.parts}
+    none = found_in(url, "content", depth=0)
+    assert [[obj.name for obj in one.parts] for one in none.failed] == [["content"]]
+
+
+def test_the_time_ends_the_search(tmp_path: Path) -> None:
+    found = found_in(made(tmp_path, STACK), "content", seconds=1e-6)
+    assert (found.is_found, found.is_out_of_time) == (False, True)
+    assert len(found.failed) == 1
+    assert "the time is over" in disassembly_line(found)
+
+
+def test_parts_in_contact_are_proved_after_it(tmp_path: Path) -> None:
+    found = found_in(lid(tmp_path, 0.0), "lid")
+    assert (found.is_found, found.verdict) == (True, "comes out of contact")
+
+
+def test_the_last_object_that_stands_is_not_taken_off(tmp_path: Path) -> None:
+    """Of two bodies, each comes out of the other, or neither does."""
+    found = found_in(corner(tmp_path), "block")
+    assert not found.is_found
+    assert found.failed[1].verdict is None
+    assert "last object" in failed_line(found.failed[1])
+
+
+@pytest.mark.long
+def test_without_a_planner_straight_orders_are_found(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shadow = tmp_path / "shadow" / "ompl"
+    shadow.mkdir(parents=True)
+    (shadow / "__init__.py").write_text("raise ImportError('no planner')")
+    monkeypatch.syspath_prepend(str(shadow.parent))  # the child has the path of its parent
+    url = made(tmp_path, BOLTED)
+    assert order(found_in(url, "cover", motions=100, keep=["base"]))[-1] == "cover"
+    (tmp_path / "chain").mkdir()
+    with pytest.raises(MissingExtraError, match=r"hapticdb\[extract\]"):
+        found_in(made(tmp_path / "chain", CHAIN), "left", motions=100)
+
+
+def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
+    url = made(tmp_path, CHAIN)
+    with pytest.raises(ObjectNotFoundError, match="no object 'nut'"):
+        found_in(url, "nut")
+    for options in ({"seconds": 0.0}, {"depth": -1}, {"seed": -1}, {"out": 0.0}):
+        with pytest.raises(UsageError, match="give"):
+            found_in(url, "left", **options)
+    with pytest.raises(UsageError, match="nothing stands"):
+        found_in(url, "*")
+
+
+def test_a_path_through_what_holds_is_no_step(tmp_path: Path) -> None:
+    """A small bolt's head is a tenth of the contacts: the pull alone would cut through it."""
+    found = found_in(made(tmp_path, held_by_a_head()), "plate", keep=["base"])
+    assert order(found) == ["bolt", "plate"]
+    assert (found.verdict, len(found.failed)) == ("comes out of contact", 1)
+    assert [one.object.name for one in found.failed[0].blockers][:1] == ["bolt"]
+
+
+@given(vectors, vectors, vectors)
+def test_a_contact_presses_if_it_moves_into_what_it_touches(
+    point: tuple[float, float, float],
+    normal: tuple[float, float, float],
+    move: tuple[float, float, float],
+) -> None:
+    n, m = np.array(normal), np.array(move)
+    n /= np.linalg.norm(n)
+    pose = np.eye(4)
+    pose[:3, 3] = m
+    cosine = float(n @ m) / float(np.linalg.norm(m))
+    if abs(cosine - AGAINST) > 1e-6:
+        assert bool(opposed(np.array([point]), n[None], pose)[0]) == (cosine < AGAINST)

@@ -2,6 +2,10 @@
 
 A pose is free if no point of the shell lies in an occupied voxel. With the guard, no point a voxel
 outside the surface does either. The search believes this; the proof is that of a sweep.
+
+A part that touches something at its start is in no free pose there, because surfaces that touch
+share voxels. In contact a pose is allowed if the part's core, its surface drawn inward, is free,
+and the part is clear of all that it does not touch at its start.
 """
 
 from typing import Self
@@ -9,7 +13,14 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.extraction.problem import Problem, guarded_shell, searched_shell
+from hapticdb.extraction.problem import (
+    Problem,
+    core_shell,
+    guarded_shell,
+    searched_shell,
+)
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.touches import Touch
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -38,11 +49,11 @@ class FreeSpace:
         self.n_poses = 0
         self._table = CellTable.create(budget_bytes)
         try:
-            residency = Residency(
+            self.residency = Residency(
                 problem.env.store, self._table, problem.exclude, where=problem.where
             )
             self._frames = [
-                ResidentFrames(residency, shell)
+                ResidentFrames(self.residency, shell)
                 for shell in (self.shell, guarded_shell(self.shell, self.voxel_size))
             ]
         except BaseException:
@@ -74,6 +85,76 @@ class FreeSpace:
             if self.hits(poses[some], is_guarded=is_guarded).any():
                 return False
         return True
+
+
+class ContactSpace:
+    """Which poses are allowed while parts leave contact. It is also a context manager.
+
+    Attributes
+    ----------
+    start : Touch
+        What the searched shell touches at the start.
+    touched : tuple of int
+        Ids of these objects.
+    """
+
+    def __init__(self, problem: Problem, space: FreeSpace, budget_bytes: int) -> None:
+        self._problem, self._space = problem, space
+        self.start = self.touch(np.eye(4))
+        self.touched = tuple(obj.id for obj in self.start.objects)
+        self._frames: list[ResidentFrames] = []
+        self._table: CellTable | None = None
+        if not self.touched:
+            return
+        self._table = CellTable.create(budget_bytes)
+        try:
+            others = Residency(
+                problem.env.store,
+                self._table,
+                (*problem.exclude, *self.touched),
+                where=problem.where,
+            )
+            self._frames.append(ResidentFrames(others, space.shell))
+            core = core_shell(space.shell, problem.voxel_size, self._are_hit)
+            if core is not None:
+                self._frames.append(ResidentFrames(space.residency, core))
+        except BaseException:
+            self.__exit__()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for frames in self._frames:
+            frames.close()
+        if self._table is not None:
+            self._table.close()
+
+    def touch(self, pose: Floats) -> Touch:
+        """Contacts of the searched shell at a pose (4, 4)."""
+        return self._touch(self._space.shell, pose)
+
+    def are_allowed(self, poses: Floats) -> NDArray[np.bool_]:
+        """Whether each of the poses (n, 4, 4) is allowed in contact."""
+        self._space.n_poses += len(poses)
+        allowed = np.ones(len(poses), dtype=np.bool_)
+        for frames in self._frames:
+            allowed &= frames.feel(poses).hits == 0
+        return allowed
+
+    def _touch(self, shell: PointShell, pose: Floats) -> Touch:
+        problem = self._problem
+        return problem.env.touch(
+            shell, pose, where=problem.where, exclude=problem.exclude, law="plane"
+        )
+
+    def _are_hit(self, points: Floats, normals: Floats) -> NDArray[np.bool_]:
+        """Whether each place (N, 3) lies in an occupied voxel at the start."""
+        flags = np.zeros(len(points), dtype=np.bool_)
+        shell = PointShell(points, normals, points.mean(axis=0))
+        flags[self._touch(shell, np.eye(4)).hits] = True
+        return flags
 
 
 def _from_coarse_to_fine(n: int) -> list[Ints]:

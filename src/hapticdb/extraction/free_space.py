@@ -4,8 +4,8 @@ A pose is free if no point of the shell lies in an occupied voxel. With the guar
 outside the surface does either. The search believes this; the proof is that of a sweep.
 
 A part that touches something at its start is in no free pose there, because surfaces that touch
-share voxels. In contact a pose is allowed if the part's core, its surface drawn inward, is free,
-and the part is clear of all that it does not touch at its start.
+share voxels. In contact a pose is allowed if the part is clear of all that it does not touch at its
+start, and if its core, its surface drawn inward, is free, or hit little more than at the start.
 """
 
 from typing import Self
@@ -19,7 +19,6 @@ from hapticdb.extraction.problem import (
     guarded_shell,
     searched_shell,
 )
-from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.touches import Touch
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
@@ -29,6 +28,12 @@ from hapticdb.sweeps.path import SweepPath
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+GROWTH = 1.2
+"""A part slides along what it touches at its start while it has at most so many times the hits of
+its start. Larger: more motions that the proof refuses."""
+CORE_GROWTH = 2.0
+"""The same for the core: where it is hit at the start, parts interlock, or are hardly thicker than
+voxels, and the number varies. Larger: more motions that cut into what is touched."""
 AT_ONCE = 32
 """Poses of a motion that are looked at together. Larger: fewer calls; more poses of motions that
 turn out blocked."""
@@ -103,6 +108,7 @@ class ContactSpace:
         self.start = self.touch(np.eye(4))
         self.touched = tuple(obj.id for obj in self.start.objects)
         self._frames: list[ResidentFrames] = []
+        self._most: list[float] = []
         self._table: CellTable | None = None
         if not self.touched:
             return
@@ -115,9 +121,10 @@ class ContactSpace:
                 where=problem.where,
             )
             self._frames.append(ResidentFrames(others, space.shell))
-            core = core_shell(space.shell, problem.voxel_size, self._are_hit)
+            core = core_shell(space.shell, problem.voxel_size)
             if core is not None:
                 self._frames.append(ResidentFrames(space.residency, core))
+            self._most = [CORE_GROWTH * frames.feel(np.eye(4)).hits[0] for frames in self._frames]
         except BaseException:
             self.__exit__()
             raise
@@ -133,28 +140,18 @@ class ContactSpace:
 
     def touch(self, pose: Floats) -> Touch:
         """Contacts of the searched shell at a pose (4, 4)."""
-        return self._touch(self._space.shell, pose)
+        problem = self._problem
+        return problem.env.touch(
+            self._space.shell, pose, where=problem.where, exclude=problem.exclude, law="plane"
+        )
 
     def are_allowed(self, poses: Floats) -> NDArray[np.bool_]:
         """Whether each of the poses (n, 4, 4) is allowed in contact."""
         self._space.n_poses += len(poses)
         allowed = np.ones(len(poses), dtype=np.bool_)
-        for frames in self._frames:
-            allowed &= frames.feel(poses).hits == 0
+        for frames, most in zip(self._frames, self._most, strict=True):
+            allowed &= frames.feel(poses).hits <= most
         return allowed
-
-    def _touch(self, shell: PointShell, pose: Floats) -> Touch:
-        problem = self._problem
-        return problem.env.touch(
-            shell, pose, where=problem.where, exclude=problem.exclude, law="plane"
-        )
-
-    def _are_hit(self, points: Floats, normals: Floats) -> NDArray[np.bool_]:
-        """Whether each place (N, 3) lies in an occupied voxel at the start."""
-        flags = np.zeros(len(points), dtype=np.bool_)
-        shell = PointShell(points, normals, points.mean(axis=0))
-        flags[self._touch(shell, np.eye(4)).hits] = True
-        return flags
 
 
 def _from_coarse_to_fine(n: int) -> list[Ints]:

@@ -1,8 +1,8 @@
-"""Places that the planner tries to reach: outside the hull of what blocks, and out of everything.
+"""Places that the planner tries to reach: those from which a straight way leads out.
 
-A place just outside the convex hull of what stops the straight pulls is nearer than one that is out
-of all that stands, and once there the part mostly leaves straight. Such a place counts only if the
-straight way from it out is free.
+Beyond the convex hull of what stops the straight pulls nothing of it is in the way. A place there
+counts if the straight way from it out is free. The part is then pushed back in from there, as far
+as it goes: the end is the goal. Other turns of the part reach places that no pull shows.
 """
 
 from collections import Counter
@@ -11,15 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AXES
-from hapticdb.extraction.free_space import FreeSpace
+from hapticdb.extraction.free_space import AT_ONCE, FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem
 from hapticdb.extraction.pulls import Pulls, shifted
+from hapticdb.sweeps.path import SweepPath
 
 Floats = NDArray[np.float64]
 
 MOST_GOALS = 6
-"""Greatest number of places outside the hull for each turn of the part. Larger: more ways are tried
+"""Greatest number of places for each turn of the part. Larger: more ways are tried
 together, more poses before the planner begins."""
 MOST_BLOCKERS = 8
 """Number of objects in the hull, those that stop most pulls."""
@@ -84,9 +85,25 @@ class GoalSampler:
             if way >= length or not self._leaving.is_out(_shift_of(out, self._problem)[None])[0]:
                 continue  # the hull reaches as far as everything else
             if self._space.is_motion_free(np.stack([place, out]), is_guarded=is_guarded):
-                found.append(place)
-                self._exits.append((place, out))
+                goal = self._inward(place, direction, way, is_guarded=is_guarded)
+                found.append(goal)
+                self._exits.append((goal, out))
         return found
+
+    def _inward(self, place: Floats, direction: Floats, way: float, *, is_guarded: bool) -> Floats:
+        """Deepest free displacement (4, 4) against a direction from a free one, `way` metres."""
+        end = place.copy()
+        end[:3, 3] -= way * direction
+        path = SweepPath.of(np.stack([place, end]), self._space.shell, self._problem.voxel_size)
+        goal = place
+        for begin in range(1, len(path), AT_ONCE):
+            poses = path.sample(begin, min(begin + AT_ONCE, len(path)))
+            is_free = self._space.hits(poses, is_guarded=is_guarded) == 0
+            n_free = len(poses) if is_free.all() else int(np.argmin(is_free))
+            goal = poses[n_free - 1] if n_free else goal
+            if n_free < len(poses):
+                break
+        return goal
 
     def _outside(self, corners: Floats, direction: Floats, across: Floats, turn: Floats) -> Floats:
         """Displacement (4, 4) to where the part lies beyond the hull in a direction."""

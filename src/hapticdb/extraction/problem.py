@@ -1,6 +1,6 @@
 """What is to come out, and what stands around it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -26,8 +26,6 @@ ways, fewer of them."""
 CORES = (2.0, 1.5, 1.0)
 """Depths, voxels, to which the surface is drawn inward for its core, one after another where the
 part is thinner. Larger: parts that touch may go deeper into one another."""
-MOST_DEEP = 0.5
-"""Share of the core's points in something at the start, above which a part has no core."""
 
 
 class Problem(NamedTuple):
@@ -109,15 +107,10 @@ def guarded_shell(shell: PointShell, voxel_size: float) -> PointShell:
     )
 
 
-def core_shell(
-    shell: PointShell,
-    voxel_size: float,
-    is_hit: Callable[[Floats, Floats], NDArray[np.bool_]],
-) -> PointShell | None:
+def core_shell(shell: PointShell, voxel_size: float) -> PointShell | None:
     """Points inside a part, two voxels from its surface or less where it is thin.
 
-    is_hit : tells whether places (N, 3) with normals (N, 3) are in something at the start; those
-    that are do not count. None if nothing is left, as of sheets and of parts deep in others.
+    None if there are none, as in thin sheets.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for parts in contact
 
@@ -132,9 +125,4 @@ def core_shell(
         points = np.concatenate([points, images[is_inside]])
         normals = np.concatenate([normals, shell.normals[left][is_inside]])
         left[np.flatnonzero(left)[is_inside]] = False
-    if not len(points):
-        return None
-    is_free = ~is_hit(points, normals)
-    if is_free.mean() < 1.0 - MOST_DEEP:
-        return None
-    return PointShell(points[is_free], normals[is_free], shell.center.copy())
+    return PointShell(points, normals, shell.center.copy()) if len(points) else None

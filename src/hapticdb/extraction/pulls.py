@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AGAINST, candidate_directions, opposed_shares
-from hapticdb.extraction.free_space import ContactSpace, FreeSpace
+from hapticdb.extraction.free_space import GROWTH, ContactSpace, FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem
 
@@ -17,9 +17,6 @@ Floats = NDArray[np.float64]
 MOST_OPPOSED = 0.1
 """Greatest share of the contacts at the start that a pull may press against. Larger: pulls through
 thin walls are tried, too; the proof does not take them for proved."""
-GROWTH = 1.2
-"""A part slides along what it touches at its start while it has at most so many times the hits of
-its start. Larger: more pulls that the proof refuses."""
 BLOCK = 64
 """Samples, half a voxel apart, that are looked at together."""
 

@@ -155,7 +155,7 @@ def bayonet(folder: Path) -> Path:
 
 
 def slot(folder: Path) -> Path:
-    """A plate that lies in a room with an upright slot in one wall: it must be turned to pass it."""
+    """A plate that lies in a room with an upright slot in a wall: it turns to pass it."""
     room = walls((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), 0.02, "+x")
     sides = [
         box((0.1, -0.12, -0.12), (0.12, -0.04, 0.12)),
@@ -166,6 +166,33 @@ def slot(folder: Path) -> Path:
         1.6 * SIZE,
         room=joined(room, *sides),
         plate=box((-0.05, -0.05, -0.01), (0.05, 0.05, 0.01)),
+    )
+
+
+def elbow(folder: Path) -> Path:
+    """A peg in a bent channel, longer than the second part is high: it must turn at the bend."""
+    channel = [
+        box((-0.06, -0.06, -0.02), (-0.04, 0.06, 0.34)),
+        box((0.04, -0.06, -0.02), (0.06, 0.06, 0.22)),
+        box((-0.06, -0.06, -0.02), (0.06, 0.06, 0.0)),
+        box((-0.06, -0.06, 0.32), (0.24, 0.06, 0.34)),
+        box((0.04, -0.06, 0.2), (0.24, 0.06, 0.22)),
+        *(box((-0.06, y - 0.01, -0.02), (0.24, y + 0.01, 0.34)) for y in (-0.05, 0.05)),
+    ]
+    peg = box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.11))
+    return imported(folder, channel=joined(*channel), peg=peg)
+
+
+def solids(url: Path, part: str) -> Floats:
+    """Corners (B, 2, 3) of the boxes that all but a part are made of, metres."""
+    scene = trimesh.load(url.with_suffix(".glb"))
+    return np.array(
+        [
+            piece.bounds
+            for name, mesh in scene.geometry.items()
+            if name != part
+            for piece in mesh.split(only_watertight=True)
+        ]
     )
 
 

@@ -32,6 +32,9 @@ FARTHEST = 4.0
 """Length of a shift in contact, radii of the part. Larger: longer slots are left, more poses."""
 WIDEST = 2.0
 """Angle of a turn in contact, radians. Larger: wider turns are found, more poses."""
+ARC = 0.2
+"""Angle of a step of a turn, radians. Smaller: turns about places far from the part's middle are
+followed more exactly, by more poses."""
 MOST_SHIFTS = 24
 """Greatest number of shifts tried from a place. Larger: oblique ways are found, a slower search."""
 MOST_TURNED = 6
@@ -57,8 +60,8 @@ class Loosened(NamedTuple):
 class Twist(NamedTuple):
     """A small motion: shift (3,) or turn (3,) about `center` (3,), metres a unit of motion.
 
-    The farthest point of the part moves about one metre a unit. opposed : share of the contacts
-    that the motion presses against.
+    The part's middle or its farthest point moves about one metre a unit. opposed : share of the
+    contacts that the motion presses against.
     """
 
     shift: Floats
@@ -66,16 +69,24 @@ class Twist(NamedTuple):
     center: Floats
     opposed: float
 
-    def moved(self, pose: Floats, amount: float) -> Floats:
-        """Displacement (4, 4) `amount` units after another displacement."""
-        angle = amount * float(np.linalg.norm(self.turn))
-        step = np.eye(4)
-        if angle > 0.0:
-            axis = self.turn / np.linalg.norm(self.turn)
-            half = 0.5 * angle
-            step[:3, :3] = rotation_of(np.concatenate([[np.cos(half)], np.sin(half) * axis]))
-        step[:3, 3] = self.center - step[:3, :3] @ self.center + amount * self.shift
-        return np.asarray(step @ pose)
+    def along(self, pose: Floats, farthest: float) -> Floats:
+        """Displacements (M, 4, 4) from a first one on: by `farthest` metres, or a turn's `WIDEST`.
+
+        Between two of them a part moves straight while it turns: a turn has steps of `ARC`.
+        """
+        speed = float(np.linalg.norm(self.turn))
+        amount = min(farthest, WIDEST / speed) if speed > 0.0 else farthest
+        angles = np.linspace(0.0, amount * speed, 1 + max(int(np.ceil(amount * speed / ARC)), 1))
+        found = np.tile(np.eye(4), (len(angles), 1, 1))
+        if speed > 0.0:
+            halves = 0.5 * angles[:, None]
+            turns = np.hstack([np.cos(halves), np.sin(halves) * self.turn / speed])
+            found[:, :3, :3] = rotation_of(turns)
+        shares = np.linspace(0.0, amount, len(angles))[:, None]
+        found[:, :3, 3] = self.center - found[:, :3, :3] @ self.center + shares * self.shift
+        moved = found @ pose
+        moved[0] = pose
+        return np.asarray(moved)
 
 
 class Loosening:
@@ -106,11 +117,9 @@ class Loosening:
                 self.n_motions += 1
                 ends, nexts = self._follow(way, twist)
                 found += ends
-                for hits, pose in nexts:
-                    if all(self._motion(pose, one) > APART * self._problem.voxel_size
-                           for one in places):  # fmt: skip
-                        places.append(pose)
-                        longer = np.concatenate([way, pose[None]])
+                for hits, longer in nexts:
+                    if self._is_new(longer[-1], places):
+                        places.append(longer[-1])
                         heapq.heappush(waiting, (hits, len(places), longer))
             else:
                 continue
@@ -118,21 +127,27 @@ class Loosening:
         return sorted(found, key=lambda one: not one.is_guarded)
 
     def _follow(self, way: Floats, twist: Twist) -> tuple[list[Loosened], list[tuple[int, Floats]]]:
-        """Move on while allowed: ends that are free, or places in contact with their hits."""
-        radius = self._problem.radius
-        turns = float(np.linalg.norm(twist.turn))
-        amount = WIDEST / turns if turns > 0.0 else FARTHEST * radius
-        ends = np.stack([way[-1], twist.moved(way[-1], amount)])
-        path = SweepPath.of(ends, self._space.shell, self._problem.voxel_size)
+        """Move on while allowed: ways that end free, or (M, 4, 4) in contact with their hits."""
+        path = SweepPath.of(
+            twist.along(way[-1], FARTHEST * self._problem.radius),
+            self._space.shell,
+            self._problem.voxel_size,
+        )
         poses, counts = self._allowed(path)
         if len(counts) < 2:
             return [], []
+
+        def longer(sample: int) -> Floats:
+            passed = path.poses[1:][path.starts[1:] < sample]
+            return np.concatenate([way, passed, poses[sample : sample + 1]])
+
         first, last = first_run(np.append(False, counts[1:] == 0))
         if first < last:
-            return self._freed(way, poses[first:last]), []
+            chosen, is_guarded = self._free(poses[first:last])
+            return [Loosened(longer(first + i), is_guarded) for i in chosen], []
         least = np.flatnonzero(counts[1:] == counts[1:].min()) + 1
-        chosen = {int(least[len(least) // 2]), len(counts) - 1}
-        return [], [(int(counts[i]), poses[i]) for i in sorted(chosen)]
+        ends = {int(least[len(least) // 2]), len(counts) - 1}
+        return [], [(int(counts[i]), longer(i)) for i in sorted(ends)]
 
     def _allowed(self, path: SweepPath) -> tuple[Floats, NDArray[np.int64]]:
         """Poses (n, 4, 4) from the path's start on that are allowed, with their hits (n,)."""
@@ -148,21 +163,22 @@ class Loosening:
                 break
         return np.concatenate(poses), np.concatenate(counts)
 
-    def _freed(self, way: Floats, poses: Floats) -> list[Loosened]:
-        """Ways to the middle and to the end of what is free with the guard, or without it."""
+    def _free(self, poses: Floats) -> tuple[list[int], bool]:
+        """Middle and end of free poses (n, 4, 4): of those free with the guard, if any are."""
         first, last = first_run(self._space.hits(poses, is_guarded=True) == 0)
         is_guarded = first < last
         if not is_guarded:
             first, last = 0, len(poses)
-        chosen = sorted({(first + last) // 2, last - 1})
-        return [Loosened(np.concatenate([way, poses[i][None]]), is_guarded) for i in chosen]
+        return sorted({(first + last) // 2, last - 1}), is_guarded
 
-    def _motion(self, a: Floats, b: Floats) -> float:
-        """Greatest motion of a point, metres, from one displacement to another, about."""
-        turn = np.linalg.norm(a[:3, :3] - b[:3, :3]) / np.sqrt(2.0)
-        center = self._problem.center
-        shift = (a[:3, :3] - b[:3, :3]) @ center + a[:3, 3] - b[:3, 3]
-        return float(np.linalg.norm(shift) + self._problem.radius * turn)
+    def _is_new(self, pose: Floats, places: list[Floats]) -> bool:
+        """Whether a displacement differs from all others by more than `APART`, about."""
+        others = np.array(places)
+        turns = np.linalg.norm(pose[:3, :3] - others[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
+        shifts = (pose[:3, :3] - others[:, :3, :3]) @ self._problem.center
+        shifts += pose[:3, 3] - others[:, :3, 3]
+        motions = np.linalg.norm(shifts, axis=1) + self._problem.radius * turns
+        return bool((motions > APART * self._problem.voxel_size).all())
 
     def _twists(self, pose: Floats) -> list[Twist]:
         """Motions to try at a displacement: those that press against fewest contacts first."""
@@ -220,17 +236,18 @@ def leaving_twist(points: Floats, normals: Floats, center: Floats, radius: float
     if not len(points):
         return np.zeros(6)
     wrenches = np.hstack([normals, np.cross(points - center, normals) / radius])
-    _, firsts, counts = np.unique(
-        np.rint(3.0 * wrenches), axis=0, return_index=True, return_counts=True
-    )
-    chosen = wrenches[firsts[np.argsort(-counts, kind="stable")[:MOST_GROUPS]]]
+    if len(wrenches) > MOST_GROUPS:
+        _, firsts, counts = np.unique(
+            np.rint(3.0 * wrenches), axis=0, return_index=True, return_counts=True
+        )
+        wrenches = wrenches[firsts[np.argsort(-counts, kind="stable")[:MOST_GROUPS]]]
     weight = 100.0  # of the condition that the shares sum to 1
     shares, _ = nnls(
-        np.vstack([chosen.T, np.full(len(chosen), weight)]), np.array([0.0] * 6 + [weight])
+        np.vstack([wrenches.T, np.full(len(wrenches), weight)]), np.array([0.0] * 6 + [weight])
     )
-    twist = chosen.T @ shares
+    twist = wrenches.T @ shares
     length = float(np.linalg.norm(twist))
-    if length < 1e-3 or float((chosen @ twist).min()) < 0.0:
+    if length < 1e-3 or float((wrenches @ twist).min()) < 0.0:
         return np.zeros(6)
     return np.asarray(twist / length)
 

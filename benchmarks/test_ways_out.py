@@ -18,8 +18,10 @@ def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object
     return {row["parts"]: row for row in found["rows"]}
 
 
-OUT = {"wheels/wheel_bolt_front_left_1", "body/hood", SAMPLE[1].name}
+OUT = {"wheels/wheel_bolt_front_left_1", "body/hood", *(SAMPLE[n].name for n in (1, 7, 8))}
 HELD_BY = {
+    "body/door_front_left": "body/pillar_a",
+    "seats/seat_*_left": "cabin/floor_pan",
     "wheels/tyre_front_left, wheels/rim_front_left": "wheels/wheel_bolt",
     "supply/battery": "supply/wiring_harness",
 }

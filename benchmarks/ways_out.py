@@ -1,6 +1,6 @@
 """Ways out: which parts are found to come out, how soon, and what exact meshes say of the paths.
 
-    python benchmarks/ways_out.py                      # seven questions of the sample car
+    python benchmarks/ways_out.py                      # questions of the sample car
     python benchmarks/ways_out.py --model FILE --bits 10 --parts 40,57,140 --out ways_out.json
 
 coal compares the triangles of the part with those of all that stands, at each found path's poses at
@@ -47,6 +47,15 @@ class Question(NamedTuple):
 
 WHEEL = ("wheels/tyre_front_left", "wheels/rim_front_left")
 BOLTS = ("wheels/wheel_bolt_front_left_*",)
+AROUND_BATTERY = ("supply/wiring_harness", "body/hood", "body/hood_lining")
+AROUND_DOOR = (
+    "body/pillar_a_left",
+    "body/pillar_b_left",
+    "body/windscreen",
+    "cabin/dashboard",
+    "cabin/door_trim_front_left",
+    "trim/mirror_left",
+)
 SAMPLE = (
     Question(("wheels/wheel_bolt_front_left_1",)),
     Question(WHEEL, BOLTS),
@@ -55,9 +64,13 @@ SAMPLE = (
     Question(("body/door_front_left",)),
     Question(("seats/seat_*_left",)),
     Question(("supply/battery",)),
+    Question(("supply/battery",), AROUND_BATTERY),
+    Question(("body/door_front_left",), AROUND_DOOR),
 )
-"""Of the sample car: the first, the second and the hood come out; bolts hold the wheel, pillars and
-hinges the door, the floor's rails the seat, and the harness the battery."""
+"""Of the sample car: the first, the second and the hood come out. Bolts hold the wheel. Triangles of
+the door cross those of pillars, dashboard, windscreen and lining, the seat's cross the floor, and
+the harness goes through the battery. Without what holds them, and what is above the battery and in
+front of the door, the last two come out."""
 
 
 def measured(env: Environment, question: Question, seconds: float) -> dict[str, Any]:

@@ -68,8 +68,8 @@ SAMPLE = (
     Question(("body/door_front_left",), AROUND_DOOR),
 )
 """Of the sample car: the first, the second and the hood come out. Bolts hold the wheel. Triangles of
-the door cross those of pillars, dashboard, windscreen and lining, the seat's cross the floor, and
-the harness goes through the battery. Without what holds them, and what is above the battery and in
+the door cross those of pillars, dashboard, windscreen and lining, the seats' cross the floor, and the
+harness goes through the battery. Without what holds them, and what is above the battery and in
 front of the door, the last two come out."""
 
 

@@ -170,7 +170,7 @@ def slot(folder: Path) -> Path:
 
 
 def elbow(folder: Path) -> Path:
-    """A peg in a bent channel, longer than the second part is high: it must turn at the bend."""
+    """A peg on the floor of a bent channel: up, and then along +x."""
     channel = [
         box((-0.06, -0.06, -0.02), (-0.04, 0.06, 0.34)),
         box((0.04, -0.06, -0.02), (0.06, 0.06, 0.22)),
@@ -179,7 +179,7 @@ def elbow(folder: Path) -> Path:
         box((0.04, -0.06, 0.2), (0.24, 0.06, 0.22)),
         *(box((-0.06, y - 0.01, -0.02), (0.24, y + 0.01, 0.34)) for y in (-0.05, 0.05)),
     ]
-    peg = box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.09))
+    peg = box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.06))
     return imported(folder, channel=joined(*channel), peg=peg)
 
 

@@ -67,10 +67,10 @@ SAMPLE = (
     Question(("supply/battery",), AROUND_BATTERY),
     Question(("body/door_front_left",), AROUND_DOOR),
 )
-"""Of the sample car: the first, the second and the hood come out. Bolts hold the wheel. Triangles of
-the door cross those of pillars, dashboard, windscreen and lining, the seats' cross the floor, and the
-harness goes through the battery. Without what holds them, and what is above the battery and in
-front of the door, the last two come out."""
+"""Of the sample car: the first, the second and the hood come out. Bolts hold the wheel. The door's
+triangles cross those of pillars, dashboard, windscreen and lining, the seat's those of the floor,
+and the harness goes through the battery. Without what holds them, and what is above the battery and
+in front of the door, the last two come out."""
 
 
 def measured(env: Environment, question: Question, seconds: float) -> dict[str, Any]:

@@ -28,7 +28,7 @@ def poses_of(found: Extraction) -> Floats:
     return path.sample(0, len(path))
 
 
-def deepest_place_in_a_box(found: Extraction, url: Path, part: str, inset: float) -> int:
+def places_in_boxes(found: Extraction, url: Path, part: str, inset: float) -> int:
     """Number of places in the part, `inset` from its surface or more, that are in a box on the way.
 
     The part is a box itself, so its places are a grid, and a place is in a box by its coordinates.
@@ -55,7 +55,8 @@ def is_out(found: Extraction, url: Path, part: str) -> bool:
 
 def turn_of(poses: Floats) -> Floats:
     """Angles (n,) of displacements (n, 4, 4), radians."""
-    return np.arccos(np.clip(0.5 * (np.trace(poses[:, :3, :3], axis1=1, axis2=2) - 1.0), -1, 1))
+    traces = np.trace(poses[:, :3, :3], axis1=1, axis2=2)
+    return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
 
 
 # --- scenes whose ways are known by construction --------------------------------------------------
@@ -66,7 +67,7 @@ def test_a_block_in_a_pocket_is_lifted_and_then_pulled(tmp_path: Path) -> None:
     found = found_in(url, "block")
     assert (found.verdict, found.pulls) == ("comes out of contact", found.blockers[0].pulls)
     assert is_out(found, url, "block")
-    assert deepest_place_in_a_box(found, url, "block", 0.5 * SIZE) == 0
+    assert places_in_boxes(found, url, "block", 0.5 * SIZE) == 0
 
 
 def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) -> None:
@@ -75,7 +76,7 @@ def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) 
     assert (found.verdict, found.is_planned) == ("comes out of contact", True)
     assert [obj.name for obj in found.touched] == ["base"]
     assert is_out(found, url, "plate")
-    assert deepest_place_in_a_box(found, url, "plate", SIZE) == 0
+    assert places_in_boxes(found, url, "plate", SIZE) == 0
     shifts = poses_of(found)[:, :3, 3]
     lifted = shifts[:, 2] > 0.01
     assert (shifts[lifted, 0] > 0.02).all()  # the ledge covers 0.02 m
@@ -86,7 +87,7 @@ def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Pa
     found = found_in(url, "bar")
     assert found.verdict == "comes out of contact"
     assert is_out(found, url, "bar")
-    assert deepest_place_in_a_box(found, url, "bar", SIZE) == 0
+    assert places_in_boxes(found, url, "bar", SIZE) == 0
     poses = poses_of(found)
     passing = (poses[:, 2, 3] > 0.01) & (poses[:, 2, 3] < 0.03)
     assert passing.any()
@@ -98,7 +99,7 @@ def test_a_peg_leaves_a_bent_channel(tmp_path: Path) -> None:
     found = found_in(url, "peg")
     assert found.verdict == "comes out of contact"  # it stands on the channel's floor
     assert is_out(found, url, "peg")
-    assert deepest_place_in_a_box(found, url, "peg", 0.5 * SIZE) == 0
+    assert places_in_boxes(found, url, "peg", 0.5 * SIZE) == 0
 
 
 @pytest.mark.parametrize(("scene", "part"), [(ledge, "plate"), (bayonet, "bar")])
@@ -132,7 +133,7 @@ def test_a_plate_is_turned_to_pass_a_slot(tmp_path: Path) -> None:
     found = found_in(url, "plate", seed=1)
     assert (found.verdict, found.touched) == ("comes out", ())
     assert is_out(found, url, "plate")
-    assert deepest_place_in_a_box(found, url, "plate", 0.0) == 0
+    assert places_in_boxes(found, url, "plate", 0.0) == 0
     assert turn_of(poses_of(found)).max() > 0.5
     again = found_in(url, "plate", seed=1)
     assert again.way is not None

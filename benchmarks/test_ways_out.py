@@ -14,7 +14,7 @@ from ways_out import BITS, SAMPLE, SECONDS, measure
 @pytest.fixture(scope="module")
 def rows(tmp_path_factory: pytest.TempPathFactory) -> dict[str, dict[str, object]]:
     folder: Path = tmp_path_factory.mktemp("ways")
-    found = measure(folder, None, BITS, SAMPLE, SECONDS)
+    found = measure(folder, None, BITS, SAMPLE, SECONDS, motions=300)
     return {row["parts"]: row for row in found["rows"]}
 
 

@@ -30,6 +30,7 @@ from peers.coal_meshes import tree_of_boxes
 Floats = NDArray[np.float64]
 BITS = 11
 SECONDS = 60.0
+MOTIONS = 20_000
 MOST_POSES = 4000
 """Greatest number of poses of a path that coal looks at; of a longer one, every n-th."""
 
@@ -73,9 +74,11 @@ and the harness goes through the battery. Without what holds them, and what is a
 in front of the door, the last two come out."""
 
 
-def measured(env: Environment, question: Question, seconds: float) -> dict[str, Any]:
+def measured(env: Environment, question: Question, seconds: float, motions: int) -> dict[str, Any]:
     """Search a way out; for a path that is found, ask coal, too."""
-    found = hapticdb.extract(env, *question.words, exclude=question.exclude, seconds=seconds)
+    found = hapticdb.extract(
+        env, *question.words, exclude=question.exclude, seconds=seconds, motions=motions
+    )
     row: dict[str, Any] = {
         "parts": question.name,
         "verdict": found.verdict,
@@ -125,7 +128,12 @@ def _tree(triangles: Floats) -> Any:  # noqa: ANN401 - coal has no types
 
 
 def measure(
-    folder: Path, model: Path | None, bits: int, questions: Sequence[Question], seconds: float
+    folder: Path,
+    model: Path | None,
+    bits: int,
+    questions: Sequence[Question],
+    seconds: float,
+    motions: int = MOTIONS,
 ) -> dict[str, Any]:
     """Import the model, the sample car unless one is given, and ask all questions."""
     file = model or write_sample(folder / "sample").car
@@ -140,7 +148,7 @@ def measure(
     with hapticdb.open(url, read_only=True) as env:
         found["conditions"]["voxel_m"] = env.grid.voxel_size
         for question in questions:
-            row = measured(env, question, seconds)
+            row = measured(env, question, seconds, motions)
             found["rows"].append(row)
             print(_line(row), flush=True)
     return found

@@ -117,3 +117,103 @@ def enclosed(folder: Path) -> Path:
         block=box((0.04, 0.04, 0.04), (0.06, 0.06, 0.06)),
         beside=box((0.3, 0.0, 0.0), (0.32, 0.02, 0.02)),
     )
+
+
+def pocket(folder: Path) -> Path:
+    """A block on the floor of a pocket, touching it; it is lifted, and then pulled along +x.
+
+    A roof ends the lift, and the pocket's walls are higher than the block but for the roof's gap.
+    """
+    walls_of_pocket = [
+        box((-0.06, -0.06, -0.02), (0.06, 0.06, 0.0)),  # the floor, which the block touches
+        box((-0.06, -0.06, -0.02), (-0.04, 0.06, 0.16)),
+        box((-0.06, -0.06, -0.02), (0.06, -0.04, 0.16)),
+        box((-0.06, 0.04, -0.02), (0.06, 0.06, 0.16)),
+        box((0.04, -0.06, -0.02), (0.06, 0.06, 0.06)),  # the lower side, towards +x
+        box((-0.06, -0.06, 0.14), (0.12, 0.06, 0.16)),  # the roof
+    ]
+    return imported(
+        folder, pocket=joined(*walls_of_pocket), block=box((-0.02, -0.02, 0.0), (0.02, 0.02, 0.04))
+    )
+
+
+def ledge(folder: Path, room: float = 0.035) -> Path:
+    """A plate between a floor and a ledge, touching both: it slides along +x, and then it lifts.
+
+    The ledge covers 0.02 m of the plate; a stop ends the slide after `room` metres, in contact with
+    the floor. So no straight pull gets free.
+    """
+    base = [
+        box((-0.02, -0.06, -0.02), (0.08 + room + 0.02, 0.06, 0.0)),  # the floor
+        box((-0.02, -0.06, -0.02), (0.0, 0.06, 0.03)),  # behind
+        box((-0.02, -0.06, 0.015), (0.02, 0.06, 0.03)),  # the ledge
+        box((0.08 + room, -0.06, -0.02), (0.08 + room + 0.02, 0.06, 0.03)),  # the stop
+        box((-0.02, -0.06, -0.02), (0.08 + room + 0.02, -0.045, 0.03)),
+        box((-0.02, 0.045, -0.02), (0.08 + room + 0.02, 0.06, 0.03)),
+    ]
+    return imported(folder, base=joined(*base), plate=box((0.0, -0.03, 0.0), (0.08, 0.03, 0.015)))
+
+
+def bayonet(folder: Path) -> Path:
+    """A bar across a slot, between floor and lid of a well: a quarter turn, and then it lifts."""
+    well = [
+        box((-0.08, -0.08, -0.02), (0.08, 0.08, 0.0)),
+        box((-0.08, -0.08, -0.02), (-0.065, 0.08, 0.035)),
+        box((0.065, -0.08, -0.02), (0.08, 0.08, 0.035)),
+        box((-0.08, -0.08, -0.02), (0.08, -0.065, 0.035)),
+        box((-0.08, 0.065, -0.02), (0.08, 0.08, 0.035)),
+        box((-0.08, -0.08, 0.02), (-0.03, 0.08, 0.035)),  # the lid on both sides of the slot
+        box((0.03, -0.08, 0.02), (0.08, 0.08, 0.035)),
+    ]
+    return imported(folder, well=joined(*well), bar=box((-0.05, -0.015, 0.0), (0.05, 0.015, 0.02)))
+
+
+def slot(folder: Path) -> Path:
+    """A plate that lies in a room with an upright slot in a wall: it turns to pass it."""
+    room = walls((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), 0.02, "+x")
+    sides = [
+        box((0.1, -0.12, -0.12), (0.12, -0.04, 0.12)),
+        box((0.1, 0.04, -0.12), (0.12, 0.12, 0.12)),
+    ]
+    return imported(
+        folder,
+        1.6 * SIZE,
+        room=joined(room, *sides),
+        plate=box((-0.05, -0.05, -0.01), (0.05, 0.05, 0.01)),
+    )
+
+
+def elbow(folder: Path) -> Path:
+    """A peg on the floor of a bent channel: up, and then along +x."""
+    channel = [
+        box((-0.06, -0.06, -0.02), (-0.04, 0.06, 0.34)),
+        box((0.04, -0.06, -0.02), (0.06, 0.06, 0.22)),
+        box((-0.06, -0.06, -0.02), (0.06, 0.06, 0.0)),
+        box((-0.06, -0.06, 0.32), (0.24, 0.06, 0.34)),
+        box((0.04, -0.06, 0.2), (0.24, 0.06, 0.22)),
+        *(box((-0.06, y - 0.01, -0.02), (0.24, y + 0.01, 0.34)) for y in (-0.05, 0.05)),
+    ]
+    peg = box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.06))
+    return imported(folder, channel=joined(*channel), peg=peg)
+
+
+def solids(url: Path, part: str) -> Floats:
+    """Corners (B, 2, 3) of the boxes that all but a part are made of, metres."""
+    scene = trimesh.load(url.with_suffix(".glb"))
+    return np.array(
+        [
+            piece.bounds
+            for name, mesh in scene.geometry.items()
+            if name != part
+            for piece in mesh.split(only_watertight=True)
+        ]
+    )
+
+
+def grounded(folder: Path) -> Path:
+    """A block on the floor of a closed box, touching it: it slides, and never comes out."""
+    return imported(
+        folder,
+        cage=walls((0.0, 0.0, 0.0), (0.08, 0.08, 0.06), 0.02),
+        block=box((0.03, 0.03, 0.0), (0.05, 0.05, 0.02)),
+    )

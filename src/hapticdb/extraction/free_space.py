@@ -2,6 +2,10 @@
 
 A pose is free if no point of the shell lies in an occupied voxel. With the guard, no point a voxel
 outside the surface does either. The search believes this; the proof is that of a sweep.
+
+A part that touches something at its start is in no free pose there, because surfaces that touch
+share voxels. In contact a pose is allowed if the part is clear of all that it does not touch at its
+start, and if its core, its surface drawn inward, is free, or hit little more than at the start.
 """
 
 from typing import Self
@@ -9,7 +13,13 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.extraction.problem import Problem, guarded_shell, searched_shell
+from hapticdb.extraction.problem import (
+    Problem,
+    core_shell,
+    guarded_shell,
+    searched_shell,
+)
+from hapticdb.query.touches import Touch
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -18,6 +28,12 @@ from hapticdb.sweeps.path import SweepPath
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
+GROWTH = 1.2
+"""A part slides along what it touches at its start while it has at most so many times the hits of
+its start. Larger: more motions that the proof refuses."""
+CORE_GROWTH = 2.0
+"""The same for the core: where it is hit at the start, parts interlock, or are hardly thicker than
+voxels, and the number varies. Larger: more motions that cut into what is touched."""
 AT_ONCE = 32
 """Poses of a motion that are looked at together. Larger: fewer calls; more poses of motions that
 turn out blocked."""
@@ -38,11 +54,11 @@ class FreeSpace:
         self.n_poses = 0
         self._table = CellTable.create(budget_bytes)
         try:
-            residency = Residency(
+            self.residency = Residency(
                 problem.env.store, self._table, problem.exclude, where=problem.where
             )
             self._frames = [
-                ResidentFrames(residency, shell)
+                ResidentFrames(self.residency, shell)
                 for shell in (self.shell, guarded_shell(self.shell, self.voxel_size))
             ]
         except BaseException:
@@ -74,6 +90,68 @@ class FreeSpace:
             if self.hits(poses[some], is_guarded=is_guarded).any():
                 return False
         return True
+
+
+class ContactSpace:
+    """Which poses are allowed while parts leave contact. It is also a context manager.
+
+    Attributes
+    ----------
+    start : Touch
+        What the searched shell touches at the start.
+    touched : tuple of int
+        Ids of these objects.
+    """
+
+    def __init__(self, problem: Problem, space: FreeSpace, budget_bytes: int) -> None:
+        self._problem, self._space = problem, space
+        self.start = self.touch(np.eye(4))
+        self.touched = tuple(obj.id for obj in self.start.objects)
+        self._frames: list[ResidentFrames] = []
+        self._most: list[float] = []
+        self._table: CellTable | None = None
+        if not self.touched:
+            return
+        self._table = CellTable.create(budget_bytes)
+        try:
+            others = Residency(
+                problem.env.store,
+                self._table,
+                (*problem.exclude, *self.touched),
+                where=problem.where,
+            )
+            self._frames.append(ResidentFrames(others, space.shell))
+            core = core_shell(space.shell, problem.voxel_size)
+            if core is not None:
+                self._frames.append(ResidentFrames(space.residency, core))
+            self._most = [CORE_GROWTH * frames.feel(np.eye(4)).hits[0] for frames in self._frames]
+        except BaseException:
+            self.__exit__()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for frames in self._frames:
+            frames.close()
+        if self._table is not None:
+            self._table.close()
+
+    def touch(self, pose: Floats) -> Touch:
+        """Contacts of the searched shell at a pose (4, 4)."""
+        problem = self._problem
+        return problem.env.touch(
+            self._space.shell, pose, where=problem.where, exclude=problem.exclude, law="plane"
+        )
+
+    def are_allowed(self, poses: Floats) -> NDArray[np.bool_]:
+        """Whether each of the poses (n, 4, 4) is allowed in contact."""
+        self._space.n_poses += len(poses)
+        allowed = np.ones(len(poses), dtype=np.bool_)
+        for frames, most in zip(self._frames, self._most, strict=True):
+            allowed &= frames.feel(poses).hits <= most
+        return allowed
 
 
 def _from_coarse_to_fine(n: int) -> list[Ints]:

@@ -8,19 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AGAINST, candidate_directions, opposed_shares
-from hapticdb.extraction.free_space import FreeSpace
+from hapticdb.extraction.free_space import GROWTH, ContactSpace, FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem
-from hapticdb.query.touches import Touch
 
 Floats = NDArray[np.float64]
 
 MOST_OPPOSED = 0.1
 """Greatest share of the contacts at the start that a pull may press against. Larger: pulls through
 thin walls are tried, too; the proof does not take them for proved."""
-GROWTH = 1.2
-"""A part slides along what it touches at its start while it has at most so many times the hits of
-its start. Larger: more pulls that the proof refuses."""
 BLOCK = 64
 """Samples, half a voxel apart, that are looked at together."""
 
@@ -80,11 +76,12 @@ class Pulls:
         Ids of the objects that the part touches where it starts.
     """
 
-    def __init__(self, problem: Problem, space: FreeSpace, leaving: Exit, seed: int) -> None:
+    def __init__(
+        self, problem: Problem, space: FreeSpace, contact: ContactSpace, leaving: Exit, seed: int
+    ) -> None:
         self.done: list[Pull] = []
-        self._problem, self._space = problem, space
-        start = self._touch(np.eye(4))
-        self.touched = tuple(obj.id for obj in start.objects)
+        self._problem, self._space, self._contact = problem, space, contact
+        start, self.touched = contact.start, contact.touched
         self._normals = start.contact_normals
         self._pairs, self._contacts = start.contact_pairs, start.contacts
         self._directions = candidate_directions(self._normals, seed)
@@ -101,12 +98,6 @@ class Pulls:
             if progress is not None:
                 progress(SearchProgress(n + 1, total))
 
-    def _touch(self, pose: Floats) -> Touch:
-        problem = self._problem
-        return problem.env.touch(
-            self._space.shell, pose, where=problem.where, exclude=problem.exclude, law="plane"
-        )
-
     def _pull(self, n: int) -> Pull:
         direction, length = self._directions[n], float(self._lengths[n])
         if self._opposed[n] > MOST_OPPOSED:
@@ -116,18 +107,26 @@ class Pulls:
         most = -1.0
         for first in range(0, len(ways), BLOCK):
             block = ways[first : first + BLOCK]
-            hits = self._space.hits(_poses_along(direction, block))
+            poses = _poses_along(direction, block)
+            hits = self._space.hits(poses)
             most = GROWTH * float(hits[0]) if most < 0.0 else most
+            slides = self._slides(poses, hits, most) if contact == first else 0
             for at, count in enumerate(hits.tolist(), start=first):
-                if count and contact == at and count <= most:
+                if count and contact == at and at - first < slides:
                     contact += 1
                 elif count:
-                    found = self._touch(shifted(direction * ways[at])).objects
+                    found = self._contact.touch(shifted(direction * ways[at])).objects
                     blockers = tuple(obj.id for obj in found)
                     return self._ended(direction, ways, contact, at, blockers)
         if contact == len(ways):  # still in contact where it should be out
             return Pull(direction, length, length, 0.0, None, self.touched)
         return self._ended(direction, ways, contact, len(ways), ())
+
+    def _slides(self, poses: Floats, hits: NDArray[np.int64], most: float) -> int:
+        """Number of the first poses (n, 4, 4) at which the part slides along what it touches."""
+        _, n = first_run(np.concatenate([[True], (hits > 0) & (hits <= most)]))
+        allowed = self._contact.are_allowed(poses[: n - 1])
+        return int(first_run(np.concatenate([[True], allowed]))[1]) - 1
 
     def _ended(
         self, direction: Floats, ways: Floats, contact: int, end: int, blockers: tuple[int, ...]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, UsageError
-from hapticdb.extraction.free_space import FreeSpace
+from hapticdb.extraction.free_space import ContactSpace, FreeSpace
 from hapticdb.extraction.judge import judge
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.planner import Planner
@@ -34,6 +34,9 @@ DEFAULT_MOTIONS = 20_000
 MOST_JUDGED = 4
 """Greatest number of straight pulls that are proved, one after another, until one is. Larger: a
 proof is found more often, at the price of a sweep each."""
+MOST_PLANS = 3
+"""Greatest number of planned paths that are proved, until one is not refuted. Larger: more ways are
+found past places that the search overlooks, at the price of a sweep each."""
 MOST_SEED = 1 << 31
 RANK: dict[WayOutVerdict, int] = {
     "comes out": 0, "slides out": 1, "comes out of contact": 2, "not decided": 3,
@@ -127,15 +130,18 @@ def _searched(problem: Problem, asked: _Asked, progress: SearchCallback | None) 
     )
     until = time.monotonic() + asked.seconds
     n_motions, is_planned = 0, False
-    with FreeSpace(problem, asked.budget_bytes) as space:
-        pulls = Pulls(problem, space, leaving, asked.seed)
+    with (
+        FreeSpace(problem, asked.budget_bytes) as space,
+        ContactSpace(problem, space, asked.budget_bytes) as contact,
+    ):
+        pulls = Pulls(problem, space, contact, leaving, asked.seed)
         pulls.run(until, progress)
         refuting: Counter[int] = Counter()
         way = _best_pull(problem, pulls.done, asked.budget_bytes, refuting)
         if asked.motions and (way is None or way.verdict == "not decided"):
             planner = Planner(
-                problem, space, leaving, pulls.done, seed=asked.seed, most_motions=asked.motions,
-                until=until,
+                problem, space, contact, leaving, pulls, seed=asked.seed,
+                most_motions=asked.motions, until=until,
             )  # fmt: skip
             way, is_planned = _planned(problem, planner, way, pulls, asked.budget_bytes), True
             n_motions = planner.n_motions
@@ -187,21 +193,35 @@ def _best_pull(
 def _planned(
     problem: Problem, planner: Planner, way: WayOut | None, pulls: Pulls, budget_bytes: int
 ) -> WayOut | None:
-    """Plan, and prove what is planned; returns the better one of that and the way so far."""
+    """Plan, and prove what is planned; returns the better one of that and the way so far.
+
+    A path that the proof refutes is planned once more from another start, `MOST_PLANS` in all.
+    """
+    for _ in range(MOST_PLANS):
+        poses = _poses_of(problem, planner, way, pulls)
+        if poses is None:
+            return way
+        planned = judge(problem, poses, "plan", budget_bytes)
+        if not planned.in_way:
+            return planned if way is None or RANK[planned.verdict] < RANK[way.verdict] else way
+        if not planner.can_refuse:
+            return way
+        planner.refuse()
+    return way
+
+
+def _poses_of(
+    problem: Problem, planner: Planner, way: WayOut | None, pulls: Pulls
+) -> Floats | None:
+    """Poses of a planned path; a missing planner is an error unless there is a way already."""
     try:
-        poses = planner.search().poses
+        return planner.search().poses
     except MissingExtraError as error:
         if way is not None:
-            return way
+            return None
         ids = [i for i, _ in _blockers(pulls.done, Counter())[:1]]
         name = "".join(f", {obj.name} is in the way" for obj in problem.standing if obj.id in ids)
         raise MissingExtraError(f"no straight pull leads out{name}; {error}") from error
-    if poses is None:
-        return way
-    planned = judge(problem, poses, "plan", budget_bytes)
-    if planned.in_way:
-        return way
-    return planned if way is None or RANK[planned.verdict] < RANK[way.verdict] else way
 
 
 def _blockers(pulls: list[Pull], refuting: Counter[int]) -> list[tuple[int, int]]:

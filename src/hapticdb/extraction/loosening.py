@@ -1,0 +1,261 @@
+"""Small motions, shifts and turns, by which a part leaves what it touches at its start.
+
+Voxels of two surfaces that touch are shared, so a part that touches something is not free at its
+start. A motion out of contact is believed while `ContactSpace` allows its poses: sliding along a
+surface, not cutting into it. The proof is that of a sweep.
+"""
+
+import heapq
+import time
+from itertools import combinations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.extraction.directions import (
+    AGAINST,
+    AXES,
+    candidate_directions,
+    distinct,
+    grouped,
+)
+from hapticdb.extraction.free_space import ContactSpace, FreeSpace
+from hapticdb.extraction.problem import Problem
+from hapticdb.extraction.pulls import MOST_OPPOSED, first_run
+from hapticdb.poses import rotation_of
+from hapticdb.sweeps.path import SweepPath
+
+Floats = NDArray[np.float64]
+
+FARTHEST = 4.0
+"""Length of a shift in contact, radii of the part. Larger: longer slots are left, more poses."""
+WIDEST = 2.0
+"""Angle of a turn in contact, radians. Larger: wider turns are found, more poses."""
+ARC = 0.2
+"""Angle of a step of a turn, radians. Smaller: turns about places far from the part's middle are
+followed more exactly, by more poses."""
+MOST_SHIFTS = 24
+"""Greatest number of shifts tried from a place. Larger: oblique ways are found, a slower search."""
+MOST_TURNED = 6
+"""Greatest number of axes of turns through a centre."""
+MOST_GROUPS = 60
+"""Greatest number of groups of contacts for which a motion that leaves all of them is computed."""
+APART = 2.0
+"""Motion, voxels, between two places from which motions are tried. Larger: fewer places."""
+BLOCK = 32
+"""Poses of a motion that are looked at together."""
+
+
+class Loosened(NamedTuple):
+    """A way out of contact: displacements (M, 4, 4) from the start to a place that is free.
+
+    is_guarded : whether that place is free with the guard.
+    """
+
+    poses: Floats
+    is_guarded: bool
+
+
+class Twist(NamedTuple):
+    """A small motion: shift (3,) or turn (3,) about `center` (3,), metres a unit of motion.
+
+    The part's middle or its farthest point moves about one metre a unit. opposed : share of the
+    contacts that the motion presses against.
+    """
+
+    shift: Floats
+    turn: Floats
+    center: Floats
+    opposed: float
+
+    def along(self, pose: Floats, farthest: float) -> Floats:
+        """Displacements (M, 4, 4) from a first one on: by `farthest` metres, or a turn's `WIDEST`.
+
+        Between two of them a part moves straight while it turns: a turn has steps of `ARC`.
+        """
+        speed = float(np.linalg.norm(self.turn))
+        amount = min(farthest, WIDEST / speed) if speed > 0.0 else farthest
+        angles = np.linspace(0.0, amount * speed, 1 + max(int(np.ceil(amount * speed / ARC)), 1))
+        found = np.tile(np.eye(4), (len(angles), 1, 1))
+        if speed > 0.0:
+            halves = 0.5 * angles[:, None]
+            turns = np.hstack([np.cos(halves), np.sin(halves) * self.turn / speed])
+            found[:, :3, :3] = rotation_of(turns)
+        shares = np.linspace(0.0, amount, len(angles))[:, None]
+        found[:, :3, 3] = self.center - found[:, :3, :3] @ self.center + shares * self.shift
+        moved = found @ pose
+        moved[0] = pose
+        return np.asarray(moved)
+
+
+class Loosening:
+    """Searches motions out of contact, shifts and turns one after another, best places first.
+
+    Attributes
+    ----------
+    n_motions : int
+        Number of motions tried so far.
+    """
+
+    def __init__(
+        self, problem: Problem, space: FreeSpace, contact: ContactSpace, seed: int
+    ) -> None:
+        self._problem, self._space, self._contact, self._seed = problem, space, contact, seed
+        self.n_motions = 0
+
+    def search(self, most_motions: int, until: float) -> list[Loosened]:
+        """Ways out of contact, those free with the guard first; ends at a time of `monotonic`."""
+        found: list[Loosened] = []
+        places = [np.eye(4)]
+        waiting: list[tuple[int, int, Floats]] = [(0, 0, np.eye(4)[None])]
+        while waiting and not found:
+            _, _, way = heapq.heappop(waiting)
+            for twist in self._twists(way[-1]):
+                if self.n_motions >= most_motions or time.monotonic() > until:
+                    break
+                self.n_motions += 1
+                ends, nexts = self._follow(way, twist)
+                found += ends
+                for hits, longer in nexts:
+                    if self._is_new(longer[-1], places):
+                        places.append(longer[-1])
+                        heapq.heappush(waiting, (hits, len(places), longer))
+            else:
+                continue
+            break
+        return sorted(found, key=lambda one: not one.is_guarded)
+
+    def _follow(self, way: Floats, twist: Twist) -> tuple[list[Loosened], list[tuple[int, Floats]]]:
+        """Move on while allowed: ways that end free, or (M, 4, 4) in contact with their hits."""
+        path = SweepPath.of(
+            twist.along(way[-1], FARTHEST * self._problem.radius),
+            self._space.shell,
+            self._problem.voxel_size,
+        )
+        poses, counts = self._allowed(path)
+        if len(counts) < 2:
+            return [], []
+
+        def longer(sample: int) -> Floats:
+            passed = path.poses[1:][path.starts[1:] < sample]
+            return np.concatenate([way, passed, poses[sample : sample + 1]])
+
+        first, last = first_run(np.append(False, counts[1:] == 0))
+        if first < last:
+            chosen, is_guarded = self._free(poses[first:last])
+            return [Loosened(longer(first + i), is_guarded) for i in chosen], []
+        least = np.flatnonzero(counts[1:] == counts[1:].min()) + 1
+        ends = {int(least[len(least) // 2]), len(counts) - 1}
+        return [], [(int(counts[i]), longer(i)) for i in sorted(ends)]
+
+    def _allowed(self, path: SweepPath) -> tuple[Floats, NDArray[np.int64]]:
+        """Poses (n, 4, 4) from the path's start on that are allowed, with their hits (n,)."""
+        poses, counts = [np.empty((0, 4, 4))], [np.empty(0, dtype=np.int64)]
+        for begin in range(0, len(path), BLOCK):
+            some = path.sample(begin, min(begin + BLOCK, len(path)))
+            is_allowed = self._contact.are_allowed(some)
+            n_allowed = len(some) if is_allowed.all() else int(np.argmin(is_allowed))
+            hits = self._space.hits(some[:n_allowed]) if n_allowed else counts[0]
+            poses.append(some[:n_allowed])
+            counts.append(hits)
+            if n_allowed < len(some) or (begin and not hits.any()):
+                break
+        return np.concatenate(poses), np.concatenate(counts)
+
+    def _free(self, poses: Floats) -> tuple[list[int], bool]:
+        """Middle and end of free poses (n, 4, 4): of those free with the guard, if any are."""
+        first, last = first_run(self._space.hits(poses, is_guarded=True) == 0)
+        is_guarded = first < last
+        if not is_guarded:
+            first, last = 0, len(poses)
+        return sorted({(first + last) // 2, last - 1}), is_guarded
+
+    def _is_new(self, pose: Floats, places: list[Floats]) -> bool:
+        """Whether a displacement differs from all others by more than `APART`, about."""
+        others = np.array(places)
+        turns = np.linalg.norm(pose[:3, :3] - others[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
+        shifts = (pose[:3, :3] - others[:, :3, :3]) @ self._problem.center
+        shifts += pose[:3, 3] - others[:, :3, 3]
+        motions = np.linalg.norm(shifts, axis=1) + self._problem.radius * turns
+        return bool((motions > APART * self._problem.voxel_size).all())
+
+    def _twists(self, pose: Floats) -> list[Twist]:
+        """Motions to try at a displacement: those that press against fewest contacts first."""
+        problem = self._problem
+        felt = self._contact.touch(pose)
+        points, normals = felt.contact_points, felt.contact_normals
+        center = pose[:3, :3] @ problem.center + pose[:3, 3]
+        found = [
+            twist
+            for twist in candidate_twists(points, normals, center, problem.radius, self._seed)
+            if twist.opposed <= MOST_OPPOSED
+        ]
+        return sorted(found, key=lambda twist: round(twist.opposed, 2))
+
+
+def candidate_twists(
+    points: Floats, normals: Floats, center: Floats, radius: float, seed: int
+) -> list[Twist]:
+    """Motions that contacts suggest: leaving all of them, shifts, and turns.
+
+    points, normals (C, 3) : contacts, unit normals away from what is touched; center (3,), radius :
+    of the part, metres.
+    """
+    middle = points.mean(axis=0) if len(points) else center
+    still = np.zeros(3)
+    leaving = leaving_twist(points, normals, center, radius)
+    shifts = candidate_directions(normals, seed)[:MOST_SHIFTS]
+    groups = grouped(normals)
+    crosses = np.array([np.cross(a, b) for a, b in combinations(groups, 2)]).reshape(-1, 3)
+    axes = distinct(np.concatenate([groups, AXES[:3], crosses]))
+    kept = [a for i, a in enumerate(axes) if not any(abs(float(a @ b)) > 0.99 for b in axes[:i])]
+    motions = [(leaving[:3], leaving[3:] / radius, center)] if leaving.any() else []
+    motions += [(direction, still, center) for direction in shifts]
+    for about in (center, middle) if np.linalg.norm(middle - center) > 0.1 * radius else (center,):
+        motions += [
+            (still, sign * axis / radius, about)
+            for axis in kept[:MOST_TURNED]
+            for sign in (1.0, -1.0)
+        ]
+    return [
+        Twist(shift, turn, about, _opposed(shift, turn, about, points, normals))
+        for shift, turn, about in motions
+    ]
+
+
+def leaving_twist(points: Floats, normals: Floats, center: Floats, radius: float) -> Floats:
+    """Unit twist (6,) that leaves all contacts: shift, and turn about `center` times radius.
+
+    It is the point of the convex hull of the contacts' wrenches that is nearest to zero: no contact
+    is left more slowly by it than the slowest one by any other. Zeros if the contacts hold the part
+    to first order, or there are none.
+    """
+    from scipy.optimize import nnls  # noqa: PLC0415 - a third of a second, for parts in contact
+
+    if not len(points):
+        return np.zeros(6)
+    wrenches = np.hstack([normals, np.cross(points - center, normals) / radius])
+    if len(wrenches) > MOST_GROUPS:
+        _, firsts, counts = np.unique(
+            np.rint(3.0 * wrenches), axis=0, return_index=True, return_counts=True
+        )
+        wrenches = wrenches[firsts[np.argsort(-counts, kind="stable")[:MOST_GROUPS]]]
+    weight = 100.0  # of the condition that the shares sum to 1
+    shares, _ = nnls(
+        np.vstack([wrenches.T, np.full(len(wrenches), weight)]), np.array([0.0] * 6 + [weight])
+    )
+    twist = wrenches.T @ shares
+    length = float(np.linalg.norm(twist))
+    if length < 1e-3 or float((wrenches @ twist).min()) < 0.0:
+        return np.zeros(6)
+    return np.asarray(twist / length)
+
+
+def _opposed(shift: Floats, turn: Floats, about: Floats, points: Floats, normals: Floats) -> float:
+    """Share of the contacts, 0 .. 1, that a motion presses against."""
+    if not len(points):
+        return 0.0
+    speeds = shift + np.cross(turn, points - about)
+    along = (speeds * normals).sum(axis=1)
+    return float((along < AGAINST * np.linalg.norm(speeds, axis=1).max()).mean())

@@ -1,0 +1,191 @@
+"""Parts that no straight pull frees: out of contact first, then past what blocks."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import hapticdb
+from extraction_scenes import SIZE, bayonet, elbow, grounded, ledge, pocket, slot, solids
+from hapticdb import Extraction, extract
+from hapticdb.extraction.loosening import Twist, leaving_twist
+
+Floats = NDArray[np.float64]
+
+
+def found_in(url: Path, part: str, **options: float) -> Extraction:
+    with hapticdb.open(url, read_only=True) as env:
+        return extract(env, part, **{"seconds": 500.0, **options})  # type: ignore[arg-type]
+
+
+def poses_of(found: Extraction) -> Floats:
+    """All samples (n, 4, 4) of the path, half a voxel apart."""
+    assert found.way is not None
+    path = found.way.swept.path
+    return path.sample(0, len(path))
+
+
+def places_in_boxes(found: Extraction, url: Path, part: str, inset: float) -> int:
+    """Number of places in the part, `inset` from its surface or more, that are in a box on the way.
+
+    The part is a box itself, so its places are a grid, and a place is in a box by its coordinates.
+    """
+    low, high = found.shell.points.min(axis=0) + inset, found.shell.points.max(axis=0) - inset
+    axes = [np.linspace(a, b, 7) for a, b in zip(low, high, strict=True)]
+    places = np.stack(np.meshgrid(*axes), axis=-1).reshape(-1, 3)
+    boxes, n = solids(url, part), 0
+    for pose in poses_of(found):
+        placed = places @ pose[:3, :3].T + pose[:3, 3]
+        n += int(((placed[:, None] > boxes[:, 0]) & (placed[:, None] < boxes[:, 1])).all(-1).sum())
+    return n
+
+
+def is_out(found: Extraction, url: Path, part: str) -> bool:
+    """Whether the part is beyond all boxes along an axis at the path's end."""
+    assert found.way is not None
+    end, boxes = found.way.poses[-1], solids(url, part)
+    placed = found.shell.points @ end[:3, :3].T + end[:3, 3]
+    beyond = placed.min(axis=0) > boxes[:, 1].max(axis=0)
+    below = placed.max(axis=0) < boxes[:, 0].min(axis=0)
+    return bool((beyond | below).any())
+
+
+def turn_of(poses: Floats) -> Floats:
+    """Angles (n,) of displacements (n, 4, 4), radians."""
+    traces = np.trace(poses[:, :3, :3], axis1=1, axis2=2)
+    return np.asarray(np.arccos(np.clip(0.5 * (traces - 1.0), -1.0, 1.0)))
+
+
+# --- scenes whose ways are known by construction --------------------------------------------------
+
+
+def test_a_block_in_a_pocket_is_lifted_and_then_pulled(tmp_path: Path) -> None:
+    url = pocket(tmp_path)
+    found = found_in(url, "block")
+    assert (found.verdict, found.pulls) == ("comes out of contact", found.blockers[0].pulls)
+    assert is_out(found, url, "block")
+    assert places_in_boxes(found, url, "block", 0.5 * SIZE) == 0
+
+
+def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) -> None:
+    url = ledge(tmp_path)
+    found = found_in(url, "plate")
+    assert (found.verdict, found.is_planned) == ("comes out of contact", True)
+    assert [obj.name for obj in found.touched] == ["base"]
+    assert is_out(found, url, "plate")
+    assert places_in_boxes(found, url, "plate", SIZE) == 0
+    shifts = poses_of(found)[:, :3, 3]
+    lifted = shifts[:, 2] > 0.01
+    assert (shifts[lifted, 0] > 0.02).all()  # the ledge covers 0.02 m
+
+
+def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Path) -> None:
+    url = bayonet(tmp_path)
+    found = found_in(url, "bar")
+    assert found.verdict == "comes out of contact"
+    assert is_out(found, url, "bar")
+    assert places_in_boxes(found, url, "bar", SIZE) == 0
+    poses = poses_of(found)
+    passing = (poses[:, 2, 3] > 0.01) & (poses[:, 2, 3] < 0.03)
+    assert passing.any()
+    assert (turn_of(poses[passing]) > 1.0).all()
+
+
+def test_a_peg_leaves_a_bent_channel(tmp_path: Path) -> None:
+    url = elbow(tmp_path)
+    found = found_in(url, "peg")
+    assert found.verdict == "comes out of contact"  # it stands on the channel's floor
+    assert is_out(found, url, "peg")
+    assert places_in_boxes(found, url, "peg", 0.5 * SIZE) == 0
+
+
+@pytest.mark.parametrize(("scene", "part"), [(ledge, "plate"), (bayonet, "bar")])
+def test_no_pull_cuts_through_what_it_touches(tmp_path: Path, scene: object, part: str) -> None:
+    """The part has fewer hits while it passes a thin wall than at its start."""
+    url = scene(tmp_path)  # type: ignore[operator]
+    found = found_in(url, part, motions=0)
+    assert found.way is None
+    assert found.blockers[0].pulls == found.pulls
+
+
+def test_a_block_on_the_floor_of_a_closed_box_has_no_way(tmp_path: Path) -> None:
+    found = found_in(grounded(tmp_path), "block", motions=200)
+    assert (found.verdict, found.is_planned) == ("no way found", True)
+    assert [one.object.name for one in found.blockers] == ["cage"]
+    assert 0 < found.motions <= 2 * 200
+
+
+def test_the_same_seed_leaves_contact_on_the_same_way(tmp_path: Path) -> None:
+    url = ledge(tmp_path)
+    found, again = found_in(url, "plate", seed=5), found_in(url, "plate", seed=5)
+    assert found.way is not None
+    assert again.way is not None
+    assert np.array_equal(found.way.poses, again.way.poses)
+    assert (found.motions, found.poses) == (again.motions, again.poses)
+
+
+@pytest.mark.long
+def test_a_plate_is_turned_to_pass_a_slot(tmp_path: Path) -> None:
+    url = slot(tmp_path)
+    found = found_in(url, "plate", seed=1)
+    assert (found.verdict, found.touched) == ("comes out", ())
+    assert is_out(found, url, "plate")
+    assert places_in_boxes(found, url, "plate", 0.0) == 0
+    assert turn_of(poses_of(found)).max() > 0.5
+    again = found_in(url, "plate", seed=1)
+    assert again.way is not None
+    assert found.way is not None
+    assert np.array_equal(found.way.poses, again.way.poses)
+
+
+# --- motions -------------------------------------------------------------------------------------
+
+numbers = st.floats(-1.0, 1.0)
+vectors = st.tuples(numbers, numbers, numbers)
+MARGIN = 0.1
+
+
+@given(st.lists(st.tuples(vectors, vectors), min_size=1, max_size=20), vectors)
+def test_no_motion_leaves_the_slowest_contact_faster(
+    contacts: list[tuple[tuple[float, ...], tuple[float, ...]]], center: tuple[float, ...]
+) -> None:
+    """Where a shift along z leaves all contacts by a margin, the found motion has it, too."""
+    points = np.array([point for point, _ in contacts])
+    normals = np.array([normal for _, normal in contacts])
+    normals[:, 2] = np.abs(normals[:, 2]) + 2.0 * MARGIN
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    margin = float(normals[:, 2].min())
+    found = leaving_twist(points, normals, np.array(center), 1.0)
+    assert np.linalg.norm(found) == pytest.approx(1.0)
+    speeds = found[:3] + np.cross(found[3:], points - np.array(center))
+    assert float((speeds * normals).sum(axis=1).min()) >= margin - 1e-6
+
+
+def test_a_part_that_is_held_all_around_is_left_by_no_motion() -> None:
+    """The middles of a box's sides hold no turn; its corners, touched on all sides, do."""
+    corners = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
+    points = np.repeat(corners, 3, axis=0)
+    normals = np.concatenate([-np.diag(corner) for corner in corners])
+    assert not leaving_twist(points, normals, np.zeros(3), 1.0).any()
+    assert not leaving_twist(np.empty((0, 3)), np.empty((0, 3)), np.zeros(3), 1.0).any()
+
+
+@given(vectors, vectors, vectors)
+def test_a_turn_keeps_its_centre_and_its_distances(
+    axis: tuple[float, ...], center: tuple[float, ...], point: tuple[float, ...]
+) -> None:
+    turn = np.array(axis)
+    if np.linalg.norm(turn) < 0.01:
+        return
+    middle, place = np.array(center), np.array(point)
+    poses = Twist(np.zeros(3), turn, middle, 0.0).along(np.eye(4), 1.0)
+    placed = poses[:, :3, :3] @ place + poses[:, :3, 3]
+    kept = poses[:, :3, :3] @ middle + poses[:, :3, 3]
+    assert np.allclose(kept, middle)
+    assert np.allclose(
+        np.linalg.norm(placed - middle, axis=1), np.linalg.norm(place - middle), atol=1e-9
+    )
+    assert np.array_equal(poses[0], np.eye(4))

@@ -100,6 +100,25 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert (code, json.loads(out)["parts_at"]) == (1, int(parted[1]))
 
 
+def test_a_budget_of_points_is_told_recorded_and_replayed(run: Run, scene: Path) -> None:
+    wish = feel(*PLAY, "--speed", 0.5, "--no-baseline", "--budget-points", 40)
+    code, out, err = run(*wish, "--record", "felt.hdbrec")
+    assert (code, err) == (0, "")
+    assert re.search(
+        r"^ *budget +40 points a frame; [\d,]+ frames? left out [\d,]+ points at most$", out,
+        re.MULTILINE,
+    )  # fmt: skip
+    assert Recording(scene.with_name("felt.hdbrec")).header.budget_points == 40
+    code, out, err = run("replay", "felt.hdbrec")
+    assert (code, err) == (0, "")
+    assert out.startswith("equal: ")
+    report = json.loads(run(*wish, "--json")[1])
+    assert report["budget_points"] == 40
+    assert 0 < report["left_out_frames"] <= report["loop"]["frames"]
+    assert report["most_left_out"] > 0
+    refused(run(*feel(*PLAY), "--record", "felt.hdbrec", "--append"), "budget_points")
+
+
 @pytest.mark.usefixtures("scene")
 def test_without_a_baseline_no_empty_loop_is_run(run: Run) -> None:
     wish = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.2)
@@ -155,6 +174,10 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         (["--device", "random", "--at", ABOVE, "--seed", -1], ["--seed -1: give 0 or more"]),
         ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
         ([*PLAY, "--budget", 0.5], ["--budget 0.5: give MiB"]),
+        ([*PLAY, "--budget-points", 0], ["a budget of 0 points leaves nothing to feel: give 1"]),
+        ([*PLAY, "--budget-points", -7], ["a budget of -7 points leaves nothing to feel: give 1"]),
+        ([*PLAY, "--budget-points", "nan"], ["--budget-points", "valid integer"]),
+        ([*PLAY, "--budget-points", "1.5"], ["--budget-points", "valid integer"]),
         ([*PLAY, "--stiffness", -5], ["stiffness"]),
         ([*PLAY, "--stiffness", 1e300], ["stiffness of 1e+300 N/m", "above 0, up to 1e+09"]),
         ([*PLAY, "--policy", "hope"], ["hold", "wait"]),

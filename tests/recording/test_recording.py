@@ -19,7 +19,7 @@ from hapticdb.kernels.rigid import poses_of
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import DistanceField
 from hapticdb.recording.file import CHUNK, FRAME, Frames, Recorder, Recording, State
-from hapticdb.recording.header import FORMAT_VERSION, PREAMBLE
+from hapticdb.recording.header import PREAMBLE, WORDS_VERSION
 from recordings import HEADER, header, motion, read, write
 
 repeatedly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
@@ -89,7 +89,7 @@ def test_a_filter_by_words_needs_the_third_version(tmp_path: Path) -> None:
     filters: list[dict[str, Any]] = [{"where": ["wheel*", 3]}, {"exclude": ["material=steel"]}]
     for name, felt in zip(("a.hdbrec", "b.hdbrec"), filters, strict=True):
         given = header(**felt)
-        assert PREAMBLE.unpack(given.packed()[: PREAMBLE.size])[1] == FORMAT_VERSION == 3
+        assert PREAMBLE.unpack(given.packed()[: PREAMBLE.size])[1] == WORDS_VERSION == 3
         Recorder(tmp_path / name, given).close()
         found = Recording(tmp_path / name).header
         assert (found.where, found.exclude) == (given.where, given.exclude)

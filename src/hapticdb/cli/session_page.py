@@ -92,7 +92,19 @@ def _frame_facts(report: "Report") -> Facts:
         f"{render.counted(report.held_frames, 'frame')}, "
         f"{report.stale_frames:,} while the database was silent"
     )
-    return [("touching", touching), ("not known", unknown), ("force held", held)]
+    facts = [("touching", touching), ("not known", unknown), ("force held", held)]
+    if report.budget_points is not None:
+        facts.append(("budget", budget_text(report)))
+    return facts
+
+
+def budget_text(report: "Report") -> str:
+    """How often the budget of points left some out, and how many."""
+    budget = f"{report.budget_points:,} points a frame"
+    if not report.left_out_frames:
+        return f"{budget}; none was left out"
+    frames = render.counted(report.left_out_frames, "frame")
+    return f"{budget}; {frames} left out {report.most_left_out:,} points at most"
 
 
 def force_facts(report: "Report") -> Facts:

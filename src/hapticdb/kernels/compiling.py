@@ -28,6 +28,7 @@ from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 ENTRIES = {
     "hand.coupling": "advance",
+    "hand.large": "advance_asleep",
     "hand.quasistatic": "advance",
     "proxy.linearize": "linearize",
     "hosting.loop": "run",
@@ -39,6 +40,7 @@ ENTRIES = {
     "resident.first_hits": "find_first_hits",
     "resident.feeling": "feel_kernel bounding_spheres",
     "resident.sleeping": "feel_sleeping",
+    "resident.budget": "feel_within",
     "query.refining": (
         "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
         "depths_of_hits"
@@ -69,6 +71,8 @@ NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name i
 TOGETHER = {
     "resident.feeling": "hand.coupling",
     "resident.sleeping": "hand.coupling",
+    "resident.budget": "hand.coupling",
+    "hand.large": "hand.coupling",
     "hosting.loop": "hand.quasistatic",
 }
 """Modules that are compiled after another module in the same process: they share its leaves."""
@@ -160,7 +164,13 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "rigid.*",
     ),
     "proxy": ("proxy.evaluate.*", "hand.handle.*"),
-    "large": (*_RESIDENT, "field.packing.unpack_kernel", "resident.sleeping.*"),
+    "large": (
+        *_RESIDENT,
+        "field.packing.unpack_kernel",
+        "resident.sleeping.*",
+        "resident.budget.*",
+        "hand.large.*",
+    ),
     "everything": ("*",),
 }
 """Entries that each purpose calls; ``*`` is any name (checked by `tests/house/test_warm.py`)."""

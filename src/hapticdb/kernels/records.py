@@ -119,6 +119,7 @@ SENT: Layout = _record(
         ("n_steps", "<i8"),  # made
         ("marks", "<i8"),  # bits named in `kernels.hand.coupling`; `flags` is NumPy's own name
         ("revision", "<i8"),  # of the database
+        ("left_out", "<i8"),  # points near something that the budget left out, most of a frame
     ]
 )
 """The result of a period of the loop."""
@@ -163,6 +164,16 @@ FOLLOWER: Layout = _record(
         ("reversals", "<f8"),  # of the force, forgotten as time passes
         ("extreme", "<f8"),  # N, greatest or least force since the last reversal
         ("is_rising", "?"),  # the force, since then
+        # of large tools, set by the caller
+        ("is_large", "?"),  # a run is tested by its sphere before its points are
+        ("most_looked", "<i8"),  # points that a look takes at most; 0: all
+        ("merges_from", "<i8"),  # near points from which one contact stands for several; 0: never
+        # of large tools, kept by the coupling
+        ("stride", "<i8"),  # every how manieth point is looked at; 0 counts as 1
+        ("merged", "<i8"),  # points for which one contact stands; 0 counts as 1
+        ("n_looked", "<i8"),  # points of the last look
+        ("n_left_out", "<i8"),  # points of its runs that were left out
+        ("most_left_out", "<i8"),  # of a look of this period
     ]
 )
 """What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""

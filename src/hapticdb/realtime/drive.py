@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.hand import coupling as plane_kernels
-from hapticdb.kernels.hand import quasistatic
+from hapticdb.kernels.hand import large, quasistatic
 from hapticdb.kernels.hand.anchors import BEFORE, MET_ROWS
 from hapticdb.kernels.hand.body import Body
 from hapticdb.kernels.hand.device_spring import DeviceSpring
@@ -23,10 +23,15 @@ from hapticdb.kernels.hand.near_points import (
     U,
 )
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS
-from hapticdb.kernels.resident import feeling
+from hapticdb.kernels.resident import budget, feeling
 from hapticdb.kernels.resident.cells import UNKNOWNS, Cells, Clusters, Place
+from hapticdb.kernels.resident.sleeping import LEFT_OUT, Sleepers
 from hapticdb.query.law import ForceLaw
+from hapticdb.resident.sleepers import counts_of
 
+MERGES_FROM = 4096
+"""Near points of the quasi-static coupling from which one contact stands for several. Larger:
+broader contacts are felt point by point, and a period with them takes longer."""
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Record = NDArray[np.void]
@@ -42,6 +47,10 @@ class DriveInputs(Protocol):
     servo: Record
     missed: NDArray[np.int64]
     pose: Floats
+    sleepers: Sleepers | None
+    """Of a large tool, or one with a budget of points; None: every run is tested in each frame."""
+    budget: int
+    """Most points near something that a frame looks at."""
 
 
 class PlaneDrive:
@@ -67,14 +76,21 @@ class PlaneDrive:
         self._tool = scene.servo["tool"]
         self._tool_before = self._tool.copy()
         self._torque = scene.servo["sent"]["wrench"][3:]
+        self._counts = counts_of(1)
 
     def step(self, dt: float) -> None:
         """Advance the tool by a period `dt` (s); `sent` then has the wrench for the device."""
         scene = self._scene
-        plane_kernels.advance(
-            self._cells, scene.row, scene.clusters, scene.place, self._body, scene.servo, dt,
-            self._met, scene.missed,
-        )  # fmt: skip
+        if scene.sleepers is None:
+            plane_kernels.advance(
+                self._cells, scene.row, scene.clusters, scene.place, self._body, scene.servo, dt,
+                self._met, scene.missed,
+            )  # fmt: skip
+        else:
+            large.advance_asleep(
+                self._cells, scene.row, scene.clusters, scene.place, self._body, scene.servo, dt,
+                self._met, scene.missed, scene.sleepers, scene.budget, self._counts,
+            )  # fmt: skip
         if self._scale != 1.0:
             self._torque /= self._scale
 
@@ -125,6 +141,11 @@ class SmoothDrive:
         self._missed_here = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._felt_here = np.zeros((1, RESULTS))
         self._felt, self._unknown = self._tool["felt"], scene.servo["sent"]["unknown"]
+        self._left_out, self._counts = scene.servo["sent"]["left_out"], counts_of(1)
+        self._follower["merges_from"] = MERGES_FROM
+        if scene.sleepers is not None:
+            self._follower["is_large"] = True
+            self._follower["most_looked"] = scene.budget if scene.budget < n_points else 0
 
     def step(self, dt: float) -> None:
         """Advance the tool by a period `dt` (s); `sent` then has the wrench for the device."""
@@ -133,6 +154,9 @@ class SmoothDrive:
             scene.cells, scene.row, scene.clusters, scene.place, self._spring, scene.servo,
             self._follower, dt, self._field, self._met, scene.missed,
         )  # fmt: skip
+        if scene.sleepers is not None and self._follower["n_active"]:
+            # a period in contact without a look rests on the last look
+            self._left_out[()] = max(self._left_out, self._follower["n_left_out"])
 
     @property
     def least_share(self) -> float:
@@ -167,9 +191,18 @@ class SmoothDrive:
         by now: `sent.unknown` counts them, and a replay leaves the frame out.
         """
         scene, felt = self._scene, self._felt_here[0]
-        feeling.feel_kernel(
-            scene.cells, scene.row, scene.clusters, scene.pose[None], scene.place, self._law,
-            self._met_here, self._missed_here, self._felt_here,
-        )  # fmt: skip
+        if scene.sleepers is None:
+            feeling.feel_kernel(
+                scene.cells, scene.row, scene.clusters, scene.pose[None], scene.place, self._law,
+                self._met_here, self._missed_here, self._felt_here,
+            )  # fmt: skip
+        else:
+            self._counts[:] = 0
+            budget.feel_within(
+                scene.cells, scene.row, scene.clusters, scene.pose[None], scene.place, self._law,
+                self._met_here, self._missed_here, self._felt_here, scene.sleepers, scene.budget,
+                self._counts,
+            )  # fmt: skip
+            self._left_out[()] = max(self._left_out, self._counts[0, LEFT_OUT])
         self._felt[:] = felt
         self._unknown += np.int64(felt[UNKNOWNS])

@@ -41,7 +41,8 @@ from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.frames import clusters_of
+from hapticdb.resident.frames import RUN, clusters_of, sleeps_by_itself
+from hapticdb.resident.sleepers import sleepers_of
 from hapticdb.resident.table import HEARTBEAT, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
@@ -87,6 +88,7 @@ class LoopRequest:
     is_waiting: bool
     has_baseline: bool = True
     is_recorded: bool = True
+    budget_points: int | None = None
 
 
 class Loop:
@@ -106,7 +108,11 @@ class Loop:
         self.cells, self.row = self.table.cells, request.row
         grid = request.grid
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-        self.clusters = clusters_of(request.shell, grid.voxel_size)
+        n_points, budget = len(request.shell), request.budget_points
+        sleeps = sleeps_by_itself(request.shell, budget)
+        self.clusters = clusters_of(request.shell, grid.voxel_size, RUN if sleeps else None)
+        self.sleepers = sleepers_of(self.clusters, budget) if sleeps else None
+        self.budget = min(budget or n_points, n_points)
         self.servo = np.zeros((), SERVO)
         self.tool, self.hand = self.servo["tool"], self.servo["hand"]
         self.sent = views_of(self.servo["sent"])
@@ -330,6 +336,7 @@ class Loop:
                 reading.buttons,
                 state,
             )
+            self._count_left_out()
             self._n_frames[()] = at + 1
             deadlines.done()
             if self._is_stopped() or (ends is not None and ends.is_over):
@@ -386,6 +393,13 @@ class Loop:
         if is_clutch_open:
             state |= State.CLUTCH_OPEN
         return int(state)
+
+    def _count_left_out(self) -> None:
+        """Count the points that the budget left out of a frame, and of its recorded wrench."""
+        left_out = self.sent.left_out.item()
+        if left_out:
+            self.counts.left_out_frames += 1
+            self.counts.most_left_out = max(self.counts.most_left_out, left_out)
 
     def close(self) -> None:
         """Set the force to zero, however the loop ended, and close the device."""

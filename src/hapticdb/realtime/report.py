@@ -98,6 +98,8 @@ class Counts:
     snapping_frames: int = 0
     guard_actions: int = 0
     least_share: float = 1.0
+    left_out_frames: int = 0
+    most_left_out: int = 0
     conditions: dict[str, str] = field(default_factory=dict)
 
 
@@ -161,6 +163,10 @@ class Report:
         How often the guard lowered the stiffness because the force went back and forth.
     least_share : float
         Share of the stiffness that the guard left.
+    budget_points : int or None
+        Most points near something that a frame looks at; None: all.
+    left_out_frames, most_left_out : int
+        Frames in which the budget left out points, and the most points that one frame left out.
     warm_up : float
         Seconds until all wanted cells were resident, before the first frame; after
         `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
@@ -216,6 +222,9 @@ class Report:
     guard_actions: int = 0
     least_share: float = 1.0
     loose_objects: tuple[int, ...] = ()
+    budget_points: int | None = None
+    left_out_frames: int = 0
+    most_left_out: int = 0
     conditions: dict[str, str] = field(default_factory=dict)
 
     @property

@@ -12,7 +12,7 @@ from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
-from hapticdb.pointshell.shell import PointShell
+from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.choosing import chosen_law, is_smooth
 from hapticdb.query.law import ForceLaw, LawName
@@ -33,6 +33,7 @@ from hapticdb.realtime.resident_cells import ResidentCells, start_error
 from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
+from hapticdb.resident.frames import sleeps_by_itself
 from hapticdb.resident.table import DEFAULT_BUDGET, anonymous_memory
 from hapticdb.store.finding import Words
 
@@ -87,6 +88,11 @@ class Session:
         Seconds without an answer of the database after which all frames act as if all cells were
         unknown; where cells come from a standby, seconds since they were last proved up to date
         (docs/postgresql.md, Replicas). With the policy "wait", resident cells are used on.
+    budget_points : int or None
+        Most points near something that a frame looks at; None: all. A frame with more looks at
+        every 2nd, 4th, 8th ... of them. A tool of 4096 points or more, or with a budget, has
+        clusters that sleep far from everything, which changes no result (docs/realtime.md, Large
+        tools).
     budget_bytes : int or None
     where, exclude : iterable of int or str
         As for `ResidentCells`; only with a URL, because sessions that share cells feel the same
@@ -132,6 +138,7 @@ class Session:
         handle: Handle | None = None,
         policy: Policy = "hold",
         staleness: float = DEFAULT_STALENESS,
+        budget_points: int | None = None,
         budget_bytes: int | None = None,
         where: Words = (),
         exclude: Words = (),
@@ -145,10 +152,10 @@ class Session:
     ) -> None:
         check_device(device)
         _check_choices(rate, seconds, staleness, policy)
+        self.budget_points, self._has_baseline = checked_budget(budget_points), has_baseline
         self.shell, self.handle = shell, handle or Handle()
         self.timing = Timing(rate, is_fifo, processor)
         self.timing.check_granted()
-        self._has_baseline = has_baseline
         self._owns_cells = isinstance(cells, str)
         law = "plane" if law is None and isinstance(coupling, Coupling) else law
         needs_distances = None if law is None else is_smooth(law)
@@ -157,8 +164,7 @@ class Session:
         self._check_distances()
         self.coupling = self._settled(coupling, device)
         self.proportions = self._compared(device)
-        self._pid = os.getpid()
-        self._row = self._memory = -1
+        self._pid, self._row, self._memory = os.getpid(), -1, -1
         self._process: Process | None = None
         self._objects: set[int] = set()
         self._loose_objects: set[int] = set()
@@ -214,7 +220,10 @@ class Session:
         staleness: float,
         seconds: float | None,
     ) -> None:
-        compile_missing(entries_for("feel"))  # here, so that the loop does not compile
+        purposes = ["feel"]
+        if sleeps_by_itself(self.shell, self.budget_points):
+            purposes.append("large")
+        compile_missing(entries_for(*purposes))  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
             self._recording.begin(self._header())
@@ -240,6 +249,7 @@ class Session:
             is_waiting=policy == "wait",
             has_baseline=self._has_baseline,
             is_recorded=self._recording is not None,
+            budget_points=self.budget_points,
         )
         self._process = Process(
             "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory]
@@ -259,6 +269,7 @@ class Session:
             where=self.cells.felt.where,
             exclude=self.cells.felt.exclude,
             coupling=asdict(self.coupling),
+            budget_points=self.budget_points,
         )
 
     def __enter__(self) -> Self:
@@ -391,6 +402,7 @@ class Session:
             proportions=self.proportions,
             law="smooth" if is_smooth(self.law) else "plane",
             coupling=self.coupling,
+            budget_points=self.budget_points,
             conditions={"points": str(len(self.shell)), **conditions},
             **counts,
         )

@@ -17,7 +17,7 @@ import numpy as np
 
 from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.pointshell.shell import MAX_POINTS, PointShell
+from hapticdb.pointshell.shell import MAX_POINTS, PointShell, checked_budget
 from hapticdb.query.choosing import law_named
 from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.store.connect import redact
@@ -26,14 +26,17 @@ from hapticdb.store.finding import Words
 
 MAGIC = b"HDBREC\r\n"
 """First bytes of each recording."""
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 """Newest version of the format; files of later versions are refused. A recording under the tangent
 plane is written as version 1, which earlier releases read; under another law as version 2; under a
-filter by words, which earlier releases would not see, as version 3."""
+filter by words, which earlier releases would not see, as version 3; with a budget of points, with
+which earlier releases would compute other wrenches, as version 4."""
 PLANE_VERSION = 1
 """Version of recordings under the tangent plane: their header names no law."""
 LAW_VERSION = 2
 """Version of recordings under another law that feel all objects but some ids."""
+WORDS_VERSION = 3
+"""Version of recordings without a budget whose filter has words."""
 PREAMBLE = struct.Struct("<8sIIII")
 """First fields of a header: magic, format version, bytes of JSON, points, CRC-32 of the header."""
 MOST_TEXT = 1 << 24
@@ -67,6 +70,8 @@ class Header:
     where, exclude : iterable of int or str
         Which objects were felt: see `hapticdb.store.filtering.Filter`. The words and no ids, since
         during the session others may have added objects that the words do not choose.
+    budget_points : int or None
+        Most points near something that a frame looked at; None: all.
     coupling : mapping
         Parameters of the virtual coupling by their names; the values are those of JSON.
     version : str
@@ -91,8 +96,10 @@ class Header:
     version: str = field(default_factory=lambda: version("hapticdb"))
     started: str = field(default_factory=_now)
     where: Words = ()
+    budget_points: int | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "budget_points", checked_budget(self.budget_points))
         if not (math.isfinite(self.rate) and self.rate > 0):
             raise UsageError(f"rate {self.rate}: give frames a second, above 0")
         try:
@@ -114,7 +121,16 @@ class Header:
         """Names of the fields that differ from another header's; time, revision, version aside."""
         names = [
             name
-            for name in ("environment", "grid", "law", "rate", "where", "exclude", "coupling")
+            for name in (
+                "environment",
+                "grid",
+                "law",
+                "rate",
+                "where",
+                "exclude",
+                "coupling",
+                "budget_points",
+            )
             if getattr(self, name) != getattr(other, name)
         ]
         return names if _arrays(self.shell) == _arrays(other.shell) else [*names, "shell"]
@@ -131,6 +147,7 @@ class Header:
         text = json.dumps(
             ({} if is_plane else {"law": "smooth"})
             | ({"where": self.where} if self.where else {})
+            | ({} if self.budget_points is None else {"budget_points": self.budget_points})
             | {
                 "environment": self.environment,
                 "grid": asdict(self.grid),
@@ -151,6 +168,8 @@ class Header:
         body = text + _arrays(self.shell)
         number = PLANE_VERSION if is_plane else LAW_VERSION
         if not Filter(self.where, self.exclude).is_fixed:
+            number = WORDS_VERSION
+        if self.budget_points is not None:
             number = FORMAT_VERSION
         counts = PREAMBLE.pack(MAGIC, number, len(text), len(shell), 0)[:-4]
         return counts + struct.pack("<I", zlib.crc32(body, zlib.crc32(counts))) + body
@@ -211,6 +230,7 @@ class Header:
                 coupling=told["coupling"],
                 version=str(told["version"]),
                 started=str(told["started"]),
+                budget_points=told.get("budget_points"),
             )
         except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
             raise FileError(f"{where}: its header cannot be used: {error}") from error

@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
-from hapticdb.errors import GridError
+from hapticdb.errors import GridError, UsageError
+from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.choosing import is_smooth
 from hapticdb.query.law import ForceLaw
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.frames import ResidentFrames, sleeps_by_itself
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.store.filtering import Filter
@@ -135,10 +136,13 @@ def resident(
     law: ForceLaw,
     exclude: Words = (),
     where: Words = (),
+    budget_points: int | None = None,
 ) -> Iterator[Feel]:
     """Provide a function that uses resident cells, fetched before their use: as fast as a session.
 
-    Its wrenches and hits are those of `touching`, bit for bit. The memory is freed at the end.
+    Its wrenches and hits are those of `touching`, bit for bit, unless `budget_points` bounds the
+    points of a frame: then they are those of a session with that budget. The memory is freed at the
+    end.
 
     Raises
     ------
@@ -146,9 +150,12 @@ def resident(
         If the environment is in lexicographic order, which has no cells, or if the law is by
         distances and an object has none.
     """
+    sleeps = sleeps_by_itself(shell, budget_points)
+    if sleeps:
+        compile_missing(entries_for("large"))
     with CellTable.create(distances=is_smooth(law)) as table:
         residency = Residency(environment.store, table, exclude, where=where)
-        frames = ResidentFrames(residency, shell, law)
+        frames = ResidentFrames(residency, shell, law, sleeps=sleeps, budget_points=budget_points)
         try:
             yield frames.wrenches
         finally:
@@ -188,6 +195,8 @@ def replay(
         If the environment has another grid than the recording.
     FileError
         If a chunk of the recording is damaged, unless `until_damage`.
+    UsageError
+        If the recording has a budget of points, and the environment has no cells.
     """
     header = recording.header
     if header.grid != environment.grid:
@@ -198,8 +207,15 @@ def replay(
     with ExitStack() as stack:
         if feel is None:
             felt = (environment, header.shell, header.law, header.exclude, header.where)
-            is_resident = environment.grid.is_hierarchical
-            feel = stack.enter_context(resident(*felt)) if is_resident else touching(*felt)
+            budget = header.budget_points
+            if environment.grid.is_hierarchical:
+                feel = stack.enter_context(resident(*felt, budget_points=budget))
+            elif budget is None:
+                feel = touching(*felt)
+            else:
+                raise UsageError(
+                    f"{environment.url} in lexicographic order has no cells: a budget needs them"
+                )
         comparison = _Comparison(environment, feel)
         for frames in recording.frames(until_damage=until_damage):
             comparison.add(frames)

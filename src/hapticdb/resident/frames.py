@@ -8,6 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import UsageError
 from hapticdb.kernels.law import felt_within, reads_distances
 from hapticdb.kernels.records import MOST_MISSED
+from hapticdb.kernels.resident import budget as budgets
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident import sleeping
 from hapticdb.kernels.resident.cells import (
@@ -15,6 +16,7 @@ from hapticdb.kernels.resident.cells import (
     DEEPEST,
     GROUP,
     HITS,
+    LISTED,
     RESULTS,
     SCRATCH_ROWS,
     UNKNOWN,
@@ -23,7 +25,7 @@ from hapticdb.kernels.resident.cells import (
     Clusters,
 )
 from hapticdb.kernels.resident.feeling import bounding_spheres, feel_kernel
-from hapticdb.pointshell.shell import PointShell
+from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.poses import as_floats
 from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.resident.residency import Residency
@@ -39,6 +41,12 @@ collisions and takes longer to clear."""
 SMALL = 16.0
 """Greatest radius of a run, voxels, for which the search for cells uses the run's middle instead of
 its points. A larger value looks up fewer places and fetches more cells that no point meets."""
+
+LARGE_FROM = 4096
+"""Points from which clusters of a session's tool sleep: one block of 64 runs of 64 points. A
+smaller tool has no block to skip at once. Results are the same: a larger value only costs time."""
+MOST_ROUNDS = 4096
+"""Most times that a frame beyond its budget is repeated because cells beside it were unknown."""
 
 Floats = NDArray[np.float64]
 
@@ -61,6 +69,11 @@ class FeltFrames(NamedTuple):
     deepest: Floats
     looked_at: NDArray[np.int64]
     left_out: NDArray[np.int64]
+
+
+def sleeps_by_itself(shell: PointShell, budget: int | None) -> bool:
+    """Whether clusters of a session's tool sleep: it is large, or has a budget of points."""
+    return len(shell) >= LARGE_FROM or budget is not None
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
@@ -183,10 +196,11 @@ class ResidentFrames:
         if not reads_distances(self.law):  # kernels are compiled for the plane without a payload
             self.cells = table.cells.without_distances()
         size = residency.grid.voxel_size
+        budget_points = checked_budget(budget_points)
         sleeps = sleeps or budget_points is not None
         self.clusters = clusters_of(shell, size, run or RUN if sleeps else run)
         self.sleepers = sleepers_of(self.clusters, budget_points) if sleeps else None
-        self.budget = len(shell) if budget_points is None else budget_points
+        self.budget = min(budget_points or len(shell), len(shell))
         self.met = np.empty(len(shell), dtype=np.int64)
         self.surroundings = surroundings_of(self.clusters, size, felt_within(self.law))
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
@@ -250,7 +264,9 @@ class ResidentFrames:
         """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
         part = slice(start, start + n_poses)
         place = self.residency.place
-        if self.sleepers is not None:
+        if self.budget < len(self.shell):
+            done = self._run_within_budget(poses[part], out[part], counts[part])
+        elif self.sleepers is not None:
             done = sleeping.feel_sleeping(
                 self.cells, self._row, self.clusters, poses[part], place, self.law, self.met,
                 self.missed, out[part], self.sleepers, self.budget, counts[part],
@@ -262,3 +278,30 @@ class ResidentFrames:
             )  # fmt: skip
         if done < n_poses:
             raise UsageError(f"pose {start + done} is no rigid transform: give a rotation")
+
+    def _run_within_budget(self, poses: Floats, out: Floats, counts: NDArray[np.int64]) -> int:
+        """Compute frames with a budget; returns the number done.
+
+        Which points a frame beyond its budget looks at depends on all cells beside its near runs,
+        so the frame is repeated until they are resident.
+        """
+        missed = self.missed
+        for n in range(len(poses)):
+            for _ in range(MOST_ROUNDS):
+                counts[n] = 0
+                if not budgets.feel_within(
+                    self.cells, self._row, self.clusters, poses[n : n + 1], self.residency.place,
+                    self.law, self.met, missed, out[n : n + 1], self.sleepers, self.budget,
+                    counts[n : n + 1],
+                ):  # fmt: skip
+                    return n
+                if not out[n, UNKNOWNS]:
+                    break
+                n_missed = missed[LISTED]
+                self.residency.make_resident(np.sort(missed[LISTED + 1 :][:n_missed]))
+            else:
+                raise UsageError(
+                    "the cells around the tool do not fit into the table: give it more memory, or "
+                    "leave out the budget of points"
+                )
+        return len(poses)

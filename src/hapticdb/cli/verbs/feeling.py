@@ -90,6 +90,15 @@ RecordLimitOption = Annotated[
         show_default="4GiB",
     ),
 ]
+BudgetPointsOption = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N",
+        help="Most points near something that a frame looks at; a frame with more looks at every "
+        "2nd, 4th, 8th ... of them, and the report says how many it left out.",
+        show_default="all",
+    ),
+]
 PolicyOption = Annotated[
     PolicyName,
     typer.Option(
@@ -171,6 +180,7 @@ def feel(
     replace: ReplaceOption = False,
     record_limit: RecordLimitOption = None,
     budget: BudgetOption = 256.0,
+    budget_points: BudgetPointsOption = None,
     policy: PolicyOption = "hold",
     staleness: StalenessOption = 1.0,
     law: LawOption = None,
@@ -195,18 +205,17 @@ def feel(
 
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
-    _check_loop(processor, policy, device)
-    motion = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
-    path_speed = motion.path_speed()
-    hand, handle = motion.open(path_speed), Handle(scale=scale, clutch=clutch)
+    _check_loop(processor, policy, device, budget_points)
+    given = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
+    hand, handle = given.open(path_speed := given.path_speed()), Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel")
     with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
         session = Session(
-            cells, shell, hand, rate=rate, seconds=seconds, **force.law_and_coupling(cells),
-            handle=handle, policy=policy, staleness=staleness, record=record,
-            append_recording=append, replace_recording=replace, record_limit_bytes=limit_bytes,
-            is_fifo=fifo, processor=processor, has_baseline=not no_baseline,
+            cells, shell, hand, rate=rate, seconds=seconds, policy=policy, handle=handle,
+            **force.law_and_coupling(cells), staleness=staleness, budget_points=budget_points,
+            record=record, append_recording=append, replace_recording=replace, is_fifo=fifo,
+            record_limit_bytes=limit_bytes, processor=processor, has_baseline=not no_baseline,
         )  # fmt: skip
         report, signals = _run(session, tool, force)
         _show(report, cells, shell, record, path_speed, json=json)
@@ -252,10 +261,14 @@ def _recording_limit(record: str | None, limit: str | None, *, is_continued: boo
     return limit_bytes
 
 
-def _check_loop(processor: int | None, policy: PolicyName, device: str) -> None:
+def _check_loop(
+    processor: int | None, policy: PolicyName, device: str, budget_points: int | None
+) -> None:
     """Refuse what the loop cannot do, before a kernel is compiled for it."""
+    from hapticdb.pointshell.shell import checked_budget
     from hapticdb.realtime.deadlines import Timing
 
+    checked_budget(budget_points)
     Timing(processor=processor).check_granted()
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")

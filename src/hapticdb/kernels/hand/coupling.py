@@ -37,6 +37,7 @@ from hapticdb.kernels.hand.anchors import (
 from hapticdb.kernels.hand.body import BODY, begin_anew, is_finite, is_somewhere
 from hapticdb.kernels.law import TangentPlaneLaw
 from hapticdb.kernels.records import RESULTS, SERVO
+from hapticdb.kernels.resident.budget import Awake, tool_frame
 from hapticdb.kernels.resident.cells import (
     CELLS,
     CLUSTERS,
@@ -51,7 +52,6 @@ from hapticdb.kernels.resident.cells import (
     begin_frame,
     end_frame,
 )
-from hapticdb.kernels.resident.feeling import felt
 from hapticdb.kernels.rigid import pose_of_quaternion, product, quaternion_by, turn, turn_of
 
 IS_HELD, IS_FADING, IS_DROPPED, IS_CUT, IS_STOPPED = 1, 2, 8, 16, 32
@@ -270,27 +270,9 @@ def slow_down(velocity, radius, fastest):
             velocity[n] *= fastest / speed
 
 
-@entry(CELLS, INT, CLUSTERS, PLACE, BODY, record_of(SERVO), FLOAT, INTS2, INTS)
-def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
-    """Move the tool for one period of dt seconds.
-
-    servo_record () of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
-    met (MET_ROWS, N) int64, rows as in `anchors`, and missed, as `felt` fills it, between periods.
-    `tool.felt` is the result of `felt` at exactly the tool's position and quaternion, in the cells
-    of one published version; its wrench is about the tool's centre of mass. `sent.wrench` is the
-    wrench of the coupling on the hand, about the handle's origin; it is exactly zero while no point
-    is a hit. Its force is at most k s, with the voxel size s: half from the spring, half from the
-    damper. Likewise its torque about the centre is at most k r s, with the radius r.
-
-    If a step would take points into unknown cells, the tool stays at rest before it. The wrench is
-    kept for `hold` seconds, then falls to zero within `fade` seconds; `sent.unknown` and missed
-    then belong to the pose that was tried. After that, and after the first frame, the wrench rises
-    to its full size within `fade` seconds and at least RISE_FRAMES frames. While the clutch is open
-    the wrench falls to zero, and the tool still follows the handle.
-
-    While the hand is not finite, the tool and the wrench are held. A tool that is not finite is
-    placed at the first finite hand, at rest.
-    """
+@leaf
+def move_body(watch, cells, reader, shell, place, body, servo_record, dt, met, missed):
+    """`advance`; watch: an `Awake` or an `Asleep`, which says how frames skip points."""
     # loops instead of slices: one assignment to a slice costs a second of compile time
     which = begin_frame(cells, reader)
     version = cells.readers[reader * READER_STRIDE]
@@ -322,7 +304,9 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
         pose_of_quaternion(
             position[0], position[1], position[2], turned[0], turned[1], turned[2], turned[3], pose
         )
-        felt(cells, which, shell, pose, place, law, next_met, missed, next_frame)
+        tool_frame(
+            watch, cells, which, version, shell, pose, place, law, next_met, missed, next_frame
+        )
         n_unknown = np.int64(next_frame[UNKNOWNS])
         if n_unknown == 0:
             if is_first:
@@ -418,7 +402,9 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
             for n in range(6):
                 velocity[n] = 0.0
             continue
-        felt(cells, which, shell, next_pose, place, law, next_met, missed, next_frame)
+        tool_frame(
+            watch, cells, which, version, shell, next_pose, place, law, next_met, missed, next_frame
+        )
         n_unknown = np.int64(next_frame[UNKNOWNS])
         if n_unknown > 0:
             break
@@ -470,3 +456,28 @@ def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
     sent.n_steps = n_steps
     sent.marks = flags
     sent.revision = revision
+
+
+@entry(CELLS, INT, CLUSTERS, PLACE, BODY, record_of(SERVO), FLOAT, INTS2, INTS)
+def advance(cells, reader, shell, place, body, servo_record, dt, met, missed):
+    """Move the tool for one period of dt seconds.
+
+    servo_record () of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
+    met (MET_ROWS, N) int64, rows as in `anchors`, and missed, as `felt` fills it, between periods.
+    `tool.felt` is the result of `felt` at exactly the tool's position and quaternion, in the cells
+    of one published version; its wrench is about the tool's centre of mass. `sent.wrench` is the
+    wrench of the coupling on the hand, about the handle's origin; it is exactly zero while no point
+    is a hit. Its force is at most k s, with the voxel size s: half from the spring, half from the
+    damper. Likewise its torque about the centre is at most k r s, with the radius r.
+
+    If a step would take points into unknown cells, the tool stays at rest before it. The wrench is
+    kept for `hold` seconds, then falls to zero within `fade` seconds; `sent.unknown` and missed
+    then belong to the pose that was tried. After that, and after the first frame, the wrench rises
+    to its full size within `fade` seconds and at least RISE_FRAMES frames. While the clutch is open
+    the wrench falls to zero, and the tool still follows the handle.
+
+    While the hand is not finite, the tool and the wrench are held. A tool that is not finite is
+    placed at the first finite hand, at rest.
+    """
+    watch = Awake(np.int64(0))
+    move_body(watch, cells, reader, shell, place, body, servo_record, dt, met, missed)

@@ -27,6 +27,7 @@ from hapticdb.kernels.resident.cells import (
     cell_key,
     enter_cell,
 )
+from hapticdb.kernels.resident.sleeping import placed_center, room_around
 from hapticdb.kernels.rigid import moment, moved, transform_of
 
 MARGIN = 0.5
@@ -68,8 +69,17 @@ FIELD_ROWS = NEAR + 2 * NEAR_ROWS
 NEAR_POINTS = 1
 """First of two rows of `met` with the indices of the near points, as `field` has their numbers. The
 row before takes the indices of the points that are felt."""
-OPEN, SHUT, NOT_KNOWN = 0, 1, 2
-"""What a look finds: the tool may be there; a point may not; points are in unknown cells."""
+OPEN, SHUT, NOT_KNOWN, CROWDED, MANY = 0, 1, 2, 3, 4
+"""What a look finds: the tool may be there; a point may not; points are in unknown cells; there are
+more points to look at than a look may take; there are so many near points that they are merged."""
+MOST_MERGED = 64
+"""Most points for which one contact stands: a run. Larger: broad contacts cost less."""
+LONGEST_REST = 16.0
+"""Most voxels that a run of a large tool may go before its sphere is tested again. Larger: fewer
+tests in free space, each of which reads more cells."""
+ROOMY = 4
+"""A look takes twice as many points again when the last one took less than this part of the most.
+Larger: points that were left out come back later, and the number of points changes less often."""
 
 
 @leaf
@@ -107,6 +117,20 @@ def distance_at(payload, slot, mask, x, y, z, dx, dy, dz):
     if dx != 0.0 or dy != 0.0 or dz != 0.0:
         u, gx, gy, gz, bound = outside_grid(u, gx, gy, gz, bound, dx, dy, dz)
     return u, gx, gy, gz, bound
+
+
+@inlined
+def bound_at(payload, slot, mask, x, y, z, dx, dy, dz):
+    """The bound of `distance_at` alone."""
+    if (mask >> brick_bit(np.int64(x), np.int64(y), np.int64(z))) & np.uint64(1):
+        bound = nearest_bound(payload, slot, x, y, z)
+        if bound < ENOUGH:
+            bound = lower_bound(payload, slot, x, y, z)
+    else:
+        bound = bound_in_free_block(x, y, z, 5 if slot == EMPTY_SLOT else 3)
+    if dx != 0.0 or dy != 0.0 or dz != 0.0:
+        bound = max(bound, math.sqrt(dx * dx + dy * dy + dz * dz))
+    return bound
 
 
 @leaf
@@ -183,7 +207,7 @@ def bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m):
 def look_at_run(
     cells, which, points, start, end, run, transform, place, center, follower, field, met, missed
 ):
-    """Look at points start .. end, which are run number `run` -> SHUT, or OPEN; see `look`."""
+    """Look at points start .. end, of run number `run` -> OPEN, or what ended it; see `look`."""
     keys, slots, masks, used = cells.keys, cells.slots, cells.masks, cells.used
     payload = cells.payload
     size, side = place.size, place.side
@@ -192,11 +216,17 @@ def look_at_run(
     base, near = NEAR + half * NEAR_ROWS, NEAR_POINTS + half
     travelled, n_near, n_missed = follower.travelled, follower.n_tried, missed[LISTED]
     is_walking, run_due = follower.is_walking, NEVER
+    stride, n_looked, most_looked = follower.stride, follower.n_looked, follower.most_looked
+    merged, most_near = follower.merged, follower.merges_from
     last_key, slot, mask = np.int64(-1), np.int64(UNKNOWN), np.uint64(0)
-    for n in range(start, end):
+    first = start + -start % stride
+    for n in range(first, end, stride):
         if travelled < field[DUE, n]:
             run_due = min(run_due, field[DUE, n])
             continue
+        if 0 < most_looked <= n_looked:
+            return CROWDED
+        n_looked += 1
         px, py, pz = moved(transform, points[n, 0], points[n, 1], points[n, 2])
         x, dx = clamped_into((px - place.x) / size, side)
         y, dy = clamped_into((py - place.y) / size, side)
@@ -211,6 +241,12 @@ def look_at_run(
             follower.n_unknown += 1
             field[DUE, n] = run_due = -NEVER
             continue
+        if n & (merged - 1):  # another point's contact stands for this one
+            bound = bound_at(payload, slot, mask, x, y, z, dx, dy, dz)
+            if bound >= LEAST_BOUND:
+                field[DUE, n] = travelled + bound - FAR
+                run_due = min(run_due, field[DUE, n])
+                continue
         u, gx, gy, gz, bound = distance_at(payload, slot, mask, x, y, z, dx, dy, dz)
         field[DUE, n] = travelled + bound - FAR
         run_due = min(run_due, field[DUE, n])
@@ -221,6 +257,8 @@ def look_at_run(
             or (bound < LEAST_BOUND and bound <= field[LAST_BOUND, n])
         ):
             return SHUT
+        if 0 < most_near <= n_near and merged < MOST_MERGED:
+            return MANY
         met[near, n_near] = n
         field[base + U, n_near], field[base + BOUND, n_near] = u, bound
         rx, ry, rz = px - cx, py - cy, pz - cz
@@ -232,6 +270,48 @@ def look_at_run(
         n_near += 1
     field[RUN_DUE, run] = run_due
     follower.n_tried, missed[LISTED] = n_near, n_missed
+    follower.n_looked = n_looked
+    follower.n_left_out += end - start - (end - first + stride - 1) // stride
+    return OPEN
+
+
+@leaf
+def rest_of_sphere(cells, which, spheres, run, transform, place):
+    """Voxels that a run's sphere may go before a point of it can be near; not above 0 if one is."""
+    x, y, z = placed_center(spheres, run, transform, place)
+    return room_around(
+        cells.keys, cells.slots, cells.masks, cells.used, which, x, y, z,
+        spheres[run, 3] / place.size + FAR, LONGEST_REST, place.side,
+    )  # fmt: skip
+
+
+@leaf
+def look_at_due_runs(
+    cells, which, shell, transform, place, center, way, follower, field, met, missed
+):
+    """Look at the points of all runs that are due -> OPEN, SHUT, CROWDED or MANY.
+
+    The sphere of a run that was near at the last look, a way ago, is not tested.
+    """
+    points, run, travelled = shell.points, shell.run, follower.travelled
+    follower.n_tried = follower.n_unknown = follower.n_looked = follower.n_left_out = 0
+    missed[LISTED] = 0
+    for start in range(0, points.shape[0], run):
+        at = start // run
+        if travelled < field[RUN_DUE, at]:
+            continue
+        is_new = field[RUN_DUE, at] == -NEVER or field[RUN_DUE, at] >= travelled - way
+        if follower.is_large and is_new:
+            rest = rest_of_sphere(cells, which, shell.spheres, at, transform, place)
+            if rest > 0.0:
+                field[RUN_DUE, at] = travelled + rest
+                continue
+        found = look_at_run(
+            cells, which, points, start, min(start + run, points.shape[0]), at, transform, place,
+            center, follower, field, met, missed,
+        )  # fmt: skip
+        if found != OPEN:
+            return found
     return OPEN
 
 
@@ -242,26 +322,33 @@ def look(cells, which, shell, pose, place, way, is_walking, follower, field, met
     way: voxels that the farthest point has moved since the last look. is_walking: SHUT if a point
     is nearer than FLOOR or LEAST_BOUND allow, and no farther than at the tool's pose. The near
     points go into the half of `field` and `met` that the tool's pose does not use; SHUT leaves it
-    unfinished.
+    unfinished. Where there are more points to look at than `most_looked`, only every 2nd, 4th, 8th
+    ... point of the shell is looked at, until `take_more_points`. Where `merges_from` points are
+    near, one contact stands for 2, 4, 8 ... neighbours by index, up to `MOST_MERGED`. Of the others
+    only the bounds are computed, so that no point passes a surface.
     """
-    points, run = shell.points, shell.run
     transform = transform_of(pose)
     center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     follower.travelled += way
     follower.is_walking = is_walking
     follower.n_looks += 1
-    follower.n_tried = follower.n_unknown = 0
-    missed[LISTED] = 0
+    follower.stride, follower.merged = max(follower.stride, 1), max(follower.merged, 1)
+    while True:
+        found = look_at_due_runs(
+            cells, which, shell, transform, place, center, way, follower, field, met, missed
+        )
+        if found == CROWDED:  # points that were seen to be far are not looked at again
+            follower.stride *= 2
+        elif found == MANY:
+            follower.merged *= 2
+        else:
+            break
+    follower.most_left_out = max(follower.most_left_out, follower.n_left_out)
+    if found == SHUT:
+        return SHUT
     travelled, least = follower.travelled, NEVER
-    for start in range(0, points.shape[0], run):
-        if not travelled < field[RUN_DUE, start // run]:
-            end = min(start + run, points.shape[0])
-            if look_at_run(
-                cells, which, points, start, end, start // run, transform, place, center, follower,
-                field, met, missed,
-            ) == SHUT:  # fmt: skip
-                return SHUT
-        least = min(least, field[RUN_DUE, start // run])
+    for run in range((shell.points.shape[0] + shell.run - 1) // shell.run):
+        least = min(least, field[RUN_DUE, run])
     follower.tried_clearance = least - travelled + FAR
     return OPEN if follower.n_unknown == 0 else NOT_KNOWN
 
@@ -285,6 +372,20 @@ def settle(follower, field, met):
     follower.side, follower.n_near = after, follower.n_tried
     follower.clearance, follower.astray = follower.tried_clearance, 0.0
     follower.least_clearance = min(follower.least_clearance, follower.clearance)
+
+
+@leaf
+def take_more_points(follower, field):
+    """Let the next look take twice as many points, if there is room -> whether it does."""
+    if follower.stride > 1 and ROOMY * follower.n_looked <= follower.most_looked:
+        follower.stride //= 2
+    elif follower.merged > 1 and ROOMY * follower.n_near <= follower.merges_from:
+        follower.merged //= 2
+    else:
+        return False
+    for n in range(field.shape[1]):
+        field[RUN_DUE, n] = -NEVER
+    return True
 
 
 @leaf

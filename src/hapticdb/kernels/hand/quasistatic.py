@@ -51,6 +51,7 @@ from hapticdb.kernels.hand.near_points import (
     look,
     look_anew,
     settle,
+    take_more_points,
 )
 from hapticdb.kernels.hand.path import MOST_LOOKS, keep_pose, place_on_way, walk, way_of_step
 from hapticdb.kernels.hand.steadying import (
@@ -156,6 +157,28 @@ def look_here(cells, which, shell, place, tool, follower, field, met, missed):
         is_sunk = least_distance(follower, field) < FLOOR
     follower.is_loose = follower.is_loose or is_sunk
     return True
+
+
+@leaf
+def look_at_more(cells, which, shell, place, tool, follower, field, met, missed):
+    """Look where the tool is, at points left out before -> OPEN or NOT_KNOWN.
+
+    A point that comes back feels contact from where it is, so that no force jumps. It goes no
+    nearer to a surface than it is, if it is nearer than FLOOR.
+    """
+    position, turned = tool.position, tool.quaternion
+    pose_of_quaternion(
+        position[0], position[1], position[2], turned[0], turned[1], turned[2], turned[3],
+        tool.tried_pose,
+    )  # fmt: skip
+    found = look(
+        cells, which, shell, tool.tried_pose, place, follower.astray, np.bool_(False), follower,
+        field, met, missed,
+    )  # fmt: skip
+    if found == OPEN:
+        meet_change(follower, field, met)
+        settle(follower, field, met)
+    return found
 
 
 @leaf
@@ -363,12 +386,15 @@ def advance(
                 tool.quaternion[n] = hand.quaternion[n]
     found = OPEN
     follower.n_looks, follower.least_clearance = 0, NEVER
+    follower.most_left_out = 0
     if not is_held:
         if tool.version != version or has_moved(tool, follower):
             if look_here(cells, which, shell, place, tool, follower, field, met, missed):
                 tool.version = version
             else:
                 found = NOT_KNOWN
+        elif take_more_points(follower, field):
+            found = look_at_more(cells, which, shell, place, tool, follower, field, met, missed)
         if found == OPEN:
             if follower.is_loose:
                 found = follow_loosely(
@@ -388,5 +414,6 @@ def advance(
     sent.contacts = np.int64(tool.felt[CONTACTS])
     sent.unknown = follower.n_unknown if found == NOT_KNOWN else 0
     sent.deepest = tool.felt[DEEPEST]
+    sent.left_out = follower.most_left_out
     sent.n_steps = follower.n_looks
     sent.revision = revision

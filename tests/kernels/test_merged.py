@@ -1,0 +1,162 @@
+"""Broad contacts of the quasi-static coupling: merged, and with a budget of points."""
+
+import numba
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from closed_forms import Field, Hand, cylinder, field_of, plane, punch, sheet
+from hapticdb.kernels.hand.near_points import MOST_MERGED
+from hapticdb.kernels.resident.feeling import bounding_spheres
+from hapticdb.realtime.drive import MERGES_FROM
+
+Floats = NDArray[np.float64]
+NEEDS_JIT = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="too slow without the JIT")
+SIZE = 0.005
+FROM = 128
+"""Near points from which these tests merge."""
+RISE = np.array([0.0, 0.0, 0.03])
+
+
+def in_curve_order(points: Floats) -> Floats:
+    """Points sorted along a Z-order curve, as shells made from files are."""
+    cells = ((points - points.min(axis=0)) / np.ptp(points) * 255.0).astype(np.int64)
+    codes = sum(((cells[:, a] >> b) & 1) << (3 * b + a) for a in range(3) for b in range(8))
+    ordered: Floats = points[np.argsort(codes, kind="stable")]
+    return ordered
+
+
+def hand_over(field: Field, points: Floats, at: Floats, **follower: int) -> Hand:
+    """A hand that rests 30 mm above a place, with numbers of its follower set."""
+    hand = Hand(field, points, at + RISE)
+    if follower.get("is_large"):
+        spheres = np.empty((-(-len(points) // 64), 4))
+        bounding_spheres(hand.shell.points, 64, 1e-3 * SIZE, spheres)
+        hand.shell = hand.shell._replace(spheres=spheres)
+    for name, number in follower.items():
+        hand.follower[name] = number
+    hand.advance()
+    return hand
+
+
+def press(hand: Hand, at: Floats, slide: float = 0.0) -> Floats:
+    """Come down to a place in 40 periods, slide aside in 40; all forces (80, 3), N."""
+    ways = [*(RISE * (1.0 - s) for s in np.linspace(0.0, 1.0, 40))]
+    ways += [np.array([slide * s, 0.0, 0.0]) for s in np.linspace(0.0, 1.0, 40)]
+    return np.array([hand.move(at + way) for way in ways])
+
+
+BROAD = in_curve_order(punch(40, 0.002))
+PRESSED = np.array([0.0, 0.0, 1.5 * SIZE - 0.004])
+"""Place at which a flat tool over the plane z = 0 is 4 mm deep."""
+
+
+@NEEDS_JIT
+def test_a_merged_contact_with_a_plane_is_as_stiff_as_single_ones() -> None:
+    """Force = stiffness times depth, to the accuracy of stored distances; no force aside."""
+    field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
+    single = hand_over(field, BROAD, PRESSED)
+    merged = hand_over(field, BROAD, PRESSED, merges_from=FROM)
+    one, other = press(single, PRESSED, 0.02), press(merged, PRESSED, 0.02)
+    assert merged.follower["merged"] > 1
+    assert FROM // 2 < merged.sent.contacts <= FROM < single.sent.contacts == len(BROAD)
+    assert other[-1, 2] == pytest.approx(4.0, rel=0.01, abs=1000.0 * SIZE * 2.75 / 508)
+    np.testing.assert_allclose(other, one, atol=0.03)
+    np.testing.assert_allclose(merged.sent.wrench[3:], single.sent.wrench[3:], atol=2e-4)
+
+
+@NEEDS_JIT
+def test_merged_contacts_with_a_curved_surface_push_as_single_ones_do() -> None:
+    """A flat tool on a cylinder of 20 voxels: the line of contact lies between merged points."""
+    field = field_of(cylinder(0.1), SIZE, (2, 2, 2))
+    at = np.array([0.0, 0.0, 0.1]) + PRESSED
+    single, merged = hand_over(field, BROAD, at), hand_over(field, BROAD, at, merges_from=FROM)
+    one, other = press(single, at, 0.01), press(merged, at, 0.01)
+    assert merged.follower["merged"] > 1
+    strength = np.linalg.norm(one[30:], axis=1).max()
+    assert np.linalg.norm(other - one, axis=1).max() <= 0.05 * strength
+
+
+@NEEDS_JIT
+def test_with_fewer_near_points_nothing_changes_bit_for_bit() -> None:
+    field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
+    few = hand_over(field, BROAD, PRESSED, merges_from=len(BROAD) + 1)
+    never = hand_over(field, BROAD, PRESSED)
+    assert press(few, PRESSED, 0.02).tobytes() == press(never, PRESSED, 0.02).tobytes()
+    assert few.state.tobytes() == never.state.tobytes()
+    assert MERGES_FROM >= MOST_MERGED
+
+
+@NEEDS_JIT
+def test_contacts_are_single_again_when_the_tool_is_lifted_and_no_force_stays() -> None:
+    field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
+    hand = hand_over(field, BROAD, PRESSED, merges_from=FROM)
+    press(hand, PRESSED)
+    for share in np.linspace(0.0, 1.0, 40):
+        force = hand.move(PRESSED + share * RISE)
+        assert force[2] >= 0.0
+    hand.rest(10)
+    assert hand.follower["merged"] == 1
+    assert not hand.sent.wrench.any()
+
+
+@NEEDS_JIT
+@pytest.mark.parametrize("speed", [0.5, 5.0, 50.0])
+def test_no_point_passes_a_sheet_whether_its_contact_is_merged_or_not(speed: float) -> None:
+    """A broad tilted tool is thrown at a sheet without thickness: all points stay above it."""
+    field = field_of(sheet([0.0, 0.0, 1.0]), SIZE)
+    start = np.array([0.0, 0.0, 0.04])
+    hand = Hand(field, BROAD, start, (0.995, 0.0995, 0.0, 0.0))
+    hand.follower["merges_from"] = FROM
+    hand.advance()
+    for n in range(1, 120):
+        hand.move(start - [0.0, 0.0, min(speed * 1e-3 * n, 0.12)])
+        assert hand.placed[:, 2].min() > 0.0
+    assert hand.follower["merged"] > 1
+
+
+@NEEDS_JIT
+def test_a_look_takes_no_more_points_than_its_budget_and_the_force_stays() -> None:
+    """The hand feels its spring, so a plane is as stiff with a part of the points."""
+    field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
+    hand = hand_over(field, BROAD, PRESSED, most_looked=100, is_large=True)
+    looked = []
+    for share in np.linspace(1.0, 0.0, 60):
+        force = hand.move(PRESSED + share * RISE)
+        looked.append(int(hand.follower["n_looked"]))
+    assert 0 < max(looked) <= 100
+    assert force[2] == pytest.approx(4.0, rel=0.01, abs=1000.0 * SIZE * 2.75 / 508)
+    assert hand.follower["n_left_out"] > len(BROAD) // 2
+    assert hand.sent.contacts <= 100
+    for height in np.linspace(1.0, 3.0, 40):
+        hand.move(PRESSED + height * RISE)
+    assert hand.follower["stride"] == 1
+    assert hand.follower["n_left_out"] == hand.sent.left_out == 0
+    assert not hand.sent.wrench.any()
+
+
+@NEEDS_JIT
+def test_points_that_come_back_make_no_force_jump() -> None:
+    """A tool pressed flat with a part of its points is lifted slowly: the force only falls."""
+    field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
+    hand = hand_over(field, BROAD, PRESSED, most_looked=100, is_large=True)
+    press(hand, PRESSED)
+    hand.follower["most_looked"] = 8 * len(BROAD)  # so that all points come back in contact
+    forces = np.array([hand.move(PRESSED)[2] for _ in range(20)])
+    assert hand.follower["stride"] == 1
+    assert np.abs(np.diff(forces)).max() < 0.02
+    lifted = np.array([hand.move(PRESSED + RISE * s)[2] for s in np.linspace(0.0, 1.0, 200)])
+    assert (np.diff(lifted) <= 0.02).all()
+    assert lifted[-1] == 0.0
+
+
+@NEEDS_JIT
+def test_runs_that_are_tested_by_their_spheres_change_no_force() -> None:
+    """A hand that comes from afar, slides, and leaves, over a plane and a cylinder."""
+    for distance, height in ((plane([0.0, 0.0, 1.0]), 0.0), (cylinder(0.1), 0.1)):
+        field = field_of(distance, SIZE)
+        at = PRESSED + np.array([0.0, 0.0, height])
+        plain, large = hand_over(field, BROAD, at), hand_over(field, BROAD, at, is_large=True)
+        one, other = press(plain, at, 0.03), press(large, at, 0.03)
+        assert one.any()
+        np.testing.assert_allclose(other, one, atol=1e-9)

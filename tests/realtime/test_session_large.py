@@ -1,0 +1,162 @@
+"""Sessions of large tools: clusters sleep by themselves, and a budget bounds the points."""
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from banded import write_points
+from children import PATIENCE
+from hapticdb import Environment, Grid, PointShell, UsageError
+from hapticdb.devices.scripted import Player
+from hapticdb.kernels.rigid import poses_of
+from hapticdb.realtime.report import Report
+from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.realtime.session import Session
+from hapticdb.recording.file import Recording, State
+from hapticdb.recording.header import FORMAT_VERSION, Header
+from hapticdb.recording.replay import replay
+from hapticdb.resident.frames import LARGE_FROM, ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
+from realtime.hands import at, still
+from realtime.sessions import NEVER_STALE, floor_points, floored, recorded
+from realtime.worlds import SIZE, make
+
+RATE = 100.0
+"""Frames a second: periods so long that a busy machine keeps them."""
+BUDGET = 150
+
+
+class Ground(NamedTuple):
+    """An environment with a floor, its cells, and the height at which a tool begins to touch."""
+
+    env: Environment
+    cells: ResidentCells
+    height: float
+
+
+@pytest.fixture(scope="module", params=["plane", "smooth"])
+def ground(
+    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[Ground]:
+    folder = tmp_path_factory.mktemp(request.param)
+    with make(folder, bits=6) as made:
+        if request.param == "plane":
+            floored(made)
+        else:
+            write_points(made.store, floor_points(31.5), "floor")
+        with ResidentCells(made.url, budget_bytes=4 << 20) as cells:
+            yield Ground(made, cells, 0.0 if request.param == "plane" else 1.0 * SIZE)
+
+
+@pytest.fixture(scope="module")
+def plate() -> PointShell:
+    """A plate of `LARGE_FROM` points in Z-order: its lower edge is felt, the rest stands up."""
+    ij = np.argwhere(np.ones((64, 64), dtype=bool))
+    codes = sum(((ij[:, a] >> b) & 1) << (2 * b + a) for a in range(2) for b in range(6))
+    ij = ij[np.argsort(codes)]
+    points = np.column_stack([(ij[:, 0] - 31.5) * 4e-4, np.zeros(len(ij)), ij[:, 1] * 4e-4])
+    shell = PointShell(points, np.tile((0.0, 0.0, 1.0), (len(ij), 1)), np.array([0, 0, 0.012]))
+    assert len(shell) == LARGE_FROM
+    return shell
+
+
+def pressing(low: float) -> Player:
+    """A hand that comes down, slides, and leaves, in a second and a half."""
+    places = [(0.0, 0.02), (0.0, low), (0.008, low), (-0.008, low), (-0.008, 0.02)]
+    return Player(np.linspace(0.0, 1.5, 5), [at(x, 0.0, z) for x, z in places])
+
+
+def felt(ground: Ground, shell: PointShell, path: Path, budget: int | None = None) -> Report:
+    hand = pressing(ground.height - 0.003)
+    with Session(
+        ground.cells, shell, hand, rate=RATE, record=path, staleness=NEVER_STALE,
+        budget_points=budget, has_baseline=False,
+    ) as session:  # fmt: skip
+        report = session.wait(PATIENCE)
+    assert report is not None
+    return report
+
+
+def test_clusters_of_a_large_tool_sleep_and_change_no_bit(
+    ground: Ground, plate: PointShell, tmp_path: Path
+) -> None:
+    """The recorded wrenches are those of the flat loop at the recorded poses."""
+    report = felt(ground, plate, tmp_path / "s.hdbrec")
+    assert report.contact_frames > 0
+    assert report.budget_points is None
+    assert (report.left_out_frames, report.most_left_out) == (0, 0)
+    recording, frames = Recording(tmp_path / "s.hdbrec"), recorded(tmp_path / "s.hdbrec")
+    known = frames[(frames["unknown"] == 0) & (frames["state"] & State.HELD == 0)]
+    poses = np.empty((len(known), 4, 4))
+    poses_of(np.ascontiguousarray(known["tool"]), poses)
+    with CellTable.create(4 << 20, distances=ground.cells.has_distances) as table:
+        residency = Residency(ground.env.store, table)
+        flat = ResidentFrames(residency, plate, recording.header.law, run=0).feel(poses)
+    assert flat.wrenches.tobytes() == np.ascontiguousarray(known["wrench"]).tobytes()
+    assert (flat.hits == known["hits"]).all()
+    assert flat.wrenches.any()
+    assert replay(recording, ground.env).is_equal
+
+
+def test_a_budget_is_kept_reported_recorded_and_replayed_bit_for_bit(
+    ground: Ground, plate: PointShell, tmp_path: Path
+) -> None:
+    report = felt(ground, plate, tmp_path / "s.hdbrec", BUDGET)
+    assert report.budget_points == BUDGET
+    assert 0 < report.left_out_frames <= report.loop.frames
+    assert 0 < report.most_left_out < len(plate)
+    figures = json.loads(json.dumps(report.figures(), allow_nan=False))
+    assert figures["budget_points"] == BUDGET
+    assert figures["left_out_frames"] == report.left_out_frames
+    assert figures["most_left_out"] == report.most_left_out
+    recording, frames = Recording(tmp_path / "s.hdbrec"), recorded(tmp_path / "s.hdbrec")
+    assert recording.header.budget_points == BUDGET
+    assert (frames["hits"] <= BUDGET).all()
+    assert frames["wrench"].any()
+    replayed = replay(recording, ground.env)
+    assert replayed.is_equal, replayed.describe()
+    assert replayed.n_compared > report.loop.frames // 2
+    number = struct.unpack_from("<I", (tmp_path / "s.hdbrec").read_bytes(), 8)[0]
+    assert number == FORMAT_VERSION
+
+
+def test_a_budget_that_is_never_reached_leaves_nothing_out(
+    ground: Ground, plate: PointShell, tmp_path: Path
+) -> None:
+    report = felt(ground, plate, tmp_path / "s.hdbrec", len(plate))
+    assert (report.budget_points, report.left_out_frames) == (len(plate), 0)
+    assert replay(Recording(tmp_path / "s.hdbrec"), ground.env).is_equal
+
+
+@pytest.mark.parametrize(
+    ("budget", "words"),
+    [
+        (0, "a budget of 0 points leaves nothing to feel: give 1 or more"),
+        (-3, "a budget of -3 points leaves nothing to feel"),
+        (1.5, r"a budget of 1\.5 points: give a whole number, 1 or more"),
+        (float("nan"), "a budget of nan points: give a whole number"),
+        ("many", "a budget of 'many' points: give a whole number"),
+        (True, "a budget of True points: give a whole number"),
+    ],
+)
+def test_a_budget_that_is_no_number_of_points_is_refused(
+    ground: Ground, plate: PointShell, budget: object, words: str
+) -> None:
+    with pytest.raises(UsageError, match=words):
+        Session(ground.cells, plate, still(0.03), budget_points=budget)  # type: ignore[arg-type]
+
+
+def test_headers_with_another_budget_differ_and_a_header_without_one_is_as_before() -> None:
+    shell = PointShell.sphere(0.01, 10)
+    grid = Grid(SIZE, (0.0, 0.0, 0.0), 6)
+    with_one, other, without = (
+        Header("a.db", grid, 1, shell, 100.0, budget_points=n) for n in (5, 6, None)
+    )
+    assert with_one.differing(other) == with_one.differing(without) == ["budget_points"]
+    assert b"budget_points" not in without.packed()

@@ -25,9 +25,9 @@ import hapticdb
 from awake import awake
 from hapticdb import DistanceField, GridOptions, ImportOptions, PointShell, TangentPlane
 from hapticdb.bench import records
+from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT, feel_sleeping
 from hapticdb.kernels.resident.cells import RESULTS
 from hapticdb.kernels.resident.feeling import feel_kernel
-from hapticdb.kernels.resident.sleeping import LEFT_OUT, LOOKED_AT, feel_sleeping
 from hapticdb.query.law import ForceLaw
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency

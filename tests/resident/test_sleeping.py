@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from banded import move_points, write_points
 from hapticdb import Environment, PointShell, UsageError
 from hapticdb.kernels.field.law import DistanceFieldLaw
-from hapticdb.kernels.resident.sleeping import BLOCK, REST, way_of_box
+from hapticdb.kernels.large.sleeping import BLOCK, REST, way_of_box
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.sleepers import boxes_of_blocks

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from banded import move_points, write_points
+from hapticdb.kernels.large.waking import WOKEN
 from hapticdb.kernels.resident import cell_table
 from hapticdb.kernels.resident.cells import CHANGES_KEPT, UNKNOWN
-from hapticdb.kernels.resident.waking import WOKEN
 from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency

@@ -39,8 +39,8 @@ ENTRIES = {
     "resident.nearest": "find_nearest",
     "resident.first_hits": "find_first_hits",
     "resident.feeling": "feel_kernel bounding_spheres",
-    "resident.sleeping": "feel_sleeping",
-    "resident.budget": "feel_within",
+    "large.sleeping": "feel_sleeping",
+    "large.budget": "feel_within",
     "query.refining": (
         "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
         "depths_of_hits"
@@ -70,8 +70,8 @@ here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {
     "resident.feeling": "hand.coupling",
-    "resident.sleeping": "hand.coupling",
-    "resident.budget": "hand.coupling",
+    "large.sleeping": "hand.coupling",
+    "large.budget": "hand.coupling",
     "hand.large": "hand.coupling",
     "hosting.loop": "hand.quasistatic",
 }
@@ -167,8 +167,8 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "large": (
         *_RESIDENT,
         "field.packing.unpack_kernel",
-        "resident.sleeping.*",
-        "resident.budget.*",
+        "large.sleeping.*",
+        "large.budget.*",
         "hand.large.*",
     ),
     "everything": ("*",),

@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.large.sleeping import BLOCK, COUNTS, REST, Sleepers
+from hapticdb.kernels.large.waking import AWAKE, FOLLOWED, STATE
 from hapticdb.kernels.resident.cells import CHANGES_KEPT, Clusters
-from hapticdb.kernels.resident.sleeping import BLOCK, COUNTS, REST, Sleepers
-from hapticdb.kernels.resident.waking import AWAKE, FOLLOWED, STATE
 
 
 def boxes_of_blocks(spheres: NDArray[np.float64]) -> NDArray[np.float64]:

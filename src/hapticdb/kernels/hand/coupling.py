@@ -35,9 +35,9 @@ from hapticdb.kernels.hand.anchors import (
     voxel_under,
 )
 from hapticdb.kernels.hand.body import BODY, begin_anew, is_finite, is_somewhere
+from hapticdb.kernels.large.budget import Awake, tool_frame
 from hapticdb.kernels.law import TangentPlaneLaw
 from hapticdb.kernels.records import RESULTS, SERVO
-from hapticdb.kernels.resident.budget import Awake, tool_frame
 from hapticdb.kernels.resident.cells import (
     CELLS,
     CLUSTERS,
@@ -304,9 +304,7 @@ def move_body(watch, cells, reader, shell, place, body, servo_record, dt, met, m
         pose_of_quaternion(
             position[0], position[1], position[2], turned[0], turned[1], turned[2], turned[3], pose
         )
-        tool_frame(
-            watch, cells, which, version, shell, pose, place, law, next_met, missed, next_frame
-        )
+        tool_frame(watch, cells, which, shell, pose, place, law, next_met, missed, next_frame)
         n_unknown = np.int64(next_frame[UNKNOWNS])
         if n_unknown == 0:
             if is_first:
@@ -402,9 +400,7 @@ def move_body(watch, cells, reader, shell, place, body, servo_record, dt, met, m
             for n in range(6):
                 velocity[n] = 0.0
             continue
-        tool_frame(
-            watch, cells, which, version, shell, next_pose, place, law, next_met, missed, next_frame
-        )
+        tool_frame(watch, cells, which, shell, next_pose, place, law, next_met, missed, next_frame)
         n_unknown = np.int64(next_frame[UNKNOWNS])
         if n_unknown > 0:
             break

@@ -6,10 +6,10 @@ It is an entry of its own, so that sessions with small tools need not compile it
 from hapticdb.kernels._jit import FLOAT, INT, INTS, INTS2, entry, record_of
 from hapticdb.kernels.hand.body import BODY
 from hapticdb.kernels.hand.coupling import move_body
+from hapticdb.kernels.large.budget import Asleep
+from hapticdb.kernels.large.sleeping import LEFT_OUT, SLEEPERS
 from hapticdb.kernels.records import SERVO
-from hapticdb.kernels.resident.budget import Asleep
 from hapticdb.kernels.resident.cells import CELLS, CLUSTERS, PLACE
-from hapticdb.kernels.resident.sleeping import LEFT_OUT, SLEEPERS
 
 
 @entry(

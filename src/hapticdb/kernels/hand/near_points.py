@@ -19,6 +19,7 @@ from hapticdb.kernels.field.spline import (
     second_derivatives,
     spline,
 )
+from hapticdb.kernels.large.sleeping import placed_center, room_around
 from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     LISTED,
@@ -27,7 +28,6 @@ from hapticdb.kernels.resident.cells import (
     cell_key,
     enter_cell,
 )
-from hapticdb.kernels.resident.sleeping import placed_center, room_around
 from hapticdb.kernels.rigid import moment, moved, transform_of
 
 MARGIN = 0.5

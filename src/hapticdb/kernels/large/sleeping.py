@@ -35,6 +35,7 @@ from hapticdb.kernels._jit import (
     leaf,
 )
 from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
+from hapticdb.kernels.large.waking import AWAKE, wake_changed
 from hapticdb.kernels.law import TANGENT_PLANE, felt_within
 from hapticdb.kernels.resident.cells import (
     CELLS,
@@ -52,7 +53,6 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.resident.clearance import gap
 from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.resident.runs import is_sphere_free
-from hapticdb.kernels.resident.waking import AWAKE, wake_changed
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turn
 
 BLOCK = 64

@@ -15,25 +15,7 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS2, chosen_by_type, entry, leaf
 from hapticdb.kernels.field.law import DISTANCE_FIELD
-from hapticdb.kernels.law import TANGENT_PLANE
-from hapticdb.kernels.resident.cells import (
-    CELLS,
-    CELLS_WITH_DISTANCES,
-    CLUSTERS,
-    HITS,
-    LISTED,
-    PLACE,
-    READER_STRIDE,
-    UNKNOWNS,
-    Clusters,
-    begin_frame,
-    end_frame,
-    key_of_cell,
-    slot_of,
-    with_missed,
-)
-from hapticdb.kernels.resident.feeling import frame_of
-from hapticdb.kernels.resident.sleeping import (
+from hapticdb.kernels.large.sleeping import (
     LEFT_OUT,
     LOOKED_AT,
     SLEEPERS,
@@ -45,6 +27,23 @@ from hapticdb.kernels.resident.sleeping import (
     points_listed,
     skip_between,
 )
+from hapticdb.kernels.law import TANGENT_PLANE
+from hapticdb.kernels.resident.cells import (
+    CELLS,
+    CELLS_WITH_DISTANCES,
+    CLUSTERS,
+    HITS,
+    LISTED,
+    PLACE,
+    UNKNOWNS,
+    Clusters,
+    begin_frame,
+    end_frame,
+    key_of_cell,
+    slot_of,
+    with_missed,
+)
+from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.rigid import is_rigid, transform_of
 
 
@@ -91,15 +90,13 @@ def runs_beside_unknown(cells, which, shell, listed, count, transform, place, ma
 
 
 @leaf
-def felt_asleep(
-    cells, which, version, shell, pose, place, law, met, missed, sleepers, budget, counts, out
-):
+def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, budget, counts, out):
     """`feeling.felt` with sleeping clusters and a budget of points; counts keeps the greatest."""
     points, center, _, _, run, columns, scratch = shell
     listed, skips, nothing = sleepers.listed, sleepers.skips, sleepers.nothing
     chosen, chosen_columns, indices = sleepers.chosen, sleepers.columns, sleepers.indices
     transform = transform_of(pose)
-    count = list_near_runs(cells, which, version, shell, sleepers, transform, place, law)
+    count = list_near_runs(cells, which, shell, sleepers, transform, place, law)
     n_near = points_listed(listed, count, run, points.shape[0])
     n_looked = n_near
     part = Clusters(points, center, nothing, skips, run, columns, scratch)
@@ -124,15 +121,15 @@ def felt_asleep(
     counts[0, LEFT_OUT] = max(counts[0, LEFT_OUT], n_near - n_looked)
 
 
-def _frame_awake(watch, cells, which, version, shell, pose, place, law, met, missed, out):  # noqa: ARG001 - the arguments of each choice
+def _frame_awake(watch, cells, which, shell, pose, place, law, met, missed, out):  # noqa: ARG001 - the arguments of each choice
     """A frame that tests each run."""
     frame_of(law, cells, which, shell, pose, place, met, missed, out)
 
 
-def _frame_asleep(watch, cells, which, version, shell, pose, place, law, met, missed, out):
+def _frame_asleep(watch, cells, which, shell, pose, place, law, met, missed, out):
     """A frame with sleeping clusters."""
     felt_asleep(
-        cells, which, version, shell, pose, place, law, met, missed, watch.sleepers, watch.budget,
+        cells, which, shell, pose, place, law, met, missed, watch.sleepers, watch.budget,
         watch.counts, out,
     )  # fmt: skip
 
@@ -158,9 +155,8 @@ def feel_within(
         if not is_rigid(poses[n]):
             return n
         which = begin_frame(cells, reader)
-        version = cells.readers[reader * READER_STRIDE]
         felt_asleep(
-            cells, which, version, shell, poses[n], place, law, met, missed, sleepers, budget,
+            cells, which, shell, poses[n], place, law, met, missed, sleepers, budget,
             counts, out[n],
         )  # fmt: skip
         end_frame(cells, reader)

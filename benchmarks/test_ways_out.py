@@ -71,6 +71,6 @@ def test_the_wheel_comes_out_after_its_bolts_by_itself(found: dict[str, Any]) ->
     assert {step["parts"] for step in bolts} == names
     assert wheel["parts"] == ", ".join(WHEEL)
     for step in order["steps"]:
-        assert step["verdict"] in {"comes out", "comes out of contact"}
+        assert step["verdict"] in {"comes out", "slides out", "comes out of contact"}
         assert step["clearance_m"] > 0.0
         assert step["mesh_distance_m"] >= step["clearance_m"]

@@ -22,9 +22,10 @@ from hapticdb.kernels.hand.near_points import (
     NEAR_ROWS,
     U,
 )
+from hapticdb.kernels.large import budget
 from hapticdb.kernels.large.sleeping import LEFT_OUT, Sleepers
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS
-from hapticdb.kernels.resident import budget, feeling
+from hapticdb.kernels.resident import feeling
 from hapticdb.kernels.resident.cells import UNKNOWNS, Cells, Clusters, Place
 from hapticdb.query.law import ForceLaw
 from hapticdb.resident.sleepers import counts_of

@@ -6,11 +6,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.large import budget as budgets
+from hapticdb.kernels.large import sleeping
 from hapticdb.kernels.law import felt_within, reads_distances
 from hapticdb.kernels.records import MOST_MISSED
-from hapticdb.kernels.resident import budget as budgets
 from hapticdb.kernels.resident import cell_table as kernels
-from hapticdb.kernels.resident import sleeping
 from hapticdb.kernels.resident.cells import (
     CONTACTS,
     DEEPEST,

@@ -8,7 +8,9 @@ from hapticdb.extraction.result import Blocker, Extraction, WayOutVerdict
 from hapticdb.store.base import Object
 
 DisassemblyVerdict = Literal["comes out", "comes out of contact", "no order found"]
-PROVED: tuple[WayOutVerdict, ...] = ("comes out", "comes out of contact")
+WHOLLY_PROVED: tuple[WayOutVerdict, ...] = ("comes out", "slides out")
+"""Verdicts that prove the whole of a path."""
+PROVED: tuple[WayOutVerdict, ...] = (*WHOLLY_PROVED, "comes out of contact")
 """Verdicts with which a part is taken off; the strongest first."""
 
 
@@ -88,7 +90,7 @@ class Disassembly:
         """The weakest verdict of the steps; "no order found" proves nothing."""
         if not self.is_found:
             return "no order found"
-        is_clear = all(step.found.verdict == "comes out" for step in self.steps)
+        is_clear = all(step.found.verdict in WHOLLY_PROVED for step in self.steps)
         return "comes out" if is_clear else "comes out of contact"
 
     @property

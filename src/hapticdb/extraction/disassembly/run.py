@@ -15,6 +15,7 @@ from hapticdb.errors import GeometryChangedError, MissingExtraError, UsageError
 from hapticdb.extraction.disassembly.pressing import pressed_objects
 from hapticdb.extraction.disassembly.result import (
     PROVED,
+    WHOLLY_PROVED,
     Disassembly,
     FailedSearch,
     Removal,
@@ -245,7 +246,7 @@ class _OrderSearch:
         n_gone = len(self.steps)
         if found.verdict not in PROVED:
             return FailedSearch(found.parts, n_gone, found.verdict, found.blockers)
-        if found.verdict == "comes out":
+        if found.verdict in WHOLLY_PROVED:
             return None
         pressed = pressed_objects(self._env, found, left_out)
         if not pressed:

@@ -65,7 +65,7 @@ def turn_of(poses: Floats) -> Floats:
 def test_a_block_in_a_pocket_is_lifted_and_then_pulled(tmp_path: Path) -> None:
     url = pocket(tmp_path)
     found = found_in(url, "block")
-    assert (found.verdict, found.pulls) == ("comes out of contact", found.blockers[0].pulls)
+    assert (found.verdict, found.pulls) == ("slides out", found.blockers[0].pulls)
     assert is_out(found, url, "block")
     assert places_in_boxes(found, url, "block", 0.5 * SIZE) == 0
 
@@ -73,7 +73,7 @@ def test_a_block_in_a_pocket_is_lifted_and_then_pulled(tmp_path: Path) -> None:
 def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) -> None:
     url = ledge(tmp_path)
     found = found_in(url, "plate")
-    assert (found.verdict, found.is_planned) == ("comes out of contact", True)
+    assert (found.verdict, found.is_planned) == ("slides out", True)
     assert [obj.name for obj in found.touched] == ["base"]
     assert is_out(found, url, "plate")
     assert places_in_boxes(found, url, "plate", SIZE) == 0
@@ -85,7 +85,7 @@ def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) 
 def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Path) -> None:
     url = bayonet(tmp_path)
     found = found_in(url, "bar")
-    assert found.verdict == "comes out of contact"
+    assert found.verdict == "slides out"
     assert is_out(found, url, "bar")
     assert places_in_boxes(found, url, "bar", SIZE) == 0
     poses = poses_of(found)
@@ -97,7 +97,7 @@ def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Pa
 def test_a_peg_leaves_a_bent_channel(tmp_path: Path) -> None:
     url = elbow(tmp_path)
     found = found_in(url, "peg")
-    assert found.verdict == "comes out of contact"  # it stands on the channel's floor
+    assert found.verdict == "slides out"  # it stands on the channel's floor
     assert is_out(found, url, "peg")
     assert places_in_boxes(found, url, "peg", 0.5 * SIZE) == 0
 

@@ -34,6 +34,10 @@ its start. Larger: more motions that the proof refuses."""
 CORE_GROWTH = 2.0
 """The same for the core: where it is hit at the start, parts interlock, or are hardly thicker than
 voxels, and the number varies. Larger: more motions that cut into what is touched."""
+CORE_SHARE = 0.05
+"""Share of the core's points that may be hit besides by straight pulls, where it is hit at the
+start. Larger: as for `CORE_GROWTH`; smaller: fewer parts that fill one another, as bricks with
+studs do, come apart. How deep they get is proved afterwards."""
 AT_ONCE = 32
 """Poses of a motion that are looked at together. Larger: fewer calls; more poses of motions that
 turn out blocked."""
@@ -109,6 +113,7 @@ class ContactSpace:
         self.touched = tuple(obj.id for obj in self.start.objects)
         self._frames: list[ResidentFrames] = []
         self._most: list[float] = []
+        self._most_pulled: list[float] = []
         self._table: CellTable | None = None
         if not self.touched:
             return
@@ -124,7 +129,11 @@ class ContactSpace:
             core = core_shell(space.shell, problem.voxel_size)
             if core is not None:
                 self._frames.append(ResidentFrames(space.residency, core))
-            self._most = [CORE_GROWTH * frames.feel(np.eye(4)).hits[0] for frames in self._frames]
+            for frames in self._frames:
+                start = int(frames.feel(np.eye(4)).hits[0])
+                self._most.append(CORE_GROWTH * start)
+                more = start + CORE_SHARE * len(frames.shell) if start else 0.0
+                self._most_pulled.append(max(CORE_GROWTH * start, more))
         except BaseException:
             self.__exit__()
             raise
@@ -145,11 +154,12 @@ class ContactSpace:
             self._space.shell, pose, where=problem.where, exclude=problem.exclude, law="plane"
         )
 
-    def are_allowed(self, poses: Floats) -> NDArray[np.bool_]:
-        """Whether each of the poses (n, 4, 4) is allowed in contact."""
+    def are_allowed(self, poses: Floats, *, is_pull: bool = False) -> NDArray[np.bool_]:
+        """Whether each of the poses (n, 4, 4) is allowed in contact; more of a straight pull."""
         self._space.n_poses += len(poses)
         allowed = np.ones(len(poses), dtype=np.bool_)
-        for frames, most in zip(self._frames, self._most, strict=True):
+        greatest = self._most_pulled if is_pull else self._most
+        for frames, most in zip(self._frames, greatest, strict=True):
             allowed &= frames.feel(poses).hits <= most
         return allowed
 

@@ -125,7 +125,7 @@ class Pulls:
     def _slides(self, poses: Floats, hits: NDArray[np.int64], most: float) -> int:
         """Number of the first poses (n, 4, 4) at which the part slides along what it touches."""
         _, n = first_run(np.concatenate([[True], (hits > 0) & (hits <= most)]))
-        allowed = self._contact.are_allowed(poses[: n - 1])
+        allowed = self._contact.are_allowed(poses[: n - 1], is_pull=True)
         return int(first_run(np.concatenate([[True], allowed]))[1]) - 1
 
     def _ended(

@@ -39,7 +39,7 @@ EASE = 0.02
 since it is not asked on which side it is."""
 MOST_FINE = 400_000
 """Greatest number of fine pieces. Larger: larger contacts are bounded, with more memory."""
-MOST_LOOKS = 6_000_000
+MOST_LOOKS = 3_000_000
 """Greatest number of places that are measured for one object. Larger: longer contacts are bounded,
 which takes minutes."""
 
@@ -151,9 +151,16 @@ class DepthSearch:
             why = "neither its surface nor the tool's is closed, so nothing has an inside"
             return _unknown(obj, self._allowed, why)
         self._looks = 0
+        whole = len(self._travels)
         try:
-            into, into_pieces = self._greatest(other, tool, self._to_world)
-            back, back_pieces = self._greatest(tool, other, self._to_tool)
+            for samples in (1, whole):  # mostly the start tells that nothing can be proved
+                into, into_pieces = self._greatest(other, tool, self._to_world, samples)
+                back, back_pieces = self._greatest(tool, other, self._to_tool, samples)
+                low = max(0.0, into.start[0], back.start[0])
+                high = max(into.start[1], back.start[1]) + (1.0 + STRETCH) * FINE * self._size
+                if high > low + self._allowed:
+                    why = "its depth at the start is not known well enough"
+                    return ContactDepth(obj, low, high, low, np.inf, 0.0, self._allowed, why)
         except _TooMuchError:
             return _unknown(obj, self._allowed, "the contact is too large or too long to bound it")
         deeper = max(into, back, key=lambda one: one.most[0])
@@ -177,23 +184,30 @@ class DepthSearch:
             return found
         return found._replace(why="both are thinner there than twice the depth that is proved")
 
-    def _greatest(self, solid: Solid, moving: Solid, to: Placing) -> tuple[_Greatest, Cut]:
-        """Greatest depths of a surface inside a solid, and the pieces that may get inside."""
-        coarse = moving.pieces
-        is_near = self._near(solid, coarse, to)
+    def _greatest(
+        self, solid: Solid, moving: Solid, to: Placing, samples: int
+    ) -> tuple[_Greatest, Cut]:
+        """Greatest depths of a surface inside a solid, and the pieces that may get inside.
+
+        Only the first samples of the path are looked at.
+        """
+        coarse, travels = moving.pieces, self._travels[:samples].tolist()
+        is_near = self._near(solid, coarse, to, travels)
         fine = cut(coarse.triangles[is_near], FINE * self._size, MOST_FINE)
         if fine is None:
             raise _TooMuchError
         fine = fine._replace(sources=coarse.sources[is_near][fine.sources])
-        return self._looked(solid, fine.middles, to), fine
+        return self._looked(solid, fine.middles, to, travels), fine
 
-    def _near(self, solid: Solid, pieces: Cut, to: Placing) -> NDArray[np.bool_]:
+    def _near(
+        self, solid: Solid, pieces: Cut, to: Placing, travels: Sequence[float]
+    ) -> NDArray[np.bool_]:
         """Whether pieces (P,) may get inside: they start inside, or come near the surface."""
         reach = (1.0 + STRETCH) * (float(pieces.radii.max()) + self._path.off)
         apart = np.zeros(len(pieces.middles))
         when = np.zeros(len(apart))
         is_near = np.zeros(len(apart), dtype=bool)
-        for n, travel in enumerate(self._travels.tolist()):
+        for n, travel in enumerate(travels):
             active = np.flatnonzero(~is_near & (apart - (travel - when) - self._slack <= reach))
             if not len(active):
                 continue
@@ -204,14 +218,16 @@ class DepthSearch:
                 is_near[active] |= solid.holds(places)
         return is_near
 
-    def _looked(self, solid: Solid, middles: Floats, to: Placing) -> _Greatest:
+    def _looked(
+        self, solid: Solid, middles: Floats, to: Placing, travels: Sequence[float]
+    ) -> _Greatest:
         """Measure the middles of pieces (P, 3), where they may be the deepest ones so far."""
         ease = EASE * self._size
         bound = np.full(len(middles), np.inf)
         when = np.zeros(len(middles))
         start = most = (-np.inf, -np.inf)
         floor, sample = ease, 0
-        for n, travel in enumerate(self._travels.tolist()):
+        for n, travel in enumerate(travels):
             active = np.flatnonzero(bound + (travel - when) + self._slack > floor)
             if not len(active):
                 continue

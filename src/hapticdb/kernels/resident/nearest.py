@@ -146,15 +146,15 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
 
     largest: metres; a larger run is not looked around as a whole. fine: binary logarithm of the
     edge, voxels, of the cubes that points are in, at most `CUBE_OF_BALL`. squares (B,): the
-    greatest distance to search before, the least after, squared, voxels; nearest (B,) int64: the
-    point, or -1 as long as nothing is nearer; done (B,) int64: points searched, 0 before, N after.
-    A pose with fewer has met a cell that is not resident, and a later call continues there.
+    greatest distance to search before, the least after, squared, voxels; nearest (B,): the point,
+    or -1 while nothing is nearer; done (B,): points searched. With fewer than N a pose has met a
+    cell that is not resident, and a later call continues there.
     """
     _, _, keys, slots, words, masks, used, _, _ = cells
     points, _, spheres, groups, run, _, _ = shell
     known_keys, bounds, known = cubes
     size, side, total = place.size, place.side, points.shape[0]
-    seed, hot, near = np.int64(-1), np.int64(-1), np.int64(-1)
+    seed = hot = near = np.int64(-1)
     which = begin_frame(cells, reader)
     for n in range(poses.shape[0]):
         if done[n] >= total:
@@ -162,14 +162,13 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
         transform = transform_of(poses[n])
         square, best = squares[n], nearest[n]
         if seed >= 0 and hot >= 0:  # the voxel that was nearest at the pose before
-            x, y, z = in_voxels(transform, place, points[hot, 0], points[hot, 1], points[hot, 2])
-            bound = square_to(x, y, z, seed)
+            point = in_voxels(transform, place, points[hot, 0], points[hot, 1], points[hot, 2])
+            bound = square_to(point[0], point[1], point[2], seed)
             square, best = (bound, hot) if bound < square else (square, best)
-        # no point farther than `within` is the nearest; a ball may promise less than was found
         within, least, first, first_end = math.sqrt(square), np.inf, np.int64(0), np.int64(0)
         for turn in range(SURVEY if done[n] == 0 else ALL, ALL + 1):
-            at, end = (first, first_end) if turn == NEAREST_BALL else (np.int64(0), total)
-            at = done[n] if turn == ALL else at
+            begin = done[n] if turn == ALL else np.int64(0)
+            at, end = (first, first_end) if turn == NEAREST_BALL else (begin, total)
             level = level_at(spheres, groups, run, at, largest)
             while at < end and within > 0.0 and (turn != SURVEY or level != POINT):
                 x, y, z, radius, n_points = ball_at(points, spheres, groups, run, at, level)
@@ -185,7 +184,6 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
                         least, first, first_end = bound - radius, at, min(at + n_points, total)
                     within = min(within, promised(x, y, z, voxel) + radius)
                 elif bound < within + radius and level != POINT:
-                    # something is near, or unknown: look around less
                     level = RUN if level == GROUPED and spheres[at // run, 3] <= largest else POINT
                     continue
                 elif bound < within:

@@ -187,7 +187,7 @@ def depth_of(shell: PointShell, path: SweepPath, made: trimesh.Trimesh) -> Conta
         path, path.sample(0, len(path)), path.travels(0, len(path)) * SIZE, SIZE, 0.005
     )
     named = voxel_object(Grid(SIZE, (0.0, 0.0, 0.0), 7), np.zeros((1, 3), dtype=np.int64))
-    return search.depth(named, Solid(shell.surface, SIZE), other)
+    return search.depth(named, Solid(shell.surface, SIZE), other, len(path))
 
 
 @given(corners=st.tuples(vectors, vectors, vectors), place=vectors)

@@ -40,8 +40,10 @@ since it is not asked on which side it is."""
 MOST_FINE = 400_000
 """Greatest number of fine pieces. Larger: larger contacts are bounded, with more memory."""
 MOST_LOOKS = 3_000_000
-"""Greatest number of places that are measured for one object. Larger: longer contacts are bounded,
+"""Greatest number of places that are measured along one path. Larger: longer contacts are bounded,
 which takes minutes."""
+MOST_AT_START = 300_000
+"""The same for the start alone, which mostly tells that a path cannot be bounded."""
 
 Placing = Callable[[Floats, int], Floats]
 """Places (n, 3) of one surface in the frame of the other one, at a sample."""
@@ -106,12 +108,18 @@ def depths_along(
     poses = path.sample(0, end)
     travels = path.travels(0, end) * voxel_size
     search = DepthSearch(path, poses, travels, voxel_size, allowed)
-    found = {}
+    found: dict[int, ContactDepth] = {}
+    solids: dict[int, Solid] = {}
     for obj, surface in _surfaces(objects):
         if isinstance(surface, str):
             found[obj.id] = _unknown(obj, allowed, surface)
             continue
-        found[obj.id] = search.depth(obj, tool, Solid(surface, COARSE * voxel_size))
+        solids[obj.id] = Solid(surface, COARSE * voxel_size)
+        found[obj.id] = search.depth(obj, tool, solids[obj.id], 1)
+    # mostly the start tells already that not all of them can be bounded
+    if all(not one.why for one in found.values()):
+        for obj in objects:
+            found[obj.id] = search.depth(obj, tool, solids[obj.id], end)
     return tuple(found[obj.id] for obj in objects)
 
 
@@ -144,23 +152,17 @@ class DepthSearch:
         self._size, self._allowed = size, allowed
         self._slack = 2.0 * path.slack * size
         self._looks = 0
+        self._most_looks = MOST_AT_START
 
-    def depth(self, obj: Object, tool: Solid, other: Solid) -> ContactDepth:
-        """Bound the depths of a tool and an object in one another."""
+    def depth(self, obj: Object, tool: Solid, other: Solid, samples: int) -> ContactDepth:
+        """Bound the depths of a tool and an object in one another, at the first samples."""
         if not (tool.is_closed or other.is_closed):
             why = "neither its surface nor the tool's is closed, so nothing has an inside"
             return _unknown(obj, self._allowed, why)
-        self._looks = 0
-        whole = len(self._travels)
+        self._most_looks = MOST_AT_START if samples < len(self._travels) else MOST_LOOKS
         try:
-            for samples in (1, whole):  # mostly the start tells that nothing can be proved
-                into, into_pieces = self._greatest(other, tool, self._to_world, samples)
-                back, back_pieces = self._greatest(tool, other, self._to_tool, samples)
-                low = max(0.0, into.start[0], back.start[0])
-                high = max(into.start[1], back.start[1]) + (1.0 + STRETCH) * FINE * self._size
-                if high > low + self._allowed:
-                    why = "its depth at the start is not known well enough"
-                    return ContactDepth(obj, low, high, low, np.inf, 0.0, self._allowed, why)
+            into, into_pieces = self._greatest(other, tool, self._to_world, samples)
+            back, back_pieces = self._greatest(tool, other, self._to_tool, samples)
         except _TooMuchError:
             return _unknown(obj, self._allowed, "the contact is too large or too long to bound it")
         deeper = max(into, back, key=lambda one: one.most[0])
@@ -176,6 +178,11 @@ class DepthSearch:
             allowed=self._allowed,
             why="",
         )
+        if found.at_start_most > found.at_start + self._allowed:
+            why = "its depth at the start is not known well enough"
+            return found._replace(deepest_most=np.inf, why=why)
+        if samples < len(self._travels):
+            return found._replace(deepest_most=np.inf)
         if not found.is_bounded:
             return found
         # places that are never deeper may still pass through what is thinner than twice the depth
@@ -252,7 +259,7 @@ class DepthSearch:
     def _measured(self, solid: Solid, places: Floats, enough: float) -> tuple[Floats, Floats]:
         """Least and greatest distance (n,) of places (n, 3) from a surface; they are counted."""
         self._looks += len(places)
-        if self._looks > MOST_LOOKS:
+        if self._looks > self._most_looks:
             raise _TooMuchError
         return solid.distances(places, enough)
 

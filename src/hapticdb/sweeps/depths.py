@@ -56,8 +56,8 @@ class _TooMuchError(Exception):
 class _Greatest(NamedTuple):
     """Greatest depths of the middles of pieces along a path, metres.
 
-    start, most : bounds from below and above, at the first sample and at any; sample : where the
-    depth is greatest.
+    start, most : bounds from below and above, at the first sample and at any (where it is not told
+    from 0, the bound from above is that of `EASE`); sample : where the depth is greatest.
     """
 
     start: tuple[float, float]
@@ -117,10 +117,10 @@ def depths_along(
         solids[obj.id] = Solid(surface, COARSE * voxel_size)
         found[obj.id] = search.depth(obj, tool, solids[obj.id], 1)
     # mostly the start tells already that not all of them can be bounded
-    if all(not one.why for one in found.values()):
-        for obj in objects:
-            found[obj.id] = search.depth(obj, tool, solids[obj.id], end)
-    return tuple(found[obj.id] for obj in objects)
+    if any(one.why for one in found.values()):
+        why = "not followed, since that in another object is not known at the start"
+        return tuple(found[obj.id]._replace(why=found[obj.id].why or why) for obj in objects)
+    return tuple(search.depth(obj, tool, solids[obj.id], end) for obj in objects)
 
 
 def _surfaces(objects: Sequence[Object]) -> Iterable[tuple[Object, Surface | str]]:
@@ -232,7 +232,7 @@ class DepthSearch:
         ease = EASE * self._size
         bound = np.full(len(middles), np.inf)
         when = np.zeros(len(middles))
-        start = most = (-np.inf, -np.inf)
+        start, lowest = (-np.inf, -np.inf), -np.inf
         floor, sample = ease, 0
         for n, travel in enumerate(travels):
             active = np.flatnonzero(bound + (travel - when) + self._slack > floor)
@@ -251,10 +251,10 @@ class DepthSearch:
                 low[highest] = max(low[highest], solid.exact(places[highest]))
             here = float(low.max()), float(high.max())
             start = here if n == 0 else start
-            sample = n if here[0] > most[0] else sample
-            most = max(most[0], here[0]), max(most[1], here[1])
-            floor = max(floor, here[1])
-        return _Greatest(start, most, sample)
+            sample = n if here[0] > lowest else sample
+            lowest = max(lowest, here[0])
+            floor = max(floor, here[1])  # what is not looked at is no deeper
+        return _Greatest(start, (lowest, floor), sample)
 
     def _measured(self, solid: Solid, places: Floats, enough: float) -> tuple[Floats, Floats]:
         """Least and greatest distance (n,) of places (n, 3) from a surface; they are counted."""

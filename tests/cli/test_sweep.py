@@ -123,7 +123,7 @@ def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
         "verdict", "comes_out", "line", "proof", "poses", "samples", "hits", "contacts",
         "first_hit", "first_contact", "deepest", "objects", "enclosed", "hit_intervals",
         "contact_intervals", "clearance", "tool", "revision", "elapsed", "cells", "proportions",
-        "at_least", "looked", "left_at_start", "decision",
+        "at_least", "looked", "left_at_start", "decision", "depths",
     ]  # fmt: skip
     assert list(found["first_contact"]) == ["sample", "fraction", "segment", "pose", "objects"]
     assert list(found["deepest"]) == ["depth", "point", "moment"]

@@ -253,7 +253,7 @@ def test_a_header_of_anything_is_told_in_one_line(tmp_path: Path, data: st.DataO
         (sealed(b"{}", n_points=2**32 - 1), "damaged"),
         (sealed(b"{}", n_points=10_000_000), "cut off"),
         (sealed(b"{}", n_text=2**32 - 1), "damaged"),
-        (sealed(b"{}", number=4), "format 4"),
+        (sealed(b"{}", number=5), "format 5"),
         (b"", "cut off"),
         (b"HDB", "cut off"),
         (b"SQLite format 3\0" * 9, "is no recording"),

@@ -14,6 +14,7 @@ from hapticdb.kernels.field.lattice import CELL_VALUES, VOXELS_A_STEP, cell_plac
 from hapticdb.kernels.field.law import AHEAD, agreement, depth_and_weight
 from hapticdb.kernels.law import accumulate, average_into
 from hapticdb.kernels.resident.cells import (
+    CELL_WORDS,
     CONTACTS,
     DEEPEST,
     HITS,
@@ -27,19 +28,24 @@ from hapticdb.kernels.resident.cells import (
     enter_cell,
 )
 from hapticdb.kernels.resident.runs import (
-    BASE_OF,
-    SLOT_OF,
+    BASE,
+    BIT,
+    INDEX,
+    KEPT,
+    WORD,
+    WORD_BITS,
     cells_of_run,
     free_runs,
+    keep_points,
     place_run,
+    words_of_run,
 )
 from hapticdb.kernels.rigid import moved, transform_of, turned
 
-NORMAL, INDEX, BASE, LOOK_UP, PART, HERE, THERE, DEPTH, WEIGHT = 6, 9, 10, 11, 12, 15, 16, 17, 18
-"""Rows of the scratch, after the six of `place_run`.
+NORMAL, LOOK_UP, PART, HERE, THERE, DEPTH, WEIGHT = 6, 11, 12, 15, 16, 17, 18
+"""Rows of the scratch, after the six of `place_run` and beside `runs.INDEX` and `runs.BASE`.
 
-The turned normal (3); the point's index; where its cell's distances begin, less the way to the
-cell's first centre; the index of the lowest corner around a place, and the place between the
+The turned normal (3); the index of the lowest corner around a place, and the place between the
 corners (3); distance at the point and ahead of it, voxels; depth, m; weight. Indices are whole
 numbers that a float has exactly.
 """
@@ -86,35 +92,21 @@ def near_of_run(
 
 
 @inlined
-def near_in_cells(
-    words, masks, near, payload, start, count, n_j, n_k, ci, cj, ck, scratch, met, n_hits
-):  # fmt: skip
+def near_in_cells(words, near, start, count, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits):
     """`near_of_run` for a run in the cells that `runs.cells_of_run` found: without a branch.
 
-    It also begins to fetch the distances of the near points, one point after another, so that the
-    processor waits for memory while it looks up the next points; for a point that is not near it
-    fetches those of the last near point again. Returns the numbers of near points and of hits.
+    Returns the numbers of near points and of hits. A hit is near, and a near voxel in a brick.
     """
-    n_near = fetched = np.int64(0)
+    words_of_run(count, n_cells, n_j, n_k, ci, cj, ck, start, scratch)
+    n_near = np.int64(0)
     for at in range(count):
-        x, y, z = scratch[3, at], scratch[4, at], scratch[5, at]
-        i, j, k = np.int64(x), np.int64(y), np.int64(z)
-        cell = (((i >> 5) - ci) * n_j + ((j >> 5) - cj)) * n_k + ((k >> 5) - ck)
-        slot = np.int64(scratch[SLOT_OF, cell])
-        is_in_brick = np.int64((masks[slot] >> brick_bit(i, j, k)) & np.uint64(1))
-        column = column_of(i, j)
+        word, bit = np.int64(scratch[WORD, at]), np.int64(scratch[BIT, at])
+        slot, column = word >> WORD_BITS, word & (CELL_WORDS - 1)
         met[n_hits] = start + at
-        n_hits += is_in_brick & np.int64(bit_in(words[slot, column], k))
-        scratch[0, n_near], scratch[3, n_near] = scratch[0, at], x
-        scratch[1, n_near], scratch[4, n_near] = scratch[1, at], y
-        scratch[2, n_near], scratch[5, n_near] = scratch[2, at], z
-        base = scratch[BASE_OF, cell]
-        scratch[INDEX, n_near], scratch[BASE, n_near] = start + at, base
-        is_near = is_in_brick & np.int64(bit_in(near[slot, column], k))
-        lowest = base + place_before(np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5))
-        fetched = np.int64(lowest) if is_near else fetched
-        fetch_corners(payload, np.uint64(fetched))
-        n_near += is_near
+        n_hits += np.int64(bit_in(words[slot, column], bit))
+        scratch[KEPT, n_near] = at
+        n_near += np.int64(bit_in(near[slot, column], bit))
+    keep_points(scratch, count, n_near, BASE + 1)
     return n_near, n_hits
 
 
@@ -143,19 +135,18 @@ def look_up(payload, scratch, count, row):
 
 
 @inlined
-def weigh(payload, points, transform, size, scratch, count, is_fetched):
+def weigh(payload, points, transform, size, scratch, count):
     """Turned normal, depth (at least 0) and weight of the first points of `scratch`.
 
-    Distances that are not on their way to the cache (is_fetched) are fetched while the normals are
-    turned. This takes a seventh off a frame of 100,000 contacts.
+    Distances are fetched into the cache while the normals are turned. This takes a seventh off a
+    frame of 100,000 contacts.
     """
     for row in range(NORMAL, NORMAL + 3):
         for at in range(count):
             scratch[row, at] = 0.0
     find_places(scratch, count, 0.0)
-    if not is_fetched:
-        for at in range(count):
-            fetch_corners(payload, np.uint64(np.int64(scratch[LOOK_UP, at])))
+    for at in range(count):
+        fetch_corners(payload, np.uint64(np.int64(scratch[LOOK_UP, at])))
     for at in range(count):
         n = np.int64(scratch[INDEX, at])
         nx, ny, nz = turned(transform, points[n, 3], points[n, 4], points[n, 5])
@@ -197,9 +188,8 @@ def felt_by_distance(law, cells, which, shell, pose, place, met, missed, out):
         )
         if n_cells > 0:
             n_near, n_hits = near_in_cells(
-                words, masks, near, payload, start, n_run, n_j, n_k, ci, cj, ck, scratch, met,
-                n_hits,
-            )  # fmt: skip
+                words, near, start, n_run, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits
+            )
         elif n_cells < 0:
             n_near, n_hits, n_missed, n_strange, last_key, slot, mask, base = near_of_run(
                 keys, slots, words, masks, used, near, which, start, n_run, place.side, scratch,
@@ -210,7 +200,7 @@ def felt_by_distance(law, cells, which, shell, pose, place, met, missed, out):
         start += n_run
         if n_near == 0:
             continue
-        weigh(payload, points, transform, place.size, scratch, n_near, n_cells > 0)
+        weigh(payload, points, transform, place.size, scratch, n_near)
         for at in range(n_near):
             depth = scratch[DEPTH, at]
             weight += scratch[WEIGHT, at]

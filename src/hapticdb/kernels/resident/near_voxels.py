@@ -30,8 +30,8 @@ def mark_near_voxels(places, payload, masks, words, near):
     """Write the near voxels of cells in slots places (n,) from their distances and their voxels.
 
     payload (S, 34^3) uint8; masks (S,) uint64; words, near (S, 1024) uint32. Occupied voxels count
-    as near. A slot whose mask is 0 has none. The loops along k are plain, so that the compiler
-    vectorizes them.
+    as near. A brick whose bit of the mask is 0 has none, since a frame on rows finds no row there.
+    The loops along k are plain, so that the compiler vectorizes them.
     """
     along_k = np.empty((CELL_SIDE * CELL_SIDE, SIDE), dtype=np.int16)
     along_j = np.empty((CELL_SIDE * SIDE, SIDE), dtype=np.int16)
@@ -60,4 +60,8 @@ def mark_near_voxels(places, payload, masks, words, near):
                 middle = along_j[word + SIDE, k]
                 beside = min(along_j[word, k], along_j[word + 2 * SIDE, k])
                 bits |= np.int64(middle + min(middle, beside) <= MOST_EIGHTHS) << k
-            near[slot, word] = bits
+            bricks = masks[slot] >> np.uint64((word >> 8) << 4 | ((word >> 3) & 3) << 2)
+            known = np.int64(0)
+            for brick in range(4):
+                known |= (np.int64(bricks >> np.uint64(brick)) & 1) * (np.int64(0xFF) << 8 * brick)
+            near[slot, word] = bits & known

@@ -11,6 +11,7 @@ import numpy as np
 from hapticdb.kernels._jit import inlined
 from hapticdb.kernels.law import accumulate, average_into, depth_below_plane
 from hapticdb.kernels.resident.cells import (
+    CELL_WORDS,
     CONTACTS,
     DEEPEST,
     HITS,
@@ -23,7 +24,18 @@ from hapticdb.kernels.resident.cells import (
     column_of,
     enter_cell,
 )
-from hapticdb.kernels.resident.runs import SLOT_OF, cells_of_run, free_runs, place_run
+from hapticdb.kernels.resident.runs import (
+    BIT,
+    KEPT,
+    PLACES,
+    WORD,
+    WORD_BITS,
+    cells_of_run,
+    free_runs,
+    keep_points,
+    place_run,
+    words_of_run,
+)
 from hapticdb.kernels.rigid import moved, transform_of, turned
 
 NORMAL, DEPTH = 6, 9
@@ -31,22 +43,19 @@ NORMAL, DEPTH = 6, 9
 
 
 @inlined
-def hits_in_cells(words, start, count, n_j, n_k, ci, cj, ck, scratch, met, n_before):
+def hits_in_cells(words, start, count, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_before):
     """Move the hits of a run in the cells of `runs.cells_of_run` to the front; returns n_hits.
 
     met takes their indices from `n_before` on; scratch, rows 0-5, their places.
     """
+    words_of_run(count, n_cells, n_j, n_k, ci, cj, ck, start, scratch)
     n_hits = np.int64(0)
     for at in range(count):
-        x, y, z = scratch[3, at], scratch[4, at], scratch[5, at]
-        i, j, k = np.int64(x), np.int64(y), np.int64(z)
-        cell = (((i >> 5) - ci) * n_j + ((j >> 5) - cj)) * n_k + ((k >> 5) - ck)
-        slot = np.int64(scratch[SLOT_OF, cell])
+        word, bit = np.int64(scratch[WORD, at]), np.int64(scratch[BIT, at])
         met[n_before + n_hits] = start + at
-        scratch[0, n_hits], scratch[3, n_hits] = scratch[0, at], x
-        scratch[1, n_hits], scratch[4, n_hits] = scratch[1, at], y
-        scratch[2, n_hits], scratch[5, n_hits] = scratch[2, at], z
-        n_hits += np.int64(bit_in(words[slot, column_of(i, j)], k))
+        scratch[KEPT, n_hits] = at
+        n_hits += np.int64(bit_in(words[word >> WORD_BITS, word & (CELL_WORDS - 1)], bit))
+    keep_points(scratch, count, n_hits, PLACES)
     return n_hits
 
 
@@ -133,7 +142,9 @@ def felt_by_plane(law, cells, which, shell, pose, place, met, missed, out):
             keys, slots, masks, used, which, n_run, place.side, scratch
         )
         if n_cells > 0:
-            n_new = hits_in_cells(words, start, n_run, n_j, n_k, ci, cj, ck, scratch, met, n_hits)
+            n_new = hits_in_cells(
+                words, start, n_run, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits
+            )
         elif n_cells < 0:
             n_new, n_strange, n_missed, last_key, slot, mask = hits_of_run(
                 keys, slots, words, masks, used, which, start, n_run, place.side, scratch, met,

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels._jit import inlined
 from hapticdb.kernels.field.lattice import CELL_VALUES, cell_place, place_before
 from hapticdb.kernels.resident.cells import (
+    CELL_WORDS,
     EMPTY_SLOT,
     GROUP,
     UNKNOWN,
@@ -22,6 +23,14 @@ MOST_CELLS = 8
 
 SLOT_OF, BASE_OF = 19, 20
 """Rows of the scratch: slots of the cells that a run meets, and where their distances begin."""
+PLACES = 6
+"""Rows of the scratch with the placed points."""
+INDEX, BASE, WORD, BIT, KEPT = 9, 10, 11, 12, 15
+"""Rows of the scratch for one run in cells: a point's index; where its cell's distances begin, less
+the way to the cell's first centre; which word holds its voxel, of all words of the table, and which
+bit; the points that are kept. Frames use these rows for other things later."""
+WORD_BITS = 10
+"""Binary logarithm of `CELL_WORDS`."""
 FURTHEST = float(1 << 22)
 """Voxels: beyond every grid, and within 32 bits."""
 
@@ -203,3 +212,48 @@ def cells_of_run(keys, slots, masks, used, which, count, side, scratch):
         first = cell_place(np.int64(0), np.int64(0), np.int64(0)) + slot * CELL_VALUES
         scratch[BASE_OF, n] = float(first - place_before(i << 5, j << 5, k << 5))
     return n_cells if met else np.int64(0), n_j, n_k, ci, cj, ck
+
+
+@inlined
+def words_of_run(count, n_cells, n_j, n_k, ci, cj, ck, start, scratch):
+    """Enter `INDEX`, `BASE`, `WORD` and `BIT` of a run in the cells that `cells_of_run` found.
+
+    All numbers are whole and below 2^53, so floats have them exactly, and the compiler vectorizes
+    the loops: it cannot do so with integers of 64 bits. Runs in a single cell, more than half of
+    them, look up no cell for each point.
+    """
+    for at in range(count):
+        scratch[INDEX, at] = start + at
+        scratch[BIT, at] = np.floor(scratch[5, at]) - 32.0 * np.floor(scratch[5, at] / 32.0)
+    if n_cells == 1:
+        first = scratch[SLOT_OF, 0] * CELL_WORDS - 32.0 * (32.0 * ci + cj)
+        base = scratch[BASE_OF, 0]
+        for at in range(count):
+            scratch[WORD, at] = first + 32.0 * np.floor(scratch[3, at]) + np.floor(scratch[4, at])
+            scratch[BASE, at] = base
+        return
+    for at in range(count):
+        i, j = np.floor(scratch[3, at] / 32.0), np.floor(scratch[4, at] / 32.0)
+        cell = ((i - ci) * n_j + (j - cj)) * n_k + (np.floor(scratch[5, at] / 32.0) - ck)
+        scratch[KEPT, at] = cell
+        scratch[WORD, at] = (
+            32.0 * (np.floor(scratch[3, at]) - 32.0 * i) + np.floor(scratch[4, at]) - 32.0 * j
+        )
+    for at in range(count):
+        cell = np.int64(scratch[KEPT, at])
+        scratch[WORD, at] += CELL_WORDS * scratch[SLOT_OF, cell]
+        scratch[BASE, at] = scratch[BASE_OF, cell]
+
+
+@inlined
+def keep_points(scratch, count, n_kept, n_rows):
+    """Move the points of a run that are listed in `KEPT` to the front, if not all of them are.
+
+    Moved are the first `n_rows` rows: those of the places, and from `INDEX` on.
+    """
+    if n_kept == count:
+        return
+    for row in range(n_rows):
+        if row < PLACES or row >= INDEX:
+            for n in range(n_kept):
+                scratch[row, n] = scratch[row, np.int64(scratch[KEPT, n])]

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.records import MOST_MISSED
+from hapticdb.kernels.records import MOST_MISSED, NEAR_CUBE
 from hapticdb.kernels.resident.cells import Clusters
-from hapticdb.kernels.resident.nearest import NearCubes
+from hapticdb.kernels.resident.nearest import NOT_KNOWN
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.table import MOST_READERS
 
@@ -21,8 +21,8 @@ CHUNK_POINTS = 1 << 18
 Ctrl-C then waits longer."""
 CHUNK_POSES = 1024
 """Most poses of one call of a kernel. A larger value makes fewer calls, which share less evenly."""
-CUBES = 1 << 17
-"""Cubes of space whose nearest voxel each thread remembers, a power of two; 24 bytes each. A larger
+CUBES = 1 << 19
+"""Cubes of space whose nearest voxel each thread remembers, a power of two; 32 bytes each. A larger
 value forgets less, and no longer fits into a processor's cache."""
 MOST_JOBS = MOST_READERS - 2
 """Most threads: each is a reader of the table, beside the shell's own and one more."""
@@ -35,7 +35,7 @@ class ThreadMemory(NamedTuple):
     clusters: Clusters
     met: NDArray[np.int64]
     missed: NDArray[np.int64]
-    cubes: NearCubes
+    cubes: NDArray[np.void]
 
 
 ChunkWork = Callable[[ThreadMemory, slice], None]
@@ -85,11 +85,7 @@ class BatchThreads:
                         frames.clusters._replace(scratch=np.empty_like(frames.clusters.scratch)),
                         np.empty(len(frames.shell), dtype=np.int64),
                         np.zeros(1 + MOST_MISSED, dtype=np.int64),
-                        NearCubes(  # takes no memory before `forget` writes to it
-                            np.empty(CUBES, dtype=np.int64),
-                            np.empty(CUBES),
-                            np.empty(CUBES, dtype=np.int64),
-                        ),
+                        np.empty(CUBES, NEAR_CUBE),  # no memory before `forget` writes to it
                     )
                 )
         except BaseException:
@@ -106,9 +102,7 @@ class BatchThreads:
     def forget(self) -> None:
         """Forget what is known of cubes of space; no thread may run. It is called before `run`."""
         for memory in [self._free.get_nowait() for _ in range(self.jobs)]:
-            memory.cubes.keys.fill(-1)
-            memory.cubes.bounds.fill(-1.0)
-            memory.cubes.nearest.fill(-1)
+            memory.cubes[:] = NOT_KNOWN
             self._free.put(memory)
 
     def run(self, work: ChunkWork, n_poses: int) -> None:

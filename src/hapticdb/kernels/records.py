@@ -416,3 +416,13 @@ PACE: Layout = _record(
     ]
 )
 """What a worker's loop is told, and what it tells."""
+
+NEAR_CUBE: Layout = _record(
+    [
+        ("key", "<i8"),  # of the cube of space, -1 for none
+        ("bound", "<f8"),  # no occupied voxel is nearer to the cube's middle, voxels
+        ("nearest", "<i8"),  # the voxel, packed, that is so far away; -1: the search ended there
+        ("unused", "<i8"),  # so that no record lies in two cache lines
+    ]
+)
+"""What a thread remembers of a cube of space (`kernels.resident.nearest`)."""

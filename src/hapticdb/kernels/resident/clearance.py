@@ -22,6 +22,7 @@ from hapticdb.kernels._jit import (
     inlined,
     leaf,
 )
+from hapticdb.kernels.bits import highest_bit, lowest_bit
 from hapticdb.kernels.resident.cells import (
     CELLS,
     CLUSTERS,
@@ -77,48 +78,42 @@ def gap(x, low, high):
 
 
 @leaf
-def highest_bit(word):
-    """Index of the highest bit set in a word of 32 bits, which is not 0."""
-    at = np.int64(0)
-    for shift in (16, 8, 4, 2, 1):
-        if word >> shift:
-            word >>= shift
-            at += shift
-    return at
+def window_of(x, radius, first):
+    """First and last voxel, 0 to 31, of a cell from `first` on whose gap to x may be below radius.
 
-
-@leaf
-def lowest_bit(word):
-    """Index of the lowest bit set in a word of 32 bits, which is not 0."""
-    return highest_bit(word & -word)
+    Voxels of a cell that lies wholly on one side of x give its border voxel.
+    """
+    low = np.int64(min(max(math.floor(x - radius) - first, 0), 31))
+    high = np.int64(min(max(math.floor(x + radius) - first, 0), 31))
+    return low, high
 
 
 @inlined
 def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
     """Least squared distance from (x, y, z) to a voxel of one cell, and that voxel, packed.
 
-    Returns `square` and `voxel` as given if no voxel is nearer. All lengths in voxels.
+    Returns `square` and `voxel` as given if no voxel is nearer. All lengths in voxels. Only columns
+    within the radius are looked at, so the loops hardly branch: that halves a search.
     """
     radius = math.sqrt(square)
-    k0 = ck << 5
-    # columns are read as far up and down as matters at first, and begin at the place's own height
-    low = np.int64(min(max(math.floor(z - radius) - k0, 0), 31))
-    high = np.int64(min(max(math.floor(z + radius) - k0, 0), 31))
+    i0, j0, k0 = ci << 5, cj << 5, ck << 5
+    first_i, last_i = window_of(x, radius, i0)
+    first_j, last_j = window_of(y, radius, j0)
+    low, high = window_of(z, radius, k0)
+    # columns begin at the place's own height
     middle = np.int64(min(max(math.floor(z) - k0, 0), 31))
     window = (np.int64(2) << high) - (np.int64(1) << low)
-    for bi in range(4):
-        i0 = (ci << 5) + (bi << 3)
-        di = gap(x, i0, i0 + 8.0)
-        if di * di >= square or not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
+    for bi in range(first_i >> 3, (last_i >> 3) + 1):
+        di = gap(x, i0 + 8.0 * bi, i0 + 8.0 * bi + 8.0)
+        if not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
             continue
-        for bj in range(4):
+        for bj in range(first_j >> 3, (last_j >> 3) + 1):
             bricks = np.int64((mask >> np.uint64((bi << 4) | (bj << 2))) & np.uint64(0xF))
-            j0 = (cj << 5) + (bj << 3)
-            dj = gap(y, j0, j0 + 8.0)
+            dj = gap(y, j0 + 8.0 * bj, j0 + 8.0 * bj + 8.0)
             if not bricks or di * di + dj * dj >= square:
                 continue
             height, kept = np.inf, np.int64(0)  # squared gap to the bricks that may be near
-            for bk in range(4):
+            for bk in range(low >> 3, (high >> 3) + 1):
                 if (bricks >> bk) & 1:
                     dk = gap(z, k0 + (bk << 3), k0 + (bk << 3) + 8.0)
                     if di * di + dj * dj + dk * dk < square:
@@ -127,17 +122,15 @@ def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
             kept &= window
             if not kept:
                 continue
-            for i in range(i0, i0 + 8):
-                dx = gap(x, i, i + 1.0)
-                if dx * dx + dj * dj + height >= square:
-                    continue
-                for j in range(j0, j0 + 8):
-                    dy = gap(y, j, j + 1.0)
+            for i in range(max(first_i, bi << 3), min(last_i, (bi << 3) | 7) + 1):
+                dx = gap(x, i0 + i, i0 + i + 1.0)
+                for j in range(max(first_j, bj << 3), min(last_j, (bj << 3) | 7) + 1):
+                    met = np.int64(words[slot, (i << 5) | j]) & kept
+                    if not met:
+                        continue
+                    dy = gap(y, j0 + j, j0 + j + 1.0)
                     column = dx * dx + dy * dy
                     if column + height >= square:
-                        continue
-                    met = np.int64(words[slot, ((i & 31) << 5) | (j & 31)]) & kept
-                    if not met:
                         continue
                     above, below = met >> middle, met & ((np.int64(1) << middle) - 1)
                     if above:
@@ -145,13 +138,13 @@ def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
                         dz = gap(z, k, k + 1.0)
                         if column + dz * dz < square:
                             square = column + dz * dz
-                            voxel = packed(i, j, k)
+                            voxel = packed(i0 + i, j0 + j, k)
                     if below:
                         k = k0 + highest_bit(below)
                         dz = gap(z, k, k + 1.0)
                         if column + dz * dz < square:
                             square = column + dz * dz
-                            voxel = packed(i, j, k)
+                            voxel = packed(i0 + i, j0 + j, k)
     return square, voxel
 
 

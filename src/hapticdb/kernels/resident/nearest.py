@@ -1,21 +1,20 @@
 """Distance of a shell from occupied voxels at poses that have nothing to do with one another.
 
 Balls of points are looked around before their points: groups of runs, then runs. What was found
-around a place is remembered for its cube of space (`NearCubes`), and bounds the distance of every
-place in that cube. So most balls and points are left out without a search, at this pose and at
-later ones.
+around a place is remembered for its cube of space (`records.NEAR_CUBE`), and bounds the distance of
+every place in that cube. So most balls and points are left out without a search, at this pose and
+at later ones.
 
 The search of a pose stops at the first cell that is not resident, and says at which point. The
 caller fetches cells there and continues the search; no distance is guessed.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS3, INT, INTS, entry, fields_of, inlined, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS3, INT, INTS, entry, inlined, leaf, record_of
+from hapticdb.kernels.records import NEAR_CUBE
 from hapticdb.kernels.resident.cells import (
     CELLS,
     CLUSTERS,
@@ -39,20 +38,11 @@ SURVEY, NEAREST_BALL, ALL = 0, 1, 2
 all that may be nearer than these."""
 
 
-class NearCubes(NamedTuple):
-    """What is known of cubes of space, in a table that forgets: an entry replaces another.
-
-    keys (F,) int64: the cube, or -1; F is a power of two; bounds (F,): no occupied voxel is nearer
-    to the cube's middle, voxels; nearest (F,) int64: the voxel, packed, that is so far away, or -1
-    where the search ended there. It holds for one revision, and each thread needs its own.
-    """
-
-    keys: NDArray[np.int64]
-    bounds: NDArray[np.float64]
-    nearest: NDArray[np.int64]
-
-
-NEAR_CUBES = fields_of(NearCubes, INTS, FLOATS, INTS)
+NOT_KNOWN = np.zeros((), NEAR_CUBE)
+"""A cube of which nothing is known. What is known holds for one revision, and each thread needs
+cubes of its own: an array (F,) of such records, F a power of two, in which one replaces another."""
+NOT_KNOWN["key"] = NOT_KNOWN["nearest"] = -1
+NOT_KNOWN["bound"] = -1.0
 
 
 @inlined
@@ -104,8 +94,7 @@ def length(x, y, z):
 
 @inlined
 def bound_at(
-    known_keys, bounds, known, keys, slots, words, masks, used, which, x, y, z, wanted, near,
-    shift, side,
+    cubes, keys, slots, words, masks, used, which, x, y, z, wanted, near, shift, side
 ):  # fmt: skip
     """Lower bound of the distance from (x, y, z) to an occupied voxel, and a voxel near it or -1.
 
@@ -119,19 +108,19 @@ def bound_at(
     i, j, k = np.int64(x) >> shift, np.int64(y) >> shift, np.int64(z) >> shift
     mx, my, mz = (i + 0.5) * edge, (j + 0.5) * edge, (k + 0.5) * edge
     key = packed(i, j, k) << 1 | (shift == CUBE_OF_BALL)
-    at = spread_key(key, known_keys.shape[0])
+    cube = cubes[spread_key(key, cubes.shape[0])]
     far = wanted + 0.5 * math.sqrt(3.0) * edge
-    if known_keys[at] != key or (known[at] < 0 and bounds[at] < far):
+    if cube.key != key or (cube.nearest < 0 and cube.bound < far):
         square, voxel = bounded_by(mx, my, mz, far * far, near)
         square, voxel = nearest_voxel(
             keys, slots, words, masks, used, which, mx, my, mz, square, voxel, side
         )
         if voxel == -2:
             return 0.0, np.int64(-1)
-        known_keys[at] = key
-        bounds[at] = math.sqrt(square)
-        known[at] = voxel
-    return bounds[at] - length(x - mx, y - my, z - mz) - CAUTION, known[at]
+        cube.key = key
+        cube.bound = math.sqrt(square)
+        cube.nearest = voxel
+    return cube.bound - length(x - mx, y - my, z - mz) - CAUTION, cube.nearest
 
 
 @leaf
@@ -140,7 +129,9 @@ def promised(x, y, z, voxel):
     return math.sqrt(square_to(x, y, z, voxel)) + CAUTION if voxel >= 0 else np.inf
 
 
-@entry(CELLS, INT, CLUSTERS, FLOATS3, PLACE, FLOAT, INT, NEAR_CUBES, FLOATS, INTS, INTS)
+@entry(
+    CELLS, INT, CLUSTERS, FLOATS3, PLACE, FLOAT, INT, record_of(NEAR_CUBE, 1), FLOATS, INTS, INTS
+)
 def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squares, nearest, done):
     """Least squared distance from the points to an occupied voxel's box at each of poses (B, 4, 4).
 
@@ -152,7 +143,6 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
     """
     _, _, keys, slots, words, masks, used, _, _ = cells
     points, _, spheres, groups, run, _, _ = shell
-    known_keys, bounds, known = cubes
     size, side, total = place.size, place.side, points.shape[0]
     seed = hot = near = np.int64(-1)
     which = begin_frame(cells, reader)
@@ -175,8 +165,8 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
                 x, y, z = in_voxels(transform, place, x, y, z)
                 radius /= size
                 bound, voxel = bound_at(
-                    known_keys, bounds, known, keys, slots, words, masks, used, which, x, y, z,
-                    within + radius, near, fine if level == POINT else CUBE_OF_BALL, side,
+                    cubes, keys, slots, words, masks, used, which, x, y, z, within + radius, near,
+                    fine if level == POINT else CUBE_OF_BALL, side,
                 )  # fmt: skip
                 near = voxel if voxel >= 0 else near
                 if turn == SURVEY:

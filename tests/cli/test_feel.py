@@ -15,8 +15,14 @@ import pytest
 import hapticdb
 from children import PATIENCE, child, until
 from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
+from hapticdb import PointShell
 from hapticdb.cli.values import size_bytes
+from hapticdb.kernels import compiling
+from hapticdb.kernels.compiling import entries_for
+from hapticdb.realtime import session
+from hapticdb.recording import replay
 from hapticdb.recording.file import Frames, Recorder, Recording
+from hapticdb.resident.frames import LARGE_FROM
 from hapticdb.resident.table import is_alive
 from recordings import header
 
@@ -117,6 +123,25 @@ def test_a_budget_of_points_is_told_recorded_and_replayed(run: Run, scene: Path)
     assert 0 < report["left_out_frames"] <= report["loop"]["frames"]
     assert report["most_left_out"] > 0
     refused(run(*feel(*PLAY), "--record", "felt.hdbrec", "--append"), "budget_points")
+
+
+@pytest.mark.usefixtures("scene")
+def test_feel_and_replay_announce_the_kernels_of_large_tools(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if this machine had compiled all kernels but those."""
+    large = set(entries_for("large")) - set(entries_for("feel", "replay"))
+    monkeypatch.setattr(compiling, "missing", lambda names: sorted(large.intersection(names)))
+    for place in (compiling, session, replay):
+        monkeypatch.setattr(place, "compile_missing", lambda *_: 0)
+    PointShell.sphere(0.01, LARGE_FROM).save("large.npz")
+    short = (*PLAY, "--seconds", 0.2, "--no-baseline", "--replace", "--record", "felt.hdbrec")
+    tools = {"small": feel(), "large": ("feel", "scene.db", "--tool", "large.npz")}
+    for tool, budget, is_told in (("small", (), 0), ("small", (40,), 1), ("large", (), 1)):
+        more = ("--budget-points", *budget) if budget else ()
+        for words in ((*tools[tool], *short, *more), ("replay", "felt.hdbrec")):
+            code, _, err = run(*words)
+            assert (code, err.count(f"compiling, once: {len(large)} kernels")) == (0, is_told), err
 
 
 @pytest.mark.usefixtures("scene")

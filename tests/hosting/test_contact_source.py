@@ -26,6 +26,7 @@ from hapticdb.protocol.contacts import (
     unpack_proxy,
 )
 from hapticdb.realtime.resident_cells import ResidentCells
+from realtime.sessions import in_z_order
 
 Floats = NDArray[np.float64]
 SIZE, RADIUS, DEPTH = 0.005, 4.0, 0.8
@@ -124,3 +125,65 @@ def test_a_tip_in_a_narrow_gap_gets_proxies_that_its_client_reads(tmp_path: Path
     assert not read.flags & IS_LOOSE
     assert read.trust == 0.0
     assert len(read.planes) == 0
+
+
+def proxies_of(source: ContactSource, places: Floats) -> list[ProxyState]:
+    """Proxies at places (M, 3) of a hand, ten milliseconds apart."""
+    first_proxy(source, places[0])
+    return [
+        source.proxy(HandState(n + 2, 0.01 * (n + 1), place, UPRIGHT, np.zeros(6)))
+        for n, place in enumerate(places)
+    ]
+
+
+def push_of_planes(source: ContactSource) -> Floats:
+    """Force (3,) of the planes in contact of a source's last proxy, N."""
+    model = source.model
+    n = int(model["n_planes"])
+    depths = np.maximum(model["depths"][:n], 0.0)
+    strengths = model["contact"] * model["weights"][:n] * depths
+    return np.asarray(strengths @ model["normals"][:n])
+
+
+BROAD = in_z_order(128, 64)
+"""Places of a flat tool's points, in the order of a curve: twice as many as are merged."""
+
+
+def test_proxies_of_a_broad_tool_are_merged_and_push_as_single_contacts_do(tmp_path: Path) -> None:
+    """The tool comes down by 5 mm, 4 mm of them in contact, slides, and leaves."""
+    floor = plane("floor", np.eye(3))
+    with Ground.of_scenes(tmp_path, [floor], SIZE, distances=True) as ground:
+        origin = ground.origins["floor"]
+    (url,) = tmp_path.glob("*.db")
+    points = np.column_stack([(BROAD - BROAD.mean(axis=0)) * [1e-3, 2e-3], np.zeros(len(BROAD))])
+    tool = PointShell(
+        points, np.tile((0.0, 0.0, 1.0), (len(BROAD), 1)), np.zeros(3), is_closed=False
+    )
+    high, low = 1.5 * SIZE + 0.03, 1.5 * SIZE - 0.004
+    heights = np.concatenate(
+        [np.linspace(high, low, 20), np.full(20, low), np.linspace(low, high, 20)]
+    )
+    aside = np.concatenate([np.zeros(20), np.linspace(0.0, 0.01, 20), np.full(20, 0.01)])
+    places = origin + np.column_stack([aside, np.zeros(60), heights])
+    with ResidentCells(str(url), budget_bytes=64 << 20, distances=True) as cells:
+        with ContactSource(cells, tool, ProxyWish()) as source:
+            merged = proxies_of(source, places[:40])
+            pushes = push_of_planes(source)
+            assert 1 < source._follower["merged"] <= 64
+            merged += proxies_of(source, places[40:])
+            assert source._follower["merged"] == 1
+        with ContactSource(cells, tool, ProxyWish()) as source:
+            source._follower["merges_from"] = 0
+            source._follower["is_large"] = False
+            single = proxies_of(source, places[:40])
+            alone = push_of_planes(source)
+            assert source._follower["merged"] == 1
+            single += proxies_of(source, places[40:])
+    ours, theirs = (np.array([proxy.wrench for proxy in some]) for some in (merged, single))
+    assert theirs[39, 2] == pytest.approx(4.0, rel=0.02, abs=1000.0 * SIZE * 2.75 / 508)
+    np.testing.assert_allclose(ours[:, :3], theirs[:, :3], atol=0.03)
+    np.testing.assert_allclose(ours[:, 3:], theirs[:, 3:], atol=2e-4)
+    np.testing.assert_allclose(pushes, ours[39, :3], atol=0.03)
+    np.testing.assert_allclose(alone, theirs[39, :3], atol=0.03)
+    np.testing.assert_allclose(merged[39].stiffness, single[39].stiffness, atol=1.0)
+    assert not ours[-1].any()

@@ -129,6 +129,7 @@ VERBS: tuple[tuple[str, str], ...] = (
     ("import", "import a.db s/car.glb --bits 7"),
     ("touch", "touch a.db --tool s/wrench.stl --poses s/path.csv"),
     ("feel", "feel a.db --tool s/wrench.stl --device s/path.csv --seconds 0.5 --record a.hdbrec"),
+    ("large", "feel a.db --tool s/wrench.stl --device s/path.csv --seconds 0.5 --budget-points 9"),
     ("replay", "replay a.hdbrec a.db"),
     ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --picture s.png"),
     ("extract", "extract a.db 12 --motions 0 --out 0.1"),

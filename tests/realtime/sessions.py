@@ -9,9 +9,10 @@ from numpy.typing import NDArray
 
 import children
 from children import PATIENCE
-from hapticdb import Environment
+from hapticdb import Environment, PointShell
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording
+from hapticdb.resident.frames import LARGE_FROM
 from hapticdb.testing import floor_voxels, write_voxels
 
 RATE = 500.0
@@ -42,6 +43,32 @@ def floor_points(height: float) -> NDArray[np.float64]:
     across = np.arange(24.0, 40.0, 0.25) + 0.125
     x, y = np.meshgrid(across, across, indexing="ij")
     return np.stack([x.ravel(), y.ravel(), np.full(x.size, height)], axis=1)
+
+
+def in_z_order(n_i: int, n_j: int) -> NDArray[np.int64]:
+    """Places (n_i * n_j, 2) of a grid in the order of a Z-order curve."""
+    ij = np.argwhere(np.ones((n_i, n_j), dtype=bool))
+    codes = sum(((ij[:, a] >> b) & 1) << (2 * b + a) for a in range(2) for b in range(10))
+    return ij[np.argsort(codes)]
+
+
+def standing_plate() -> PointShell:
+    """A plate of `LARGE_FROM` points: its lower edge is felt, the rest stands up."""
+    ij = in_z_order(64, 64)
+    points = np.column_stack([(ij[:, 0] - 31.5) * 4e-4, np.zeros(len(ij)), ij[:, 1] * 4e-4])
+    shell = PointShell(points, np.tile((0.0, 0.0, 1.0), (len(ij), 1)), np.array([0, 0, 0.012]))
+    assert len(shell) == LARGE_FROM
+    return shell
+
+
+def lying_plate() -> PointShell:
+    """A plate of twice as many points, all of which touch a floor at once."""
+    ij = in_z_order(128, 64)
+    x, y = (ij[:, 0] - 63.5) * 2e-4, (ij[:, 1] - 31.5) * 3e-4
+    return PointShell(
+        np.column_stack([x, y, np.zeros(len(ij))]), np.tile((0.0, 0.0, 1.0), (len(ij), 1)),
+        np.zeros(3),
+    )  # fmt: skip
 
 
 def recorded(path: Path) -> Recorded:

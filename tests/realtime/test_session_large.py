@@ -20,11 +20,11 @@ from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording, State
 from hapticdb.recording.header import FORMAT_VERSION, Header
 from hapticdb.recording.replay import replay
-from hapticdb.resident.frames import LARGE_FROM, ResidentFrames
+from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from realtime.hands import at, still
-from realtime.sessions import NEVER_STALE, floor_points, floored, recorded
+from realtime.sessions import NEVER_STALE, floor_points, floored, recorded, standing_plate
 from realtime.worlds import SIZE, make
 
 RATE = 100.0
@@ -56,14 +56,7 @@ def ground(
 
 @pytest.fixture(scope="module")
 def plate() -> PointShell:
-    """A plate of `LARGE_FROM` points in Z-order: its lower edge is felt, the rest stands up."""
-    ij = np.argwhere(np.ones((64, 64), dtype=bool))
-    codes = sum(((ij[:, a] >> b) & 1) << (2 * b + a) for a in range(2) for b in range(6))
-    ij = ij[np.argsort(codes)]
-    points = np.column_stack([(ij[:, 0] - 31.5) * 4e-4, np.zeros(len(ij)), ij[:, 1] * 4e-4])
-    shell = PointShell(points, np.tile((0.0, 0.0, 1.0), (len(ij), 1)), np.array([0, 0, 0.012]))
-    assert len(shell) == LARGE_FROM
-    return shell
+    return standing_plate()
 
 
 def pressing(low: float) -> Player:

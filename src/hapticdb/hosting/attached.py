@@ -63,10 +63,12 @@ class AttachedHost:
         coupling: Coupling | DeviceCoupling | None = None,
         scale: float = 1.0,
         label: str = "",
+        budget_points: int | None = None,
     ) -> HostedSession:
         """Begin a session; as `SessionHost.begin`, with its errors."""
         options = {
-            "where": where, "exclude": exclude, "coupling": coupling, "scale": scale, "label": label
+            "where": where, "exclude": exclude, "coupling": coupling, "scale": scale,
+            "label": label, "budget_points": budget_points,
         }  # fmt: skip
         seat, session = self._channel.ask("begin", shell, start, options)
         return HostedSession(self._board, seat, session, self._call)

@@ -26,7 +26,7 @@ from hapticdb.hosting.tables import SharedTables, Words
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.records import LABEL_BYTES
 from hapticdb.kernels.rigid import is_rigid
-from hapticdb.pointshell.shell import PointShell
+from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.poses import quaternion_of
 from hapticdb.query.choosing import chosen_law, is_smooth
 from hapticdb.query.law import ForceLaw
@@ -130,6 +130,7 @@ class SessionHost:
         coupling: Coupling | DeviceCoupling | None = None,
         scale: float = 1.0,
         label: str = "",
+        budget_points: int | None = None,
     ) -> HostedSession:
         """Begin a session; its tool waits at `start` until the hand is moved.
 
@@ -150,6 +151,9 @@ class SessionHost:
             the hand are the scene's: whoever moves the hand scales them.
         label : str
             What the session is called where others see it; cut at 128 bytes.
+        budget_points : int or None
+            Most points near something that a frame looks at; None for all. As for
+            `hapticdb.realtime.session.Session`.
 
         Raises
         ------
@@ -167,12 +171,13 @@ class SessionHost:
             raise UsageError(
                 f"a scale of {scale}: give a number above 0, {LARGEST_SCALE:g} at most"
             )
+        budget = checked_budget(budget_points)
         compile_missing(entries_for("host"))  # here, so that no worker compiles
         felt = self._tables.checked(where, exclude)
         with self._changing:
             if self._is_closed.is_set():
                 raise UsageError("the host is closed: make another")
-            return self._begin(shell, pose, felt, coupling, scale, label)
+            return self._begin(shell, pose, felt, coupling, scale, label, budget)
 
     def _begin(
         self,
@@ -182,6 +187,7 @@ class SessionHost:
         coupling: Coupling | DeviceCoupling | None,
         scale: float,
         label: str,
+        budget: int | None,
     ) -> HostedSession:
         """Take seat, cells and worker for a session; all are given back if one is not to be had."""
         session = next(self._ids)
@@ -200,6 +206,7 @@ class SessionHost:
                 seat=seat, table=id(cells), n_slots=cells.table.n_slots, reader=reader,
                 grid=cells.grid, shell=shell, law=law, coupling=settled, scale=scale,
                 pose=(*pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3])[0].tolist()),
+                budget_points=budget,
             ).without_surface()  # fmt: skip
             hand = np.array(request.pose)
             self._board.seats["hand_pose"][seat] = hand
@@ -265,6 +272,7 @@ class SessionHost:
             where=running.cells.felt.where,
             exclude=running.cells.felt.exclude,
             coupling=asdict(asked.coupling),
+            budget_points=asked.budget_points,
         )
         running.record(path, header, self._board, replace=replace)
 

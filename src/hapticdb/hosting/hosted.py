@@ -29,7 +29,9 @@ class HostedFigures(NamedTuple):
     session's frame; elapsed : seconds of computing a frame; unknown, held, stale : numbers of
     frames with a point in a cell that was not resident, with an earlier wrench, and with a database
     that had not answered for too long; moves : poses of the hand that arrived; worker : number of
-    the worker process; recording_ended : why the recording ended early, None if it did not.
+    the worker process; recording_ended : why the recording ended early, None if it did not;
+    left_out_frames, most_left_out : frames in which the budget left out points, and the most points
+    that one frame left out.
     """
 
     frames: int
@@ -43,6 +45,8 @@ class HostedFigures(NamedTuple):
     moves: int
     worker: int
     recording_ended: str | None = None
+    left_out_frames: int = 0
+    most_left_out: int = 0
 
 
 class Recorded(NamedTuple):
@@ -204,6 +208,8 @@ class HostedSession:
             moves=int(row["n_moves"]),
             worker=int(row["worker"]),
             recording_ended=ended,
+            left_out_frames=int(row["left_out_frames"]),
+            most_left_out=int(row["most_left_out"]),
         )
 
     def end(self) -> None:

@@ -12,6 +12,7 @@ from hapticdb.kernels.hand.near_points import FIELD_ROWS
 from hapticdb.kernels.hosting import loop
 from hapticdb.kernels.hosting.following import USUAL_GAP_NS
 from hapticdb.kernels.hosting.showing import HOSTED_ROWS
+from hapticdb.kernels.large.budget import Asleep
 from hapticdb.kernels.records import (
     FOLLOWER,
     MOST_MISSED,
@@ -26,7 +27,9 @@ from hapticdb.kernels.resident.cells import Place
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.coupling import Coupling, SettledCoupling
-from hapticdb.resident.frames import clusters_of
+from hapticdb.realtime.drive import prepare_follower
+from hapticdb.resident.frames import RUN, clusters_of, sleeps_by_itself
+from hapticdb.resident.sleepers import counts_of, sleepers_of
 from hapticdb.resident.table import CONTROL_WORDS, HEARTBEAT, MOST_READERS, CellTable
 
 
@@ -48,6 +51,7 @@ class SeatRequest:
     coupling: Coupling | SettledCoupling
     scale: float
     pose: tuple[float, ...]
+    budget_points: int | None = None
 
     def without_surface(self) -> "SeatRequest":
         """Return the same request without the tool's triangles, which no frame reads."""
@@ -82,6 +86,7 @@ class Stations:
         self._requests: dict[int, SeatRequest] = {}
         self._tables: dict[int, CellTable] = {}
         self._arrays: dict[int, tuple[NDArray[np.generic], ...]] = {}
+        self._asleep: dict[int, Asleep] = {}
         self._places: dict[int, int] = {}
 
     @property
@@ -138,8 +143,11 @@ class Stations:
     def _write_tool(self, n: int, request: SeatRequest, table: CellTable) -> None:
         """Make the tool's arrays, and write their addresses."""
         grid, station = request.grid, self._stations[n : n + 1]
-        clusters = clusters_of(request.shell, grid.voxel_size)
+        sleeps = sleeps_by_itself(request.shell, request.budget_points)
+        clusters = clusters_of(request.shell, grid.voxel_size, RUN if sleeps else None)
         n_points = len(request.shell)
+        budget = min(request.budget_points or n_points, n_points)
+        prepare_follower(self._followers[n, ...], n_points, budget if sleeps else None)
         met = np.zeros((HOSTED_ROWS, n_points), dtype=np.int64)
         field = np.zeros((FIELD_ROWS, n_points)) if table.has_distances else np.zeros((1, 1))
         arrays = {
@@ -152,6 +160,20 @@ class Stations:
         station["n_spheres"], station["n_groups"] = len(clusters.spheres), len(clusters.groups)
         station["place"] = (*grid.origin, grid.voxel_size, float(grid.side))
         self._arrays[n] = tuple(arrays.values())
+        if sleeps:
+            sleepers = sleepers_of(clusters, request.budget_points)
+            self._write_sleepers(n, Asleep(sleepers, budget, counts_of(1)))
+
+    def _write_sleepers(self, n: int, asleep: Asleep) -> None:
+        """Write the addresses of what frames of a large tool keep."""
+        station, sleepers = self._stations[n : n + 1], asleep.sleepers
+        sleeping = station["sleeping"]
+        for name, array in sleepers._asdict().items():
+            sleeping[name] = array.ctypes.data
+        sleeping["counts"], sleeping["budget"] = asleep.counts.ctypes.data, asleep.budget
+        sleeping["n_blocks"], sleeping["n_chosen"] = len(sleepers.boxes), len(sleepers.indices)
+        station["is_large"] = 1
+        self._asleep[n] = asleep
 
     def _write_cells(self, n: int, table: CellTable) -> None:
         """Write the addresses of the table's arrays."""
@@ -193,3 +215,4 @@ class Stations:
         request, table = self._requests.pop(n), self._tables.pop(n)
         table.desk.sessions["told"]["is_active"][request.reader] = False
         del self._arrays[n]
+        self._asleep.pop(n, None)

@@ -343,6 +343,8 @@ SEAT: Layout = _record(
         ("unknown_frames", "<i8"),
         ("held_frames", "<i8"),
         ("stale_frames", "<i8"),
+        ("left_out_frames", "<i8"),  # frames in which the budget left out points
+        ("most_left_out", "<i8"),  # points that one frame left out
         ("worst_lateness", "<f8"),  # s
         ("worst_elapsed", "<f8"),  # s
         ("n_objects", "<i8"),
@@ -367,12 +369,27 @@ WAY: Layout = _record(
 )
 """The way of a hand to the pose that arrived last."""
 
+SLEEPING: Layout = _record(
+    [
+        # addresses of the arrays of `kernels.large.sleeping.Sleepers`, by their names
+        *((name, "<i8") for name in ("boxes", "block_rests", "run_rests", "state", "changed")),
+        *((name, "<i8") for name in ("listed", "skips", "nothing")),
+        *((name, "<i8") for name in ("chosen", "columns", "indices")),
+        ("counts", "<i8"),  # address of the counts of a period's frames
+        ("n_blocks", "<i8"),
+        ("n_chosen", "<i8"),  # room for the points of a frame beyond its budget
+        ("budget", "<i8"),  # most points near something that a frame looks at
+    ]
+)
+"""The sleeping clusters of a hosted session's tool: where their memory is."""
+
 STATION: Layout = _record(
     [
         ("is_running", "<i8"),  # all other fields are complete
         ("seat", "<i8"),  # row of the board
         ("reader", "<i8"),  # row of the table of cells
         ("is_smooth", "<i8"),  # the cells have distances
+        ("is_large", "<i8"),  # clusters of the tool sleep, or it has a budget of points
         # addresses of the table's arrays and of its row SESSION, and sizes
         *((name, "<i8") for name in ("control", "readers", "keys", "slots", "words", "masks")),
         *((name, "<i8") for name in ("used", "payload", "near", "session")),
@@ -384,6 +401,7 @@ STATION: Layout = _record(
         *((name, "<i8") for name in ("points", "center", "spheres", "groups", "columns")),
         *((name, "<i8") for name in ("scratch", "field", "met")),
         *((name, "<i8") for name in ("n_points", "n_spheres", "n_groups", "run")),
+        ("sleeping", SLEEPING),  # of a large tool; zeros of all others
         ("place", "<f8", 5),  # origin and voxel size m, voxels on an axis
         ("bits", "<i8"),  # of the grid's curve, on an axis
         ("curve", "<i8"),  # its code

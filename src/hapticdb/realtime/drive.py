@@ -38,6 +38,17 @@ Indices = NDArray[np.int64]
 Record = NDArray[np.void]
 
 
+def prepare_follower(follower: Record, n_points: int, budget: int | None) -> None:
+    """Let the quasi-static coupling of a tool merge broad contacts.
+
+    budget : most points that a look takes, of a tool whose clusters sleep; None for other tools.
+    """
+    follower["merges_from"] = MERGES_FROM
+    if budget is not None:
+        follower["is_large"] = True
+        follower["most_looked"] = budget if budget < n_points else 0
+
+
 class DriveInputs(Protocol):
     """What a drive reads: the loop has these."""
 
@@ -143,10 +154,8 @@ class SmoothDrive:
         self._felt_here = np.zeros((1, RESULTS))
         self._felt, self._unknown = self._tool["felt"], scene.servo["sent"]["unknown"]
         self._left_out, self._counts = scene.servo["sent"]["left_out"], counts_of(1)
-        self._follower["merges_from"] = MERGES_FROM
-        if scene.sleepers is not None:
-            self._follower["is_large"] = True
-            self._follower["most_looked"] = scene.budget if scene.budget < n_points else 0
+        is_awake = scene.sleepers is None
+        prepare_follower(self._follower, n_points, None if is_awake else scene.budget)
 
     def step(self, dt: float) -> None:
         """Advance the tool by a period `dt` (s); `sent` then has the wrench for the device."""
@@ -155,9 +164,6 @@ class SmoothDrive:
             scene.cells, scene.row, scene.clusters, scene.place, self._spring, scene.servo,
             self._follower, dt, self._field, self._met, scene.missed,
         )  # fmt: skip
-        if scene.sleepers is not None and self._follower["n_active"]:
-            # a period in contact without a look rests on the last look
-            self._left_out[()] = max(self._left_out, self._follower["n_left_out"])
 
     @property
     def least_share(self) -> float:

@@ -23,7 +23,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.cli.tools import compile_for, shell_of, shell_record
+from hapticdb.cli.tools import compile_for, compile_for_large, shell_of, shell_record
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.errors import UsageError
 
@@ -210,7 +210,7 @@ def feel(
     hand, handle = given.open(path_speed := given.path_speed()), Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel")
     with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
-        shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
+        shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells), budget_points)
         session = Session(
             cells, shell, hand, rate=rate, seconds=seconds, policy=policy, handle=handle,
             **force.law_and_coupling(cells), staleness=staleness, budget_points=budget_points,
@@ -223,12 +223,16 @@ def feel(
 
 
 def _shell(
-    tool: str, unit: str | None, points: int | None, seed: int | None, device: str, inset: float
-) -> "PointShell":
-    """Make the tool's shell, drawn inward by `inset` metres."""
+    tool: str, unit: str | None, points: int | None, seed: int | None, device: str, inset: float,
+    budget_points: int | None,
+) -> "PointShell":  # fmt: skip
+    """Make the tool's shell, drawn inward by `inset` metres, and compile what its size needs."""
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
-    return shell_of(tool, unit, points, None if is_for_hand_alone else seed, inset=inset)
+    seed = None if is_for_hand_alone else seed
+    shell = shell_of(tool, unit, points, seed, inset=inset)
+    compile_for_large(shell, budget_points)
+    return shell
 
 
 def _show(

@@ -415,5 +415,7 @@ def advance(
     sent.unknown = follower.n_unknown if found == NOT_KNOWN else 0
     sent.deepest = tool.felt[DEEPEST]
     sent.left_out = follower.most_left_out
+    if follower.n_active > 0:  # a period in contact without a look rests on the last look
+        sent.left_out = max(sent.left_out, follower.n_left_out)
     sent.n_steps = follower.n_looks
     sent.revision = revision

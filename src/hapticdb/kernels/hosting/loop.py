@@ -10,7 +10,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, FLOATS3, INTS, INTS2, entry, leaf, record_of
 from hapticdb.kernels.field.law import DistanceFieldLaw
-from hapticdb.kernels.hand import coupling, quasistatic
+from hapticdb.kernels.hand import coupling, large, quasistatic
 from hapticdb.kernels.hand.body import Body
 from hapticdb.kernels.hand.coupling import IS_FADING, IS_HELD
 from hapticdb.kernels.hand.device_spring import DeviceSpring
@@ -21,6 +21,7 @@ from hapticdb.kernels.hosting.clock import now_ns, sleep_ns
 from hapticdb.kernels.hosting.following import follow_hand
 from hapticdb.kernels.hosting.memory import (
     array_at,
+    asleep_of,
     grid_of,
     plane_cells,
     smooth_cells,
@@ -30,12 +31,15 @@ from hapticdb.kernels.hosting.showing import (
     FELT,
     HOSTED_ROWS,
     TOUCHING,
+    count_left_out,
     count_times,
     list_touching,
     show_objects,
     show_plane,
     show_smooth,
 )
+from hapticdb.kernels.large.budget import feel_within
+from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.records import (
     FOLLOWER,
     FRAME,
@@ -87,11 +91,18 @@ def place_tool(tool, pose):
 @leaf
 def feel_again(station, cells, shell, place, poses, met, missed, felts, servo):
     """Compute the law's frame at the tool's pose, for a recording; into tool.felt."""
-    tool, sent = servo.tool, servo.sent
-    feel_kernel(
-        cells, station.reader, shell, poses, place, DistanceFieldLaw(station.stiffness), met[FELT],
-        missed, felts,
-    )  # fmt: skip
+    tool, sent, law = servo.tool, servo.sent, DistanceFieldLaw(station.stiffness)
+    if station.is_large:
+        asleep = asleep_of(station)
+        counts = asleep.counts
+        counts[0, LOOKED_AT] = counts[0, LEFT_OUT] = 0
+        feel_within(
+            cells, station.reader, shell, poses, place, law, met[FELT], missed, felts,
+            asleep.sleepers, asleep.budget, counts,
+        )  # fmt: skip
+        sent.left_out = max(sent.left_out, counts[0, LEFT_OUT])
+    else:
+        feel_kernel(cells, station.reader, shell, poses, place, law, met[FELT], missed, felts)
     for n in range(RESULTS):
         tool.felt[n] = felts[0, n]
     sent.unknown += np.int64(felts[0, UNKNOWNS])
@@ -153,9 +164,15 @@ def step_plane(station, seat, shell, place, dt, met, missed, poses, is_shown):
     body = body_of(station)
     servo_record = array_at(station.servo, (), SERVO)
     servo = servo_record[()]
-    coupling.advance(
-        plane_cells(station), station.reader, shell, place, body, servo_record, dt, met, missed
-    )
+    cells = plane_cells(station)
+    if station.is_large:
+        asleep = asleep_of(station)
+        large.advance_asleep(
+            cells, station.reader, shell, place, body, servo_record, dt, met, missed,
+            asleep.sleepers, asleep.budget, asleep.counts,
+        )  # fmt: skip
+    else:
+        coupling.advance(cells, station.reader, shell, place, body, servo_record, dt, met, missed)
     for axis in range(3, 6):
         servo.sent.wrench[axis] /= station.scale
     place_tool(servo.tool, poses[0])
@@ -218,6 +235,7 @@ def run_session(station, seat, ring, missed, poses, felts, due, moment):
     seat.unknown_frames += sent.unknown > 0
     seat.held_frames += (sent.marks & IS_HELD) != 0
     seat.stale_frames += hand.is_stale
+    count_left_out(seat, sent.left_out)
 
 
 @entry(

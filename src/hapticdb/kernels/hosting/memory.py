@@ -13,9 +13,13 @@ from numba.extending import intrinsic
 
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.field.lattice import CELL_VALUES
+from hapticdb.kernels.large.budget import Asleep
+from hapticdb.kernels.large.sleeping import COUNTS, RADIUS, REST, Sleepers
+from hapticdb.kernels.large.waking import STATE
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
     CELL_WORDS,
+    CHANGES_KEPT,
     READER_STRIDE,
     SCRATCH_ROWS,
     Cells,
@@ -95,6 +99,26 @@ def tool_of(station):
         array_at(station.columns, (3, n_points), np.float64),
         array_at(station.scratch, (SCRATCH_ROWS, station.run), np.float64),
     )
+
+
+@leaf
+def asleep_of(station):
+    """Sleeping clusters of a session with a large tool, with its budget and counts."""
+    at, n_runs = station.sleeping, station.n_spheres
+    sleepers = Sleepers(
+        array_at(at.boxes, (at.n_blocks, RADIUS + 1), np.float64),
+        array_at(at.block_rests, (at.n_blocks, REST + 1), np.float64),
+        array_at(at.run_rests, (n_runs, 4), np.float64),
+        array_at(at.state, (STATE,), np.int64),
+        array_at(at.changed, (CHANGES_KEPT, 3), np.float64),
+        array_at(at.listed, (n_runs,), np.int64),
+        array_at(at.skips, (n_runs, 1), np.float64),
+        array_at(at.nothing, (0, 4), np.float64),
+        array_at(at.chosen, (at.n_chosen, 6), np.float64),
+        array_at(at.columns, (3, at.n_chosen), np.float64),
+        array_at(at.indices, (at.n_chosen,), np.int64),
+    )
+    return Asleep(sleepers, at.budget, array_at(at.counts, (1, COUNTS), np.int64))
 
 
 @leaf

@@ -124,6 +124,13 @@ def show_objects(seat, session):
 
 
 @leaf
+def count_left_out(seat, left_out):
+    """Count the points that the budget left out of a frame, and of its recorded wrench."""
+    seat.left_out_frames += left_out > 0
+    seat.most_left_out = max(seat.most_left_out, left_out)
+
+
+@leaf
 def count_times(seat, lateness, elapsed):
     """Count a frame's lateness and computing time, seconds."""
     seat.lateness[min(np.int64(lateness / TIME_BIN), np.int64(TIME_BINS))] += 1

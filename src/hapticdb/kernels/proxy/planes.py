@@ -15,9 +15,11 @@ from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.field.spline import second_derivatives
 from hapticdb.kernels.hand.near_points import (
     FAR,
+    LEAST_BOUND,
     ONSETS,
     RUN_DUE,
     bends_of,
+    bound_at,
     clamped_into,
     distance_at,
 )
@@ -69,14 +71,15 @@ def write_bends(payload, slot, x, y, z, gx, gy, gz, size, row):
 def find_rows(cells, which, shell, place, tool, follower, field, rows):
     """Make a row of each point in REACH at the tool's pose -> their number, and the trust, voxels.
 
-    The trust: how far every other point may move without contact.
+    The trust: how far every other point may move without contact. Where the coupling has merged
+    contacts (`near_points.look`), the points that it leaves to others make no row here either.
     """
     keys, slots, masks = cells.keys, cells.slots, cells.masks
     payload = cells.payload
     transform = transform_of(tool.pose)
     cx, cy, cz = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     size, side, points, run = place.size, place.side, shell.points, shell.run
-    count, trust = 0, 1e30
+    count, trust, merged = 0, 1e30, max(follower.merged, 1)
     for start in range(0, points.shape[0], run):
         bound = field[RUN_DUE, start // run] - follower.travelled + FAR
         if bound >= HALF_WIDTH:
@@ -93,6 +96,11 @@ def find_rows(cells, which, shell, place, tool, follower, field, rows):
                 trust = 0.0
                 continue
             mask = masks[slot]
+            if n & (merged - 1):
+                bound = bound_at(payload, slot, mask, x, y, z, dx, dy, dz)
+                if bound >= LEAST_BOUND:
+                    trust = min(trust, bound - LEAST_BOUND)
+                    continue
             u, gx, gy, gz, bound = distance_at(payload, slot, mask, x, y, z, dx, dy, dz)
             length = math.sqrt(gx * gx + gy * gy + gz * gz)
             if u >= REACH or length < 0.5:

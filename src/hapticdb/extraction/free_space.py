@@ -38,6 +38,9 @@ CORE_SHARE = 0.05
 """Share of the core's points that may be hit besides by straight pulls, where it is hit at the
 start. Larger: as for `CORE_GROWTH`; smaller: fewer parts that fill one another, as bricks with
 studs do, come apart. How deep they get is proved afterwards."""
+FRESH = 1.0
+"""Voxels from where a part is at its start beyond which it is in a fresh place. Larger: more pulls
+against contacts, also through thin walls of what is touched."""
 AT_ONCE = 32
 """Poses of a motion that are looked at together. Larger: fewer calls; more poses of motions that
 turn out blocked."""
@@ -162,6 +165,24 @@ class ContactSpace:
         for frames, most in zip(self._frames, greatest, strict=True):
             allowed &= frames.feel(poses).hits <= most
         return allowed
+
+    def stays(self, poses: Floats) -> bool:
+        """Whether a part at poses (n, 4, 4) hits something only where it is at its start.
+
+        No point that hits may be more than `FRESH` voxels outside the part as it stands.
+        """
+        from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for the last resort
+
+        shell, farthest = self._space.shell, FRESH * self._problem.voxel_size
+        tree = cKDTree(shell.points)
+        for pose in poses:
+            hits = self.touch(pose).hits
+            places = shell.points[hits] @ pose[:3, :3].T + pose[:3, 3]
+            distances, nearest = tree.query(places)
+            inward = ((places - shell.points[nearest]) * shell.normals[nearest]).sum(axis=1)
+            if ((distances > farthest) & (inward < 0.0)).any():
+                return False
+        return True
 
 
 def _from_coarse_to_fine(n: int) -> list[Ints]:

@@ -15,8 +15,9 @@ from hapticdb.extraction.problem import Problem
 Floats = NDArray[np.float64]
 
 MOST_OPPOSED = 0.1
-"""Greatest share of the contacts at the start that a pull may press against. Larger: pulls through
-thin walls are tried, too; the proof does not take them for proved."""
+"""Greatest share of the contacts at the start that a pull may press against, unless nothing else
+leads out. Larger: pulls through thin walls are tried, too; the proof does not take them for
+proved."""
 BLOCK = 64
 """Samples, half a voxel apart, that are looked at together."""
 
@@ -94,14 +95,39 @@ class Pulls:
         for n in range(total):
             if self.done and time.monotonic() > until:
                 return
-            self.done.append(self._pull(n))
+            is_opposed = self._opposed[n] > MOST_OPPOSED
+            self.done.append(self._blocked(n) if is_opposed else self._pull(n))
             if progress is not None:
                 progress(SearchProgress(n + 1, total))
 
+    def opposed_out(self, until: float) -> list[Pull]:
+        """Pulls that lead out though they press against more than `MOST_OPPOSED` of the contacts.
+
+        Contacts are points in voxels: in a recess hardly wider than the part, its front is in
+        contact, too. So a pull counts if the part is in contact only where it was at its start. A
+        bolt in its bore is; a part that is pulled through something else is not.
+        """
+        found = []
+        for n in np.flatnonzero(self._opposed > MOST_OPPOSED).tolist():
+            if time.monotonic() > until:
+                break
+            pull = self._pull(n)
+            if pull.is_out and self._contact.stays(self._in_contact(pull)):
+                found.append(pull)
+        return found
+
+    def _in_contact(self, pull: Pull) -> Floats:
+        """Poses (n, 4, 4) of a pull in contact, half a voxel apart or less."""
+        n = int(np.ceil(2.0 * pull.touching / self._problem.voxel_size)) + 1
+        return _poses_along(pull.direction, np.linspace(0.0, pull.touching, n))
+
+    def _blocked(self, n: int) -> Pull:
+        """A pull that is not tried, because it presses against contacts."""
+        direction = self._directions[n]
+        return Pull(direction, float(self._lengths[n]), 0.0, 0.0, None, self._opposing(direction))
+
     def _pull(self, n: int) -> Pull:
         direction, length = self._directions[n], float(self._lengths[n])
-        if self._opposed[n] > MOST_OPPOSED:
-            return Pull(direction, length, 0.0, 0.0, None, self._opposing(direction))
         ways = np.linspace(0.0, length, int(np.ceil(2.0 * length / self._problem.voxel_size)) + 1)
         contact = 0  # samples in contact from the start on
         most = -1.0

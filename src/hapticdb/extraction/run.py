@@ -138,6 +138,9 @@ def _searched(problem: Problem, asked: _Asked, progress: SearchCallback | None) 
         pulls.run(until, progress)
         refuting: Counter[int] = Counter()
         way = _best_pull(problem, pulls.done, asked.budget_bytes, refuting)
+        if way is None or way.verdict == "not decided":  # what blocks is counted already
+            last = _best_pull(problem, pulls.opposed_out(until), asked.budget_bytes, Counter())
+            way = last if last is not None and last.verdict != "not decided" else way
         if asked.motions and (way is None or way.verdict == "not decided"):
             planner = Planner(
                 problem, space, contact, leaving, pulls, seed=asked.seed,

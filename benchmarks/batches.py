@@ -49,8 +49,11 @@ NEAR = 8.0
 """Voxels: a tool is near if it is no farther away and does not touch."""
 REACH = 32.0
 """Greatest distance that hapticdb searches, voxels. A farther tool is that far away at least."""
-MOST_POSES = 4096
-"""Poses of each situation."""
+MOST_POSES, MOST_OF_FEW = 4096, 16_384
+"""Poses of each situation, and those of a tool of `FEW` points or less: fewer would be answered in
+a few milliseconds, of which much is the call itself."""
+FEW = 1000
+"""Points of such a tool."""
 PATH_FRAMES = 400
 """Poses of the path that a tool slides along, where poses are chosen around it."""
 FIRST_POSES = 4
@@ -196,9 +199,10 @@ def measure_tool(
             gap = np.minimum(np.maximum(other, 0.0), reach) - own
             return float((np.abs(gap) <= 2.0 * np.sqrt(3.0) * size).mean())
 
-        for situation, poses in poses_by_situation(
-            env, tool.shell, path, settings.most_poses
-        ).items():
+        most = settings.most_poses
+        if len(points) <= FEW and most == MOST_POSES:
+            most = MOST_OF_FEW
+        for situation, poses in poses_by_situation(env, tool.shell, path, most).items():
             if not len(poses):
                 notes.append(f"no pose is {situation} with {len(points)} points")
                 continue

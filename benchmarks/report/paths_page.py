@@ -16,6 +16,9 @@ BATCH_SIDES = {
 WAY_HEAD = """\
 | part | answer | seconds | path, mm | proved from, mm | proved gap, mm | gap of the triangles, mm |
 | --- | --- | ---: | ---: | ---: | ---: | ---: |"""
+RATIO_HEAD = """\
+| tool is | points | touch, one thread | all threads | how far, one thread | all threads |
+| --- | ---: | ---: | ---: | ---: | ---: |"""
 SHELL_HEAD = """\
 | points | near | law | flat loop, us | sleeping, us | p99 | of the flat loop |
 | ---: | ---: | --- | ---: | ---: | ---: | ---: |"""
@@ -41,6 +44,19 @@ def batch_table(results: Mapping[str, Any]) -> str:
             for side in measured
         ]
         lines.append(f"| {' | '.join([situation, f'{points:,}', *sides])} |")
+    return "\n".join(lines)
+
+
+def batch_ratio_table(results: Mapping[str, Any]) -> str:
+    """How many times as many poses a second as the fastest of the others, of wall time."""
+    lines = [RATIO_HEAD]
+    rows: dict[tuple[str, int], list[str]] = {}
+    for cell in results["cells"]:
+        ratios = (cell["times_best_peer_one_thread"], cell["times_best_peer"])
+        row = rows.setdefault((cell["situation"], cell["points"]), [])
+        row += [f"{ratio:.{0 if ratio >= 9.95 else 1}f}" for ratio in ratios]
+    for (situation, points), row in rows.items():
+        lines.append(f"| {' | '.join([situation, f'{points:,}', *row])} |")
     return "\n".join(lines)
 
 

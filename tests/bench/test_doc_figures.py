@@ -17,7 +17,14 @@ from report.floods_page import flood_table
 from report.hosting_page import hosted_table
 from report.laws_page import law_frame_table, law_session_table
 from report.page import write_report
-from report.paths_page import batch_table, batch_words, shell_table, shell_words, way_table
+from report.paths_page import (
+    batch_ratio_table,
+    batch_table,
+    batch_words,
+    shell_table,
+    shell_words,
+    way_table,
+)
 from report.plots import REPORT_KINDS
 from report.proxies_page import proxy_table
 from report.realtime_page import edit_table, frame_table, model_words, session_table
@@ -134,6 +141,7 @@ TABLES = {
     "results/floods.json": [flood_table],
     "results/remote_cells.json": [remote_table],
     "results/batches.json": [batch_table],
+    "results/batches_1400.json": [batch_table, batch_ratio_table],
     "results/large_shells.json": [shell_table],
     "results/ways_out.json": [way_table],
     "results/ways_out_vintage.json": [way_table],
@@ -141,6 +149,7 @@ TABLES = {
 WORDS = {
     "results/realtime.json": model_words,
     "results/batches.json": batch_words,
+    "results/batches_1400.json": batch_words,
     "results/large_shells.json": shell_words,
     "results/shards.json": copy_words,
     "results/shards_scale.json": scale_words,

@@ -145,7 +145,8 @@ def test_a_hosted_session_moves_a_large_tool_as_a_session_of_its_own_does(
         [frames["tool"], frames["applied"], frames["wrench"], frames["hits"]]
     ).astype(np.float64)
     assert not (frames["state"] & State.HELD).any()
-    assert np.abs(frames["applied"]).max() > 0.1
+    assert frames["applied"].any()
+    assert frames["hits"].any()
     own = followed(ground, asked, frames)
     assert ours.tobytes() == own.tobytes()
     monkeypatch.setattr(hapticdb.realtime.loop, "sleeps_by_itself", lambda *_: False)

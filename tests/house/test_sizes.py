@@ -18,9 +18,6 @@ MOST_LINES = 60
 LONG_FUNCTIONS = {
     "src/hapticdb/kernels/hand/coupling.py:move_body": "one step of the coupling: smooth forces "
     "replace it",
-    "src/hapticdb/kernels/hand/coupling.py:cut_back": "likewise",
-    "src/hapticdb/kernels/hand/near_points.py:look_at_run": "one pass over the points",
-    "src/hapticdb/kernels/hand/quasistatic.py:advance": "one period, half of it its docstring",
     "src/hapticdb/kernels/resident/feeling.py:felt": "one pass over the points",
 }
 """Functions that may be longer than `MOST_LINES`, each with the reason."""

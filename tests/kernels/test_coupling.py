@@ -94,9 +94,8 @@ def test_an_impulse_stops_a_point_and_never_adds_energy(
         return
     along = np.array(direction) / length
     mass = 0.5
-    after = np.array(
-        coupling.stopped_along(*along, 0.0, *lever, *moving, *turning, 1.0 / mass, slimness)
-    )
+    after = np.array([*moving, *turning])
+    coupling.stop_along(*along, *lever, 1.0 / mass, slimness, after)
     speed = (after[:3] + np.cross(after[3:], lever)) @ along
     before = (np.array(moving) + np.cross(turning, lever)) @ along
     assert speed == pytest.approx(max(before, 0.0), abs=1e-9)

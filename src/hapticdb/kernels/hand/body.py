@@ -59,3 +59,16 @@ def begin_anew(tool):
             tool.pose[row, column] = tool.tried_pose[row, column] = 0.0
     tool.held_for = tool.risen = 0.0
     tool.version = 0
+
+
+@leaf
+def place_lost(tool, hand, is_hand):
+    """Begin anew, at the hand if there is one, with a tool that is not finite."""
+    if is_somewhere(tool) and is_finite(tool.kept) and math.isfinite(tool.held_for):
+        return
+    begin_anew(tool)
+    if is_hand:
+        for n in range(3):
+            tool.position[n] = hand.position[n]
+        for n in range(4):
+            tool.quaternion[n] = hand.quaternion[n]

@@ -19,6 +19,7 @@ from hapticdb.kernels._jit import (
     INTS,
     INTS2,
     entry,
+    inlined,
     leaf,
     record_of,
 )
@@ -34,7 +35,7 @@ from hapticdb.kernels.hand.anchors import (
     settle_anchors,
     voxel_under,
 )
-from hapticdb.kernels.hand.body import BODY, begin_anew, is_finite, is_somewhere
+from hapticdb.kernels.hand.body import BODY, is_finite, is_somewhere, place_lost
 from hapticdb.kernels.large.budget import Awake, tool_frame
 from hapticdb.kernels.law import TangentPlaneLaw
 from hapticdb.kernels.records import RESULTS, SERVO
@@ -163,24 +164,23 @@ def place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
     return px, py, pz, w, x, y, z
 
 
-@leaf
-def stopped_along(gx, gy, gz, floor, rx, ry, rz, vx, vy, vz, wx, wy, wz, lightness, slimness):
-    """Velocities after an impulse at a point that raises its speed along unit vector g to `floor`.
+@inlined
+def stop_along(gx, gy, gz, rx, ry, rz, lightness, slimness, v):
+    """Change velocities v (6,) by an impulse at a point, so that it does not move against g.
 
-    r: the point's lever; lightness: 1/m; slimness: 1/I, or 0 for a body that does not turn. A
-    point that already has that speed gets no impulse.
+    g: a unit vector; r: the point's lever; lightness: 1/m; slimness: 1/I, or 0 for a body that does
+    not turn. A point that does not move against g gets no impulse.
     """
+    vx, vy, vz, wx, wy, wz = v[0], v[1], v[2], v[3], v[4], v[5]
     ux, uy, uz = vx + wy * rz - wz * ry, vy + wz * rx - wx * rz, vz + wx * ry - wy * rx
-    lacking = floor - (ux * gx + uy * gy + uz * gz)
+    lacking = 0.0 - (ux * gx + uy * gy + uz * gz)
     if lacking <= 0.0:
-        return vx, vy, vz, wx, wy, wz
+        return
     ax, ay, az = ry * gz - rz * gy, rz * gx - rx * gz, rx * gy - ry * gx
     impulse = lacking / (lightness + slimness * (ax * ax + ay * ay + az * az))
     push, twist = impulse * lightness, impulse * slimness
-    return (
-        vx + push * gx, vy + push * gy, vz + push * gz,
-        wx + twist * ax, wy + twist * ay, wz + twist * az,
-    )  # fmt: skip
+    v[0], v[1], v[2] = vx + push * gx, vy + push * gy, vz + push * gz
+    v[3], v[4], v[5] = wx + twist * ax, wy + twist * ay, wz + twist * az
 
 
 @leaf
@@ -216,10 +216,7 @@ def cut_back(
             uy = v[1] + v[5] * rx - v[3] * rz
             uz = v[2] + v[3] * ry - v[4] * rx
             if ux * gx + uy * gy + uz * gz < 0.0:
-                v[0], v[1], v[2], v[3], v[4], v[5] = stopped_along(
-                    gx, gy, gz, 0.0, rx, ry, rz, v[0], v[1], v[2], v[3], v[4], v[5],
-                    lightness, slimness,
-                )  # fmt: skip
+                stop_along(gx, gy, gz, rx, ry, rz, lightness, slimness, v)
                 continue
         n_shut = 0
         for axis in range(3):
@@ -234,17 +231,12 @@ def cut_back(
             ):
                 continue
             n_shut += 1
-            v[0], v[1], v[2], v[3], v[4], v[5] = stopped_along(
-                -float(di), -float(dj), -float(dk), 0.0, rx, ry, rz,
-                v[0], v[1], v[2], v[3], v[4], v[5], lightness, slimness,
-            )  # fmt: skip
+            gx, gy, gz = -float(di), -float(dj), -float(dk)
+            stop_along(gx, gy, gz, rx, ry, rz, lightness, slimness, v)
         if n_shut == 0:  # only the way across an edge or a corner is shut: stop along that way
-            di, dj, dk = float(oi - i), float(oj - j), float(ok - k)
-            length = math.sqrt(di * di + dj * dj + dk * dk)
-            v[0], v[1], v[2], v[3], v[4], v[5] = stopped_along(
-                di / length, dj / length, dk / length, 0.0, rx, ry, rz,
-                v[0], v[1], v[2], v[3], v[4], v[5], lightness, slimness,
-            )  # fmt: skip
+            gx, gy, gz = float(oi - i), float(oj - j), float(ok - k)
+            length = math.sqrt(gx * gx + gy * gy + gz * gz)
+            stop_along(gx / length, gy / length, gz / length, rx, ry, rz, lightness, slimness, v)
     return count
 
 
@@ -292,13 +284,7 @@ def move_body(watch, cells, reader, shell, place, body, servo_record, dt, met, m
     n_unknown = np.int64(0)
     is_hand = is_somewhere(hand)
     is_held = hand.is_stale or not is_hand
-    if not (is_somewhere(tool) and is_finite(kept) and math.isfinite(tool.held_for)):
-        begin_anew(tool)
-        if is_hand:
-            for n in range(3):
-                position[n] = hand.position[n]
-            for n in range(4):
-                turned[n] = hand.quaternion[n]
+    place_lost(tool, hand, is_hand)
     if not is_held and tool.version != version:
         is_first = tool.version == 0
         pose_of_quaternion(

@@ -203,23 +203,40 @@ def bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m):
     write_bend(field, row + BEND_ROWS, m, d, wx, wy, wz, rx, ry, rz)
 
 
+@inlined
+def goes_nearer(u, bound, last_u, last_bound):
+    """Whether a point would be too near a surface, and no farther from it than it was."""
+    return (u < FLOOR and u <= last_u) or (bound < LEAST_BOUND and bound <= last_bound)
+
+
+@inlined
+def write_near(
+    payload, slot, mask, x, y, z, rx, ry, rz, u, gx, gy, gz, bound, is_bent, field, rows, m
+):
+    """Write near point m, at (x, y, z) voxels with lever r, into its rows."""
+    field[rows + U, m], field[rows + BOUND, m] = u, bound
+    write_row(field, rows, m, gx, gy, gz, rx, ry, rz)
+    if is_bent and u < ONSET:
+        bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m)
+    else:
+        field[rows + BENDS, m] = field[rows + BENDS + BEND_ROWS, m] = 0.0
+
+
 @leaf
 def look_at_run(
     cells, which, points, start, end, run, transform, place, center, follower, field, met, missed
 ):
     """Look at points start .. end, of run number `run` -> OPEN, or what ended it; see `look`."""
     keys, slots, masks, used = cells.keys, cells.slots, cells.masks, cells.used
-    payload = cells.payload
-    size, side = place.size, place.side
+    payload, size, side = cells.payload, place.size, place.side
     cx, cy, cz = center[0], center[1], center[2]
     half = 1 - follower.side
     base, near = NEAR + half * NEAR_ROWS, NEAR_POINTS + half
     travelled, n_near, n_missed = follower.travelled, follower.n_tried, missed[LISTED]
-    is_walking, run_due = follower.is_walking, NEVER
     stride, n_looked, most_looked = follower.stride, follower.n_looked, follower.most_looked
     merged, most_near = follower.merged, follower.merges_from
     last_key, slot, mask = np.int64(-1), np.int64(UNKNOWN), np.uint64(0)
-    first = start + -start % stride
+    first, run_due = start + -start % stride, NEVER
     for n in range(first, end, stride):
         if travelled < field[DUE, n]:
             run_due = min(run_due, field[DUE, n])
@@ -252,25 +269,18 @@ def look_at_run(
         run_due = min(run_due, field[DUE, n])
         if u >= ONSET + MARGIN and bound >= LEAST_BOUND:
             continue
-        if is_walking and (
-            (u < FLOOR and u <= field[LAST_U, n])
-            or (bound < LEAST_BOUND and bound <= field[LAST_BOUND, n])
-        ):
+        if follower.is_walking and goes_nearer(u, bound, field[LAST_U, n], field[LAST_BOUND, n]):
             return SHUT
         if 0 < most_near <= n_near and merged < MOST_MERGED:
             return MANY
         met[near, n_near] = n
-        field[base + U, n_near], field[base + BOUND, n_near] = u, bound
-        rx, ry, rz = px - cx, py - cy, pz - cz
-        write_row(field, base, n_near, gx, gy, gz, rx, ry, rz)
-        if follower.is_bent and u < ONSET:
-            bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, base, n_near)
-        else:
-            field[base + BENDS, n_near] = field[base + BENDS + BEND_ROWS, n_near] = 0.0
+        write_near(
+            payload, slot, mask, x, y, z, px - cx, py - cy, pz - cz, u, gx, gy, gz, bound,
+            follower.is_bent, field, base, n_near,
+        )  # fmt: skip
         n_near += 1
     field[RUN_DUE, run] = run_due
-    follower.n_tried, missed[LISTED] = n_near, n_missed
-    follower.n_looked = n_looked
+    follower.n_tried, follower.n_looked, missed[LISTED] = n_near, n_looked, n_missed
     follower.n_left_out += end - start - (end - first + stride - 1) // stride
     return OPEN
 

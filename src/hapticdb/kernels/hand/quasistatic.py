@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS, INTS2, entry, leaf, record_of
-from hapticdb.kernels.hand.body import begin_anew, is_finite, is_somewhere
+from hapticdb.kernels.hand.body import is_finite, is_somewhere, place_lost
 from hapticdb.kernels.hand.coupling import (
     IS_CUT,
     IS_DROPPED,
@@ -349,6 +349,30 @@ def finish(spring, shell, place, tool, hand, follower, field, met, is_held, foun
     return flags
 
 
+@leaf
+def move_tool(
+    cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
+):
+    """Move the tool after the hand, in the present version of the cells -> what was found."""
+    found = OPEN
+    if tool.version != version or has_moved(tool, follower):
+        if not look_here(cells, which, shell, place, tool, follower, field, met, missed):
+            return NOT_KNOWN
+        tool.version = version
+    elif take_more_points(follower, field):
+        found = look_at_more(cells, which, shell, place, tool, follower, field, met, missed)
+    if found == OPEN:
+        if follower.is_loose:
+            found = follow_loosely(
+                cells, which, shell, place, spring, tool, hand, follower, field, met, missed
+            )
+        else:
+            found = follow(
+                cells, which, shell, place, spring, tool, hand, follower, field, met, missed
+            )
+    return found
+
+
 @entry(
     CELLS_WITH_DISTANCES, INT, CLUSTERS, PLACE, DEVICE_SPRING, record_of(SERVO),
     record_of(FOLLOWER), FLOAT, FLOATS2, INTS2, INTS,
@@ -377,33 +401,14 @@ def advance(
     tool, hand, sent = servo.tool, servo.hand, servo.sent
     is_hand = is_somewhere(hand)
     is_held = hand.is_stale or not is_hand
-    if not (is_somewhere(tool) and is_finite(tool.kept) and math.isfinite(tool.held_for)):
-        begin_anew(tool)
-        if is_hand:
-            for n in range(3):
-                tool.position[n] = hand.position[n]
-            for n in range(4):
-                tool.quaternion[n] = hand.quaternion[n]
-    found = OPEN
+    place_lost(tool, hand, is_hand)
     follower.n_looks, follower.least_clearance = 0, NEVER
     follower.most_left_out = 0
+    found = OPEN
     if not is_held:
-        if tool.version != version or has_moved(tool, follower):
-            if look_here(cells, which, shell, place, tool, follower, field, met, missed):
-                tool.version = version
-            else:
-                found = NOT_KNOWN
-        elif take_more_points(follower, field):
-            found = look_at_more(cells, which, shell, place, tool, follower, field, met, missed)
-        if found == OPEN:
-            if follower.is_loose:
-                found = follow_loosely(
-                    cells, which, shell, place, spring, tool, hand, follower, field, met, missed
-                )
-            else:
-                found = follow(
-                    cells, which, shell, place, spring, tool, hand, follower, field, met, missed
-                )
+        found = move_tool(
+            cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
+        )
     revision = cells.control[REVISION + which]  # before end_frame: then the buffer may be reused
     end_frame(cells, reader)
     is_held = is_held or found == NOT_KNOWN

@@ -13,13 +13,14 @@ from scipy.spatial.transform import Rotation
 import hapticdb
 from extraction_scenes import box, imported, joined
 from hapticdb import Grid, PointShell
+from hapticdb.kernels.surfaces import nearest, sides
 from hapticdb.pointshell.orientation import Surface, orient
-from hapticdb.sweeps.depths import DepthSearch
+from hapticdb.sweeps.depths import MOST_LOOKS, DepthSearch
 from hapticdb.sweeps.path import SweepPath
 from hapticdb.sweeps.record import sweep_record
 from hapticdb.sweeps.result import ContactDepth, Swept
 from hapticdb.sweeps.run import sweep
-from hapticdb.sweeps.solid import Solid, distances_to
+from hapticdb.sweeps.solid import Solid
 from hapticdb.sweeps.verdict import verdict_line
 from hapticdb.testing import voxel_object
 from moving_boxes import mesh
@@ -100,7 +101,7 @@ def test_two_thin_sheets_that_pass_each_other_are_not_taken_for_sliding(tmp_path
     (depth,) = swept(url, "standing", moved((0.0, 0.0, -0.3)), tolerance=SIZE).depths
     assert depth.deepest_most <= SIZE
     assert not depth.is_bounded
-    assert "thinner" in depth.why
+    assert "too thin" in depth.why
 
 
 def test_what_is_open_on_both_sides_has_no_depth(tmp_path: Path) -> None:
@@ -116,6 +117,24 @@ def test_what_is_open_on_both_sides_has_no_depth(tmp_path: Path) -> None:
     shell = PointShell.from_mesh(upper.vertices, upper.faces, 20)
     (record,) = sweep_record(found, shell, [], [])["depths"]
     assert (record["deepest_most"], record["is_bounded"]) == (None, False)
+
+
+def test_a_cut_is_told_although_another_depth_is_not_known(tmp_path: Path) -> None:
+    """The peg also stands on a block that is pierced by it, and whose lid is missing."""
+    sides = [
+        box((0.02, -0.08, 0.0), (0.08, 0.08, 0.1)),
+        box((-0.08, -0.08, 0.0), (-0.02, 0.08, 0.1)),
+    ]
+    standing = box((-0.02, -0.02, 0.0), (0.02, 0.02, 0.15))
+    standing.update_faces(np.arange(len(standing.faces)) > 1)
+    floor = box((-0.08, -0.08, -0.05), (0.08, 0.08, 0.0))
+    floor.update_faces(np.arange(len(floor.faces)) > 1)
+    url = imported(tmp_path, SIZE, block=joined(*sides), floor=floor, peg=standing)
+    found = swept(url, "peg", moved((0.03, 0.0, 0.0)))
+    depths = {one.object.name: one for one in found.depths}
+    assert "nothing has an inside" in depths["floor"].why
+    assert depths["block"].is_cut
+    assert found.verdict == "hits"
 
 
 def test_a_file_that_is_gone_leaves_the_depth_open(tmp_path: Path) -> None:
@@ -183,11 +202,9 @@ def test_depths_hold_between_boxes_at_every_pose(
 def depth_of(shell: PointShell, path: SweepPath, made: trimesh.Trimesh) -> ContactDepth:
     assert isinstance(shell.surface, Surface)
     other = Solid(orient(np.array(made.triangles)), SIZE)
-    search = DepthSearch(
-        path, path.sample(0, len(path)), path.travels(0, len(path)) * SIZE, SIZE, 0.005
-    )
+    search = DepthSearch(path, len(path), SIZE, 0.005)
     named = voxel_object(Grid(SIZE, (0.0, 0.0, 0.0), 7), np.zeros((1, 3), dtype=np.int64))
-    return search.depth(named, Solid(shell.surface, SIZE), other, len(path))
+    return search.along(named, Solid(shell.surface, SIZE), other, MOST_LOOKS)
 
 
 @given(corners=st.tuples(vectors, vectors, vectors), place=vectors)
@@ -195,7 +212,8 @@ def test_the_distance_to_a_triangle_is_that_to_its_nearest_place(
     corners: tuple[Floats, Floats, Floats], place: Floats
 ) -> None:
     triangle = np.stack(corners)
-    exact = float(distances_to(place, triangle))
+    tree = sides.triangle_tree(triangle[None], np.zeros(1, dtype=np.int64))
+    exact = float(nearest.distances_to(tree, place[None])[0])
     u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, 60), np.linspace(0, 1, 60)))
     kept = u + v <= 1.0 + 1e-12
     places = (

@@ -131,7 +131,7 @@ def depths_along(
             most = MOST_BESIDE if is_open else MOST_LOOKS
             later = search.along(obj, tool, solids[obj.id], most)
             is_known = np.isfinite(later.at_start_most)
-            found[obj.id] = later if is_known else start._replace(why=later.why)
+            found[obj.id] = later if is_known else start._replace(why=start.why or later.why)
     return tuple(found[obj.id] for obj in objects)
 
 

@@ -49,11 +49,11 @@ NEAR = 8.0
 """Voxels: a tool is near if it is no farther away and does not touch."""
 REACH = 32.0
 """Greatest distance that hapticdb searches, voxels. A farther tool is that far away at least."""
-MOST_POSES, MOST_OF_FEW = 4096, 16_384
-"""Poses of each situation, and those of a tool of `FEW` points or less: fewer would be answered in
-a few milliseconds, of which much is the call itself."""
-FEW = 1000
-"""Points of such a tool."""
+MOST_POSES = 4096
+"""Poses of each situation."""
+FEW, TIMES_OF_FEW = 1000, 4
+"""A tool of so many points or less gets so many times as many poses: fewer would be answered in a
+few milliseconds, of which much is the call itself."""
 PATH_FRAMES = 400
 """Poses of the path that a tool slides along, where poses are chosen around it."""
 FIRST_POSES = 4
@@ -199,9 +199,7 @@ def measure_tool(
             gap = np.minimum(np.maximum(other, 0.0), reach) - own
             return float((np.abs(gap) <= 2.0 * np.sqrt(3.0) * size).mean())
 
-        most = settings.most_poses
-        if len(points) <= FEW and most == MOST_POSES:
-            most = MOST_OF_FEW
+        most = settings.most_poses * (TIMES_OF_FEW if len(points) <= FEW else 1)
         for situation, poses in poses_by_situation(env, tool.shell, path, most).items():
             if not len(poses):
                 notes.append(f"no pose is {situation} with {len(points)} points")

@@ -8,7 +8,7 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.resident import clearance, first_hits
 from hapticdb.kernels.resident import nearest as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
-from hapticdb.resident.frames import SMALL, ResidentFrames, clusters_of
+from hapticdb.resident.frames import SMALL, ResidentFrames, spheres_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -62,12 +62,11 @@ class NearestSearch:
         self._reach = reach
         self._cells = frames.residency.table.cells.without_distances()
         size = frames.residency.grid.voxel_size
-        runs = clusters_of(frames.shell, size, RUN)
-        self._spheres, self._groups = runs.spheres, runs.groups
+        self._spheres, self._groups = spheres_of(frames.clusters.points, size, RUN)
         radii = frames.clusters.spheres[:, 3] / size
         self._fine = int(np.searchsorted(CLOSE, np.median(radii))) if len(radii) else len(CLOSE)
-        small = runs.spheres[runs.spheres[:, 3] <= SMALL * size, 3]
-        self._largest = float(small.max(initial=0.0))
+        of_runs = self._spheres[:, 3]
+        self._largest = float(of_runs[of_runs <= SMALL * size].max(initial=0.0))
         self._around = reach + 1.0 + max(frames.surroundings.reach, self._largest / size)
         self._most = (frames.residency.table.n_slots - 1) // 2
         across = 2.0 * self._around / CELL

@@ -92,15 +92,21 @@ def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) ->
     if run is None:
         run = RUN if len(shell) > RUN else 0
     points = np.hstack([shell.points, shell.normals])
+    spheres, groups = spheres_of(points, voxel_size, run)
+    run = run or min(len(points), FLAT_RUN)
+    columns = np.array(shell.points.T, order="C")  # a view of one point would be read-only
+    scratch = np.empty((SCRATCH_ROWS, run))
+    return Clusters(points, np.array(shell.center), spheres, groups, run, columns, scratch)
+
+
+def spheres_of(points: Floats, voxel_size: float, run: int) -> tuple[Floats, Floats]:
+    """Bounding spheres of runs of points (N, 6), and of groups of runs, as `Clusters` has them."""
     spheres = np.empty((-(-len(points) // run) if run else 0, 4))
     groups = np.empty((-(-len(spheres) // GROUP), 4))
     if run:
         bounding_spheres(points, run, 1e-3 * voxel_size, spheres)
         bounding_spheres(points, GROUP * run, 1e-3 * voxel_size, groups)
-    run = run or min(len(points), FLAT_RUN)
-    columns = np.array(shell.points.T, order="C")  # a view of one point would be read-only
-    scratch = np.empty((SCRATCH_ROWS, run))
-    return Clusters(points, np.array(shell.center), spheres, groups, run, columns, scratch)
+    return spheres, groups
 
 
 class Surroundings(NamedTuple):

@@ -93,7 +93,7 @@ def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
     """Least squared distance from (x, y, z) to a voxel of one cell, and that voxel, packed.
 
     Returns `square` and `voxel` as given if no voxel is nearer. All lengths in voxels. Only columns
-    within the radius are looked at, so the loops hardly branch: that halves a search.
+    within the radius are looked at, so the loops hardly branch: a fifth off a search.
     """
     radius = math.sqrt(square)
     i0, j0, k0 = ci << 5, cj << 5, ck << 5

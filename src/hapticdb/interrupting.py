@@ -1,8 +1,10 @@
 """Ctrl-C at any moment of the command line: one line, exit code 130, no traceback.
 
 A signal may raise its exception in any line of code. Within an import it may turn into another
-error, or into a traceback that Python prints and ignores. Until a verb begins, nothing is open, so
-Ctrl-C ends the process at once. Afterwards the interrupt waits until no import is running.
+error, or into a traceback that Python prints and ignores. Within llvmlite, which gives an object to
+LLVM in one line and notes it in the next one, it may have the object freed twice. Until a verb
+begins, nothing is open, so Ctrl-C ends the process at once. Afterwards the interrupt waits until
+neither is running.
 """
 
 import os
@@ -15,8 +17,11 @@ from typing import Literal
 EXIT_CODE = 130
 MESSAGE = b"hapticdb: interrupted\n"
 AGAIN_S = 0.01
-"""Seconds until an interrupt that came within an import is raised again. A larger value answers
-later."""
+"""Seconds until an interrupt that came where none may be raised is tried again. A larger value
+answers later."""
+
+LLVMLITE = f"{os.sep}llvmlite{os.sep}"
+"""In the paths of llvmlite's modules."""
 
 Phase = Literal["not ours", "starting", "working", "leaving"]
 _phase: Phase = "not ours"
@@ -62,15 +67,17 @@ def interrupt(_number: int, frame: FrameType | None) -> None:
         os._exit(EXIT_CODE)
     if _phase == "leaving":
         _phase = "starting"  # a second Ctrl-C ends the process at once
-    elif _is_importing(frame) and _try_again():
+    elif _must_wait(frame) and _try_again():
         pass
     else:
         raise KeyboardInterrupt  # without the number: SIGALRM's would be read as a message
 
 
-def _is_importing(frame: FrameType | None) -> bool:
+def _must_wait(frame: FrameType | None) -> bool:
+    """Whether an import or llvmlite is running."""
     while frame is not None:
-        if frame.f_code.co_filename.startswith("<frozen importlib"):
+        file = frame.f_code.co_filename
+        if file.startswith("<frozen importlib") or LLVMLITE in file:
             return True
         frame = frame.f_back
     return False

@@ -61,6 +61,30 @@ def test_ctrl_c_within_an_import_of_a_touch_is_one_line(scene: Path, at: int) ->
         assert (done.returncode, done.stderr) == (130, "hapticdb: interrupted\n")
 
 
+IN_LLVMLITE = """
+import os, signal
+from hapticdb import interrupting
+
+interrupting.begin()
+interrupting.work()
+lines = "given = True\\nos.kill(os.getpid(), signal.SIGINT)\\nnoted = True"
+scope = {"os": os, "signal": signal}
+try:
+    exec(compile(lines, os.sep.join(["", "llvmlite", "binding.py"]), "exec"), scope)
+    while True:
+        signal.pause()
+except KeyboardInterrupt:
+    print("noted" in scope)
+"""
+"""A program that is interrupted between two lines of a module of llvmlite."""
+
+
+def test_llvmlite_notes_what_it_gave_away_before_ctrl_c_is_raised() -> None:
+    """Its ``ExecutionEngine.add_module`` gives a module to LLVM, and notes it in the next line."""
+    done = finished([sys.executable, "-c", IN_LLVMLITE])
+    assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
+
+
 @pytest.mark.long
 def test_ctrl_c_after_any_delay_leaves_no_traceback_of_ours(scene: Path) -> None:
     """Before hapticdb's first line Python prints a traceback, which names no file of hapticdb."""

@@ -1,6 +1,8 @@
 """Hands for tests of contact proxies, and servers in processes of their own that they feel."""
 
 import contextlib
+import random
+import socket
 import subprocess
 import sys
 import time
@@ -12,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from websockets.sync.client import ClientConnection, connect
 
-from children import PIPE, child
+from children import PATIENCE, PIPE, child
 from contact_server import TOKEN, save_shell
 from hapticdb.bench.feel.ground import Ground
 from hapticdb.bench.feel.scenes import plane
@@ -47,6 +49,25 @@ class Served:
         pose[:3, 3] = self.origin
         pose[2, 3] += 1.5 * SIZE - depth
         return pose
+
+
+def lasting_port() -> int:
+    """A free port that no client is given in the meantime, when a test ends and restarts a server.
+
+    Clients get ports from 32,768 on. One of them may get the port of a server that has just ended.
+    """
+    rng = random.SystemRandom()
+    for _ in range(100):
+        port = rng.randrange(20_000, 32_000)
+        with contextlib.suppress(OSError), socket.create_server(("127.0.0.1", port)):
+            return port
+    pytest.fail("no free port among 100")
+
+
+def ended(served: Served) -> None:
+    """Kill a server and wait until it is gone, and its port is free."""
+    served.process.kill()
+    served.process.wait(PATIENCE)
 
 
 @contextlib.contextmanager

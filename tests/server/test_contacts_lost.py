@@ -16,7 +16,17 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
 from children import PATIENCE, joined, until
-from contact_hands import DEPTH, STILL, Served, falls_to_zero, pressed, serving, started
+from contact_hands import (
+    DEPTH,
+    STILL,
+    Served,
+    ended,
+    falls_to_zero,
+    lasting_port,
+    pressed,
+    serving,
+    started,
+)
 from hapticdb.client import contact_link, contact_proxy
 from hapticdb.client.contact_proxy import ContactProxy
 from hapticdb.errors import ConnectionLostError, ProtocolError, UsageError
@@ -28,7 +38,7 @@ TERMS = ProxyTerms("a", (0.0, 0.0, 0.0), 0.01, 1000.0, 0.1, 7.0, 0.07, 5e4, 0.00
 @pytest.fixture
 def mortal(tmp_path: Path) -> Iterator[Served]:
     """A server that the test may freeze or kill."""
-    with serving(tmp_path) as server:
+    with serving(tmp_path, port=lasting_port()) as server:
         yield server
 
 
@@ -57,7 +67,7 @@ def test_the_force_comes_back_with_a_server_that_goes_on(mortal: Served) -> None
 def test_the_force_comes_back_with_a_server_that_is_started_again(mortal: Served) -> None:
     with ContactProxy(mortal.url()) as proxy:
         pressed(mortal, proxy)
-        mortal.process.kill()
+        ended(mortal)
         falls_to_zero(mortal, proxy)
         with started(mortal.file, mortal.plate, mortal.origin, port=mortal.port) as again:
             until(lambda: proxy.wrench(again.pose(-DEPTH), STILL)[2] == 0.0 and proxy.told.is_fresh)
@@ -169,7 +179,7 @@ def test_without_any_proxy_there_is_no_force() -> None:
 def test_the_force_comes_back_after_a_server_that_talks_nonsense(mortal: Served) -> None:
     with ContactProxy(mortal.url()) as proxy:
         pressed(mortal, proxy)
-        mortal.process.kill()
+        ended(mortal)
         falls_to_zero(mortal, proxy)
         with stalling(lambda connection: connection.send(b"nonsense"), mortal.port):
             until(lambda: isinstance(proxy.error, ProtocolError))

@@ -6,7 +6,8 @@
 A sheet of points slides over a box as a hand moves it, at 0.5 m/s and 1 kHz, up and down and with
 small turns. The box lies below a given share of the sheet. The flat loop, runs that are tested in
 every frame, and sleeping clusters take turns on the same poses, and give the same wrenches bit for
-bit. Cells are resident; one processor computes.
+bit. Sleeping clusters with a budget of points take their turns, too, where more points are near;
+their wrenches differ, and it is said by how much. Cells are resident; one processor computes.
 """
 
 import argparse
@@ -29,7 +30,7 @@ from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT, feel_sleeping
 from hapticdb.kernels.resident.cells import RESULTS
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.query.law import ForceLaw
-from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.sleepers import counts_of
 from hapticdb.resident.table import CellTable
@@ -42,6 +43,8 @@ SPEED, RATE = 0.5, 1000.0
 """Of the hand: metres a second, and frames a second."""
 ROUNDS = 5
 """Timed passes over all poses; a frame's time is the least of them, without what others cost."""
+BUDGET = 10_000
+"""Points near something that a frame with a budget looks at, at most."""
 TABLE = 512 << 20
 """Bytes for cells."""
 
@@ -96,7 +99,7 @@ def frame_times(frame: Callable[[Floats], object], poses: Floats) -> Floats:
 def measure(
     database: Path, law: str, shell: PointShell, poses: Floats, rounds: int = ROUNDS
 ) -> dict[str, Any]:
-    """Times of a frame, us, by three ways that take turns; the results are compared bit for bit."""
+    """Times of a frame, us, by ways that take turns; without a budget they agree bit for bit."""
     distances = law == "smooth"
     with (
         hapticdb.open(database, read_only=True) as env,
@@ -107,9 +110,12 @@ def measure(
             "flat": ResidentFrames(residency, shell, LAWS[law], run=0),
             "tested": ResidentFrames(residency, shell, LAWS[law]),
             "sleeping": ResidentFrames(residency, shell, LAWS[law], sleeps=True),
+            "budget": ResidentFrames(residency, shell, LAWS[law], budget_points=BUDGET),
         }
         felt = {name: one.feel(poses) for name, one in ways.items()}
-        wrenches = {(one.wrenches + 0.0).tobytes() for one in felt.values()}
+        if not felt["budget"].left_out.any():
+            del ways["budget"]
+        wrenches = {(felt[name].wrenches + 0.0).tobytes() for name in ways if name != "budget"}
         if len(wrenches) != 1:
             raise SystemExit("the wrenches differ")
         out, counts = np.zeros((1, RESULTS)), counts_of(1)
@@ -133,7 +139,7 @@ def measure(
                 return frame
 
             frames = {
-                name: asleep(one) if name == "sleeping" else plain(one)
+                name: plain(one) if one.sleepers is None else asleep(one)
                 for name, one in ways.items()
             }
             least: dict[str, Floats] = {}
@@ -147,6 +153,7 @@ def measure(
             for name, spent in least.items()
         }
         return {
+            "budget": _within_budget(felt["flat"], felt["budget"]),
             "points": len(shell),
             "law": law,
             "near_share": float(shares.mean()),
@@ -155,6 +162,18 @@ def measure(
             "ratio": {name: us[name]["p50"] / us["flat"]["p50"] for name in us},
             "bytes_a_point": bytes_of(ways["sleeping"]) / len(shell),
         }
+
+
+def _within_budget(whole: FeltFrames, part: FeltFrames) -> dict[str, Any]:
+    """What a budget leaves out, and how far its forces are from those of all points."""
+    forces = np.linalg.norm(whole.wrenches[:, :3], axis=1)
+    off = np.linalg.norm(part.wrenches[:, :3] - whole.wrenches[:, :3], axis=1)
+    return {
+        "points": BUDGET,
+        "left_out_frames": int((part.left_out > 0).sum()),
+        "looked_at": float(part.looked_at.mean()),
+        "most_off": float(off.max() / forces.max()),
+    }
 
 
 def bytes_of(frames: ResidentFrames) -> int:

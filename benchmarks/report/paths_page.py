@@ -20,8 +20,8 @@ RATIO_HEAD = """\
 | tool is | points | touch, one thread | all threads | how far, one thread | all threads |
 | --- | ---: | ---: | ---: | ---: | ---: |"""
 SHELL_HEAD = """\
-| points | near | law | flat loop, us | sleeping, us | p99 | of the flat loop |
-| ---: | ---: | --- | ---: | ---: | ---: | ---: |"""
+| points | near | law | flat, us | sleeping, us | p99 | of the flat loop | budget, us | p99 |
+| ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |"""
 
 
 def batch_table(results: Mapping[str, Any]) -> str:
@@ -70,7 +70,7 @@ def batch_words(results: Mapping[str, Any]) -> list[str]:
 
 
 def shell_table(results: Mapping[str, Any]) -> str:
-    """Medians of both loops and p99 of the sleeping one, in microseconds."""
+    """Medians of the loops and p99 of the sleeping ones, without and with a budget, us."""
     lines = [SHELL_HEAD]
     for one in results["lines"]:
         times = one["us"]
@@ -84,6 +84,10 @@ def shell_table(results: Mapping[str, Any]) -> str:
             f"{times['sleeping']['p99']:,.0f}",
             f"{one['ratio']['sleeping']:.2f}",
         ]
+        if "budget" in times:
+            columns += [f"{times['budget']['p50']:,.0f}", f"{times['budget']['p99']:,.0f}"]
+        else:
+            columns += ["-", "-"]
         lines.append(f"| {' | '.join(columns)} |")
     return "\n".join(lines)
 
@@ -91,7 +95,10 @@ def shell_table(results: Mapping[str, Any]) -> str:
 def shell_words(results: Mapping[str, Any]) -> list[str]:
     """Sizes of the sheet, as the results have them."""
     assert {one["points"] for one in results["lines"]} == {99_856, 1_000_000}
-    return ["`make paths`", "500 frames"]
+    budgets = [one["budget"] for one in results["lines"] if "budget" in one["us"]]
+    (points,) = {one["points"] for one in budgets}
+    most_off = 100.0 * max(one["most_off"] for one in budgets)
+    return ["`make paths`", "500 frames", f"{points:,} points", f"{most_off:.1f} %"]
 
 
 def way_table(results: Mapping[str, Any]) -> str:

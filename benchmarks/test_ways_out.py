@@ -23,8 +23,8 @@ def rows(found: dict[str, Any]) -> dict[str, dict[str, object]]:
     return {row["parts"]: row for row in found["rows"]}
 
 
-PLUG = SAMPLE[-1].name
-OUT = {"wheels/wheel_bolt_front_left_1", "body/hood", *(SAMPLE[n].name for n in (1, 7, 8, 9))}
+SEAT, PLUG = SAMPLE[-2].name, SAMPLE[-1].name
+OUT = {"wheels/wheel_bolt_front_left_1", "body/hood", *(SAMPLE[n].name for n in (1, 7, 8, 9, 10))}
 HELD_BY = {
     "body/door_front_left": "body/pillar_a",
     "seats/seat_*_left": "cabin/floor_pan",
@@ -62,6 +62,15 @@ def test_the_spark_plug_comes_out_along_its_bore(rows: dict[str, dict[str, Any]]
     assert (row["verdict"], row["how"]) == ("comes out", "pull")
     assert z > 0.0
     assert max(abs(x), abs(y)) < 0.5 * z  # the bore's rim lets it lean so far, no farther
+
+
+def test_the_seat_comes_out_by_the_door_in_three_legs(rows: dict[str, dict[str, Any]]) -> None:
+    """No straight pull leads out. It touches nothing at its start, so all of the way is proved."""
+    row = rows[SEAT]
+    _, y, z = row["end_m"]
+    assert (row["verdict"], row["how"], row["motions"]) == ("comes out", "plan", 0)
+    assert y > 1.0  # to the left
+    assert 0.03 < z < 0.1  # over the sill, below the roof
 
 
 def test_the_wheel_comes_out_after_its_bolts_by_itself(found: dict[str, Any]) -> None:

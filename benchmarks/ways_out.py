@@ -63,6 +63,12 @@ AROUND_DOOR = (
     "cabin/door_trim_front_left",
     "trim/mirror_left",
 )
+AROUND_SEAT = (
+    "cabin/floor_pan",
+    "cabin/carpet",
+    "body/door_front_left",
+    "cabin/door_trim_front_left",
+)
 SAMPLE = (
     Question(("wheels/wheel_bolt_front_left_1",)),
     Question(WHEEL, BOLTS),
@@ -73,12 +79,14 @@ SAMPLE = (
     Question(("supply/battery",)),
     Question(("supply/battery",), AROUND_BATTERY),
     Question(("body/door_front_left",), AROUND_DOOR),
+    Question(("seats/seat_*_left",), AROUND_SEAT),
     Question(("engine/spark_plug",), ("body/hood*",)),
 )
 """Of the sample car: the first, the second and the hood come out. Bolts hold the wheel. The door's
 triangles cross those of pillars, dashboard, windscreen and lining, the seat's those of the floor,
 and the harness goes through the battery. Without what holds them, and what is above the battery and
-in front of the door, these two come out. The spark plug, which is added to the car, comes out along
+in front of the door, these two come out. Without floor, carpet and door the seat goes forward, up,
+and then out by the door. The spark plug, which is added to the car, comes out along
 the bore of its seat."""
 SEAT = (1.15, 0.40, 0.80)
 """Middle of the spark plug's seat in the engine bay, metres."""

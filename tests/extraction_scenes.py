@@ -183,6 +183,23 @@ def slot(folder: Path) -> Path:
     )
 
 
+def room_with_a_door(folder: Path) -> Path:
+    """A block in a pit of a room: up, along +x, and out by a door in the side +y.
+
+    No end of a straight pull is in line with the door, neither along x nor along z.
+    """
+    thick = 0.02
+    room = walls((0.0, 0.0, 0.0), (0.6, 0.16, 0.2), thick, "+y")
+    side = [
+        box((-thick, 0.16, -thick), (0.34, 0.18, 0.22)),
+        box((0.48, 0.16, -thick), (0.62, 0.18, 0.22)),
+        box((0.34, 0.16, -thick), (0.48, 0.18, 0.1)),  # the door's sill
+    ]
+    floor = box((0.16, 0.0, 0.0), (0.6, 0.16, 0.08))
+    block = box((0.05, 0.05, 0.015), (0.11, 0.11, 0.075))
+    return imported(folder, room=joined(room, *side, floor), block=block)
+
+
 def elbow(folder: Path) -> Path:
     """A peg on the floor of a bent channel: up, and then along +x."""
     channel = [

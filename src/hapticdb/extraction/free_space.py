@@ -44,6 +44,8 @@ against contacts, also through thin walls of what is touched."""
 AT_ONCE = 32
 """Poses of a motion that are looked at together. Larger: fewer calls; more poses of motions that
 turn out blocked."""
+FIRST_AT_ONCE = 4
+"""The same for the first ones, which refuse most of the blocked motions; twice as many follow."""
 
 
 class FreeSpace:
@@ -196,4 +198,8 @@ def _from_coarse_to_fine(n: int) -> list[Ints]:
         seen.update(fresh)
         stride //= 2
     at = np.array(order)
-    return [at[:1], *(at[k : k + AT_ONCE] for k in range(1, n, AT_ONCE))]
+    blocks, begin, length = [at[:1]], 1, FIRST_AT_ONCE
+    while begin < n:
+        blocks.append(at[begin : begin + length])
+        begin, length = begin + length, min(2 * length, AT_ONCE)
+    return blocks

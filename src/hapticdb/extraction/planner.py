@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError
-from hapticdb.extraction.directions import AXES
 from hapticdb.extraction.free_space import ContactSpace, FreeSpace
 from hapticdb.extraction.goals import GoalSampler
 from hapticdb.extraction.leaving import Exit
+from hapticdb.extraction.legs import Legs
 from hapticdb.extraction.loosening import Loosened, Loosening
 from hapticdb.extraction.planner_child import PlanRequest
 from hapticdb.extraction.problem import Problem
@@ -32,6 +32,9 @@ STRIDE = 0.5
 the open, more of them refused in narrow places."""
 SHARE_OF_SHIFTS = 0.3
 """Share of the questions and of the time that go to shifts without turns, which need far fewer."""
+SHARE_OF_LEGS = 0.3
+"""Greatest share of the time that goes to straight legs along the axes. Their motions are no
+questions of the planner, and not counted as such."""
 SHARE_OF_LOOSENING = 0.2
 """Share of the questions and of the time that go to motions out of contact, where no pull is free.
 Larger: longer ways out of contact are found, less is left for what follows."""
@@ -115,12 +118,13 @@ class Planner:
         if self._starts is None:
             self._starts = self._found_starts()
         is_guarded = any(one.is_guarded for one in self._starts)
-        starts = [one for one in self._starts if one.is_guarded == is_guarded][:MOST_STARTS]
+        starts = [one for one in self._starts if one.is_guarded == is_guarded]
         if not starts:
             return Planned(None, self.n_motions)
-        path = self._straight_out(starts, is_guarded=is_guarded)
+        path = self._by_legs(starts, is_guarded=is_guarded)
         if path is not None:
             return Planned(path, self.n_motions)
+        del starts[MOST_STARTS:]
         began, left = time.monotonic(), max(self._most - self.n_motions, 0)
         soon = began + SHARE_OF_SHIFTS * (self._until - began)
         asked = self.n_motions
@@ -162,22 +166,15 @@ class Planner:
         self.n_motions += loosening.n_motions
         return found
 
-    def _straight_out(self, starts: list[Loosened], *, is_guarded: bool) -> Floats | None:
-        """Path (M, 4, 4) to a start and from there straight out along an axis, or None."""
-        shifts = self._leaving.goals(AXES)
-        for start in starts:
-            here = start.poses[-1]
-            moved = here[:3, :3] @ self._problem.center + here[:3, 3] - self._problem.center
-            for axis, shift in zip(AXES, shifts, strict=True):
-                out = here.copy()
-                out[:3, 3] += max(float((shift - moved) @ axis), 0.0) * axis
-                if self.n_motions >= self._most or time.monotonic() > self._until:
-                    return None
-                self.n_motions += 1
-                if self._space.is_motion_free(np.stack([here, out]), is_guarded=is_guarded):
-                    self._used = start
-                    return np.concatenate([start.poses, out[None]])
-        return None
+    def _by_legs(self, starts: list[Loosened], *, is_guarded: bool) -> Floats | None:
+        """Path (M, 4, 4) out by straight legs along axes, or None."""
+        now = time.monotonic()
+        until = now + SHARE_OF_LEGS * (self._until - now)
+        found = Legs(self._problem, self._space, self._leaving, is_guarded, until).search(starts)
+        if found is None:
+            return None
+        self._used, path = found
+        return path
 
     def _ask(
         self, starts: list[Loosened], turning: float, most: int, until: float, *, is_guarded: bool

@@ -1,13 +1,20 @@
 """Straight pulls: how far a part goes in each direction before something is in the way."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.extraction.directions import AGAINST, candidate_directions, opposed_shares
+from hapticdb.extraction.directions import (
+    AGAINST,
+    ALIKE,
+    AXES,
+    candidate_directions,
+    grouped,
+    opposed_shares,
+)
 from hapticdb.extraction.free_space import GROWTH, ContactSpace, FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem
@@ -18,8 +25,9 @@ MOST_OPPOSED = 0.1
 """Greatest share of the contacts at the start that a pull may press against, unless nothing else
 leads out. Larger: pulls through thin walls are tried, too; the proof does not take them for
 proved."""
-BLOCK = 64
-"""Samples, half a voxel apart, that are looked at together."""
+BLOCKS = (8, 64)
+"""Samples, half a voxel apart, that are looked at together: at first, since most pulls are blocked
+soon, and at most; each block is twice as long as the one before."""
 
 
 class SearchProgress(NamedTuple):
@@ -103,12 +111,15 @@ class Pulls:
     def opposed_out(self, until: float) -> list[Pull]:
         """Pulls that lead out though they press against more than `MOST_OPPOSED` of the contacts.
 
+        Only the axes and the groups of contact normals are tried, because a long slide takes time.
         Contacts are points in voxels: in a recess hardly wider than the part, its front is in
         contact, too. So a pull counts if the part is in contact only where it was at its start. A
         bolt in its bore is; a part that is pulled through something else is not.
         """
         found = []
-        for n in np.flatnonzero(self._opposed > MOST_OPPOSED).tolist():
+        likely = np.concatenate([AXES, grouped(self._normals)])
+        is_likely = (self._directions @ likely.T >= ALIKE).any(axis=1)
+        for n in np.flatnonzero(is_likely & (self._opposed > MOST_OPPOSED)).tolist():
             if time.monotonic() > until:
                 break
             pull = self._pull(n)
@@ -131,8 +142,8 @@ class Pulls:
         ways = np.linspace(0.0, length, int(np.ceil(2.0 * length / self._problem.voxel_size)) + 1)
         contact = 0  # samples in contact from the start on
         most = -1.0
-        for first in range(0, len(ways), BLOCK):
-            block = ways[first : first + BLOCK]
+        for first, end in _blocks(len(ways)):
+            block = ways[first:end]
             poses = _poses_along(direction, block)
             hits = self._space.hits(poses)
             most = GROWTH * float(hits[0]) if most < 0.0 else most
@@ -174,6 +185,14 @@ class Pulls:
         against = self._contacts[self._normals @ direction < AGAINST]
         pairs = self._pairs[np.isin(self._pairs[:, 0], against)]
         return tuple(np.unique(pairs[:, 1]).tolist())
+
+
+def _blocks(n: int) -> Iterator[tuple[int, int]]:
+    """First and last + 1 sample of each block of `BLOCKS` samples, of n."""
+    first, length = 0, BLOCKS[0]
+    while first < n:
+        yield first, min(first + length, n)
+        first, length = first + length, min(2 * length, BLOCKS[1])
 
 
 def first_run(flags: NDArray[np.bool_]) -> tuple[int, int]:

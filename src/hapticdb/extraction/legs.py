@@ -1,0 +1,129 @@
+"""Ways out of straight legs along the axes, from places where a part is free.
+
+A part that stands in a room often leaves it as furniture does: up from its place, along to the
+door, and out. A planner draws its places at random and seldom finds the few that are in line with
+the door.
+"""
+
+import math
+import time
+from collections.abc import Iterator
+from itertools import islice
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.extraction.directions import AXES
+from hapticdb.extraction.free_space import AT_ONCE, FreeSpace
+from hapticdb.extraction.leaving import Exit
+from hapticdb.extraction.loosening import Loosened
+from hapticdb.extraction.problem import Problem
+from hapticdb.sweeps.path import SweepPath
+
+Floats = NDArray[np.float64]
+
+STOPS = (1, 2, 4)
+"""Numbers of places of a leg at which the next one may begin, tried one after another. More:
+narrower doors are found, by the square of as many motions."""
+BETWEEN, MOST_STOPS = 0.5, 8
+"""The second leg has so many more places that they lie this near to one another, radii of the part;
+and their greatest number."""
+MOST_MOTIONS = 3000
+"""Greatest number of motions that are looked at."""
+MOST_STARTS = 12
+"""Greatest number of starts. Larger: fewer places along each of them."""
+
+
+class Legs(NamedTuple):
+    """Searches ways of one problem's parts.
+
+    problem, space, leaving : what is to come out, whether poses are free, where it is out;
+    is_guarded : whether the way is to be free with the guard; until : time of `time.monotonic` at
+    which the search ends.
+    """
+
+    problem: Problem
+    space: FreeSpace
+    leaving: Exit
+    is_guarded: bool
+    until: float
+
+    def search(self, starts: list[Loosened]) -> tuple[Loosened, Floats] | None:
+        """A start, and the way (M, 4, 4) to its end or a place before, and out by one or two legs.
+
+        From all ends by one leg, then by two; then also from places of the way to each start.
+        Starts that lie along an axis come first.
+        """
+        first = sorted(starts, key=lambda one: not _is_along_axis(one))[:MOST_STARTS]
+        for start, poses, axis in islice(self._tries(first), MOST_MOTIONS):
+            if time.monotonic() > self.until:
+                return None
+            here, out = poses[-1], self._end(poses[-1], axis)
+            if self.space.is_motion_free(np.stack([here, out]), is_guarded=self.is_guarded):
+                return start, np.concatenate([poses, out[None]])
+        return None
+
+    def _tries(self, starts: list[Loosened]) -> Iterator[tuple[Loosened, Floats, Floats]]:
+        """Starts, ways (M, 4, 4) from there to a place, and axes (3,) that may lead out."""
+        for start in starts:
+            for axis in AXES:
+                yield start, start.poses, axis
+        for n_stops in STOPS:
+            for start in starts:
+                for stop in self._stops(start.poses[-2], start.poses[-1], n_stops):
+                    way = np.concatenate([start.poses[:-1], stop[None]])
+                    for axis in AXES:
+                        for last in self._along(stop, axis, n_stops):
+                            longer = np.concatenate([way, last[None]])
+                            for out in AXES[np.abs(AXES @ axis) < 0.5]:
+                                yield start, longer, out
+
+    def _end(self, here: Floats, axis: Floats) -> Floats:
+        """Displacement (4, 4) straight on along an axis to where the part is out."""
+        center = self.problem.center
+        moved = here[:3, :3] @ center + here[:3, 3] - center
+        way = float(self.leaving.distances(axis[None])[0]) - float(moved @ axis)
+        out = here.copy()
+        out[:3, 3] += max(way, 0.0) * axis
+        return out
+
+    def _along(self, here: Floats, axis: Floats, n_stops: int) -> Floats:
+        """Places (n, 4, 4) along an axis as far as it is free; none if it is not for a voxel."""
+        ends = np.stack([here, self._end(here, axis)])
+        path = SweepPath.of(ends, self.space.shell, self.problem.voxel_size)
+        n_free = 1
+        for begin in range(1, len(path), AT_ONCE):
+            poses = path.sample(begin, min(begin + AT_ONCE, len(path)))
+            is_free = self.space.hits(poses, is_guarded=self.is_guarded) == 0
+            n_free += len(poses) if is_free.all() else int(np.argmin(is_free))
+            if not is_free.all():
+                break
+        last = path.at(np.array([n_free - 1.0]))[0]
+        way = float(np.linalg.norm(last[:3, 3] - here[:3, 3]))
+        if way < self.problem.voxel_size:
+            return np.empty((0, 4, 4))
+        wanted = math.ceil(way / (BETWEEN * self.problem.radius))
+        return _between(here, last, max(n_stops, min(wanted, MOST_STOPS)))
+
+    def _stops(self, begin: Floats, end: Floats, n_stops: int) -> Floats:
+        """Places (n, 4, 4) of the last leg to a start at which the part is free; with its end."""
+        if not np.array_equal(begin[:3, :3], end[:3, :3]):
+            return end[None]
+        stops = _between(begin, end, n_stops)
+        is_free = self.space.hits(stops, is_guarded=self.is_guarded) == 0
+        return np.asarray(stops[is_free])
+
+
+def _is_along_axis(start: Loosened) -> bool:
+    """Whether the last leg to a start lies along an axis."""
+    shift = start.poses[-1, :3, 3] - start.poses[-2, :3, 3]
+    return bool(np.abs(shift).max() >= 0.999 * np.linalg.norm(shift))
+
+
+def _between(begin: Floats, end: Floats, n: int) -> Floats:
+    """Displacements (n, 4, 4) that shift from one to another, evenly spaced; the last one first."""
+    stops = np.tile(end, (n, 1, 1))
+    shares = np.linspace(1.0, 0.0, n, endpoint=False)[:, None]
+    stops[:, :3, 3] = begin[:3, 3] + shares * (end[:3, 3] - begin[:3, 3])
+    return stops

@@ -47,6 +47,11 @@ def test_frames_are_the_oracles_bit_for_bit(
                 frames = ResidentFrames(Residency(env.store, table, exclude), shell, run=run)
                 felt = frames.feel(poses)
                 frames.close()
+            with CellTable.create(LEAST_BUDGET) as table:
+                frames = ResidentFrames(Residency(env.store, table, exclude), shell, run=run)
+                collides = frames.collides(poses)
+                frames.close()
+            assert collides.tolist() == (felt.hits > 0).tolist()
             assert felt.hits.any()
             assert not felt.unknown.any()
             for n, pose in enumerate(poses):

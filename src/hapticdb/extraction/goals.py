@@ -94,11 +94,11 @@ class GoalSampler:
         """Deepest free displacement (4, 4) against a direction from a free one, `way` metres."""
         end = place.copy()
         end[:3, 3] -= way * direction
-        path = SweepPath.of(np.stack([place, end]), self._space.shell, self._problem.voxel_size)
+        path = SweepPath.of(np.stack([place, end]), self._space.extent, self._problem.voxel_size)
         goal = place
         for begin in range(1, len(path), AT_ONCE):
             poses = path.sample(begin, min(begin + AT_ONCE, len(path)))
-            is_free = self._space.hits(poses, is_guarded=is_guarded) == 0
+            is_free = self._space.are_free(poses, is_guarded=is_guarded)
             n_free = len(poses) if is_free.all() else int(np.argmin(is_free))
             goal = poses[n_free - 1] if n_free else goal
             if n_free < len(poses):

@@ -91,11 +91,11 @@ class Legs(NamedTuple):
     def _along(self, here: Floats, axis: Floats, n_stops: int) -> Floats:
         """Places (n, 4, 4) along an axis as far as it is free; none if it is not for a voxel."""
         ends = np.stack([here, self._end(here, axis)])
-        path = SweepPath.of(ends, self.space.shell, self.problem.voxel_size)
+        path = SweepPath.of(ends, self.space.extent, self.problem.voxel_size)
         n_free = 1
         for begin in range(1, len(path), AT_ONCE):
             poses = path.sample(begin, min(begin + AT_ONCE, len(path)))
-            is_free = self.space.hits(poses, is_guarded=self.is_guarded) == 0
+            is_free = self.space.are_free(poses, is_guarded=self.is_guarded)
             n_free += len(poses) if is_free.all() else int(np.argmin(is_free))
             if not is_free.all():
                 break
@@ -111,8 +111,7 @@ class Legs(NamedTuple):
         if not np.array_equal(begin[:3, :3], end[:3, :3]):
             return end[None]
         stops = _between(begin, end, n_stops)
-        is_free = self.space.hits(stops, is_guarded=self.is_guarded) == 0
-        return np.asarray(stops[is_free])
+        return np.asarray(stops[self.space.are_free(stops, is_guarded=self.is_guarded)])
 
 
 def _is_along_axis(start: Loosened) -> bool:

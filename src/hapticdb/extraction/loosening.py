@@ -130,7 +130,7 @@ class Loosening:
         """Move on while allowed: ways that end free, or (M, 4, 4) in contact with their hits."""
         path = SweepPath.of(
             twist.along(way[-1], FARTHEST * self._problem.radius),
-            self._space.shell,
+            self._space.extent,
             self._problem.voxel_size,
         )
         poses, counts = self._allowed(path)
@@ -165,7 +165,7 @@ class Loosening:
 
     def _free(self, poses: Floats) -> tuple[list[int], bool]:
         """Middle and end of free poses (n, 4, 4): of those free with the guard, if any are."""
-        first, last = first_run(self._space.hits(poses, is_guarded=True) == 0)
+        first, last = first_run(self._space.are_free(poses, is_guarded=True))
         is_guarded = first < last
         if not is_guarded:
             first, last = 0, len(poses)

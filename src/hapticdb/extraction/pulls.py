@@ -145,9 +145,13 @@ class Pulls:
         for first, end in _blocks(len(ways)):
             block = ways[first:end]
             poses = _poses_along(direction, block)
-            hits = self._space.hits(poses)
-            most = GROWTH * float(hits[0]) if most < 0.0 else most
-            slides = self._slides(poses, hits, most) if contact == first else 0
+            slides = 0
+            if contact == first:
+                hits = self._space.hits(poses)
+                most = GROWTH * float(hits[0]) if most < 0.0 else most
+                slides = self._slides(poses, hits, most)
+            else:  # once out of contact, a pull is free until its first hit
+                hits = (~self._space.are_free(poses)).astype(np.int64)
             for at, count in enumerate(hits.tolist(), start=first):
                 if count and contact == at and at - first < slides:
                     contact += 1
@@ -175,7 +179,7 @@ class Pulls:
         guarded = None
         if end > contact:
             poses = _poses_along(direction, ways[contact:end])
-            first, last = first_run(self._space.hits(poses, is_guarded=True) == 0)
+            first, last = first_run(self._space.are_free(poses, is_guarded=True))
             if first < last:
                 guarded = (float(ways[contact + first]), float(ways[contact + last - 1]))
         return Pull(direction, length, touching, free, guarded, blockers)

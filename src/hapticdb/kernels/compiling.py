@@ -151,6 +151,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         *_SHELL,
         *_RESIDENT,
         "resident.feeling.*",
+        "resident.first_hits.*",
         "resident.sweep.*",
         "resident.clearance.*",
         "surfaces.nearest.*",

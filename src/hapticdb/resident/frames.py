@@ -25,6 +25,7 @@ from hapticdb.kernels.resident.cells import (
     Clusters,
 )
 from hapticdb.kernels.resident.feeling import bounding_spheres, feel_kernel
+from hapticdb.kernels.resident.first_hits import UNDECIDED, find_first_hits
 from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.poses import as_floats
 from hapticdb.query.law import ForceLaw, TangentPlane
@@ -242,6 +243,27 @@ class ResidentFrames:
             counts[:, sleeping.LOOKED_AT],
             counts[:, sleeping.LEFT_OUT],
         )
+
+    def collides(self, poses: Floats) -> NDArray[np.bool_]:
+        """Whether a point is in an occupied voxel at each of poses (M, 4, 4), rigid transforms.
+
+        These are the poses at which `feel` counts hits under the plane law. The search of a pose
+        ends at its first hit, and cells are fetched only where it does not know them.
+        """
+        found = self._first_hits(poses)
+        pending = np.flatnonzero(found == UNDECIDED)
+        while len(pending):
+            n_poses = self.fetch(poses[pending])
+            now, pending = pending[:n_poses], pending[n_poses:]
+            found[now] = self._first_hits(poses[now])
+        return np.asarray(found >= 0)
+
+    def _first_hits(self, poses: Floats) -> NDArray[np.int64]:
+        """A point (M,) that hits at each of poses (M, 4, 4), `NOTHING` or `UNDECIDED`."""
+        found = np.empty(len(poses), dtype=np.int64)
+        cells = self.residency.table.cells.without_distances()
+        find_first_hits(cells, self._row, self.clusters, poses, self.residency.place, found)
+        return found
 
     def wrenches(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
         """Wrenches (M, 6) and numbers of hits (M,) at poses, in the form that a replay needs."""

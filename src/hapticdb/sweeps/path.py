@@ -1,6 +1,7 @@
 """A path between given poses, sampled so densely that no point of the tool skips half a voxel."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,6 +20,24 @@ FINEST = 1 << 10
 """Parts of a step at which `SweepPath.at` gives poses. Larger: shorter parts can be looked at."""
 RIGID = 1e-6
 """Greatest deviation of a rotation's columns from orthonormal ones; the same as for a frame."""
+
+
+class Extent(NamedTuple):
+    """What a path knows of a shell.
+
+    center (3,) : middle of its bounding box; radius : greatest distance from there of a place
+    within the covering radius of a point, metres. Tool frame.
+    """
+
+    center: Floats
+    radius: float
+
+    @classmethod
+    def of(cls, shell: PointShell) -> "Extent":
+        """Extent of a shell's points."""
+        center = 0.5 * (shell.points.min(axis=0) + shell.points.max(axis=0))
+        radius = float(np.sqrt(((shell.points - center) ** 2).sum(axis=1).max()))
+        return cls(center, radius + (shell.cover or 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,8 +76,10 @@ class SweepPath:
     _slacks: Floats
 
     @classmethod
-    def of(cls, poses: ArrayLike, shell: PointShell, voxel_size: float) -> "SweepPath":
+    def of(cls, poses: ArrayLike, shell: "PointShell | Extent", voxel_size: float) -> "SweepPath":
         """Path of a shell through poses (M, 4, 4), at least one; voxel size in metres.
+
+        The shell's extent does for many paths of one shell: it is computed from all points.
 
         Raises
         ------
@@ -66,10 +87,7 @@ class SweepPath:
             If there is no pose, a pose is not rigid, or the path is too long for its voxels.
         """
         given = _checked(poses)
-        low, high = shell.points.min(axis=0), shell.points.max(axis=0)
-        center = 0.5 * (low + high)
-        radius = float(np.sqrt(((shell.points - center) ** 2).sum(axis=1).max()))
-        radius += shell.cover or 0.0
+        center, radius = shell if isinstance(shell, Extent) else Extent.of(shell)
         rotations = given[:, :3, :3]
         quaternions = quaternion_of(rotations)
         centers = rotations @ center + given[:, :3, 3]

@@ -172,7 +172,7 @@ def _within_budget(whole: FeltFrames, part: FeltFrames) -> dict[str, Any]:
         "points": BUDGET,
         "left_out_frames": int((part.left_out > 0).sum()),
         "looked_at": float(part.looked_at.mean()),
-        "most_off": float(off.max() / forces.max()),
+        "most_off": float(off.max() / forces.max()) if forces.any() else 0.0,
     }
 
 
@@ -206,7 +206,9 @@ def main() -> None:
     """Measure, print the figures, and write them to a file."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--points", default="1e5,1e6", help="sizes of the sheet")
-    parser.add_argument("--shares", default="0.05,0.25", help="of the sheet that the box is below")
+    parser.add_argument(
+        "--shares", default="0.025,0.05,0.25", help="of the sheet that the box is below"
+    )
     parser.add_argument("--frames", type=int, default=500)
     parser.add_argument("--bits", type=int, default=11, help="of the grid on each axis")
     parser.add_argument("--out", type=Path, default=Path("results/large_shells.json"))

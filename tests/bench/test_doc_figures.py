@@ -140,7 +140,7 @@ TABLES = {
     "results/contact_proxies.json": [proxy_table],
     "results/floods.json": [flood_table],
     "results/remote_cells.json": [remote_table],
-    "results/batches.json": [batch_table],
+    "results/batches.json": [batch_table, batch_ratio_table],
     "results/batches_1400.json": [batch_table, batch_ratio_table],
     "results/large_shells.json": [shell_table],
     "results/ways_out.json": [way_table],

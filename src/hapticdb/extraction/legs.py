@@ -8,7 +8,6 @@ the door.
 import math
 import time
 from collections.abc import Iterator
-from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
@@ -56,8 +55,13 @@ class Legs(NamedTuple):
         Starts that lie along an axis come first.
         """
         first = sorted(starts, key=lambda one: not _is_along_axis(one))[:MOST_STARTS]
-        for start, poses, axis in islice(self._tries(first), MOST_MOTIONS):
-            if time.monotonic() > self.until:
+        tried: set[bytes] = set()
+        for start, poses, axis in self._tries(first):
+            motion = poses[-1].tobytes() + axis.tobytes()
+            if motion in tried:
+                continue
+            tried.add(motion)
+            if len(tried) > MOST_MOTIONS or time.monotonic() > self.until:
                 return None
             here, out = poses[-1], self._end(poses[-1], axis)
             if self.space.is_motion_free(np.stack([here, out]), is_guarded=self.is_guarded):

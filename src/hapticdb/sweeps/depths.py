@@ -41,7 +41,7 @@ EASE = 0.02
 since it is not asked on which side it is."""
 MOST_FINE = 400_000
 """Greatest number of fine pieces. Larger: larger contacts are bounded, with more memory."""
-MOST_LOOKS = 3_000_000
+MOST_LOOKS = 6_000_000
 """Greatest number of places that are measured along one path. Larger: longer contacts are bounded,
 which takes minutes."""
 MOST_AT_START = 300_000

@@ -95,6 +95,22 @@ class FreeSpace:
         self.n_poses += len(poses)
         return ~self._frames[is_guarded].collides(poses)
 
+    def farthest(self, ends: Floats, *, is_guarded: bool) -> Floats:
+        """Last displacement (4, 4) before the first hit between two poses (2, 4, 4).
+
+        The samples are those of a sweep; the first pose is taken for free.
+        """
+        path = SweepPath.of(ends, self.extent, self.voxel_size)
+        last = np.asarray(ends[0])
+        for begin in range(1, len(path), AT_ONCE):
+            poses = path.sample(begin, min(begin + AT_ONCE, len(path)))
+            is_free = self.are_free(poses, is_guarded=is_guarded)
+            n_free = len(poses) if is_free.all() else int(np.argmin(is_free))
+            last = poses[n_free - 1] if n_free else last
+            if n_free < len(poses):
+                break
+        return last
+
     def is_motion_free(self, ends: Floats, *, is_guarded: bool) -> bool:
         """Whether all poses between two poses (2, 4, 4) are free, in steps of half a voxel.
 

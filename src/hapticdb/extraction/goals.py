@@ -11,11 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AXES
-from hapticdb.extraction.free_space import AT_ONCE, FreeSpace
+from hapticdb.extraction.free_space import FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem
 from hapticdb.extraction.pulls import Pulls, shifted
-from hapticdb.sweeps.path import SweepPath
 
 Floats = NDArray[np.float64]
 
@@ -94,16 +93,7 @@ class GoalSampler:
         """Deepest free displacement (4, 4) against a direction from a free one, `way` metres."""
         end = place.copy()
         end[:3, 3] -= way * direction
-        path = SweepPath.of(np.stack([place, end]), self._space.extent, self._problem.voxel_size)
-        goal = place
-        for begin in range(1, len(path), AT_ONCE):
-            poses = path.sample(begin, min(begin + AT_ONCE, len(path)))
-            is_free = self._space.are_free(poses, is_guarded=is_guarded)
-            n_free = len(poses) if is_free.all() else int(np.argmin(is_free))
-            goal = poses[n_free - 1] if n_free else goal
-            if n_free < len(poses):
-                break
-        return goal
+        return self._space.farthest(np.stack([place, end]), is_guarded=is_guarded)
 
     def _outside(self, corners: Floats, direction: Floats, across: Floats, turn: Floats) -> Floats:
         """Displacement (4, 4) to where the part lies beyond the hull in a direction."""

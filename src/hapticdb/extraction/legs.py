@@ -14,11 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AXES
-from hapticdb.extraction.free_space import AT_ONCE, FreeSpace
+from hapticdb.extraction.free_space import FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.loosening import Loosened
 from hapticdb.extraction.problem import Problem
-from hapticdb.sweeps.path import SweepPath
 
 Floats = NDArray[np.float64]
 
@@ -95,15 +94,7 @@ class Legs(NamedTuple):
     def _along(self, here: Floats, axis: Floats, n_stops: int) -> Floats:
         """Places (n, 4, 4) along an axis as far as it is free; none if it is not for a voxel."""
         ends = np.stack([here, self._end(here, axis)])
-        path = SweepPath.of(ends, self.space.extent, self.problem.voxel_size)
-        n_free = 1
-        for begin in range(1, len(path), AT_ONCE):
-            poses = path.sample(begin, min(begin + AT_ONCE, len(path)))
-            is_free = self.space.are_free(poses, is_guarded=self.is_guarded)
-            n_free += len(poses) if is_free.all() else int(np.argmin(is_free))
-            if not is_free.all():
-                break
-        last = path.at(np.array([n_free - 1.0]))[0]
+        last = self.space.farthest(ends, is_guarded=self.is_guarded)
         way = float(np.linalg.norm(last[:3, 3] - here[:3, 3]))
         if way < self.problem.voxel_size:
             return np.empty((0, 4, 4))

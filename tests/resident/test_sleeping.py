@@ -183,6 +183,42 @@ def test_a_budget_is_kept_and_is_the_same_whatever_slept_before(tmp_path: Path, 
                 assert one[order].tobytes() == other.tobytes()
 
 
+SIDE_OF_SHEET = 64
+"""Points of the sheet below on each side."""
+
+
+def sheet(pitch: float) -> PointShell:
+    """A square sheet of points in Z-order, as files give it: row y, column x."""
+    n = np.arange(SIDE_OF_SHEET**2)
+    x, y = (sum((n >> 2 * bit + axis & 1) << bit for bit in range(6)) for axis in (0, 1))
+    points = np.stack([x, y, np.zeros_like(x)], axis=1) * pitch
+    return PointShell(points, np.tile([0.0, 0.0, 1.0], (len(n), 1)), np.zeros(3))
+
+
+def test_beyond_the_budget_each_row_of_a_sheet_keeps_its_share_of_hits(tmp_path: Path) -> None:
+    """One row of points lies in a bar one voxel wide: a choice in a pattern misses such rows."""
+    env = make(tmp_path)
+    pitch = env.grid.voxel_size
+    scatter(env, n_objects=1, n_voxels=10)
+    move(env.store, 1, block((32, 64, 64), (95, 64, 64)))
+    place = env.grid.origin + (np.array([32, 64, 64]) + 0.5) * pitch
+    shares = []
+    with CellTable.create(8 << 20) as table:
+        residency = Residency(env.store, table)
+        whole = ResidentFrames(residency, sheet(pitch), sleeps=True)
+        part = ResidentFrames(residency, sheet(pitch), budget_points=128)
+        for row in range(SIDE_OF_SHEET):
+            pose = np.eye(4)
+            pose[:3, 3] = place - [0.0, row * pitch, 0.0]
+            felt, some = whole.feel(pose), part.feel(pose)
+            assert felt.hits[0] == SIDE_OF_SHEET
+            assert 64 <= some.looked_at[0] <= 128
+            shares.append(some.hits[0] / some.looked_at[0] * felt.looked_at[0] / felt.hits[0])
+    assert min(shares) > 0.0
+    assert np.mean(shares) == pytest.approx(1.0, abs=0.1)
+    assert np.std(shares) < 0.5
+
+
 def test_beyond_the_budget_the_indices_of_hits_are_those_of_the_shell(tmp_path: Path) -> None:
     env = make(tmp_path)
     move_to = block((50, 50, 50), (78, 78, 78))

@@ -90,7 +90,7 @@ class Session:
         (docs/postgresql.md, Replicas). With the policy "wait", resident cells are used on.
     budget_points : int or None
         Most points near something that a frame looks at; None: all. A frame with more looks at
-        every 2nd, 4th, 8th ... of them. A tool of 4096 points or more, or with a budget, has
+        one in 2, 4, 8 ... of them. A tool of 4096 points or more, or with a budget, has
         clusters that sleep far from everything, which changes no result (docs/realtime.md, Large
         tools).
     budget_bytes : int or None

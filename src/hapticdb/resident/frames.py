@@ -172,7 +172,7 @@ class ResidentFrames:
         are the same, bit for bit; large shells are felt sooner.
     budget_points : int or None
         Most points near something that a frame looks at; then clusters sleep. A frame with more
-        looks at every 2nd, 4th, 8th ... of them. `FeltFrames.left_out` counts the others.
+        looks at one in 2, 4, 8 ... of them. `FeltFrames.left_out` counts the others.
 
     Raises
     ------

@@ -94,8 +94,8 @@ BudgetPointsOption = Annotated[
     int | None,
     typer.Option(
         metavar="N",
-        help="Most points near something that a frame looks at; a frame with more looks at every "
-        "2nd, 4th, 8th ... of them, and the report says how many it left out.",
+        help="Most points near something that a frame looks at; a frame with more looks at one "
+        "in 2, 4, 8 ... of them, and the report says how many it left out.",
         show_default="all",
     ),
 ]

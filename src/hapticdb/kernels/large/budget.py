@@ -1,7 +1,7 @@
 """Frames of a session's tool: clusters sleep where it is large, and a budget bounds the points.
 
-A frame within the budget is that of the flat loop, bit for bit. A frame beyond it looks at every
-2nd, 4th, 8th ... point of the runs near something (`sleeping`). Which points these are depends on
+A frame within the budget is that of the flat loop, bit for bit. A frame beyond it looks at one of
+each 2, 4, 8 ... points of the runs near something (`sleeping`). Which points these are depends on
 the runs that are near, so it must not depend on what is in memory. An unknown cell counts as
 occupied, and would make runs near that are not. So a frame beyond its budget that has a listed run
 beside an unknown cell counts that run as an unknown point: the loop holds the frame or waits, and a
@@ -103,11 +103,8 @@ def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, bu
     if n_near <= budget:
         skip_between(listed, count, skips)
     else:
-        stride = 1
-        while (n_near + stride - 1) // stride > budget:
-            stride *= 2
         n_looked = choose_points(
-            listed, count, points, columns, run, stride, chosen, chosen_columns, indices
+            listed, count, points, columns, run, budget, chosen, chosen_columns, indices
         )
         part = Clusters(chosen[:n_looked], center, nothing, nothing, run, chosen_columns, scratch)
     frame_of(law, cells, which, part, pose, place, met, missed, out)

@@ -62,6 +62,8 @@ SHORTEST, LONGEST = 8.0, 16.0
 equal ones would end in one frame when a tool moves without turning."""
 GOLDEN = 0.6180339887498949
 """Golden ratio: its multiples, without their whole parts, spread evenly (Knuth, volume 3, 6.4)."""
+HASH_FACTOR, LOW_32 = 0x45D9F3B, 0xFFFFFFFF
+"""Factor of the hash of a group of points, and the bits that are kept of a product."""
 REST_BETWEEN_BRICKS = 2.0
 """Rest of a run, voxels, that is tested voxel by voxel because an occupied brick is near."""
 ROUNDING = 1e-6
@@ -380,19 +382,47 @@ def skip_between(listed, count, skips):
 
 
 @inlined
-def choose_points(listed, count, points, columns, run, stride, chosen, chosen_columns, indices):
-    """Copy every stride-th point of the listed runs, in their order; returns the number."""
-    n_chosen = past = 0
-    for n in range(count):
+def chosen_of_group(group, stride):
+    """Number of the one point that a frame looks at of a group of `stride` points of a shell.
+
+    stride: a power of two, at most 2^31. The place in the group is a hash of the group's number:
+    one place for all groups would make a grid, because the points are in Z-order, and would miss
+    an edge between its rows. The hash is T. Mueller's for 32 bits: shifts and products, twice.
+    """
+    mixed = ((group ^ (group >> 16)) * HASH_FACTOR) & LOW_32
+    mixed = ((mixed ^ (mixed >> 16)) * HASH_FACTOR) & LOW_32
+    return group * stride + ((mixed ^ (mixed >> 16)) & (stride - 1))
+
+
+@inlined
+def choose_points(listed, count, points, columns, run, budget, chosen, chosen_columns, indices):
+    """Copy one point of each 2, 4, 8 ... of a shell if it is in a listed run; returns the number.
+
+    These are the most that are not more than `budget`, in the order of the shell. Which point
+    stands for a group depends on its number alone: it stays while other runs come near.
+    """
+    stride, n_chosen = 2, 0
+    while points_listed(listed, count, run, points.shape[0]) > stride * budget:
+        stride *= 2
+    n = 0
+    while n < count:
         start = listed[n] * run
-        n_run = min(run, points.shape[0] - start)
-        for at in range(-past % stride, n_run, stride):
+        end = min(start + run, points.shape[0])
+        for group in range(start // stride, (end - 1) // stride + 1):
+            at = chosen_of_group(group, stride)
+            if at < start or at >= end:
+                continue
+            if n_chosen == budget:
+                n_chosen = budget + 1
+                break
             for axis in range(3):
-                chosen[n_chosen, 3 + axis] = points[start + at, 3 + axis]
-                chosen_columns[axis, n_chosen] = columns[axis, start + at]
-            indices[n_chosen] = start + at
+                chosen[n_chosen, 3 + axis] = points[at, 3 + axis]
+                chosen_columns[axis, n_chosen] = columns[axis, at]
+            indices[n_chosen] = at
             n_chosen += 1
-        past += n_run
+        n += 1
+        if n_chosen > budget:  # groups that lie in several runs are chosen by chance
+            stride, n_chosen, n = 2 * stride, 0, 0
     return n_chosen
 
 
@@ -406,8 +436,8 @@ def feel_sleeping(
     """`feeling.feel_kernel` with sleeping clusters, at most `budget` points a frame.
 
     counts (M, COUNTS) int64 takes the numbers of points near something. Where there are more than
-    the budget, a frame looks at every 2nd, 4th, 8th ... of them, in the order of the shell, so
-    that every cluster keeps its share. Returns the number of poses done.
+    the budget, a frame looks at one of each 2, 4, 8 ... of them, so that every cluster keeps its
+    share (`choose_points`). Returns the number of poses done.
     """
     points, center, _, _, run, columns, scratch = shell
     _, _, _, _, _, listed, skips, nothing, chosen, chosen_columns, indices = sleepers
@@ -424,11 +454,8 @@ def feel_sleeping(
         if n_near <= budget:
             skip_between(listed, count, skips)
         else:
-            stride = 1
-            while (n_near + stride - 1) // stride > budget:
-                stride *= 2
             n_looked = choose_points(
-                listed, count, points, columns, run, stride, chosen, chosen_columns, indices
+                listed, count, points, columns, run, budget, chosen, chosen_columns, indices
             )
             felt = Clusters(
                 chosen[:n_looked], center, nothing, nothing, run, chosen_columns, scratch

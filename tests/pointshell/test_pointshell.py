@@ -1,5 +1,6 @@
 """A tool's mesh, however damaged, becomes evenly spread points with normals into the tool."""
 
+import itertools
 import struct
 from itertools import pairwise
 from pathlib import Path
@@ -277,6 +278,16 @@ def test_bodies_apart_glued_or_overlapping_each_have_their_inside(gap: float) ->
         assert (shell.normals[on_face, axis] == normal).all()
     if gap == 0.5:
         assert (shell.normals[shell.points[:, 0] == 1.0, 0] == -1.0).all()
+
+
+def test_a_face_that_a_body_shares_with_one_around_it_is_kept() -> None:
+    """It is a wall between two bodies only if they lie on either side of it."""
+    corners, faces = cube()
+    pair = together((corners, faces), (corners * (1.0, 1.0, 0.5), faces))
+    shell = PointShell.from_mesh(*tumbled(pair), 1000)
+    assert not shell.is_closed
+    for axis, level in itertools.product(range(3), (0.0, 1.0)):
+        assert (shell.points[:, axis] == level).sum() > 50
 
 
 def test_an_open_hemisphere_faces_its_hollow_and_says_that_it_is_open() -> None:

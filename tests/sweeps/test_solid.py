@@ -77,8 +77,8 @@ def test_depths_in_a_union_of_boxes_are_between_their_bounds(
     solid = solid_of(*map(box, lows, highs), goal=0.5)
     places = np.random.default_rng(seed).uniform(lows.min(0), highs.max(0), (40, 3))
     exact = np.array([depth_in_union(place, lows, highs) for place in places])
-    # triangles that coincide are taken out in pairs: what they close is another solid, or none
-    assume(solid.is_closed and len(solid.surface.triangles) == 12 * len(boxes))
+    # boxes with a face in common on the same side are not closed without it
+    assume(solid.is_closed)
     # a box that shares edges with another one that it overlaps counts as a void in it
     assume(all(sign > 0 for _, sign in Interior(solid.surface).bodies))
     low, high = solid.depths(places, 0.0)

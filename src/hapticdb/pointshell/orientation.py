@@ -70,28 +70,51 @@ def orient(triangles: Floats) -> Surface:
     origin = corners.min(axis=0) / 2.0 + corners.max(axis=0) / 2.0
     local = triangles - origin
     faces = _join_corners(local)
-    kept = _drop_repeated(faces)
-    normals, areas = kernels.normals_of(local[kept])
-    total = float(areas.sum())
-    if not 0.0 < total < np.inf:
+    kept, walls = _drop_repeated(faces)
+    sides, is_even = _sides_of(faces[kept], local[kept])
+    outer = walls[~_are_within(sides, faces[kept], faces[walls], local[walls])]
+    if len(outer):
+        kept = np.sort(np.append(kept, outer))
+        sides, is_even = _sides_of(faces[kept], local[kept])
+    areas = sides.areas
+    inward = sides.normals * _vote(sides)[:, None]
+    center, has_volume = _center(sides, inward)
+    is_closed = has_volume and is_even
+    if not is_closed:
+        center = np.einsum("f,fk->k", areas, sides.centroids) / areas.sum()
+    sampled = areas > 0.0
+    return Surface(
+        triangles[kept][sampled], areas[sampled], inward[sampled], center + origin, is_closed,
+        sides.body[sampled],
+    )  # fmt: skip
+
+
+def _sides_of(faces: Ints, triangles: Floats) -> tuple[_Sides, bool]:
+    """Sides of the triangles (F, 3, 3), and whether no edge of their faces (F, 3) is open."""
+    normals, areas = kernels.normals_of(triangles)
+    if not 0.0 < float(areas.sum()) < np.inf:
         raise UsageError("its triangles have no area, or more than can be counted")
-    faces, local = faces[kept], local[kept]
     edges = _edges_of(faces)
     patch, is_flipped = _wind(faces, edges)
     normals[is_flipped] *= -1.0
     body = _bodies(len(faces), edges)
-    sides = _Sides(local, local.mean(axis=1), normals, areas, patch, body, is_flipped)
-    signs = _vote(sides)
-    inward = normals * signs[:, None]
-    center, has_volume = _center(sides, inward)
-    is_closed = has_volume and not bool((edges.uses % 2).any())
-    if not is_closed:
-        center = np.einsum("f,fk->k", areas, sides.centroids) / total
-    sampled = areas > 0.0
-    return Surface(
-        triangles[kept][sampled], areas[sampled], inward[sampled], center + origin, is_closed,
-        body[sampled],
-    )  # fmt: skip
+    sides = _Sides(triangles, triangles.mean(axis=1), normals, areas, patch, body, is_flipped)
+    return sides, not bool((edges.uses % 2).any())
+
+
+def _are_within(sides: _Sides, faces: Ints, walls: Ints, triangles: Floats) -> NDArray[np.bool_]:
+    """Whether each dropped wall (W, 3) lies inside a closed body of the kept faces that it joins.
+
+    It does where two bodies are glued together. Where one body is inside another, and a face of
+    both is the same, that face is border: without it the outer body would be open there.
+    """
+    is_within = np.zeros(len(walls), dtype=bool)
+    joined = np.unique(sides.body[np.isin(faces, walls).any(axis=1)])
+    if len(walls) and joined.any():
+        tree = kernels.triangle_tree(sides.triangles, sides.body)
+        for body in joined[joined > 0].tolist():
+            is_within |= kernels.encloses(tree, body, triangles.mean(axis=1))
+    return is_within
 
 
 def _edges_of(faces: Ints) -> _Edges:
@@ -155,8 +178,10 @@ def _neighbours(number: Ints, sides: Ints) -> Ints:
     return np.stack((order[:-1][is_pair], order[1:][is_pair]), axis=1)
 
 
-def _drop_repeated(faces: Ints) -> Ints:
+def _drop_repeated(faces: Ints) -> tuple[Ints, Ints]:
     """Numbers of the faces to keep, ascending: one of the faces with the same corners.
+
+    Then those of the walls that are not kept, one of each pair.
 
     Two bodies that are glued together may have the wall between them twice. If the wall is kept
     once, its border edges have an odd number of faces, so they are open. So a patch of repeated
@@ -165,14 +190,14 @@ def _drop_repeated(faces: Ints) -> Ints:
     is_face = (faces != np.roll(faces, -1, axis=1)).all(axis=1)
     whole = np.flatnonzero(is_face)
     if len(whole) == 0:
-        return whole
+        return whole, whole
     _, first, counts = np.unique(
         np.sort(faces[whole], axis=1), axis=0, return_index=True, return_counts=True
     )
     kept = whole[np.sort(first)]
     is_even = (counts % 2 == 0)[np.argsort(first)]
     if not is_even.any():
-        return kept
+        return kept, kept[:0]
     edges = _edges_of(faces[kept])
     sides = np.flatnonzero(np.repeat(is_even, 3))
     pairs = _neighbours(edges.number, sides)
@@ -183,7 +208,7 @@ def _drop_repeated(faces: Ints) -> Ints:
     is_odd = edges.uses[edges.number[border]] % 2 == 1
     lean = np.bincount(patch[border // 3], np.where(is_odd, 1.0, -1.0), len(kept))
     is_wall: NDArray[np.bool_] = is_even & (lean[patch] > 0.0)
-    return kept[~is_wall]
+    return kept[~is_wall], kept[is_wall]
 
 
 def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:

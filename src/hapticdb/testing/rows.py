@@ -25,7 +25,9 @@ class RowsContract(StoreCase):
         self, store: Store, plain: dict[int, set[int]]
     ) -> None:
         """Tests `lookup` and `lookup_each`."""
-        keys = np.arange(0, max(plain) + 3, dtype=np.int64)[::3].copy()
+        spread = np.linspace(0, max(plain) + 3, 20_000, dtype=np.int64)
+        known = np.array(sorted(plain), dtype=np.int64)[::3]
+        keys = np.unique(np.concatenate([spread, known, known + 1]))
         expected = [(k, i) for k in keys.tolist() for i in sorted(plain.get(k, ()))]
         asking: list[Callable[[Keys], object]] = [store.lookup, store.lookup_each]
         for ask in asking:

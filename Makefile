@@ -16,15 +16,16 @@ demo: $(USER)
 test: $(READY)
 	$(PYTEST) -m "not long" $(ARGS)
 
-# the long loops of kills, rights and recovery, every page's commands, and 200 examples a property
+# The long loops of kills, rights and recovery, every page's commands, and 200 examples a property.
+# Three tests run on each two processors: most of them wait for servers half of their time.
 test-long: $(READY)
-	HYPOTHESIS_PROFILE=thorough $(PYTEST) -m long $(ARGS)
+	HYPOTHESIS_PROFILE=thorough $(PYTEST) --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) -m long $(ARGS)
 
 test-all: test test-long
 
 # the kernels as plain Python: what the JIT must not change
 test-plain: $(READY)
-	NUMBA_DISABLE_JIT=1 $(BIN)/pytest tests/kernels
+	NUMBA_DISABLE_JIT=1 $(BIN)/pytest tests/kernels --numprocesses=auto --dist=worksteal
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -24,6 +24,7 @@ from psycopg import sql
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
 from servers import FOUND, SETTINGS, Place, named, private_server
+from steps import MOST_STEPS
 
 N_SHARDS = 3
 SHARD_SETTINGS = {**SETTINGS, "shared_buffers": "16MB"}
@@ -50,6 +51,16 @@ class ShardedServers(NamedTuple):
     @property
     def url(self) -> str:
         return self.coordinator.conninfo()
+
+    @property
+    def steps_tried(self) -> range:
+        """Steps before which a test of all steps kills something: of older versions every 5th.
+
+        The steps are the client's, the same on each version. 5 goes through every kind of edit,
+        and through odd and even steps.
+        """
+        is_newest = self.coordinator.binaries.major == SHARDED_FOUND[0].major
+        return range(1, MOST_STEPS, 1 if is_newest else 5)
 
     def url_of(self, environment: str) -> str:
         """URL that makes an environment of that name on these shards."""

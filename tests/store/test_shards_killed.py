@@ -176,7 +176,7 @@ def test_a_server_killed_at_any_step_leaves_an_object_whole(
 ) -> None:
     victim = victims(sharded_servers)[which]
     n_without = 0
-    for at in range(1, MOST_STEPS):
+    for at in sharded_servers.steps_tried:
         is_there = killed_at(sharded_servers, url, steps, at, victim, back=back)
         n_without = 0 if is_there else n_without + 1
         if n_without == len(KINDS):
@@ -267,7 +267,7 @@ def test_a_writer_killed_at_any_step_leaves_an_object_whole(
     sharded_servers: ShardedServers, url: str
 ) -> None:
     n_without = 0
-    for at in range(1, MOST_STEPS):
+    for at in sharded_servers.steps_tried:
         n_without = 0 if writer_killed_at(sharded_servers, url, at) else n_without + 1
         if n_without == len(KINDS):
             break

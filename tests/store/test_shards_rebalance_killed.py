@@ -103,7 +103,7 @@ def test_a_rebalance_killed_at_a_step_is_taken_up(
 def test_a_rebalance_killed_at_any_step_is_taken_up(
     sharded_servers: ShardedServers, url: str
 ) -> None:
-    for at in range(1, MOST_STEPS):
+    for at in sharded_servers.steps_tried:
         if not process_killed_at(sharded_servers, url, at):
             break
     assert 40 < at < MOST_STEPS - 1
@@ -139,7 +139,7 @@ def test_a_rebalance_whose_coordinator_is_killed_at_any_step_is_taken_up(
     sharded_servers: ShardedServers, url: str, steps: Steps
 ) -> None:
     """Before every other step it is back at once, as after a crash; else it stays away."""
-    for at in range(1, MOST_STEPS):
+    for at in sharded_servers.steps_tried:
         if not coordinator_killed_at(sharded_servers, url, steps, at, back=at % 2 == 0):
             break
     assert 40 < at < MOST_STEPS - 1

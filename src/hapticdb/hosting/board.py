@@ -8,6 +8,9 @@ sequence number, odd while a part of a row is written, tells a reader to read ag
 import mmap
 import os
 import threading
+import time
+from collections.abc import Iterator
+from itertools import repeat
 from typing import Self
 
 import numpy as np
@@ -21,9 +24,14 @@ from hapticdb.resident.table import anonymous_memory
 RING = 2048
 """Frames of a session that the board holds: two seconds at 1 kHz. Larger: a recording survives
 longer pauses of the host's process, and each session takes more memory."""
-READ_ATTEMPTS = 1000
-"""Attempts to read a part of a row that another process writes. Writing takes microseconds, so a
-part that stays unfinished belongs to a process that died."""
+QUICK_ATTEMPTS = 100
+"""Attempts, without a pause between them, to read what another process writes: that takes it
+microseconds, unless it is stopped in the middle by a busy machine."""
+READ_PATIENCE = 1.0
+"""Seconds of further attempts. Larger: a busier machine is borne, and a reader is held up for
+longer by a process that died while it wrote."""
+READ_PAUSE = 5e-4
+"""Seconds between further attempts, which let the writer have a processor."""
 FREE, TAKEN, LOST = 0, 1, 2
 """States of a seat: nobody's; a session's; a session's whose worker process has died."""
 
@@ -116,7 +124,7 @@ class Board:
 
     def last_frame(self, row: int) -> Frames | None:
         """Latest frame of a seat, (1,) of `FRAME`; None before the first."""
-        for _ in range(READ_ATTEMPTS):
+        for _ in _attempts():
             done = int(self.seats["n_frames"][row])
             if not done:
                 return None
@@ -129,7 +137,7 @@ class Board:
     def contacts(self, row: int) -> NDArray[np.float64]:
         """Contacts of a seat now (n, 6): points, m, and forces on the tool, N, world frame."""
         seats = self.seats
-        for _ in range(READ_ATTEMPTS):
+        for _ in _attempts():
             before = int(seats["contacts_sequence"][row])
             n_contacts = min(int(seats["n_contacts"][row]), MOST_SHOWN)
             found: NDArray[np.float64] = seats["contacts"][row, :n_contacts].copy()
@@ -142,5 +150,17 @@ def _bytes_a_seat() -> int:
     return SEAT.itemsize + RING * FRAME.itemsize
 
 
+def _attempts() -> Iterator[None]:
+    """Times to try to read what another process may be writing, until patience ends."""
+    yield from repeat(None, QUICK_ATTEMPTS)
+    end = time.monotonic() + READ_PATIENCE
+    while time.monotonic() < end:
+        time.sleep(READ_PAUSE)
+        yield
+
+
 def _unreadable() -> HapticDBError:
-    return HapticDBError("a worker process died while it wrote: end the session and begin another")
+    return HapticDBError(
+        f"a frame stayed unfinished for {READ_PATIENCE:g} s: the session's worker process has died "
+        "or does not get to run; end the session and begin another"
+    )

@@ -1,7 +1,7 @@
 """Does anything pass? Tools thrown at sheets and plates, or astride them; pegs in holes."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -43,7 +43,7 @@ LEAD = 12.0
 least one and a half period's way."""
 KINDS = (("sheets", 0.0), ("half-voxel plates", 0.5))
 """What is passed through, and its thickness in voxels."""
-ASTRIDE = 24
+N_ASTRIDE = 24
 """Starts astride a sheet."""
 FREE_N = 1e-9
 """Largest force, N, of a free tool."""
@@ -127,7 +127,7 @@ def sheets_of_sessions(side: Side, folder: Path, count: int) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for size in SIZES:
         for kind, thickness in KINDS:
-            axes = random_axes(N_SHEETS)
+            axes = random_axes(min(N_SHEETS, count))
             reach = max(HALF, lead_of(SPEEDS[1], size) + 2.0 * RADIUS)
             scenes = [
                 replace(plate(f"{kind} {n}", thickness, a, HALF), reach=reach)
@@ -146,14 +146,14 @@ def sheets_of_sessions(side: Side, folder: Path, count: int) -> dict[str, Any]:
     return {"values": [share], "nearest": min(row["nearest"] for row in rows), "cases": rows}
 
 
-def starts_astride(side: Side, folder: Path) -> dict[str, Any]:
+def starts_astride(side: Side, folder: Path, count: int) -> dict[str, Any]:
     """Share of starts astride a sheet from which the tool comes free without a step of force.
 
     The hand rests for 50 periods, then draws the tool out along the sheet's z at 50 mm/s, 30 voxels
     far. Free: no force at the end; no step: no change of the force above 0.05 N a period.
     """
     size = SIZES[0]
-    scenes = [plate(f"sheet {n}", 0.0, a, HALF) for n, a in enumerate(random_axes(ASTRIDE))]
+    scenes = [plate(f"sheet {n}", 0.0, a, HALF) for n, a in enumerate(random_axes(count))]
     rng = np.random.default_rng(1)
     free = 0
     held_up = []
@@ -166,7 +166,7 @@ def starts_astride(side: Side, folder: Path) -> dict[str, Any]:
             is_free = np.linalg.norm(forces[-1]) <= FREE_N and float(steps.max()) <= 0.05
             free += int(is_free)
             held_up.append(float(np.linalg.norm(forces, axis=1).max()))
-    return {"values": [free / ASTRIDE], "free": free, "count": ASTRIDE, "largest": max(held_up)}
+    return {"values": [free / count], "free": free, "count": count, "largest": max(held_up)}
 
 
 def draw_out(side: Side, ground: Ground, scene: Scene, offset: Floats, shell: PointShell) -> Floats:
@@ -187,12 +187,12 @@ def draw_out(side: Side, ground: Ground, scene: Scene, offset: Floats, shell: Po
 # --- a peg ----------------------------------------------------------------------------------------
 
 
-def clearances_of_pegs(side: Side, folder: Path) -> dict[str, Any]:
-    """Least of `CLEARANCES` at which a round and a square peg are free on all their way through."""
+def clearances_of_pegs(side: Side, folder: Path, clearances: Sequence[float]) -> dict[str, Any]:
+    """Least clearance, voxels, at which each peg, round and square, is free on all its way."""
     axes = random_axes(1)[0]
     values, cases = [], {}
     for scene, shape in ((round_hole(HOLE, axes), round_peg), (hole(HOLE, axes), peg)):
-        forces = forces_in_hole(side, folder, scene, shape)
+        forces = forces_in_hole(side, folder, scene, shape, clearances)
         free = [clearance for clearance, force in forces.items() if force <= FREE_TOUCH]
         values.append(min(free, default=math.inf))
         cases[scene.name] = forces
@@ -200,7 +200,11 @@ def clearances_of_pegs(side: Side, folder: Path) -> dict[str, Any]:
 
 
 def forces_in_hole(
-    side: Side, folder: Path, scene: Scene, shape: Callable[..., PointShell]
+    side: Side,
+    folder: Path,
+    scene: Scene,
+    shape: Callable[..., PointShell],
+    clearances: Sequence[float],
 ) -> dict[float, float]:
     """Largest force of `touch` on a peg's way through a hole, N, at each clearance."""
     size, axes = SIZES[0], scene.axes
@@ -210,7 +214,7 @@ def forces_in_hole(
         middle = ground.origins[scene.name]
         poses = np.stack([posed(middle + size * height * axes[:, 2]) for height in heights])
         law = side.law_of(STIFFNESS)
-        for clearance in CLEARANCES:
+        for clearance in clearances:
             width = HOLE - 2.0 * clearance
             shell = shape(width, PEG_LENGTH, size, axes, PEG_POINTS, side.onset)
             felt = ground.environment.touch_many(shell, poses, law=law).forces

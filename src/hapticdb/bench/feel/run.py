@@ -35,7 +35,8 @@ class Effort:
 
     n_random : planes turned at random; n_throws : throws at sheets, and at plates, for each voxel
     size; tries : halvings of the range of stiffness; rates, delays : of the stiffest wall, Hz and
-    s; periods : that are timed; places : of the walk.
+    s; periods : that are timed; places : of the walk; n_astride : starts astride a sheet;
+    clearances : of pegs, voxels.
     """
 
     n_random: int = N_RANDOM
@@ -45,9 +46,11 @@ class Effort:
     delays: Sequence[float] = stability.DELAYS
     periods: int = 20_000
     places: int = PLACES
+    n_astride: int = passing.N_ASTRIDE
+    clearances: Sequence[float] = passing.CLEARANCES
 
 
-QUICK_EFFORT = Effort(2, 10, 5, (1000.0,), (0.0, 0.002), 2000, 200)
+QUICK_EFFORT = Effort(2, 10, 5, (1000.0,), (0.0, 0.002), 2000, 200, 4, (0.0, 0.2, 1.1, 1.8))
 """A first look, a minute."""
 
 
@@ -152,8 +155,8 @@ def measured(
     found["z_width"] = stability.z_width(side, place, effort.rates, effort.delays, effort.tries)
     say(f"{side.law}: sheets, plates, pegs")
     found["sheets"] = passing.sheets_of_sessions(side, place, effort.n_throws)
-    found["astride"] = passing.starts_astride(side, place)
-    found["peg"] = passing.clearances_of_pegs(side, place)
+    found["astride"] = passing.starts_astride(side, place, effort.n_astride)
+    found["peg"] = passing.clearances_of_pegs(side, place, effort.clearances)
     return found, curves
 
 

@@ -109,8 +109,10 @@ def _are_within(sides: _Sides, faces: Ints, walls: Ints, triangles: Floats) -> N
     both is the same, that face is border: without it the outer body would be open there.
     """
     is_within = np.zeros(len(walls), dtype=bool)
+    if not len(walls):
+        return is_within
     joined = np.unique(sides.body[np.isin(faces, walls).any(axis=1)])
-    if len(walls) and joined.any():
+    if joined.any():
         tree = kernels.triangle_tree(sides.triangles, sides.body)
         for body in joined[joined > 0].tolist():
             is_within |= kernels.encloses(tree, body, triangles.mean(axis=1))

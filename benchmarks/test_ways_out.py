@@ -9,13 +9,18 @@ import pytest
 if "CI" not in os.environ:
     pytest.importorskip("coal", reason="make peers installs it")
 
-from ways_out import BITS, SAMPLE, SECONDS, WHEEL, measure
+from ways_out import BITS, SAMPLE, WHEEL, measure
+
+MOTIONS = 300
+"""After so many a search ends in vain, so that it is the same on a busy machine."""
+PATIENCE = 600.0
+"""Seconds in which each search must end by itself."""
 
 
 @pytest.fixture(scope="module")
 def found(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     folder: Path = tmp_path_factory.mktemp("ways")
-    return measure(folder, None, BITS, SAMPLE, SECONDS, motions=300)
+    return measure(folder, None, BITS, SAMPLE, PATIENCE, MOTIONS, os.cpu_count() or 1)
 
 
 @pytest.fixture(scope="module")

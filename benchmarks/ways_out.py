@@ -12,6 +12,8 @@ import json
 import os
 import tempfile
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -36,6 +38,8 @@ BITS = 11
 SECONDS = 60.0
 ORDER_SECONDS = 1200.0
 """Time of the search for an order."""
+ANSWER_PATIENCE = 3600.0
+"""Seconds that any answer, with its proofs and coal's distances, takes at most."""
 MOTIONS = 20_000
 MOST_POSES = 4000
 """Greatest number of poses of a path that coal looks at; of a longer one, every n-th."""
@@ -110,11 +114,16 @@ def plug_parts() -> list[SamplePart]:
     ]
 
 
-def measured(env: Environment, question: Question, seconds: float, motions: int) -> dict[str, Any]:
+def measured(url: Path, question: Question, seconds: float, motions: int) -> dict[str, Any]:
     """Search a way out; for a path that is found, ask coal, too."""
-    found = hapticdb.extract(
-        env, *question.words, exclude=question.exclude, seconds=seconds, motions=motions
-    )
+    with hapticdb.open(url, read_only=True) as env:
+        found = hapticdb.extract(
+            env, *question.words, exclude=question.exclude, seconds=seconds, motions=motions
+        )
+        return _record(env, question, found)
+
+
+def _record(env: Environment, question: Question, found: Extraction) -> dict[str, Any]:
     row: dict[str, Any] = {
         "parts": question.name,
         "verdict": found.verdict,
@@ -139,21 +148,22 @@ def measured(env: Environment, question: Question, seconds: float, motions: int)
     return row
 
 
-def measured_order(env: Environment, words: Sequence[str], seconds: float) -> dict[str, Any]:
+def measured_order(url: Path, words: Sequence[str], seconds: float) -> dict[str, Any]:
     """Search an order in which parts come out, and ask coal about each step."""
-    found = hapticdb.disassemble(env, *words, seconds=seconds)
     steps: list[dict[str, Any]] = []
-    for step in found.steps:
-        way = step.found.way
-        assert way is not None
-        row = {
-            "parts": ", ".join(obj.name for obj in step.found.parts),
-            "verdict": step.found.verdict,
-            "length_m": way.length,
-            "clearance_m": way.clearance,
-            "proved_from_m": way.rest_from,
-        }
-        steps.append(row | by_meshes(step.found, env.felt((), step.excluded)))
+    with hapticdb.open(url, read_only=True) as env:
+        found = hapticdb.disassemble(env, *words, seconds=seconds)
+        for step in found.steps:
+            way = step.found.way
+            assert way is not None
+            row = {
+                "parts": ", ".join(obj.name for obj in step.found.parts),
+                "verdict": step.found.verdict,
+                "length_m": way.length,
+                "clearance_m": way.clearance,
+                "proved_from_m": way.rest_from,
+            }
+            steps.append(row | by_meshes(step.found, env.felt((), step.excluded)))
     return {
         "parts": ", ".join(words),
         "verdict": found.verdict,
@@ -196,8 +206,13 @@ def measure(
     questions: Sequence[Question],
     seconds: float,
     motions: int = MOTIONS,
+    processes: int = 1,
 ) -> dict[str, Any]:
-    """Import the model, the sample car with a spark plug unless one is given, and ask all."""
+    """Import the model, the sample car with a spark plug unless one is given, and ask all.
+
+    Several processes ask at the same time: what they find is the same where no search ends by its
+    time, the seconds are not.
+    """
     file = model or write_sample(folder / "sample").car
     files = [file]
     if model is None:
@@ -205,20 +220,26 @@ def measure(
         files[1].write_bytes(car_scene(plug_parts()).export(file_type="glb"))
     url = folder / "scene.db"
     hapticdb.import_files(url, files, ImportOptions(grid=GridOptions(bits=bits)))
+    with hapticdb.open(url, read_only=True) as env:
+        voxel_size = env.grid.voxel_size
     found: dict[str, Any] = {
         "commit": records.commit(),
         "load_before": os.getloadavg()[0],
-        "conditions": {"model": file.name, "bits": bits, "seconds": seconds},
+        "conditions": {
+            "model": file.name, "bits": bits, "seconds": seconds, "voxel_m": voxel_size
+        },
         "rows": [],
-    }
-    with hapticdb.open(url, read_only=True) as env:
-        found["conditions"]["voxel_m"] = env.grid.voxel_size
-        for question in questions:
-            row = measured(env, question, seconds, motions)
-            found["rows"].append(row)
-            print(_line(row), flush=True)
-        if model is None:
-            found["order"] = measured_order(env, WHEEL, ORDER_SECONDS)
+    }  # fmt: skip
+    fresh = get_context("spawn")  # kernels and threads do not survive a fork
+    with ProcessPoolExecutor(processes, mp_context=fresh) as pool:
+        # the order takes longest, so it begins first
+        order = None if model else pool.submit(measured_order, url, WHEEL, ORDER_SECONDS)
+        asked = [pool.submit(measured, url, one, seconds, motions) for one in questions]
+        for answer in asked:
+            found["rows"].append(answer.result(ANSWER_PATIENCE))
+            print(_line(found["rows"][-1]), flush=True)
+        if order:
+            found["order"] = order.result(ANSWER_PATIENCE)
             print(f"order for {', '.join(WHEEL)}: {found['order']['verdict']}", flush=True)
     return found
 

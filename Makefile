@@ -7,21 +7,25 @@ READY := .venv/ready
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 PYTEST := $(BIN)/pytest tests --numprocesses=auto --dist=worksteal
 
-.PHONY: demo test test-long test-all test-plain lint types bench figures peers realtime feel scale paths wheel pins clean
+.PHONY: demo test test-long test-browser test-all test-plain lint types bench figures peers realtime feel scale paths wheel pins clean
 
 demo: $(USER)
 	$(BIN)/hapticdb demo demo
 
 # what a person runs ten times a day: minutes, 25 examples a property
 test: $(READY)
-	$(PYTEST) -m "not long" $(ARGS)
+	$(PYTEST) -m "not long and not browser" $(ARGS)
 
 # The long loops of kills, rights and recovery, every page's commands, and 200 examples a property.
 # Three tests run on each two processors: most of them wait for servers half of their time.
 test-long: $(READY)
-	HYPOTHESIS_PROFILE=thorough $(PYTEST) --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) -m long $(ARGS)
+	HYPOTHESIS_PROFILE=thorough $(PYTEST) --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) -m "long and not browser" $(ARGS)
 
-test-all: test test-long
+# Chromium draws with all processors: beside other tests its pages would be too slow.
+test-browser: $(READY)
+	$(BIN)/pytest tests -m browser $(ARGS)
+
+test-all: test test-long test-browser
 
 # the kernels as plain Python: what the JIT must not change
 test-plain: $(READY)

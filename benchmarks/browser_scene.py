@@ -29,6 +29,7 @@ if TYPE_CHECKING:
 
 SECONDS = 120.0
 """Limit of each wait."""
+SHELL = "/usr/bin/chromium-headless-shell"
 CHROMIUM = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 COUNT_CALLS = """
 window.calls = 0; window.frames = []; window.begun = performance.now();
@@ -134,7 +135,7 @@ def report(url: str, picture: Path) -> None:
         print(f"\n{len(view.objects):,} parts, {view.n_triangles:,} triangles")
         print(f"nodes {view.n_nodes}, {view.bytes_sent / 1e6:.1f} MB to each browser")
         print(f"boxes sent after {boxes:.2f} s, all shapes after {shapes:.2f} s")
-        chromium = tools.chromium.launch(executable_path="/usr/bin/chromium", args=CHROMIUM)
+        chromium = tools.chromium.launch(executable_path=SHELL, args=CHROMIUM)
         page = chromium.new_page(viewport={"width": 640, "height": 400})
         page.add_init_script(COUNT_CALLS)
         page.goto(f"http://127.0.0.1:{server.get_port()}")

@@ -25,6 +25,7 @@ from hapticdb.sample import write_sample
 from plant import imported
 from served import TOKENS, ServedProcess, car_or_sample
 
+SHELL = "/usr/bin/chromium-headless-shell"
 CHROMIUM = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 SIZE: ViewportSize = {"width": 640, "height": 400}
 EDITS, UNCOUNTED = 24, 3
@@ -136,7 +137,7 @@ def row(name: str, url: str, folder: Path) -> str:
         hapticdb.open(url) as env,
         sync_playwright() as tools,
     ):
-        chromium = tools.chromium.launch(executable_path="/usr/bin/chromium", args=CHROMIUM)
+        chromium = tools.chromium.launch(executable_path=SHELL, args=CHROMIUM)
         page = chromium.new_page(viewport=SIZE)
         page.add_init_script(WATCH)
         page.goto(f"http://127.0.0.1:{server.port}/?token={TOKENS['viewer']}")

@@ -10,26 +10,27 @@ from pathlib import Path
 import imageio.v3 as iio
 import numpy as np
 from numpy.typing import NDArray
-from playwright.sync_api import (
-    Browser,
-    Locator,
-    Page,
-    ViewportSize,
-    sync_playwright,
-)
-from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
+from playwright.sync_api import Browser, Locator, Page, ViewportSize, sync_playwright
 
 from hapticdb.page.scene.stage import FIELD_OF_VIEW, View
 
 Floats = NDArray[np.float64]
 
+EXECUTABLE = "/usr/bin/chromium-headless-shell"
+"""The shell, not the browser: that one at times never gave a picture of a page it did not show."""
+ARGUMENTS = [
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--disable-gpu-compositing",  # the page's own layers would be drawn in software WebGL, too
+    "--disable-gpu-vsync",
+]
+"""What makes it draw in software, and as little of it as possible."""
 SIZE: ViewportSize = {"width": 800, "height": 480}
 """Size of a page. Larger: drawing in software takes longer, about as its area."""
 PATIENCE = 120.0
 """Seconds that any wait lasts at most: drawing in software is slow on a busy machine."""
-MOST_ASKED = 4
-"""How often Chromium is asked for one picture: on a busy machine an answer may never come."""
-DRAGGED_STEPS = 10
+DRAGGED_STEPS = 6
 """Places of the pointer on the way of a drag. Larger: each waits for a picture to be drawn."""
 
 
@@ -37,10 +38,7 @@ DRAGGED_STEPS = 10
 def chromium() -> Iterator[Browser]:
     """Run Chromium; a missing one fails the test."""
     with sync_playwright() as play:
-        browser = play.chromium.launch(
-            executable_path="/usr/bin/chromium",
-            args=["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"],
-        )
+        browser = play.chromium.launch(executable_path=EXECUTABLE, args=ARGUMENTS)
         try:
             yield browser
         finally:
@@ -146,12 +144,6 @@ def drag(page: Page, eye: Eye, grabbed: Floats, way: Floats, *, lets_go: bool = 
 def picture(page: Page, name: str, folder: Path) -> Floats:
     """Take a picture (height, width, 3) of a page; HAPTICDB_TEST_PICTURES names another folder."""
     path = Path(os.environ.get("HAPTICDB_TEST_PICTURES") or folder) / f"{name}.png"
-    for asked in range(1, MOST_ASKED + 1):
-        try:
-            taken = page.screenshot(path=path, timeout=1000.0 * PATIENCE / MOST_ASKED)
-            break
-        except PlaywrightTimeoutError:
-            if asked == MOST_ASKED:
-                raise
+    taken = page.screenshot(path=path)
     image = iio.imread(taken, extension=".png")
     return np.asarray(image[..., :3], dtype=np.float64)

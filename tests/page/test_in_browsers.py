@@ -36,6 +36,8 @@ from hapticdb.server.access import Role
 from hapticdb.server.running import Serving
 from serving import TOKENS, Running, running, urls
 
+pytestmark = pytest.mark.browser
+
 Floats = NDArray[np.float64]
 
 PUSHED = 0.2
@@ -147,7 +149,6 @@ def around(image: Floats, pixel: tuple[float, float]) -> Floats:
     return image[y - 12 : y + 12, x - 12 : x + 12]
 
 
-@pytest.mark.long
 def test_one_feels_a_part_until_another_moves_it_away(
     server: Running, aim: Aim, tmp_path: Path
 ) -> None:
@@ -201,7 +202,6 @@ def test_one_feels_a_part_until_another_moves_it_away(
         picture(ben, "6-ben-sweeps", tmp_path)
 
 
-@pytest.mark.long
 def test_a_page_that_is_closed_in_a_drag_moves_nothing(
     server: Running, aim: Aim, car: Path, tmp_path: Path
 ) -> None:
@@ -238,7 +238,6 @@ def type_place(page: Page, place: Floats) -> None:
         entry.fill(f"{value:.5f}")
 
 
-@pytest.mark.long
 def test_a_person_hides_measures_records_and_replays(
     server: Running, aim: Aim, tmp_path: Path
 ) -> None:

@@ -11,6 +11,8 @@ from hapticdb.server.access import Role
 from hapticdb.server.running import Serving
 from serving import TOKENS, Running, running, urls
 
+pytestmark = pytest.mark.browser
+
 INJECTED = """() => {
     const script = document.createElement("script");
     script.textContent = "window.injected = 1";

@@ -204,6 +204,7 @@ def test_points_stay_in_the_wall_around_a_void(wall: float, inset: float) -> Non
 
 @given(seed=st.integers(0, 2**32), n=st.integers(4, 30), share=st.floats(0.05, 0.9))
 @example(seed=1, n=4, share=0.5)  # an edge below 8 degrees
+@example(seed=152, n=4, share=0.5)  # samples that lie 4e-5 insets from the other side of an edge
 @settings(max_examples=12, deadline=None)
 def test_random_convex_bodies_keep_the_inset_and_leave_no_part_without_points(
     seed: int, n: int, share: float
@@ -222,6 +223,16 @@ def test_random_convex_bodies_keep_the_inset_and_leave_no_part_without_points(
     area = ConvexHull(corners).area
     covering = np.sqrt(2.0 * area / (np.sqrt(3.0) * 200))
     assert nearest_to(shell.points, on_surface.points).max() <= 2.0 * inset + 2.5 * covering
+
+
+@pytest.mark.parametrize("degrees", [0.2, 1.0, 3.0, 7.0])
+def test_no_point_leaves_a_wedge_through_its_sharp_edge(degrees: float) -> None:
+    """Near the edge the other side is nearer than any share of the inset."""
+    for seed in range(3):
+        corners, faces = wedge(degrees)
+        shell = PointShell.from_mesh(corners, faces, 1000, inset=0.02, seed=seed)
+        inside = plane_distances(shell.points, corners)
+        assert np.all(inside >= shell.inset * 0.97 - 1e-9)
 
 
 def test_points_are_spread_evenly_after_they_were_drawn_in() -> None:

@@ -7,6 +7,7 @@ medial axis point approximation using nearest neighbors and the normal field", T
 28, 2012; here with the exact distances to triangles in place of those to sample points).
 """
 
+from functools import cached_property
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -46,6 +47,9 @@ FEW = 100
 """Pieces of a fine mesh around a ball that are enough for its facing, about. Larger: slower."""
 ROUNDS = 60
 """Most steps of shrinking. A step shrinks a ball by `SLACK` at least; most take 2 to 4."""
+SCALES = 4
+"""Sizes of smaller balls, each `2 SLACK` of the one before, that find walls too thin for larger
+ones: the last is 1.6e-7 of the wanted radius, and finds walls of a hundredth of that."""
 LINES = 12
 """Lines that vote whether an open surface has matter at a position. A larger value decides more
 exactly and takes longer."""
@@ -154,16 +158,47 @@ class InscribedBalls:
         """
         local = positions - self._center
         radii, facing = self._shrunk(local, face_of, radius)
-        # A wall thinner than the slack of a ball is not seen by the ball, but by a smaller one.
-        small = 2.0 * SLACK * radius
-        near, near_facing = self._shrunk(local, face_of, small)
-        is_thin = (near < (1.0 - SLACK) * small) & (near < radii)
-        radii[is_thin], facing[is_thin] = near[is_thin], near_facing[is_thin]
+        self._see_thin_walls(local, face_of, radii, facing, radius)
         is_open = np.flatnonzero(self._bodies[face_of] == 0)
         if len(is_open):
             middles = local[is_open] + 0.5 * radii[is_open, None] * self._normals[face_of[is_open]]
             radii[is_open[~self._has_matter(middles)]] = 0.0
         return Balls(radii, facing)
+
+    def _see_thin_walls(
+        self, local: Floats, face_of: NDArray[np.int32], radii: Floats, facing: Floats, most: float
+    ) -> None:
+        """Shrink balls through walls thinner than their slack, which only smaller ones see.
+
+        Beside a sharp edge of a closed body there is no thinnest wall. A ball that meets something
+        other than its own plane and has its middle outside its solid is tried smaller and smaller.
+        Where none of these meets a wall, the body crosses itself, and the ball stays.
+        """
+        some = np.arange(len(local))
+        for _ in range(SCALES):
+            most *= 2.0 * SLACK
+            near, near_facing = self._shrunk(local[some], face_of[some], most)
+            is_thin = (near < (1.0 - SLACK) * most) & (near < radii[some])
+            radii[some[is_thin]], facing[some[is_thin]] = near[is_thin], near_facing[is_thin]
+            some = some[near_facing < 1.0]
+            images = local[some] + radii[some, None] * self._normals[face_of[some]]
+            some = some[~self._are_inside(images, face_of[some])]
+            if not len(some):
+                break
+
+    @cached_property
+    def _sides(self) -> sides.TriangleTree:
+        return sides.triangle_tree(self._triangles, self._bodies)
+
+    def _are_inside(self, images: Floats, face_of: NDArray[np.int32]) -> NDArray[np.bool_]:
+        """Whether images (Q, 3) of positions are in their solids; yes for those of open bodies."""
+        solids, is_inside = self._solids[face_of], self._bodies[face_of] == 0
+        for body in np.unique(self._bodies[self._bodies > 0]).tolist():
+            solid = self._solids[np.argmax(self._bodies == body)]
+            held = np.flatnonzero(solids == solid)
+            # what a void encloses is out again
+            is_inside[held] ^= sides.encloses(self._sides, body, images[held])
+        return np.asarray(is_inside)
 
     def _shrunk(
         self, local: Floats, face_of: NDArray[np.int32], radius: float

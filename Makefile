@@ -19,7 +19,7 @@ test: $(READY)
 # The long loops of kills, rights and recovery, every page's commands, and 200 examples a property.
 # Three tests run on each two processors: most of them wait for servers half of their time.
 test-long: $(READY)
-	HYPOTHESIS_PROFILE=thorough $(PYTEST) --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) -m "long and not browser" $(ARGS)
+	HYPOTHESIS_PROFILE=thorough $(PYTEST) --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) -m long $(ARGS)
 
 # Chromium draws with all processors: beside other tests its pages would be too slow.
 test-browser: $(READY)

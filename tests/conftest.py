@@ -34,18 +34,19 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """On older PostgreSQL, all but one server's contract is `long`, and `NEWEST` is left out."""
     older = set(map(named, FOUND[1:]))
-    left_out = []
+    kept: list[pytest.Item] = []
+    left_out: list[pytest.Item] = []
     for item in items:
         params = getattr(getattr(item, "callspec", None), "id", "").split("-")
-        if older.isdisjoint(params):
-            continue
+        is_older = not older.isdisjoint(params)
+        is_left_out = is_older and item.path.parent.name in NEWEST
+        (left_out if is_left_out else kept).append(item)
         name = item.path.name
-        if item.path.parent.name in NEWEST:
-            left_out.append(item)
-        elif not name.startswith("test_contract_postgres") or "shards" in name:
+        is_contract = name.startswith("test_contract_postgres") and "shards" not in name
+        if is_older and not is_contract:
             item.add_marker(pytest.mark.long)
     config.hook.pytest_deselected(items=left_out)
-    items[:] = [item for item in items if item not in left_out]
+    items[:] = kept
 
 
 def real_folder() -> Path | None:

@@ -181,8 +181,9 @@ class InscribedBalls:
             is_thin = (near < (1.0 - SLACK) * most) & (near < radii[some])
             radii[some[is_thin]], facing[some[is_thin]] = near[is_thin], near_facing[is_thin]
             some = some[near_facing < 1.0]
-            images = local[some] + radii[some, None] * self._normals[face_of[some]]
-            some = some[~self._are_inside(images, face_of[some])]
+            if len(some):
+                images = local[some] + radii[some, None] * self._normals[face_of[some]]
+                some = some[~self._are_inside(images, face_of[some])]
             if not len(some):
                 break
 
@@ -193,11 +194,11 @@ class InscribedBalls:
     def _are_inside(self, images: Floats, face_of: NDArray[np.int32]) -> NDArray[np.bool_]:
         """Whether images (Q, 3) of positions are in their solids; yes for those of open bodies."""
         solids, is_inside = self._solids[face_of], self._bodies[face_of] == 0
-        for body in np.unique(self._bodies[self._bodies > 0]).tolist():
-            solid = self._solids[np.argmax(self._bodies == body)]
+        bodies, firsts = np.unique(self._bodies, return_index=True)
+        for body, solid in zip(bodies.tolist(), self._solids[firsts].tolist(), strict=True):
             held = np.flatnonzero(solids == solid)
-            # what a void encloses is out again
-            is_inside[held] ^= sides.encloses(self._sides, body, images[held])
+            if body > 0 and len(held):  # what a void encloses is out again
+                is_inside[held] ^= sides.encloses(self._sides, body, images[held])
         return np.asarray(is_inside)
 
     def _shrunk(

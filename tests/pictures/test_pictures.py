@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import hapticdb
 from hapticdb import Grid, PointShell
 from hapticdb.pictures.demo import PAPER, SCENE, SIZE, TOWARDS, mixed
-from hapticdb.pictures.lettering import extent_of, shortened, width_of
+from hapticdb.pictures.lettering import extent_of, in_lines, shortened, width_of
 from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat, turned
 from hapticdb.pictures.sweep import compose_sweep
 from hapticdb.store.attributes import AXES, up_axis
@@ -90,6 +90,23 @@ def test_words_are_shortened_in_the_middle_until_they_fit(words: str, most: floa
         assert words.startswith(head)
         assert words.endswith(tail)
         assert abs(len(head) - len(tail)) <= 3
+
+
+@pytest.mark.parametrize("words", ["", "short", LONG, "W" * 300 + " " + LONG])
+@pytest.mark.parametrize("count", [1, 2, 20])
+def test_long_words_are_broken_into_lines_and_only_their_end_is_left_out(
+    words: str, count: int
+) -> None:
+    figure = Figure(figsize=(16, 10), dpi=100)
+    lines = in_lines(figure, words, 12, 380.0, count)
+    assert len(lines) <= count
+    assert all(width_of(figure, line, 12) <= 380.0 for line in lines)
+    assert not figure.texts
+    if "W" not in words:
+        told = " ".join(lines)
+        assert told == " ".join(words.split()) or (
+            len(lines) == count and told.endswith("…") and words.startswith(told[:-1])
+        )
 
 
 @pytest.mark.parametrize(

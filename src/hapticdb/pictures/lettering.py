@@ -41,6 +41,23 @@ def shortened(figure: FigureBase, words: str, size: float, most: float) -> str:
     return without_middle(words, low)
 
 
+def in_lines(figure: FigureBase, words: str, size: float, most: float, count: int) -> list[str]:
+    """Break words into at most `count` lines of at most `most` pixels; what is over is left out."""
+    lines: list[str] = []
+    for word in words.split():
+        longer = f"{lines[-1]} {word}" if lines else word
+        if lines and width_of(figure, longer, size) <= most:
+            lines[-1] = longer
+        else:
+            lines.append(word)
+    if len(lines) > count:
+        last = lines[count - 1].split()
+        while len(last) > 1 and width_of(figure, " ".join(last) + ELLIPSIS, size) > most:
+            last.pop()
+        lines[count - 1 :] = [" ".join(last) + ELLIPSIS]
+    return [shortened(figure, line, size, most) for line in lines]
+
+
 def without_middle(words: str, kept: int) -> str:
     """Words with `kept` of their letters, half from either end, and an ellipsis between."""
     head = (kept + 1) // 2

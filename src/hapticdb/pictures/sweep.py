@@ -26,7 +26,7 @@ from hapticdb.pictures.demo import (
     TOWARDS,
     mixed,
 )
-from hapticdb.pictures.lettering import extent_of, shortened
+from hapticdb.pictures.lettering import extent_of, in_lines, shortened, width_of
 from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.attributes import AXES, up_axis
@@ -42,6 +42,8 @@ FADE = 90
 """Pixels from the edges within which a scene fades that continues beyond them."""
 LEFT, RIGHT, TOP, LINE = 35, 1565, 45, 24
 """Places of the words, pixels from the upper left corner; LINE: from one name to the next."""
+VERDICT_LINES = 3
+"""Lines that a verdict takes at most; the end of a longer one is left out."""
 LEGEND = 380
 """Pixels that the name of an object takes at most."""
 ROOM = 0.1
@@ -64,6 +66,8 @@ words that stands there."""
 WAY = 400
 """Samples of the path that are drawn at most. More follow a curved path better."""
 FREE, CAUGHT = "#ffffff", "#ff5d73"
+BEHIND = {"facecolor": PAPER, "alpha": 0.55, "linewidth": 0, "pad": 1.5}
+"""What is behind words, so that they are readable over the scene."""
 
 Floats = NDArray[np.float64]
 
@@ -121,10 +125,7 @@ def compose_sweep(
     above = figure.add_axes((0.0, 1 - SCENE[1] / SIZE[1], 1.0, SCENE[1] / SIZE[1]))
     colors = dict(zip((one.object.id for one in found.objects), COLORS, strict=False))
     legend = _draw_legend(figure, found, colors)
-    room = legend - 2 * LEFT - LINE
-    _write(figure, TOP, shortened(figure, verdict, 17, room), color="white", fontsize=17)
-    words = shortened(figure, _words(env, shell, found), 12, room)
-    _write(figure, TOP + 30, words, color=FAINT, fontsize=12)
+    _write_verdict(figure, verdict, _words(env, shell, found), legend - 2 * LEFT - LINE)
     axis = up_axis(env.objects()) if up is None else AXES.index(up)
     camera = _camera(env, shell, found, left_out, axis, legend)
     _draw_scene(above, env, camera, colors, left_out)
@@ -135,9 +136,20 @@ def compose_sweep(
     return figure
 
 
+def _write_verdict(figure: Figure, verdict: str, words: str, room: float) -> None:
+    """Write the verdict, a long one smaller and in lines; below it what was swept."""
+    size = 17 if width_of(figure, verdict, 17) <= room else 13
+    lines = in_lines(figure, verdict, size, room, VERDICT_LINES)
+    down = TOP - 10 * (len(lines) > 1)
+    for line in lines:
+        _write(figure, down, line, color="white", fontsize=size)
+        down += LINE
+    _write(figure, down + 6, shortened(figure, words, 12, room), color=FAINT, fontsize=12)
+
+
 def _write(figure: Figure, down: float, words: str, **style: Any) -> None:  # noqa: ANN401 - matplotlib's
-    """Write a line at the left, so many pixels from the top."""
-    figure.text(LEFT / SIZE[0], 1.0 - down / SIZE[1], words, va="center", **style)
+    """Write a line at the left, so many pixels from the top, readable over the scene."""
+    figure.text(LEFT / SIZE[0], 1.0 - down / SIZE[1], words, va="center", bbox=BEHIND, **style)
 
 
 def _words(env: Environment, shell: PointShell, found: Swept) -> str:
@@ -295,7 +307,7 @@ def _mark(axes: Axes, at: Floats, text: str, color: str) -> None:
         color=color,
         fontsize=11,
         zorder=6,
-        bbox={"facecolor": PAPER, "alpha": 0.55, "linewidth": 0, "pad": 1.5},
+        bbox=BEHIND,
     )
     for right, lift, side in BESIDE:
         label.set_position((right, lift))
@@ -349,6 +361,7 @@ def _draw_legend(figure: Figure, found: Swept, colors: dict[int, str]) -> float:
             fontsize=12,
             ha="right",
             va="center",
+            bbox=BEHIND,
         )
         begins = min(begins, float(extent_of(text).x0))
     return begins

@@ -186,6 +186,7 @@ def test_an_opened_store_has_one_connection_to_each_server_at_most(
     with hapticdb.create(url, GRID, layout="brick") as env:
         write_blocks(env)
         until(lambda: are(1))  # a server takes a moment to notice a goodbye
+        assert set(at_once) == {1}
         with (
             ResidentCells(env.url, budget_bytes=4 << 20) as cells,
             Session(cells, sphere, over(-0.064), **BY_DEFAULT) as session,

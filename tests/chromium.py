@@ -28,6 +28,12 @@ ARGUMENTS = [
 """What makes it draw in software, and as little of it as possible."""
 SIZE: ViewportSize = {"width": 800, "height": 480}
 """Size of a page. Larger: drawing in software takes longer, about as its area."""
+FULL_RESOLUTION = """
+if (!new URLSearchParams(location.search).has("token"))
+    history.replaceState(null, "", location.pathname + "?fixedDpr=1")
+"""
+"""Run before the page's own code. Else viser draws fewer pixels where it finds that it is slow, and
+two pictures of the same scene differ."""
 PATIENCE = 120.0
 """Seconds that any wait lasts at most: drawing in software is slow on a busy machine."""
 DRAGGED_STEPS = 6
@@ -46,8 +52,9 @@ def chromium() -> Iterator[Browser]:
 
 
 def new_page(browser: Browser, address: str) -> Page:
-    """Open an address as a person of its own does: no cookie is shared."""
+    """Open an address as a person of its own does: no cookie is shared; drawn with all pixels."""
     page = browser.new_context(viewport=SIZE).new_page()
+    page.add_init_script(FULL_RESOLUTION)
     page.set_default_timeout(1000.0 * PATIENCE)
     page.goto(address)
     return page

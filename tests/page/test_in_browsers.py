@@ -50,7 +50,7 @@ rings that turn it cross it at other places."""
 
 
 @pytest.fixture(scope="module")
-def car(test_data: Path | None, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def imported(test_data: Path | None, tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert test_data is not None, "the real car is needed: give HAPTICDB_TEST_DATA its folder"
     folder = tmp_path_factory.mktemp("car")
     shutil.copy(test_data / "demo_vintage_car" / "vintage_car.glb", folder)
@@ -59,6 +59,12 @@ def car(test_data: Path | None, tmp_path_factory: pytest.TempPathFactory) -> Pat
     assert [report.status for report in reports] == ["imported"]
     compile_missing(entries_for("host", "sweep"))
     return folder / "car.db"
+
+
+@pytest.fixture
+def car(imported: Path, tmp_path: Path) -> Path:
+    """The imported car, a copy for each test: one of them moves a part."""
+    return Path(shutil.copy(imported, tmp_path))
 
 
 @pytest.fixture

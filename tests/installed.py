@@ -9,7 +9,7 @@ import pytest
 from hapticdb.store import engines
 
 BLOCK = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
-PAGE = BLOCK.findall((Path(__file__).parent.parent / "docs" / "engines.md").read_text())
+PAGE = BLOCK.findall((Path(__file__).parent.parent / "docs" / "extending.md").read_text())
 """Kind and text of each block of the page that says how an engine is added."""
 (ENTRY_POINT,) = [text for kind, text in PAGE if kind == "toml"]
 

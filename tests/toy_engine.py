@@ -1,6 +1,6 @@
 """The smallest engine: environments in this process's memory, opened by ``memory://name``.
 
-docs/engines.md refers to this file. Every commit makes a new, immutable `State`; a snapshot is a
+docs/extending.md refers to this file. Every commit makes a new, immutable `State`; a snapshot is a
 reference to one. The engine has what each engine must have, and no capability that only some
 engines have.
 """

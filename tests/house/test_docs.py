@@ -1,4 +1,4 @@
-"""Every block of the README runs, and the SQL in the docs is the SQL that runs."""
+"""Every block of the pages runs, and the SQL in the docs is the SQL that runs."""
 
 import os
 import re
@@ -9,7 +9,6 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from children import finished
-from hapticdb.cli import app
 from hapticdb.store.postgres.connecting import link
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.tables import statements
@@ -30,70 +29,19 @@ def blocks(kind: str, page: str = "README.md") -> list[str]:
 
 
 @pytest.mark.long
-def test_every_block_of_the_readme_runs(tmp_path: Path) -> None:
-    """Shell blocks run first, since Python needs the sample; then all Python in one session."""
+@pytest.mark.parametrize(
+    "pages", [("README.md", "docs/query.md"), ("docs/realtime.md",), ("docs/paths.md",)]
+)
+def test_every_block_of_the_pages_runs(tmp_path: Path, pages: tuple[str, ...]) -> None:
+    """All shell blocks in one session of the shell, then all Python blocks in one of Python."""
     tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    for block in blocks("sh"):
-        bash = ["bash", "-euo", "pipefail", "-c", block]
-        done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
-        assert done.returncode == 0, done.stderr
-    (tmp_path / "car.db").unlink()
-    session = "\n".join(blocks("python"))
-    done = finished([sys.executable, "-c", session], cwd=tmp_path, patience=LONG)
-    assert done.returncode == 0, done.stderr
-    assert len(done.stdout.splitlines()) >= 100
-
-
-@pytest.mark.long
-def test_every_block_of_the_realtime_page_runs(tmp_path: Path) -> None:
-    """Shell blocks run first; the Python blocks use the files that the shell has made."""
-    page = "docs/realtime.md"
-    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    for block in blocks("sh", page):
-        for line in block.splitlines():
-            bash = ["bash", "-euo", "pipefail", "-c", line]
-            done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
-            # exit code 1 of a sweep: the part hits something
-            assert done.returncode == (1 if " sweep " in line else 0), done.stderr
-    session = "\n".join(blocks("python", page))
-    done = finished([sys.executable, "-c", session], cwd=tmp_path, patience=LONG)
-    assert done.returncode == 0, done.stderr
-    assert (tmp_path / "sweep.png").stat().st_size > 10_000
-
-
-@pytest.mark.long
-def test_every_block_of_the_page_of_paths_runs(tmp_path: Path) -> None:
-    """In one session of the shell: each line needs what those before it have made."""
-    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    bash = ["bash", "-euo", "pipefail", "-c", "\n".join(blocks("sh", "docs/paths.md"))]
+    script = "\n".join(block for page in pages for block in blocks("sh", page))
+    bash = ["bash", "-euo", "pipefail", "-c", script]
     done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "hood.png").stat().st_size > 10_000
-    assert (tmp_path / "hood.csv").read_text().startswith("object_id,")
-
-
-@pytest.mark.long
-def test_every_block_of_the_page_of_batches_runs(tmp_path: Path) -> None:
-    """The shell makes the sample; then all Python blocks run in one session."""
-    page = "docs/batches.md"
-    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    for block in blocks("sh", page):
-        bash = ["bash", "-euo", "pipefail", "-c", block]
-        done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
-        assert done.returncode == 0, done.stderr
-    session = "\n".join(blocks("python", page))
+    session = "\n".join(block for page in pages for block in blocks("python", page))
     done = finished([sys.executable, "-c", session], cwd=tmp_path, patience=LONG)
     assert done.returncode == 0, done.stderr
-
-
-@pytest.mark.long
-def test_every_block_of_the_page_of_the_way_out_runs(tmp_path: Path) -> None:
-    tools = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
-    for block in blocks("sh", "docs/extract.md"):
-        bash = ["bash", "-euo", "pipefail", "-c", block]
-        done = finished(bash, cwd=tmp_path, env=os.environ | {"PATH": tools}, patience=LONG)
-        assert done.returncode == 0, done.stderr
-    assert (tmp_path / "out.csv").exists()
 
 
 @pytest.mark.long
@@ -136,7 +84,7 @@ def test_every_make_line_of_the_readme_is_run_by_ci() -> None:
 
 
 def test_the_docs_show_the_sql_that_runs() -> None:
-    shown = SHOWN.findall((ROOT / "docs" / "strategies.md").read_text())
+    shown = SHOWN.findall((ROOT / "docs" / "query.md").read_text())
     assert len(shown) == 9
     for module, constant, layout, text in shown:
         runs = getattr(CODE[module], constant)[layout]
@@ -157,11 +105,3 @@ def test_every_link_in_the_docs_leads_somewhere(page: str) -> None:
     for target in re.findall(r"\]\(([^)#]+)\)", path.read_text()):
         if "://" not in target:
             assert (path.parent / target).exists(), target
-
-
-def test_the_readme_names_every_command() -> None:
-    readme = (ROOT / "README.md").read_text()
-    for command in app.registered_commands:
-        assert command.callback is not None
-        verb = (command.name or command.callback.__name__).replace("_", "-")
-        assert f"hapticdb {verb}" in readme or f"make {verb}" in readme, verb

@@ -1,12 +1,8 @@
-"""docs/serving.md gives the limits and figures that the code has, and deploy/ what it promises."""
+"""docs/serving.md gives the limits that the code has, and deploy/ what it promises."""
 
 import re
-from pathlib import Path
 
-from hapticdb.hosting.host import SessionHost
 from hapticdb.server import access, messages
-from hapticdb.server.figures import Figures
-from hapticdb.server.health import HostCollector
 from hapticdb.server.limits import Limits
 from sources import ROOT
 
@@ -25,16 +21,6 @@ def test_the_table_of_limits_is_that_of_the_code() -> None:
         )
     }
     assert {name: float(value) for name, value in shown.items()} == known
-
-
-def test_the_page_names_every_figure_and_no_other(environment: Path) -> None:
-    figures = Figures()
-    with SessionHost(str(environment)) as host:
-        figures.add(HostCollector(host))
-        found = set(re.findall(r"^# HELP (\w+)", figures.text().decode(), re.MULTILINE))
-    assert set(re.findall(r"^\| `(hapticdb_\w+)` \|", PAGE, re.MULTILINE)) == {
-        name for name in found if not name.endswith("_created")
-    }
 
 
 def test_the_unit_waits_longer_than_the_server_needs_to_stop() -> None:

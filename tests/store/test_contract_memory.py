@@ -1,4 +1,4 @@
-"""The toy engine passes the contract: docs/engines.md shows this file."""
+"""The toy engine passes the contract: docs/extending.md shows this file."""
 
 import itertools
 import os

@@ -1,4 +1,4 @@
-"""What the server counts, for Prometheus; docs/serving.md names each figure."""
+"""What the server counts, for Prometheus."""
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.registry import Collector

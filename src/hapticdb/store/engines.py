@@ -2,7 +2,7 @@
 
 The engines of this package are listed in `BUILT_IN`. Another distribution adds its own engine by
 an entry point of the group `hapticdb.engines`: its name is the scheme, its object an `Engine`
-(docs/engines.md). The command line and the processes of a session find an entry point, too; a
+(docs/extending.md). The command line and the processes of a session find an entry point, too; a
 function that registers an engine would have to be called in each of them.
 
 An engine's module is imported when a URL first names it, so that a verb on a file loads no driver

@@ -13,7 +13,7 @@ An engine's tests subclass `StoreContract` and say how a store is made and opene
 
 They also subclass `EngineContract`, which tests what an engine does with URLs. `lacks` names the
 capabilities that the engine lacks. Their tests are skipped, each with its reason; every other
-capability is tested. docs/engines.md leads from the first line to a tested engine.
+capability is tested. docs/extending.md leads from the first line to a tested engine.
 
 Needs pytest.
 """

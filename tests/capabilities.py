@@ -6,13 +6,11 @@ The contract suites skip the tests of these, and the header of each run lists th
 STORE_LACKS = {
     "SQLite": frozenset({"server", "grouping threshold"}),
     "PostgreSQL": frozenset({"caches"}),
-    "PostgreSQL on shards": frozenset({"statement", "caches", "server"}),
     "memory": frozenset({"statement", "caches", "watch", "server", "grouping threshold"}),
 }
 ENGINE_LACKS = {
     "SQLite": frozenset({"grant"}),
     "PostgreSQL": frozenset({"backup", "first findings"}),
-    "PostgreSQL on shards": frozenset({"backup", "first findings"}),
     "memory": frozenset({"grant", "backup", "first findings"}),
 }
 

@@ -17,8 +17,7 @@ from hapticdb import PointShell
 from hapticdb.kernels.compiling import NAMES, compile_missing
 from hapticdb.pointshell.shell import fibonacci_sphere
 from installed import toy_is_installed  # noqa: F401 - a fixture
-from servers import FOUND, admin, citus_line, database, named, place  # noqa: F401 - fixtures
-from sharded import sharded_place, sharded_servers  # noqa: F401 - fixtures
+from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 
 NEWEST = {"cli", "house"}
 """Rooms tested on the newest PostgreSQL alone: what is said, not what a server is asked."""
@@ -41,8 +40,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         is_older = not older.isdisjoint(params)
         is_left_out = is_older and item.path.parent.name in NEWEST
         (left_out if is_left_out else kept).append(item)
-        name = item.path.name
-        is_contract = name.startswith("test_contract_postgres") and "shards" not in name
+        is_contract = item.path.name.startswith("test_contract_postgres")
         if is_older and not is_contract:
             item.add_marker(pytest.mark.long)
     config.hook.pytest_deselected(items=left_out)
@@ -64,7 +62,6 @@ def pytest_report_header() -> list[str]:
     servers = ", ".join(map(named, FOUND))
     return [
         f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, {servers}, JIT {jit}",
-        citus_line(),
         *capabilities.header(),
     ]
 

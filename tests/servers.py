@@ -48,24 +48,6 @@ def named(found: Binaries | str) -> str:
     return "postgres" if isinstance(found, str) else f"postgres{found.major}"
 
 
-def share_folders(binaries: Binaries) -> list[Path]:
-    """Folders that may hold an installation's extensions: PostgreSQL's own layout, and Debian's."""
-    debian = Path("/usr/share/postgresql") / str(binaries.major)
-    return [folder / "extension" for folder in (binaries.bindir.parent / "share", debian)]
-
-
-def citus_line() -> str:
-    """Line of the header: whether Citus is there, and that the shards' suite did not use it."""
-    having = [
-        named(found)
-        for found in FOUND
-        if isinstance(found, Binaries)
-        and any((folder / "citus.control").is_file() for folder in share_folders(found))
-    ]
-    state = f"installed for {', '.join(having)}" if having else "not installed"
-    return f"Citus: {state}; the shards' suite runs without it, hapticdb asks the shards itself"
-
-
 @cache
 def private_server(found: Binaries) -> PrivateServer:
     """A running server for all tests of this process."""

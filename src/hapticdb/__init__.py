@@ -37,8 +37,6 @@ if TYPE_CHECKING:
         OutsideGridError,
         ProtocolError,
         ReadOnlyError,
-        ShardAwayError,
-        StaleError,
         StuckError,
         UsageError,
     )
@@ -68,7 +66,6 @@ if TYPE_CHECKING:
     from hapticdb.store.base import Object
     from hapticdb.store.connect import (
         backup_environment,
-        rebalance_environment,
         restore_environment,
     )
     from hapticdb.sweeps.result import Swept
@@ -126,8 +123,6 @@ __all__ = [
     "Report",
     "ResidentCells",
     "Session",
-    "ShardAwayError",
-    "StaleError",
     "StuckError",
     "Swept",
     "TangentPlane",
@@ -147,7 +142,6 @@ __all__ = [
     "import_files",
     "open",
     "read_poses",
-    "rebalance_environment",
     "replay",
     "restore_environment",
     "sweep",
@@ -168,7 +162,7 @@ _HOMES = {
         "DatabaseError DeviceError EnvironmentExistsError EnvironmentNotFoundError "
         "FileError GeometryChangedError GridError HapticDBError MissingExtraError "
         "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutdatedError "
-        "OutsideGridError ProtocolError ReadOnlyError ShardAwayError StaleError StuckError "
+        "OutsideGridError ProtocolError ReadOnlyError StuckError "
         "UsageError"
     ),
     "extraction.disassembly.result": "Disassembly",
@@ -196,7 +190,7 @@ _HOMES = {
     "query.cost_model": "CostModel",
     "query.quantiles": "QuantileVector",
     "store.base": "Object",
-    "store.connect": "backup_environment rebalance_environment restore_environment",
+    "store.connect": "backup_environment restore_environment",
     "query.touches": "Touch Touches",
     "transfer": "CopyReport copy_environment",
     "warm": "warm_up",

@@ -22,9 +22,7 @@
         ├── AccessError (PermissionError)     the server does not let this user in
         ├── ConflictError                     another has written the object meanwhile
         ├── ConnectionLostError (ConnectionError)  the server went away
-        │   ├── OutdatedError                 a snapshot that a server could not hold
-        │   ├── ShardAwayError                one of the servers that hold the rows went away
-        │   └── StaleError                    a standby that is behind, or may be
+        │   └── OutdatedError                 a snapshot that a server could not hold
         ├── BusyError (TimeoutError)          another writer held the database too long
         └── StuckError (TimeoutError)         the database took longer than a frame may
 
@@ -119,14 +117,6 @@ class ConnectionLostError(DatabaseError, ConnectionError):
 
 class OutdatedError(ConnectionLostError):
     """A snapshot that a server could not hold: read all of it again."""
-
-
-class ShardAwayError(ConnectionLostError):
-    """One of the servers that hold an environment's rows went away, or was never there."""
-
-
-class StaleError(ConnectionLostError):
-    """The server that answers is a standby: its rows are, or may be, older than allowed."""
 
 
 class StuckError(DatabaseError, TimeoutError):

@@ -26,7 +26,6 @@ from hapticdb.store.base import Layout, Object, Rows, Store
 from hapticdb.store.batches import joined
 from hapticdb.store.believed import distances_crc
 from hapticdb.store.connect import create_store, exists, open_store
-from hapticdb.store.sharding import SupportsShards
 
 MOST_ROWS = 1 << 19
 """Rows of the index that one statement may read, whatever objects they belong to. It takes far less
@@ -183,8 +182,6 @@ def _copy_objects(source: Store, target: Store, progress: CopyCallback | None) -
         missing = _missing(objects, source, target)
         quantiles = QuantileVector.of(source)
         if missing:
-            if isinstance(target, SupportsShards) and is_same_kind(source, target):
-                target.spread(quantiles.bounds)
             loading.enter_context(target.loading())
         for done, obj in enumerate(missing, start=len(objects) - len(missing) + 1):
             rows = _rows_for(target, source, obj, quantiles)

@@ -36,7 +36,6 @@ LINES = {
     "check": "scene.db",
     "backup": "scene.db whole.db",
     "restore": "scene.db put.db",
-    "rebalance": "scene.db",
     "upgrade": "scene.db",
     "calibrate": "scene.db",
     "analyze": "scene.db",
@@ -47,8 +46,8 @@ LINES = {
     "serve": "scene.db --seconds 1",
 }
 """Arguments of each verb, without a picture."""
-REFUSED = {"grant": 2, "rebalance": 2}
-"""Verbs with an exit code other than 0: an SQLite file has neither roles nor servers."""
+REFUSED = {"grant": 2}
+"""Verbs with an exit code other than 0: an SQLite file has no roles."""
 DRAWING = {"demo", "bench"}
 """Verbs that always draw."""
 LONG = {"feel", "replay", "sweep", "extract", "calibrate", "sample", "warm", "view", "serve"}

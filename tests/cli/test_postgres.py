@@ -11,13 +11,12 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from subprocess import Popen
-from urllib.parse import parse_qs, urlsplit
 
 import psycopg
 import pytest
 from psycopg import sql
 
-from children import PATIENCE, child, finished, until
+from children import PATIENCE, child, finished
 from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixture `scene` below
     test_a_move_that_cannot_be_changes_nothing,
     test_a_pose_and_a_matrix_replace_the_placement,
@@ -37,7 +36,6 @@ from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixtur
 )
 from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
 from hapticdb.demo import prepare
-from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.connect import beside, redact
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
@@ -193,46 +191,6 @@ def test_a_wrong_password_and_a_missing_role_are_one_line(run: Run, server: Priv
     ):
         assert "wr0ng" not in refused(run("info", url + user), *words)
     refused(run("info", f"{url}locked&password=right"), "no environment")
-
-
-@pytest.mark.long
-def test_a_standby_is_read_and_refuses_to_be_written(
-    run: Run, server: PrivateServer, made: Path, tmp_path: Path
-) -> None:
-    standby = tmp_path / "standby"
-    standby.mkdir(mode=0o700)
-    (standby / "lock").touch(mode=0o600)
-    primary, file = server.conninfo(), made / "boxes.glb"
-    assert run("import", primary, file, "--bits", 6)[0] == 0
-    copied = [server.binaries.path("pg_basebackup"), "--write-recovery-conf", "--checkpoint=fast"]
-    finished([*copied, f"--pgdata={standby / 'data'}", f"--dbname={primary}"], check=True)
-    (standby / "data").chmod(0o700)
-    replica = PrivateServer.at(standby, server.binaries, SETTINGS)
-    try:
-        replica.start()
-        url = replica.conninfo()
-        assert rows_of(url) == rows_of(primary)
-        assert "how far behind is not known" in run("info", url)[1]
-        both = f"{url}&target_session_attrs=prefer-standby".replace(
-            "host=", f"host={parse_qs(urlsplit(primary).query)['host'][0]},"
-        ).replace("port=5432", "port=5432,5432")
-        until(lambda: "all that its primary has written" in run("info", both)[1])
-        told = json.loads(run("info", both, "--json")[1])["standby"]
-        assert (told["bytes"], told["writes"], told["unknown"]) == (0, 0, None)
-        assert json.loads(run("info", primary, "--json")[1])["standby"] is None
-        refused(run("import", url, file), "standby")
-        refused(run("remove", url, 1), "standby")
-        assert run("calibrate", url, "--json")[0] == 0
-        touched = ("--tool", made / "tool.npz", "--poses", made / "path.csv", "--json")
-        for strategy in STRATEGIES:
-            args = (*touched, "--law", "plane", "--strategy", strategy)
-            felt = [run("touch", place, *args)[1] for place in (primary, url)]
-            assert felt[0].count('"pose"') == len(PLACES)
-            assert re.sub('"query".*', "", felt[0]) == re.sub('"query".*', "", felt[1])
-        assert run("remove", primary, 1)[0] == 0
-        until(lambda: rows_of(url) == rows_of(primary))
-    finally:
-        replica.stop()
 
 
 # -- a private server -----------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""What `feel` says of a tool in an object and of shards that are away: live, and at the end."""
+"""What `feel` says of a tool in an object: live, and at the end."""
 
 from types import SimpleNamespace
 from typing import Any
@@ -6,7 +6,6 @@ from typing import Any
 import pytest
 
 from hapticdb.cli import session_page
-from hapticdb.resident.outages import ShardOutage
 
 AWAY = SimpleNamespace(is_away=True, url="gone.db")
 """Cells whose database does not answer: ids stand in place of names."""
@@ -80,54 +79,3 @@ def test_the_report_says_how_many_points_the_budget_left_out(
 ) -> None:
     told = report(budget_points=2000, left_out_frames=frames, most_left_out=points)
     assert session_page.budget_text(told) == said
-
-
-# --- shards ---------------------------------------------------------------------------------------
-
-
-def cells(*names: str, is_away: bool = False) -> Any:  # noqa: ANN401 - of a stand-in
-    return SimpleNamespace(is_away=is_away, shards_away=names)
-
-
-def test_a_shard_that_goes_is_told_once_and_so_is_its_return(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    notes = session_page.ShardNotes()
-    notes.look(cells())
-    assert capsys.readouterr().err == ""
-    for _ in range(3):
-        notes.look(cells("shard 2 (b)"))
-    notes.look(cells("shard 1 (a)", "shard 2 (b)"))
-    said = capsys.readouterr().err
-    assert said.count("shard 2 (b) is away: its cells are unknown") == 1
-    assert said.count("shard 1 (a) is away: its cells are unknown") == 1
-    notes.look(cells(is_away=True))  # whether the shards are there is not known now
-    assert capsys.readouterr().err == ""
-    notes.look(cells("shard 1 (a)"))
-    assert capsys.readouterr().err.count("shard 2 (b) is back") == 1
-
-
-@pytest.mark.parametrize(
-    ("shard", "said"),
-    [
-        (
-            ShardOutage("shard 2 (b)", 3.104, 1, is_away=False),
-            "shard 2 (b) was away for 3.1 s; its cells were unknown, except those in memory",
-        ),
-        (
-            ShardOutage("shard 1", 0.5, 4, is_away=True),
-            "shard 1 was away for 0.5 s in 4 outages, and still is; its cells were unknown",
-        ),
-    ],
-)
-def test_the_report_says_which_shard_was_away_and_for_how_long(
-    shard: ShardOutage, said: str
-) -> None:
-    told: Any = SimpleNamespace(
-        empty=object(),
-        bad_reading=None,
-        cache=SimpleNamespace(losses=0, restarts=0, shards=(shard,)),
-    )
-    ((name, text),) = session_page._exceptional_facts(told)
-    assert name == "shard away"
-    assert text.startswith(said)

@@ -99,6 +99,14 @@ def test_a_newer_format_is_refused(url: str, admin: psycopg.Connection) -> None:
         hapticdb.open(url)
 
 
+def test_an_environment_whose_rows_lie_elsewhere_is_refused_and_not_empty(
+    url: str, admin: psycopg.Connection
+) -> None:
+    admin.execute(f"CREATE TABLE {parse(url).environment}.distribution (id int)")
+    with pytest.raises(hapticdb.NotAnEnvironmentError, match="rows on several servers"):
+        hapticdb.open(url, read_only=True)
+
+
 def test_an_environment_of_format_2_is_read_as_it_is_and_brought_up_to_date_by_its_owner(
     url: str, admin: psycopg.Connection
 ) -> None:

@@ -70,10 +70,10 @@ def test_two_ways_to_one_host_are_two_reasons() -> None:
 def test_a_full_server_is_named_and_what_to_do(reason: str) -> None:
     where = 'connection failed: connection to server on socket "/run/.s.PGSQL.5432" failed: '
     text = f"{where}FATAL:  {reason}"
-    error = failures.refused(psycopg.OperationalError(text), "shard 2 (/run) of URL")
+    error = failures.refused(psycopg.OperationalError(text), "URL")
     assert isinstance(error, ConnectionLostError)
     assert str(error) == (
-        f"shard 2 (/run) of URL has no free connection (/run/.s.PGSQL.5432: {reason}): end "
+        f"URL has no free connection (/run/.s.PGSQL.5432: {reason}): end "
         "programs that use this server, or raise max_connections there"
     )
 

@@ -383,7 +383,8 @@ def test_what_is_no_secret_stays_readable(password: str) -> None:
 def lines(url: str) -> dict[str, list[str]]:
     """Arguments for each verb that takes a URL, in an order in which all succeed."""
     by = ("--tool", "tool.stl")
-    return {"import": [url, "boxes.glb", "--bits", "6"], "rebalance": [url]} | {
+    return {
+        "import": [url, "boxes.glb", "--bits", "6"],
         **{verb: [url] for verb in ("info", "objects", "check", "calibrate", "analyze", "upgrade")},
         "touch": [url, *by, "--poses", "path.csv"],
         "feel": [url, *by, "--device", "path.csv", "--seconds", "0.2", "--record", "felt.hdbrec"],
@@ -419,7 +420,7 @@ def test_no_verb_prints_a_password_when_all_goes_well(run: Run, place: Place) ->
     for verb, args in lines(url).items():
         if verb != "demo":  # the demo takes long
             code, out, err = run("--debug", verb, *args)
-            is_well = code in {0, {"sweep": 1, "extract": 3, "rebalance": 2}.get(verb, 0)}
+            is_well = code in {0, {"sweep": 1, "extract": 3}.get(verb, 0)}
             assert (is_well, MARK in out + err) == (True, False), (verb, out, err)
     for verb in ("info", "touch", "remove", "copy", "grant"):
         code, out, err = run("--debug", verb, *lines(f"{url}&environment=missing")[verb])

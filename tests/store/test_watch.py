@@ -1,7 +1,5 @@
 """How a reader learns of others' writes, as far as the contract leaves it to each engine."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import contextlib
 import itertools
 import sys
@@ -26,7 +24,6 @@ from hapticdb.store.connect import create_store, grant, open_store
 from hapticdb.store.postgres import watching
 from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.watching import channel_of
@@ -291,35 +288,6 @@ def test_a_server_that_refuses_to_be_listened_to_is_asked_instead(
         assert is_noticed(reader)
         assert asked
     reader.close()
-
-
-@pytest.mark.long
-def test_a_standby_tells_of_the_commits_that_it_follows(
-    server: PrivateServer, tmp_path: Path
-) -> None:
-    (tmp_path / "lock").touch(mode=0o600)
-    tmp_path.chmod(0o700)
-    create_store(server.conninfo(), GRID).close()
-    finished(
-        [
-            *(server.binaries.path("pg_basebackup"), "--write-recovery-conf", "--checkpoint=fast"),
-            *(f"--pgdata={tmp_path / 'data'}", f"--dbname={server.conninfo()}"),
-        ],
-        check=True,
-    )
-    replica = PrivateServer.at(tmp_path, server.binaries, {})
-    try:
-        replica.start()
-        reader = PostgresStore.open(replica.conninfo(), read_only=True)
-        reader.watch()
-        for n in range(3):
-            assert not reader.has_changed()
-            write(server.conninfo())
-            assert is_noticed(reader)
-            assert reader.revision() == n + 1
-        reader.close()
-    finally:
-        replica.stop()
 
 
 def test_an_environment_made_anew_is_told_from_the_one_before(

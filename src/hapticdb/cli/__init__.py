@@ -20,7 +20,7 @@ from hapticdb.cli.verbs.editing import move, remove
 from hapticdb.cli.verbs.feeling import feel
 from hapticdb.cli.verbs.granting import grant
 from hapticdb.cli.verbs.importing import import_
-from hapticdb.cli.verbs.keeping import backup, rebalance, restore
+from hapticdb.cli.verbs.keeping import backup, restore
 from hapticdb.cli.verbs.listing import analyze, calibrate, info, objects
 from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.paths.extracting import HELP as EXTRACT_HELP
@@ -59,7 +59,6 @@ VERBS: dict[Callable[..., None], str] = {
     check: "Say whether an environment is sound.",
     backup: "Copy an SQLite environment into a file, whole.",
     restore: "Put such a copy in an environment's place.",
-    rebalance: "Give each of several servers equally many rows.",
     upgrade: "Give distances to objects imported without.",
     calibrate: "Measure what queries cost on this machine.",
     analyze: "Renew the statistics of the keys.",

@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from hapticdb.extraction.pulls import SearchCallback
     from hapticdb.ingest.files import ImportCallback
     from hapticdb.store.engines import BackupCallback
-    from hapticdb.store.sharding import RebalanceCallback
     from hapticdb.transfer import CopyCallback
 
 _UNPRINTABLE = re.compile(
@@ -190,12 +189,6 @@ def check_bar(doing: str) -> "AbstractContextManager[CheckCallback | None]":
 def pull_bar() -> "AbstractContextManager[SearchCallback | None]":
     """Show how many straight pulls are tried; see `_progress_bar`."""
     return _progress_bar("pulling", "pulls", lambda now: ("pulling", now.done, now.total, 0))
-
-
-def rebalance_bar() -> "AbstractContextManager[RebalanceCallback | None]":
-    """Show how many rows have moved; see `_progress_bar`."""
-    doing = "moving"
-    return _progress_bar(doing, "rows", lambda now: (doing, now.rows_done, now.rows_total, 0))
 
 
 @contextmanager

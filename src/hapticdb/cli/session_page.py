@@ -14,7 +14,6 @@ if TYPE_CHECKING:
     from hapticdb.realtime.report import Report, Spread
     from hapticdb.realtime.resident_cells import ResidentCells
     from hapticdb.realtime.session import Session
-    from hapticdb.resident.outages import ShardOutage
 
 MOST_NAMED = 8
 """Objects that were touched whose names are printed; more are counted."""
@@ -174,28 +173,6 @@ class LooseNotes:
             self._looks = 0
 
 
-class ShardNotes:
-    """Tells on the command line when a server of some of the rows is away, and when it is back."""
-
-    def __init__(self) -> None:
-        self._away: tuple[str, ...] = ()
-
-    def look(self, cells: "ResidentCells") -> None:
-        """Tell what has changed since the last look; nothing while the whole database is away."""
-        if cells.is_away:
-            return
-        before, self._away = self._away, cells.shards_away
-        for name in self._away:
-            if name not in before:
-                render.note(
-                    f"{name} is away: its cells are unknown, except those in memory, and nothing "
-                    "is felt there until it is back"
-                )
-        for name in before:
-            if name not in self._away:
-                render.note(f"{name} is back: all its cells are felt again")
-
-
 def _lowered_clause(spring: "SettledCoupling") -> str:
     return "" if spring.lowered is None else f"; {spring.lowered}"
 
@@ -217,7 +194,7 @@ def _cell_facts(report: "Report") -> Facts:
 
 
 def _exceptional_facts(report: "Report") -> Facts:
-    """What most sessions have not: no baseline, bad readings, outages."""
+    """What most sessions have not: no baseline, bad readings, outages, a standby."""
     facts: Facts = []
     if report.empty is None:
         facts.append(("empty loop", "not measured (--no-baseline)"))
@@ -228,18 +205,11 @@ def _exceptional_facts(report: "Report") -> Facts:
     if losses or restarts:
         outages = f"{losses:,} of the database, {restarts:,} of the process that fetches"
         facts.append(("outages", outages))
-    facts += [("shard away", _shard_text(shard)) for shard in report.cache.shards]
+    if report.cache.lag is not None:
+        facts.append(
+            ("standby", f"the last commit that it has replayed: {report.cache.lag:.3g} s old")
+        )
     return facts
-
-
-def _shard_text(shard: "ShardOutage") -> str:
-    """How long one of the servers was away, and what that meant."""
-    often = "" if shard.times == 1 else f" in {shard.times:,} outages"
-    end = ", and still is" if shard.is_away else ""
-    return (
-        f"{shard.name} was away for {shard.seconds:.3g} s{often}{end}; its cells were unknown, "
-        "except those in memory"
-    )
 
 
 def _cold_clause(report: "Report") -> str:

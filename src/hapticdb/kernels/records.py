@@ -278,22 +278,6 @@ SESSION: Layout = _record_in_lines(
 )
 """A session's row on the desk (`hapticdb.resident.table.Desk`)."""
 
-MOST_SHARDS_AWAY = 24
-"""Most shards of which the desk tells that they were away; of further ones it tells nothing.
-Larger: more bytes of the desk's figures, which fit into one page."""
-SHARD_NAME_BYTES = 128
-"""Longest name of a shard on the desk, bytes of UTF-8; longer names are cut."""
-
-SHARD_AWAY: Layout = _record(
-    [
-        ("name", f"S{SHARD_NAME_BYTES}"),
-        ("seconds", "<f8"),  # that the shard was away so far
-        ("times", "<i8"),  # how often it went away; 0 in a row without a shard
-        ("is_away", "?"),  # now
-    ]
-)
-"""A shard of the environment that was away while the fetching process ran."""
-
 FIGURES: Layout = _record(
     [
         ("cells", "<i8"),  # fetched so far
@@ -308,7 +292,7 @@ FIGURES: Layout = _record(
         ("wanted", "<i8"),  # cells wanted, summed over all looks
         ("granted", "<i8"),  # wanted cells that were in memory
         ("losses", "<i8"),  # how often the database was lost
-        ("shards", SHARD_AWAY, MOST_SHARDS_AWAY),  # those that were away, in the order of that
+        ("lag", "<f8"),  # s since the commit that a standby replayed last; NaN: none answers
     ]
 )
 """Counts and latencies of the fetching process."""

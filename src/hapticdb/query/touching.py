@@ -6,7 +6,7 @@ from typing import TypeVar
 
 from numpy.typing import ArrayLike
 
-from hapticdb.errors import ConnectionLostError, ShardAwayError
+from hapticdb.errors import ConnectionLostError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import Answer, HapticQuery, Strategy, as_poses
@@ -126,7 +126,5 @@ def _twice(work: Callable[[], _Felt]) -> _Felt:
     """Result of `work`; if a connection is lost inside its snapshot, all of it is repeated once."""
     try:
         return work()
-    except ShardAwayError:  # that server was asked twice already
-        raise
     except ConnectionLostError:
         return work()

@@ -2,8 +2,7 @@
 
 The process has a connection of its own and is the only writer of its table. Sessions report where
 tool and hand are and how they move. The process asks the database for the cells within reach,
-nearest first, follows the writes of others, and names the objects that tools touch. If one of
-several servers is away (a shard), its cells are unknown until it is back, and all others go on.
+nearest first, follows the writes of others, and names the objects that tools touch.
 """
 
 import contextlib
@@ -19,8 +18,6 @@ from hapticdb.realtime.object_names import ObjectAnswers
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.tracking import SessionTracker
 from hapticdb.realtime.wishes import Motion, Wish
-from hapticdb.resident.outages import OutageCounter
-from hapticdb.resident.partial import AnsweringShards
 from hapticdb.resident.pushing import SupportsPush
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
@@ -62,8 +59,8 @@ CONFIRM_EVERY = 0.1
 """Seconds between queries for the revision if the engine reports commits. Such a report may need no
 round trip, so only a query shows that the database still answers."""
 RELEASE_EVERY = 1.0
-"""Seconds between checks for sessions whose processes have ended, and between queries for objects'
-names for which a shard was away. Larger: rows stay longer, names come later."""
+"""Seconds between checks for sessions whose processes have ended, and between questions to a
+standby for its lag. Larger: rows stay longer, the lag that is told is older."""
 RETRY = (0.05, 0.5)
 """Seconds until a lost database is tried again: first and greatest delay; it doubles each time."""
 
@@ -114,7 +111,6 @@ class Fetcher:
         self.tracker = SessionTracker(self.table, request.grid)
         self._clock = clock
         self._figures = self.table.desk.figures
-        self._outages = OutageCounter(self.table)
         self._evicted_before = int(self._figures["evicted"])
         self._latencies: list[float] = [0.0]
         self.store = self._open()
@@ -134,6 +130,7 @@ class Fetcher:
         self._confirmed_at = -np.inf
         self._is_confirmed = False
         self._version_seen = -1
+        self._note_lag()
 
     def _open(self) -> Store:
         store = open_store(self.request.url, read_only=True)
@@ -147,8 +144,6 @@ class Fetcher:
         try:
             if isinstance(store, SupportsWatch):
                 store.watch()
-            if isinstance(store, MayLag):
-                store.begin_proofs()
         except BaseException:
             store.close()
             raise
@@ -161,7 +156,7 @@ class Fetcher:
         assert wish is not None  # noqa: S101 - the origin is finite
         self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
         self.residency.warm_up()
-        self._answers.ids_of(AnsweringShards(self.store), np.zeros(1, dtype=np.int64))
+        self._answers.ids_of(self.store, np.zeros(1, dtype=np.int64))
 
     @property
     def lookahead(self) -> float:
@@ -179,36 +174,29 @@ class Fetcher:
             self._is_confirmed = True
             self._answers.forget()
         is_busy = self._bring_in(self._now - before)
-        if self._outages.count(self.residency.shards_away, self._now - before):
-            self._answers.retry()
         if self._now - self._asked_at >= ASK_EVERY:
             self._asked_at = self._now
             self._answers.answer(self.store, self.tracker.sessions)
         if self._now - self._released_at >= RELEASE_EVERY:
             self._released_at = self._now
-            self._answers.retry()
             self.table.release_dead()
+            self._note_lag()
         # Only here: the database has answered every query of this round.
         self._confirm(begun)
         return is_busy
 
     def _confirm(self, begun: int) -> None:
-        """Note when all resident cells were last up to date: when the round began, in ns.
-
-        A standby's answers do not show it, so there it is the last instant that is proved. Cells of
-        a standby never go back to an earlier revision, so that instant never does.
-        """
+        """Note when the database was last asked for all that is new: when the round began, ns."""
         control = self.table.cells.control
-        proved_at = None
-        if isinstance(self.store, MayLag):
-            proved_at = self.store.newest_at(self.residency.revision)
         if self._is_confirmed:
             self._confirmed_at = self._now
             control[AWAY] = 0
-        if proved_at is not None:
-            control[HEARTBEAT] = max(control[HEARTBEAT], proved_at)
-        elif self._is_confirmed:
             control[HEARTBEAT] = begun
+
+    def _note_lag(self) -> None:
+        """Write to the desk how far a standby is behind."""
+        lag = self.store.lag() if isinstance(self.store, MayLag) else None
+        self._figures["lag"] = np.nan if lag is None or lag.seconds is None else lag.seconds
 
     def _has_changed(self) -> bool:
         """Whether others have written; queries the database only as often as the engine needs."""
@@ -227,8 +215,8 @@ class Fetcher:
         """Fetch the most urgent missing cells of all sessions; returns whether any was fetched."""
         has_moved = self.tracker.read_desk(elapsed, self.lookahead)
         missing = NO_KEYS
-        is_due = self._version_seen != self.table.version or self.residency.is_due
-        if has_moved or is_due or self.tracker.has_met_unknown_cells():
+        has_new_cells = self._version_seen != self.table.version
+        if has_moved or has_new_cells or self.tracker.has_met_unknown_cells():
             self._version_seen = self.table.version
             missing = self.tracker.missing_cells(self.residency)
         self.tracker.report_missing()
@@ -236,8 +224,6 @@ class Fetcher:
             return False
         loaded = self.residency.load(missing[:BATCH])
         self._is_confirmed |= loaded.ranges > 0  # without room in the table, no query is sent
-        if loaded.n_away:
-            self._version_seen = -1  # look for the cells after these, also if nothing was published
         self._record_figures(loaded)
         return loaded.cells > 0
 
@@ -261,7 +247,6 @@ class Fetcher:
         """Mark the database as unreachable for all sessions, so that their forces fall to zero."""
         self.table.cells.control[AWAY] = 1
         self._figures["losses"] += 1
-        self._outages.stop()
 
     def reopen(self) -> None:
         """Open the database again, and follow the writes made meanwhile."""

@@ -6,11 +6,10 @@ import numpy as np
 
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.records import MOST_ASKED
-from hapticdb.resident.partial import AnsweringShards
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Keys, Store
-from hapticdb.store.objects_at import LooksUp, ids_near_voxels, ids_of_voxels
+from hapticdb.store.objects_at import ids_near_voxels, ids_of_voxels
 
 NEAR = ONSET + 0.87
 """Voxels within which an object is felt, where cells have distances: the onset of the smooth law,
@@ -36,23 +35,13 @@ class ObjectAnswers:
         self._residency = residency
         self._has_distances = table.has_distances
         self._answered: dict[int, bytes] = {}
-        self._short: set[int] = set()
 
     def forget(self) -> None:
         """Forget all answers, so that every request is answered again: the database has changed."""
         self._answered.clear()
 
-    def retry(self) -> None:
-        """Answer again the requests of whose voxels some were on shards that were away."""
-        for row in self._short:
-            self._answered.pop(row, None)
-        self._short.clear()
-
     def answer(self, store: Store, rows: Iterable[int]) -> None:
-        """Answer the sessions in `rows` whose requests have changed since the last answer.
-
-        Objects on shards that are away are named after a `retry`.
-        """
+        """Answer the sessions in `rows` whose requests have changed since the last answer."""
         before, self._answered = self._answered, {}
         for row in rows:
             n_asked = int(self._desk["n_asked"][row])
@@ -62,15 +51,12 @@ class ObjectAnswers:
             keys = np.unique(self._desk["asked"][row, :n_asked])
             question = keys.tobytes()
             if before.get(row) != question:
-                asked = AnsweringShards(store)
-                ids = self.ids_of(asked, keys)[:MOST_ASKED]
+                ids = self.ids_of(store, keys)[:MOST_ASKED]
                 self._desk["objects"][row, : len(ids)] = ids
                 self._desk["n_objects"][row] = len(ids)
-                if asked.is_short:
-                    self._short.add(row)
             self._answered[row] = question
 
-    def ids_of(self, store: LooksUp, keys: Keys) -> Keys:
+    def ids_of(self, store: Store, keys: Keys) -> Keys:
         """Ids of the objects that are felt in voxels (n,), distinct and ascending."""
         exclude = self._residency.exclude
         if self._has_distances:

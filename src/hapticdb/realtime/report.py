@@ -171,8 +171,7 @@ class Report:
         Seconds until all wanted cells were resident, before the first frame; after
         `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
     is_warm : bool
-        Whether all wanted cells were resident before the first frame; cells of a shard that was
-        away do not count.
+        Whether all wanted cells were resident before the first frame.
     cache : CacheFigures
         Figures of the fetching process.
     objects : tuple of int
@@ -243,7 +242,6 @@ class Report:
             for times in ("lateness", "elapsed"):
                 plain[name][times] = getattr(part, times)._asdict()
         plain["cache"] = self.cache._asdict()
-        plain["cache"]["shards"] = [shard._asdict() for shard in self.cache.shards]
         plain["hit_rate"] = self.hit_rate
         plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
         plain["proportions"] = None if self.proportions is None else self.proportions.record()

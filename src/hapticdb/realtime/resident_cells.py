@@ -1,5 +1,6 @@
 """ResidentCells: a table of cells and the process that fills it, for one or several sessions."""
 
+import math
 import os
 import threading
 import time
@@ -11,7 +12,6 @@ from hapticdb.grid import Grid
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.processes import Process
-from hapticdb.resident.outages import ShardOutage, outages_of
 from hapticdb.resident.residency import check_cells, check_distances
 from hapticdb.resident.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellTable
 from hapticdb.store.connect import open_store
@@ -34,8 +34,8 @@ class CacheFigures(NamedTuple):
     be empty; loaded, evicted, rows, ranges, statements : numbers so far; latency, worst : seconds
     that the database took for a batch, median of recent batches and greatest; hit_rate : share of
     the wanted cells that were resident when they were wanted; losses : how often the database was
-    lost; restarts : how often the process was started again; shards : servers of a part of the rows
-    that were away: their cells were unknown, unless they were in memory already.
+    lost; restarts : how often the process was started again; lag : where a standby answers, seconds
+    since the commit that it had replayed last, as it said itself (`hapticdb.store.engines.Lag`).
     """
 
     budget_bytes: int
@@ -51,7 +51,7 @@ class CacheFigures(NamedTuple):
     hit_rate: float
     losses: int
     restarts: int
-    shards: tuple[ShardOutage, ...] = ()
+    lag: float | None = None
 
 
 def start_error(process: Process, name: str, seconds: float) -> HapticDBError:
@@ -199,14 +199,9 @@ class ResidentCells:
 
     @property
     def is_away(self) -> bool:
-        """Whether the database does not answer now, or is a standby not proved up to date."""
+        """Whether the database does not answer now."""
         control = self.table.cells.control
         return bool(control[AWAY]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
-
-    @property
-    def shards_away(self) -> tuple[str, ...]:
-        """Names of the shards that are away now: their cells are unknown if not in memory."""
-        return tuple(one.name for one in outages_of(self.table) if one.is_away)
 
     def supervise(self) -> None:
         """Start the fetching process again if it has ended. Sessions call it in `wait`.
@@ -264,7 +259,7 @@ class ResidentCells:
             hit_rate=float(counted["granted"]) / wanted if wanted else 1.0,
             losses=int(counted["losses"]),
             restarts=self.restarts,
-            shards=outages_of(self.table),
+            lag=None if math.isnan(counted["lag"]) else float(counted["lag"]),
         )
 
     def close(self) -> None:

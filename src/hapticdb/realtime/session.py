@@ -86,8 +86,7 @@ class Session:
         let it fall to zero. "wait": wait for the cells; the frame is exact, but late.
     staleness : float
         Seconds without an answer of the database after which all frames act as if all cells were
-        unknown; where cells come from a standby, seconds since they were last proved up to date
-        (docs/postgresql.md, Replicas). With the policy "wait", resident cells are used on.
+        unknown. With the policy "wait", resident cells are used on.
     budget_points : int or None
         Most points near something that a frame looks at; None: all. A frame with more looks at
         one in 2, 4, 8 ... of them. A tool of 4096 points or more, or with a budget, has

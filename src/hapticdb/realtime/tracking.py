@@ -36,8 +36,7 @@ class TrackedSession:
 
     sequence : number of the desk's row at its last reading; wish : the wish whose cells were
     computed; cells, urgency (n,) : most urgent first; speed : recent greatest speed of the hand,
-    m/s; n_missing : wanted cells that were unknown at the last check, without those whose shard did
-    not answer: nobody shall wait for these.
+    m/s; n_missing : wanted cells that were unknown at the last check.
     """
 
     sequence: int = 0
@@ -112,13 +111,10 @@ class SessionTracker:
         return ranked([(one.cells, one.urgency) for one in self.sessions.values()])
 
     def missing_cells(self, residency: Residency) -> Keys:
-        """Unknown cells that sessions want and that may be asked for now, most urgent first.
-
-        Protects the known ones.
-        """
+        """Unknown cells that sessions want, most urgent first; protects the known ones."""
         residency.begin_round()
         wanted = [part for row in self.sessions for part in self._wanted(row, residency)]
-        return residency.without_away(residency.missing(ranked(wanted)))
+        return residency.missing(ranked(wanted))
 
     def _wanted(self, row: int, residency: Residency) -> Iterator[Ranked]:
         """Cells of one session: as many as its share of the table has room for."""
@@ -133,12 +129,11 @@ class SessionTracker:
         unknown = cells[slots == UNKNOWN]
         table.desk.figures["wanted"] += len(cells)
         table.desk.figures["granted"] += len(cells) - len(unknown)
-        session.n_missing = len(residency.without_away(unknown))
+        session.n_missing = len(unknown)
         n_missed = int(table.desk.sessions["n_missed"][row])
         if n_missed:
             missed = np.unique(table.desk.sessions["missed"][row, :n_missed])
-            unknown = missed[residency.slots_of(missed) == UNKNOWN]
-            session.n_missing += len(residency.without_away(unknown))
+            session.n_missing += int(np.count_nonzero(residency.slots_of(missed) == UNKNOWN))
             yield missed, np.full(len(missed), MET)
 
     def report_missing(self) -> None:

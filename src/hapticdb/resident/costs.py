@@ -1,12 +1,9 @@
 """Cost model for statements that fetch cells, found at the start without a long wait."""
 
 from collections.abc import Callable
-from contextlib import suppress
 
-from hapticdb.errors import ShardAwayError
 from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.resident.partial import shards_away
 from hapticdb.store.base import Store
 
 FAR = 2e-3
@@ -28,16 +25,14 @@ def costs_at_start(
     clock : callable
         Returns seconds, to time a round trip.
     may_measure : bool
-        Whether there is time for a measurement, and a row to measure. If not, if a round trip takes
-        longer than `FAR`, or if a shard is away, all parts cost the same: results are equal, ranges
-        less efficient.
+        Whether there is time for a measurement, and a row to measure. If not, or if a round trip
+        takes longer than `FAR`, all parts cost the same: results are equal, ranges less efficient.
     """
     kept = store.costs(machine_name())
     if kept:
         return CostModel.from_figures(kept)
-    if may_measure and not shards_away(store) and _round_trip(store, clock) <= FAR:
-        with suppress(ShardAwayError):  # it went away just now
-            return calibrate(store)
+    if may_measure and _round_trip(store, clock) <= FAR:
+        return calibrate(store)
     return CostModel.of_equal_parts()
 
 

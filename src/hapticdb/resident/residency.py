@@ -16,7 +16,6 @@ from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, Place
 from hapticdb.resident.changes import known_cells_touched, writes_since
 from hapticdb.resident.left_out import LeftOutObjects
-from hapticdb.resident.partial import AwayCells, away_error, shards_away
 from hapticdb.resident.source import CellSource
 from hapticdb.resident.table import FIRST_VERSION, LOADING, CellTable
 from hapticdb.resident.writer import CellWriter, UnpublishedCells
@@ -69,14 +68,12 @@ class Loaded(NamedTuple):
     """Result of a load: cells fetched, rows read, ranges queried, seconds that the database took.
 
     There are fewer cells than requested if the table has no room; 0 if all others are still wanted.
-    n_away : cells that were not fetched because the shard that holds them is away.
     """
 
     cells: int
     rows: int
     ranges: int
     elapsed: float
-    n_away: int = 0
 
 
 class Residency:
@@ -132,7 +129,6 @@ class Residency:
         self.writer = CellWriter(table)
         self.n_loaded = 0
         self._clock = clock
-        self._away = AwayCells(clock)
         self._urgent = NO_KEYS
         self._revision = NOTHING_KNOWN
         self._commit_count = NOTHING_KNOWN
@@ -175,7 +171,6 @@ class Residency:
             self._revision = NOTHING_KNOWN
         self._source.store = store
         self._commit_count = NOTHING_KNOWN
-        self._away.forget()
         self.writer.slots.free_lost()
         self.refresh()
 
@@ -204,7 +199,6 @@ class Residency:
     def begin_round(self) -> None:
         """Begin a round of wanted cells; cells last wanted a few rounds ago may be evicted."""
         self.writer.slots.begin_round()
-        self._away.release(self.shards_away)
 
     def slots_of(self, cells: Keys) -> Keys:
         """Slots (n,) of cells (n,): UNKNOWN, EMPTY_SLOT, or a slot."""
@@ -224,23 +218,6 @@ class Residency:
         self.want(cells, slots)
         return np.compress(slots == UNKNOWN, cells)
 
-    @property
-    def shards_away(self) -> tuple[str, ...]:
-        """Names of the store's shards that are away now."""
-        return shards_away(self.store)
-
-    @property
-    def is_due(self) -> bool:
-        """Whether the next round asks again for cells whose shards were away."""
-        return self._away.is_due(self.shards_away)
-
-    def without_away(self, cells: Keys) -> Keys:
-        """Those of unknown cells (n,) that may be asked for in this round, in their order.
-
-        The others were asked for a moment ago, when the shards that hold them were away.
-        """
-        return self._away.without(cells)
-
     # -- bringing in -------------------------------------------------------------------------------
 
     def make_resident(self, cells: Keys) -> None:
@@ -250,8 +227,6 @@ class Residency:
         ------
         UsageError
             If they do not fit into the table together.
-        ShardAwayError
-            If one of them is on a shard that is away.
         """
         self.begin_round()
         missing = self.missing(cells)
@@ -259,9 +234,7 @@ class Residency:
             if not len(missing):
                 return
             for at in range(0, len(missing), BATCH):
-                n_away = self.load(missing[at : at + BATCH]).n_away
-                if n_away:
-                    raise away_error(self.store, n_away)
+                self.load(missing[at : at + BATCH])
             missing = self.missing(cells)
         raise UsageError(
             f"the tool and its surroundings meet {len(cells)} cells at once, more than fit into "
@@ -277,7 +250,7 @@ class Residency:
         """Fetch up to `BATCH` of cells (n,), distinct and unknown, by one statement.
 
         If others have written meanwhile, their writes are followed in the same version, so that all
-        resident cells have one revision. Cells on a shard that is away stay unknown.
+        resident cells have one revision.
         """
         cells = cells[: min(BATCH, max(self.table.n_slots // 4, 1))]
         self._make_room(len(cells))
@@ -293,7 +266,7 @@ class Residency:
             self.table.cells.control[LOADING] = 0
         elapsed = self._clock() - started
         self.n_loaded += len(read.cells)
-        return Loaded(len(read.cells), read.n_rows, read.n_ranges, elapsed, read.n_away)
+        return Loaded(len(read.cells), read.n_rows, read.n_ranges, elapsed)
 
     def _read_now(self, cells: Keys) -> UnpublishedCells | None:
         """Read cells (n,) of the known revision; None if others have written since then."""
@@ -311,7 +284,7 @@ class Residency:
         """Follow the writes of others; returns their number.
 
         Cells that a write has touched are read again or become unknown, in one version, so no frame
-        mixes two revisions of an object. Touched cells on a shard that is away become unknown.
+        mixes two revisions of an object.
         """
         n_writes, _ = self._follow_writes(NO_KEYS)
         return n_writes
@@ -363,24 +336,19 @@ class Residency:
             np.concatenate([NO_KEYS, *(part.slots for part in parts)]),
             sum(part.n_rows for part in parts),
             sum(part.n_ranges for part in parts),
-            sum(part.n_away for part in parts),
         )
 
     def _read_batch(self, cells: Keys) -> UnpublishedCells:
-        """Read cells (n,) by one statement, without those that are away; no more than have room."""
+        """Read cells (n,) by one statement; no more than have room."""
         slots = self.writer.slots.next_free(len(cells))
         if not len(slots):
             return UnpublishedCells()
         cells = cells[: len(slots)]
         read = self._source.read(cells, self.table, slots)
-        self._away.note(cells, read.is_away, self.shards_away)
         self.writer.slots.take(slots)
-        self.writer.slots.give_back(slots[read.is_empty | read.is_away])
+        self.writer.slots.give_back(slots[read.is_empty])
         slots[read.is_empty] = EMPTY_SLOT
-        n_away = int(np.count_nonzero(read.is_away))
-        if n_away:
-            cells, slots = cells[~read.is_away], slots[~read.is_away]
-        return UnpublishedCells(cells, slots, read.n_rows, read.n_ranges, n_away)
+        return UnpublishedCells(cells, slots, read.n_rows, read.n_ranges)
 
     def _make_room(self, n_cells: int) -> None:
         """Free slots for `n_cells` cells, but keep cells that are still wanted."""

@@ -10,10 +10,9 @@ from hapticdb.errors import DatabaseError
 from hapticdb.kernels.field.packing import unpack
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
-from hapticdb.query.grouping import Ranges, group_spans
+from hapticdb.query.grouping import group_spans
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.resident.costs import costs_at_start
-from hapticdb.resident.partial import SupportsPartialScan, meeting
 from hapticdb.resident.pushing import SupportsPush
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import (
@@ -24,9 +23,7 @@ from hapticdb.store.base import (
     Store,
     row_shift,
 )
-from hapticdb.store.batches import PartialRows
 
-NO_RANGES = np.empty((0, 2), dtype=np.int64)
 ROWS_AT_ONCE = 1024
 """Rows whose distances are unpacked together, into a megabyte. A larger value makes fewer calls; a
 smaller one merges the values while they are still in the processor's cache."""
@@ -35,13 +32,11 @@ smaller one merges the values while they are still in the processor's cache."""
 class CellsRead(NamedTuple):
     """Result of one statement.
 
-    is_empty (n,) : whether each cell has no voxel and no distances; is_away (n,) : whether each
-    cell is on a shard that is away, so that nothing is known of it; n_rows : rows read; n_ranges :
+    is_empty (n,) : whether each cell has no voxel and no distances; n_rows : rows read; n_ranges :
     ranges queried.
     """
 
     is_empty: NDArray[np.bool_]
-    is_away: NDArray[np.bool_]
     n_rows: int
     n_ranges: int
 
@@ -74,10 +69,7 @@ class CellSource:
         self._costs = costs_at_start(store, clock, may_measure=may_measure)
 
     def read(self, cells: Keys, table: CellTable, slots: Keys) -> CellsRead:
-        """Read cells (n,), distinct, by one statement into slots (n,) that no frame can read.
-
-        The slot of a cell that is away has no content: it must not be published.
-        """
+        """Read cells (n,), distinct, by one statement into slots (n,) that no frame can read."""
         grid, shift = self.store.grid, row_shift(self.store.layout)
         on_curve = np.empty(len(cells), dtype=np.int64)
         kernels.curve_keys_of_cells(cells, grid.bits, grid.curve_code, on_curve)
@@ -88,12 +80,10 @@ class CellSource:
         words, masks, payload = table.cells.words, table.cells.masks, table.cells.payload
         costs = self._costs if payload is None else self._costs.with_distances
         rows, n_ranges = self._pushed_rows(on_curve, distances=payload is not None), 0
-        is_away = np.zeros(len(cells), dtype=np.bool_)
         if rows is None:
             ranges = group_spans(lows, highs, self._quantiles, costs)
             n_ranges = len(ranges.lows)
-            rows, away = self._scan(ranges, distances=payload is not None)
-            is_away[order] = meeting(away, lows, highs)
+            rows = self.store.scan(*ranges, distances=payload is not None)
         words[slots] = 0
         masks[slots] = 0
         kernels.fill_cells(
@@ -103,13 +93,7 @@ class CellSource:
         if payload is not None:
             self._fill_distances(rows, on_curve, slots[order], payload, masks)
             mark_near_voxels(slots, payload, masks, words, table.cells.near)
-        return CellsRead(masks[slots] == 0, is_away, len(rows), n_ranges)
-
-    def _scan(self, ranges: Ranges, *, distances: bool) -> PartialRows:
-        """Rows of ranges, and the ranges of the shards that are away."""
-        if isinstance(self.store, SupportsPartialScan):
-            return self.store.scan_partly(*ranges, distances=distances)
-        return PartialRows(self.store.scan(*ranges, distances=distances), NO_RANGES)
+        return CellsRead(masks[slots] == 0, len(rows), n_ranges)
 
     def _pushed_rows(self, on_curve: Keys, *, distances: bool) -> Rows | None:
         """Rows that a server has sent without being asked; None if there are none."""

@@ -19,15 +19,13 @@ from hapticdb.store.base import NO_KEYS, Keys
 class UnpublishedCells(NamedTuple):
     """Cells (n,) in slots (n,) that are in no directory yet, and the cost of reading them.
 
-    The slot of a cell that is empty is EMPTY_SLOT. n_away : cells that were asked for, too, and are
-    on a shard that is away.
+    The slot of a cell that is empty is EMPTY_SLOT.
     """
 
     cells: Keys = NO_KEYS
     slots: Keys = NO_KEYS
     n_rows: int = 0
     n_ranges: int = 0
-    n_away: int = 0
 
 
 class CellWriter:

@@ -1,25 +1,12 @@
-"""Batches of rows: an empty one, several as one, and one of the servers that answer."""
+"""Batches of rows: an empty one, and several as one."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from hapticdb.store.base import NO_KEYS, NO_OCCUPANCY, NO_ROWS, Band, Rows
 
 NO_DISTANCES = NO_ROWS.having(Band(NO_OCCUPANCY, NO_KEYS))
-
-
-class PartialRows(NamedTuple):
-    """Rows of ranges whose rows several servers hold, some of which may not answer.
-
-    rows : of the servers that answer; away (A, 2) int64 : closed ranges of the row keys of those
-    that do not, ascending and disjoint. In these ranges nothing is known.
-    """
-
-    rows: Rows
-    away: NDArray[np.int64]
 
 
 def no_rows(*, distances: bool) -> Rows:

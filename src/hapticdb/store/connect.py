@@ -4,7 +4,6 @@ A URL's scheme picks the engine (`hapticdb.store.engines`).
 """
 
 import os
-from contextlib import closing
 
 from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
@@ -18,16 +17,13 @@ from hapticdb.store.engines import (
     SupportsBackup,
     SupportsFirstFindings,
     SupportsGrant,
-    SupportsStandbys,
     Url,
     engine_of,
 )
 from hapticdb.store.refusals import check_distances
-from hapticdb.store.sharding import RebalanceCallback, Rebalanced, SupportsShards
 from hapticdb.store.urls import redact
 
 __all__ = [
-    "at_primary",
     "backup_environment",
     "beside",
     "check_curve",
@@ -37,7 +33,6 @@ __all__ = [
     "grant",
     "name_of",
     "open_store",
-    "rebalance_environment",
     "redact",
     "restore_environment",
 ]
@@ -73,13 +68,6 @@ def findings_before_opening(url: Url) -> list[str]:
     if not isinstance(engine, SupportsFirstFindings):
         return []
     return engine.findings_before_opening(os.fspath(url))
-
-
-def at_primary(url: Url) -> str:
-    """URL whose reads come from the server that is written, never from a standby."""
-    engine = engine_of(url)
-    given = os.fspath(url)
-    return engine.at_primary(given) if isinstance(engine, SupportsStandbys) else given
 
 
 def beside(url: Url, name: str) -> str:
@@ -178,36 +166,6 @@ def restore_environment(
         raise _refusal(engine, url, "restore")
     _check_one_engine(engine, file)
     return engine.restore(os.fspath(file), os.fspath(url), progress=progress)
-
-
-def rebalance_environment(url: Url, *, progress: RebalanceCallback | None = None) -> Rebalanced:
-    """Give each server of an environment equally many rows, while others read and write it.
-
-    Whole cells move, a few megabytes at a time; a writer waits for one such batch at most. Run it
-    again to go on with what was interrupted.
-
-    Parameters
-    ----------
-    url : str or path
-        An environment whose rows are on several servers.
-    progress : callable or None
-        Called after each batch with `rows_done` and `rows_total`.
-
-    Raises
-    ------
-    AccessError
-        When the URL's user does not own the environment.
-    BusyError
-        When another rebalances it, or imports into it while it is empty.
-    ShardAwayError
-        When a server cannot be reached. What has moved is moved.
-    UsageError
-        When all rows are on one server.
-    """
-    with closing(open_store(url)) as store:
-        if not isinstance(store, SupportsShards):
-            raise UsageError(f"{store.url} has one server: nothing to rebalance")
-        return store.rebalance(progress)
 
 
 def _refusal(engine: Engine, url: Url, capability: Capability) -> UsageError:

@@ -100,54 +100,24 @@ class SupportsGrant(Protocol):
         """Give a role one right on an environment; it replaces the role's former one."""
 
 
-@runtime_checkable
-class SupportsStandbys(Protocol):
-    """An engine whose URLs may lead to copies that follow the database later."""
-
-    def at_primary(self, url: str) -> str:
-        """URL of the same environment on the server that is written. Connects to nothing."""
-
-
 class Lag(NamedTuple):
-    """How far a standby is behind its primary.
+    """How far a standby is behind its primary, as the standby states it.
 
-    replayed : position in the primary's log up to which the standby has replayed it; bytes : of the
-    log that the primary has written and the standby has not replayed; seconds : the standby has
-    everything that was committed so many seconds ago, by the primary's own clock; writes : to the
-    environment that it has not replayed. The last three are None where `unknown` says why.
+    replayed : position in the primary's log up to which it has replayed it; seconds : since the
+    commit that it has replayed last, None before the first. Where nothing is written, that time
+    grows although nothing is missing.
     """
 
     replayed: str
-    bytes: int | None = None
-    seconds: float | None = None
-    writes: int | None = None
-    unknown: str | None = None
+    seconds: float | None
 
 
 @runtime_checkable
 class MayLag(Protocol):
-    """An opened store whose answers may come from a standby, which proves how old they may be.
-
-    Without a proof, what a standby answers counts as older than any limit.
-    """
-
-    def begin_proofs(self) -> None:
-        """Have answers proved from now on, if they come from a standby.
-
-        Raises StaleError when nothing can be proved now: the primary cannot be asked, or the
-        standby is behind.
-        """
-
-    def newest_at(self, revision: int) -> int | None:
-        """Last instant known at which `revision` had everything that was committed. Never waits.
-
-        In nanoseconds of `time.monotonic_ns`; 0 if no instant is known. None if all answers since
-        the last call came from the database itself: each has what was committed when it was asked
-        for.
-        """
+    """An opened store whose answers may come from a standby."""
 
     def lag(self) -> Lag | None:
-        """How far the server that answers is behind; None if it is no standby. May take seconds."""
+        """How far the server that answers is behind; None if it is no standby."""
 
 
 @runtime_checkable

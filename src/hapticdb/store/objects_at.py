@@ -1,33 +1,15 @@
 """Which objects are in given voxels, exactly, by queries of the store."""
 
-from typing import Protocol
-
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.grid import Grid
 from hapticdb.kernels.curves import Z_ORDER, encode
 from hapticdb.kernels.field.lattice import HALF_WIDTH, ROW_SIDE, VOXELS_A_STEP
 from hapticdb.kernels.field.packing import unpack
-from hapticdb.store.base import BRICK_BYTES, BRICK_SHIFT, NO_KEYS, Keys, Layout, Rows
+from hapticdb.store.base import BRICK_BYTES, BRICK_SHIFT, NO_KEYS, Keys, Rows, Store
 
 
-class LooksUp(Protocol):
-    """What these queries need: a store, or what stands for one."""
-
-    @property
-    def grid(self) -> Grid:
-        """Grid of the environment."""
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of its rows."""
-
-    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,)."""
-
-
-def ids_of_voxels(store: LooksUp, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
+def ids_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
     """Ids of the objects in voxels (n,), distinct and ascending.
 
     keys (n,) int64: of voxels on the environment's curve, distinct and ascending; exclude (E,) ids
@@ -36,7 +18,7 @@ def ids_of_voxels(store: LooksUp, keys: Keys, exclude: Keys) -> NDArray[np.int64
     return np.unique(pairs_of_voxels(store, keys, exclude)[:, 1])
 
 
-def ids_near_voxels(store: LooksUp, keys: Keys, exclude: Keys, within: float) -> NDArray[np.int64]:
+def ids_near_voxels(store: Store, keys: Keys, exclude: Keys, within: float) -> NDArray[np.int64]:
     """Ids of the objects whose surface is near the centres of voxels (n,), distinct and ascending.
 
     Near is at most `within` voxels, and no more than the half width of the band; an object in a
@@ -59,7 +41,7 @@ def ids_near_voxels(store: LooksUp, keys: Keys, exclude: Keys, within: float) ->
     return ids[~np.isin(ids, exclude)]
 
 
-def pairs_of_voxels(store: LooksUp, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
+def pairs_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
     """Every voxel with every object in it, (P, 2): index in `keys`, and object id; ordered by both.
 
     The arguments are those of `ids_of_voxels`.
@@ -73,7 +55,7 @@ def pairs_of_voxels(store: LooksUp, keys: Keys, exclude: Keys) -> NDArray[np.int
     return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
 
 
-def _pairs_in_bricks(store: LooksUp, keys: Keys) -> NDArray[np.int64]:
+def _pairs_in_bricks(store: Store, keys: Keys) -> NDArray[np.int64]:
     bricks, inverse = np.unique(keys >> BRICK_SHIFT, return_inverse=True)
     rows = store.lookup(bricks)
     voxel, row = _rows_of_bricks(rows, bricks[inverse])
@@ -90,9 +72,7 @@ def _rows_of_bricks(rows: Rows, bricks: Keys) -> tuple[NDArray[np.int64], NDArra
     return brick, row
 
 
-def _is_in_voxel(
-    store: LooksUp, rows: Rows, row: NDArray[np.int64], keys: Keys
-) -> NDArray[np.bool_]:
+def _is_in_voxel(store: Store, rows: Rows, row: NDArray[np.int64], keys: Keys) -> NDArray[np.bool_]:
     """Whether the brick of rows (P,), given by their indices, holds the voxel of each key (P,)."""
     if store.grid.curve == "z":
         bit = keys & ((1 << BRICK_SHIFT) - 1)

@@ -27,7 +27,7 @@ STEPS = (
     Step("removed parts", readers_need_it=False),
     # without it no object has distances
     Step("distances", readers_need_it=False),
-    # rows on several servers: who does not know of them would find no rows
+    # changes no table; earlier versions could place rows on several servers
     Step("shards", readers_need_it=False),
 )
 FORMAT_VERSION = len(STEPS)

@@ -40,18 +40,10 @@ def redact(url: str) -> str:
         url = secret["user"] + url[secret.end() - 1 :]
     head, mark, query = url.partition("?")
     pairs = [
-        f"{key}=***" if _is_secret(unquote(key), value) else f"{key}={value}" if equals else "***"
+        f"{key}=***" if SECRET.search(unquote(key)) else f"{key}={value}" if equals else "***"
         for key, equals, value in (pair.partition("=") for pair in query.split("&") if pair)
     ]
     return head + mark + "&".join(pairs)
-
-
-def _is_secret(key: str, value: str) -> bool:
-    """Whether a parameter may hold a password: in a list of servers, one may stand before an @."""
-    if SECRET.search(key):
-        return True
-    listed = unquote(unquote(value))
-    return key == "shards" and bool("@" in listed or SECRET.search(listed))
 
 
 class RemoteAddress(NamedTuple):

@@ -309,11 +309,9 @@ def _exit_after(signals: Sequence[int], report: "Report") -> None:
 def _waited_for(session: "Session") -> "Report":
     """Wait for a session's end; what a person should know at once is told at once."""
     report, is_told, notes = None, False, session_page.LooseNotes()
-    shard_notes = session_page.ShardNotes()
     while report is None:
         report = session.wait(LOOK_EVERY)
         notes.look(session)
-        shard_notes.look(session.cells)
         if session.recording_ended is not None and not is_told:
             render.note(f"{session.recording_ended}; the session goes on without it")
             is_told = True

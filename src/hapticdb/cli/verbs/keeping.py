@@ -1,4 +1,4 @@
-"""The verbs that keep environments: whole copies (backup, restore), even servers (rebalance)."""
+"""The verbs that keep environments as whole copies: backup and restore."""
 
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,7 +10,6 @@ from hapticdb.cli.root import Interrupted
 
 if TYPE_CHECKING:
     from hapticdb.store.engines import BackupReport
-    from hapticdb.store.sharding import Rebalanced
 
 CopyArgument = Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")]
 
@@ -57,44 +56,6 @@ def restore(file: CopyArgument, url: UrlArgument, *, json: JsonOption = False) -
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; {url} is as it was") from None
     _say(report, json=json)
-
-
-def rebalance(url: UrlArgument, *, json: JsonOption = False) -> None:
-    """Give each of an environment's servers equally many rows, while others go on with it.
-
-    For environments whose rows are on several PostgreSQL servers
-    (shards=server1,server2). Rows move a few megabytes at a time; whoever
-    touches them meanwhile feels no difference. Run the same command again
-    to go on with what was interrupted. Only the owner may do it.
-
-    Example: hapticdb rebalance postgresql://me@host/plant
-    """
-    from hapticdb.store.connect import rebalance_environment
-
-    try:
-        with render.rebalance_bar() as progress:
-            report = rebalance_environment(url, progress=progress)
-    except KeyboardInterrupt:
-        raise Interrupted(
-            "interrupted; what has moved is whole, and the same command goes on from there"
-        ) from None
-    if json:
-        render.say_json(report._asdict())
-    else:
-        render.say(_rebalanced(report))
-
-
-def _rebalanced(report: "Rebalanced") -> str:
-    def listed(rows: tuple[int, ...]) -> str:
-        return " + ".join(f"{n:,}" for n in rows)
-
-    if not report.moved_rows:
-        return f"{report.environment}: balanced already ({listed(report.rows_after)} rows)"
-    return (
-        f"{report.environment}: {render.counted(report.moved_rows, 'row')} moved "
-        f"({report.moved_bytes / 1e6:,.1f} MB); rows of the servers before: "
-        f"{listed(report.rows_before)}, now: {listed(report.rows_after)}"
-    )
 
 
 def _say(report: "BackupReport", *, json: bool) -> None:

@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from hapticdb.query.cost_model import CostModel
     from hapticdb.store.base import Freshness, Layout, Object, Size, Store
     from hapticdb.store.engines import Lag
-    from hapticdb.store.sharding import Shard
 
 MEANINGS = {
     "statement": "a statement of ranges, without what it reads",
@@ -90,15 +89,7 @@ def info(url: UrlArgument, *, json: JsonOption = False) -> None:
         render.show(render.facts(looked_at.facts()))
 
 
-CHECKSUMS = {True: "of pages", False: NO_CHECKSUMS, None: "not known while a shard is away"}
-
-
-def _told(shard: "Shard") -> tuple[str, str]:
-    """One shard in words: its name, and what it holds or why it does not answer."""
-    if shard.rows is None or shard.bytes is None:
-        return shard.name, f"away: {shard.trouble}"
-    standby = "" if shard.behind is None else f", standby, {shard.behind:,} writes behind"
-    return shard.name, f"about {shard.rows:,} rows, {render.bytes_text(shard.bytes)}{standby}"
+CHECKSUMS = {True: "of pages", False: NO_CHECKSUMS}
 
 
 class _Overview(NamedTuple):
@@ -109,15 +100,14 @@ class _Overview(NamedTuple):
     engine: str
     grid: "Grid"
     layout: "Layout"
-    size: "Size | None"
+    size: "Size"
     n_objects: int
     n_with_distances: int
     voxels: int
     scene: "NDArray[np.float64] | None"
     freshness: "Freshness"
     source: str
-    has_checksums: bool | None
-    shards: "list[Shard]"
+    has_checksums: bool
     lag: "Lag | None"
 
     @classmethod
@@ -126,27 +116,22 @@ class _Overview(NamedTuple):
         from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
         from hapticdb.store.base import scene_bounds
         from hapticdb.store.engines import MayLag
-        from hapticdb.store.sharding import SupportsShards
 
         objects = store.objects()
-        shards = store.shards() if isinstance(store, SupportsShards) else []
-        is_whole = not any(shard.trouble for shard in shards)
-        source = QuantileVector.of(store, DEFAULT_RESOLUTION).source if is_whole else "kept"
         return cls(
             url=store.url,
             name=store.name,
             engine=store.engine,
             grid=store.grid,
             layout=store.layout,
-            size=store.size() if is_whole else None,
+            size=store.size(),
             n_objects=len(objects),
             n_with_distances=sum(obj.has_distances for obj in objects),
             voxels=sum(obj.voxels for obj in objects),
             scene=scene_bounds(objects),
             freshness=store.freshness(DEFAULT_RESOLUTION),
-            source=source,
-            has_checksums=store.checker().has_page_checksums() if is_whole else None,
-            shards=shards,
+            source=QuantileVector.of(store, DEFAULT_RESOLUTION).source,
+            has_checksums=store.checker().has_page_checksums(),
             lag=store.lag() if isinstance(store, MayLag) else None,
         )
 
@@ -163,8 +148,6 @@ class _Overview(NamedTuple):
         whose = "all objects"
         if not self.has_distances:
             whose = f"{self.n_with_distances:,} of {render.counted(self.n_objects, 'object')}"
-        if self.size is None:
-            return f"of {whose}"
         band = self.size.band_bytes
         return f"of {whose}: {self.size.band_rows:,} rows, {render.bytes_text(band)}"
 
@@ -186,27 +169,24 @@ class _Overview(NamedTuple):
             "objects": self.n_objects,
             "scene": render.box_record(self.scene),
             "voxels": self.voxels,
-            "rows": self.size and self.size.rows,
-            "bytes": self.size and self.size.bytes,
+            "rows": self.size.rows,
+            "bytes": self.size.bytes,
             "distances": {
                 "objects": self.n_with_distances,
-                "rows": self.size and self.size.band_rows,
-                "bytes": self.size and self.size.band_bytes,
+                "rows": self.size.band_rows,
+                "bytes": self.size.band_bytes,
             },
             "page_checksums": self.has_checksums,
             "standby": None if self.lag is None else self.lag._asdict(),
             "fit": None if self.fit is None else self.fit._asdict(),
             "statistics": {"source": self.source, **self.freshness._asdict()},
-            **({"shards": [shard._asdict() for shard in self.shards]} if self.shards else {}),
         }
 
     def facts(self) -> list[tuple[str, str]]:
         """Put it in words."""
         grid, size = self.grid, self.size
         origin = ", ".join(f"{x:.6g}" for x in grid.origin)
-        n_bytes = 0 if size is None else size.bytes
-        a_voxel = f" ({n_bytes / self.voxels:.3g} a voxel)" if self.voxels else ""
-        unknown = "not known while a shard is away"
+        a_voxel = f" ({size.bytes / self.voxels:.3g} a voxel)" if self.voxels else ""
         return [
             ("environment", self.url),
             ("name", self.name),
@@ -221,9 +201,8 @@ class _Overview(NamedTuple):
             ("objects", f"{self.n_objects:,}"),
             ("scene", "nothing in it" if self.scene is None else render.box(self.scene)),
             ("voxels", f"{self.voxels:,}"),
-            ("rows", unknown if size is None else f"{size.rows:,}"),
-            ("size", unknown if size is None else f"{render.bytes_text(n_bytes)}{a_voxel}"),
-            *(_told(shard) for shard in self.shards),
+            ("rows", f"{size.rows:,}"),
+            ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
             ("distances", self._distances),
             *(self.fit.facts if self.fit is not None else ()),
             ("checksums", CHECKSUMS[self.has_checksums]),
@@ -233,14 +212,8 @@ class _Overview(NamedTuple):
 
 def _lag_text(lag: "Lag") -> str:
     """Put in words how far a standby is behind."""
-    text = f"replayed to {lag.replayed}"
-    if lag.bytes is None or lag.writes is None:
-        return f"{text}; how far behind is not known: {lag.unknown}"
-    if not lag.bytes:
-        return f"{text}, all that its primary has written"
-    since = "" if lag.seconds is None else f", {lag.seconds:.3g} s at most"
-    writes = render.counted(lag.writes, "write")
-    return f"{text}, {render.bytes_text(lag.bytes)} behind its primary: {writes}{since}"
+    age = "none yet" if lag.seconds is None else f"{lag.seconds:.3g} s old"
+    return f"replayed to {lag.replayed}, the last commit there: {age}"
 
 
 def objects(

@@ -16,7 +16,6 @@ from hapticdb.server.cells.limits import CellsLimits
 from hapticdb.server.cells.readers import Readers
 from hapticdb.server.cells.watcher import Watcher
 from hapticdb.server.served import Served
-from hapticdb.store.connect import at_primary
 
 Admission = Callable[[Mapping[str, str]], bool]
 """Tells by the headers of an opening request, names in lower case, whether a client may read."""
@@ -42,8 +41,7 @@ class CellsEndpoint:
     def __init__(
         self, url: str, *, may_enter: Admission, limits: CellsLimits | None = None
     ) -> None:
-        # clients count each answer as new, so none may come from a standby
-        self._url = at_primary(url)
+        self._url = url
         self._may_enter = may_enter
         self.limits = limits or CellsLimits()
         self._answers = Answers()

@@ -4,11 +4,6 @@
 URL, its TLS parameters among them. An environment is a schema of its own, `hapticdb` unless named;
 libpq's own way, ``?options=-csearch_path=NAME``, names it, too. ``?data=FOLDER`` asks for a private
 server in a folder (see `hapticdb.store.postgres.private_server`).
-
-``?shards=server1,server2:5433,[::1]:5434,%2Frun%2Fpg4`` names the servers that hold the rows of a
-new environment: hosts with or without a port, or folders of sockets, each percent-encoded. A shard
-with standbys names its servers with ``|`` between, as in ``server1|standby1``. With ``data=``,
-``shards=3`` asks for three more private servers.
 """
 
 import re
@@ -22,26 +17,19 @@ DEFAULT_ENVIRONMENT = "hapticdb"
 SEARCH_PATH = re.compile(r"(?:-c\s*|--)search_path=(?:\"([^\"]+)\"|([^\s,]+))")
 LONE_PERCENT = re.compile(r"%(?![0-9a-fA-F]{2})|%00")
 LONGEST_NAME = 63
-PORT = 5432
-"""Port of a shard whose address names none."""
-HOST = re.compile(r"(?P<host>/[^,|]*?|\[[\w:.%]+\]|[\w.-]+)(?::(?P<port>[0-9]{1,5}))?")
-MOST_SHARDS, MOST_PRIVATE_SHARDS = 999, 99
 
 
 class Address(NamedTuple):
     """A URL taken apart.
 
     conninfo : for libpq, without hapticdb's own parameters; environment : the schema; data : folder
-    of the private server, if one is meant; shown : the whole URL as messages may show it;
-    shards : where the rows of a new environment go, each as `servers_of` reads it, or with
-    `data` the numbers of the private shards from "1"; () when the URL names none.
+    of the private server, if one is meant; shown : the whole URL as messages may show it.
     """
 
     conninfo: str
     environment: str
     data: str | None
     shown: str
-    shards: tuple[str, ...] = ()
 
 
 def parse(url: str) -> Address:
@@ -51,14 +39,12 @@ def parse(url: str) -> Address:
     ------
     UsageError
         When the environment's name cannot be a schema's, or is given twice; when the text is no
-        URL; when the URL names a user or a database that no server can have; when a shard is no
-        address of a server, or is named twice.
+        URL; when the URL names a user or a database that no server can have.
     """
     parts = _split(url)
     _check_login(parts, url)
     named: list[str] = []
     data: list[str] = []
-    shards: list[str] = []
     others: list[str] = []
     found: str | None = None
     for pair in parts.query.split("&") if parts.query else []:
@@ -67,8 +53,6 @@ def parse(url: str) -> Address:
             named.append(unquote(value))
         elif key == "data":
             data.append(unquote(value))
-        elif key == "shards":
-            shards.append(value)
         else:
             # libpq takes no second = in a pair, and people write ?options=-cstatement_timeout=50
             others.append(f"{key}={value.replace('=', '%3D')}")
@@ -76,10 +60,8 @@ def parse(url: str) -> Address:
                 found = match[1] or match[2]
     if found is not None:
         named.append(found)
-    if len(set(named)) > 1 or len(data) > 1 or len(shards) > 1:
-        raise UsageError(
-            f"{redact(url)}: name one environment, and one folder and one list of shards at most"
-        )
+    if len(set(named)) > 1 or len(data) > 1:
+        raise UsageError(f"{redact(url)}: name one environment, and one folder at most")
     environment = named[0] if named else DEFAULT_ENVIRONMENT
     _check_name(environment, url)
     if data and not data[0]:
@@ -87,68 +69,7 @@ def parse(url: str) -> Address:
     conninfo = urlunsplit(parts._replace(query="&".join(others), fragment=""))
     if not parts.netloc:  # urlunsplit drops the empty host's slashes
         conninfo = f"{parts.scheme}://{parts.path}{'?' + '&'.join(others) if others else ''}"
-    there = _shards(shards[0], redact(url), are_private=bool(data)) if shards else ()
-    return Address(conninfo, environment, data[0] if data else None, redact(url), there)
-
-
-def _shards(value: str, shown: str, *, are_private: bool) -> tuple[str, ...]:
-    """Shards that the value of ``shards=`` names."""
-    if are_private:
-        if not re.fullmatch("[1-9][0-9]?", value):
-            raise UsageError(
-                f"{shown}: with data=, shards= is the number of private servers, "
-                f"1 to {MOST_PRIVATE_SHARDS}"
-            )
-        return tuple(str(n) for n in range(1, int(value) + 1))
-    # what is not UTF-8 becomes characters that no address has
-    hosts = [unquote(word, errors="surrogateescape") for word in value.split(",")]
-    if re.fullmatch("[0-9]+", hosts[0]):
-        raise UsageError(
-            f"{shown}: shards= names servers, such as shards=server1,server2; a number is for "
-            "private servers, with data="
-        )
-    seen: set[tuple[str, int]] = set()
-    for n, host in enumerate(hosts, 1):
-        found = servers_of(host)
-        if not found:
-            raise UsageError(
-                f"{shown}: shard {n} of shards= is no server: write a name, name:port, "
-                "[IPv6 address]:port, or the folder of a socket, with @ : , % in it "
-                "percent-encoded; its standbys behind it, with | between"
-            )
-        if seen & set(found) or len(set(found)) < len(found):
-            raise UsageError(f"{shown}: shard {n} of shards= is named twice: name each server once")
-        seen |= set(found)
-    if len(hosts) > MOST_SHARDS:
-        raise UsageError(f"{shown}: {len(hosts)} shards are too many: name {MOST_SHARDS} at most")
-    return tuple(hosts)
-
-
-def servers_of(shard: str) -> list[tuple[str, int]]:
-    """Hosts and ports of a shard and its standbys; empty if one of them is no address of a server.
-
-    shard : as `Address.shards` and the catalogue have it, servers with ``|`` between.
-    """
-    found = [host_and_port(server) for server in shard.split("|")]
-    known = [server for server in found if server is not None]
-    return known if len(known) == len(found) else []
-
-
-def host_and_port(server: str) -> tuple[str, int] | None:
-    """Host and port of one server of a shard; None if it is no address of a server.
-
-    A text that begins with / is the folder of a socket. An address of IPv6 stands in brackets.
-    """
-    match = HOST.fullmatch(server)
-    if match is None or not server.isprintable() or re.fullmatch("[0-9]+", match["host"]):
-        return None
-    port = int(match["port"] or PORT)
-    if not 0 < port < 1 << 16:
-        return None
-    host = match["host"]
-    if host.startswith("/"):
-        return host.rstrip("/") or "/", port
-    return host.strip("[]").lower(), port
+    return Address(conninfo, environment, data[0] if data else None, redact(url))
 
 
 def _split(url: str) -> SplitResult:

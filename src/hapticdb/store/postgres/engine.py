@@ -1,6 +1,5 @@
 """PostgreSQL as an engine: ``postgresql://...``, one schema an environment."""
 
-import contextlib
 from collections.abc import Mapping
 from types import MappingProxyType
 
@@ -9,9 +8,6 @@ from hapticdb.store.base import Layout, Store
 from hapticdb.store.engines import Capability, Right
 from hapticdb.store.postgres import rights, schema_of
 from hapticdb.store.postgres.address import parse, with_environment
-from hapticdb.store.postgres.shards.making import is_sharded, shards_of
-from hapticdb.store.postgres.shards.store import ShardedStore
-from hapticdb.store.postgres.standby.aiming import url_at_primary
 from hapticdb.store.postgres.store import PostgresStore
 
 
@@ -28,13 +24,11 @@ class PostgresEngine:
 
     def open(self, url: str, *, read_only: bool) -> Store:
         """Connect to an existing environment; ``?data=FOLDER`` starts its private server."""
-        connection = schema_of.opened(url, read_only=read_only)
-        return ShardedStore(connection) if is_sharded(connection) else PostgresStore(connection)
+        return PostgresStore.open(url, read_only=read_only)
 
     def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
         """Make a schema, which appears whole or not at all; ``?data=FOLDER`` makes the server."""
-        kind = ShardedStore if parse(url).shards else PostgresStore
-        return kind.create(url, grid, layout, distances=distances)
+        return PostgresStore.create(url, grid, layout, distances=distances)
 
     def exists(self, url: str) -> bool:
         """Whether a schema of that name is there. Connects."""
@@ -48,21 +42,11 @@ class PostgresEngine:
         """Name of the schema."""
         return parse(url).environment
 
-    def at_primary(self, url: str) -> str:
-        """URL of the same environment on the primary."""
-        return url_at_primary(url)
-
     def grant(self, url: str, role: str, right: Right) -> None:
         """Give a role of the server one right; see `hapticdb.store.postgres.rights`."""
         with schema_of.connected(url) as connection:
             schema_of.check(connection)
-            if not is_sharded(connection):
-                rights.grant(connection, role, right)
-                return
-            rights.check_role_and_right(role, right)
-            with contextlib.closing(shards_of(connection)) as shards:
-                shards.each(lambda _, shard: rights.grant_on_shard(shard, role, right))
-                rights.grant(connection, role, right, is_coordinator=True)
+            rights.grant(connection, role, right)
 
 
 ENGINE = PostgresEngine()

@@ -226,5 +226,5 @@ MIGRATIONS: Dialect = {
     "lineage": (),  # only SQLite needs it: its log lies beside the file, a server keeps its own log
     "removed parts": REMOVED,
     "distances": DISTANCES,
-    "shards": (),  # made with the environment, or never: store/postgres/shards/schemas.py
+    "shards": (),
 }

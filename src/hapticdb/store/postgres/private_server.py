@@ -1,9 +1,8 @@
 """A PostgreSQL server of our own in a folder: for the tests, and for a first try of the engine.
 
-The folder holds ``data`` (PostgreSQL's own), ``socket``, ``log``, ``lock`` and ``users``, and in
-``shards`` the folders of further servers, where an environment is on several. Only a Unix socket
-leads to the server, in a folder that its owner alone may enter, so it asks for no password. It runs
-until it is stopped, whatever becomes of the process that started it.
+The folder holds ``data`` (PostgreSQL's own), ``socket``, ``log``, ``lock`` and ``users``. Only a
+Unix socket leads to the server, in a folder that its owner alone may enter, so it asks for no
+password. It runs until it is stopped, whatever becomes of the process that started it.
 """
 
 import atexit
@@ -43,7 +42,7 @@ USER = "hapticdb"
 """The superuser of a private server."""
 PORT = 5432
 """Number in the name of the socket. No network port is opened."""
-OWN_NAMES = {"data", "data.new", "socket", "log", "lock", "users", "shards"}
+OWN_NAMES = {"data", "data.new", "socket", "log", "lock", "users"}
 SOCKET_BYTES = 107 - len(f"/.s.PGSQL.{PORT}")
 """Bytes of the longest path of a socket's folder."""
 LOG_BYTES = 8 << 20

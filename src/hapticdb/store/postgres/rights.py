@@ -4,8 +4,6 @@ A viewer reads and touches. A toucher also keeps fitted cost figures. An editor 
 removes objects. Only the owner, who made the environment, may change its tables and grant rights.
 """
 
-from collections.abc import Sequence
-
 from psycopg import sql
 
 from hapticdb.errors import AccessError, UsageError
@@ -50,37 +48,15 @@ GRANTED: dict[Right, tuple[str, ...]] = {
     "editor": EDITOR,
     "nobody": (),
 }
-MORE_FOR_EDITORS = (
-    "GRANT INSERT, UPDATE ON {schema}.live TO {role}",
-    "GRANT UPDATE (writes) ON {schema}.shard TO {role}",
-)
-"""Rights of editors at the coordinator of several servers, beside `EDITOR`."""
-SHARD_WITHDRAWN = tuple(text for text in WITHDRAWN if "TYPE" not in text)
-SHARD_VIEWER = VIEWER[:2]
-SHARD_GRANTED: dict[Right, tuple[str, ...]] = {
-    "viewer": SHARD_VIEWER,
-    "toucher": SHARD_VIEWER,
-    "editor": (
-        *SHARD_VIEWER,
-        "GRANT INSERT, DELETE ON ALL TABLES IN SCHEMA {schema} TO {role}",
-        "REVOKE INSERT, DELETE ON {schema}.mark FROM {role}",
-        "GRANT UPDATE (writes, swept) ON {schema}.mark TO {role}",
-        "GRANT EXECUTE ON FUNCTION {schema}.refresh_statistics() TO {role}",
-    ),
-    "nobody": (),
-}
-"""Rights on a shard."""
 # a lock: two changes of the same rights at once would conflict in the server's catalog
 GRANTERS = 0x4841505447524E54
 KNOWN_ROLE = """
 SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')
   FROM pg_roles AS role, pg_class AS kept
- WHERE role.rolname = %s AND kept.oid = %s::regclass"""
+ WHERE role.rolname = %s AND kept.oid = 'environment'::regclass"""
 
 
-def grant(
-    connection: ServerConnection, role: str, right: Right, *, is_coordinator: bool = False
-) -> None:
+def grant(connection: ServerConnection, role: str, right: Right) -> None:
     """Give a role that right on an environment, and no more; one transaction.
 
     Parameters
@@ -92,8 +68,6 @@ def grant(
     right : {"viewer", "toucher", "editor", "nobody"}
         Replaces the role's former right on this environment. Rights that the role has through a
         group stay.
-    is_coordinator : bool
-        Whether the rows lie on other servers, where `grant_on_shard` gives the right, too.
 
     Raises
     ------
@@ -103,44 +77,27 @@ def grant(
         When there is no such role; when the role may do everything anyway; when the name is longer
         than 63 bytes, so that the server would cut it off to another name.
     """
-    check_role_and_right(role, right)
+    check_name(role, "a role's name")
+    if right not in GRANTED:
+        raise UsageError(f"right {right!r}: choose one of {', '.join(GRANTED)}")
     if not connection.is_owner():
         raise AccessError(
             f"{connection.shown}: only the owner of the environment "
             f"{connection.address.environment!r} may grant rights; connect as the owner"
         )
-    more = MORE_FOR_EDITORS if is_coordinator and right == "editor" else ()
-    _give(connection, role, (*WITHDRAWN, *GRANTED[right], *more), "environment")
-
-
-def grant_on_shard(shard: ServerConnection, role: str, right: Right) -> None:
-    """Give a role that right on a shard; raises as `grant` does."""
-    check_role_and_right(role, right)
-    _give(shard, role, (*SHARD_WITHDRAWN, *SHARD_GRANTED[right]), "mark")
-
-
-def check_role_and_right(role: str, right: Right) -> None:
-    """Refuse a role's name that no server has, and a right that there is not."""
-    check_name(role, "a role's name")
-    if right not in GRANTED:
-        raise UsageError(f"right {right!r}: choose one of {', '.join(GRANTED)}")
-
-
-def _give(connection: ServerConnection, role: str, statements: Sequence[str], table: str) -> None:
-    """Run statements that change a role's rights; the owner of `table` is nobody's role."""
     names = {"schema": identifier(connection.address.environment), "role": identifier(role)}
 
     def work() -> None:
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (GRANTERS,))
-        _check_role(connection, role, table)
-        for statement in statements:
+        _check_role(connection, role)
+        for statement in (*WITHDRAWN, *GRANTED[right]):
             connection.execute(sql.SQL(statement).format(**names))
 
     connection.write(work)
 
 
-def _check_role(connection: ServerConnection, role: str, table: str) -> None:
-    found = connection.execute(KNOWN_ROLE, (role, table)).fetchone()
+def _check_role(connection: ServerConnection, role: str) -> None:
+    found = connection.execute(KNOWN_ROLE, (role,)).fetchone()
     if found is None:
         raise UsageError(
             f"{connection.shown}: no role {role!r} on this server; create it first with "

@@ -1,7 +1,6 @@
 """The schema of an environment: made, opened, checked, brought up to date, dropped."""
 
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
@@ -25,28 +24,26 @@ from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 from hapticdb.store.postgres.migrations import MIGRATIONS
 from hapticdb.store.postgres.private_server import shared_server
-from hapticdb.store.postgres.standby.aiming import aimed
 from hapticdb.store.schema import FORMAT_VERSION, migrations_after
 
 DEFAULT_DATABASE = "hapticdb"
 SERVER_IS_OURS = re.compile(r"(?:^|&)(?:host|hostaddr|port|user|service)=")
 
 
-def connected(
-    url: str, *, read_only: bool = False, making: bool = False, is_to_be_written: bool = False
-) -> ServerConnection:
+def connected(url: str, *, read_only: bool = False, making: bool = False) -> ServerConnection:
     """Connect to an environment's database. The environment itself may be missing.
 
-    With `making`, a private server and its database are made if they are missing. With
-    `is_to_be_written`, a connection that reads goes to the server that is written, too.
+    With `making`, a private server and its database are made if they are missing.
     """
     address = parse(url)
     try:
-        found = conninfo(address, making=making)
-        found = aimed(found, address.shown, read_only=read_only and not is_to_be_written)
-        return ServerConnection(address, found, read_only=read_only)
+        found = ServerConnection(address, conninfo(address, making=making), read_only=read_only)
     except EnvironmentNotFoundError as error:
         raise error if address.data is None else _not_found(address) from None
+    if found.is_standby and not read_only:
+        found.close()
+        raise failures.standby(address.shown)
+    return found
 
 
 def conninfo(address: Address, *, making: bool) -> str:
@@ -79,7 +76,7 @@ def _not_found(address: Address) -> EnvironmentNotFoundError:
 def exists(url: str) -> bool:
     """Whether a schema of that name is there, an environment or not."""
     try:
-        with connected(url, read_only=True, is_to_be_written=True) as connection:
+        with connected(url, read_only=True) as connection:
             return _has_schema(connection)
     except EnvironmentNotFoundError:
         if parse(url).data is None:
@@ -150,12 +147,7 @@ def _check_writable(connection: ServerConnection) -> None:
 
     A toucher may write cost figures; `Loading` refuses a toucher who begins to write objects.
     """
-    ((may_write, is_standby),) = connection.rows(
-        "SELECT has_table_privilege('cost', 'INSERT'), pg_is_in_recovery()"
-    )
-    if is_standby:
-        raise ReadOnlyError(f"{connection.shown} is a standby: it can only be read")
-    if not may_write:
+    if connection.rows("SELECT has_table_privilege('cost', 'INSERT')") != [(True,)]:
         raise ReadOnlyError(
             f"{connection.shown} can only be read by this user; its owner can allow more with "
             "'hapticdb grant URL ROLE --as editor'"
@@ -167,6 +159,10 @@ SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'v' THEN 'view'
                       WHEN 'm' THEN 'materialized view' ELSE 'relation ' || relkind::text END
   FROM pg_class JOIN pg_namespace n ON n.oid = relnamespace
  WHERE nspname = %s AND relkind <> 'i'"""
+
+
+ROWS_ELSEWHERE = "distribution"
+"""Table of an environment whose rows lie on several servers; its own tables of rows are empty."""
 
 
 class Made(NamedTuple):
@@ -185,6 +181,11 @@ class Made(NamedTuple):
 def read_environment(connection: ServerConnection) -> Made:
     """Read the one row of the table `environment`."""
     kinds = dict(connection.rows(TABLE_KINDS, (connection.address.environment,)))
+    if ROWS_ELSEWHERE in kinds:
+        raise NotAnEnvironmentError(
+            f"{connection.shown} has its rows on several servers, which this version cannot read: "
+            "copy it to one server with the version that made it"
+        )
     # a reader may have opened an environment of an older format
     wish = "wants_distances" if believed.BAND in kinds else "false"
     rows = connection.rows(
@@ -196,18 +197,8 @@ def read_environment(connection: ServerConnection) -> Made:
     return Made(grid, layout, believed.wish_of(connection.shown, rows[0][8]), rows[0][7])
 
 
-def created(
-    url: str,
-    grid: Grid,
-    layout: Layout,
-    *,
-    distances: bool,
-    also: Callable[[ServerConnection], None] | None = None,
-) -> None:
-    """Make the schema with all tables and the grid, in one transaction.
-
-    `also` makes more tables in it, inside that transaction.
-    """
+def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
+    """Make the schema with all tables and the grid, in one transaction."""
     with connected(url, making=True) as connection:
         name = connection.address.environment
 
@@ -238,8 +229,6 @@ def created(
                     distances,
                 ),
             )
-            if also is not None:
-                also(connection)
 
         connection.write(work, lambda: _has_schema(connection))
 

@@ -5,13 +5,12 @@ from typing import cast
 
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Store
+from hapticdb.store.engines import Lag
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.looping import LoopInServer
-from hapticdb.store.postgres.standby.following import Following
-from hapticdb.store.postgres.tables.loading import Indexes, IndexesHere, Loading
-from hapticdb.store.postgres.tables.placing import PlacesRows, RowsHere
+from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.tables.statistics import PostgresStatistics
 from hapticdb.store.postgres.tables.writing import PostgresWriter
@@ -24,10 +23,17 @@ GROUPING_THRESHOLD = 256
 """Least number of distinct keys that `auto` groups on older servers: docs/decisions/0014."""
 
 
-class ServerStore:
-    """What all environments on PostgreSQL do: objects, changes, watching; rows are the subclass's.
+REPLAYED = """
+SELECT pg_last_wal_replay_lsn()::text,
+       extract(epoch FROM clock_timestamp() - pg_last_xact_replay_timestamp())::float8
+ WHERE pg_is_in_recovery()"""
 
-    `_take_over` gives it the methods of those who read and write rows.
+
+class PostgresStore:
+    """An environment on a PostgreSQL server. Open with `open`, make with `create`.
+
+    Reading, writing, statistics and watching are classes of their own. The store takes over their
+    methods.
     """
 
     def __init__(self, connection: ServerConnection) -> None:
@@ -45,26 +51,36 @@ class ServerStore:
             raise
         self.grid, self.layout, self.wants_distances, self.identity = made
         reader = self._reader = PostgresReader(connection, self.layout)
+        self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
+        self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
+        self.statement, self.statement_hits = reader.statement, reader.statement_hits
         self.version, self.revision = reader.version, reader.revision
         self.objects, self.object = reader.objects, reader.object
         self.removed, self.changes = reader.removed, reader.changes
         watch = Watch(connection, self.identity)
         self.watch, self.has_changed = watch.begin, watch.has_changed
-        following = self._following = Following(connection, self.identity, reader.revision)
-        self.begin_proofs, self.newest_at = following.begin, following.newest_at
-        self.lag = following.lag
-
-    def _take_over(self, indexes: Indexes, rows: PlacesRows, known: PostgresStatistics) -> None:
-        """Write and load rows by these, and ask that one for statistics."""
-        connection, layout = self._connection, self.layout
-        loading = self._loading = Loading(connection, indexes)
-        writer = PostgresWriter(connection, self.grid, layout, self._reader, loading, rows)
+        loading = self._loading = Loading(connection, self.layout)
+        writer = PostgresWriter(connection, self.grid, self.layout, reader, loading)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
         self.add_distances, self._write_wish = writer.add_distances, writer.want_distances
+        known = PostgresStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
         if not self.is_read_only:
             loading.mend()
+
+    @classmethod
+    def open(cls, url: str, *, read_only: bool = False) -> "PostgresStore":
+        """Open an existing environment."""
+        return cls(schema_of.opened(url, read_only=read_only))
+
+    @classmethod
+    def create(
+        cls, url: str, grid: Grid, layout: Layout = "brick", *, distances: bool = False
+    ) -> "PostgresStore":
+        """Make a new environment with its grid: a schema that appears whole or not at all."""
+        schema_of.created(url, grid, layout, distances=distances)
+        return cls.open(url)
 
     @property
     def connection(self) -> ServerConnection:
@@ -73,7 +89,6 @@ class ServerStore:
 
     def close(self) -> None:
         """Close the connection."""
-        self._following.close()
         self._connection.close()
 
     @property
@@ -100,42 +115,16 @@ class ServerStore:
         self._write_wish()
         self.wants_distances = True
 
-
-class PostgresStore(ServerStore):
-    """An environment on a PostgreSQL server. Open with `open`, make with `create`.
-
-    Reading, writing, statistics and watching are classes of their own. The store takes over their
-    methods.
-    """
-
-    def __init__(self, connection: ServerConnection) -> None:
-        super().__init__(connection)
-        reader = self._reader
-        self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
-        self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
-        self.statement, self.statement_hits = reader.statement, reader.statement_hits
-        self._take_over(
-            IndexesHere(connection, self.layout),
-            RowsHere(connection, self.layout),
-            PostgresStatistics(connection, self.layout, reader),
-        )
-
-    @classmethod
-    def open(cls, url: str, *, read_only: bool = False) -> "PostgresStore":
-        """Open an existing environment."""
-        return cls(schema_of.opened(url, read_only=read_only))
-
-    @classmethod
-    def create(
-        cls, url: str, grid: Grid, layout: Layout = "brick", *, distances: bool = False
-    ) -> "PostgresStore":
-        """Make a new environment with its grid: a schema that appears whole or not at all."""
-        schema_of.created(url, grid, layout, distances=distances)
-        return cls.open(url)
-
     def snapshot(self) -> contextlib.AbstractContextManager[None]:
         """All reads inside see one committed revision. May be nested."""
         return self._connection.snapshot()
+
+    def lag(self) -> Lag | None:
+        """How far the server that answers is behind its primary; None if it is no standby."""
+        if not self._connection.is_standby:
+            return None
+        found = self._connection.rows(REPLAYED)
+        return Lag(*found[0]) if found else None
 
     def looping(self) -> Store:
         """The same store, but its `scan` loops over the ranges inside the server, one at a time."""

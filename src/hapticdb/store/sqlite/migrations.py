@@ -115,5 +115,5 @@ MIGRATIONS: Dialect = {
     "lineage": LINEAGE,
     "removed parts": REMOVED,
     "distances": DISTANCES,
-    "shards": (),  # rows on several servers: PostgreSQL only
+    "shards": (),
 }

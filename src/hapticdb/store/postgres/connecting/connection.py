@@ -8,7 +8,7 @@ from typing import Any, Self, TypeVar
 import psycopg
 from psycopg import sql
 
-from hapticdb.errors import ConnectionLostError, DatabaseError, ShardAwayError
+from hapticdb.errors import ConnectionLostError, DatabaseError
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.answering import SilentServerError
@@ -36,7 +36,6 @@ class ServerConnection:
     def __init__(self, address: Address, conninfo: str, *, read_only: bool = False) -> None:
         self.address = address
         self.shown = address.shown
-        self.conninfo = conninfo
         self.is_read_only = read_only
         self._thread = this_thread()
         self._depth = 0
@@ -141,42 +140,6 @@ class ServerConnection:
 
         return self.again(read)
 
-    def send(self, text: str, *parameters: Parameter) -> None:
-        """Send a prepared statement without waiting for its answer, and without a second try."""
-        self.check_thread()
-        if self._is_closed:
-            raise DatabaseError(f"{self.shown} has been closed: open it again")
-        if self._link.is_lost:
-            raise ConnectionLostError(f"{self.shown}: the server went away")
-        with failures.named_errors(self.shown):
-            self._link.send(text, parameters)
-
-    @property
-    def awaited(self) -> tuple[int, int]:
-        """Socket and events after which `take` goes on, as `select.poll` takes them."""
-        return self._link.awaited
-
-    @contextlib.contextmanager
-    def patient_for(self, patience_ms: int | None) -> Iterator[None]:
-        """Wait no longer for each part of an answer inside; None for the usual limit."""
-        with self._link.patient_for(patience_ms):
-            yield
-
-    def prepare(self, text: str, oids: Sequence[int]) -> None:
-        """Prepare a statement before it is first needed; oids : types of its parameters."""
-        with failures.named_errors(self.shown):
-            self._link.prepare(text, oids)
-
-    def take(self, patience_ms: int | None = None) -> list[bytes | None]:
-        """First row of the statement that was sent, every value in its binary form.
-
-        patience_ms : raise StuckError and close the connection when it takes longer; None for the
-        connection's own limit.
-        """
-        with failures.named_errors(self.shown):
-            result = self._link.take(patience_ms)
-            return [result.get_value(0, column) for column in range(result.nfields)]
-
     def rows(self, text: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
         """All rows of a statement as Python values: for statements outside frames."""
         return self.again(lambda: self.execute(text, parameters).fetchall())
@@ -218,7 +181,6 @@ class ServerConnection:
         When the connection is lost before the commit was sent, everything is done again. When it is
         lost during the commit, `is_committed` tells, on the new connection, whether the commit was
         done. Without `is_committed`, `work` must be harmless when it is done twice.
-        A `ShardAwayError` of `work` is of another server, which was tried again already.
         """
         self.check_thread()
         for tries_left in reversed(range(WRITE_TRIES)):
@@ -226,8 +188,6 @@ class ServerConnection:
                 self._reconnect()
             try:
                 result, is_certain = self._write_once(work)
-            except ShardAwayError:
-                raise
             except ConnectionLostError:
                 self._link.close()
                 if not tries_left:

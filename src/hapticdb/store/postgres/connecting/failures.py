@@ -121,7 +121,7 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
     if IS_STANDBY in cause:  # only where a primary was asked for
         others = [host for host in hosts if IS_STANDBY not in host]
         if not others:
-            return ReadOnlyError(f"{shown} is a standby: it can only be read")
+            return standby(shown)
         return ConnectionLostError(
             f"{shown}: the primary cannot be reached: {'; '.join(others)}; the other hosts are "
             "standbys, which can only be read"
@@ -175,6 +175,14 @@ def denied(shown: str, name: str) -> AccessError:
     return AccessError(
         f"{shown}: this user may not read the environment {name!r}; its owner can allow it with "
         "'hapticdb grant URL ROLE --as viewer'"
+    )
+
+
+def standby(shown: str) -> ReadOnlyError:
+    """Build the error for a server that cannot be written."""
+    return ReadOnlyError(
+        f"{shown} is a standby: it can only be read; to write, name its primary, or all servers "
+        "with target_session_attrs=primary"
     )
 
 

@@ -176,43 +176,16 @@ class Link:
 
     def run(self, text: str, parameters: Sequence[Parameter]) -> pq.abc.PGresult:
         """Result of a statement, which is prepared when it is first run."""
-        self.send(text, parameters)
-        return self.take()
-
-    def prepare(self, text: str, oids: Sequence[int]) -> bytes:
-        """Prepare a statement with parameters of these types, once; returns its name."""
         name = self._prepared.get(text)
         if name is None:
             name = f"hapticdb_{len(self._prepared)}".encode()
+            oids = [parameter.oid for parameter in parameters]
             self._pgconn.send_prepare(name, text.encode(), oids)
             self._result()
             self._prepared[text] = name
-        return name
-
-    def send(self, text: str, parameters: Sequence[Parameter]) -> None:
-        """Send a statement, which is prepared when it is first sent; `take` gives its result.
-
-        Statements on several links are answered at the same time if all are sent before the first
-        result is taken.
-        """
-        name = self.prepare(text, [parameter.oid for parameter in parameters])
         values = [parameter.value for parameter in parameters]
         self._pgconn.send_query_prepared(name, values, [1] * len(values), 1)
-        self._pgconn.flush()
-
-    def take(self, patience_ms: int | None = None) -> pq.abc.PGresult:
-        """Result of the statement that was sent; patience_ms : wait no longer for each part."""
-        with self.patient_for(patience_ms):
-            return self._result()
-
-    @property
-    def awaited(self) -> tuple[int, int]:
-        """The socket and the events, as `select.poll` takes them, after which `take` goes on."""
-        try:
-            unsent = self._pgconn.flush() > 0
-        except psycopg.Error:  # the connection is lost, as `take` will tell
-            unsent = True
-        return self._pgconn.socket, select.POLLIN | (select.POLLOUT if unsent else 0)
+        return self._result()
 
     def hear(self) -> None:
         """Give notifications that have arrived to the notify handlers. Never waits.
@@ -230,17 +203,6 @@ class Link:
     def _patience_ms(self) -> int | None:
         """Milliseconds to wait for an answer; None inside `unhurried`."""
         return None if self._leisure else self._limit_ms
-
-    @contextlib.contextmanager
-    def patient_for(self, patience_ms: int | None) -> Iterator[None]:
-        """Wait no longer for each part of an answer inside; None for the usual limit."""
-        before = self._limit_ms
-        if patience_ms is not None:
-            self._limit_ms = patience_ms
-        try:
-            yield
-        finally:
-            self._limit_ms = before
 
     @contextlib.contextmanager
     def unhurried(self) -> Iterator[None]:

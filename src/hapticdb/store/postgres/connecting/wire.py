@@ -26,13 +26,6 @@ COPY_HEADER = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 COPY_TRAILER = b"\xff\xff"
 
 
-def _layout_of(*last: tuple[str, str], versions: bool) -> np.dtype[np.void]:
-    """One row of COPY: key, id, perhaps a version, and the fields that follow them."""
-    version = [("version_length", ">i4"), ("version", ">i8")] if versions else []
-    first = [("fields", ">i2"), ("z_length", ">i4"), ("z_val", ">i8")]
-    return np.dtype([*first, ("id_length", ">i4"), ("id", ">i8"), *version, *last])
-
-
 class Parameter(NamedTuple):
     """A parameter of a statement: the OID of its type, and its binary form."""
 
@@ -104,44 +97,37 @@ def read_float8s(value: bytes) -> NDArray[np.float64]:
     return np.ndarray((count,), ">f8", value, HEADER_BYTES + 4, (_STRIDE,)).astype(np.float64)
 
 
-def copy_rows(rows: Rows, object_id: int, version: int | None = None) -> bytes:
+def copy_rows(rows: Rows, object_id: int) -> bytes:
     """Rows of an object in the form of COPY, without header and trailer.
 
-    Rows with distances are rows of the table `band`, others of the index table. `version` is a
-    column after the id, where the tables have it.
+    Rows with distances are rows of the table `band`, others of the index table.
     """
     if rows.distances is not None:
-        return _copy_band(rows.keys, rows.distances, object_id, version)
+        return _copy_band(rows.keys, rows.distances, object_id)
     has_bits = rows.occupancy.size > 0
     bits = (("bits_length", ">i4"), ("bits", f"V{BRICK_BYTES}")) if has_bits else ()
-    packed = _begun(rows.keys, object_id, version, *bits)
+    packed = _begun(rows.keys, object_id, *bits)
     if has_bits:
         packed["bits_length"] = BRICK_BYTES
         packed["bits"] = np.ascontiguousarray(rows.occupancy).view(f"V{BRICK_BYTES}").reshape(-1)
     return packed.tobytes()
 
 
-def _begun(
-    keys: NDArray[np.int64], object_id: int, version: int | None, *last: tuple[str, str]
-) -> NDArray[np.void]:
-    """Rows of COPY with key, id and version, but without the fields that follow."""
-    packed = np.empty(len(keys), _layout_of(*last, versions=version is not None))
-    packed["fields"] = 2 + (version is not None) + bool(last)
+def _begun(keys: NDArray[np.int64], object_id: int, *last: tuple[str, str]) -> NDArray[np.void]:
+    """Rows of COPY with key and id, but without the fields that follow."""
+    first = [("fields", ">i2"), ("z_length", ">i4"), ("z_val", ">i8")]
+    packed = np.empty(len(keys), [*first, ("id_length", ">i4"), ("id", ">i8"), *last])
+    packed["fields"] = 2 + bool(last)
     packed["z_length"] = packed["id_length"] = 8
     packed["z_val"] = keys
     packed["id"] = object_id
-    if version is not None:
-        packed["version_length"] = 8
-        packed["version"] = version
     return packed
 
 
-def _copy_band(
-    keys: NDArray[np.int64], distances: Band, object_id: int, version: int | None
-) -> bytes:
+def _copy_band(keys: NDArray[np.int64], distances: Band, object_id: int) -> bytes:
     """Rows of the table `band`: what stands before each row's bytes, then these bytes."""
     lengths = distances.lengths
-    heads = _begun(keys, object_id, version, ("distances_length", ">i4"))
+    heads = _begun(keys, object_id, ("distances_length", ">i4"))
     heads["distances_length"] = lengths
     size = heads.itemsize
     starts = distances.ends - lengths + size * np.arange(len(keys))

@@ -7,9 +7,8 @@ an object that was reported as written is there after a crash, and an import can
 """
 
 import contextlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from types import TracebackType
-from typing import Protocol
 
 import psycopg
 
@@ -28,34 +27,12 @@ LOADERS, MAKERS = 0x48415054, 0x48415055
 KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
 
-class Indexes(Protocol):
+class Indexes:
     """The indexes of an environment's rows, and the tables that they belong to."""
 
-    def are_there(self) -> bool:
-        """Whether no index is missing."""
-
-    def have_no_rows(self) -> bool:
-        """Whether the tables are empty."""
-
-    def drop(self) -> None:
-        """Drop the indexes. If somebody is reading, they stay, and nobody waits."""
-
-    def make(self) -> None:
-        """Make the missing indexes, while readers go on and writers wait."""
-
-    def vacuum(self) -> None:
-        """Let frames read the index only."""
-
-
-class IndexesHere:
-    """Indexes on one server; `key` names the columns of each."""
-
-    def __init__(
-        self, connection: ServerConnection, layout: Layout, key: str = "z_val, id"
-    ) -> None:
+    def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
         self._tables = TABLES[layout]
-        self._key = key
 
     def are_there(self) -> bool:
         """Whether no index is missing."""
@@ -91,7 +68,7 @@ class IndexesHere:
         connection.command("SET maintenance_work_mem = '256MB'")
         for table in self._tables:
             connection.command(
-                f"CREATE UNIQUE INDEX IF NOT EXISTS {table}_key ON {table} ({self._key})"
+                f"CREATE UNIQUE INDEX IF NOT EXISTS {table}_key ON {table} (z_val, id)"
             )
         connection.command("RESET maintenance_work_mem")
 
@@ -103,9 +80,9 @@ class IndexesHere:
 class Loading:
     """The context in which a connection writes many objects. May be nested."""
 
-    def __init__(self, connection: ServerConnection, indexes: "Indexes") -> None:
+    def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
-        self._indexes = indexes
+        self._indexes = Indexes(connection, layout)
         self._depth = 0
         self._is_owner = False
         self._has_written = False
@@ -180,18 +157,12 @@ class Loading:
             if is_alone:
                 self._make_index()
 
-    def drop_unused(self, before: Callable[[], object] = lambda: None) -> bool:
-        """Delete the environment if nothing was ever written to it and nobody is loading.
-
-        Returns whether it is deleted. `before` is called in a transaction before it is.
-        """
+    def drop_unused(self) -> None:
+        """Delete the environment if nothing was ever written to it and nobody is loading."""
         connection = self._connection
         with self._alone() as is_alone:
             if is_alone and not connection.rows("SELECT 1 FROM environment WHERE revision > 0"):
-                connection.write(before)
                 schema_of.drop(connection)
-                return True
-        return False
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[bool]:

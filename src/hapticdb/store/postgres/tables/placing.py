@@ -1,6 +1,4 @@
-"""Rows of an object in the tables of the server itself: copied in, and deleted."""
-
-from typing import Protocol
+"""Rows of an object in the tables of a server: copied in, and deleted."""
 
 import numpy as np
 
@@ -18,40 +16,24 @@ COLUMNS: dict[Table, str] = {
 }
 
 
-class PlacesRows(Protocol):
+class PostgresRows:
     """Writes and takes away rows of objects, inside the transaction of a write."""
-
-    def put(self, rows: Rows, object_id: int, revision: int) -> None:
-        """Write the rows of an object that has none."""
-
-    def put_band(self, rows: Rows, object_id: int, revision: int) -> None:
-        """Write rows of distances beside the object's bricks, which are among the rows."""
-
-    def take(self, known: Object, covering: Covering, revision: int) -> Keys:
-        """Take an object's rows away; returns keys of rows in all cells that they were in."""
-
-    def committed(self) -> None:
-        """Learn that the write is committed."""
-
-
-class RowsHere:
-    """Rows in the tables of the connection's own server."""
 
     def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
         self._layout = layout
 
-    def put(self, rows: Rows, object_id: int, _revision: int) -> None:
+    def put(self, rows: Rows, object_id: int) -> None:
         """Write the rows of an object that has none."""
         self._copy_into(self._layout, rows.occupied(), object_id)
         if rows.distances is not None:
             self._copy_into("band", rows, object_id)
 
-    def put_band(self, rows: Rows, object_id: int, _revision: int) -> None:
+    def put_band(self, rows: Rows, object_id: int) -> None:
         """Write rows of distances beside the object's bricks."""
         self._copy_into("band", rows, object_id)
 
-    def take(self, known: Object, covering: Covering, _revision: int) -> Keys:
+    def take(self, known: Object, covering: Covering) -> Keys:
         """Delete the rows of an object as it is now, from both tables; returns their keys."""
         ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
         chosen = wire.int8s(ends[:, 0]), wire.int8s(ends[:, 1]), wire.int8(known.id)
@@ -64,26 +46,12 @@ class RowsHere:
             gone.append(wire.read_int8s(found))
         return np.concatenate(gone)
 
-    def committed(self) -> None:
-        """Nothing is left to do after a commit."""
-
     def _copy_into(self, table: Table, rows: Rows, object_id: int) -> None:
-        copy_into(self._connection, f"{table} ({COLUMNS[table]})", rows, object_id)
-
-
-def copy_into(
-    connection: ServerConnection,
-    target: str,
-    rows: Rows,
-    object_id: int,
-    version: int | None = None,
-) -> None:
-    """Copy rows of an object into a table, inside a transaction.
-
-    target : the table and its columns; version : see `wire.copy_rows`.
-    """
-    with connection.driver.cursor().copy(f"COPY {target} FROM STDIN (FORMAT binary)") as copy:
-        copy.write(wire.COPY_HEADER)
-        for at in range(0, len(rows), COPY_CHUNK):
-            copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id, version))
-        copy.write(wire.COPY_TRAILER)
+        target = f"{table} ({COLUMNS[table]})"
+        with self._connection.driver.cursor().copy(
+            f"COPY {target} FROM STDIN (FORMAT binary)"
+        ) as copy:
+            copy.write(wire.COPY_HEADER)
+            for at in range(0, len(rows), COPY_CHUNK):
+                copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id))
+            copy.write(wire.COPY_TRAILER)

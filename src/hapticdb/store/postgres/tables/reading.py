@@ -5,7 +5,6 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import StaleError
 from hapticdb.store import believed
 from hapticdb.store.base import (
     NO_KEYS,
@@ -32,17 +31,14 @@ HAS_BAND = "SELECT to_regclass('band') IS NOT NULL"
 
 
 class PostgresReader:
-    """Reads of one environment. The reader remembers the revision that its last read has seen.
-
-    Reads from standbys never go back to an earlier revision: they raise StaleError instead.
-    """
+    """Reads of one environment. The reader remembers the revision that its last read has seen."""
 
     def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
         self._url = connection.shown
         self._layout = layout
         self._shift = row_shift(layout)
-        self._seen = self._newest = -1
+        self._seen = -1
         self._has_band = False
         self._excluded = NO_KEYS
         self._excluded_parameters: list[wire.Parameter] = []
@@ -54,31 +50,15 @@ class PostgresReader:
     def revision(self) -> int:
         """Number of the last committed write; 0 for an empty environment."""
         rows = self._connection.rows("SELECT revision FROM environment WHERE id = 1")
-        return self.see(int(rows[0][0]))
-
-    def see(self, revision: int) -> int:
-        """Note and return the revision of an answer, also of one that others got.
-
-        After a loss the connection may lead to a standby that is further behind. What it has was
-        replaced by what was read before, so its answer is refused.
-        """
-        if not self._connection.is_standby:
-            self._newest = revision
-        elif 0 <= revision < self._newest:
-            raise StaleError(
-                f"{self._url}: the standby that answers now has replayed the revision {revision}, "
-                f"and {self._newest} was read before: try again when it has caught up"
-            )
-        self._newest = max(self._newest, revision)
-        self._seen = revision
-        return revision
+        self._seen = int(rows[0][0])
+        return self._seen
 
     # -- rows -----------------------------------------------------------------------------------
 
     def unpacked(self, found: list[bytes | None], *, distances: bool = False) -> Rows:
         """Rows from a statement's one packed row; its last value is the revision that was read."""
         seen = found[-1]
-        self.see(wire.read_int8(seen) if seen is not None else -1)
+        self._seen = wire.read_int8(seen) if seen is not None else -1
         if found[0] is None:
             return no_rows(distances=distances)
         keys, ids = wire.read_int8s(found[0]), wire.read_int8s(found[1])
@@ -87,7 +67,7 @@ class PostgresReader:
         if distances:
             lengths = wire.read_int8s(found[4])
             rows = rows.having(believed.band_of(self._url, found[3] or b"", lengths))
-        return rows if is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
+        return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
 
     def has_band(self) -> bool:
         """Whether there is a table of distances; another may make it while a reader has it open."""
@@ -158,7 +138,7 @@ class PostgresReader:
         parameters = [wire.int8s(frame.addresses)]
         text, parameters = self._without_excluded(text, parameters, frame.exclude)
         ordinals, ids, seen = self._connection.fetch(text, *parameters)
-        self.see(wire.read_int8(seen or b""))
+        self._seen = wire.read_int8(seen or b"")
         return wire.read_int8s(ordinals) - 1, wire.read_int8s(ids)
 
     def _without_excluded(
@@ -218,7 +198,7 @@ def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:
     return [wire.int8(low), wire.int8(high), wire.Parameter(wire.BYTEA, bits)]
 
 
-def is_in_order(rows: Rows) -> bool:
+def _is_in_order(rows: Rows) -> bool:
     """Whether rows are ordered by key and id. They are not while a first import has no index."""
     keys, ids = rows.keys, rows.ids
     if len(keys) < 2:

@@ -4,11 +4,9 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from psycopg import sql
-
 from hapticdb.store import believed
 from hapticdb.store.base import Freshness, Histogram, Keys, Layout, Size
-from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
 from hapticdb.store.postgres.tables.histogram import (
     ENOUGH_ROWS,
     SERVER_RESOLUTION,
@@ -29,27 +27,22 @@ class PostgresStatistics:
         self._connection = connection
         self._layout = layout
         self._reader = reader
-        self._counted_table: str = layout
-        """Table whose changed rows the server counts; empty where it counts none."""
 
     def size(self) -> Size:
         """Rows, bytes of all tables and indexes, leaf blocks of the index; rows of distances."""
         with self._connection.snapshot(), self._connection.without_limit():
             self._reader.revision()
-            return self._size()
-
-    def _size(self) -> Size:
-        band = (0, 0)
-        counted = (
-            "SELECT count(*) FROM brick"
-            if self._layout == "brick"
-            else "SELECT coalesce(sum(voxels), 0) FROM object"  # a row for each voxel
-        )
-        ((rows,),) = self._connection.execute(counted).fetchall()
-        total, index = bytes_of(self._connection, self._layout)
-        if self._reader.has_band():
-            (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
-        return Size(int(rows), total, max(index, 1), *map(int, band))
+            band = (0, 0)
+            counted = (
+                "SELECT count(*) FROM brick"
+                if self._layout == "brick"
+                else "SELECT coalesce(sum(voxels), 0) FROM object"  # a row for each voxel
+            )
+            ((rows,),) = self._connection.execute(counted).fetchall()
+            total, index = self._bytes()
+            if self._reader.has_band():
+                (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
+            return Size(int(rows), total, max(index, 1), *map(int, band))
 
     def quantiles(self, resolution: int) -> Histogram:
         """Equi-count histogram of all row keys, of R buckets.
@@ -58,7 +51,7 @@ class PostgresStatistics:
         no object was written since, else computed exactly.
         """
         if resolution == SERVER_RESOLUTION:
-            found = self._server_histogram()
+            found = server_histogram(self._connection, self._layout)
             if found is not None and found[1] >= ENOUGH_ROWS:
                 return Histogram(*found, "server statistics")
         kept = self._connection.rows(
@@ -68,7 +61,7 @@ class PostgresStatistics:
         )
         if kept:
             return believed.histogram_of(self._connection.shown, *kept[0])
-        return Histogram(*self._exact_histogram(resolution), "computed")
+        return Histogram(*self._exact(resolution), "computed")
 
     def freshness(self, resolution: int) -> Freshness:
         """How old the histogram of that resolution is, by the revision stored with it."""
@@ -79,7 +72,7 @@ class PostgresStatistics:
             "       CASE WHEN q.bounds IS NULL THEN (SELECT n_mod_since_analyze"
             "         FROM pg_stat_user_tables WHERE schemaname = %s AND relname = %s) END"
             "  FROM environment e LEFT JOIN quantile q ON q.resolution = %s",
-            (self._connection.address.environment, self._counted_table, resolution),
+            (self._connection.address.environment, self._layout, resolution),
         )
         since = 0 if made is None else int(made)
         rows = int(changed if made is None or unseen is None else unseen)
@@ -97,10 +90,11 @@ class PostgresStatistics:
             n_rows = self.size().rows
             is_computed = resolution != SERVER_RESOLUTION or n_rows < ENOUGH_ROWS
             if is_computed:
-                keys, n_rows = self._exact_histogram(resolution)
+                keys, n_rows = self._exact(resolution)
                 bounds = keys.tolist()
         if not is_computed:
-            self._refresh()
+            with self._connection.without_limit("statement_timeout", "lock_timeout"):
+                self._connection.execute("SELECT refresh_statistics()")
         self._save(
             "INSERT INTO quantile VALUES (%s, %s, %s, %s)"
             " ON CONFLICT (resolution) DO UPDATE SET revision = EXCLUDED.revision,"
@@ -109,15 +103,8 @@ class PostgresStatistics:
             (resolution, revision, n_rows, bounds),
         )
 
-    def _server_histogram(self) -> tuple[Keys, int] | None:
-        return server_histogram(self._connection, self._layout)
-
-    def _exact_histogram(self, resolution: int) -> tuple[Keys, int]:
+    def _exact(self, resolution: int) -> tuple[Keys, int]:
         return exact_histogram(self._connection, self._layout, resolution)
-
-    def _refresh(self) -> None:
-        with self._connection.without_limit("statement_timeout", "lock_timeout"):
-            self._connection.execute("SELECT refresh_statistics()")
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""
@@ -137,15 +124,14 @@ class PostgresStatistics:
     def _save(self, text: str, parameters: Sequence[Any]) -> None:
         self._connection.write(lambda: self._connection.execute(text, parameters))
 
-
-def bytes_of(connection: ServerConnection, layout: Layout) -> tuple[int, int]:
-    """Bytes of all tables and indexes of a schema, and pages of the index of its rows."""
-    schema = sql.Identifier(connection.address.environment).as_string(connection.driver)
-    ((total, pages),) = connection.execute(
-        "SELECT (SELECT coalesce(sum(pg_total_relation_size(c.oid)), 0) FROM pg_class c"
-        "         WHERE c.relnamespace = to_regnamespace(%s) AND c.relkind = 'r'),"
-        "       coalesce(pg_relation_size(to_regclass(%s)), 0)"
-        "         / current_setting('block_size')::int",
-        (schema, f"{schema}.{layout}_key"),
-    ).fetchall()
-    return int(total), int(pages)
+    def _bytes(self) -> tuple[int, int]:
+        """Bytes of all tables and indexes of the schema, and pages of the index of its rows."""
+        schema = identifier(self._connection.address.environment).as_string(self._connection.driver)
+        ((total, pages),) = self._connection.execute(
+            "SELECT (SELECT coalesce(sum(pg_total_relation_size(c.oid)), 0) FROM pg_class c"
+            "         WHERE c.relnamespace = to_regnamespace(%s) AND c.relkind = 'r'),"
+            "       coalesce(pg_relation_size(to_regclass(%s)), 0)"
+            "         / current_setting('block_size')::int",
+            (schema, f"{schema}.{self._layout}_key"),
+        ).fetchall()
+        return int(total), int(pages)

@@ -18,7 +18,7 @@ from hapticdb.store.base import (
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import records
 from hapticdb.store.postgres.tables.loading import Loading
-from hapticdb.store.postgres.tables.placing import PlacesRows
+from hapticdb.store.postgres.tables.placing import PostgresRows
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.watching import channel_of
 from hapticdb.store.refusals import check_unwritten, check_without_distances, present_already
@@ -42,14 +42,13 @@ class PostgresWriter:
         layout: Layout,
         reader: PostgresReader,
         loading: Loading,
-        rows: PlacesRows,
     ) -> None:
         self._connection = connection
         self._grid = grid
         self._layout = layout
         self._reader = reader
         self._loading = loading
-        self._rows = rows
+        self._rows = PostgresRows(connection, layout)
         self._written: tuple[int, str, int, str] = (0, "", 0, "")
         self._highest_id = (0, 0)  # at which revision
 
@@ -63,7 +62,7 @@ class PostgresWriter:
                 object_id = self._execute(records.INSERT_OBJECT, new)[0][0]
             except errors.UniqueViolation as error:
                 raise present_already(record, self._connection.shown) from error
-            self._copy(rows, object_id, revision)
+            self._rows.put(rows, object_id)
             self._log(revision, "add", object_id, rows.keys)
             return int(object_id)
 
@@ -76,9 +75,9 @@ class PostgresWriter:
             revision = self._next_revision()
             known = self._reader.object(record.id)
             check_unwritten(record, known, self._connection.shown)
-            gone = self._delete(known, covering, revision)
+            gone = self._rows.take(known, covering)
             self._execute(records.UPDATE_OBJECT, records.contents(record, rows, revision))
-            self._copy(rows, record.id, revision)
+            self._rows.put(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
         self._commit(work)
@@ -91,7 +90,7 @@ class PostgresWriter:
             known = self._reader.object(record.id)
             check_without_distances(record, known, self._connection.shown)
             self._execute(records.UPDATE_OBJECT, records.contents(record, rows, revision))
-            self._rows.put_band(rows, record.id, revision)
+            self._rows.put_band(rows, record.id)
             self._log(revision, "move", record.id, rows.keys)
 
         self._commit(work)
@@ -101,7 +100,7 @@ class PostgresWriter:
 
         def work() -> None:
             revision = self._next_revision()
-            gone = self._delete(self._reader.object(object_id), covering, revision)
+            gone = self._rows.take(self._reader.object(object_id), covering)
             self._execute("DELETE FROM object WHERE id = %s", (object_id,))
             self._log(revision, "remove", object_id, gone)
 
@@ -126,7 +125,6 @@ class PostgresWriter:
 
     def _commit(self, work: Callable[[], Result]) -> Result:
         result = self._connection.write(work, self._is_written)
-        self._rows.committed()
         self._loading.note()
         return result
 
@@ -134,12 +132,6 @@ class PostgresWriter:
         """One statement of a write; its rows, when it returns some."""
         cursor = self._connection.execute(text, parameters)
         return cursor.fetchall() if cursor.description else []
-
-    def _copy(self, rows: Rows, object_id: int, revision: int) -> None:
-        self._rows.put(rows, object_id, revision)
-
-    def _delete(self, known: Object, covering: Covering, revision: int) -> Keys:
-        return self._rows.take(known, covering, revision)
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
         """Record which keys a write touched, and notify those who watch when it is committed."""

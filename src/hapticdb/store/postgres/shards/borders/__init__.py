@@ -1,1 +1,0 @@
-"""Borders between shards, moved while others read and write."""

@@ -1,1 +1,0 @@
-"""Connections to the servers of one environment: where they are, asked at once, away."""

@@ -16,8 +16,6 @@ import pytest
 import hapticdb
 from children import joined, until
 from hapticdb import Grid
-from hapticdb.server.cells.endpoint import CellsEndpoint
-from hapticdb.store.connect import at_primary as url_at_primary
 from hapticdb.store.connect import create_store, exists, grant, open_store
 from hapticdb.store.engines import MayLag
 from hapticdb.store.postgres.connecting.connection import ServerConnection
@@ -153,14 +151,6 @@ def test_the_primary_is_asked_with_a_limit_beside_the_urls_own_options() -> None
     )
     assert "target_session_attrs=primary" in found
     assert "-cjit=on -cstatement_timeout=1000" in found
-
-
-def test_clients_on_other_machines_are_served_from_the_primary(pair: Pair, name: str) -> None:
-    endpoint = CellsEndpoint(pair.url(name), may_enter=lambda _: True)
-    with opened(endpoint._url) as store:
-        assert not is_standby(store)
-    assert url_at_primary("a.db") == "a.db"
-    assert url_at_primary("postgresql://h/x") == "postgresql://h/x?target_session_attrs=primary"
 
 
 # -- how old the answers are ----------------------------------------------------------------------

@@ -14,7 +14,6 @@ from hapticdb.query.grouping import Ranges, group_spans
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.resident.costs import costs_at_start
 from hapticdb.resident.partial import SupportsPartialScan, meeting
-from hapticdb.resident.pushing import SupportsPush
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import (
     BRICK_SHIFT,
@@ -87,13 +86,10 @@ class CellSource:
         highs = ((on_curve + 1) << (CELL_SHIFT - shift)) - 1
         words, masks, payload = table.cells.words, table.cells.masks, table.cells.payload
         costs = self._costs if payload is None else self._costs.with_distances
-        rows, n_ranges = self._pushed_rows(on_curve, distances=payload is not None), 0
+        ranges = group_spans(lows, highs, self._quantiles, costs)
+        rows, away = self._scan(ranges, distances=payload is not None)
         is_away = np.zeros(len(cells), dtype=np.bool_)
-        if rows is None:
-            ranges = group_spans(lows, highs, self._quantiles, costs)
-            n_ranges = len(ranges.lows)
-            rows, away = self._scan(ranges, distances=payload is not None)
-            is_away[order] = meeting(away, lows, highs)
+        is_away[order] = meeting(away, lows, highs)
         words[slots] = 0
         masks[slots] = 0
         kernels.fill_cells(
@@ -103,19 +99,13 @@ class CellSource:
         if payload is not None:
             self._fill_distances(rows, on_curve, slots[order], payload, masks)
             mark_near_voxels(slots, payload, masks, words, table.cells.near)
-        return CellsRead(masks[slots] == 0, is_away, len(rows), n_ranges)
+        return CellsRead(masks[slots] == 0, is_away, len(rows), len(ranges.lows))
 
     def _scan(self, ranges: Ranges, *, distances: bool) -> PartialRows:
         """Rows of ranges, and the ranges of the shards that are away."""
         if isinstance(self.store, SupportsPartialScan):
             return self.store.scan_partly(*ranges, distances=distances)
         return PartialRows(self.store.scan(*ranges, distances=distances), NO_RANGES)
-
-    def _pushed_rows(self, on_curve: Keys, *, distances: bool) -> Rows | None:
-        """Rows that a server has sent without being asked; None if there are none."""
-        if not isinstance(self.store, SupportsPush):
-            return None
-        return self.store.pushed_rows(on_curve, distances=distances)
 
     def _fill_distances(
         self,

@@ -18,7 +18,6 @@ from hapticdb.store.engines import (
     SupportsBackup,
     SupportsFirstFindings,
     SupportsGrant,
-    SupportsStandbys,
     Url,
     engine_of,
 )
@@ -27,7 +26,6 @@ from hapticdb.store.sharding import RebalanceCallback, Rebalanced, SupportsShard
 from hapticdb.store.urls import redact
 
 __all__ = [
-    "at_primary",
     "backup_environment",
     "beside",
     "check_curve",
@@ -73,13 +71,6 @@ def findings_before_opening(url: Url) -> list[str]:
     if not isinstance(engine, SupportsFirstFindings):
         return []
     return engine.findings_before_opening(os.fspath(url))
-
-
-def at_primary(url: Url) -> str:
-    """URL whose reads come from the server that is written, never from a standby."""
-    engine = engine_of(url)
-    given = os.fspath(url)
-    return engine.at_primary(given) if isinstance(engine, SupportsStandbys) else given
 
 
 def beside(url: Url, name: str) -> str:

@@ -100,14 +100,6 @@ class SupportsGrant(Protocol):
         """Give a role one right on an environment; it replaces the role's former one."""
 
 
-@runtime_checkable
-class SupportsStandbys(Protocol):
-    """An engine whose URLs may lead to copies that follow the database later."""
-
-    def at_primary(self, url: str) -> str:
-        """URL of the same environment on the server that is written. Connects to nothing."""
-
-
 class Lag(NamedTuple):
     """How far a standby is behind its primary.
 
@@ -186,13 +178,10 @@ class BuiltIn(NamedTuple):
 FILE_SCHEME = "sqlite"
 """The engine of paths, which have no scheme."""
 POSTGRES = BuiltIn("hapticdb.store.postgres.engine", "psycopg", "hapticdb[postgres]")
-SERVER = BuiltIn("hapticdb.store.remote.engine", "websockets", "hapticdb[client]")
 BUILT_IN = {
     FILE_SCHEME: BuiltIn("hapticdb.store.sqlite.engine"),
     "postgresql": POSTGRES,
     "postgres": POSTGRES,
-    "ws": SERVER,
-    "wss": SERVER,
 }
 
 
@@ -233,6 +222,5 @@ def _installed(scheme: str) -> Engine:
 def unknown_scheme(scheme: str) -> UsageError:
     """Build the error for a URL that no engine opens."""
     return UsageError(
-        f"scheme {scheme!r}: give a path, sqlite:///path, postgresql://host/database, "
-        "or ws://host:port"
+        f"scheme {scheme!r}: give a path, sqlite:///path or postgresql://host/database"
     )

@@ -11,7 +11,6 @@ from hapticdb.store.postgres import rights, schema_of
 from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.shards.making import is_sharded, shards_of
 from hapticdb.store.postgres.shards.store import ShardedStore
-from hapticdb.store.postgres.standby.aiming import url_at_primary
 from hapticdb.store.postgres.store import PostgresStore
 
 
@@ -47,10 +46,6 @@ class PostgresEngine:
     def name_of(self, url: str) -> str:
         """Name of the schema."""
         return parse(url).environment
-
-    def at_primary(self, url: str) -> str:
-        """URL of the same environment on the primary."""
-        return url_at_primary(url)
 
     def grant(self, url: str, role: str, right: Right) -> None:
         """Give a role of the server one right; see `hapticdb.store.postgres.rights`."""

@@ -64,11 +64,3 @@ def at_primary(conninfo: str) -> str:
         target_session_attrs="primary",
         options=f"{options} -cstatement_timeout={ANSWER_MS}".strip(),
     )
-
-
-def url_at_primary(url: str) -> str:
-    """Rewrite a URL so that all its connections lead to the primary among its hosts."""
-    head, _, query = url.partition("?")
-    attrs = "target_session_attrs="
-    kept = [pair for pair in query.split("&") if pair and not pair.startswith(attrs)]
-    return f"{head}?{'&'.join([*kept, f'{attrs}primary'])}"

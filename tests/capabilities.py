@@ -11,9 +11,9 @@ STORE_LACKS = {
 }
 ENGINE_LACKS = {
     "SQLite": frozenset({"grant"}),
-    "PostgreSQL": frozenset({"backup", "first findings"}),
-    "PostgreSQL on shards": frozenset({"backup", "first findings"}),
-    "memory": frozenset({"grant", "backup", "first findings"}),
+    "PostgreSQL": frozenset({"backup"}),
+    "PostgreSQL on shards": frozenset({"backup"}),
+    "memory": frozenset({"grant", "backup"}),
 }
 
 

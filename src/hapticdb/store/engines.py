@@ -155,14 +155,6 @@ class SupportsBackup(Protocol):
         """Put a copy in an environment's place, whole or not at all."""
 
 
-@runtime_checkable
-class SupportsFirstFindings(Protocol):
-    """An engine that finds damage in an environment that may not even open."""
-
-    def findings_before_opening(self, url: str) -> list[str]:
-        """What is wrong, a line each."""
-
-
 class BuiltIn(NamedTuple):
     """An engine of this package, not imported yet.
 

@@ -42,7 +42,6 @@ SOURCES = {
     "computed": "computed when needed",
 }
 """Where the statistics of the keys come from, in words."""
-NO_CHECKSUMS = "none of pages; 'hapticdb copy' makes an environment that has them"
 
 NameOption = Annotated[
     list[str] | None,
@@ -90,9 +89,6 @@ def info(url: UrlArgument, *, json: JsonOption = False) -> None:
         render.show(render.facts(looked_at.facts()))
 
 
-CHECKSUMS = {True: "of pages", False: NO_CHECKSUMS, None: "not known while a shard is away"}
-
-
 def _told(shard: "Shard") -> tuple[str, str]:
     """One shard in words: its name, and what it holds or why it does not answer."""
     if shard.rows is None or shard.bytes is None:
@@ -116,7 +112,6 @@ class _Overview(NamedTuple):
     scene: "NDArray[np.float64] | None"
     freshness: "Freshness"
     source: str
-    has_checksums: bool | None
     shards: "list[Shard]"
     lag: "Lag | None"
 
@@ -145,7 +140,6 @@ class _Overview(NamedTuple):
             scene=scene_bounds(objects),
             freshness=store.freshness(DEFAULT_RESOLUTION),
             source=source,
-            has_checksums=store.checker().has_page_checksums() if is_whole else None,
             shards=shards,
             lag=store.lag() if isinstance(store, MayLag) else None,
         )
@@ -193,7 +187,6 @@ class _Overview(NamedTuple):
                 "rows": self.size and self.size.band_rows,
                 "bytes": self.size and self.size.band_bytes,
             },
-            "page_checksums": self.has_checksums,
             "standby": None if self.lag is None else self.lag._asdict(),
             "fit": None if self.fit is None else self.fit._asdict(),
             "statistics": {"source": self.source, **self.freshness._asdict()},
@@ -226,7 +219,6 @@ class _Overview(NamedTuple):
             *(_told(shard) for shard in self.shards),
             ("distances", self._distances),
             *(self.fit.facts if self.fit is not None else ()),
-            ("checksums", CHECKSUMS[self.has_checksums]),
             ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),
         ]
 

@@ -26,11 +26,6 @@ class ShardedChecker:
         self._shards = shards
         self._reader = reader
 
-    def has_page_checksums(self) -> bool:
-        """Whether the pages of all servers carry checksums."""
-        asked = self._shards.each(lambda _, shard: shard.rows("SHOW data_checksums"))
-        return self._coordinator.has_page_checksums() and all(one == [("on",)] for one in asked)
-
     def findings(self) -> Iterator[str]:
         """What is wrong with kept statistics, and with whole shards, a line each.
 

@@ -58,26 +58,6 @@ class ServedProcess:
         """Process id of the server itself."""
         return self._process.pid
 
-    def pids(self) -> list[int]:
-        """Process ids of the server and of all processes below it."""
-        found = [self.pid]
-        for pid in found:
-            for task in Path(f"/proc/{pid}/task").glob("*/children"):
-                found += map(int, task.read_text().split())
-        return found
-
-    def memory(self) -> float:
-        """Memory of the server and its processes, MB; shared pages by their share."""
-        total = 0
-        for pid in self.pids():
-            lines = Path(f"/proc/{pid}/smaps_rollup").read_text().splitlines()
-            total += sum(int(one.split()[1]) for one in lines if one.startswith("Pss:"))
-        return total / 1e3
-
-    def device_url(self, port: int | None = None) -> str:
-        """URL of the environment for a client, through another port if one is given."""
-        return f"ws://127.0.0.1:{port or self.port}?token={TOKENS['toucher']}"
-
     def __enter__(self) -> Self:
         return self
 

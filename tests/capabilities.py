@@ -10,8 +10,8 @@ STORE_LACKS = {
 }
 ENGINE_LACKS = {
     "SQLite": frozenset({"grant"}),
-    "PostgreSQL": frozenset({"backup", "first findings"}),
-    "memory": frozenset({"grant", "backup", "first findings"}),
+    "PostgreSQL": frozenset({"backup"}),
+    "memory": frozenset({"grant", "backup"}),
 }
 
 

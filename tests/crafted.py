@@ -8,7 +8,6 @@ import numpy as np
 
 from hapticdb import Grid
 from hapticdb.store.base import Layout
-from hapticdb.store.sqlite.pages import LAYER
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import floor_voxels, write_voxels
 
@@ -84,8 +83,8 @@ def made(path: Path, layout: Layout) -> Path:
 
 
 def edited(path: Path, statements: str, layout: Layout) -> None:
-    """Run statements as an attacker would: without CHECKs, and with correct page checksums."""
-    with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
+    """Run statements as an attacker would: without CHECKs."""
+    with closing(apsw.Connection(str(path))) as connection:
         connection.execute("PRAGMA ignore_check_constraints = ON")
         connection.execute("PRAGMA legacy_alter_table = ON")
         connection.execute("PRAGMA writable_schema = ON")
@@ -93,7 +92,7 @@ def edited(path: Path, statements: str, layout: Layout) -> None:
         connection.execute(
             "UPDATE sqlite_master SET sql = replace(sql, ', WITHOUT ROWID', 'WITHOUT ROWID')"
         )
-    with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
+    with closing(apsw.Connection(str(path))) as connection:
         connection.execute("PRAGMA ignore_check_constraints = ON")
         connection.execute("PRAGMA legacy_alter_table = ON")
         for statement in statements.replace("{layout}", layout).split("; "):

@@ -26,7 +26,6 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field import packing
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Band, Layout, Rows
-from hapticdb.store.sqlite.pages import LAYER
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
 from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 from hapticdb.testing import KINDS, blob, voxel_object, with_distances, write_voxels
@@ -57,7 +56,7 @@ def add(env: Environment, ijk: NDArray[np.int64], name: str, **fields: Any) -> i
 
 def change(path: Path, *statements: str) -> None:
     """Change the database with plain SQL, without the library."""
-    with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
+    with closing(apsw.Connection(str(path))) as connection:
         for sql in statements:
             connection.execute(sql)
 

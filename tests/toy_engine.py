@@ -342,9 +342,6 @@ class MemoryStore:
     def checker(self) -> "MemoryStore":
         return self
 
-    def has_page_checksums(self) -> bool:
-        return False
-
     def findings(self) -> Iterator[str]:
         yield from ()
 

@@ -1,4 +1,4 @@
-"""Checks whether an environment is sound: pages, rows, objects, the log of changes."""
+"""Checks whether an environment is sound: structure, rows, objects, the log of changes."""
 
 import os
 from collections.abc import Callable, Iterator
@@ -23,7 +23,7 @@ from hapticdb.store.base import (
     row_shift,
 )
 from hapticdb.store.believed import BandChecksum, RowsChecksum
-from hapticdb.store.connect import findings_before_opening, open_store
+from hapticdb.store.connect import open_store
 
 ROWS_AT_ONCE = 1 << 17
 """Rows that are read at a time. A larger value takes more memory and hardly less time."""
@@ -59,8 +59,6 @@ class CheckReport:
         Number of all faults.
     objects, voxels, rows : int
         Numbers of objects, voxels and rows that were read.
-    has_page_checksums : bool
-        Whether the engine's pages carry checksums that are compared when they are read.
     without_row_checksums : int
         Objects that were written before there were checksums of their rows.
     """
@@ -71,7 +69,6 @@ class CheckReport:
     objects: int = 0
     voxels: int = 0
     rows: int = 0
-    has_page_checksums: bool = False
     without_row_checksums: int = 0
 
     @property
@@ -93,12 +90,12 @@ def check_environment(
 ) -> CheckReport:
     """Read all of an environment and say what is wrong with it.
 
-    The check compares the checksums of all pages (SQLite) and runs the engine's own check. Every
-    row must belong to an object, be in order, and lie in the grid and in its object's bounds. A
-    brick must hold a voxel, and none outside the grid. Every object must have its number of voxels,
-    and its rows the checksum that was written with them; so must its distances, if it has any, and
-    every brick that holds a voxel of it must have distances. The log of changes must have no gaps
-    and agree with the objects. Rows are read in batches, so memory does not grow with their number.
+    The check runs the engine's own check of its structure. Every row must belong to an object, be
+    in order, and lie in the grid and in its object's bounds. A brick must hold a voxel, and none
+    outside the grid. Every object must have its number of voxels, and its rows the checksum that
+    was written with them; so must its distances, if it has any, and every brick that holds a voxel
+    of it must have distances. The log of changes must have no gaps and agree with the objects. Rows
+    are read in batches, so memory does not grow with their number.
 
     Parameters
     ----------
@@ -113,8 +110,6 @@ def check_environment(
         When the environment cannot be read for another reason than damage.
     """
     report = CheckReport(os.fspath(url))
-    for finding in findings_before_opening(url):
-        report.add(finding)
     try:
         with closing(open_store(url, read_only=True)) as store:
             report.url = store.url
@@ -127,7 +122,6 @@ def check_environment(
 def _check(store: Store, report: CheckReport, progress: CheckCallback | None) -> None:
     with store.snapshot():
         checker = store.checker()
-        report.has_page_checksums = checker.has_page_checksums()
         try:
             for finding in checker.findings():
                 report.add(finding)

@@ -27,7 +27,7 @@ def test_info_json_has_the_documented_keys(run: Run, scene: Scene) -> None:
     found = json.loads(out)
     assert list(found) == [
         *("name", "engine", "voxel_size", "bits", "origin", "curve", "layout"),
-        *("objects", "scene", "voxels", "rows", "bytes", "distances", "page_checksums"),
+        *("objects", "scene", "voxels", "rows", "bytes", "distances"),
         *("standby", "fit", "statistics"),
     ]
     with hapticdb.open(scene, read_only=True) as env:

@@ -209,6 +209,14 @@ def test_a_quaternion_without_unit_length_is_refused() -> None:
         unpack_hand(pack_hand(bad))
 
 
+def test_a_length_of_a_text_is_not_trusted() -> None:
+    message = bytearray(pack_wish(ProxyWish("abc")))
+    for length in (0, 2, 4, 1 << 20, 0xFFFFFFFF):
+        struct.pack_into("<I", message, LAYOUT.size, length)
+        with pytest.raises(ProtocolError, match="not those of its fields"):
+            unpack_wish(bytes(message))
+
+
 def test_another_kind_is_refused() -> None:
-    with pytest.raises(ProtocolError, match="where a proxy must come"):
+    with pytest.raises(ProtocolError, match="where PROXY must come"):
         unpack_proxy(pack_wish(ProxyWish()))

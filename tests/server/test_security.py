@@ -102,10 +102,10 @@ def test_figures_need_a_token_or_this_machine(server: Running) -> None:
 def test_open_connections_of_devices_are_counted(server: Running) -> None:
     def is_counted(number: str) -> bool:
         text = server.ask("/metrics")[1].decode()
-        return f'hapticdb_devices{{endpoint="cells"}} {number}\n' in text
+        return f"hapticdb_devices {number}\n" in text
 
     shown = {"Authorization": f"Bearer a-token-for-{Role.TOUCHER.word}"}
-    address = f"ws://{server.place}{server.prefix}/device/cells"
+    address = f"ws://{server.place}{server.prefix}/device/contacts"
     with connect(address, additional_headers=shown, proxy=None, compression=None):
         until(lambda: is_counted("1.0"))
     until(lambda: is_counted("0.0"))

@@ -9,15 +9,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from websockets.sync.client import connect
+from websockets.exceptions import ConnectionClosed
+from websockets.sync.client import ClientConnection, connect
 
-import hapticdb
 from children import PATIENCE, finished
-from hapticdb.errors import AccessError, FileError
+from hapticdb.client.opening import open_websocket, parse_address
+from hapticdb.errors import AccessError, ConnectionLostError, FileError
 from hapticdb.server.access import Role
 from hapticdb.server.running import Serving
 from hapticdb.server.transports import StrictWebSocket
-from hapticdb.store.remote.store import RemoteStore
 from serving import CAMERA, PROTOCOL, TOKENS, Running, running, sent, text_until, urls
 
 TOKEN = "a-token-for-toucher"  # noqa: S105
@@ -43,9 +43,12 @@ def made_certificate(folder: Path, name: str) -> tuple[str, str]:
 def served(environment: Path, certificate: tuple[str, str] | None) -> Serving:
     cert, key = certificate or (None, None)
     return Serving(
-        urls(environment), tokens=TOKENS, certificate=cert, key=key, page="viser_page:work",
-        awaits_devices=True,
-    )  # fmt: skip
+        urls(environment), tokens=TOKENS, certificate=cert, key=key, page="viser_page:work"
+    )
+
+
+def device(url: str) -> ClientConnection:
+    return open_websocket(parse_address(url), PATIENCE)
 
 
 @pytest.fixture(scope="module")
@@ -59,26 +62,25 @@ def test_every_connection_of_many_is_answered(
     secure: Running, certificate: tuple[str, str]
 ) -> None:
     """With tickets after the handshake, a few in a hundred were not."""
-    url = f"wss://{secure.place}?token={TOKEN}&ca={certificate[0]}"
     for _ in range(150):
-        with hapticdb.open(url, read_only=True) as env:
-            assert env.grid.bits == 6
+        with device(f"wss://{secure.place}?token={TOKEN}&ca={certificate[0]}") as link:
+            link.send("text")
+            with pytest.raises(ConnectionClosed):
+                link.recv(PATIENCE)
+            assert link.close_code == 4400
 
 
 def test_a_client_trusts_the_file_that_it_is_given(
     secure: Running, certificate: tuple[str, str]
 ) -> None:
-    url = f"wss://{secure.place}?token={TOKEN}&ca={certificate[0]}"
-    with hapticdb.open(url, read_only=True) as env:
-        assert env.objects() == []
+    device(f"wss://{secure.place}?token={TOKEN}&ca={certificate[0]}").close()
 
 
 def test_a_client_trusts_what_ssl_cert_file_names(
     secure: Running, certificate: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SSL_CERT_FILE", certificate[0])
-    with hapticdb.open(f"wss://{secure.place}?token={TOKEN}", read_only=True) as env:
-        assert env.objects() == []
+    device(f"wss://{secure.place}?token={TOKEN}").close()
 
 
 def test_a_stranger_is_not_trusted_and_gets_no_token(
@@ -89,7 +91,7 @@ def test_a_stranger_is_not_trusted_and_gets_no_token(
     other, _ = made_certificate(tmp_path, "IP:127.0.0.1")
     for untrusted in (url, f"{url}&ca={other}"):
         with pytest.raises(AccessError, match=r"certificate is not trusted.*\?ca=FILE") as told:
-            hapticdb.open(untrusted, read_only=True)
+            device(untrusted)
         assert TOKEN not in str(told.value)
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
@@ -98,9 +100,9 @@ def test_a_stranger_is_not_trusted_and_gets_no_token(
         running(served(environment, named)) as found,
         pytest.raises(AccessError, match="certificate is not trusted"),
     ):
-        hapticdb.open(f"wss://{found.place}?token={TOKEN}&ca={named[0]}", read_only=True)
+        device(f"wss://{found.place}?token={TOKEN}&ca={named[0]}")
     with pytest.raises(FileError, match="no file of certificates"):
-        hapticdb.open(f"{url}&ca={certificate[0]}.none", read_only=True)
+        device(f"{url}&ca={certificate[0]}.none")
 
 
 def test_a_browser_uses_the_page_over_tls(secure: Running, certificate: tuple[str, str]) -> None:
@@ -120,8 +122,8 @@ def test_a_browser_uses_the_page_over_tls(secure: Running, certificate: tuple[st
 
 
 def test_a_client_without_tls_gets_no_further(secure: Running) -> None:
-    with pytest.raises(hapticdb.HapticDBError, match="cannot be reached"):
-        hapticdb.open(f"ws://{secure.place}?token={TOKEN}", read_only=True)
+    with pytest.raises(ConnectionLostError, match="cannot be reached"):
+        device(f"ws://{secure.place}?token={TOKEN}")
 
 
 @pytest.mark.parametrize("is_secure", [False, True])
@@ -145,9 +147,7 @@ def test_small_messages_leave_at_once_and_uncompressed(
     scheme = "wss" if is_secure else "ws"
     trust = ssl.create_default_context(cafile=certificate[0]) if is_secure else None
     with running(served(environment, certificate if is_secure else None)) as found:
-        with closing(RemoteStore(f"{scheme}://{found.place}{query}")) as store:
-            link = store._connection._link
-            assert link is not None
+        with device(f"{scheme}://{found.place}{query}") as link:
             assert link.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
             assert link.request is not None
             assert "Sec-WebSocket-Extensions" not in link.request.headers
@@ -155,7 +155,7 @@ def test_small_messages_leave_at_once_and_uncompressed(
         shown = {"Authorization": f"Bearer {TOKEN}"}
         page = shown | {"Origin": f"{scheme.replace('ws', 'http')}://{found.place}"}
         for path, headers, protocols in (
-            ("/device/cells", shown, None),
+            ("/device/contacts", shown, None),
             ("/", page, PROTOCOL),
         ):
             with connect(
@@ -175,4 +175,4 @@ def test_over_tls_too_a_device_needs_the_right(
 ) -> None:
     token = f"&token=a-token-for-{role.word}" if role else ""
     with pytest.raises(AccessError, match="does not let this client in"):
-        hapticdb.open(f"wss://{secure.place}?ca={certificate[0]}{token}", read_only=True)
+        device(f"wss://{secure.place}?ca={certificate[0]}{token}")

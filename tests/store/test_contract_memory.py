@@ -29,7 +29,7 @@ class TestMemoryStore(StoreContract):
 
 @pytest.mark.usefixtures("toy_is_installed")
 class TestMemoryEngine(EngineContract):
-    lacks = frozenset({"grant", "backup", "first findings"})
+    lacks = frozenset({"grant", "backup"})
 
     def url(self) -> str:
         return new_url("engine")

@@ -18,9 +18,8 @@ from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import PATIENCE, child, exit_code
 from hapticdb import Grid
 from hapticdb.store.base import Layout, Store
+from hapticdb.store.connect import backup_environment
 from hapticdb.store.schema import FORMAT_VERSION
-from hapticdb.store.sqlite.migrations import CHECKED_VERSION
-from hapticdb.store.sqlite.pages import LAYER
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import (
     EngineContract,
@@ -30,7 +29,7 @@ from hapticdb.testing import (
     with_distances,
     write_voxels,
 )
-from old_formats import make_old
+from old_formats import give_checksums, make_old
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 
@@ -72,9 +71,7 @@ def path(tmp_path: Path) -> Path:
 def test_the_file_is_marked_as_ours(path: Path) -> None:
     with closing(sqlite3.connect(path)) as plain, plain:
         assert plain.execute("PRAGMA application_id").fetchone() == (0x48415054,)
-        assert plain.execute("PRAGMA user_version").fetchone() == (
-            CHECKED_VERSION + FORMAT_VERSION,
-        )
+        assert version_of(path) == FORMAT_VERSION
         assert plain.execute("PRAGMA journal_mode").fetchone() == ("wal",)
 
 
@@ -91,6 +88,29 @@ def test_a_file_of_format_1_has_no_distances_until_somebody_writes_some(path: Pa
             assert not writer.wants_distances
             writer.add(replace(obj, name="blob"), rows)
         assert len(reader.scan(*everywhere, distances=True)) == len(rows)
+
+
+def test_a_file_whose_pages_had_checksums_is_read_copied_and_written(
+    path: Path, tmp_path: Path
+) -> None:
+    give_checksums(path)
+    everywhere = np.array([0]), np.array([2**62])
+    copy = tmp_path / "copy.db"
+    backup_environment(path, copy)
+    with closing(SQLiteStore.open(path, read_only=True)) as reader:
+        rows = reader.scan(*everywhere)
+    assert version_of(path) == 1000 + FORMAT_VERSION
+    for file in (path, copy):
+        with closing(SQLiteStore.open(file)) as writer:
+            np.testing.assert_array_equal(writer.scan(*everywhere).keys, rows.keys)
+            write_voxels(writer, blob(1, (20, 20, 20)), "blob")
+        assert version_of(file) == 2000 + FORMAT_VERSION  # what wrote checksums refuses it
+        assert hapticdb.check_environment(file).findings == []
+
+
+def version_of(path: Path) -> int:
+    with closing(sqlite3.connect(path)) as plain:
+        return int(plain.execute("PRAGMA user_version").fetchone()[0])
 
 
 def test_creating_never_replaces_a_file(path: Path) -> None:
@@ -113,7 +133,7 @@ def write_other_database(path: Path) -> None:
 
 def write_newer_version(path: Path) -> None:
     with closing(sqlite3.connect(path)) as plain, plain:
-        plain.execute(f"PRAGMA user_version = {CHECKED_VERSION + FORMAT_VERSION + 1}")
+        plain.execute(f"PRAGMA user_version = {FORMAT_VERSION + 1}")
 
 
 def cut_off(path: Path) -> None:
@@ -125,7 +145,7 @@ def cut_header(path: Path) -> None:
 
 
 def drop_table(path: Path) -> None:
-    with closing(apsw.Connection(str(path), vfs=LAYER)) as connection:
+    with closing(apsw.Connection(str(path))) as connection:
         connection.execute("DROP TABLE environment")
 
 

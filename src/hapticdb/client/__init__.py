@@ -1,4 +1,4 @@
-"""Devices on another machine: mirrors of cells, and contact proxies."""
+"""Devices on another machine: contact proxies."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -1,13 +1,12 @@
 """ContactLink: one connection to a server's contact endpoint, its opening and its messages."""
 
-import logging
 import socket
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
+from hapticdb.client.opening import open_websocket, parse_address
 from hapticdb.errors import (
     ConnectionLostError,
-    MissingExtraError,
     ProtocolError,
     UsageError,
 )
@@ -21,20 +20,13 @@ from hapticdb.protocol.contacts import (
     unpack_proxy,
     unpack_terms,
 )
-from hapticdb.store.urls import CONTACTS, parse_address
 
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
-LARGEST = 4096
-"""Bytes of the largest message that is accepted. Larger: a wrong server may cost more memory."""
 GRANTED_WITHIN = 60.0
 """Seconds in which a server that has answered must grant a tool: the first client's cells and tools
 are made then. Larger: a server that hangs is noticed later."""
-PING_EVERY, PING_PATIENCE = 2.0, 10.0
-"""Seconds between two pings, and until an answer must come; then the connection counts as lost.
-Larger: a server that is frozen is noticed later, and a busy one is kept. The force waits for
-neither."""
 
 
 class ContactLink:
@@ -93,21 +85,7 @@ def connect(url: str, wish: ProxyWish, patience: float) -> ContactLink:
     EnvironmentNotFoundError
         If another server answers there.
     """
-    address = parse_address(url, CONTACTS)
-    try:
-        from hapticdb.protocol.opening import open_websocket  # noqa: PLC0415 - an extra
-    except ImportError:
-        raise MissingExtraError(
-            "the package websockets is missing: pip install 'hapticdb[client]'"
-        ) from None
-    quiet = logging.getLogger("hapticdb.client.websockets")
-    quiet.setLevel(logging.CRITICAL)  # every failure is raised, or is `ContactProxy.error`
-    connection = open_websocket(
-        address.endpoint, token=address.token, trust=address.trust(), shown=address.shown,
-        max_size=LARGEST, max_queue=None, open_timeout=patience, close_timeout=1.0,
-        ping_interval=PING_EVERY, ping_timeout=PING_PATIENCE,
-        logger=quiet,
-    )  # fmt: skip
+    connection = open_websocket(parse_address(url), patience)
     try:
         _send(connection, pack_wish(wish))
         return ContactLink(connection, unpack_terms(_received(connection, GRANTED_WITHIN)))

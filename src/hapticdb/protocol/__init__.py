@@ -1,1 +1,1 @@
-"""Messages between a server and its clients, to the byte."""
+"""Messages between a server and devices on other machines, to the byte."""

@@ -4,6 +4,7 @@ All numbers are little-endian. Each message is checked as it is read: its length
 what its fields need, every number must be finite, and quaternions must have unit length.
 """
 
+import struct
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -11,13 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import ProtocolError
-from hapticdb.protocol.fields import FieldsRead, FieldsWritten
-from hapticdb.protocol.header import NO_REVISION, Kind, MessageHeader, header_of
+from hapticdb.protocol.header import LAYOUT, Kind, MessageHeader, header_of
 
 Floats = NDArray[np.float64]
 
-HAND_KIND, PROXY_KIND = 128, 129
-"""Kinds of the two messages that are sent again and again."""
 IS_OPEN, IS_LOOSE, IS_WAITING = 1, 2, 4
 """Flags. Of a hand: the clutch is open, so nothing is felt. Of a proxy: the tool lies in something,
 and feels nothing until it is free; the cells near the tool are not in memory yet."""
@@ -177,38 +175,26 @@ class ProxyState:
 
 def pack_wish(wish: ProxyWish) -> bytes:
     """Bytes of a client's HELLO."""
-    body = FieldsWritten().text(wish.tool)
-    body.f8(wish.stiffness, wish.turn_stiffness, wish.cap, wish.turn_cap)
-    return MessageHeader(Kind.HELLO).packed() + body.joined()
+    return _packed(Kind.HELLO, *wish)
 
 
 def unpack_wish(message: bytes) -> ProxyWish:
     """Read a client's HELLO; ProtocolError if it is malformed."""
-    _expect(message, Kind.HELLO, "HELLO")
-    fields = FieldsRead(message)
-    tool = fields.text()
+    tool, numbers = _unpacked(message, Kind.HELLO, 4)
     if len(tool.encode()) > MOST_NAME:
         raise ProtocolError(f"a tool's name of more than {MOST_NAME} bytes")
-    numbers = [fields.f8() for _ in range(4)]
-    fields.end()
     _check_range("a spring", np.array(numbers), 0.0)
     return ProxyWish(tool, *numbers)
 
 
 def pack_terms(terms: ProxyTerms) -> bytes:
     """Bytes of the server's WELCOME."""
-    body = FieldsWritten().text(terms.tool).f8(*terms.center).f8(*terms[2:])
-    return MessageHeader(Kind.WELCOME).packed() + body.joined()
+    return _packed(Kind.WELCOME, terms.tool, *terms.center, *terms[2:])
 
 
 def unpack_terms(message: bytes) -> ProxyTerms:
     """Read the server's WELCOME; ProtocolError if it is malformed."""
-    _expect(message, Kind.WELCOME, "WELCOME")
-    fields = FieldsRead(message)
-    tool = fields.text()
-    x, y, z = (fields.f8() for _ in range(3))
-    numbers = [fields.f8() for _ in range(9)]
-    fields.end()
+    tool, (x, y, z, *numbers) = _unpacked(message, Kind.WELCOME, 12)
     _check_range("a centre", np.array([x, y, z]))
     for name, number in zip(ProxyTerms._fields[2:], numbers, strict=True):
         most = STIFFEST if name == "contact" else FARTHEST
@@ -225,15 +211,14 @@ def pack_hand(hand: HandState) -> bytes:
     body["clock"], body["position"], body["quaternion"] = hand.clock, hand.position, hand.quaternion
     body["velocity"], body["buttons"], body["seen"] = hand.velocity, hand.buttons, hand.seen
     body["flags"] = IS_OPEN if hand.is_open else 0
-    return MessageHeader(HAND_KIND, hand.sequence, NO_REVISION).packed() + body.tobytes()
+    return MessageHeader(Kind.HAND, hand.sequence).packed() + body.tobytes()
 
 
 def unpack_hand(message: bytes) -> HandState:
     """Read a hand's message; ProtocolError if it is malformed."""
-    header = _expect(message, HAND_KIND, "a hand")
-    data = FieldsRead(message)
-    body = np.frombuffer(data.take(HAND_BODY.itemsize), HAND_BODY)[0]
-    data.end()
+    header, body, rest = _parts(message, Kind.HAND, HAND_BODY)
+    if rest:
+        raise ProtocolError(f"a message with {len(rest)} bytes after its last field")
     position, velocity = body["position"].copy(), body["velocity"].astype(np.float64)
     _check_range("a hand", np.concatenate([position, velocity]))
     if not np.isfinite(body["clock"]):
@@ -251,20 +236,19 @@ def pack_proxy(proxy: ProxyState) -> bytes:
         if name not in ("n_planes", "stiffness"):
             body[name] = getattr(proxy, name)
     body["n_planes"], body["stiffness"] = len(proxy.planes), proxy.stiffness[LOWER]
-    header = MessageHeader(PROXY_KIND, proxy.sequence, proxy.revision)
+    header = MessageHeader(Kind.PROXY, proxy.sequence, proxy.revision)
     return header.packed() + body.tobytes() + proxy.planes.tobytes()
 
 
 def unpack_proxy(message: bytes) -> ProxyState:
     """Read a proxy's message; ProtocolError if it is malformed."""
-    header = _expect(message, PROXY_KIND, "a proxy")
-    data = FieldsRead(message)
-    body = np.frombuffer(data.take(PROXY_BODY.itemsize), PROXY_BODY)[0]
+    header, body, rest = _parts(message, Kind.PROXY, PROXY_BODY)
     n_planes = int(body["n_planes"])
     if n_planes > MOST_PLANES:
         raise ProtocolError(f"a proxy of {n_planes} planes: at most {MOST_PLANES} may be sent")
-    planes = np.frombuffer(data.take(n_planes * PLANE.itemsize), PLANE).copy()
-    data.end()
+    if len(rest) != n_planes * PLANE.itemsize:
+        raise ProtocolError(f"a proxy of {n_planes} planes in {len(rest)} bytes")
+    planes = np.frombuffer(rest, PLANE).copy()
     wrench, lower = body["wrench"].astype(np.float64), body["stiffness"].astype(np.float64)
     offset = body["tool_offset"].astype(np.float64)
     position = body["position"].copy()
@@ -285,10 +269,42 @@ def unpack_proxy(message: bytes) -> ProxyState:
     )  # fmt: skip
 
 
-def _expect(message: bytes, kind: int, name: str) -> MessageHeader:
+def _packed(kind: Kind, text: str, *numbers: float) -> bytes:
+    """Bytes of a message of one text and some numbers."""
+    data = text.encode("utf-8", "replace")
+    body = struct.pack(f"<I{len(data)}s{len(numbers)}d", len(data), data, *numbers)
+    return MessageHeader(kind).packed() + body
+
+
+def _unpacked(message: bytes, kind: Kind, count: int) -> tuple[str, list[float]]:
+    """Read a message of one text and so many numbers."""
+    _expect(message, kind)
+    start = LAYOUT.size + 4
+    end = len(message) - 8 * count
+    if end < start or struct.unpack_from("<I", message, LAYOUT.size) != (end - start,):
+        raise ProtocolError(f"a message of {len(message)} bytes, which are not those of its fields")
+    try:
+        text = message[start:end].decode()
+    except UnicodeDecodeError:
+        raise ProtocolError("a text that is no UTF-8") from None
+    return text, list(struct.unpack_from(f"<{count}d", message, end))
+
+
+def _parts(
+    message: bytes, kind: Kind, layout: np.dtype[np.void]
+) -> tuple[MessageHeader, np.void, bytes]:
+    """Header and body of a message, and the bytes behind them."""
+    header = _expect(message, kind)
+    end = LAYOUT.size + layout.itemsize
+    if len(message) < end:
+        raise ProtocolError(f"a message that ends after {len(message)} bytes, inside a field")
+    return header, np.frombuffer(message, layout, 1, LAYOUT.size)[0], message[end:]
+
+
+def _expect(message: bytes, kind: Kind) -> MessageHeader:
     header = header_of(message)
     if header.kind != kind:
-        raise ProtocolError(f"a message of kind {header.kind}, where {name} must come")
+        raise ProtocolError(f"a message of kind {header.kind}, where {kind.name} must come")
     return header
 
 

@@ -18,7 +18,6 @@ from hapticdb.realtime.object_names import ObjectAnswers
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.tracking import SessionTracker
 from hapticdb.realtime.wishes import Motion, Wish
-from hapticdb.resident.pushing import SupportsPush
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
     AWAY,
@@ -203,9 +202,6 @@ class Fetcher:
         is_watched = isinstance(self.store, SupportsWatch)
         if isinstance(self.store, SupportsWatch) and self.store.has_changed():
             return True
-        if isinstance(self.store, SupportsPush) and self.store.is_beating():
-            self._is_confirmed = True  # a query would only hold up what is pushed next
-            return False
         if self._now - self._confirmed_at < (CONFIRM_EVERY if is_watched else POLL_EVERY):
             return False
         self._is_confirmed = True

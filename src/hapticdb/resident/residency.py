@@ -293,7 +293,7 @@ class Residency:
         """Update the known cells in one snapshot; in a second one if the first was outdated."""
         try:
             return self._follow_once(asked)
-        except OutdatedError:  # what a server had pushed was not the newest any more
+        except OutdatedError:
             self.writer.slots.free_lost()
             return self._follow_once(asked)
 

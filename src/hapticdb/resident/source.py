@@ -13,7 +13,6 @@ from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.query.grouping import group_spans
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.resident.costs import costs_at_start
-from hapticdb.resident.pushing import SupportsPush
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import (
     BRICK_SHIFT,
@@ -79,11 +78,8 @@ class CellSource:
         highs = ((on_curve + 1) << (CELL_SHIFT - shift)) - 1
         words, masks, payload = table.cells.words, table.cells.masks, table.cells.payload
         costs = self._costs if payload is None else self._costs.with_distances
-        rows, n_ranges = self._pushed_rows(on_curve, distances=payload is not None), 0
-        if rows is None:
-            ranges = group_spans(lows, highs, self._quantiles, costs)
-            n_ranges = len(ranges.lows)
-            rows = self.store.scan(*ranges, distances=payload is not None)
+        ranges = group_spans(lows, highs, self._quantiles, costs)
+        rows = self.store.scan(*ranges, distances=payload is not None)
         words[slots] = 0
         masks[slots] = 0
         kernels.fill_cells(
@@ -93,13 +89,7 @@ class CellSource:
         if payload is not None:
             self._fill_distances(rows, on_curve, slots[order], payload, masks)
             mark_near_voxels(slots, payload, masks, words, table.cells.near)
-        return CellsRead(masks[slots] == 0, len(rows), n_ranges)
-
-    def _pushed_rows(self, on_curve: Keys, *, distances: bool) -> Rows | None:
-        """Rows that a server has sent without being asked; None if there are none."""
-        if not isinstance(self.store, SupportsPush):
-            return None
-        return self.store.pushed_rows(on_curve, distances=distances)
+        return CellsRead(masks[slots] == 0, len(rows), len(ranges.lows))
 
     def _fill_distances(
         self,

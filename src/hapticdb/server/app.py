@@ -2,8 +2,6 @@
 
 import asyncio
 import logging
-from collections.abc import Awaitable, Callable
-from importlib import import_module
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -13,6 +11,7 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from hapticdb.server.client_page import ClientPage
+from hapticdb.server.contacts.serving import ServedContacts
 from hapticdb.server.guards import Guards
 from hapticdb.server.health import Doctor
 from hapticdb.server.relay import Relay
@@ -24,11 +23,6 @@ LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 """Addresses of this machine; a request that came by a proxy has the proxy's client instead."""
 FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "via")
 """Headers by which proxies tell that they passed a request on."""
-DEVICES: dict[str, str] = {
-    "/device/cells": "hapticdb.server.cells.endpoint:serve_cells",
-    "/device/contacts": "hapticdb.server.contacts.serving:serve_contacts",
-}
-"""Endpoints of devices: path -> ``module:function`` that gets a WebSocket."""
 
 
 def application(
@@ -69,35 +63,24 @@ def application(
         text = await asyncio.to_thread(served.figures.text)  # sessions may be beginning
         return Response(text, media_type="text/plain; version=0.0.4")
 
-    devices = [
-        WebSocketRoute(path, _counted(path, place, served)) for path, place in DEVICES.items()
-    ]
+    contacts = ServedContacts(served)
+
+    async def device(websocket: WebSocket) -> None:
+        with served.figures.devices.track_inprogress():
+            await contacts.serve(websocket)
+
     routes: list[BaseRoute] = [
         Route("/", door.view, methods=["GET"]),
         Route("/sign-in", door.sign_in, methods=["POST"]),
         Route("/healthz", healthz, methods=["GET"]),
         Route("/metrics", metrics, methods=["GET"]),
         WebSocketRoute("/", relay.browser),
-        *devices,
+        WebSocketRoute("/device/contacts", device),
     ]
     # viser's client leaves out the last slash of the page's address
     bare: list[BaseRoute] = [WebSocketRoute(prefix, relay.browser)] if prefix else []
     app = Starlette(routes=[*bare, Mount(prefix, routes=routes)] if prefix else routes)
-    app.state.served = served
     return Guards(app, host_names)
-
-
-def _counted(path: str, place: str, served: Served) -> Callable[[WebSocket], Awaitable[None]]:
-    """Endpoint of devices whose open connections are counted."""
-    module, name = place.split(":")
-    serve = getattr(import_module(module), name)
-    connected = served.figures.devices.labels(path.rpartition("/")[2])
-
-    async def attend(websocket: WebSocket) -> None:
-        with connected.track_inprogress():
-            await serve(websocket)
-
-    return attend
 
 
 def _may_read_figures(request: Request, served: Served) -> bool:

@@ -24,7 +24,6 @@ class Figures:
         self.devices = Gauge(
             "hapticdb_devices",
             "Connections of devices that are open, those that still ask among them.",
-            ["endpoint"],
             registry=self.registry,
         )
         self.messages = Counter(

@@ -1,4 +1,4 @@
-"""What the endpoints of one server share."""
+"""What the parts of one server share."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from hapticdb.server.limits import Limits
 
 @dataclass(frozen=True)
 class Served:
-    """An environment as one server offers it; endpoints find it as ``app.state.served``.
+    """An environment as one server offers it.
 
     Attributes
     ----------

@@ -467,9 +467,6 @@ class SupportsServer(Protocol):
 class Checker(Protocol):
     """Answers of an engine for `hapticdb check`: pages, indexes, and all rows in their order."""
 
-    def has_page_checksums(self) -> bool:
-        """Whether pages carry checksums that are compared when they are read."""
-
     def findings(self) -> Iterator[str]:
         """What is wrong with pages, indexes and kept statistics, a line each."""
 

@@ -15,7 +15,6 @@ from hapticdb.store.engines import (
     Engine,
     Right,
     SupportsBackup,
-    SupportsFirstFindings,
     SupportsGrant,
     Url,
     engine_of,
@@ -29,7 +28,6 @@ __all__ = [
     "check_curve",
     "create_store",
     "exists",
-    "findings_before_opening",
     "grant",
     "name_of",
     "open_store",
@@ -60,14 +58,6 @@ def create_store(
 def exists(url: Url) -> bool:
     """Whether something is there already, an environment or not."""
     return engine_of(url).exists(os.fspath(url))
-
-
-def findings_before_opening(url: Url) -> list[str]:
-    """Damage that can be found without opening an environment; a line each."""
-    engine = engine_of(url)
-    if not isinstance(engine, SupportsFirstFindings):
-        return []
-    return engine.findings_before_opening(os.fspath(url))
 
 
 def beside(url: Url, name: str) -> str:

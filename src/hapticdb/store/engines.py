@@ -133,14 +133,6 @@ class SupportsBackup(Protocol):
         """Put a copy in an environment's place, whole or not at all."""
 
 
-@runtime_checkable
-class SupportsFirstFindings(Protocol):
-    """An engine that finds damage in an environment that may not even open."""
-
-    def findings_before_opening(self, url: str) -> list[str]:
-        """What is wrong, a line each."""
-
-
 class BuiltIn(NamedTuple):
     """An engine of this package, not imported yet.
 
@@ -156,13 +148,10 @@ class BuiltIn(NamedTuple):
 FILE_SCHEME = "sqlite"
 """The engine of paths, which have no scheme."""
 POSTGRES = BuiltIn("hapticdb.store.postgres.engine", "psycopg", "hapticdb[postgres]")
-SERVER = BuiltIn("hapticdb.store.remote.engine", "websockets", "hapticdb[client]")
 BUILT_IN = {
     FILE_SCHEME: BuiltIn("hapticdb.store.sqlite.engine"),
     "postgresql": POSTGRES,
     "postgres": POSTGRES,
-    "ws": SERVER,
-    "wss": SERVER,
 }
 
 
@@ -203,6 +192,5 @@ def _installed(scheme: str) -> Engine:
 def unknown_scheme(scheme: str) -> UsageError:
     """Build the error for a URL that no engine opens."""
     return UsageError(
-        f"scheme {scheme!r}: give a path, sqlite:///path, postgresql://host/database, "
-        "or ws://host:port"
+        f"scheme {scheme!r}: give a path, sqlite:///path or postgresql://host/database"
     )

@@ -16,7 +16,6 @@ from hapticdb.store.connect import backup_environment, grant, open_store, restor
 from hapticdb.store.engines import (
     Engine,
     SupportsBackup,
-    SupportsFirstFindings,
     SupportsGrant,
     engine_of,
 )
@@ -30,7 +29,6 @@ from hapticdb.testing.scenes import (
 ENGINE_CAPABILITIES: dict[str, Any] = {
     "grant": SupportsGrant,
     "backup": SupportsBackup,
-    "first findings": SupportsFirstFindings,
 }
 """Capabilities that only some engines have, by their names in `EngineContract.lacks`."""
 
@@ -164,10 +162,3 @@ class EngineContract:
             for found, wanted in zip(everything(store), expected, strict=True):
                 np.testing.assert_array_equal(found, wanted)
             store.close()
-
-    def test_a_sound_environment_has_no_findings_before_it_is_opened(self) -> None:
-        """Each engine has its own kinds of damage, so its own tests make some."""
-        self.need("first findings")
-        engine = self.engine()
-        assert isinstance(engine, SupportsFirstFindings)
-        assert engine.findings_before_opening(self.make()) == []

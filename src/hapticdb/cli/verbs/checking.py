@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 def check(url: UrlArgument, *, json: JsonOption = False) -> None:
     """Read all of an environment and say what is wrong with it, a line each.
 
-    Pages, rows, objects and the log of changes are compared. The exit code
+    The structure, rows, objects and the log of changes are compared. The exit code
     is 0 when it is sound, 1 when it is damaged, 2 when it cannot be read.
 
     Example: hapticdb check car.db
@@ -49,10 +49,9 @@ def _summary(report: "CheckReport") -> str:
         f"{report.url} is sound: {render.counted(report.objects, 'object')}, "
         f"{render.counted(report.voxels, 'voxel')}, {render.counted(report.rows, 'row')}"
     )
-    if not report.has_page_checksums:
-        line += "; its pages carry no checksums"
     if report.without_row_checksums:
-        line += f"; {render.counted(report.without_row_checksums, 'object')} without checksums"
-    if not report.has_page_checksums or report.without_row_checksums:
-        line += ": 'hapticdb copy' makes an environment that has them"
+        line += (
+            f"; {render.counted(report.without_row_checksums, 'object')} without checksums: "
+            "'hapticdb copy' makes an environment that has them"
+        )
     return line

@@ -41,7 +41,6 @@ SOURCES = {
     "computed": "computed when needed",
 }
 """Where the statistics of the keys come from, in words."""
-NO_CHECKSUMS = "none of pages; 'hapticdb copy' makes an environment that has them"
 
 NameOption = Annotated[
     list[str] | None,
@@ -89,7 +88,6 @@ def info(url: UrlArgument, *, json: JsonOption = False) -> None:
         render.show(render.facts(looked_at.facts()))
 
 
-CHECKSUMS = {True: "of pages", False: NO_CHECKSUMS}
 
 
 class _Overview(NamedTuple):
@@ -107,7 +105,6 @@ class _Overview(NamedTuple):
     scene: "NDArray[np.float64] | None"
     freshness: "Freshness"
     source: str
-    has_checksums: bool
     lag: "Lag | None"
 
     @classmethod
@@ -131,7 +128,6 @@ class _Overview(NamedTuple):
             scene=scene_bounds(objects),
             freshness=store.freshness(DEFAULT_RESOLUTION),
             source=QuantileVector.of(store, DEFAULT_RESOLUTION).source,
-            has_checksums=store.checker().has_page_checksums(),
             lag=store.lag() if isinstance(store, MayLag) else None,
         )
 
@@ -176,7 +172,6 @@ class _Overview(NamedTuple):
                 "rows": self.size.band_rows,
                 "bytes": self.size.band_bytes,
             },
-            "page_checksums": self.has_checksums,
             "standby": None if self.lag is None else self.lag._asdict(),
             "fit": None if self.fit is None else self.fit._asdict(),
             "statistics": {"source": self.source, **self.freshness._asdict()},
@@ -205,7 +200,6 @@ class _Overview(NamedTuple):
             ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
             ("distances", self._distances),
             *(self.fit.facts if self.fit is not None else ()),
-            ("checksums", CHECKSUMS[self.has_checksums]),
             ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),
         ]
 

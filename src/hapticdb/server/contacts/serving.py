@@ -119,11 +119,3 @@ def _tools(files: tuple[str, ...], cells: ResidentCells) -> dict[str, PointShell
     bounds = scene_bounds(cells.first_objects)
     diagonal = 0.0 if bounds is None else float(((bounds[1] - bounds[0]) ** 2).sum() ** 0.5)
     return {tool.name: tool.shell for tool in built_in(diagonal, size, smooth=True)}
-
-
-async def serve_contacts(websocket: WebSocket) -> None:
-    """Serve one connection with what the server's application knows: `Served`."""
-    state = websocket.app.state
-    if not hasattr(state, "contacts"):
-        state.contacts = ServedContacts(state.served)
-    await state.contacts.serve(websocket)

@@ -24,10 +24,6 @@ class PostgresChecker:
         self._layout = layout
         self._reader = reader
 
-    def has_page_checksums(self) -> bool:
-        """Whether the server's pages carry checksums."""
-        return self._connection.rows("SHOW data_checksums") == [("on",)]
-
     def findings(self) -> Iterator[str]:
         """What is wrong with kept statistics, a line each."""
         kept = self._connection.rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")

@@ -26,10 +26,10 @@ from hapticdb.errors import (
 from hapticdb.store.engines import BackupCallback, BackupProgress, BackupReport
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
-from hapticdb.store.sqlite import pages as sqlite_pages
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.file import named_errors
-from hapticdb.store.sqlite.migrations import APPLICATION_ID
+from hapticdb.store.sqlite.migrations import APPLICATION_ID, VERSION_UNIT
+from hapticdb.store.sqlite.raw import PAGE_BYTES
 
 STEP_PAGES = 512
 """Pages copied between two reports of progress: 4 MiB. With a larger value the bar jumps."""
@@ -70,11 +70,10 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
         first = b""
         if target.is_file():
             try:
-                first = sqlite_bytes.read_bytes(target, sqlite_pages.PAGE_BYTES)
+                first = sqlite_bytes.read_bytes(target, sqlite_file.HEADER_BYTES)
             except OSError as error:
                 raise ReadOnlyError(f"{target} cannot be read: {error.strerror}") from error
-        is_ours = int.from_bytes(first[68:72], "big") == APPLICATION_ID
-        if not (is_ours or sqlite_pages.is_marked(first)):
+        if int.from_bytes(first[68:72], "big") != APPLICATION_ID:
             raise NotAnEnvironmentError(
                 f"{target} is no hapticdb environment, so it is not replaced; give another path"
             )
@@ -94,12 +93,12 @@ def _copied(source: Path, unfinished: Path, progress: BackupCallback | None) -> 
         ((revision, objects),) = connection.execute(
             "SELECT (SELECT coalesce(max(revision), 0) FROM change), (SELECT count(*) FROM object)"
         ).fetchall()
-        layer = sqlite_file.layer_of(source)
-        with named_errors(str(unfinished)):
-            made = apsw.Connection(str(unfinished), vfs=layer)
-            with contextlib.closing(made):
-                _copy_pages(connection, made, progress, is_checked=layer is not None)
-                _finish(made)
+        with (
+            named_errors(str(unfinished)),
+            contextlib.closing(apsw.Connection(str(unfinished))) as made,
+        ):
+            _copy_pages(connection, made, progress)
+            _finish(made)
         if Path(f"{unfinished}-wal").exists():
             raise DatabaseError(f"{unfinished}-wal could not be folded into the copy: try again")
         file.look()  # the path must still lead to the file that was copied
@@ -109,15 +108,9 @@ def _copied(source: Path, unfinished: Path, progress: BackupCallback | None) -> 
 
 
 def _copy_pages(
-    source: apsw.Connection,
-    made: apsw.Connection,
-    progress: BackupCallback | None,
-    *,
-    is_checked: bool,
+    source: apsw.Connection, made: apsw.Connection, progress: BackupCallback | None
 ) -> None:
-    made.execute(f"PRAGMA page_size = {sqlite_pages.PAGE_BYTES}")
-    if is_checked:
-        made.reserve_bytes(reserve=sqlite_pages.TAIL_BYTES)
+    made.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     made.execute("PRAGMA journal_mode = OFF").fetchall()
     made.execute("PRAGMA synchronous = OFF")  # nobody uses the file yet; `_sync` comes later
     with made.backup("main", source, "main") as copying:
@@ -125,22 +118,21 @@ def _copy_pages(
             copying.step(STEP_PAGES)
             if progress is not None:
                 done = copying.page_count - copying.remaining
-                total = copying.page_count * sqlite_pages.PAGE_BYTES
-                progress(BackupProgress(done * sqlite_pages.PAGE_BYTES, total))
+                progress(BackupProgress(done * PAGE_BYTES, copying.page_count * PAGE_BYTES))
 
 
 def _finish(made: apsw.Connection) -> None:
     """Bring a copy up to date and draw a new mark, so that only its own log can be applied."""
     ((version,),) = made.execute("PRAGMA user_version").fetchall()
-    sqlite_file.migrate(made, sqlite_file.tables_version(int(str(version))))
+    sqlite_file.migrate(made, int(str(version)) % VERSION_UNIT)
+    sqlite_file.leave_checksums(made)
     made.execute("UPDATE environment SET lineage = ?", (sqlite_log.first_lineage(),))
-    if made.vfsname("main") != sqlite_pages.LAYER:  # its pages have no checksums
-        found = made.execute("PRAGMA quick_check(1)").fetchall()
-        if found != [("ok",)]:
-            raise DamagedError(
-                f"what was to be copied is damaged ({found[0][0]}): restore an older copy, "
-                "or import the files again"
-            )
+    found = made.execute("PRAGMA quick_check(1)").fetchall()
+    if found != [("ok",)]:
+        raise DamagedError(
+            f"what was to be copied is damaged ({found[0][0]}): restore an older copy, "
+            "or import the files again"
+        )
     made.wal_checkpoint(mode=apsw.SQLITE_CHECKPOINT_TRUNCATE)
 
 

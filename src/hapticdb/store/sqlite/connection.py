@@ -57,7 +57,7 @@ class FileConnection:
             if self.file.stamp is not None:
                 self.file.check_stamp()
             return self._cursor.execute(sql, bindings).fetchall()
-        except apsw.Error:
+        except (apsw.Error, UnicodeDecodeError):
             with sqlite_file.named_errors(self.url):
                 raise
 

@@ -9,7 +9,6 @@ from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.engines import BackupCallback, BackupReport, Capability, unknown_scheme
-from hapticdb.store.sqlite.checking import first_findings
 from hapticdb.store.sqlite.store import SQLiteStore
 
 PREFIX = "sqlite:///"
@@ -44,10 +43,6 @@ class SQLiteEngine:
     def name_of(self, url: str) -> str:
         """Name of a file without its ending."""
         return path_of(url).stem
-
-    def findings_before_opening(self, url: str) -> list[str]:
-        """What is wrong with a file's pages and its log."""
-        return first_findings(path_of(url))
 
     def back_up(
         self, url: str, copy: str, *, replace: bool, progress: BackupCallback | None

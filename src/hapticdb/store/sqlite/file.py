@@ -20,9 +20,8 @@ from hapticdb.errors import (
     ReadOnlyError,
 )
 from hapticdb.store.schema import FORMAT_VERSION, migrations_after
-from hapticdb.store.sqlite import pages as sqlite_pages
 from hapticdb.store.sqlite import raw as sqlite_bytes
-from hapticdb.store.sqlite.migrations import APPLICATION_ID, CHECKED_VERSION, MIGRATIONS
+from hapticdb.store.sqlite.migrations import APPLICATION_ID, MIGRATIONS, VERSION_UNIT
 from hapticdb.store.sqlite.place import OpenedFile
 
 BUSY_TIMEOUT_MS = 10_000
@@ -39,7 +38,7 @@ def named_errors(path: str) -> Iterator[None]:
     """Turn SQLite's errors into hapticdb's, which say what, where, and what next."""
     try:
         yield
-    except (apsw.CorruptError, apsw.NotADBError, apsw.FormatError) as error:
+    except (apsw.CorruptError, apsw.NotADBError, apsw.FormatError, UnicodeDecodeError) as error:
         raise damaged(path, str(error)) from error
     except (apsw.ReadOnlyError, apsw.PermissionsError) as error:
         raise ReadOnlyError(
@@ -63,7 +62,10 @@ def named_errors(path: str) -> Iterator[None]:
 
 def damaged(path: str, cause: str) -> DamagedError:
     """Build the error for an environment whose contents are broken."""
-    return sqlite_pages.damaged_page(path, cause)
+    return DamagedError(
+        f"{path} is damaged ({cause}): restore a copy with 'hapticdb restore COPY {path}', or "
+        "import the files again"
+    )
 
 
 def check_kind(path: Path) -> None:
@@ -83,21 +85,17 @@ def check_kind(path: Path) -> None:
     if not path.is_file():
         raise NotAnEnvironmentError(f"{path} is not a file, so it is no environment")
     try:
-        first = sqlite_bytes.read_bytes(path, sqlite_pages.PAGE_BYTES)
+        header = sqlite_bytes.read_bytes(path, HEADER_BYTES)
     except OSError as error:
         raise DatabaseError(f"{path} cannot be read: {error.strerror}") from error
-    header = first[:HEADER_BYTES]
-    foreign: DatabaseError = _foreign(path)
-    if sqlite_pages.is_marked(first):
-        foreign = damaged(str(path), "its header is not what was written")
     if not header:
         raise NotAnEnvironmentError(f"{path} is empty; remove it, or give another path")
     if header[:16] != MAGIC[: len(header[:16])]:
-        raise foreign
+        raise _foreign(path)
     if len(header) < HEADER_BYTES:
         raise damaged(str(path), "its header is cut off")
     if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
-        raise foreign
+        raise _foreign(path)
     _check_known(path, int.from_bytes(header[60:64], "big"))
     wal = Path(f"{path.resolve()}-wal")
     if wal.exists() and wal.stat().st_size:
@@ -141,12 +139,10 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
     check_free(path)
     check_folder(path)
     with unfinished_beside(path) as unfinished:
-        made = apsw.Connection(str(unfinished), vfs=sqlite_pages.LAYER)
+        made = apsw.Connection(str(unfinished))
         with named_errors(str(path)), contextlib.closing(made) as new:
-            new.execute(f"PRAGMA page_size = {sqlite_pages.PAGE_BYTES}")
-            new.reserve_bytes(reserve=sqlite_pages.TAIL_BYTES)
+            new.execute(f"PRAGMA page_size = {sqlite_bytes.PAGE_BYTES}")
             new.execute("PRAGMA journal_mode = OFF").fetchall()
-            new.execute(f"PRAGMA user_version = {CHECKED_VERSION}")
             migrate(new, 0)
             fill(new)
             new.execute("PRAGMA journal_mode = WAL").fetchall()
@@ -214,12 +210,12 @@ def migrate(connection: apsw.Connection, version: int) -> None:
     for number, statements, _ in migrations_after(version, MIGRATIONS):
         connection.execute("BEGIN IMMEDIATE")
         try:
-            marked, done = divmod(_pragma(connection, "user_version"), CHECKED_VERSION)
+            marked, done = divmod(_pragma(connection, "user_version"), VERSION_UNIT)
             if done < number:  # else another process was faster
                 for statement in statements:
                     connection.execute(statement)
                 connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-                connection.execute(f"PRAGMA user_version = {marked * CHECKED_VERSION + number}")
+                connection.execute(f"PRAGMA user_version = {marked * VERSION_UNIT + number}")
             connection.execute("COMMIT")
         except BaseException:
             connection.execute("ROLLBACK")
@@ -243,7 +239,6 @@ def _connect_to_read(path: Path) -> apsw.Connection:
     connection = apsw.Connection(
         path.resolve().as_uri() + options,
         flags=apsw.SQLITE_OPEN_READONLY | apsw.SQLITE_OPEN_URI | apsw.SQLITE_OPEN_NOMUTEX,
-        vfs=layer_of(path),
     )
     _settle(connection)
     return connection
@@ -255,19 +250,9 @@ def _connect_to_write(path: Path) -> apsw.Connection:
             f"{path} can only be read: 'hapticdb backup {path} COPY' makes one to write to"
         )
     flags = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_NOMUTEX
-    connection = apsw.Connection(str(path), flags=flags, vfs=layer_of(path))
+    connection = apsw.Connection(str(path), flags=flags)
     _settle(connection)
     return connection
-
-
-def is_checked(path: Path) -> bool:
-    """Whether the pages of a file carry checksums."""
-    return sqlite_pages.is_checked(sqlite_bytes.read_bytes(path, sqlite_pages.PAGE_BYTES))
-
-
-def layer_of(path: Path) -> str | None:
-    """Name of the file system layer through which a file is to be opened."""
-    return sqlite_pages.LAYER if is_checked(path) else None
 
 
 def _pragma(connection: apsw.Connection, name: str) -> int:
@@ -302,6 +287,7 @@ def _bring_up_to_date(
     """Run the migrations that an older file lacks; a reader does not need all of them."""
     if not read_only:
         migrate(connection, version)
+        leave_checksums(connection)
     elif any(step.readers_need_it for step in migrations_after(version, MIGRATIONS)):
         raise ReadOnlyError(
             f"{path} has the older format {version}: open it once to write, "
@@ -309,14 +295,16 @@ def _bring_up_to_date(
         )
 
 
-def tables_version(found: int) -> int:
-    """Version of a file's tables, from its user version."""
-    return found - CHECKED_VERSION if found >= CHECKED_VERSION else found
+def leave_checksums(connection: apsw.Connection) -> None:
+    """Have earlier programs refuse a file whose pages had checksums, since none are written now."""
+    marked, version = divmod(_pragma(connection, "user_version"), VERSION_UNIT)
+    if marked == 1:
+        connection.execute(f"PRAGMA user_version = {2 * VERSION_UNIT + version}")
 
 
 def _check_known(path: Path, found: int) -> int:
     """Version of a file's tables, from its user version; refuses one that is newer."""
-    version = tables_version(found)
+    version = found % VERSION_UNIT
     if version > FORMAT_VERSION:
         raise NewerVersionError(
             f"{path} has format {version}, newer than the {FORMAT_VERSION} known here: "

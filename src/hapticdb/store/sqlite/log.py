@@ -18,14 +18,14 @@ import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticdb.errors import DamagedError
-from hapticdb.store.sqlite import pages as sqlite_pages
 from hapticdb.store.sqlite import raw as sqlite_bytes
-from hapticdb.store.sqlite.pages import FRAME_BYTES, FRAME_HEADER, LOG_HEADER, PAGE_BYTES
+from hapticdb.store.sqlite.raw import PAGE_BYTES
 
 MARK_BYTES = 16
 NO_MARK = bytes(MARK_BYTES)
@@ -45,6 +45,9 @@ BLOB_TYPE = 12
 NUMBER_BYTES = (0, 1, 2, 3, 4, 6, 8, 8, 0, 0)
 """Bytes of a value of each serial type below 10."""
 
+LOG_HEADER = 32
+FRAME_HEADER = 24
+FRAME_BYTES = FRAME_HEADER + PAGE_BYTES
 LOG_MAGIC = 0x377F0682
 """First word of a log. It is 1 more if checksums are computed from big-endian words."""
 SUMS = struct.Struct(">2I")
@@ -223,7 +226,7 @@ class _Log:
             frame = self._read(FRAME_BYTES, at)
             if len(frame) < FRAME_BYTES:
                 return False
-            sums = sqlite_pages.log_checksum(np.frombuffer(frame, self._order), *sums)
+            sums = log_checksum(np.frombuffer(frame, self._order), *sums)
             if sums != SUMS.unpack_from(frame, 16):
                 return False
             is_ours = is_ours or (number == LINEAGE_PAGE and self._lineage(at) is not None)
@@ -234,8 +237,40 @@ class _Log:
 
 def _header_sums(header: bytes, order: str) -> tuple[int, int]:
     """Checksum of a log's header."""
-    s1 = s2 = 0
-    for word, other in np.frombuffer(header[:24], order).reshape(3, 2).tolist():
-        s1 = (s1 + word + s2) & 0xFFFFFFFF
-        s2 = (s2 + other + s1) & 0xFFFFFFFF
+    return words_checksum(np.frombuffer(header[:24], order).tolist(), 0, 0)
+
+
+def log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:
+    """Both sums after a frame's words (2054,), from the sums before the frame, modulo 2^32.
+
+    SQLite adds the page's number and size and then its content, word after word: s1 += word + s2,
+    s2 += the next + s1. Both are linear in the words, with Fibonacci's numbers for weights.
+    """
+    s1, s2 = words_checksum(frame[:2].tolist(), s1, s2)
+    page = frame[6:].astype(np.uint32, copy=False)
+    return (
+        (int(_WEIGHTS[0].dot(page)) + _PAST[0] * s1 + _PAST[1] * s2) & 0xFFFFFFFF,
+        (int(_WEIGHTS[1].dot(page)) + _PAST[1] * s1 + _PAST[2] * s2) & 0xFFFFFFFF,
+    )
+
+
+def words_checksum(words: list[int], s1: int, s2: int) -> tuple[int, int]:
+    """Both sums after an even number of words, one by one."""
+    for even, odd in zip(words[::2], words[1::2], strict=True):
+        s1 = (s1 + even + s2) & 0xFFFFFFFF
+        s2 = (s2 + odd + s1) & 0xFFFFFFFF
     return s1, s2
+
+
+def _weights() -> tuple[tuple[NDArray[np.uint32], NDArray[np.uint32]], list[int]]:
+    """Weights of a page's words in both sums, and of the sums before the page."""
+    n_words = PAGE_BYTES // 4
+    numbers = [0, 1]
+    while len(numbers) < n_words + 2:
+        numbers.append((numbers[-1] + numbers[-2]) & 0xFFFFFFFF)
+    fibonacci = np.array(numbers, np.uint32)
+    of_words = fibonacci[n_words - 1 :: -1].copy(), fibonacci[n_words:0:-1].copy()
+    return of_words, numbers[n_words - 1 :]
+
+
+_WEIGHTS, _PAST = _weights()

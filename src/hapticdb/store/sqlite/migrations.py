@@ -7,8 +7,10 @@ from hapticdb.store.schema import Dialect
 
 APPLICATION_ID = 0x48415054  # "HAPT"
 """Number in the header of each hapticdb file. Another program's database does not have it."""
-CHECKED_VERSION = 1000
-"""Added to the version of a file with checksums, so that a program that writes none refuses it."""
+VERSION_UNIT = 1000
+"""The version of a file's tables is its `user_version` modulo this. The thousands tell of the
+checksums of pages that earlier programs wrote: 1, all pages have theirs; 2, some are written
+without, so that those programs refuse the file as newer."""
 
 ENVIRONMENT = """
 CREATE TABLE environment (

@@ -14,7 +14,7 @@ import apsw
 from hapticdb.errors import BusyError, ConnectionLostError, DamagedError
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
-from hapticdb.store.sqlite.pages import PAGE_BYTES
+from hapticdb.store.sqlite.raw import PAGE_BYTES
 
 LOOK_SECONDS = 0.25
 """Longest time until a reader notices that its path leads to another file. A smaller value costs
@@ -151,10 +151,8 @@ class OpenedFile:
     def _check_mark(self) -> None:
         if self._connection is None or self.stamp is not None:
             return
-        # read in halves, without the checksum: another process may be writing the page
-        half, at = PAGE_BYTES // 2, sqlite_log.LINEAGE_AT
-        first, second = (self._connection.read("main", 0, at + n * half, half)[1] for n in (0, 1))
-        if (mark := sqlite_log.mark_in(first + second)) != self._mark:
+        _, page = self._connection.read("main", 0, sqlite_log.LINEAGE_AT, PAGE_BYTES)
+        if (mark := sqlite_log.mark_in(page)) != self._mark:
             mark = sqlite_log.check_log(self._real)
             if mark is None:  # the log had a mark before, and a checkpoint keeps it
                 raise sqlite_log.not_its_log(self._real)

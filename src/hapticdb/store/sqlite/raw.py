@@ -16,6 +16,8 @@ import apsw
 
 READ_MAIN = apsw.SQLITE_OPEN_MAIN_DB | apsw.SQLITE_OPEN_READONLY
 DESCRIPTORS = Path("/proc/self/fd")
+PAGE_BYTES = 8192
+"""Bytes of a page: the block size of the paper."""
 
 
 @contextlib.contextmanager
@@ -43,16 +45,11 @@ def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
 def read_bytes(path: Path, amount: int, offset: int = 0) -> bytes:
     """Bytes of a database file; fewer if the file ends before."""
     with opened_bytes(path) as file:
-        return read_from(file, amount, offset)
-
-
-def read_from(file: apsw.VFSFile, amount: int, offset: int = 0) -> bytes:
-    """Bytes of an opened file; fewer if the file ends before."""
-    try:
-        there = max(min(amount, file.xFileSize() - offset), 0)
-        return file.xRead(there, offset) if there else b""
-    except apsw.IOError as error:  # or cut off since its size was asked
-        raise OSError(errno.EIO, os.strerror(errno.EIO), str(error)) from error
+        try:
+            there = max(min(amount, file.xFileSize() - offset), 0)
+            return file.xRead(there, offset) if there else b""
+        except apsw.IOError as error:  # or cut off since its size was asked
+            raise OSError(errno.EIO, os.strerror(errno.EIO), str(error)) from error
 
 
 def descriptor_of(identity: tuple[int, int]) -> int | None:

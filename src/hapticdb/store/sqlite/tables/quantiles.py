@@ -4,16 +4,15 @@ The paper takes quantiles from the engine's statistics. SQLite's own (``sqlite_s
 samples, so hapticdb computes the quantiles and keeps them.
 """
 
-from typing import cast
-
-import apsw
 import numpy as np
 
+from hapticdb.store import believed
 from hapticdb.store.base import Keys, Layout
+from hapticdb.store.sqlite.connection import FileConnection
 
 
 def exact_quantiles(
-    connection: apsw.Connection, layout: Layout, resolution: int
+    connection: FileConnection, layout: Layout, resolution: int
 ) -> tuple[Keys, int]:
     """Bounds (v + 1,) of the v-quantile vector (the paper's Definition 2), and the rows N.
 
@@ -22,13 +21,17 @@ def exact_quantiles(
     order of (z_val, id). Rows with the same key count one by one.
     """
 
-    def ask(sql: str, *bindings: int) -> list[tuple[int, ...]]:
-        return cast("list[tuple[int, ...]]", connection.execute(sql, bindings).fetchall())
+    def row_of(sql: str, *bindings: int) -> tuple[int, int]:
+        found = connection.fetch(sql, bindings)
+        if not found:
+            raise believed.damaged(connection.url, "fewer rows than are counted")
+        key, object_id = found[0]
+        return key, object_id
 
-    ((n_rows,),) = ask(f"SELECT count(*) FROM {layout}")
+    ((n_rows,),) = connection.fetch(f"SELECT count(*) FROM {layout}")
     if n_rows == 0:
         return np.zeros(2, dtype=np.int64), 0
-    ((key, object_id),) = ask(f"SELECT z_val, id FROM {layout} ORDER BY z_val, id LIMIT 1")
+    key, object_id = row_of(f"SELECT z_val, id FROM {layout} ORDER BY z_val, id LIMIT 1")
     step = (
         f"SELECT z_val, id FROM {layout} WHERE (z_val, id) >= (?1, ?2)"
         " ORDER BY z_val, id LIMIT 1 OFFSET ?3"
@@ -38,7 +41,7 @@ def exact_quantiles(
     for i in range(1, resolution + 1):
         target = max(1, -(-i * n_rows // resolution))
         if target > rank:
-            ((key, object_id),) = ask(step, key, object_id, target - rank)
+            key, object_id = row_of(step, key, object_id, target - rank)
             rank = target
         bounds.append(key)
     return np.array(bounds, dtype=np.int64), n_rows

@@ -46,7 +46,7 @@ class SQLiteStatistics:
             kept = self._kept_quantiles(resolution)
             if kept:
                 return believed.histogram_of(self._connection.url, *kept[0])
-            bounds, n_rows = exact_quantiles(self._connection.driver, self._layout, resolution)
+            bounds, n_rows = exact_quantiles(self._connection, self._layout, resolution)
             return Histogram(bounds, n_rows, "computed")
 
     def freshness(self, resolution: int) -> Freshness:
@@ -74,7 +74,7 @@ class SQLiteStatistics:
         """Compute and keep the quantile vector of that resolution, unless a fresh one is kept."""
         if self._kept_quantiles(resolution) and not anew:
             return
-        bounds, n_rows = exact_quantiles(self._connection.driver, self._layout, resolution)
+        bounds, n_rows = exact_quantiles(self._connection, self._layout, resolution)
         with self._connection.writing():
             # another process may have written since: then the vector carries the older revision's
             # rows under the newer number, off by that one write, as statistics are allowed to be

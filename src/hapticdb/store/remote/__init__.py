@@ -1,1 +1,0 @@
-"""Environments behind a hapticdb server, to read: ``ws://host:port``."""

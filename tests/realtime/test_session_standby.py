@@ -83,7 +83,13 @@ def test_a_standby_that_lags_takes_the_force_away_in_time_and_gives_it_back(
     with (
         ResidentCells(pair.url(name), budget_bytes=1 << 20) as cells,
         Session(
-            cells, sphere, still(HEIGHT_M), rate=RATE, staleness=STALENESS_S, record=path
+            cells,
+            sphere,
+            still(HEIGHT_M),
+            law="plane",
+            rate=RATE,
+            staleness=STALENESS_S,
+            record=path,
         ) as session,
     ):
         until(lambda: force(session) > 0 and not is_fading(session), session)
@@ -124,8 +130,8 @@ def test_an_edit_on_the_primary_is_felt_through_the_standby(
 ) -> None:
     path = tmp_path / "edited.hdbrec"
     with Session(
-        pair.url(name), sphere, still(HEIGHT_M), rate=RATE, staleness=60.0, record=path,
-        budget_bytes=1 << 20,
+        pair.url(name), sphere, still(HEIGHT_M), law="plane", rate=RATE, staleness=60.0,
+        record=path, budget_bytes=1 << 20,
     ) as session:  # fmt: skip
         until(lambda: force(session) > 0, session)
         move(env.store, 1, DOWN)
@@ -153,7 +159,9 @@ def test_a_primary_that_is_lost_takes_the_force_away_until_it_is_back(
     env.close()
     with (
         ResidentCells(pair.url(name), budget_bytes=1 << 20) as cells,
-        Session(cells, sphere, still(HEIGHT_M), rate=RATE, staleness=STALENESS_S) as session,
+        Session(
+            cells, sphere, still(HEIGHT_M), law="plane", rate=RATE, staleness=STALENESS_S
+        ) as session,
     ):
         until(lambda: force(session) > 0 and not is_fading(session), session)
         pair.primary.kill()
@@ -171,7 +179,9 @@ def test_a_standby_that_is_lost_is_replaced_by_the_primary(
 ) -> None:
     with (
         ResidentCells(pair.url(name), budget_bytes=1 << 20) as cells,
-        Session(cells, sphere, still(HEIGHT_M), rate=RATE, staleness=STALENESS_S) as session,
+        Session(
+            cells, sphere, still(HEIGHT_M), law="plane", rate=RATE, staleness=STALENESS_S
+        ) as session,
     ):
         until(lambda: force(session) > 0 and not is_fading(session), session)
         pair.standby.kill()

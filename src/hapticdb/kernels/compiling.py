@@ -27,8 +27,6 @@ from typing import NamedTuple, Self
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 ENTRIES = {
-    "hand.coupling": "advance",
-    "hand.large": "advance_asleep",
     "hand.quasistatic": "advance",
     "proxy.linearize": "linearize",
     "hosting.loop": "run",
@@ -59,6 +57,7 @@ ENTRIES = {
     "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
     "resident.sweep": "poses_between unpack find_hits",
     "surfaces.sampling": "eliminate_kernel",
+    "hand.direct": "render",
     "hand.servo": "tell name_voxels note",
     "curves": "encode_kernel decode_kernel",
     "rigid": "poses_of first_not_rigid",
@@ -70,10 +69,8 @@ ENTRIES = {
 here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {
-    "resident.feeling": "hand.coupling",
-    "large.sleeping": "hand.coupling",
-    "large.budget": "hand.coupling",
-    "hand.large": "hand.coupling",
+    "large.sleeping": "resident.feeling",
+    "large.budget": "resident.feeling",
     "hosting.loop": "hand.quasistatic",
 }
 """Modules that are compiled after another module in the same process: they share its leaves."""
@@ -122,7 +119,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         *_RESIDENT,
         "field.packing.unpack_kernel",
         "resident.feeling.feel_kernel",
-        "hand.coupling.*",
+        "hand.direct.*",
         "hand.quasistatic.*",
         "hand.servo.*",
         "hand.handle.*",
@@ -173,7 +170,6 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "field.packing.unpack_kernel",
         "large.sleeping.*",
         "large.budget.*",
-        "hand.large.*",
     ),
     "everything": ("*",),
 }

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS2, chosen_by_type, entry, leaf
+from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS2, entry, leaf
 from hapticdb.kernels.field.law import DISTANCE_FIELD
 from hapticdb.kernels.large.sleeping import (
     LEFT_OUT,
@@ -45,12 +45,6 @@ from hapticdb.kernels.resident.cells import (
 )
 from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.rigid import is_rigid, transform_of
-
-
-class Awake(NamedTuple):
-    """Frames that test each run: those of small tools. Its field is not read."""
-
-    nothing: np.int64
 
 
 class Asleep(NamedTuple):
@@ -116,23 +110,6 @@ def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, bu
         )
     counts[0, LOOKED_AT] = max(counts[0, LOOKED_AT], n_looked)
     counts[0, LEFT_OUT] = max(counts[0, LEFT_OUT], n_near - n_looked)
-
-
-def _frame_awake(watch, cells, which, shell, pose, place, law, met, missed, out):  # noqa: ARG001 - the arguments of each choice
-    """A frame that tests each run."""
-    frame_of(law, cells, which, shell, pose, place, met, missed, out)
-
-
-def _frame_asleep(watch, cells, which, shell, pose, place, law, met, missed, out):
-    """A frame with sleeping clusters."""
-    felt_asleep(
-        cells, which, shell, pose, place, law, met, missed, watch.sleepers, watch.budget,
-        watch.counts, out,
-    )  # fmt: skip
-
-
-tool_frame = chosen_by_type(lambda watch: _frame_asleep if watch is Asleep else _frame_awake)
-"""A frame of a session's tool: arguments as of `_frame_awake`, an `Awake` or an `Asleep` first."""
 
 
 @entry(

@@ -181,7 +181,7 @@ def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
     hand = Unplugged(still(0.010), 100)
     hand.apply = applied.append  # type: ignore[assignment]
     with pytest.raises(DeviceError, match="unplugged"):
-        run(hand)
+        run(hand, seconds=60.0)
     assert any(wrench.any() for wrench in applied)
     assert not applied[-1].any()
 
@@ -207,7 +207,7 @@ def test_a_reading_of_the_wrong_kind_ends_the_loop_without_force(
 ) -> None:
     hand = Odd(still(0.010), change, first=100)
     with pytest.raises(DeviceError, match=rf"^Odd\.read\(\) returned {told}.*; expected [^\n]+$"):
-        run(hand)
+        run(hand, seconds=60.0)
     assert any(wrench.any() for wrench in hand.pushed)
     assert not hand.pushed[-1].any()
 

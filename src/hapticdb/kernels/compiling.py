@@ -37,7 +37,6 @@ ENTRIES = {
     "resident.nearest": "find_nearest",
     "resident.first_hits": "find_first_hits",
     "resident.feeling": "feel_kernel bounding_spheres",
-    "large.sleeping": "feel_sleeping",
     "large.budget": "feel_within",
     "query.refining": (
         "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
@@ -69,9 +68,14 @@ ENTRIES = {
 here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {
-    "large.sleeping": "resident.feeling",
-    "large.budget": "resident.feeling",
+    "resident.feeling": "hand.quasistatic",
+    "large.budget": "hand.quasistatic",
+    "proxy.linearize": "hand.quasistatic",
     "hosting.loop": "hand.quasistatic",
+    "resident.first_hits": "resident.sweep",
+    "resident.clearance": "resident.sweep",
+    "resident.proving": "resident.sweep",
+    "resident.nearest": "resident.sweep",
 }
 """Modules that are compiled after another module in the same process: they share its leaves."""
 LONGEST_S = 600.0
@@ -168,7 +172,6 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "large": (
         *_RESIDENT,
         "field.packing.unpack_kernel",
-        "large.sleeping.*",
         "large.budget.*",
     ),
     "everything": ("*",),

@@ -35,7 +35,7 @@ from hapticdb.kernels.hosting.showing import (
     show_contacts,
     show_objects,
 )
-from hapticdb.kernels.large.budget import feel_within
+from hapticdb.kernels.large.budget import felt_asleep
 from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.records import (
     FOLLOWER,
@@ -48,8 +48,8 @@ from hapticdb.kernels.records import (
     STATION,
     TOLD,
 )
-from hapticdb.kernels.resident.cells import UNKNOWNS
-from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.resident.cells import UNKNOWNS, begin_frame, end_frame
+from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import moved, pose_of_quaternion, transform_of, turned
 
@@ -81,17 +81,19 @@ def place_tool(tool, pose):
 def feel_again(station, cells, shell, place, poses, met, missed, felts, servo):
     """Compute the law's frame at the tool's pose, for a recording; into tool.felt."""
     tool, sent, law = servo.tool, servo.sent, DistanceFieldLaw(station.stiffness)
+    which = begin_frame(cells, station.reader)
     if station.is_large:
         asleep = asleep_of(station)
         counts = asleep.counts
         counts[0, LOOKED_AT] = counts[0, LEFT_OUT] = 0
-        feel_within(
-            cells, station.reader, shell, poses, place, law, met[FELT], missed, felts,
-            asleep.sleepers, asleep.budget, counts,
+        felt_asleep(
+            cells, which, shell, poses[0], place, law, met[FELT], missed, asleep.sleepers,
+            asleep.budget, counts[0], felts[0],
         )  # fmt: skip
         sent.left_out = max(sent.left_out, counts[0, LEFT_OUT])
     else:
-        feel_kernel(cells, station.reader, shell, poses, place, law, met[FELT], missed, felts)
+        frame_of(law, cells, which, shell, poses[0], place, met[FELT], missed, felts[0])
+    end_frame(cells, station.reader)
     for n in range(RESULTS):
         tool.felt[n] = felts[0, n]
     sent.unknown += np.int64(felts[0, UNKNOWNS])

@@ -85,7 +85,10 @@ def runs_beside_unknown(cells, which, shell, listed, count, transform, place, ma
 
 @leaf
 def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, budget, counts, out):
-    """`feeling.felt` with sleeping clusters and a budget of points; counts keeps the greatest."""
+    """`feeling.felt` with sleeping clusters and a budget of points.
+
+    counts (COUNTS,) keeps the greatest numbers (`sleeping.LOOKED_AT`).
+    """
     points, center, _, _, run, columns, scratch = shell
     listed, skips, nothing = sleepers.listed, sleepers.skips, sleepers.nothing
     chosen, chosen_columns, indices = sleepers.chosen, sleepers.columns, sleepers.indices
@@ -108,8 +111,8 @@ def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, bu
         out[UNKNOWNS] += runs_beside_unknown(
             cells, which, shell, listed, count, transform, place, felt_margin(law), missed
         )
-    counts[0, LOOKED_AT] = max(counts[0, LOOKED_AT], n_looked)
-    counts[0, LEFT_OUT] = max(counts[0, LEFT_OUT], n_near - n_looked)
+    counts[LOOKED_AT] = max(counts[LOOKED_AT], n_looked)
+    counts[LEFT_OUT] = max(counts[LEFT_OUT], n_near - n_looked)
 
 
 @entry(
@@ -119,10 +122,12 @@ def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, bu
 def feel_within(
     cells, reader, shell, poses, place, law, met, missed, out, sleepers, budget, counts
 ):
-    """`sleeping.feel_sleeping` for frames that must not depend on what is in memory.
+    """`feeling.feel_kernel` with sleeping clusters, at most `budget` points a frame.
 
-    Where the budget is exceeded, out (M, RESULTS) counts runs beside unknown cells as unknown
-    points, and `missed` lists the cells. counts (1, COUNTS) int64 keeps the greatest numbers.
+    Where there are more points near something than the budget, a frame looks at one of each 2, 4,
+    8 ... of them, so that every cluster keeps its share (`sleeping.choose_points`). Then out (M,
+    RESULTS) counts runs beside unknown cells as unknown points, and `missed` lists the cells.
+    counts (M, COUNTS) int64 keeps the greatest numbers of each pose, or (1, COUNTS) those of all.
     Returns the number of poses done.
     """
     for n in range(poses.shape[0]):
@@ -131,7 +136,7 @@ def feel_within(
         which = begin_frame(cells, reader)
         felt_asleep(
             cells, which, shell, poses[n], place, law, met, missed, sleepers, budget,
-            counts, out[n],
+            counts[min(n, counts.shape[0] - 1)], out[n],
         )  # fmt: skip
         end_frame(cells, reader)
     return poses.shape[0]

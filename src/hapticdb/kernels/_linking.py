@@ -15,8 +15,10 @@ ENVIRONMENT = "_ZN08NumbaEnv"
 """Prefix of the variables through which numba gives functions their constants."""
 
 
-class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc] - numba is untyped
+class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]  # numba is untyped
     """Code of a leaf, for its callers alone."""
+
+    _final_module: Any
 
     def _optimize_final_module(self) -> None:
         """Leave that to the entry."""
@@ -31,7 +33,7 @@ class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc] - numba is untyped
         super()._finalize_final_module()
 
 
-class LeafCompiler(Compiler):  # type: ignore[misc] - likewise
+class LeafCompiler(Compiler):  # type: ignore[misc]  # likewise
     """numba's compiler, for leaves."""
 
     def __init__(self, typing_context: Any, target: Any, library: Any, *others: Any) -> None:  # noqa: ANN401 - likewise

@@ -26,7 +26,8 @@ import hapticdb
 from awake import awake
 from hapticdb import DistanceField, GridOptions, ImportOptions, PointShell, TangentPlane
 from hapticdb.bench import records
-from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT, feel_sleeping
+from hapticdb.kernels.large.budget import feel_within
+from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.resident.cells import RESULTS
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.query.law import ForceLaw
@@ -130,7 +131,8 @@ def measure(
 
             def asleep(one: ResidentFrames) -> Callable[[Floats], object]:
                 def frame(pose: Floats) -> None:
-                    feel_sleeping(
+                    counts[:] = 0
+                    feel_within(
                         one.cells, row, one.clusters, pose, residency.place, one.law, one.met,
                         one.missed, out, one.sleepers, one.budget, counts,
                     )  # fmt: skip

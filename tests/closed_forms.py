@@ -14,9 +14,8 @@ from hapticdb.kernels.field.lattice import (
     STEPS,
 )
 from hapticdb.kernels.hand import quasistatic
-from hapticdb.kernels.hand.anchors import MET_ROWS
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.near_points import FIELD_ROWS
+from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, SERVO, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import (
     READER_STRIDE,

@@ -56,7 +56,7 @@ if TYPE_CHECKING:
     from hapticdb.query.law import DistanceField, TangentPlane
     from hapticdb.query.quantiles import QuantileVector
     from hapticdb.query.touches import Touch, Touches
-    from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+    from hapticdb.realtime.coupling import Coupling
     from hapticdb.realtime.handle import Handle
     from hapticdb.realtime.report import Report
     from hapticdb.realtime.resident_cells import ResidentCells
@@ -85,7 +85,6 @@ __all__ = [
     "Coupling",
     "DamagedError",
     "DatabaseError",
-    "DeviceCoupling",
     "DeviceError",
     "Difference",
     "Disassembly",
@@ -178,7 +177,7 @@ _HOMES = {
     "poses": "read_poses write_poses",
     "proportions": "Proportions compare_proportions",
     "query.frame": "Query",
-    "realtime.coupling": "Coupling DeviceCoupling",
+    "realtime.coupling": "Coupling",
     "realtime.handle": "Handle",
     "recording.file": "Recording",
     "recording.replay": "Replayed replay",

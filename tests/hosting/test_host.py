@@ -19,13 +19,12 @@ from hapticdb.errors import HapticDBError, ObjectNotFoundError, UsageError
 from hapticdb.hosting.attached import AttachedHost
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
-from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+from hapticdb.realtime.coupling import Coupling
 from hapticdb.recording.file import Recording
 from hapticdb.recording.replay import replay
-from hapticdb.testing import write_voxels
 from realtime.hands import at
 from realtime.sessions import floor_points, floored, recorded
-from realtime.worlds import block, make
+from realtime.worlds import make
 
 RATE = 500.0
 """Frames a second of the tests' sessions."""
@@ -34,24 +33,11 @@ ABOVE, PRESSED = at(0.0, 0.0, 0.02), at(0.0, 0.0, 0.004)
 
 
 @pytest.fixture(scope="module")
-def plane(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    """A floor with its top at z = 0, without distances."""
-    with floored(make(tmp_path_factory.mktemp("plane"), bits=6)) as env:
-        yield env
-
-
-@pytest.fixture(scope="module")
-def smooth(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
     """A floor just under z = 0, with distances."""
-    with make(tmp_path_factory.mktemp("smooth"), bits=6) as env:
-        write_points(env.store, floor_points(31.5), "floor")
-        yield env
-
-
-@pytest.fixture(scope="module", params=["plane", "smooth"])
-def env(request: pytest.FixtureRequest) -> Environment:
-    found: Environment = request.getfixturevalue(request.param)
-    return found
+    with make(tmp_path_factory.mktemp("hosted"), bits=6) as made:
+        write_points(made.store, floor_points(31.5), "floor")
+        yield made
 
 
 @pytest.fixture(scope="module")
@@ -185,29 +171,24 @@ def test_objects_that_a_session_leaves_out_are_not_felt(
     assert len(host.cells) == 1
 
 
-def test_where_chooses_what_is_felt(plane: Environment, sphere: PointShell) -> None:
-    write_voxels(plane.store, block((50, 50, 50), (52, 52, 52)), "post")
-    with SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20) as host:
+def test_where_chooses_what_is_felt(env: Environment, sphere: PointShell) -> None:
+    write_points(env.store, np.array([[50.5, 50.5, 50.5]]), "post")
+    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20) as host:
         session = host.begin(sphere, ABOVE, where=["post"])
-        (floor,) = plane.find("floor")
+        (floor,) = env.find("floor")
         assert host.cells[0].left_out == (floor.id,)
         with pytest.raises(ObjectNotFoundError):
             host.begin(sphere, ABOVE, where=["nothing so called"])
         assert [one.id for one in host.sessions()] == [session.id]
 
 
-def test_a_new_coupling_is_felt(session: HostedSession, env: Environment) -> None:
+def test_a_new_coupling_is_felt(session: HostedSession) -> None:
     press(session, lambda: pushed(session) > 0.5)
     risen = time.monotonic() + 0.5  # the hand comes down over a few moves
     press(session, lambda: time.monotonic() > risen)
     before = pushed(session)
-    is_smooth = all(obj.has_distances for obj in env.objects())
-    session.set_coupling(
-        DeviceCoupling(stiffness=100.0) if is_smooth else Coupling(stiffness=100.0)
-    )
+    session.set_coupling(Coupling(stiffness=100.0))
     press(session, lambda: 0.0 < pushed(session) < 0.5 * before)
-    with pytest.raises(UsageError, match="does not go with"):
-        session.set_coupling(Coupling() if is_smooth else DeviceCoupling())
 
 
 def test_figures_count_frames_and_label_names_the_session(session: HostedSession) -> None:
@@ -236,10 +217,21 @@ def test_a_session_that_has_ended_says_so(host: SessionHost, sphere: PointShell)
             use()
 
 
-def test_a_host_takes_no_more_sessions_than_it_was_made_for(
-    plane: Environment, sphere: PointShell
+def test_what_has_no_distances_is_not_felt_and_the_line_names_what_may_be_done(
+    tmp_path: Path, sphere: PointShell
 ) -> None:
-    with SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20, most_sessions=1) as host:
+    with (
+        floored(make(tmp_path, bits=6)) as flat,
+        SessionHost(flat.url, rate=RATE, budget_bytes=8 << 20) as host,
+        pytest.raises(UsageError, match=r"run 'hapticdb upgrade .*', or .* --law plane$"),
+    ):
+        host.begin(sphere, ABOVE)
+
+
+def test_a_host_takes_no_more_sessions_than_it_was_made_for(
+    env: Environment, sphere: PointShell
+) -> None:
+    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20, most_sessions=1) as host:
         first = host.begin(sphere, ABOVE)
         with pytest.raises(UsageError, match="end one first"):
             host.begin(sphere, ABOVE)
@@ -287,9 +279,9 @@ def test_the_sessions_of_a_process_that_dies_end(host: SessionHost) -> None:
 
 
 def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
-    plane: Environment, sphere: PointShell
+    env: Environment, sphere: PointShell
 ) -> None:
-    with SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20) as host:
+    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20) as host:
         session = host.begin(sphere, ABOVE)
         os.kill(host.pids[0], signal.SIGKILL)
         until(lambda: session.is_over)
@@ -301,9 +293,9 @@ def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
 
 
 def test_a_closed_host_leaves_no_process_and_refuses_sessions(
-    plane: Environment, sphere: PointShell
+    env: Environment, sphere: PointShell
 ) -> None:
-    host = SessionHost(plane.url, rate=RATE, budget_bytes=8 << 20)
+    host = SessionHost(env.url, rate=RATE, budget_bytes=8 << 20)
     host.begin(sphere, ABOVE)
     pids = [*host.pids, *(cells.pid for cells in host.cells)]
     host.close()
@@ -318,9 +310,9 @@ def test_a_closed_host_leaves_no_process_and_refuses_sessions(
 @pytest.mark.parametrize(
     "options", [{"rate": 5.0}, {"most_sessions": 0}, {"most_sessions": 100}, {"processes": 0}]
 )
-def test_numbers_out_of_range_are_refused(plane: Environment, options: dict[str, float]) -> None:
+def test_numbers_out_of_range_are_refused(env: Environment, options: dict[str, float]) -> None:
     with pytest.raises(UsageError):
-        SessionHost(plane.url, **options)  # type: ignore[arg-type]
+        SessionHost(env.url, **options)  # type: ignore[arg-type]
 
 
 def test_the_other_end_of_a_closed_socket_is_an_error() -> None:

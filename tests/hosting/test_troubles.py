@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from banded import write_points
 from children import joined, until
 from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
@@ -20,7 +21,7 @@ from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.realtime.session_recording import SessionRecording
 from realtime.hands import at
-from realtime.sessions import floored
+from realtime.sessions import floor_points
 from realtime.worlds import make
 
 ABOVE = at(0.0, 0.0, 0.02)
@@ -31,7 +32,8 @@ PATIENCE = 30.0
 
 @pytest.fixture(scope="module")
 def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    with floored(make(tmp_path_factory.mktemp("plane"), bits=6)) as made:
+    with make(tmp_path_factory.mktemp("troubles"), bits=6) as made:
+        write_points(made.store, floor_points(31.5), "floor")
         yield made
 
 

@@ -112,7 +112,7 @@ def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
     several = {name for name, (_, declared) in found.items() if len(declared) > 1}
     assert several == {
         "query.refining.refine_kernel", "resident.feeling.feel_kernel", "resident.proving.prove",
-        "large.sleeping.feel_sleeping", "large.budget.feel_within",
+        "large.budget.feel_within",
     }  # fmt: skip
 
 

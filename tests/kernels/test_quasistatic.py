@@ -27,8 +27,8 @@ from closed_forms import (
     wedge,
 )
 from hapticdb.kernels.hand import quasistatic
-from hapticdb.kernels.hand.coupling import IS_HELD
 from hapticdb.kernels.hand.device_spring import contact_stiffness
+from hapticdb.kernels.hand.holding import IS_HELD
 from hapticdb.kernels.rigid import product, quaternion_by
 
 Floats = NDArray[np.float64]

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from devices.readings import FAULTS, FORMS, MOMENTS, Change
 from hapticdb import PointShell, TangentPlane
+from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.scripted import Device
 from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.kernels.hand import servo
@@ -32,6 +33,8 @@ from realtime.hands import Clutched, Lost, Odd, Slow, Talking, Unplugged, still,
 from realtime.worlds import make
 
 N_RING = 4096
+DIRECT = Coupling().direct(SCRIPTED, 1.0, 0.012)
+"""What bounds the forces of the tests' loops."""
 Floats = NDArray[np.float64]
 
 
@@ -71,7 +74,7 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
                 shell=sphere,
                 device=device,
                 law=TangentPlane(),
-                coupling=Coupling(),
+                coupling=DIRECT,
                 handle=Handle(),
                 timing=Timing(rate),
                 seconds=0.3,
@@ -111,8 +114,8 @@ def test_a_loop_counts_what_it_records(run: Run) -> None:
     assert counts.peak_torque == pytest.approx(
         np.linalg.norm(frames["applied"][:, 3:], axis=1).max()
     )
-    # the path pushes 2 mm into a floor of 2 mm voxels; the spring is clamped at half a voxel
-    assert 0.1 < counts.peak_force < 5.0
+    # the path pushes 2 mm into a floor of 2 mm voxels
+    assert 0.1 < counts.peak_force < 7.0
 
 
 def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
@@ -178,7 +181,7 @@ def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
     hand = Unplugged(still(0.010), 100)
     hand.apply = applied.append  # type: ignore[assignment]
     with pytest.raises(DeviceError, match="unplugged"):
-        run(hand)
+        run(hand, seconds=60.0)
     assert any(wrench.any() for wrench in applied)
     assert not applied[-1].any()
 
@@ -204,7 +207,7 @@ def test_a_reading_of_the_wrong_kind_ends_the_loop_without_force(
 ) -> None:
     hand = Odd(still(0.010), change, first=100)
     with pytest.raises(DeviceError, match=rf"^Odd\.read\(\) returned {told}.*; expected [^\n]+$"):
-        run(hand)
+        run(hand, seconds=60.0)
     assert any(wrench.any() for wrench in hand.pushed)
     assert not hand.pushed[-1].any()
 
@@ -268,13 +271,6 @@ def test_a_frame_that_waits_lets_go_and_ends_with_the_session(
     assert applied[-5].any()
     assert not np.any(applied[-4:])  # one during the wait, one of that frame, two at the end
     assert not frames["applied"][-1].any()
-
-
-def test_frames_in_which_the_tool_was_held_back_are_counted(run: Run) -> None:
-    assert (
-        run(stroking(-0.010, 0.5), seconds=0.6, law=TangentPlane(0.0)).answer.counts.cut_frames > 0
-    )
-    assert run(still(0.03)).answer.counts.cut_frames == 0
 
 
 def test_after_an_answer_the_loop_runs_as_often_as_one_likes(run: Run) -> None:

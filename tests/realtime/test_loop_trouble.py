@@ -3,37 +3,107 @@
 import io
 import os
 import signal
+import tempfile
 import time
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from hapticdb import TangentPlane
+import hapticdb
+from closed_forms import field_of, plane
+from hapticdb import Environment, Grid, PointShell, TangentPlane
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.scripted import Reading
 from hapticdb.errors import DeviceError
-from hapticdb.kernels.hand import coupling as kernels
-from hapticdb.kernels.resident.cells import BUFFERS, VERSION, Cells
+from hapticdb.kernels.hand.holding import RISE_FRAMES
+from hapticdb.kernels.resident.cells import BUFFERS, VERSION, Cells, spread_key
 from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime import loop as subject
-from hapticdb.realtime.coupling import Coupling, DeviceCoupling, SettledCoupling
+from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import WITHDRAWN_NS, Loop, LoopRequest, ring_bytes, work
 from hapticdb.realtime.processes import MessageSender
-from hapticdb.resident.table import HEARTBEAT, anonymous_memory
-from realtime.coupled import SIDE, SmoothWorld, World, punch
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import HEARTBEAT, CellTable, anonymous_memory
+from hapticdb.testing import write_voxels
 from realtime.hands import at
-from realtime.worlds import block
+from realtime.worlds import block, cells_of
 
 Floats = NDArray[np.float64]
+SIZE = 0.005
+"""Voxel size in metres."""
+BITS = 6
+SIDE = 1 << BITS
 N_RING = 64
 MIDDLE = SIDE // 2
 FLOOR = block((MIDDLE - 12, MIDDLE - 12, MIDDLE - 4), (MIDDLE + 11, MIDDLE + 11, MIDDLE - 1))
 LATE = 10 * 10**9
 """Longest wait of a frame in ns: so long that no test reaches it."""
+
+
+class World:
+    """Voxels of 5 mm about the world's origin; no cell is resident if `is_known` is false."""
+
+    def __init__(self, ijk: ArrayLike = (), *, is_known: bool = True) -> None:
+        self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
+        self._folder = tempfile.TemporaryDirectory()
+        path = Path(self._folder.name) / "world.db"
+        self.environment: Environment = hapticdb.create(path, self.grid)
+        voxels = np.asarray(ijk, dtype=np.int64).reshape(-1, 3)
+        self.occupied = np.zeros((SIDE,) * 3, dtype=np.bool_)
+        self.occupied[tuple(voxels.T)] = True
+        if len(voxels):
+            write_voxels(self.environment.store, voxels)
+        self.table = CellTable.create(4 << 20)
+        self.residency = Residency(self.environment.store, self.table)
+        if is_known:
+            self.load(cells_of(self.grid))
+
+    def load(self, cells: NDArray[np.int64]) -> None:
+        while len(missing := self.residency.missing(cells)):
+            self.residency.load(missing)
+
+    def close(self) -> None:
+        self.environment.close()
+        self.table.close()
+        self._folder.cleanup()
+
+
+class SmoothWorld:
+    """Cells of a `World`'s size with distances: full below z = 0."""
+
+    def __init__(self) -> None:
+        field = field_of(plane((0.0, 0.0, 1.0)), SIZE)
+        self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
+        self.table = CellTable.create(4 << 20, distances=True)
+        cells = self.table.cells
+        is_cell = field.cells.keys[0] >= 0
+        for key, slot in zip(
+            field.cells.keys[0, is_cell], field.cells.slots[0, is_cell], strict=True
+        ):
+            at = int(spread_key(key, np.int64(self.table.capacity)))
+            while cells.keys[0, at] >= 0:
+                at = (at + 1) % self.table.capacity
+            cells.keys[:, at], cells.slots[:, at] = key, slot
+        for name in ("words", "masks", "payload"):
+            filled = getattr(field.cells, name)
+            getattr(cells, name)[: len(filled)] = filled
+
+    def close(self) -> None:
+        self.table.close()
+
+
+def punch(n_across: int, pitch: float = 0.002) -> PointShell:
+    """A flat square of points, facing down."""
+    across = (np.arange(n_across) - (n_across - 1) / 2.0) * pitch
+    x, y = np.meshgrid(across, across, indexing="ij")
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(n_across**2)], axis=1)
+    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
+    return PointShell(points, normals, np.zeros(3), is_closed=False)
 
 
 class Pressing:
@@ -55,7 +125,7 @@ class Pressing:
 def world(
     request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[World | SmoothWorld]:
-    """A floor, felt by one coupling or the other."""
+    """A floor that is felt directly, or through the coupling."""
     monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
     monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no fetching process exists
     before = signal.getsignal(signal.SIGTERM)
@@ -68,11 +138,11 @@ def world(
 def requested(world: World | SmoothWorld, hand: Pressing, **options: object) -> LoopRequest:
     hold = float(str(options.pop("hold", 0.02)))
     law: ForceLaw = TangentPlane()
-    coupling: Coupling | SettledCoupling = Coupling(hold=hold)
+    given_numbers = Coupling(hold=hold)
+    coupling: DirectRendering | SettledCoupling = given_numbers.direct(SCRIPTED, 1.0, 0.01)
     if isinstance(world, SmoothWorld):
         law = DistanceField()
-        spring = DeviceCoupling(hold=hold, profile=SCRIPTED)
-        coupling = spring.settled(SCRIPTED, 200.0, 1.0, 0.01)
+        coupling = given_numbers.settled(SCRIPTED, 200.0, 1.0, 0.01)
     given: dict[str, object] = {"is_waiting": True, "seconds": 1.0}
     return LoopRequest(
         descriptor=world.table.descriptor,
@@ -153,7 +223,7 @@ def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World | Sm
     sent = [float(wrench[2]) for wrench in hand.sent[n_before:]]
     assert sent[0] == 0.0
     assert sent[1] == pytest.approx(full / 20, rel=0.1)
-    assert max(np.diff(sent)) <= full / kernels.RISE_FRAMES * 1.01
+    assert max(np.diff(sent)) <= full / RISE_FRAMES * 1.01
     assert sent[-1] == pytest.approx(full, rel=0.01)
 
 

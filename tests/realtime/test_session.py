@@ -21,6 +21,7 @@ from children import PATIENCE, child, finished
 from hapticdb import Environment, PointShell
 from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
+from hapticdb.query.law import LawName
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
@@ -62,14 +63,14 @@ def played(
     cells: ResidentCells, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
 ) -> Played:
     """A session that moves 2 mm deep over the floor until the device's end."""
-    return play(cells, sphere, tmp_path_factory.mktemp("played") / "session.hdbrec")
+    return play(cells, sphere, tmp_path_factory.mktemp("played") / "session.hdbrec", "plane")
 
 
 @pytest.fixture(scope="module", params=["plane", "smooth"])
 def by_law(
     request: pytest.FixtureRequest, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Played]:
-    """The same session under either coupling: over voxels, and over distances to a floor."""
+    """The same session over voxels, rendered directly, and over distances, with a coupling."""
     if request.param == "plane":
         yield request.getfixturevalue("played")
         return
@@ -77,13 +78,13 @@ def by_law(
     with make(folder, bits=6) as made:
         write_points(made.store, floor_points(31.5), "floor")
         with ResidentCells(made.url, budget_bytes=4 << 20) as cells:
-            yield play(cells, sphere, folder / "session.hdbrec")
+            yield play(cells, sphere, folder / "session.hdbrec", "smooth")
 
 
-def play(cells: ResidentCells, shell: PointShell, path: Path) -> Played:
+def play(cells: ResidentCells, shell: PointShell, path: Path, law: LawName) -> Played:
     """Move over the floor until the device's end."""
     with Session(
-        cells, shell, stroking(0.010), rate=RATE, record=path, staleness=NEVER_STALE
+        cells, shell, stroking(0.010), law=law, rate=RATE, record=path, staleness=NEVER_STALE
     ) as session:
         pid = session.pid
         report = session.wait(PATIENCE)
@@ -170,7 +171,9 @@ def test_nothing_is_sent_while_nothing_is_touched(played: Played) -> None:
 def test_a_session_is_waited_for_in_steps_and_stopped(
     cells: ResidentCells, sphere: PointShell
 ) -> None:
-    with Session(cells, sphere, Talking(still(0.010), 1 << 30, 0.0), rate=RATE) as session:
+    with Session(
+        cells, sphere, Talking(still(0.010), 1 << 30, 0.0), law="plane", rate=RATE
+    ) as session:
         until(lambda: session.n_frames > 100, session)
         last = session.last()
         assert last is not None
@@ -188,7 +191,7 @@ def test_a_session_lasts_its_seconds_however_slow_it_is(
     cells: ResidentCells, sphere: PointShell
 ) -> None:
     """A busy machine cannot keep a rate of 20,000 Hz; frames are then missed."""
-    with Session(cells, sphere, still(0.03), rate=20_000.0, seconds=0.5) as session:
+    with Session(cells, sphere, still(0.03), law="plane", rate=20_000.0, seconds=0.5) as session:
         report = session.wait(PATIENCE)
     assert report is not None
     loop = report.loop
@@ -201,7 +204,7 @@ def test_a_loop_that_is_killed_is_one_clear_error(
     cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "cut.hdbrec"
-    with Session(cells, sphere, still(0.010), rate=RATE, record=path) as session:
+    with Session(cells, sphere, still(0.010), law="plane", rate=RATE, record=path) as session:
         until(lambda: session.n_frames > 50, session)
         os.kill(session.pid, signal.SIGKILL)
         with pytest.raises(HapticDBError, match="ended from outside") as raised:
@@ -209,7 +212,7 @@ def test_a_loop_that_is_killed_is_one_clear_error(
     assert "\n" not in str(raised.value)
     n_frames = sum(map(len, Recording(path).frames()))
     assert n_frames > 50
-    with Session(cells, sphere, still(0.010), rate=RATE, seconds=0.1) as session:
+    with Session(cells, sphere, still(0.010), law="plane", rate=RATE, seconds=0.1) as session:
         report = session.wait(PATIENCE)  # the cells are still usable
     assert report is not None
     assert report.hit_frames == report.loop.frames
@@ -219,7 +222,7 @@ def test_a_session_that_is_closed_without_waiting_has_recorded_all(
     cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "unwatched.hdbrec"
-    with Session(cells, sphere, still(0.010), rate=RATE, record=path) as session:
+    with Session(cells, sphere, still(0.010), law="plane", rate=RATE, record=path) as session:
         until(lambda: session.n_frames > 50)
         n_frames = session.n_frames
     assert len(recorded(path)) >= n_frames
@@ -229,7 +232,7 @@ def test_what_is_recorded_reaches_the_file_within_a_second(
     cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "slow.hdbrec"
-    with Session(cells, sphere, still(0.010), rate=50.0, record=path) as session:
+    with Session(cells, sphere, still(0.010), law="plane", rate=50.0, record=path) as session:
         assert session.wait(1.5) is None
         assert sum(map(len, Recording(path).frames())) > 10
 
@@ -237,7 +240,7 @@ def test_what_is_recorded_reaches_the_file_within_a_second(
 def test_a_loop_that_the_system_ends_is_one_clear_error_too(
     cells: ResidentCells, sphere: PointShell
 ) -> None:
-    with Session(cells, sphere, still(0.010), rate=RATE) as session:
+    with Session(cells, sphere, still(0.010), law="plane", rate=RATE) as session:
         os.kill(session.pid, signal.SIGTERM)
         with pytest.raises(HapticDBError, match="ended from outside"):
             session.wait(PATIENCE)
@@ -251,7 +254,7 @@ def test_a_hand_that_fails_ends_the_session_with_its_error(
     cells: ResidentCells, sphere: PointShell, kind: type[Exception], message: str
 ) -> None:
     hand = Unplugged(still(0.010), 200, kind)
-    with Session(cells, sphere, hand, rate=RATE) as session:
+    with Session(cells, sphere, hand, law="plane", rate=RATE) as session:
         with pytest.raises(HapticDBError, match=message):
             session.wait(PATIENCE)
         pid = session.pid
@@ -265,11 +268,11 @@ def test_a_session_that_does_not_begin_leaves_no_recording(
     hand = Unplugged(still(0.010), 1)
     for _ in range(2):
         with pytest.raises(DeviceError, match="unplugged"):
-            Session(cells, sphere, hand, record=path)
+            Session(cells, sphere, hand, law="plane", record=path)
         assert not path.exists()
     path.write_text("mine")
     with pytest.raises(UsageError, match="is there already"):
-        Session(cells, sphere, still(0.010), record=path)
+        Session(cells, sphere, still(0.010), law="plane", record=path)
     assert path.read_text() == "mine"
     assert not cells.table.desk.pids.any()
 
@@ -293,10 +296,10 @@ def test_a_session_ended_while_its_recording_is_made_leaves_none(
 
     monkeypatch.setattr(Recorder, step, ended)
     with pytest.raises(SystemExit):
-        Session(cells, sphere, still(0.010), record=path)
+        Session(cells, sphere, still(0.010), law="plane", record=path)
     assert not path.exists()
     with pytest.raises(SystemExit):
-        Session(cells, sphere, still(0.010), record=mine, replace_recording=True)
+        Session(cells, sphere, still(0.010), law="plane", record=mine, replace_recording=True)
     assert mine.read_bytes() == before
 
 
@@ -318,12 +321,19 @@ def test_what_makes_no_sense_is_refused(
     cells: ResidentCells, sphere: PointShell, options: dict[str, object], message: str
 ) -> None:
     with pytest.raises(UsageError, match=re.escape(message)):
-        Session(cells, sphere, still(0.01), **options)  # type: ignore[arg-type]
+        Session(cells, sphere, still(0.01), law="plane", **options)  # type: ignore[arg-type]
 
 
 def test_other_exclusions_need_cells_of_their_own(env: Environment, sphere: PointShell) -> None:
     with Session(
-        env.url, sphere, still(0.010), rate=RATE, seconds=0.2, exclude=[1], budget_bytes=1 << 20
+        env.url,
+        sphere,
+        still(0.010),
+        law="plane",
+        rate=RATE,
+        seconds=0.2,
+        exclude=[1],
+        budget_bytes=1 << 20,
     ) as session:
         report = session.wait(PATIENCE)
         pid = session.cells.pid
@@ -342,7 +352,8 @@ import hapticdb
 from hapticdb.realtime.session import Session
 from realtime.hands import still
 points = hapticdb.PointShell.load(sys.argv[2])
-with Session(sys.argv[1], points, still(0.010), rate=100.0, policy=sys.argv[3]) as session:
+options = {"law": "plane", "rate": 100.0, "policy": sys.argv[3]}
+with Session(sys.argv[1], points, still(0.010), **options) as session:
     session.wait(0.2)
     print(session.pid, session.cells.pid, flush=True)
     session.wait(600.0)
@@ -375,7 +386,7 @@ class Mine:
     def read(self): ...
     def apply(self, wrench): ...
 try:
-    Session(sys.argv[1], hapticdb.PointShell.load(sys.argv[2]), Mine())
+    Session(sys.argv[1], hapticdb.PointShell.load(sys.argv[2]), Mine(), law="plane")
 except hapticdb.UsageError as error:
     print(error)
 """
@@ -424,7 +435,9 @@ def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
     path = tmp_path / "killed.hdbrec"
     with (
         ResidentCells(env.url, budget_bytes=1 << 20) as cells,
-        Session(cells, sphere, still(0.010), rate=RATE, staleness=0.2, record=path) as session,
+        Session(
+            cells, sphere, still(0.010), law="plane", rate=RATE, staleness=0.2, record=path
+        ) as session,
     ):
         until(lambda: session.n_frames > 50, session)
         killed = cells.pid
@@ -461,9 +474,17 @@ def test_unknown_cells_hold_and_fade_for_one_session_and_are_waited_for_by_anoth
         write_voxels(env.store, block((0, 240, 248), (511, 271, 255)), "floor, 1 m long")
         with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
             holding = Session(
-                cells, sphere, hand, rate=RATE, record=tmp_path / "a", staleness=NEVER_STALE
+                cells,
+                sphere,
+                hand,
+                law="plane",
+                rate=RATE,
+                record=tmp_path / "a",
+                staleness=NEVER_STALE,
             )
-            waiting = Session(cells, sphere, hand, rate=RATE, record=tmp_path / "b", policy="wait")
+            waiting = Session(
+                cells, sphere, hand, law="plane", rate=RATE, record=tmp_path / "b", policy="wait"
+            )
             with holding, waiting:
                 until(lambda: min(holding.n_frames, waiting.n_frames) > 100, holding)
                 os.kill(cells.pid, signal.SIGSTOP)

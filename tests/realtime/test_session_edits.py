@@ -52,7 +52,7 @@ def check_edits(
     down = up - np.array([0, 0, 3])
     path = tmp_path / "edited.hdbrec"
     with Session(
-        edited.url, sphere, stroking(0.010, 0.4, loops=True), rate=RATE, record=path,
+        edited.url, sphere, stroking(0.010, 0.4, loops=True), law="plane", rate=RATE, record=path,
         budget_bytes=1 << 20, staleness=NEVER_STALE,
     ) as session:  # fmt: skip
         for ijk in (down, up, down):

@@ -14,6 +14,7 @@ from children import PATIENCE
 from hapticdb import Environment, Grid, PointShell, UsageError
 from hapticdb.devices.scripted import Player
 from hapticdb.kernels.rigid import poses_of
+from hapticdb.query.law import LawName
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
@@ -38,6 +39,7 @@ class Ground(NamedTuple):
     env: Environment
     cells: ResidentCells
     height: float
+    law: LawName
 
 
 @pytest.fixture(scope="module", params=["plane", "smooth"])
@@ -51,7 +53,8 @@ def ground(
         else:
             write_points(made.store, floor_points(31.5), "floor")
         with ResidentCells(made.url, budget_bytes=4 << 20) as cells:
-            yield Ground(made, cells, 0.0 if request.param == "plane" else 1.0 * SIZE)
+            height = 0.0 if request.param == "plane" else 1.0 * SIZE
+            yield Ground(made, cells, height, request.param)
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +71,7 @@ def pressing(low: float) -> Player:
 def felt(ground: Ground, shell: PointShell, path: Path, budget: int | None = None) -> Report:
     hand = pressing(ground.height - 0.003)
     with Session(
-        ground.cells, shell, hand, rate=RATE, record=path, staleness=NEVER_STALE,
+        ground.cells, shell, hand, law=ground.law, rate=RATE, record=path, staleness=NEVER_STALE,
         budget_points=budget, has_baseline=False,
     ) as session:  # fmt: skip
         report = session.wait(PATIENCE)
@@ -142,7 +145,7 @@ def test_a_budget_that_is_no_number_of_points_is_refused(
     ground: Ground, plate: PointShell, budget: object, words: str
 ) -> None:
     with pytest.raises(UsageError, match=words):
-        Session(ground.cells, plate, still(0.03), budget_points=budget)  # type: ignore[arg-type]
+        Session(ground.cells, plate, still(0.03), law=ground.law, budget_points=budget)  # type: ignore[arg-type]
 
 
 def test_headers_with_another_budget_differ_and_a_header_without_one_is_as_before() -> None:

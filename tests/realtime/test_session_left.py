@@ -44,7 +44,9 @@ def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
     path, record = tmp_path / "wrench", tmp_path / "dropped.hdbrec"
     hand = Noted(still(DEEP), path)
     n_before = n_memories()
-    sessions = [Session(env.url, sphere, hand, rate=RATE, budget_bytes=4 << 20, record=record)]
+    sessions = [
+        Session(env.url, sphere, hand, law="plane", rate=RATE, budget_bytes=4 << 20, record=record)
+    ]
     pids = sessions[0].pid, sessions[0].cells.pid
     until(lambda: sessions[0].n_frames > 100 and force_in(path) > 0, sessions[0])
     n_frames = sessions[0].n_frames
@@ -71,7 +73,7 @@ def n_memories() -> int:
 def test_dropped_sessions_leave_their_rows_to_others(env: Environment, sphere: PointShell) -> None:
     with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
         for _ in range(2):
-            Session(cells, sphere, still(0.03), rate=RATE)
+            Session(cells, sphere, still(0.03), law="plane", rate=RATE)
             gc.collect()
             assert cells.table.desk.pids.tolist() == [0] * MOST_READERS
 
@@ -105,7 +107,7 @@ def test_a_forked_copy_that_leaves_a_session_does_not_end_it(
     path = tmp_path / "forked.hdbrec"
     with (
         ResidentCells(env.url, budget_bytes=4 << 20) as cells,
-        Session(cells, sphere, still(DEEP), rate=RATE, record=path) as session,
+        Session(cells, sphere, still(DEEP), law="plane", rate=RATE, record=path) as session,
     ):
         until(lambda: session.n_frames > 50, session)
 
@@ -129,7 +131,9 @@ def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
         raise FileError("no space is left: free some")
 
     path = tmp_path / "full.hdbrec"
-    session = Session(env.url, sphere, still(DEEP), rate=RATE, budget_bytes=4 << 20, record=path)
+    session = Session(
+        env.url, sphere, still(DEEP), law="plane", rate=RATE, budget_bytes=4 << 20, record=path
+    )
     pids = session.pid, session.cells.pid
     with monkeypatch.context() as patch:
         patch.setattr(Recorder, "close", full)
@@ -161,7 +165,7 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
     monkeypatch.setattr(Session, "close", cut_off)
     with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
         with pytest.raises(KeyboardInterrupt):
-            Session(cells, sphere, still(DEEP), record=path)
+            Session(cells, sphere, still(DEEP), law="plane", record=path)
         assert not path.exists()
 
 
@@ -170,19 +174,19 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
 
 def test_a_budget_of_nothing_is_refused(env: Environment, sphere: PointShell) -> None:
     with pytest.raises(UsageError, match="budget of 0 bytes"):
-        Session(env.url, sphere, still(0.03), budget_bytes=0)
+        Session(env.url, sphere, still(0.03), law="plane", budget_bytes=0)
 
 
 def test_a_policy_that_is_none_is_refused(env: Environment, sphere: PointShell) -> None:
     with pytest.raises(UsageError, match=r"^policy 'Wait': give 'hold' or 'wait'$"):
-        Session(env.url, sphere, still(0.03), policy="Wait")  # type: ignore[arg-type]
+        Session(env.url, sphere, still(0.03), law="plane", policy="Wait")  # type: ignore[arg-type]
 
 
 def test_cells_that_are_closed_are_refused(env: Environment, sphere: PointShell) -> None:
     with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
         pass
     with pytest.raises(UsageError, match=r"^these cells are closed: make others$"):
-        Session(cells, sphere, still(0.03))
+        Session(cells, sphere, still(0.03), law="plane")
 
 
 @pytest.mark.long
@@ -196,4 +200,4 @@ def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
 ) -> None:
     monkeypatch.setattr(place, "START_PATIENCE", 0.0)
     with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s: "):
-        Session(env.url, sphere, still(0.03), budget_bytes=4 << 20)
+        Session(env.url, sphere, still(0.03), law="plane", budget_bytes=4 << 20)

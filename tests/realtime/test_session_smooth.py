@@ -9,11 +9,11 @@ import pytest
 
 from banded import write_points
 from children import PATIENCE
-from hapticdb import DeviceCoupling, Environment, Handle, PointShell, TangentPlane, UsageError
+from hapticdb import Coupling, Environment, Handle, PointShell, TangentPlane, UsageError
 from hapticdb.devices.scripted import Device, Player
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.query.law import DistanceField
-from hapticdb.realtime.coupling import Coupling, SettledCoupling
+from hapticdb.realtime.coupling import SettledCoupling
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
@@ -102,13 +102,19 @@ def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
     assert frames["wrench"].any()
 
 
-def test_the_plane_law_is_felt_there_too_and_replays_as_what_it_is(
+def test_the_plane_law_is_felt_there_too_directly_and_replays_as_what_it_is(
     cells: ResidentCells, ball: PointShell, env: Environment, tmp_path: Path
 ) -> None:
+    """The tool is at the hand; the device gets each frame's wrench, once the force has risen."""
     report = felt(cells, ball, pressing(0.004), tmp_path / "p.hdbrec", law="plane")
-    assert (report.law, report.coupling) == ("plane", Coupling())
-    assert 0.0 < report.peak_force < 1000.0 * SIZE
+    assert (report.law, report.is_direct, report.figures()["is_direct"]) == ("plane", True, True)
     assert Recording(tmp_path / "p.hdbrec").header.law == TangentPlane()
+    frames = recorded(tmp_path / "p.hdbrec")
+    assert frames["contacts"].any()
+    assert (frames["tool"] == frames["hand"]).all()
+    assert not frames["applied"][0].any()
+    late = frames[frames["time"] > 0.1]
+    np.testing.assert_allclose(late["applied"][:, :3], late["wrench"][:, :3], atol=1e-12)
     replayed = replay(Recording(tmp_path / "p.hdbrec"), env)
     assert replayed.is_equal, replayed.describe()
 
@@ -117,7 +123,7 @@ def test_a_stiffness_too_great_for_the_device_is_lowered_and_reported(
     cells: ResidentCells, ball: PointShell
 ) -> None:
     hand = SimulatedDevice(still(0.03))
-    report = felt(cells, ball, hand, seconds=0.1, coupling=DeviceCoupling(stiffness=50_000.0))
+    report = felt(cells, ball, hand, seconds=0.1, coupling=Coupling(stiffness=50_000.0))
     assert isinstance(report.coupling, SettledCoupling)
     assert report.coupling.stiffness < 50_000.0
     assert str(report.coupling.lowered).startswith("stiffness 5e+04 N/m lowered to")
@@ -173,15 +179,15 @@ def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_whe
 def test_a_law_and_a_coupling_that_do_not_fit_are_refused(
     cells: ResidentCells, ball: PointShell, tmp_path: Path
 ) -> None:
-    with pytest.raises(UsageError, match="does not go with the smooth law"):
-        Session(cells, ball, still(0.03), law="smooth", coupling=Coupling())
-    with pytest.raises(UsageError, match="does not go with the tangent plane"):
-        Session(cells, ball, still(0.03), law="plane", coupling=DeviceCoupling())
+    with pytest.raises(UsageError, match="does not go with the plane law"):
+        Session(cells, ball, still(0.03), law="plane", coupling=Coupling(stiffness=100.0))
     with pytest.raises(UsageError, match="law 'hard': choose one of plane, smooth"):
         Session(cells, ball, still(0.03), law="hard")  # type: ignore[arg-type]
     with floored(make(tmp_path, bits=5)) as without:
         with pytest.raises(UsageError, match="has no distances to its surface"):
             Session(without.url, ball, still(0.03), law="smooth")
+        with pytest.raises(UsageError, match=r"run 'hapticdb upgrade .*', or .* --law plane$"):
+            Session(without.url, ball, still(0.03))
         with (
             ResidentCells(without.url, budget_bytes=1 << 20) as plain,
             pytest.raises(UsageError, match="the smooth law needs cells with distances"),

@@ -13,7 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hapticdb import DeviceCoupling, FileError, PointShell, TangentPlane, UsageError
+from hapticdb import Coupling, FileError, PointShell, TangentPlane, UsageError
 from hapticdb.devices.profiles import PROFILES
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.poses import rotation_of
@@ -62,7 +62,7 @@ def test_the_header_returns(tmp_path: Path, sphere: PointShell) -> None:
 
 
 def test_the_header_names_law_and_coupling(tmp_path: Path) -> None:
-    coupling = asdict(DeviceCoupling().settled(PROFILES["omni"], 1000.0, 2.0, 0.1))
+    coupling = asdict(Coupling().settled(PROFILES["omni"], 1000.0, 2.0, 0.1))
     given = header(law=DistanceField(800.0), coupling=coupling)
     Recorder(tmp_path / "smooth.hdbrec", given).close()
     found = Recording(tmp_path / "smooth.hdbrec").header

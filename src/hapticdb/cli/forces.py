@@ -1,7 +1,7 @@
-"""What the options of `feel` say of the force: its law, and the spring between hand and tool."""
+"""What the options of `feel` say of the force: its law, and the coupling of hand and tool."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
 from hapticdb.cli.tools import inset_for
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from hapticdb.cli.choosing import Felt
     from hapticdb.devices.profiles import DeviceProfile
     from hapticdb.query.law import ForceLaw, LawName
-    from hapticdb.realtime.coupling import DeviceCoupling
+    from hapticdb.realtime.coupling import Coupling
     from hapticdb.realtime.resident_cells import ResidentCells
     from hapticdb.realtime.session import Session
 
@@ -26,7 +26,7 @@ class ForceOptions:
     Attributes
     ----------
     law_name : {"plane", "smooth"} or None
-        --law. None: smooth where the environment has distances.
+        --law. None: smooth.
     stiffness : float or None
         --stiffness, N/m: at the device under the smooth law, of a contact under the plane law.
     profile_name : str or None
@@ -53,10 +53,7 @@ class ForceOptions:
 
     def __post_init__(self) -> None:
         """Refuse what no session takes, before anything is opened."""
-        self._device_coupling()
-        if self.law_name == "plane":
-            self._check_plane()
-            self._plane()
+        self._law_and_coupling()
 
     def profile(self) -> "DeviceProfile | None":
         """Profile that --device-profile names; None where it is not given."""
@@ -74,16 +71,23 @@ class ForceOptions:
             distances=distances,
         )  # fmt: skip
 
-    def law_and_coupling(self, cells: "ResidentCells") -> dict[str, Any]:
-        """Arguments `law` and `coupling` of a session on those cells."""
-        if cells.has_distances:
-            return {"law": "smooth", "coupling": self._device_coupling()}
-        self._check_plane()
-        return {"law": self._plane(), "coupling": None}
+    def law_and_coupling(self, cells: "ResidentCells") -> "tuple[ForceLaw | None, Coupling]":
+        """Law and coupling of a session on those cells.
+
+        Raises
+        ------
+        UsageError
+            If no law was asked for and the cells have no distances.
+        """
+        from hapticdb.realtime.resident_cells import without_distances
+
+        if self.law_name is None and not cells.has_distances:
+            raise UsageError(without_distances(cells.url))
+        return self._law_and_coupling()
 
     def inset(self, cells: "ResidentCells") -> float:
         """How far a tool is drawn inward on those cells, metres; see `inset_for`."""
-        law = "smooth" if cells.has_distances else "plane"
+        law = self.law_name or "smooth"
         return inset_for(cells.grid.voxel_size, law, is_conservative=self.is_conservative)
 
     def tell_lowered(self, session: "Session") -> None:
@@ -92,27 +96,17 @@ class ForceOptions:
         if self.stiffness is not None and lowered is not None:
             render.note(lowered)
 
-    def _device_coupling(self) -> "DeviceCoupling":
-        from hapticdb.realtime.coupling import DeviceCoupling
-
-        return DeviceCoupling(
-            stiffness=self.stiffness,
-            cap=self.cap,
-            delay=None if self.delay_ms is None else 1e-3 * self.delay_ms,
-            profile=self.profile(),
-        )
-
-    def _plane(self) -> "ForceLaw":
+    def _law_and_coupling(self) -> "tuple[ForceLaw | None, Coupling]":
         from hapticdb import TangentPlane
+        from hapticdb.realtime.coupling import Coupling
 
-        return TangentPlane(PLANE_STIFFNESS if self.stiffness is None else self.stiffness)
-
-    def _check_plane(self) -> None:
-        """Refuse options that the plane law does not take."""
-        given = {"--cap": self.cap, "--delay": self.delay_ms}
-        for option, value in given.items():
-            if value is not None:
-                raise UsageError(
-                    f"{option} belongs to the smooth law, and this session has the plane law: "
-                    "leave it out, or use an environment with distances"
-                )
+        if self.law_name != "plane":
+            delay = None if self.delay_ms is None else 1e-3 * self.delay_ms
+            return None, Coupling(self.stiffness, self.cap, delay=delay, profile=self.profile())
+        if self.delay_ms is not None:
+            raise UsageError(
+                "--delay belongs to the smooth law: under the plane law there is no coupling that "
+                "it could change; leave it out"
+            )
+        stiffness = PLANE_STIFFNESS if self.stiffness is None else self.stiffness
+        return TangentPlane(stiffness), Coupling(cap=self.cap, profile=self.profile())

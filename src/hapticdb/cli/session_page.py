@@ -110,10 +110,18 @@ def force_facts(report: "Report") -> Facts:
     """Law and coupling, the greatest force, and what was done to keep it stable."""
     from hapticdb.realtime.coupling import SettledCoupling
 
+    facts: Facts
     spring = report.coupling
     if not isinstance(spring, SettledCoupling):
-        return [("force law", "plane: tangent planes of voxels"), ("peak", _peak_text(report))]
-    facts: Facts = [
+        facts = [
+            ("force law", "plane: tangent planes of voxels"),
+            ("rendering", "direct, without coupling: each frame's wrench goes to the device"),
+        ]
+        if spring is not None:
+            caps = f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m (profile {spring.profile})"
+            facts.append(("at most", caps))
+        return [*facts, ("peak", _peak_text(report))]
+    facts = [
         ("force law", "smooth: distances to surfaces"),
         ("stiffness", f"{spring.stiffness:.4g} N/m at the device{_lowered_clause(spring)}"),
         (

@@ -13,7 +13,7 @@ from hapticdb.hosting.channel import Ask, Channel
 from hapticdb.hosting.hosted import Calls, HostedSession
 from hapticdb.hosting.tables import Words
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+from hapticdb.realtime.coupling import Coupling
 
 LOG = logging.getLogger("hapticdb.hosting")
 
@@ -60,7 +60,7 @@ class AttachedHost:
         *,
         where: Words = (),
         exclude: Words = (),
-        coupling: Coupling | DeviceCoupling | None = None,
+        coupling: Coupling | None = None,
         scale: float = 1.0,
         label: str = "",
         budget_points: int | None = None,

@@ -19,10 +19,9 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.hand import quasistatic, servo
-from hapticdb.kernels.hand.anchors import MET_ROWS
-from hapticdb.kernels.hand.coupling import IS_HELD
 from hapticdb.kernels.hand.device_spring import contact_stiffness
-from hapticdb.kernels.hand.near_points import FIELD_ROWS
+from hapticdb.kernels.hand.holding import IS_HELD
+from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
 from hapticdb.kernels.proxy.linearize import linearize
 from hapticdb.kernels.proxy.planes import ROW_COLUMNS
 from hapticdb.kernels.records import (
@@ -48,7 +47,7 @@ from hapticdb.protocol.contacts import (
     ProxyTerms,
     ProxyWish,
 )
-from hapticdb.realtime.coupling import DeviceCoupling, radius_of
+from hapticdb.realtime.coupling import Coupling, radius_of
 from hapticdb.realtime.drive import prepare_follower
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.resident.frames import clusters_of, sleeps_by_itself
@@ -102,7 +101,7 @@ class ContactSource:
         compile_missing(entries_for("proxies"))
         size = cells.grid.voxel_size
         radius = radius_of(shell, size)
-        coupling = DeviceCoupling(
+        coupling = Coupling(
             stiffness=wish.stiffness or None,
             turn_stiffness=wish.turn_stiffness or None,
             cap=wish.cap or None,

@@ -28,16 +28,9 @@ from hapticdb.kernels.records import LABEL_BYTES
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.poses import quaternion_of
-from hapticdb.query.choosing import chosen_law, is_smooth
-from hapticdb.query.law import ForceLaw
-from hapticdb.realtime.coupling import (
-    Coupling,
-    DeviceCoupling,
-    SettledCoupling,
-    coupling_for,
-    radius_of,
-)
-from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.query.law import SMOOTH
+from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
+from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.recording.header import Header
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.filtering import Filter
@@ -127,7 +120,7 @@ class SessionHost:
         *,
         where: Words = (),
         exclude: Words = (),
-        coupling: Coupling | DeviceCoupling | None = None,
+        coupling: Coupling | None = None,
         scale: float = 1.0,
         label: str = "",
         budget_points: int | None = None,
@@ -143,7 +136,7 @@ class SessionHost:
         where, exclude : sequence of int or str
             Words as of `Environment.find`. The tool feels the objects that `where` chooses (all if
             it is empty) and `exclude` does not choose.
-        coupling : DeviceCoupling, Coupling or None
+        coupling : Coupling or None
             As for `hapticdb.realtime.session.Session`. Unless it has a profile, its hand counts as
             one that no force moves.
         scale : float
@@ -158,7 +151,8 @@ class SessionHost:
         Raises
         ------
         UsageError
-            If a number is out of its range or no seat is free.
+            If a number is out of its range, no seat is free, or something that is felt has no
+            distances to its surfaces.
         ObjectNotFoundError
             If a word chooses nothing.
         DatabaseError
@@ -184,7 +178,7 @@ class SessionHost:
         shell: PointShell,
         pose: Any,  # noqa: ANN401 - (4, 4), checked
         felt: Filter,
-        coupling: Coupling | DeviceCoupling | None,
+        coupling: Coupling | None,
         scale: float,
         label: str,
         budget: int | None,
@@ -197,14 +191,15 @@ class SessionHost:
             undo.callback(self._board.release, seat)
             cells = self._tables.take(felt)
             undo.callback(self._tables.release, cells)
-            law = chosen_law(None, has_distances=cells.has_distances)
-            settled = self._settled(coupling, law, cells, shell, scale)
+            if not cells.has_distances:
+                raise UsageError(without_distances(self.url))
+            settled = self._settled(coupling, cells, shell, scale)
             reader = cells.table.join()
             undo.callback(cells.table.leave, reader)
             cells.table.desk.pids[reader] = worker.pid
             request = SeatRequest(
                 seat=seat, table=id(cells), n_slots=cells.table.n_slots, reader=reader,
-                grid=cells.grid, shell=shell, law=law, coupling=settled, scale=scale,
+                grid=cells.grid, shell=shell, coupling=settled,
                 pose=(*pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3])[0].tolist()),
                 budget_points=budget,
             ).without_surface()  # fmt: skip
@@ -218,18 +213,14 @@ class SessionHost:
 
     def _settled(
         self,
-        coupling: Coupling | DeviceCoupling | None,
-        law: ForceLaw,
+        coupling: Coupling | None,
         cells: ResidentCells,
         shell: PointShell,
         scale: float,
-    ) -> Coupling | SettledCoupling:
-        """Coupling for the session's law, with all its numbers."""
-        chosen = coupling_for(coupling, smooth=is_smooth(law))
-        if isinstance(chosen, Coupling):
-            return chosen
+    ) -> SettledCoupling:
+        """Coupling of a session, with all its numbers."""
         radius = radius_of(shell, cells.grid.voxel_size)
-        return chosen.settled(SCRIPTED, self.rate, scale, radius)
+        return (coupling or Coupling()).settled(SCRIPTED, self.rate, scale, radius)
 
     def sessions(self) -> list[HostedSession]:
         """Sessions that run now, by their ids."""
@@ -255,9 +246,9 @@ class SessionHost:
                 raise UsageError(f"the hosted session {session} is over: begin another")
             return known[word](running, *content)
 
-    def _set_coupling(self, running: Running, coupling: Coupling | DeviceCoupling | None) -> None:
+    def _set_coupling(self, running: Running, coupling: Coupling | None) -> None:
         asked = running.request
-        settled = self._settled(coupling, asked.law, running.cells, asked.shell, asked.scale)
+        settled = self._settled(coupling, running.cells, asked.shell, asked.coupling.scale)
         running.worker.ask("set_coupling", asked.seat, settled)
 
     def _record(self, running: Running, path: str, replace: bool) -> None:  # noqa: FBT001 - of a call
@@ -268,7 +259,7 @@ class SessionHost:
             revision=running.cells.table.revision,
             shell=asked.shell,
             rate=self.rate,
-            law=asked.law,
+            law=SMOOTH,
             where=running.cells.felt.where,
             exclude=running.cells.felt.exclude,
             coupling=asdict(asked.coupling),

@@ -15,7 +15,7 @@ from hapticdb.kernels.hand.handle import FARTHEST
 from hapticdb.kernels.records import TIME_BIN, TIME_BINS
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.poses import quaternion_of
-from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.report import Spread
 from hapticdb.recording.frame import Frames, State
 
@@ -154,14 +154,8 @@ class HostedSession:
         found = self._board.contacts(self._open_seat())
         return found[:, :3], found[:, 3:]
 
-    def set_coupling(self, coupling: Coupling | DeviceCoupling | None) -> None:
-        """Replace the coupling between hand and tool; None: the default one.
-
-        Raises
-        ------
-        UsageError
-            If the coupling belongs to the other force law.
-        """
+    def set_coupling(self, coupling: Coupling | None) -> None:
+        """Replace the coupling between hand and tool; None: the default one."""
         self._call("set_coupling", self.id, coupling)
 
     def record(self, path: str | os.PathLike[str], *, replace: bool = False) -> None:

@@ -23,10 +23,9 @@ from hapticdb.kernels.records import (
     TOLD,
     pose_numbers,
 )
-from hapticdb.kernels.resident.cells import Place
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import ForceLaw
-from hapticdb.realtime.coupling import Coupling, SettledCoupling
+from hapticdb.query.law import SMOOTH
+from hapticdb.realtime.coupling import SettledCoupling
 from hapticdb.realtime.drive import prepare_follower
 from hapticdb.resident.frames import RUN, clusters_of, sleeps_by_itself
 from hapticdb.resident.sleepers import counts_of, sleepers_of
@@ -47,9 +46,7 @@ class SeatRequest:
     reader: int
     grid: Grid
     shell: PointShell
-    law: ForceLaw
-    coupling: Coupling | SettledCoupling
-    scale: float
+    coupling: SettledCoupling
     pose: tuple[float, ...]
     budget_points: int | None = None
 
@@ -121,9 +118,9 @@ class Stations:
         pose_numbers(servo["tool"])[:] = pose_numbers(servo["hand"])[:] = request.pose
         way = station["way"]
         way["start"], way["end"], way["seconds"] = request.pose, request.pose, 1e-9
-        self._write_tool(n, request, table)
+        self._write_tool(n, request)
         self._write_cells(n, table)
-        self._write_coupling(n, 0, request, request.coupling)
+        station["springs"][:, 0] = request.coupling.spring()
         sessions = table.desk.sessions
         station["session"] = sessions[request.reader : request.reader + 1].ctypes.data
         for name, rows in (
@@ -131,8 +128,7 @@ class Stations:
         ):  # fmt: skip
             station[name] = rows[n : n + 1].ctypes.data
         station["seat"], station["reader"] = request.seat, request.reader
-        station["is_smooth"] = isinstance(request.coupling, SettledCoupling)
-        station["stiffness"], station["scale"] = request.law.stiffness, request.scale
+        station["stiffness"] = SMOOTH.stiffness
         station["bits"], station["curve"] = request.grid.bits, request.grid.curve_code
         station["gap"] = USUAL_GAP_NS
         station["began"] = station["last"] = time.monotonic_ns()
@@ -140,7 +136,7 @@ class Stations:
         self._places[request.seat] = n
         station["is_running"] = 1
 
-    def _write_tool(self, n: int, request: SeatRequest, table: CellTable) -> None:
+    def _write_tool(self, n: int, request: SeatRequest) -> None:
         """Make the tool's arrays, and write their addresses."""
         grid, station = request.grid, self._stations[n : n + 1]
         sleeps = sleeps_by_itself(request.shell, request.budget_points)
@@ -149,7 +145,7 @@ class Stations:
         budget = min(request.budget_points or n_points, n_points)
         prepare_follower(self._followers[n, ...], n_points, budget if sleeps else None)
         met = np.zeros((HOSTED_ROWS, n_points), dtype=np.int64)
-        field = np.zeros((FIELD_ROWS, n_points)) if table.has_distances else np.zeros((1, 1))
+        field = np.zeros((FIELD_ROWS, n_points))
         arrays = {
             name: np.ascontiguousarray(getattr(clusters, name))
             for name in ("points", "center", "spheres", "groups", "columns", "scratch")
@@ -184,25 +180,11 @@ class Stations:
         station["n_readers"], station["n_slots"] = MOST_READERS, table.n_slots
         station["capacity"] = table.capacity
 
-    def _write_coupling(
-        self, n: int, which: int, request: SeatRequest, coupling: Coupling | SettledCoupling
-    ) -> None:
-        """Write a coupling's numbers into one of a station's two places for them."""
-        station = self._stations[n : n + 1]
-        if isinstance(coupling, SettledCoupling):
-            station["springs"][:, which] = coupling.spring()
-            return
-        grid = request.grid
-        place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-        station["bodies"][:, which] = coupling.body(
-            request.shell, place, request.law.stiffness, request.scale
-        )
-
-    def set_coupling(self, seat: int, coupling: Coupling | SettledCoupling) -> None:
+    def set_coupling(self, seat: int, coupling: SettledCoupling) -> None:
         """Replace a session's coupling; the loop takes the new one whole, between two frames."""
         n = self._places[seat]
         which = 1 - int(self._stations["coupling"][n])
-        self._write_coupling(n, which, self._requests[n], coupling)
+        self._stations["springs"][n, which] = coupling.spring()
         self._stations["coupling"][n] = which
 
     def withdraw(self, seat: int) -> None:

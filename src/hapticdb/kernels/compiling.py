@@ -27,8 +27,6 @@ from typing import NamedTuple, Self
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 ENTRIES = {
-    "hand.coupling": "advance",
-    "hand.large": "advance_asleep",
     "hand.quasistatic": "advance",
     "proxy.linearize": "linearize",
     "hosting.loop": "run",
@@ -39,7 +37,6 @@ ENTRIES = {
     "resident.nearest": "find_nearest",
     "resident.first_hits": "find_first_hits",
     "resident.feeling": "feel_kernel bounding_spheres",
-    "large.sleeping": "feel_sleeping",
     "large.budget": "feel_within",
     "query.refining": (
         "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
@@ -59,6 +56,7 @@ ENTRIES = {
     "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
     "resident.sweep": "poses_between unpack find_hits",
     "surfaces.sampling": "eliminate_kernel",
+    "hand.direct": "render",
     "hand.servo": "tell name_voxels note",
     "curves": "encode_kernel decode_kernel",
     "rigid": "poses_of first_not_rigid",
@@ -70,11 +68,14 @@ ENTRIES = {
 here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {
-    "resident.feeling": "hand.coupling",
-    "large.sleeping": "hand.coupling",
-    "large.budget": "hand.coupling",
-    "hand.large": "hand.coupling",
+    "resident.feeling": "hand.quasistatic",
+    "large.budget": "hand.quasistatic",
+    "proxy.linearize": "hand.quasistatic",
     "hosting.loop": "hand.quasistatic",
+    "resident.first_hits": "resident.sweep",
+    "resident.clearance": "resident.sweep",
+    "resident.proving": "resident.sweep",
+    "resident.nearest": "resident.sweep",
 }
 """Modules that are compiled after another module in the same process: they share its leaves."""
 LONGEST_S = 600.0
@@ -122,7 +123,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         *_RESIDENT,
         "field.packing.unpack_kernel",
         "resident.feeling.feel_kernel",
-        "hand.coupling.*",
+        "hand.direct.*",
         "hand.quasistatic.*",
         "hand.servo.*",
         "hand.handle.*",
@@ -171,9 +172,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "large": (
         *_RESIDENT,
         "field.packing.unpack_kernel",
-        "large.sleeping.*",
         "large.budget.*",
-        "hand.large.*",
     ),
     "everything": ("*",),
 }

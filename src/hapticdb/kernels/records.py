@@ -95,19 +95,16 @@ TOOL: Layout = _record(
     [
         ("position", "<f8", 3),  # of the tool's frame, m
         ("quaternion", "<f8", 4),  # unit, scalar first
-        ("velocity", "<f8", 6),  # of the centre of mass, m/s, then rad/s
         ("kept", "<f8", 6),  # the last unfaded wrench for the hand: N, N m
         ("held_for", "<f8"),  # s for which that wrench is kept
         ("risen", "<f8"),  # share of the wrench that is sent, 0 to 1
         ("version", "<i8"),  # of the cells that `felt` was computed from, 0 for none
         ("felt", "<f8", RESULTS),  # frame at this pose, about the centre of mass
         ("pose", "<f8", (4, 4)),
-        ("tried_felt", "<f8", RESULTS),  # the same at the end of a step that is tried
-        ("tried_pose", "<f8", (4, 4)),
-        ("loose", "<f8", 6),  # box of voxels in which no new hit gets an anchor
+        ("tried_pose", "<f8", (4, 4)),  # that is looked at
     ]
 )
-"""The tool as a body; at the start all fields but position and quaternion are zero."""
+"""The tool; at the start all fields but position and quaternion are zero."""
 
 SENT: Layout = _record(
     [
@@ -117,7 +114,7 @@ SENT: Layout = _record(
         ("unknown", "<i8"),  # points, at the pose that was tried
         ("deepest", "<f8"),  # m
         ("n_steps", "<i8"),  # made
-        ("marks", "<i8"),  # bits named in `kernels.hand.coupling`; `flags` is NumPy's own name
+        ("marks", "<i8"),  # bits named in `kernels.hand.holding`; `flags` is NumPy's own name
         ("revision", "<i8"),  # of the database
         ("left_out", "<i8"),  # points near something that the budget left out, most of a frame
     ]
@@ -372,7 +369,6 @@ STATION: Layout = _record(
         ("is_running", "<i8"),  # all other fields are complete
         ("seat", "<i8"),  # row of the board
         ("reader", "<i8"),  # row of the table of cells
-        ("is_smooth", "<i8"),  # the cells have distances
         ("is_large", "<i8"),  # clusters of the tool sleep, or it has a budget of points
         # addresses of the table's arrays and of its row SESSION, and sizes
         *((name, "<i8") for name in ("control", "readers", "keys", "slots", "words", "masks")),
@@ -390,10 +386,8 @@ STATION: Layout = _record(
         ("bits", "<i8"),  # of the grid's curve, on an axis
         ("curve", "<i8"),  # its code
         ("coupling", "<i8"),  # which of the two rows is used: the other one may be written
-        ("springs", "<f8", (2, 9)),  # fields of DeviceSpring, with distances
-        ("bodies", "<f8", (2, 11)),  # fields of Body, without
+        ("springs", "<f8", (2, 9)),  # fields of DeviceSpring
         ("stiffness", "<f8"),  # of the law of a recording, N/m
-        ("scale", "<f8"),  # metres of the scene for a metre of the device
         # the hand between arrivals
         ("seen", "<i8"),  # sequence number of the last arrival
         ("arrived", "<i8"),  # ns

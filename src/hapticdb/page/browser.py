@@ -21,7 +21,7 @@ from hapticdb.page.panels.touch import TouchPanel
 from hapticdb.page.tools import HeldTool, start_pose
 from hapticdb.page.wording import plain_name
 from hapticdb.poses import quaternion_of
-from hapticdb.realtime.coupling import DeviceCoupling
+from hapticdb.realtime.coupling import Coupling
 
 if TYPE_CHECKING:
     from viser import ClientHandle, TransformControlsEvent
@@ -238,7 +238,8 @@ class Browser:
             undo.callback(self._unshare)
             session = self.site.host.begin(
                 self.tool.shell, matrix(start), exclude=self._unfelt,
-                coupling=self._coupling(), scale=self.scale, label=self.visitor.name,
+                coupling=Coupling(stiffness=self.stiffness), scale=self.scale,
+                label=self.visitor.name,
             )  # fmt: skip
             undo.callback(session.end)
             session.move(matrix(self.hand))
@@ -303,10 +304,7 @@ class Browser:
         self.stiffness = stiffness
         session = self.session
         if session is not None and not session.is_over:
-            session.set_coupling(self._coupling())
-
-    def _coupling(self) -> DeviceCoupling | None:
-        return DeviceCoupling(stiffness=self.stiffness) if self.site.stage.is_smooth else None
+            session.set_coupling(Coupling(stiffness=self.stiffness))
 
     def _start(self) -> Floats:
         stage = self.site.stage

@@ -24,7 +24,7 @@ from hapticdb.page.link import PageRequest
 from hapticdb.page.scene.view import SceneEdit, SceneView
 from hapticdb.page.wording import error_text
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.realtime.coupling import Coupling, DeviceCoupling
+from hapticdb.realtime.coupling import Coupling
 from hapticdb.store.connect import open_store
 
 if TYPE_CHECKING:
@@ -56,7 +56,7 @@ class Host(Protocol):
         *,
         where: Sequence[int | str] = (),
         exclude: Sequence[int | str] = (),
-        coupling: Coupling | DeviceCoupling | None = None,
+        coupling: Coupling | None = None,
         scale: float = 1.0,
         label: str = "",
     ) -> HostedSession:

@@ -1,4 +1,4 @@
-"""Which force law a name means, and which one is used where none is asked for."""
+"""Which force law a name means, and whether it reads distances."""
 
 from hapticdb.errors import UsageError
 from hapticdb.query.law import (
@@ -9,7 +9,6 @@ from hapticdb.query.law import (
     ForceLaw,
     LawName,
     TangentPlane,
-    as_law,
 )
 
 
@@ -24,17 +23,6 @@ def law_named(name: str, stiffness: float) -> TangentPlane | DistanceField:
     if name not in LAW_NAMES:
         raise UsageError(f"law {name!r}: this hapticdb has {', '.join(LAW_NAMES)}")
     return TangentPlane(stiffness) if name == PLANE.name else DistanceField(stiffness)
-
-
-def chosen_law(law: ForceLaw | LawName | None, *, has_distances: bool) -> ForceLaw:
-    """Law that was asked for. None: the smooth law where there are distances, else the plane.
-
-    Raises
-    ------
-    UsageError
-        If there is no law of that name.
-    """
-    return as_law(law) or (SMOOTH if has_distances else PLANE)
 
 
 def is_smooth(law: ForceLaw | LawName) -> bool:

@@ -1,8 +1,7 @@
-"""Couplings between hand and tool.
+"""The coupling between hand and tool, and direct rendering without one.
 
-`Coupling` is for environments without distances: the tool is a body with a mass, and a spring and a
-damper pull it to the handle. `DeviceCoupling` is for environments with distances: the tool has no
-mass, and the numbers are those of the device.
+The coupling needs distances to surfaces: the tool rests where its spring and the contacts balance.
+Without distances the wrench of each frame goes to the device directly, up to the device's caps.
 """
 
 import math
@@ -13,102 +12,26 @@ import numpy as np
 from hapticdb.devices.profiles import DeviceProfile
 from hapticdb.devices.stability import allow
 from hapticdb.errors import UsageError
-from hapticdb.kernels.hand.body import Body
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.resident.cells import Place
+from hapticdb.kernels.hand.direct import DirectTerms
 from hapticdb.pointshell.shell import PointShell
 
 MOST = 1e9
-"""Largest number of a `DeviceCoupling`, in its unit: more than any device has."""
+"""Largest number of a `Coupling`, in its unit: more than any device has."""
 
 
 @dataclass(frozen=True)
 class Coupling:
-    """The tool as a body, and the spring and damper that pull it to the hand.
-
-    Translations and rotations are critically damped. The moment of inertia is m r^2: all mass at
-    the point farthest from the centre, more than any tool of that mass has. A push anywhere then
-    moves no point more than twice as easily as a push at the centre, so long tools are as stable
-    as round ones. Stiffness and damping of rotations are those of translations, times r^2.
-
-    In contact the spring is stretched by half a voxel at most, and the damper pulls no harder than
-    that spring. So the force is at most `stiffness` times a voxel, however fast the hand moves;
-    the torque is bounded likewise. The torque sent to the device is about the handle's origin.
-
-    Attributes
-    ----------
-    mass : float
-        Mass of the tool, kg.
-    stiffness : float
-        K, stiffness of the spring, N/m at the device.
-    hold, fade : float
-        In unknown cells the last wrench is kept for `hold` seconds and then falls to zero in `fade`
-        seconds. It rises again within `fade`, in at least four frames. It rises in the same way
-        when a session starts, and falls and rises when the clutch opens and closes.
-    most_substeps : int
-        Greatest number of substeps of a period. If a period needs more, its rest is dropped.
-
-    Raises
-    ------
-    UsageError
-        If a number is out of its range.
-    """
-
-    mass: float = 0.012
-    stiffness: float = 1000.0
-    hold: float = 0.02
-    fade: float = 0.02
-    most_substeps: int = 64
-
-    def __post_init__(self) -> None:
-        for name, unit in (("mass", "kg"), ("stiffness", "N/m"), ("hold", "s"), ("fade", "s")):
-            value = getattr(self, name)
-            if not (math.isfinite(value) and value > 0.0):
-                raise UsageError(f"a coupling's {name} of {value} {unit}: give a number above 0")
-        if self.most_substeps < 1:
-            raise UsageError(f"{self.most_substeps} substeps a period: give 1 or more")
-
-    def body(self, shell: PointShell, place: Place, stiffness: float, scale: float = 1.0) -> Body:
-        """Body of a shell in a grid, in the kernel's form; `stiffness` is a contact's, N/m.
-
-        The spring of the body is K / S in the scene, so that a device whose metre is S metres of
-        the scene (`scale`) feels K.
-
-        Raises
-        ------
-        UsageError
-            If the stiffness is negative or not finite.
-        """
-        if not (math.isfinite(stiffness) and stiffness >= 0.0):
-            raise UsageError(f"a contact's stiffness of {stiffness} N/m: give 0 or more")
-        radius = radius_of(shell, place.size)  # a single point would have no inertia
-        inertia = self.mass * radius**2
-        spring = self.stiffness / scale
-        damping = 2.0 * math.sqrt(spring * self.mass)
-        return Body(
-            mass=float(self.mass),
-            inertia=inertia,
-            spring=float(spring),
-            damping=damping,
-            turn_spring=spring * radius**2,
-            turn_damping=damping * radius**2,
-            radius=radius,
-            stiffness=float(stiffness),
-            hold=float(self.hold),
-            fade=float(self.fade),
-            most_substeps=int(self.most_substeps),
-        )
-
-
-@dataclass(frozen=True)
-class DeviceCoupling:
-    """The spring between hand and tool where the environment has distances; all in device units.
+    """The spring between hand and tool; all in device units.
 
     The tool has no mass: in each period it rests where the spring and the contacts balance. The
     hand feels the spring, so the force is min(stiffness times depth, cap), whatever the voxel size,
     the number of points and the scale. A number that is not given comes from the device's profile
     (`hapticdb.devices.profiles`), and the stiffness is lowered to what stays stable
     (`hapticdb.devices.stability`).
+
+    Without distances there is no spring: `cap`, `torque_cap`, `profile`, `hold` and `fade` then
+    bound what is rendered directly, and the other numbers are refused.
 
     Attributes
     ----------
@@ -131,7 +54,9 @@ class DeviceCoupling:
     profile : DeviceProfile or None
         Takes the place of the device's own profile.
     hold, fade : float
-        As for `Coupling`.
+        In unknown cells the last wrench is kept for `hold` seconds and then falls to zero in `fade`
+        seconds. It rises again within `fade`, in at least four frames. It rises in the same way
+        when a session starts, and falls and rises when the clutch opens and closes.
 
     Raises
     ------
@@ -189,7 +114,7 @@ class DeviceCoupling:
         UsageError
             If the stiffness or the delay cannot be used.
         """
-        profile = profile if self.profile is None else self.profile
+        profile = self.profile or profile
         allowed = allow(profile, rate, self.stiffness, self.delay)
         stiffness, lever = allowed.stiffness, radius / scale
         cap = profile.cap if self.cap is None else self.cap
@@ -212,10 +137,36 @@ class DeviceCoupling:
             fade=self.fade,
         )
 
+    def direct(self, profile: DeviceProfile, scale: float, radius: float) -> "DirectRendering":
+        """Rendering without a coupling; the parameters are those of `settled`.
+
+        Raises
+        ------
+        UsageError
+            If a number is given that only a spring has.
+        """
+        for name in ("stiffness", "turn_stiffness", "damping", "delay"):
+            if getattr(self, name) is not None:
+                raise UsageError(
+                    f"a coupling's {name} does not go with the plane law, which is rendered "
+                    "without a coupling: leave it out, or use the smooth law"
+                )
+        profile = self.profile or profile
+        cap = profile.cap if self.cap is None else self.cap
+        return DirectRendering(
+            profile=profile.name,
+            cap=cap,
+            torque_cap=_first(self.torque_cap, profile.torque_cap, cap * radius / scale),
+            scale=scale,
+            radius=radius,
+            hold=self.hold,
+            fade=self.fade,
+        )
+
 
 @dataclass(frozen=True)
 class SettledCoupling:
-    """A `DeviceCoupling` of one session: every number is settled. A recording has these.
+    """A `Coupling` of one session: every number is settled. A recording has these.
 
     Attributes
     ----------
@@ -226,7 +177,7 @@ class SettledCoupling:
     lowered : str or None
         One line: what lowered the stiffness; None if nothing did.
     cap, turn_stiffness, torque_cap, damping, delay, hold, fade : float
-        As for `DeviceCoupling`.
+        As for `Coupling`.
     scale : float
         S, metres of the scene for one metre of the device.
     radius : float
@@ -262,6 +213,42 @@ class SettledCoupling:
         )
 
 
+@dataclass(frozen=True)
+class DirectRendering:
+    """Rendering without a coupling: the tool is at the hand, and feels what the device renders.
+
+    This is the loop of the paper (section 4, Figure 4). The wrench of the tangent-plane law goes to
+    the device, up to its caps; nothing keeps the tool out of surfaces.
+
+    Attributes
+    ----------
+    profile : str
+        Name of the device's profile.
+    cap, torque_cap : float
+        Greatest force, N, and greatest torque about the tool's centre, N m, at the device.
+    scale, radius, hold, fade : float
+        As for `SettledCoupling`.
+    """
+
+    profile: str
+    cap: float
+    torque_cap: float
+    scale: float
+    radius: float
+    hold: float
+    fade: float
+
+    def terms(self) -> DirectTerms:
+        """Return the numbers in the kernel's form."""
+        return DirectTerms(
+            cap=float(self.cap),
+            turn_cap=float(self.torque_cap),
+            scale=float(self.scale),
+            hold=float(self.hold),
+            fade=float(self.fade),
+        )
+
+
 def radius_of(shell: PointShell, voxel_size: float) -> float:
     """Distance of the shell's farthest point from its centre, m; a voxel for a single point."""
     reach = float(np.linalg.norm(shell.points - shell.center, axis=1).max())
@@ -271,24 +258,3 @@ def radius_of(shell: PointShell, voxel_size: float) -> float:
 def _first(*values: float | None) -> float:
     """Return the first value that is not None."""
     return next(value for value in values if value is not None)
-
-
-def coupling_for(
-    coupling: Coupling | DeviceCoupling | None, *, smooth: bool
-) -> Coupling | DeviceCoupling:
-    """Coupling for a law: the given one if it fits, the law's own if none is given.
-
-    Raises
-    ------
-    UsageError
-        If the coupling belongs to the other law.
-    """
-    wanted = DeviceCoupling if smooth else Coupling
-    if coupling is None:
-        return wanted()
-    if not isinstance(coupling, wanted):
-        law = "smooth law" if smooth else "tangent plane"
-        raise UsageError(
-            f"a {type(coupling).__name__} does not go with the {law}: give a {wanted.__name__}"
-        )
-    return coupling

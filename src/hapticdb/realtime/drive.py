@@ -1,7 +1,7 @@
-"""Drives: what moves the tool in each period of the loop, one for each coupling.
+"""Drives: what moves the tool in each period of the loop, with a coupling or without.
 
-A drive has the state that a coupling keeps beside the servo record, and calls its kernel. The loop
-treats both alike.
+A drive has the state that is kept beside the servo record, and calls the kernels. The loop treats
+both alike.
 """
 
 from typing import Protocol
@@ -9,14 +9,13 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.hand import coupling as plane_kernels
-from hapticdb.kernels.hand import large, quasistatic
-from hapticdb.kernels.hand.anchors import BEFORE, MET_ROWS
-from hapticdb.kernels.hand.body import Body
+from hapticdb.kernels.hand import direct, quasistatic
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.near_points import (
+    FELT_POINTS,
     FIELD_ROWS,
     FLOOR,
+    MET_ROWS,
     NEAR,
     NEAR_POINTS,
     NEAR_ROWS,
@@ -24,9 +23,18 @@ from hapticdb.kernels.hand.near_points import (
 )
 from hapticdb.kernels.large import budget
 from hapticdb.kernels.large.sleeping import LEFT_OUT, Sleepers
-from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS
+from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS, pose_numbers
 from hapticdb.kernels.resident import feeling
-from hapticdb.kernels.resident.cells import UNKNOWNS, Cells, Clusters, Place
+from hapticdb.kernels.resident.cells import (
+    BUFFERS,
+    REVISION,
+    UNKNOWNS,
+    VERSION,
+    Cells,
+    Clusters,
+    Place,
+)
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.query.law import ForceLaw
 from hapticdb.resident.sleepers import counts_of
 
@@ -65,69 +73,91 @@ class DriveInputs(Protocol):
     """Most points near something that a frame looks at."""
 
 
-class PlaneDrive:
-    """The body of `Coupling`, pushed by the tangent-plane law.
+class _Feeling:
+    """Frames of the law at one pose, and the memory that they need."""
+
+    def __init__(self, scene: DriveInputs, cells: Cells, law: ForceLaw) -> None:
+        self._scene, self._cells, self._law = scene, cells, law.for_kernels
+        self.met = np.empty(len(scene.clusters.points), dtype=np.int64)
+        self.counts = counts_of(1)
+
+    def frame(self, poses: Floats, missed: Indices, out: Floats) -> None:
+        """Compute the frame at poses (1, 4, 4) into out (1, RESULTS), unless the pose is NaN.
+
+        `met` takes the indices of the hits, `missed` the unknown cells, and `counts` what the
+        budget left out.
+        """
+        scene = self._scene
+        if scene.sleepers is None:
+            feeling.feel_kernel(
+                self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self.met,
+                missed, out,
+            )  # fmt: skip
+            return
+        self.counts[:] = 0
+        budget.feel_within(
+            self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self.met,
+            missed, out, scene.sleepers, scene.budget, self.counts,
+        )  # fmt: skip
+
+
+class DirectDrive:
+    """The tool at the hand: the wrench of each frame goes to the device, up to its caps.
 
     Parameters
     ----------
     scene : DriveInputs
         Cells, tool and servo record.
-    body : Body
-        The tool as a body.
-    scale : float
-        S: the torque at the device is the scene's over S.
+    terms : DirectTerms
+        What bounds the wrench.
+    radius : float
+        Distance of the tool's farthest point from its centre, m.
+    law : ForceLaw
+        Law of the wrench; it reads no distances.
     """
 
-    def __init__(self, scene: DriveInputs, body: Body, scale: float) -> None:
-        self._scene, self._body, self._scale = scene, body, scale
-        self._cells = scene.cells.without_distances()  # distances, if any, are not read
-        self.radius, self.hold = body.radius, body.hold
-        self.least_share = 1.0
-        self._met = np.empty((MET_ROWS, len(scene.clusters.points)), dtype=np.int64)
-        self._met_before = self._met.copy()
+    def __init__(
+        self, scene: DriveInputs, terms: direct.DirectTerms, radius: float, law: ForceLaw
+    ) -> None:
+        self._scene, self._terms = scene, terms
+        self.radius, self.hold, self.least_share = radius, terms.hold, 1.0
+        self._feeling = _Feeling(scene, scene.cells.without_distances(), law)
+        self._hand_pose, self._at_hand = pose_numbers(scene.servo["hand"])[None], np.eye(4)[None]
+        self._felt = np.zeros((1, RESULTS))
         self._tool = scene.servo["tool"]
         self._tool_before = self._tool.copy()
-        self._torque = scene.servo["sent"]["wrench"][3:]
-        self._counts = counts_of(1)
+        self._left_out = scene.servo["sent"]["left_out"]
 
     def step(self, dt: float) -> None:
-        """Advance the tool by a period `dt` (s); `sent` then has the wrench for the device."""
-        scene = self._scene
-        if scene.sleepers is None:
-            plane_kernels.advance(
-                self._cells, scene.row, scene.clusters, scene.place, self._body, scene.servo, dt,
-                self._met, scene.missed,
-            )  # fmt: skip
-        else:
-            large.advance_asleep(
-                self._cells, scene.row, scene.clusters, scene.place, self._body, scene.servo, dt,
-                self._met, scene.missed, scene.sleepers, scene.budget, self._counts,
-            )  # fmt: skip
-        if self._scale != 1.0:
-            self._torque /= self._scale
+        """Feel the scene at the hand, a period `dt` (s) later; `sent` then has the wrench."""
+        scene, control = self._scene, self._scene.cells.control
+        # read before the frame: what is written meanwhile is then felt under an older revision
+        revision = control[REVISION + control[VERSION] % BUFFERS]
+        poses_of(self._hand_pose, self._at_hand)
+        self._feeling.frame(self._at_hand, scene.missed, self._felt)
+        direct.render(self._terms, scene.clusters.center, scene.servo, self._felt, revision, dt)
+        self._left_out[()] = self._feeling.counts[0, LEFT_OUT]
 
     def remember(self) -> None:
         """Store the state, so that `step_back` can return to it."""
         self._tool_before[()] = self._tool
-        self._met_before[:] = self._met
 
     def step_back(self, *, from_zero: bool) -> None:
         """Return to the remembered state; `from_zero`: the force rises again from zero."""
         self._tool[()] = self._tool_before
-        self._met[:] = self._met_before
         if from_zero:
             self._tool["risen"] = 0.0
 
     def touching(self, n_hits: int) -> Indices:
         """Indices of the last frame's hits, as many as it had."""
-        return self._met[BEFORE, :n_hits]
+        return self._feeling.met[:n_hits]
 
     def feel(self) -> None:
-        """Nothing to do: the frame at the tool's pose is computed in each step."""
+        """Nothing to do: each step is a frame of the law at the tool's pose."""
 
 
 class SmoothDrive:
-    """The quasi-static tool of `DeviceCoupling`, over distances to surfaces.
+    """The quasi-static tool of `Coupling`, over distances to surfaces.
 
     Parameters
     ----------
@@ -141,7 +171,8 @@ class SmoothDrive:
     """
 
     def __init__(self, scene: DriveInputs, spring: DeviceSpring, law: ForceLaw) -> None:
-        self._scene, self._spring, self._law = scene, spring, law.for_kernels
+        self._scene, self._spring = scene, spring
+        self._feeling = _Feeling(scene, scene.cells, law)
         self.radius, self.hold = spring.radius, spring.hold
         n_points = len(scene.clusters.points)
         self._follower = np.zeros((), FOLLOWER)
@@ -149,11 +180,10 @@ class SmoothDrive:
         self._met = np.zeros((MET_ROWS, n_points), dtype=np.int64)
         self._tool = scene.servo["tool"]
         self._tool_before = self._tool.copy()
-        self._met_here = np.empty(n_points, dtype=np.int64)
         self._missed_here = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._felt_here = np.zeros((1, RESULTS))
         self._felt, self._unknown = self._tool["felt"], scene.servo["sent"]["unknown"]
-        self._left_out, self._counts = scene.servo["sent"]["left_out"], counts_of(1)
+        self._left_out = scene.servo["sent"]["left_out"]
         is_awake = scene.sleepers is None
         prepare_follower(self._follower, n_points, None if is_awake else scene.budget)
 
@@ -186,7 +216,7 @@ class SmoothDrive:
         The voxels of these points may be free: the fetching process looks around them.
         """
         if not self._follower["is_loose"]:
-            return self._met[BEFORE, :n_hits]
+            return self._met[FELT_POINTS, :n_hits]
         side, n_near = int(self._follower["side"]), int(self._follower["n_near"])
         distances = self._field[NEAR + side * NEAR_ROWS + U, :n_near]
         return self._met[NEAR_POINTS + side, :n_near][distances < FLOOR]
@@ -197,19 +227,8 @@ class SmoothDrive:
         `tool.felt` takes its result. If cells were evicted since the step, points may be unknown
         by now: `sent.unknown` counts them, and a replay leaves the frame out.
         """
-        scene, felt = self._scene, self._felt_here[0]
-        if scene.sleepers is None:
-            feeling.feel_kernel(
-                scene.cells, scene.row, scene.clusters, scene.pose[None], scene.place, self._law,
-                self._met_here, self._missed_here, self._felt_here,
-            )  # fmt: skip
-        else:
-            self._counts[:] = 0
-            budget.feel_within(
-                scene.cells, scene.row, scene.clusters, scene.pose[None], scene.place, self._law,
-                self._met_here, self._missed_here, self._felt_here, scene.sleepers, scene.budget,
-                self._counts,
-            )  # fmt: skip
-            self._left_out[()] = max(self._left_out, self._counts[0, LEFT_OUT])
+        felt = self._felt_here[0]
+        self._feeling.frame(self._scene.pose[None], self._missed_here, self._felt_here)
+        self._left_out[()] = max(self._left_out, self._feeling.counts[0, LEFT_OUT])
         self._felt[:] = felt
         self._unknown += np.int64(felt[UNKNOWNS])

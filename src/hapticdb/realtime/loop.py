@@ -26,17 +26,16 @@ from hapticdb.devices.protocol import (
 from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.kernels._jit import ENTRIES
-from hapticdb.kernels.hand import coupling as kernels
-from hapticdb.kernels.hand import quasistatic, servo
+from hapticdb.kernels.hand import holding, quasistatic, servo
 from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.records import FRAME, MOST_MISSED, SERVO, TOLD, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import Place
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw
-from hapticdb.realtime.coupling import Coupling, SettledCoupling
+from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
-from hapticdb.realtime.drive import PlaneDrive, SmoothDrive
+from hapticdb.realtime.drive import DirectDrive, SmoothDrive
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
@@ -80,7 +79,7 @@ class LoopRequest:
     shell: PointShell
     device: Device
     law: ForceLaw
-    coupling: Coupling | SettledCoupling
+    coupling: SettledCoupling | DirectRendering
     handle: Handle
     timing: Timing
     seconds: float
@@ -134,13 +133,11 @@ class Loop:
         self._asked_at = 0  # ns; 0 without a request
         self.lateness, self.elapsed = Times(), Times()
 
-    def _make_drive(self) -> PlaneDrive | SmoothDrive:
-        request, coupling = self.request, self.request.coupling
+    def _make_drive(self) -> DirectDrive | SmoothDrive:
+        law, coupling = self.request.law, self.request.coupling
         if isinstance(coupling, SettledCoupling):
-            return SmoothDrive(self, coupling.spring(), request.law)
-        scale = request.handle.scale
-        body = coupling.body(request.shell, self.place, request.law.stiffness, scale)
-        return PlaneDrive(self, body, scale)
+            return SmoothDrive(self, coupling.spring(), law)
+        return DirectDrive(self, coupling.terms(), coupling.radius, law)
 
     # -- before the first frame --------------------------------------------------------------
 
@@ -284,7 +281,7 @@ class Loop:
         buttons: int,
         state: int,
     ) -> None:
-        if self.request.is_recorded and not self.sent.marks.item() & kernels.IS_HELD:
+        if self.request.is_recorded and not self.sent.marks.item() & holding.IS_HELD:
             poses_of(self._tool_pose, self._pose)
             self.drive.feel()
         servo.note(self.ring, at, begun, dt, lateness, elapsed, self.servo, buttons, state)
@@ -367,15 +364,15 @@ class Loop:
         if sent.unknown:
             counts.unknown_frames += 1
             counts.unknown_points += sent.unknown.item()
-        if flags & (kernels.IS_HELD | kernels.IS_DROPPED):
-            if flags & kernels.IS_HELD:
+        if flags & (holding.IS_HELD | holding.IS_DROPPED):
+            if flags & holding.IS_HELD:
                 counts.held_frames += 1
                 state |= State.HELD
-            if flags & kernels.IS_FADING:
+            if flags & holding.IS_FADING:
                 state |= State.FADING
-            if flags & kernels.IS_DROPPED:
+            if flags & holding.IS_DROPPED:
                 counts.dropped_frames += 1
-        if flags & (kernels.IS_CUT | kernels.IS_STOPPED):
+        if flags & holding.IS_CUT:
             counts.cut_frames += 1
         if flags & SMOOTH_FLAGS:
             if flags & quasistatic.IS_LOOSE:

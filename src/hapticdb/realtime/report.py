@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.proportions import Proportions
-from hapticdb.realtime.coupling import Coupling, SettledCoupling
+from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
 from hapticdb.realtime.resident_cells import CacheFigures
 
 BINS = 200_000
@@ -148,8 +148,9 @@ class Report:
         which contact begins.
     law : str
         The force law: "plane" or "smooth".
-    coupling : Coupling or SettledCoupling or None
-        The coupling between hand and tool, with what lowered its stiffness.
+    coupling : SettledCoupling or DirectRendering or None
+        The coupling between hand and tool, with what lowered its stiffness; under the plane law
+        what bounded the wrench, which went to the device directly.
     loose_frames, first_loose_frame : int
         With distances. Frames in which the tool lay in an object and felt nothing, since it began
         there or a part was put upon it; number of the first of them from 0, or -1 without any.
@@ -213,7 +214,7 @@ class Report:
     nowhere_frames: int = 0
     bad_reading: str | None = None
     law: str = "plane"
-    coupling: Coupling | SettledCoupling | None = None
+    coupling: SettledCoupling | DirectRendering | None = None
     loose_frames: int = 0
     first_loose_frame: int = -1
     ended_loose: bool = False
@@ -231,6 +232,11 @@ class Report:
         """Share of the looked-up points whose cell was resident."""
         return 1.0 - self.unknown_points / self.points if self.points else 1.0
 
+    @property
+    def is_direct(self) -> bool:
+        """Whether the frames' wrenches went to the device directly, without a coupling."""
+        return isinstance(self.coupling, DirectRendering)
+
     def figures(self) -> dict[str, object]:
         """All fields as plain numbers and strings, for JSON; times in seconds."""
         plain = asdict(self)
@@ -242,7 +248,7 @@ class Report:
             for times in ("lateness", "elapsed"):
                 plain[name][times] = getattr(part, times)._asdict()
         plain["cache"] = self.cache._asdict()
-        plain["hit_rate"] = self.hit_rate
+        plain["hit_rate"], plain["is_direct"] = self.hit_rate, self.is_direct
         plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
         plain["proportions"] = None if self.proportions is None else self.proportions.record()
         return plain

@@ -14,7 +14,7 @@ from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.processes import Process
 from hapticdb.resident.residency import check_cells, check_distances
 from hapticdb.resident.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellTable
-from hapticdb.store.connect import open_store
+from hapticdb.store.connect import open_store, redact
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 
@@ -64,6 +64,14 @@ def start_error(process: Process, name: str, seconds: float) -> HapticDBError:
             "is too slow now; try again"
         )
     return HapticDBError(f"the {name} process did not start: its errors are above")
+
+
+def without_distances(url: str) -> str:
+    """Words for a coupling in an environment without distances: what may be done."""
+    return (
+        f"{redact(url)} has no distances to surfaces, which the coupling of hand and tool needs: "
+        f"run 'hapticdb upgrade {redact(url)}', or feel tangent planes directly with --law plane"
+    )
 
 
 class ResidentCells:
@@ -159,7 +167,7 @@ class ResidentCells:
             self.left_out: tuple[int, ...] = tuple(left_out.ids.tolist())
             ids = set(self.left_out)
             felt = [obj for obj in self.first_objects if obj.id not in ids]
-            has_all = bool(felt) and all(obj.has_distances for obj in felt)
+            has_all = all(obj.has_distances for obj in felt)
             return store.grid, has_all if distances is None else distances
         finally:
             store.close()

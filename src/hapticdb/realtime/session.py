@@ -14,22 +14,16 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.proportions import Proportions, compare_proportions
-from hapticdb.query.choosing import chosen_law, is_smooth
-from hapticdb.query.law import ForceLaw, LawName
-from hapticdb.realtime.coupling import (
-    Coupling,
-    DeviceCoupling,
-    SettledCoupling,
-    coupling_for,
-    radius_of,
-)
+from hapticdb.query.choosing import is_smooth
+from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law
+from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling, radius_of
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.hand_path import path_of_hand
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report
-from hapticdb.realtime.resident_cells import ResidentCells, start_error
+from hapticdb.realtime.resident_cells import ResidentCells, start_error, without_distances
 from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
@@ -74,11 +68,12 @@ class Session:
     seconds : float or None
         Duration; None: until the device's script ends or `stop` is called.
     law : {"plane", "smooth"}, ForceLaw or None
-        Force law of the contacts. None: the smooth law where the environment has distances to
-        surfaces and `coupling` is no `Coupling`, else the tangent plane.
-    coupling : DeviceCoupling, Coupling or None
-        Coupling between hand and tool: a `DeviceCoupling` for the smooth law, a `Coupling` for the
-        tangent plane. Its stiffness is lowered to what the device holds: see `coupling.lowered`.
+        Force law of the contacts. None: the smooth law, which needs distances to surfaces. The
+        tangent plane needs none, and is rendered directly: the tool is at the hand, and the wrench
+        of each frame goes to the device, up to its caps.
+    coupling : Coupling or None
+        Coupling between hand and tool under the smooth law. Its stiffness is lowered to what the
+        device holds: see `coupling.lowered`. Under the tangent plane it gives caps alone.
     handle : Handle or None
         Mapping of the hand to the scene: scale and clutch.
     policy : {"hold", "wait"}
@@ -133,7 +128,7 @@ class Session:
         rate: float = 1000.0,
         seconds: float | None = None,
         law: ForceLaw | LawName | None = None,
-        coupling: DeviceCoupling | Coupling | None = None,
+        coupling: Coupling | None = None,
         handle: Handle | None = None,
         policy: Policy = "hold",
         staleness: float = DEFAULT_STALENESS,
@@ -156,12 +151,11 @@ class Session:
         self.timing = Timing(rate, is_fifo, processor)
         self.timing.check_granted()
         self._owns_cells = isinstance(cells, str)
-        law = "plane" if law is None and isinstance(coupling, Coupling) else law
         needs_distances = None if law is None else is_smooth(law)
         self.cells = _cells_of(cells, budget_bytes, where, exclude, needs_distances)
-        self.law = chosen_law(law, has_distances=self.cells.has_distances)
-        self._check_distances()
-        self.coupling = self._settled(coupling, device)
+        self.law = as_law(law) or SMOOTH
+        self._check_distances(law)
+        self.coupling = self._settled(coupling or Coupling(), device)
         self.proportions = self._compared(device)
         self._pid, self._row, self._memory = os.getpid(), -1, -1
         self._process: Process | None = None
@@ -185,24 +179,23 @@ class Session:
                     self._recording.remove_new_file()
             raise
 
-    def _check_distances(self) -> None:
-        if is_smooth(self.law) and not self.cells.has_distances:
-            raise UsageError(
-                "the smooth law needs cells with distances to surfaces, and these have none: make "
-                "ResidentCells(..., distances=True), or give law='plane'"
-            )
+    def _check_distances(self, asked: ForceLaw | LawName | None) -> None:
+        if not is_smooth(self.law) or self.cells.has_distances:
+            return
+        if asked is None:
+            raise UsageError(without_distances(self.cells.url))
+        raise UsageError(
+            "the smooth law needs cells with distances to surfaces, and these have none: make "
+            "ResidentCells(..., distances=True), or give law='plane'"
+        )
 
-    def _settled(
-        self, coupling: DeviceCoupling | Coupling | None, device: Device
-    ) -> Coupling | SettledCoupling:
-        """Coupling for the session's law, with all its numbers."""
-        chosen = coupling_for(coupling, smooth=is_smooth(self.law))
-        if isinstance(chosen, Coupling):
-            return chosen
-        return chosen.settled(
-            profile_of(device), self.timing.rate, self.handle.scale,
-            radius_of(self.shell, self.cells.grid.voxel_size),
-        )  # fmt: skip
+    def _settled(self, coupling: Coupling, device: Device) -> SettledCoupling | DirectRendering:
+        """Coupling or caps of the session, with all numbers."""
+        profile, scale = profile_of(device), self.handle.scale
+        radius = radius_of(self.shell, self.cells.grid.voxel_size)
+        if is_smooth(self.law):
+            return coupling.settled(profile, self.timing.rate, scale, radius)
+        return coupling.direct(profile, scale, radius)
 
     def _compared(self, device: Device) -> Proportions:
         poses, sway = path_of_hand(device, self.handle)

@@ -295,7 +295,8 @@ class ResidentFrames:
         if self.budget < len(self.shell):
             done = self._run_within_budget(poses[part], out[part], counts[part])
         elif self.sleepers is not None:
-            done = sleeping.feel_sleeping(
+            counts[part] = 0
+            done = budgets.feel_within(
                 self.cells, self._row, self.clusters, poses[part], place, self.law, self.met,
                 self.missed, out[part], self.sleepers, self.budget, counts[part],
             )  # fmt: skip

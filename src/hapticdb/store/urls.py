@@ -32,5 +32,3 @@ def redact(url: str) -> str:
         for key, equals, value in (pair.partition("=") for pair in query.split("&") if pair)
     ]
     return head + mark + "&".join(pairs)
-
-

@@ -1,4 +1,4 @@
-"""The couplings of both laws behind one interface, period by period in this process.
+"""Sessions under both laws behind one interface, period by period in this process.
 
 No loop, no clock and no device: a measure gives the hand's place and reads the force.
 """
@@ -13,16 +13,22 @@ from numpy.typing import NDArray
 from hapticdb.bench.feel.ground import Ground
 from hapticdb.devices.protocol import Reading
 from hapticdb.kernels.field.law import ONSET
-from hapticdb.kernels.hand import coupling as kernels
-from hapticdb.kernels.hand import quasistatic
-from hapticdb.kernels.hand.anchors import MET_ROWS
+from hapticdb.kernels.hand import direct, quasistatic
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.near_points import FIELD_ROWS
-from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, SERVO, views_of
+from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
+from hapticdb.kernels.records import (
+    FOLLOWER,
+    MOST_MISSED,
+    RESULTS,
+    SERVO,
+    pose_numbers,
+    views_of,
+)
+from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
-from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.handle import Handle
 from hapticdb.resident.frames import clusters_of
 
@@ -33,7 +39,7 @@ STIFFNESS = 1000.0
 RATE = 1000.0
 """Periods a second, where a measure names no other."""
 CAP = 20.0
-"""Most force of the smooth law's device, N: above all that is wanted of it here. Larger: stiffer
+"""Most force of the device, N: above all that is wanted of it here. Larger: stiffer
 contacts in its coupling."""
 REST = 40
 """Periods that a tool rests at its first place: a session's force rises within 20 ms. Larger: a
@@ -77,7 +83,7 @@ Grasp = Callable[[Ground, PointShell, Floats, Terms], Hand]
 
 
 class _Held:
-    """A tool in a hand: what both couplings keep, and how they begin."""
+    """A tool in a hand: what both laws keep, and how they begin."""
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
         self._cells, self._place = ground.table.cells, ground.residency.place
@@ -95,7 +101,7 @@ class _Held:
         self._tool.quaternion[:] = self._hand["quaternion"]
 
     def _advance(self) -> None:
-        """Run one period of the coupling."""
+        """Run one period."""
         raise NotImplementedError
 
     def _rest(self, pose: Floats) -> None:
@@ -121,7 +127,7 @@ class _Held:
 
 
 class PlaneHand(_Held):
-    """The tangent plane with its coupling: a body between spring and contacts.
+    """The tangent plane, rendered directly: the tool is at the hand.
 
     The tool is at rest at the pose, and has been there for `REST` periods.
     """
@@ -129,14 +135,19 @@ class PlaneHand(_Held):
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
         super().__init__(ground, shell, pose, terms)
         self._cells = self._cells.without_distances()
-        coupling = Coupling(stiffness=terms.stiffness)
-        self._body = coupling.body(shell, self._place, terms.stiffness)
+        self._law = TangentPlane(terms.stiffness).for_kernels
+        self._terms = direct.DirectTerms(CAP, CAP, terms.scale, 0.02, 0.02)
+        self._poses, self._felt = np.empty((1, 4, 4)), np.zeros((1, RESULTS))
         self._rest(pose)
 
     def _advance(self) -> None:
-        kernels.advance(
-            self._cells, self._row, self._clusters, self._place, self._body, self._servo,
-            self._period, self._met, self._missed,
+        poses_of(pose_numbers(self._hand)[None], self._poses)
+        feel_kernel(
+            self._cells, self._row, self._clusters, self._poses, self._place, self._law,
+            self._met[0], self._missed, self._felt,
+        )  # fmt: skip
+        direct.render(
+            self._terms, self._clusters.center, self._servo, self._felt, 0, self._period
         )  # fmt: skip
 
 

@@ -25,10 +25,9 @@ OPENING = """\
 Written by `hapticdb bench --feel` (in a clone: `make feel`) from `feel.json`. Both laws are
 measured in one run, on the same scenes:
 
-- **plane**: the tangent plane (McNeely, Puterbaugh and Troy 1999) with the coupling of a body
-  between springs, as environments without distances have it;
-- **smooth**: the distance law with the quasi-static coupling, as environments with distances have
-  it.
+- **plane**: the tangent plane (McNeely, Puterbaugh and Troy 1999) rendered directly,
+  without a coupling, as `--law plane` does;
+- **smooth**: the distance law with the quasi-static coupling.
 
 The scenes are closed forms as triangles. They go the way of a user's files: written as a mesh,
 imported, stored, fetched into cells. No surface is aligned to the grid by chance: places and most

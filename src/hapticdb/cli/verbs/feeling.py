@@ -210,10 +210,11 @@ def feel(
     hand, handle = given.open(path_speed := given.path_speed()), Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel")
     with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
+        chosen, coupling = force.law_and_coupling(cells)
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells), budget_points)
         session = Session(
             cells, shell, hand, rate=rate, seconds=seconds, policy=policy, handle=handle,
-            **force.law_and_coupling(cells), staleness=staleness, budget_points=budget_points,
+            law=chosen, coupling=coupling, staleness=staleness, budget_points=budget_points,
             record=record, append_recording=append, replace_recording=replace, is_fifo=fifo,
             record_limit_bytes=limit_bytes, processor=processor, has_baseline=not no_baseline,
         )  # fmt: skip

@@ -88,8 +88,6 @@ def info(url: UrlArgument, *, json: JsonOption = False) -> None:
         render.show(render.facts(looked_at.facts()))
 
 
-
-
 class _Overview(NamedTuple):
     """What `info` tells of an environment."""
 

@@ -66,9 +66,9 @@ BENT = 0.05
 """Curvature, 1/voxel, that is not counted: the noise of stored distances. Larger: less resistance
 along rough surfaces, and steps that overshoot in gentle hollows."""
 FIELD_ROWS = NEAR + 2 * NEAR_ROWS
-NEAR_POINTS = 1
-"""First of two rows of `met` with the indices of the near points, as `field` has their numbers. The
-row before takes the indices of the points that are felt."""
+FELT_POINTS, NEAR_POINTS, MET_ROWS = 0, 1, 3
+"""Rows of `met` (MET_ROWS, N) int64: FELT_POINTS takes the indices of the points that are felt, and
+two rows from NEAR_POINTS on those of the near points, in the order of `field`'s numbers."""
 OPEN, SHUT, NOT_KNOWN, CROWDED, MANY = 0, 1, 2, 3, 4
 """What a look finds: the tool may be there; a point may not; points are in unknown cells; there are
 more points to look at than a look may take; there are so many near points that they are merged."""

@@ -10,9 +10,8 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import leaf
-from hapticdb.kernels.hand.coupling import place_next
 from hapticdb.kernels.hand.near_points import NOT_KNOWN, OPEN, SHUT, look, settle
-from hapticdb.kernels.rigid import pose_of_quaternion
+from hapticdb.kernels.rigid import pose_of_quaternion, product, quaternion_by, turn
 
 STRIDE = 0.98
 """Length of a stride, in lower bounds of the least distance. Larger: fewer looks; below 1, or the
@@ -25,6 +24,30 @@ SHORTEST = 0.02
 MOST_LOOKS = 96
 """Most poses that a period looks at. Larger: a faster hand is followed in one period, and the worst
 period takes longer."""
+
+
+@leaf
+def place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
+    """Pose after a step at constant velocities, into next_pose (4, 4) -> position, quaternion.
+
+    turned (4,): unit quaternion of pose (4, 4); step in s, velocities of the centre, m/s and rad/s.
+    """
+    w, x, y, z = product(
+        *quaternion_by(step * wx, step * wy, step * wz), turned[0], turned[1], turned[2], turned[3]
+    )
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = scale * w, scale * x, scale * y, scale * z
+    pose_of_quaternion(0.0, 0.0, 0.0, w, x, y, z, next_pose)
+    cx, cy, cz = center[0], center[1], center[2]
+    # position: the moved centre, minus the centre's lever in the turned frame
+    px = turn(pose[0, 0], pose[0, 1], pose[0, 2], cx, cy, cz) + pose[0, 3] + step * vx
+    py = turn(pose[1, 0], pose[1, 1], pose[1, 2], cx, cy, cz) + pose[1, 3] + step * vy
+    pz = turn(pose[2, 0], pose[2, 1], pose[2, 2], cx, cy, cz) + pose[2, 3] + step * vz
+    px -= turn(next_pose[0, 0], next_pose[0, 1], next_pose[0, 2], cx, cy, cz)
+    py -= turn(next_pose[1, 0], next_pose[1, 1], next_pose[1, 2], cx, cy, cz)
+    pz -= turn(next_pose[2, 0], next_pose[2, 1], next_pose[2, 2], cx, cy, cz)
+    pose_of_quaternion(px, py, pz, w, x, y, z, next_pose)
+    return px, py, pz, w, x, y, z
 
 
 @leaf

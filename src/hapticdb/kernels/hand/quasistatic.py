@@ -5,7 +5,7 @@ the spring to the hand and of the contacts with the distance field (`step`), by 
 that are walked in strides (`path`). The hand feels the spring. So it never feels more than the
 spring's stiffness, whatever the voxel size, the number of points and the contacts' stiffness.
 
-It needs resident cells with distances. Without distances `coupling.advance` takes its place.
+It needs resident cells with distances.
 """
 
 import math
@@ -13,14 +13,6 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS, INTS2, entry, leaf, record_of
-from hapticdb.kernels.hand.body import is_finite, is_somewhere, place_lost
-from hapticdb.kernels.hand.coupling import (
-    IS_CUT,
-    IS_DROPPED,
-    IS_FADING,
-    IS_HELD,
-    RISE_FRAMES,
-)
 from hapticdb.kernels.hand.device_spring import (
     BEYOND_CAP,
     DEVICE_SPRING,
@@ -29,6 +21,16 @@ from hapticdb.kernels.hand.device_spring import (
     lever_in_hand,
     measure_pull,
     push_of,
+)
+from hapticdb.kernels.hand.holding import (
+    IS_CUT,
+    IS_DROPPED,
+    IS_FADING,
+    IS_HELD,
+    is_finite,
+    is_somewhere,
+    place_lost,
+    share_of_wrench,
 )
 from hapticdb.kernels.hand.near_points import (
     ABOUT,
@@ -81,7 +83,7 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.rigid import pose_of_quaternion
 
 IS_LOOSE, IS_SOFTER, IS_SNAPPING = 64, 128, 256
-"""Flags of a period, beside those of `coupling`: the tool lies in something and feels nothing; the
+"""Marks of a period, beside those of `holding`: the tool lies in something and feels nothing; the
 guard has lowered the stiffness; the change of the force is softened."""
 
 STEPS = 3
@@ -299,30 +301,6 @@ def push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
 
 
 @leaf
-def share_of_wrench(spring, tool, hand, is_held, dt):
-    """Share of the wrench that is sent: it fades while cells are unknown, and rises again."""
-    passed = dt / spring.fade
-    faded = 0.0
-    if is_held:
-        tool.held_for += dt
-        faded = faded_share(spring, tool.held_for)
-    else:
-        tool.risen *= 1.0 - faded_share(spring, tool.held_for)
-        tool.held_for = 0.0
-        if not hand.is_open:
-            tool.risen = min(tool.risen + min(passed, 1.0 / RISE_FRAMES), 1.0)
-    if hand.is_open:
-        tool.risen = max(tool.risen - passed, 0.0)
-    return (1.0 - faded) * tool.risen, faded > 0.0
-
-
-@leaf
-def faded_share(spring, seconds):
-    """Share, 0 to 1, by which a wrench has faded that was kept for so many seconds."""
-    return min(max((seconds - spring.hold) / spring.fade, 0.0), 1.0)
-
-
-@leaf
 def finish(spring, shell, place, tool, hand, follower, field, met, is_held, found, dt, wrench):
     """Wrench for the device into wrench (6,), contacts into tool.felt -> flags of the period."""
     flags, kept = 0, tool.kept
@@ -382,16 +360,24 @@ def advance(
 ):
     """Move the tool for one period of dt seconds.
 
-    As `coupling.advance`, with these differences. The spring is a `DeviceSpring`. follower_record
-    () of FOLLOWER, field (FIELD_ROWS, N) float64 and met (MET_ROWS, N) int64 are the coupling's own
-    from period to period; it starts anew, whatever they hold, while `tool.version` is 0. The
-    caller may put the tool back to an earlier pose, but must not put back these three.
+    servo_record () of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
+    missed, as `felt` fills it, between periods. follower_record () of FOLLOWER, field (FIELD_ROWS,
+    N) float64 and met (MET_ROWS, N) int64 are the coupling's own from period to period; it starts
+    anew, whatever they hold, while `tool.version` is 0. The caller may put the tool back to an
+    earlier pose, but must not put back these three.
+
+    If a step would take points into unknown cells, the tool stays before it. The wrench is kept for
+    `hold` seconds, then falls to zero within `fade` seconds; `sent.unknown` and missed then belong
+    to the pose that was tried. After that, and after the first frame, the wrench rises to its full
+    size within `fade` seconds and at least RISE_FRAMES frames. While the clutch is open the wrench
+    falls to zero, and the tool still follows the handle. While the hand is not finite, tool and
+    wrench are held; a tool that is not finite is placed at the first finite hand.
 
     `sent.wrench` is the wrench for the device, in the device's units, about the handle's origin: a
     force of min(k |x|, cap) against the way x from tool to hand, changed by the damper along it;
     the torque is that of this force at the tool's centre, and of the turning spring. It is exactly
     zero while no point touches or is held back. `tool.felt` has the contacts' wrench on the tool,
-    N and N m of the scene, and their counts. `sent.hits` points are in met[BEFORE]: those that
+    N and N m of the scene, and their counts. `sent.hits` points are in met[FELT_POINTS]: those that
     push, which `sent.contacts` counts, and those about to. `sent.deepest`: onset less distance, m.
     """
     dt = max(dt, 0.0)

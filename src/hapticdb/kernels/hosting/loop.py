@@ -10,10 +10,9 @@ import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, FLOATS3, INTS, INTS2, entry, leaf, record_of
 from hapticdb.kernels.field.law import DistanceFieldLaw
-from hapticdb.kernels.hand import coupling, large, quasistatic
-from hapticdb.kernels.hand.body import Body
-from hapticdb.kernels.hand.coupling import IS_FADING, IS_HELD
+from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.device_spring import DeviceSpring
+from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD
 from hapticdb.kernels.hand.near_points import FIELD_ROWS
 from hapticdb.kernels.hand.quasistatic import IS_LOOSE
 from hapticdb.kernels.hand.servo import name_voxels, note, tell
@@ -22,9 +21,8 @@ from hapticdb.kernels.hosting.following import follow_hand
 from hapticdb.kernels.hosting.memory import (
     array_at,
     asleep_of,
+    cells_of,
     grid_of,
-    plane_cells,
-    smooth_cells,
     tool_of,
 )
 from hapticdb.kernels.hosting.showing import (
@@ -34,11 +32,10 @@ from hapticdb.kernels.hosting.showing import (
     count_left_out,
     count_times,
     list_touching,
+    show_contacts,
     show_objects,
-    show_plane,
-    show_smooth,
 )
-from hapticdb.kernels.large.budget import feel_within
+from hapticdb.kernels.large.budget import felt_asleep
 from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.records import (
     FOLLOWER,
@@ -51,8 +48,8 @@ from hapticdb.kernels.records import (
     STATION,
     TOLD,
 )
-from hapticdb.kernels.resident.cells import UNKNOWNS
-from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.kernels.resident.cells import UNKNOWNS, begin_frame, end_frame
+from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import moved, pose_of_quaternion, transform_of, turned
 
@@ -68,17 +65,9 @@ HELD, FADING, IN_OBJECT = 1, 2, 8
 
 @leaf
 def spring_of(station):
-    """Coupling of a session over distances."""
+    """Coupling of a session."""
     n = station.springs[station.coupling]
     return DeviceSpring(n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
-
-
-@leaf
-def body_of(station):
-    """Coupling of a session over voxels alone."""
-    n = station.bodies[station.coupling]
-    most = np.int64(n[10])
-    return Body(n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9], most)
 
 
 @leaf
@@ -92,17 +81,19 @@ def place_tool(tool, pose):
 def feel_again(station, cells, shell, place, poses, met, missed, felts, servo):
     """Compute the law's frame at the tool's pose, for a recording; into tool.felt."""
     tool, sent, law = servo.tool, servo.sent, DistanceFieldLaw(station.stiffness)
+    which = begin_frame(cells, station.reader)
     if station.is_large:
         asleep = asleep_of(station)
         counts = asleep.counts
         counts[0, LOOKED_AT] = counts[0, LEFT_OUT] = 0
-        feel_within(
-            cells, station.reader, shell, poses, place, law, met[FELT], missed, felts,
-            asleep.sleepers, asleep.budget, counts,
+        felt_asleep(
+            cells, which, shell, poses[0], place, law, met[FELT], missed, asleep.sleepers,
+            asleep.budget, counts[0], felts[0],
         )  # fmt: skip
         sent.left_out = max(sent.left_out, counts[0, LEFT_OUT])
     else:
-        feel_kernel(cells, station.reader, shell, poses, place, law, met[FELT], missed, felts)
+        frame_of(law, cells, which, shell, poses[0], place, met[FELT], missed, felts[0])
+    end_frame(cells, station.reader)
     for n in range(RESULTS):
         tool.felt[n] = felts[0, n]
     sent.unknown += np.int64(felts[0, UNKNOWNS])
@@ -140,9 +131,9 @@ def state_of_flags(flags):
 
 
 @leaf
-def step_smooth(station, seat, shell, place, dt, field, met, missed, poses, felts, is_shown):
-    """Move the tool of a session with distances; returns its radius, m."""
-    cells, spring = smooth_cells(station), spring_of(station)
+def step(station, seat, shell, place, dt, field, met, missed, poses, felts, is_shown):
+    """Move the tool of a session; returns its radius, m."""
+    cells, spring = cells_of(station), spring_of(station)
     servo_record = array_at(station.servo, (), SERVO)
     follower_record = array_at(station.follower, (), FOLLOWER)
     servo, follower = servo_record[()], follower_record[()]
@@ -152,33 +143,10 @@ def step_smooth(station, seat, shell, place, dt, field, met, missed, poses, felt
     )  # fmt: skip
     place_tool(servo.tool, poses[0])
     if is_shown:
-        show_smooth(seat, shell, poses[0], place, spring, follower, field, met)
+        show_contacts(seat, shell, poses[0], place, spring, follower, field, met)
     if seat.is_recorded and not servo.sent.marks & IS_HELD:
         feel_again(station, cells, shell, place, poses, met, missed, felts, servo)
     return spring.radius
-
-
-@leaf
-def step_plane(station, seat, shell, place, dt, met, missed, poses, is_shown):
-    """Move the tool of a session without distances; returns its radius, m."""
-    body = body_of(station)
-    servo_record = array_at(station.servo, (), SERVO)
-    servo = servo_record[()]
-    cells = plane_cells(station)
-    if station.is_large:
-        asleep = asleep_of(station)
-        large.advance_asleep(
-            cells, station.reader, shell, place, body, servo_record, dt, met, missed,
-            asleep.sleepers, asleep.budget, asleep.counts,
-        )  # fmt: skip
-    else:
-        coupling.advance(cells, station.reader, shell, place, body, servo_record, dt, met, missed)
-    for axis in range(3, 6):
-        servo.sent.wrench[axis] /= station.scale
-    place_tool(servo.tool, poses[0])
-    if is_shown:
-        show_plane(seat, shell, poses[0], place, body.stiffness, met, servo.sent.hits)
-    return body.radius
 
 
 @leaf
@@ -211,12 +179,7 @@ def run_session(station, seat, ring, missed, poses, felts, due, moment):
     is_shown = begun - station.shown_at >= SHOW_EVERY_NS
     if is_shown:
         station.shown_at = begun
-    if station.is_smooth:
-        radius = step_smooth(
-            station, seat, shell, place, dt, field, met, missed, poses, felts, is_shown
-        )
-    else:
-        radius = step_plane(station, seat, shell, place, dt, met, missed, poses, is_shown)
+    radius = step(station, seat, shell, place, dt, field, met, missed, poses, felts, is_shown)
     report_tool(station, told_record[()], servo, shell, poses[0], radius)
     tell(session_record, told_record, missed)
     if begun - station.asked_at >= ASK_EVERY_NS:

@@ -53,25 +53,8 @@ else:
 
 
 @leaf
-def plane_cells(station):
-    """Cells of a session without their distances."""
-    n_slots, capacity = station.n_slots, station.capacity
-    return Cells(
-        array_at(station.control, (station.n_control,), np.int64),
-        array_at(station.readers, (station.n_readers * READER_STRIDE,), np.int64),
-        array_at(station.keys, (BUFFERS, capacity), np.int64),
-        array_at(station.slots, (BUFFERS, capacity), np.int32),
-        array_at(station.words, (n_slots, CELL_WORDS), np.uint32),
-        array_at(station.masks, (n_slots,), np.uint64),
-        array_at(station.used, (n_slots,), np.uint8),
-        None,
-        None,
-    )
-
-
-@leaf
-def smooth_cells(station):
-    """Cells of a session with their distances."""
+def cells_of(station):
+    """Cells of a session."""
     n_slots, capacity = station.n_slots, station.capacity
     return Cells(
         array_at(station.control, (station.n_control,), np.int64),

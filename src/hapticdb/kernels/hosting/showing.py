@@ -3,29 +3,25 @@
 import numpy as np
 
 from hapticdb.kernels._jit import leaf
-from hapticdb.kernels.hand.anchors import BEFORE
 from hapticdb.kernels.hand.device_spring import contact_stiffness
 from hapticdb.kernels.hand.near_points import (
     ALONG,
+    FELT_POINTS,
     FLOOR,
+    MET_ROWS,
     NEAR,
     NEAR_POINTS,
     NEAR_ROWS,
     ONSETS,
     U,
 )
-from hapticdb.kernels.law import AVERAGE_FROM
-from hapticdb.kernels.query.contact import center_of
 from hapticdb.kernels.records import MOST_ASKED, MOST_SHOWN, TIME_BIN, TIME_BINS
 from hapticdb.kernels.resident.fence import fence
-from hapticdb.kernels.rigid import moved, transform_of, turned
+from hapticdb.kernels.rigid import moved, transform_of
 
-TOUCHING = 3
-"""Row of `met`, after those of the couplings, with the indices of the points that touch."""
-FELT = 4
-"""Row of `met` for the frame of a recording."""
-HOSTED_ROWS = 5
-"""Rows of a hosted session's `met`."""
+TOUCHING, FELT, HOSTED_ROWS = MET_ROWS, MET_ROWS + 1, MET_ROWS + 2
+"""Rows of a hosted session's `met`, after those of the coupling: the indices of the points that
+touch; those of the frame of a recording."""
 
 
 @leaf
@@ -36,7 +32,7 @@ def list_touching(follower, field, met, n_hits, is_loose):
     """
     if not is_loose:
         for n in range(n_hits):
-            met[TOUCHING, n] = met[BEFORE, n]
+            met[TOUCHING, n] = met[FELT_POINTS, n]
         return n_hits
     rows, near = NEAR + follower.side * NEAR_ROWS, NEAR_POINTS + follower.side
     n_found = 0
@@ -56,8 +52,8 @@ def show_contact(seat, at, transform, x, y, z, fx, fy, fz):
 
 
 @leaf
-def show_smooth(seat, shell, pose, place, spring, follower, field, met):
-    """List the contacts of the quasi-static coupling on the board."""
+def show_contacts(seat, shell, pose, place, spring, follower, field, met):
+    """List the contacts on the board."""
     rows, near = NEAR + follower.side * NEAR_ROWS, NEAR_POINTS + follower.side
     points, transform = shell.points, transform_of(pose)
     stiffness = contact_stiffness(spring, place.size)
@@ -84,31 +80,6 @@ def show_smooth(seat, shell, pose, place, spring, follower, field, met):
                     force * field[rows + ALONG + 2, m],
                 )  # fmt: skip
                 n_shown += 1
-    seat.n_contacts = n_shown
-    fence()
-    seat.contacts_sequence += 1
-
-
-@leaf
-def show_plane(seat, shell, pose, place, stiffness, met, n_hits):
-    """List the contacts of the tangent-plane law on the board: the first of them, if too many."""
-    points, transform = shell.points, transform_of(pose)
-    share = stiffness / max(n_hits / AVERAGE_FROM, 1.0)
-    seat.contacts_sequence += 1
-    fence()
-    n_shown = 0
-    for hit in range(n_hits):
-        n = met[BEFORE, hit]
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        px, py, pz = moved(transform, x, y, z)
-        nx, ny, nz = turned(transform, points[n, 3], points[n, 4], points[n, 5])
-        depth = (center_of(px, place.x, place.size) - px) * nx
-        depth += (center_of(py, place.y, place.size) - py) * ny
-        depth += (center_of(pz, place.z, place.size) - pz) * nz
-        if depth > 0.0 and n_shown < MOST_SHOWN:
-            force = share * depth
-            show_contact(seat, n_shown, transform, x, y, z, force * nx, force * ny, force * nz)
-            n_shown += 1
     seat.n_contacts = n_shown
     fence()
     seat.contacts_sequence += 1

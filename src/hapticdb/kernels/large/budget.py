@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS2, chosen_by_type, entry, leaf
+from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS2, entry, leaf
 from hapticdb.kernels.field.law import DISTANCE_FIELD
 from hapticdb.kernels.large.sleeping import (
     LEFT_OUT,
@@ -45,12 +45,6 @@ from hapticdb.kernels.resident.cells import (
 )
 from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.rigid import is_rigid, transform_of
-
-
-class Awake(NamedTuple):
-    """Frames that test each run: those of small tools. Its field is not read."""
-
-    nothing: np.int64
 
 
 class Asleep(NamedTuple):
@@ -91,7 +85,10 @@ def runs_beside_unknown(cells, which, shell, listed, count, transform, place, ma
 
 @leaf
 def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, budget, counts, out):
-    """`feeling.felt` with sleeping clusters and a budget of points; counts keeps the greatest."""
+    """`feeling.felt` with sleeping clusters and a budget of points.
+
+    counts (COUNTS,) keeps the greatest numbers (`sleeping.LOOKED_AT`).
+    """
     points, center, _, _, run, columns, scratch = shell
     listed, skips, nothing = sleepers.listed, sleepers.skips, sleepers.nothing
     chosen, chosen_columns, indices = sleepers.chosen, sleepers.columns, sleepers.indices
@@ -114,25 +111,8 @@ def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, bu
         out[UNKNOWNS] += runs_beside_unknown(
             cells, which, shell, listed, count, transform, place, felt_margin(law), missed
         )
-    counts[0, LOOKED_AT] = max(counts[0, LOOKED_AT], n_looked)
-    counts[0, LEFT_OUT] = max(counts[0, LEFT_OUT], n_near - n_looked)
-
-
-def _frame_awake(watch, cells, which, shell, pose, place, law, met, missed, out):  # noqa: ARG001 - the arguments of each choice
-    """A frame that tests each run."""
-    frame_of(law, cells, which, shell, pose, place, met, missed, out)
-
-
-def _frame_asleep(watch, cells, which, shell, pose, place, law, met, missed, out):
-    """A frame with sleeping clusters."""
-    felt_asleep(
-        cells, which, shell, pose, place, law, met, missed, watch.sleepers, watch.budget,
-        watch.counts, out,
-    )  # fmt: skip
-
-
-tool_frame = chosen_by_type(lambda watch: _frame_asleep if watch is Asleep else _frame_awake)
-"""A frame of a session's tool: arguments as of `_frame_awake`, an `Awake` or an `Asleep` first."""
+    counts[LOOKED_AT] = max(counts[LOOKED_AT], n_looked)
+    counts[LEFT_OUT] = max(counts[LEFT_OUT], n_near - n_looked)
 
 
 @entry(
@@ -142,10 +122,12 @@ tool_frame = chosen_by_type(lambda watch: _frame_asleep if watch is Asleep else 
 def feel_within(
     cells, reader, shell, poses, place, law, met, missed, out, sleepers, budget, counts
 ):
-    """`sleeping.feel_sleeping` for frames that must not depend on what is in memory.
+    """`feeling.feel_kernel` with sleeping clusters, at most `budget` points a frame.
 
-    Where the budget is exceeded, out (M, RESULTS) counts runs beside unknown cells as unknown
-    points, and `missed` lists the cells. counts (1, COUNTS) int64 keeps the greatest numbers.
+    Where there are more points near something than the budget, a frame looks at one of each 2, 4,
+    8 ... of them, so that every cluster keeps its share (`sleeping.choose_points`). Then out (M,
+    RESULTS) counts runs beside unknown cells as unknown points, and `missed` lists the cells.
+    counts (M, COUNTS) int64 keeps the greatest numbers of each pose, or (1, COUNTS) those of all.
     Returns the number of poses done.
     """
     for n in range(poses.shape[0]):
@@ -154,7 +136,7 @@ def feel_within(
         which = begin_frame(cells, reader)
         felt_asleep(
             cells, which, shell, poses[n], place, law, met, missed, sleepers, budget,
-            counts, out[n],
+            counts[min(n, counts.shape[0] - 1)], out[n],
         )  # fmt: skip
         end_frame(cells, reader)
     return poses.shape[0]

@@ -21,13 +21,13 @@ from hapticdb.kernels._jit import (
     record_of,
 )
 from hapticdb.kernels.field.law import ONSET
-from hapticdb.kernels.hand.coupling import IS_CUT, IS_HELD
 from hapticdb.kernels.hand.device_spring import (
     DEVICE_SPRING,
     contact_stiffness,
     lever_in_hand,
     shortened,
 )
+from hapticdb.kernels.hand.holding import IS_CUT, IS_HELD
 from hapticdb.kernels.hand.quasistatic import IS_LOOSE
 from hapticdb.kernels.hand.step import add_row, factor
 from hapticdb.kernels.proxy.planes import (

@@ -103,7 +103,6 @@ class TouchPanel:
                 hint="Of the spring between hand and tool: force for a metre of the hand.",
             )  # fmt: skip
             stiffness.on_update(browser.guarded("toucher", self._stiffen))
-            stiffness.visible = browser.site.stage.is_smooth
             scale = gui.add_number(
                 "Scale", round(browser.scale, 3), step=0.001,
                 min=round(browser.scale * SCALES[0], 4), max=round(browser.scale * SCALES[1], 3),

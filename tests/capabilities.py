@@ -4,10 +4,10 @@ The contract suites skip the tests of these, and the header of each run lists th
 """
 
 STORE_LACKS = {
-    "SQLite": frozenset({"server", "grouping threshold"}),
+    "SQLite": frozenset({"grouping threshold"}),
     "PostgreSQL": frozenset({"caches"}),
-    "PostgreSQL on shards": frozenset({"statement", "caches", "server"}),
-    "memory": frozenset({"statement", "caches", "watch", "server", "grouping threshold"}),
+    "PostgreSQL on shards": frozenset({"statement", "caches"}),
+    "memory": frozenset({"statement", "caches", "watch", "grouping threshold"}),
 }
 ENGINE_LACKS = {
     "SQLite": frozenset({"grant"}),

@@ -1,6 +1,6 @@
 """Batches of poses: poses a second beside python-fcl, coal and Open3D, on the same questions.
 
-    make paths                        # 200 and 1,428 parts of real assemblies, or the sample car
+    make paths                        # a real assembly of 1,428 parts, or the sample car
     python benchmarks/batches.py --quick
 
 A tool is far from all parts (free), within a few voxels of one (near), or in contact (touching).
@@ -24,7 +24,7 @@ import trimesh
 from numpy.typing import NDArray
 
 import hapticdb
-import pages
+import page_tables
 import records
 from batch_peers import PEERS, Open3DBatch, PeerMissingError
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
@@ -35,11 +35,8 @@ from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
 
 Floats = NDArray[np.float64]
-MODELS = {
-    "batches": "demo_vintage_car/vintage_car.glb",
-    "batches_1400": "assembly_vw_t1/vw_t1.glb",
-}
-"""Results, and the files below HAPTICDB_TEST_DATA that they are of: 200 parts, and 1,428."""
+MODEL = "assembly_vw_t1/vw_t1.glb"
+"""A van of 1,428 parts, below the folder that HAPTICDB_TEST_DATA names."""
 BITS, EXTENT = 11, 1.6
 """Grid: bits an axis, and its edge as a multiple of the model's longest side."""
 POINTS = (300, 10_000, 100_000)
@@ -255,23 +252,20 @@ def measure(folder: Path, model: Path | None, bits: int, settings: Settings) -> 
 
 
 def main() -> None:
-    """Measure, and fill the tables of docs/batches.md."""
+    """Measure, and fill the table of docs/query.md."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="short turns, into results-quick/")
     given = parser.parse_args()
     out = Path("results-quick" if given.quick else "results")
-    data = Path(os.environ.get("HAPTICDB_TEST_DATA", ""))
-    models: dict[str, Path | None] = {
-        name: data / file for name, file in MODELS.items() if (data / file).is_file()
-    }
+    real = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), MODEL)
+    model = real if real.is_file() else None
     settings = Settings(0.1, 256, POINTS[:2]) if given.quick else Settings(2.0)
-    for name, model in (models or {"batches": None}).items():
-        with tempfile.TemporaryDirectory(prefix="hapticdb-batches-") as folder:
-            found = measure(Path(folder), model, BITS, settings)
-        records.write(out, {name: found})
-        print(pages.batches(name)({name: found}), *found["notes"], sep="\n")
+    with tempfile.TemporaryDirectory(prefix="hapticdb-batches-") as folder:
+        found = measure(Path(folder), model, BITS, settings)
+    records.write(out, {"batches": found})
+    print(page_tables.batch_ratios({"batches": found}), *found["notes"], sep="\n")
     if not given.quick:
-        pages.refill("docs/batches.md", out)
+        page_tables.refill("docs/query.md", out)
 
 
 if __name__ == "__main__":

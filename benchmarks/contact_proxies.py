@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
-import pages
+import page_tables
 import records
 from delaying import READY_WITHIN, DelayingRelay
 from feel.couplings import SmoothHand, Terms, posed, straight
@@ -236,7 +236,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="hapticdb-proxies-") as folder:
         found = measure(Path(folder))
     records.write(Path("results"), {"contact_proxies": found})
-    pages.refill("docs/protocol.md", Path("results"))
+    page_tables.refill("docs/protocol.md", Path("results"))
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import hapticdb
-import pages
+import page_tables
 import records
 from awake import awake
 from feel import sliding, stability, touching, walking
@@ -170,7 +170,7 @@ def main() -> None:
     found = records.result("feel", cells, inputs_of(effort, model)) | {"curves": curves}
     records.write(out, {"feel": found})
     plot(curves, out / "feel.svg")
-    pages.refill("docs/feel.md", out, out / "feel.md" if given.quick else None)
+    page_tables.refill("docs/feel.md", out, out / "feel.md" if given.quick else None)
     print(table_of(cells))
 
 

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 import hapticdb
-import pages
+import page_tables
 import records
 from awake import awake
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
@@ -126,7 +126,6 @@ class Evaluation:
             found["conditions"] += experiments.cold(subject, work.slide, budget)
             tasks = (work.slide, work.random, work.recorded)
             found |= {
-                "costs": [cost_row(subject, work.slide)],
                 "figure8": experiments.figure_8(subject, work.slide, work.finest, budget),
                 "figure10": experiments.figure_10(subject, work.slide, work.regions, budget),
                 "strategies": experiments.strategies(subject, tasks, budget),
@@ -141,19 +140,6 @@ def import_file(url: str, file: Path, options: ImportOptions) -> None:
     (report,) = hapticdb.import_files(url, [file], options)
     if report.error is not None:
         raise report.error
-
-
-def cost_row(subject: Subject, task: Task) -> Cell:
-    """What the cost model was fitted to under these conditions, microseconds and ratios."""
-    costs = subject.costs
-    kept = ("environment", "engine", "layout", "curve", "cache", "file", "resolution")
-    conditions = subject.conditions(task)
-    return {
-        **{name: conditions[name] for name in kept},
-        **{name: value for name, value in costs.figures().items() if "." not in name},
-        "row_scanned": costs.row_scanned,
-        "gap_rows": costs.descent / costs.row_in_gap,
-    }
 
 
 def distinct_voxels(env: Environment) -> int:
@@ -313,7 +299,7 @@ def main() -> None:
         )
     records.write(out, found)
     draw(found, out)
-    pages.refill("docs/evaluation.md", out, out / "evaluation.md" if given.quick else None)
+    page_tables.refill("docs/evaluation.md", out, out / "evaluation.md" if given.quick else None)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
-import pages
+import page_tables
 import records
 from awake import awake
 from dense_frame import dense_bitmap, dense_feel
@@ -201,7 +201,7 @@ def measure(folder: Path, model: Path | None, effort: Effort) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, and fill the tables of docs/realtime.md."""
+    """Measure, and fill the tables of docs/evaluation.md."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="short sessions, a coarse sample")
     given = parser.parse_args()
@@ -213,10 +213,10 @@ def main() -> None:
         results = measure(Path(folder), model, QUICK if given.quick else Effort())
     records.write(out, {"realtime": results})
     made = {"realtime": results}
-    for one in (pages.frames, pages.laws, pages.sessions, pages.edits):
+    for one in (page_tables.frames, page_tables.laws, page_tables.sessions, page_tables.edits):
         print(one(made), end="\n\n")
     if not given.quick:
-        pages.refill("docs/realtime.md", out)
+        page_tables.refill("docs/evaluation.md", out)
 
 
 if __name__ == "__main__":

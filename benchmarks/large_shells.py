@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
-import pages
+import page_tables
 import records
 from awake import awake
 from hapticdb import DistanceField, GridOptions, ImportOptions, PointShell, TangentPlane
@@ -40,7 +40,7 @@ Floats = NDArray[np.float64]
 LAWS: dict[str, ForceLaw] = {"plane": TangentPlane(), "smooth": DistanceField()}
 SIZES = (100_000, 1_000_000)
 """Points of the sheet."""
-SHARES = (0.025, 0.05, 0.25)
+SHARES = (0.05, 0.25)
 """Of the sheet that the box is below."""
 BITS = 11
 """Of the grid on each axis."""
@@ -220,7 +220,7 @@ def main() -> None:
         lines = compare(Path(folder), sizes, SHARES, count, BITS)
     records.write(out, {"large_shells": records.conditions() | {"lines": lines}})
     if not given.quick:
-        pages.refill("docs/realtime.md", out)
+        page_tables.refill("docs/realtime.md", out)
 
 
 if __name__ == "__main__":

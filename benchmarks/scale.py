@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
-import pages
+import page_tables
 import records
 from awake import awake
 from copies import Plan, Source, write_copies
@@ -227,7 +227,7 @@ def main() -> None:
     records.write(out, found)
     draw(found, out)
     if not given.quick:
-        pages.refill("docs/evaluation.md", out)
+        page_tables.refill("docs/evaluation.md", out)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,7 @@ import figures
 import hapticdb
 import in_real_time
 import large_shells
-import many_sessions
-import pages
+import page_tables
 import scale
 from feel.measures import MEASURES
 from hapticdb import GridOptions, ImportOptions, PointShell
@@ -115,8 +114,8 @@ def test_the_feel_has_every_measure_and_curve(tmp_path: Path, sample: SampleFile
     (tmp_path / "scenes").mkdir()
     cells, curves = feeling.measure(effort, tmp_path / "scenes", Path(sample.car))
     found: dict[str, Any] = {"feel": {"cells": cells}}
-    assert pages.tables()["feel"](found).count("\n") == 1 + len(MEASURES)
-    assert pages.tables()["walls"](found).count("\n") == 3
+    assert page_tables.tables()["feel"](found).count("\n") == 1 + len(MEASURES)
+    assert page_tables.tables()["walls"](found).count("\n") == 3
     feeling.plot(curves, tmp_path / "feel.svg")
     assert {(c["curve"], c["law"]) for c in curves} == {one[:2] for one in feeling.PANELS}
 
@@ -128,12 +127,3 @@ def test_a_remote_hand_feels_through_a_relay(
     url, shell, (case, *_) = contact_proxies.closed_forms(tmp_path)
     (line,) = contact_proxies.lines_of(url, shell, [case], tmp_path)[0]
     assert line["force"]["max"] > 0.0
-
-
-def test_a_hosted_session_runs(
-    database: Path, sample: SampleFiles, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(many_sessions, "SETTLING", 0.2)
-    shell, poses = PointShell.from_file(sample.wrench, 300), read_poses(sample.path)
-    line = many_sessions.hosted_line(str(database), shell, poses, 1, 0.3)
-    assert line["rate"] > 0.0

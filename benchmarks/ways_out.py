@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
-import pages
+import page_tables
 import records
 from batch_peers import mesh_of, tree_of_boxes
 from hapticdb import Environment, Extraction, GridOptions, ImportOptions
@@ -55,14 +55,6 @@ class Question(NamedTuple):
 WHEEL = ("wheels/tyre_front_left", "wheels/rim_front_left")
 BOLTS = ("wheels/wheel_bolt_front_left_*",)
 AROUND_BATTERY = ("supply/wiring_harness", "body/hood", "body/hood_lining")
-AROUND_DOOR = (
-    "body/pillar_a_left",
-    "body/pillar_b_left",
-    "body/windscreen",
-    "cabin/dashboard",
-    "cabin/door_trim_front_left",
-    "trim/mirror_left",
-)
 AROUND_SEAT = (
     "cabin/floor_pan",
     "cabin/carpet",
@@ -74,20 +66,14 @@ SAMPLE = (
     Question(WHEEL, BOLTS),
     Question(WHEEL),
     Question(("body/hood",)),
-    Question(("body/door_front_left",)),
-    Question(("seats/seat_*_left",)),
     Question(("supply/battery",)),
     Question(("supply/battery",), AROUND_BATTERY),
-    Question(("body/door_front_left",), AROUND_DOOR),
     Question(("seats/seat_*_left",), AROUND_SEAT),
     Question(("engine/spark_plug",), ("body/hood*",)),
 )
-"""Of the sample car: the first, the second and the hood come out. Bolts hold the wheel. The door's
-triangles cross those of pillars, dashboard, windscreen and lining, the seat's those of the floor,
-and the harness goes through the battery. Without what holds them, and what is above the battery and
-in front of the door, these two come out. Without floor, carpet and door the seat goes forward, up,
-and then out by the door. The spark plug, which is added to the car, comes out along
-the bore of its seat."""
+"""Of the sample car. Bolts hold the wheel; the harness goes through the battery, and the seat's
+triangles cross those of the floor. Without floor, carpet and door the seat goes forward, up, and
+then out by the door. The spark plug, which is added to the car, comes out along its bore."""
 SEAT = (1.15, 0.40, 0.80)
 """Middle of the spark plug's seat in the engine bay, metres."""
 BORE, PLUG = 0.024, 0.012
@@ -237,7 +223,7 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measure, print, and fill the tables of docs/extract.md."""
+    """Measure, print, and fill the table of docs/paths.md."""
     argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
     vintage = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), VINTAGE)
     bricks = [Question((f"{n}",)) for n in (1, *range(20, 200, 20))]
@@ -247,7 +233,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder:
             found["ways_out_vintage"] = measure(Path(folder), vintage, 10, bricks)
     records.write(Path("results"), found)
-    pages.refill("docs/extract.md", Path("results"))
+    page_tables.refill("docs/paths.md", Path("results"))
 
 
 if __name__ == "__main__":

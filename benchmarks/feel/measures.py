@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pages import NONE, table
+from page_tables import NONE, table
 
 Cell = Mapping[str, Any]
 LAWS = ("plane", "smooth")

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from pages import NONE, facts, table, us_text
+from page_tables import NONE, facts, table, us_text
 from paper.cells import (
     ALL_CACHED,
     FRAME_US,
@@ -25,15 +25,6 @@ CLOSE = 1.05
 AUTO_CLOSE = 1.10
 """`auto` counts as good as the best strategy up to this ratio of their times."""
 FORMS = {ONE_STATEMENT: "In one statement", IN_THE_SERVER: "In a loop in the server"}
-COST_COLUMNS = {
-    "statement": "statement of ranges",
-    "descent": "a range more",
-    "row_scanned": "a row more",
-    "lookup": "statement of keys",
-    "probe": "a key more",
-    "caution": "caution",
-    "gap_rows": "a gap is closed up to rows",
-}
 
 
 def cells_of(results: Results, name: str) -> Sequence[Cell]:
@@ -138,13 +129,14 @@ def contest_table(name: str) -> Callable[[Results], str]:
                     f"{one.best['maxgap']:,}",
                     time_text(one.best),
                     time_text(own),
-                    *(count_text(own[key]) for key in ("ranges", "false_rows")),
+                    *(count_text(own[key]) for key in ("ranges", "false_rows") if has_loop),
                     f"{one.ratio:.2f}",
                     time_text(one.array),
                 ]
             )
         head = ["", *(["form"] if has_loop else []), "best MAXGAP", "its us", "CBGroup's us"]
-        return table([*head, "ranges", "false rows", "ratio", "`array`, us"], rows)
+        head += ["ranges", "false rows"] if has_loop else []
+        return table([*head, "ratio", "`array`, us"], rows)
 
     return of
 
@@ -170,15 +162,6 @@ def contest_counts(name: str) -> Callable[[Results], str]:
 
 
 # --- the others -----------------------------------------------------------------------------------
-
-
-def costs(results: Results) -> str:
-    """Fitted figures, microseconds, and the rows up to which a gap is closed."""
-    cells = [cell for group in grouped(cells_of(results, "costs")).values() for cell in group]
-    rows = [
-        [place_of(cell, cells), *(f"{cell[key]:,.3g}" for key in COST_COLUMNS)] for cell in cells
-    ]
-    return table(["", *COST_COLUMNS.values()], rows)
 
 
 def strategies(name: str, *, without: Sequence[object] = ()) -> Callable[[Results], str]:
@@ -212,6 +195,7 @@ def tail(results: Results) -> str:
         ]
         for group in grouped(cells, (*WHERE, "strategy")).values()
         for cell in group
+        if cell["strategy"] != "auto"
     ]
     return table(["", "strategy", "p50", "p99", "p99.9", "worst"], rows)
 
@@ -304,9 +288,8 @@ EVALUATION: dict[str, Callable[[Results], str]] = {
     "figure9-counts": contest_counts("figure9"),
     "figure10": contest_table("figure10"),
     "figure10-counts": contest_counts("figure10"),
-    "costs": costs,
     "conditions": strategies("conditions", without=["maxgap", "auto"]),
-    "strategies": strategies("strategies", without=["random"]),
+    "strategies": strategies("strategies", without=["random", "auto"]),
     "layouts": strategies("layouts", without=["auto"]),
     "points": strategies("points", without=["auto"]),
     "tail": tail,

@@ -174,7 +174,7 @@ def test_wrong_messages_end_or_are_refused_and_harm_nobody(
 ) -> None:
     """No error inside the server, no memory that stays; a healthy client is answered as before.
 
-    The long ones are 3,000 messages together; benchmarks/floods.py sends 100,000.
+    The long ones are 3,000 messages together.
     """
     with (
         DeviceServer(tmp_path / "log", requests_a_second=1e9, burst_requests=1e9) as server,

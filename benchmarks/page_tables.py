@@ -1,6 +1,6 @@
 """The tables of the pages, made from results/.
 
-    python benchmarks/pages.py        # fill the tables of all pages anew
+    python benchmarks/page_tables.py        # fill the tables of all pages anew
 
 A page is written by hand. Below each line ``<!-- table: NAME -->`` stands a table, or a list, made
 from results; it is replaced, up to the next empty line.
@@ -48,7 +48,7 @@ def facts(found: Result) -> str:
     return table(["", ""], [(key, f"{value}") for key, value in said])
 
 
-# --- docs/realtime.md -----------------------------------------------------------------------------
+# --- in real time --------------------------------------------------------------------------------
 
 
 def _times(spread: Mapping[str, float], shares: Sequence[str] = ("p50", "p99")) -> str:
@@ -125,25 +125,6 @@ def edits(results: Results) -> str:
     return table(head, rows)
 
 
-def many_sessions(results: Results) -> str:
-    """Rates, shares of frames in time, times in microseconds (p50 / p99), memory a session."""
-    rows = [
-        [
-            f"{one['sessions']}",
-            f"{one['workers']}",
-            f"{one['rate']:,.0f}",
-            f"{100 * one['in_time']:.1f}",
-            f"{max(100 * one['least_in_time'], 0.0):.1f}",
-            _times(one["lateness"]),
-            _times(one["elapsed"]),
-            f"{one['worker_mb'] / one['sessions']:,.1f}",
-        ]
-        for one in results["many_sessions"]["lines"]
-    ]
-    head = ["sessions", "processes", "Hz", "in time, %", "least, %", "late, us", "computing, us"]
-    return table([*head, "MB each"], rows)
-
-
 def large_shells(results: Results) -> str:
     """Medians of the loops and p99 of the sleeping ones, without and with a budget, us."""
     rows = []
@@ -165,71 +146,33 @@ def large_shells(results: Results) -> str:
     return table([*head, "budget, us", "p99"], rows)
 
 
-# --- docs/batches.md, docs/extract.md, docs/protocol.md -------------------------------------------
-
-BATCH_SIDES = {
-    "hapticdb, one thread": "hapticdb",
-    "hapticdb, with force, one thread": "with force",
-    "python-fcl": "python-fcl",
-    "python-fcl, parts": "fcl, parts",
-    "coal": "coal",
-    "coal, parts": "coal, parts",
-    "Open3D": "Open3D",
-}
-"""Sides of the table, and the heads of their columns."""
+# --- docs/query.md, docs/paths.md, docs/protocol.md -----------------------------------------------
 
 
-def batches(name: str) -> Callable[[Results], str]:
-    """Poses a second of processor time: does the tool touch, and how far is the nearest part."""
-
-    def of(results: Results) -> str:
-        rates: dict[tuple[str, str], dict[str, list[str]]] = {}
-        for cell in results[name]["cells"]:
-            row = rates.setdefault((cell["situation"], f"{cell['points']:,}"), {})
-            for side, one in cell["sides"].items():
-                row.setdefault(side, []).append(f"{one['poses_per_processor_s']:,.0f}")
-        measured = [side for side in BATCH_SIDES if any(side in row for row in rates.values())]
-        rows = [
-            [*place, *(", ".join(row.get(side, [NONE])) for side in measured)]
-            for place, row in rates.items()
-        ]
-        return table(["tool is", "points", *(BATCH_SIDES[side] for side in measured)], rows)
-
-    return of
-
-
-def batch_ratios(name: str) -> Callable[[Results], str]:
+def batch_ratios(results: Results) -> str:
     """How many times as many poses a second as the fastest of the others, of wall time."""
-
-    def of(results: Results) -> str:
-        rows: dict[tuple[str, str], list[str]] = {}
-        for cell in results[name]["cells"]:
-            row = rows.setdefault((cell["situation"], f"{cell['points']:,}"), [])
-            for ratio in (cell["times_best_peer_one_thread"], cell["times_best_peer"]):
-                row.append(f"{ratio:.{0 if ratio >= 9.95 else 1}f}" if ratio else NONE)
-        head = ["tool is", "points", "touch, one thread", "all threads", "how far, one thread"]
-        return table([*head, "all threads"], [[*place, *row] for place, row in rows.items()])
-
-    return of
+    rows: dict[tuple[str, str], list[str]] = {}
+    for cell in results["batches"]["cells"]:
+        row = rows.setdefault((cell["situation"], f"{cell['points']:,}"), [])
+        for ratio in (cell["times_best_peer_one_thread"], cell["times_best_peer"]):
+            row.append(f"{ratio:.{0 if ratio >= 9.95 else 1}f}" if ratio else NONE)
+    head = ["tool is", "points", "touch, one thread", "all threads", "how far, one thread"]
+    return table([*head, "all threads"], [[*place, *row] for place, row in rows.items()])
 
 
-def ways_out(name: str) -> Callable[[Results], str]:
+def ways_out(results: Results) -> str:
     """Answer, seconds and lengths of each question; what blocks first where no way was found."""
-
-    def of(results: Results) -> str:
-        rows = []
-        for one in results[name]["rows"]:
-            answer, lengths = one["verdict"], [NONE] * 4
-            if "length_m" in one:
-                keys = ["length_m", "proved_from_m", "clearance_m", "mesh_distance_m"]
-                lengths = [f"{1e3 * one[key]:,.{0 if key == 'length_m' else 2}f}" for key in keys]
-            elif one["blockers"]:
-                answer += f", {one['blockers'][0][0].rpartition('|')[2]} named first"
-            rows.append([one["parts"], answer, f"{one['s']:.1f}", *lengths])
-        head = ["part", "answer", "seconds", "path, mm", "proved from, mm", "proved gap, mm"]
-        return table([*head, "gap of the triangles, mm"], rows)
-
-    return of
+    rows = []
+    for one in results["ways_out"]["rows"]:
+        answer, lengths = one["verdict"], [NONE] * 4
+        if "length_m" in one:
+            keys = ["length_m", "proved_from_m", "clearance_m", "mesh_distance_m"]
+            lengths = [f"{1e3 * one[key]:,.{0 if key == 'length_m' else 2}f}" for key in keys]
+        elif one["blockers"]:
+            answer += f", {one['blockers'][0][0]} named first"
+        rows.append([one["parts"], answer, f"{one['s']:.1f}", *lengths])
+    head = ["part", "answer", "seconds", "path, mm", "proved from, mm", "proved gap, mm"]
+    return table([*head, "gap of the triangles, mm"], rows)
 
 
 def contact_proxies(results: Results) -> str:
@@ -265,14 +208,9 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "frames": frames,
         "laws": laws,
         "edits": edits,
-        "many-sessions": many_sessions,
         "large-shells": large_shells,
-        "batches": batches("batches"),
-        "batch-ratios": batch_ratios("batches"),
-        "batches-1400": batches("batches_1400"),
-        "batch-ratios-1400": batch_ratios("batches_1400"),
-        "ways-out": ways_out("ways_out"),
-        "ways-out-vintage": ways_out("ways_out_vintage"),
+        "batch-ratios": batch_ratios,
+        "ways-out": ways_out,
         "contact-proxies": contact_proxies,
         "feel": lambda results: table_of(results["feel"]["cells"]),
         "walls": lambda results: walls_of(results["feel"]["cells"]),

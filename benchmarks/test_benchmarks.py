@@ -48,7 +48,7 @@ def test_the_evaluation_has_every_experiment_on_every_engine_and_layout(
 ) -> None:
     newest = max(find_binaries(), key=lambda found: found.major)
     monkeypatch.setattr(figures, "find_binaries", lambda: [newest])
-    results = figures.evaluate(tmp_path, 8, TINY, None)
+    results = figures.evaluate(tmp_path, 7, TINY, None)
     for name in ("figure8", "figure9", "figure10", "conditions", "strategies", "points", "tail"):
         places = {(cell["engine"], cell["layout"]) for cell in results[name]["cells"]}
         assert len(places) == len(LAYOUTS) * 2, name

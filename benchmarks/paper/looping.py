@@ -63,8 +63,9 @@ class LoopInServer:
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - all else is the store's own
         return getattr(self._store, name)
 
-    def scan(self, lows: Keys, highs: Keys) -> Rows:
-        """Rows with a key in any of the closed ranges, ascending and disjoint."""
+    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        """Rows with a key in any of the closed ranges, ascending and disjoint; no distances."""
+        assert not distances
         if not lows.size:
             return NO_ROWS
         columns = "keys, ids, bits" if self._store.layout == "brick" else "keys, ids"

@@ -7,7 +7,7 @@ READY := .venv/ready
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
 PYTEST := $(BIN)/pytest tests --numprocesses=auto --dist=worksteal
 
-.PHONY: demo test test-long test-browser test-all test-plain lint types bench figures peers realtime feel scale paths wheel pins clean
+.PHONY: demo test test-long test-browser test-all test-plain lint types figures peers realtime feel scale paths wheel pins clean
 
 demo: $(USER)
 	$(BIN)/hapticdb demo demo
@@ -39,38 +39,30 @@ types: $(READY)
 	$(BIN)/mypy
 	$(BIN)/mypy benchmarks
 
-# Open3D stands beside in the voxelizing benchmark where 'make figures' or 'make peers' has run.
-bench: $(READY)
-	$(BIN)/pytest benchmarks --benchmark-enable --benchmark-only --benchmark-columns=median,min,iqr,rounds
+# The measurements behind docs/; ARGS=--quick for a first look, into results-quick/. Real assemblies are read
+# from the folder that HAPTICDB_TEST_DATA names; without it the sample car stands in for them.
+figures realtime feel paths: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
 
-# The evaluation in docs/evaluation.md: a quarter of an hour; ARGS=--quick for two minutes.
-# PostgreSQL 15 and PostGIS or pgpointcloud, where they are installed, take part (README.md).
-# Real assemblies for Table 1 and voxelizing are read from the folder that HAPTICDB_TEST_DATA names.
-figures: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
-figures: $(READY) .venv/figures
+# docs/evaluation.md, on SQLite and every PostgreSQL found: a quarter of an hour
+figures: $(READY)
 	$(BIN)/python benchmarks/figures.py $(ARGS)
 
-# Frames and bytes at 1.4 million to 1.4 billion voxels: five minutes, 10 GB of disk.
+# its chapter on 1.4 million to 1.4 billion voxels: five minutes, 10 GB of disk
 scale: $(READY)
-	$(BIN)/python benchmarks/scale.py --report docs/evaluation.md $(ARGS)
+	$(BIN)/python benchmarks/scale.py $(ARGS)
 
-# Frames in memory beside a dense bitmap, and sessions beside an empty loop: three minutes.
+# docs/realtime.md: frames in memory beside a dense bitmap, sessions beside an empty loop: five minutes
 realtime: $(READY)
 	$(BIN)/python benchmarks/in_real_time.py $(ARGS)
 
-# Poses a second, by batches, beside python-fcl, coal and Open3D, over the vintage car where
-# HAPTICDB_TEST_DATA has it, else over the sample; and large tools beside the flat loop. A quarter of an
-# hour.
-paths: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
-paths: $(READY) .venv/figures
-	$(BIN)/python benchmarks/batches.py
-	$(BIN)/python benchmarks/large_shells.py
-
-# How good the forces feel, under both laws (docs/feel.md): a quarter of an hour; ARGS=--quick for two
-# minutes. The walk is over the vintage car where HAPTICDB_TEST_DATA has it, else over the sample.
-feel: export HAPTICDB_TEST_DATA ?= $(wildcard ../shared/data)
+# docs/feel.md: how good the forces feel: ten minutes
 feel: $(READY)
 	$(BIN)/python benchmarks/feeling.py $(ARGS)
+
+# docs/batches.md beside python-fcl, coal and Open3D, and large tools beside the flat loop: a quarter of an hour
+paths: $(READY) .venv/figures
+	$(BIN)/python benchmarks/batches.py $(ARGS)
+	$(BIN)/python benchmarks/large_shells.py $(ARGS)
 
 peers: .venv/figures
 

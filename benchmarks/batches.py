@@ -1,7 +1,7 @@
 """Batches of poses: poses a second beside python-fcl, coal and Open3D, on the same questions.
 
-    make paths                        # 200 and 1,428 parts of real assemblies, or the sample car
-    python benchmarks/batches.py --model FILE --seconds 5 --out results/batches.json
+    make paths                        # a real assembly of 1,428 parts, or the sample car
+    python benchmarks/batches.py --quick
 
 A tool is far from all parts (free), within a few voxels of one (near), or in contact (touching).
 Every side says of each pose whether the tool touches, and how far it is from the nearest part. All
@@ -11,7 +11,6 @@ it, and beside that by the force; only the first hit is compared with the best o
 """
 
 import argparse
-import json
 import os
 import tempfile
 import time
@@ -25,22 +24,19 @@ import trimesh
 from numpy.typing import NDArray
 
 import hapticdb
+import page_tables
+import records
+from batch_peers import PEERS, Open3DBatch, PeerMissingError
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.batches.feeler import Feeler
-from hapticdb.bench import records
 from hapticdb.demo import write_along
 from hapticdb.mesh import read_file
 from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
-from peers import PeerMissingError
-from peers.batched import batch_peers
 
 Floats = NDArray[np.float64]
-MODELS = {
-    "batches.json": "demo_vintage_car/vintage_car.glb",
-    "batches_1400.json": "assembly_vw_t1/vw_t1.glb",
-}
-"""Results, and the files below HAPTICDB_TEST_DATA that they are of: 200 parts, and 1,428."""
+MODEL = "assembly_vw_t1/vw_t1.glb"
+"""A van of 1,428 parts, below the folder that HAPTICDB_TEST_DATA names."""
 BITS, EXTENT = 11, 1.6
 """Grid: bits an axis, and its edge as a multiple of the model's longest side."""
 POINTS = (300, 10_000, 100_000)
@@ -168,12 +164,14 @@ def measure_tool(
     size, points = env.grid.voxel_size, tool.shell.points
     reach = REACH * size
     peers, notes = [], []
-    for peer in batch_peers(0.5 * size):
+    for kind in PEERS:
         try:
-            peer.build(parts, tool.mesh)
-            peers.append(peer)
+            peers.append(kind(parts, tool.mesh))
         except PeerMissingError as error:
-            notes.append(f"{peer.name}: {error}")
+            notes.append(f"{kind.name}: {error}")
+    for peer in peers:
+        if isinstance(peer, Open3DBatch):
+            peer.close = 0.5 * size
     cells: list[dict[str, Any]] = []
     with (
         env.feeler(tool.shell, law="plane") as all_of,
@@ -253,45 +251,21 @@ def measure(folder: Path, model: Path | None, bits: int, settings: Settings) -> 
     return records.conditions() | loads | {"scene": scene, "cells": cells, "notes": notes}
 
 
-def table(results: Mapping[str, Any]) -> str:
-    """The figures as Markdown."""
-    lines = [
-        "| question | points | tool is | side | poses a second | a processor second | agree |",
-        "| --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for cell in results["cells"]:
-        for name, side in cell["sides"].items():
-            lines.append(
-                f"| {cell['question']} | {cell['points']:,} | {cell['situation']} | {name} | "
-                f"{side['poses_per_s']:,.0f} | {side['poses_per_processor_s']:,.0f} | "
-                f"{100.0 * side['agree']:.1f} % |"
-            )
-    return "\n".join(lines)
-
-
 def main() -> None:
-    """Measure, print the figures, and write them to a file."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--model", type=Path, help="a car or another model")
-    parser.add_argument("--seconds", type=float, default=2.0, help="of each turn of a side")
-    parser.add_argument("--bits", type=int, default=BITS, help="of the grid on each axis")
-    parser.add_argument("--points", default=",".join(map(str, POINTS)), help="of the shells")
-    parser.add_argument("--out", type=Path, help="of that model, or of the sample car")
+    """Measure, and fill the table of docs/query.md."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="short turns, into results-quick/")
     given = parser.parse_args()
-    data, results = Path(os.environ.get("HAPTICDB_TEST_DATA", "")), Path("results")
-    found = {
-        results / name: data / file for name, file in MODELS.items() if (data / file).is_file()
-    }
-    models: Mapping[Path, Path | None] = found
-    if given.model or given.out or not found:
-        models = {given.out or results / "batches.json": given.model}
-    settings = Settings(given.seconds, points=tuple(int(n) for n in given.points.split(",")))
-    for out, model in models.items():
-        with tempfile.TemporaryDirectory(prefix="hapticdb-batches-") as folder:
-            figures = measure(Path(folder), model, given.bits, settings)
-        print(table(figures))
-        print(*figures["notes"], sep="\n")
-        out.write_text(json.dumps(figures, indent=1) + "\n")
+    out = Path("results-quick" if given.quick else "results")
+    real = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), MODEL)
+    model = real if real.is_file() else None
+    settings = Settings(0.1, 256, POINTS[:2]) if given.quick else Settings(2.0)
+    with tempfile.TemporaryDirectory(prefix="hapticdb-batches-") as folder:
+        found = measure(Path(folder), model, BITS, settings)
+    records.write(out, {"batches": found})
+    print(page_tables.batch_ratios({"batches": found}), *found["notes"], sep="\n")
+    if not given.quick:
+        page_tables.refill("docs/query.md", out)
 
 
 if __name__ == "__main__":

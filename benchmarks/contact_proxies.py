@@ -1,7 +1,6 @@
 """Contact proxies over a network that delays, beside the coupling on this machine.
 
     python benchmarks/contact_proxies.py                # the vintage car, or the sample car
-    python benchmarks/contact_proxies.py --busy         # the machine does more
 
 The server and the relay are processes of their own on 127.0.0.1. The client moves a ball along each
 path in real time, 1000 times a second; the coupling of this machine has felt the same path before.
@@ -22,20 +21,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
-from delaying import READY_WITHIN, DelayingRelay, echo_trips
+import page_tables
+import records
+from delaying import READY_WITHIN, DelayingRelay
+from feel.couplings import SmoothHand, Terms, posed, straight
+from feel.ground import Ground
+from feel.scenes import concave_corner, convex_edge, plane, slope_axes
+from feel.sliding import SPEED, way_round_edge
+from feel.tools import ball
 from hapticdb import GridOptions, ImportOptions
-from hapticdb.bench import records
-from hapticdb.bench.feel.couplings import SmoothHand, Terms, posed, straight
-from hapticdb.bench.feel.ground import Ground
-from hapticdb.bench.feel.scenes import concave_corner, convex_edge, plane, slope_axes
-from hapticdb.bench.feel.sliding import SPEED, way_round_edge
-from hapticdb.bench.feel.tools import ball
-from hapticdb.bench.workload import slide_poses
 from hapticdb.client import ContactProxy
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.sample import write_sample
-from report.proxies_page import proxy_table
+from paper.workload import slide_poses
 
 TESTS = Path(__file__).parent.parent / "tests"
 sys.path.insert(0, str(TESTS))
@@ -53,8 +52,6 @@ DEPTH = 0.8
 """Depth of the hand below the onset of contact, voxels."""
 LATENCIES = (0.0, 0.010, 0.050)
 """Seconds added to a round trip, half of them each way."""
-ECHOES = 100
-"""Round trips of the bare echo. More: its median is steadier."""
 CAP = 7.0
 """Greatest force that the server grants, N."""
 CAR = "demo_vintage_car/vintage_car.glb"
@@ -215,7 +212,7 @@ def lines_of(
     return lines, float(spent) / int(count)
 
 
-def measure(folder: Path, *, is_busy: bool) -> Line:
+def measure(folder: Path) -> Line:
     """Measure all lines; a record for JSON."""
     compile_missing(entries_for("import", "resident", "proxies", "proxy"))
     lines, times = [], []
@@ -228,8 +225,6 @@ def measure(folder: Path, *, is_busy: bool) -> Line:
         **records.conditions(),
         "car": found[3],
         "points": POINTS,
-        "is_busy": is_busy,
-        "echo": [{"added": s, **quantiles(echo_trips(s, ECHOES))} for s in LATENCIES],
         "server": max(times),
         "lines": lines,
     }
@@ -237,14 +232,11 @@ def measure(folder: Path, *, is_busy: bool) -> Line:
 
 def main() -> None:
     """Measure, print the table, and write the figures to a file."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--busy", action="store_true", help="note that other work runs, too")
-    parser.add_argument("--out", type=Path, default=Path("results/contact_proxies.json"))
-    given = parser.parse_args()
+    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
     with tempfile.TemporaryDirectory(prefix="hapticdb-proxies-") as folder:
-        found = measure(Path(folder), is_busy=given.busy)
-    print(proxy_table(found))
-    given.out.write_text(json.dumps(found, indent=1) + "\n")
+        found = measure(Path(folder))
+    records.write(Path("results"), {"contact_proxies": found})
+    page_tables.refill("docs/protocol.md", Path("results"))
 
 
 if __name__ == "__main__":

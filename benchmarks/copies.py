@@ -6,21 +6,16 @@ triangle is voxelized again. Copies lie side by side on a plane, like parked car
 """
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb import Environment
-from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
 from hapticdb.query.grouping import object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Rows, Store, row_shift
-
-MAX_BITS = 15
-"""Most bits an axis of the larger grid; one more allows four times as many copies on the plane."""
 
 
 @dataclass(frozen=True)
@@ -38,16 +33,11 @@ class Source:
 
     @classmethod
     def of(cls, env: Environment) -> "Source":
-        """All objects of an environment that fits into memory, with distances if all have them.
-
-        In Z-order only.
-        """
-        if env.grid.curve != "z":
-            raise UsageError(f"{env.url} is in {env.grid.curve} order: copies need z order")
+        """All objects of an environment in Z-order that fits into memory, without distances."""
         parts = []
         for obj in env.objects():
             ranges = object_ranges(env.grid, env.layout, obj)
-            parts.append((obj, env.store.rows_of(obj.id, *ranges, distances=env.has_distances)))
+            parts.append((obj, env.store.rows_of(obj.id, *ranges)))
         return cls(env.grid, env.layout, tuple(parts))
 
     def within(self, voxels: float) -> "Source":
@@ -60,8 +50,6 @@ class Source:
             if self.parts[n][0].voxels <= room:
                 room -= self.parts[n][0].voxels
                 chosen.append(int(n))
-        if not chosen:
-            raise UsageError(f"{voxels:g} voxels hold no object of the sample: give a larger size")
         return replace(self, parts=tuple(self.parts[n] for n in sorted(chosen)))
 
 
@@ -78,8 +66,6 @@ class Plan:
         """Copies nearly in a square, in the order of their keys: rows are written ascending."""
         side = math.isqrt(copies - 1) + 1
         bits = source.grid.bits + (side - 1).bit_length()
-        if bits > MAX_BITS:
-            raise UsageError(f"{copies} copies need {bits} bits an axis, at most {MAX_BITS}")
         grid = replace(source.grid, bits=bits)
         numbers = np.arange(copies)
         tiles = np.stack([numbers % side, numbers // side, np.zeros_like(numbers)], axis=1)
@@ -117,17 +103,16 @@ class Plan:
                     transform=shift @ obj.transform,
                     bounds=obj.bounds + offset,
                 ),
-                Rows(rows.keys + key, rows.ids, rows.occupancy, rows.distances),
+                Rows(rows.keys + key, rows.ids, rows.occupancy),
             )
             for obj, rows in self.source.parts
         ]
 
 
-def write_copies(store: Store, plan: Plan, progress: Callable[[int], None]) -> None:
-    """Write all copies into an empty store on the plan's grid; `progress` gets their count."""
+def write_copies(store: Store, plan: Plan) -> None:
+    """Write all copies into an empty store on the plan's grid."""
     with store.loading():
         for copy in range(len(plan.tiles)):
             for obj, rows in plan.parts_of(copy):
                 store.add(obj, rows)
-            progress(copy + 1)
     store.analyze(DEFAULT_RESOLUTION)

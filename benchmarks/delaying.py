@@ -1,9 +1,8 @@
-"""A TCP relay that delays what passes, in a process of its own, and round trips of a bare echo.
+"""A TCP relay that delays what passes, in a process of its own.
 
-    python benchmarks/delaying.py relay PORT SECONDS   # SECONDS are added to a round trip
-    python benchmarks/delaying.py echo                 # a WebSocket that sends back what it gets
+    python benchmarks/delaying.py PORT SECONDS   # SECONDS are added to a round trip
 
-Both listen on 127.0.0.1, print their port, and end when their standard input closes.
+It listens on 127.0.0.1, prints its port, and ends when its standard input closes.
 """
 
 import queue
@@ -15,9 +14,6 @@ import time
 from contextlib import suppress
 from typing import Self
 
-import numpy as np
-from numpy.typing import NDArray
-
 PIECES = 4096
 """Most pieces of 64 KiB on the way in one direction. Larger: more memory for a sender that is
 faster than its receiver."""
@@ -25,22 +21,22 @@ READY_WITHIN = 30.0
 """Seconds in which a process must print its port, and end when it is asked to."""
 IDLE_FOR = 600.0
 """Seconds without a byte in one direction after which the relay ends it."""
-ECHO_BYTES = 100
-"""Bytes of a message of the echo: those of a hand."""
 
 
-class ChildServer:
-    """A server of this module in a process of its own. Also a context manager.
+class DelayingRelay:
+    """Relays connections to a port of this machine. Also a context manager.
 
     Parameters
     ----------
-    arguments : str
-        What the process is started with.
+    port : int
+        Where to relay to.
+    seconds : float
+        Latency added to a round trip, half of it each way.
     """
 
-    def __init__(self, *arguments: str) -> None:
+    def __init__(self, port: int, seconds: float) -> None:
         self._process = subprocess.Popen(
-            [sys.executable, __file__, *arguments],
+            [sys.executable, __file__, str(port), repr(seconds)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         late = threading.Timer(READY_WITHIN, self._process.kill)
@@ -50,7 +46,7 @@ class ChildServer:
         late.cancel()
         if not told:
             self._process.wait(READY_WITHIN)
-            raise RuntimeError(f"no server began: {arguments}")
+            raise RuntimeError("no relay began")
         self.port = int(told)
 
     def __enter__(self) -> Self:
@@ -64,38 +60,7 @@ class ChildServer:
         self._process.wait(READY_WITHIN)
 
 
-class DelayingRelay(ChildServer):
-    """Relays connections to a port of this machine. Half of the latency is added each way.
-
-    Parameters
-    ----------
-    port : int
-        Where to relay to.
-    seconds : float
-        Latency added to a round trip.
-    """
-
-    def __init__(self, port: int, seconds: float) -> None:
-        super().__init__("relay", str(port), repr(seconds))
-
-
-def echo_trips(seconds: float, count: int) -> NDArray[np.float64]:
-    """Round trips (count,), s, of a bare WebSocket echo with seconds of added latency."""
-    from websockets.sync.client import connect  # noqa: PLC0415 - an extra
-
-    trips = np.zeros(count)
-    with ChildServer("echo") as echo, DelayingRelay(echo.port, seconds) as relay:
-        url = f"ws://127.0.0.1:{relay.port}"
-        with connect(url, compression=None, proxy=None, open_timeout=READY_WITHIN) as peer:
-            for n in range(-10, count):  # the first ones warm both sides up
-                start = time.perf_counter()
-                peer.send(bytes(ECHO_BYTES))
-                peer.recv(READY_WITHIN)
-                trips[max(n, 0)] = time.perf_counter() - start
-    return trips
-
-
-# -- in the processes ------------------------------------------------------------------------------
+# -- in the process -------------------------------------------------------------------------------
 
 
 def relay(port: int, seconds: float) -> None:
@@ -149,27 +114,6 @@ def _write(peer: socket.socket, pieces: "queue.Queue[tuple[float, bytes]]") -> N
             return
 
 
-def echo() -> None:
-    """Send back what comes, for as long as the process lives."""
-    from websockets.sync.server import ServerConnection, serve  # noqa: PLC0415 - an extra
-
-    def send_back(connection: ServerConnection) -> None:
-        for message in connection:
-            connection.send(message)
-
-    with serve(send_back, "127.0.0.1", 0, compression=None) as server:
-        print(server.socket.getsockname()[1], flush=True)
-        server.serve_forever()
-
-
-def main() -> None:
-    """Serve until standard input closes."""
-    if sys.argv[1] == "relay":
-        _start(relay, int(sys.argv[2]), float(sys.argv[3]))
-    else:
-        _start(echo)
-    sys.stdin.read()
-
-
 if __name__ == "__main__":
-    main()
+    _start(relay, int(sys.argv[1]), float(sys.argv[2]))
+    sys.stdin.read()

@@ -20,8 +20,6 @@ from hapticdb.poses import read_poses
 
 RATE = 1000.0
 """Frames a second of the session."""
-EDITS = 60
-"""Number of commits of the writer."""
 LIFT = 5.0
 """Height in voxels by which the object is lifted."""
 LOOK = 0.0005
@@ -53,7 +51,7 @@ def write(url: str, object_id: int, n_edits: int) -> None:
             print(env.store.revision(), committed, committed - started, flush=True)
 
 
-def edits(url: str, tool: FilePath, path: FilePath, n_edits: int = EDITS) -> dict[str, Any]:
+def edits(url: str, tool: FilePath, path: FilePath, n_edits: int) -> dict[str, Any]:
     """Milliseconds from a commit to a frame of its revision; at the end the object is put back."""
     shell = PointShell.from_file(tool, 300)
     object_id = touched_object(url, shell, path)

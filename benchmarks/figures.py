@@ -1,7 +1,7 @@
-"""The evaluation: every figure on every engine, the peers, plots and the written report.
+"""The evaluation: every figure on every engine, plots, and the tables of docs/evaluation.md.
 
     make figures                    # the sample at 11 bits: a quarter of an hour on two processors
-    make figures ARGS=--quick       # a coarse sample and few frames: whether all of it runs
+    make figures ARGS=--quick       # a coarse sample and few frames, into results-quick/
 
 All inputs are made in a temporary folder: the sample, and its environments on SQLite and on a
 private server of every PostgreSQL found. They are measured with 4 MB of cache as in the paper, then
@@ -9,44 +9,45 @@ with a large cache.
 """
 
 import argparse
-import contextlib
 import os
 import signal
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import trimesh
 
 import hapticdb
+import page_tables
+import records
 from awake import awake
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
-from hapticdb.bench import experiments, records, run
-from hapticdb.bench.drawing.draw import draw
-from hapticdb.bench.experiments import QUICK, Budget
-from hapticdb.bench.measure import Cell
-from hapticdb.bench.run import Workload
-from hapticdb.bench.subject import PAPER_CACHE, Subject, limited
-from hapticdb.bench.workload import RADIUS_VOXELS, Task
 from hapticdb.grid import CurveName
-from hapticdb.kernels.surfaces.voxelize import count_voxels
 from hapticdb.poses import read_poses
+from hapticdb.query.quantiles import QuantileVector
 from hapticdb.sample import SampleFiles, write_sample
-from hapticdb.store.base import LAYOUTS, Layout
+from hapticdb.store.base import BRICK_BYTES, LAYOUTS, Layout, SupportsCaches
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import Binaries, find_binaries
-from peers import Peer, PeerWork, all_bricks
-from peers.run import PeerResults, measure_peers
-from peers.voxelizers import measure_voxelizers, read_assembly
+from paper import experiments
+from paper.experiments import QUICK, Budget
+from paper.measure import Cell
+from paper.plots import draw
+from paper.subject import PAPER_CACHE, Subject, limited
+from paper.workload import (
+    INPUTS,
+    Region,
+    Task,
+    random_poses,
+    regions,
+    slide_poses,
+    sphere_shell,
+)
 from places import serving
-from report.page import write_report
-from report.plots import REPORT_KINDS
-from servers_cold import Cold
 
 EXTENT = 1.6
 """Edge of the sample's grid, as a multiple of the car's longest side; more gives larger voxels."""
@@ -55,11 +56,34 @@ CAD = (
     ("assembly_vw_t1", "vw_t1.glb", 2.4),
 )
 """Real assemblies of Table 1: folder and file under HAPTICDB_TEST_DATA, extent of the grid."""
-VOXELIZED = Path("assembly_vw_t1/vw_t1.glb")
-POINTCLOUD_MAJOR = 15
-"""Major version of PostgreSQL for which Debian has a package of pgpointcloud."""
 CACHES = {"4 MB": "4MB", "all cached": "2GB"}
 SETTINGS = {"max_wal_size": "4GB", "fsync": "off"}
+ALL_BYTES = 2 << 30
+"""Bytes of a cache that holds every page of most environments; it takes memory as it is filled."""
+
+
+@dataclass(frozen=True)
+class Workload:
+    """Tasks and regions of one environment, the same under all conditions."""
+
+    slide: Task
+    random: Task
+    recorded: Task
+    regions: tuple[Region, ...]
+    finest: QuantileVector
+
+    @classmethod
+    def of(cls, env: Environment, budget: Budget, files: SampleFiles) -> "Workload":
+        """The same for all environments that have the grid of this one."""
+        shell = sphere_shell(env.grid.voxel_size)
+        wrench = PointShell.from_file(files.wrench, 300)
+        return cls(
+            Task("slide", "sphere", shell, slide_poses(env, shell, budget.frames)),
+            Task("random", "sphere", shell, random_poses(env, budget.frames)),
+            Task("recorded", "wrench", wrench, read_poses(files.path)[: budget.frames]),
+            tuple(regions(env, max(budget.frames // 4, 10), windows=budget.windows)),
+            env.quantiles(max(budget.resolutions)),
+        )
 
 
 @dataclass
@@ -71,24 +95,18 @@ class Evaluation:
     bits: int
     budget: Budget
     data: Path | None
-    with_peers: bool
-    seconds: float = field(default_factory=time.perf_counter)
+    started: float = field(default_factory=time.perf_counter)
     found: dict[str, list[Cell]] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
     work: dict[Layout, Workload] = field(default_factory=dict)
 
     def say(self, line: str) -> None:
         """Print what is measured next, and the seconds since the start."""
-        print(f"{time.perf_counter() - self.seconds:6.0f} s  {line}", file=sys.stderr, flush=True)
+        print(f"{time.perf_counter() - self.started:6.0f} s  {line}", file=sys.stderr, flush=True)
 
-    def keep(self, name: str, measured: PeerResults) -> None:
-        """Keep measured cells, and notes on measurements that were not possible."""
-        self.add(name, measured.cells)
-        self.notes += measured.notes
-
-    def add(self, name: str, cells: list[Cell]) -> None:
-        """Keep measured cells of one experiment."""
-        self.found.setdefault(name, []).extend(cells)
+    def add(self, found: Mapping[str, list[Cell]]) -> None:
+        """Keep measured cells by their experiment."""
+        for name, cells in found.items():
+            self.found.setdefault(name, []).extend(cells)
 
     def make(self, url: str, layout: Layout, curve: CurveName = "z") -> str:
         """Import the sample; all environments have the same grid except for curve and layout."""
@@ -96,16 +114,25 @@ class Evaluation:
         import_file(url, self.files.car, ImportOptions(grid=grid, layout=layout, distances=False))
         return url
 
-    def describe(self, name: str, url: str, extent: float, import_s: float) -> None:
-        """Add an environment in bricks to Table 1."""
-        with hapticdb.open(url, read_only=True) as env:
-            row = run.table_1_row(
-                env,
-                extent=extent,
-                import_s=import_s,
-                distinct_voxels=count_voxels(all_bricks(env).occupancy),
-            )
-        self.add("table1", [row | {"environment": name}])
+    def measure(self, subject: Subject, *, is_paper: bool) -> None:
+        """Run all experiments with the paper's cache; with a large one those that it affects."""
+        work, budget = self.work[subject.env.layout], self.budget
+        self.say(f"{subject.env.engine}, {subject.env.layout}: cache {subject.cache}")
+        found = {
+            "figure9": experiments.figure_9(subject, work.slide, budget),
+            "conditions": experiments.cached(subject, work.slide, budget),
+        }
+        if is_paper:
+            found["conditions"] += experiments.cold(subject, work.slide, budget)
+            tasks = (work.slide, work.random, work.recorded)
+            found |= {
+                "figure8": experiments.figure_8(subject, work.slide, work.finest, budget),
+                "figure10": experiments.figure_10(subject, work.slide, work.regions, budget),
+                "strategies": experiments.strategies(subject, tasks, budget),
+                "points": experiments.points(subject, budget),
+                "tail": experiments.tail(subject, work.slide, budget),
+            }
+        self.add(found)
 
 
 def import_file(url: str, file: Path, options: ImportOptions) -> None:
@@ -115,21 +142,60 @@ def import_file(url: str, file: Path, options: ImportOptions) -> None:
         raise report.error
 
 
+def distinct_voxels(env: Environment) -> int:
+    """Voxels of an environment in bricks, each once, of whatever objects."""
+    rows = env.store.scan(np.array([0]), np.array([8**env.grid.bits]))
+    starts = np.flatnonzero(np.diff(rows.keys, prepend=-1))
+    bricks = np.bitwise_or.reduceat(rows.occupancy.reshape(-1, BRICK_BYTES), starts, axis=0)
+    return int(np.bitwise_count(bricks).sum())
+
+
+def table_1_row(name: str, url: str, import_s: float) -> Cell:
+    """Voxels, objects, cells of the data space of an environment in bricks."""
+    with hapticdb.open(url, read_only=True) as env:
+        size, objects = env.size(), env.objects()
+        return {
+            "environment": name,
+            "engine": env.engine,
+            "layout": env.layout,
+            "objects": len(objects),
+            "object_voxels": sum(obj.voxels for obj in objects),
+            "distinct_voxels": distinct_voxels(env),
+            "bits": env.grid.bits,
+            "cells_of_space": 8**env.grid.bits,
+            "edge": env.grid.edge,
+            "voxel_size": env.grid.voxel_size,
+            "rows_brick": size.rows,
+            "bytes_brick": size.bytes,
+            "import_s": import_s,
+        }
+
+
 def table_1(evaluation: Evaluation) -> None:
-    """Add real assemblies to Table 1, beside the sample."""
+    """Real assemblies for Table 1, beside the sample."""
     if evaluation.data is None:
-        evaluation.notes.append("real CAD assemblies: HAPTICDB_TEST_DATA names no folder")
+        evaluation.say("no real assemblies: HAPTICDB_TEST_DATA names no folder")
         return
     for folder, pattern, extent in CAD:
         (file,) = sorted((evaluation.data / folder).glob(pattern))
         evaluation.say(f"table 1: {folder}")
         url = str(evaluation.folder / f"{folder}.db")
-        options = ImportOptions(
-            grid=GridOptions(bits=evaluation.bits, extent=extent), distances=False
-        )
+        grid = GridOptions(bits=evaluation.bits, extent=extent)
         started = time.perf_counter()
-        import_file(url, file, options)
-        evaluation.describe(folder, url, extent, time.perf_counter() - started)
+        import_file(url, file, ImportOptions(grid=grid, distances=False))
+        row = table_1_row(folder, url, time.perf_counter() - started)
+        evaluation.add({"table1": [row]})
+
+
+def caches_of(env: Environment) -> Iterator[tuple[str, bool]]:
+    """Set SQLite's cache to each size in turn; give its name, and whether it is the paper's.
+
+    An environment that fits into the paper's cache has one size.
+    """
+    first = limited(env, PAPER_CACHE)
+    yield first, True
+    if (second := limited(env, ALL_BYTES)) != first:
+        yield second, False
 
 
 def on_sqlite(evaluation: Evaluation) -> None:
@@ -141,27 +207,18 @@ def on_sqlite(evaluation: Evaluation) -> None:
         url = evaluation.make(str(evaluation.folder / f"{layout}.db"), layout)
         seconds = time.perf_counter() - started
         if layout == "brick":
-            evaluation.describe("sample", url, EXTENT, seconds)
+            evaluation.add({"table1": [table_1_row("sample", url, seconds)]})
     evaluation.say("inputs: shells, poses, regions")
-    shell = PointShell.from_file(evaluation.files.wrench, 300)
-    recorded = Task("recorded", "wrench", shell, read_poses(evaluation.files.path))
     with hapticdb.open(evaluation.folder / "brick.db", read_only=True) as env:
-        work = run.workload_of(env, budget, recorded)
+        work = Workload.of(env, budget, evaluation.files)
     for layout in LAYOUTS:
         with hapticdb.open(evaluation.folder / f"{layout}.db", read_only=True) as env:
+            assert isinstance(env.store, SupportsCaches)
             # every engine has the same rows, so the same quantile vector
             evaluation.work[layout] = replace(work, finest=env.quantiles(max(budget.resolutions)))
-            for cache, is_paper in run.caches_of(env):
-                subject = Subject(env, "sample", cache, run.drop_of(env))
-                measure(evaluation, subject, is_paper=is_paper)
-
-
-def measure(evaluation: Evaluation, subject: Subject, *, is_paper: bool) -> None:
-    """Run all experiments with the paper's cache; with a large cache those that it affects."""
-    work, budget = evaluation.work[subject.env.layout], evaluation.budget
-    evaluation.say(f"{subject.env.engine}, {subject.env.layout}: cache {subject.cache}")
-    for name, more in run.measured(subject, work, budget, is_paper=is_paper).items():
-        evaluation.add(name, more)
+            for cache, is_paper in caches_of(env):
+                subject = Subject(env, "sample", cache, env.store.drop_caches)
+                evaluation.measure(subject, is_paper=is_paper)
 
 
 def on_postgres(evaluation: Evaluation, binaries: Binaries) -> None:
@@ -175,149 +232,74 @@ def on_postgres(evaluation: Evaluation, binaries: Binaries) -> None:
     measured: set[tuple[Layout, str]] = set()
     for cache, shared_buffers in CACHES.items():
         settings = SETTINGS | {"shared_buffers": shared_buffers}
-        with serving(folder, binaries, settings) as server, contextlib.ExitStack() as opened:
-            drop = None
-            if cache == "4 MB":
-                drop = Cold(server.conninfo(), folder / "data")
-                opened.callback(drop.close)
+        with serving(folder, binaries, settings) as server:
             for layout in LAYOUTS:
-                url = with_environment(server.conninfo(), layout)
-                env = opened.enter_context(hapticdb.open(url))
-                subject = Subject(env, "sample", limited(env, 0), drop)
-                if (layout, subject.cache) in measured:
-                    continue  # a small environment was already fully cached
-                measured.add((layout, subject.cache))
-                measure(evaluation, subject, is_paper=cache == "4 MB")
-                if evaluation.with_peers and layout == "brick" and cache == "4 MB":
-                    compare(evaluation, env, ())
+                with hapticdb.open(with_environment(server.conninfo(), layout)) as env:
+                    subject = Subject(env, "sample", limited(env, 0))
+                    if (layout, subject.cache) not in measured:  # a small one is cached already
+                        measured.add((layout, subject.cache))
+                        evaluation.measure(subject, is_paper=cache == "4 MB")
 
 
-def curves(evaluation: Evaluation) -> None:
+def layouts(evaluation: Evaluation) -> None:
     """Measure the three curves on SQLite in both layouts; lexicographic order has no bricks."""
-    made: list[tuple[Layout, CurveName, str]] = [
-        ("brick", "z", str(evaluation.folder / "brick.db")),
-        ("voxel", "z", str(evaluation.folder / "voxel.db")),
-    ]
-    others: tuple[tuple[Layout, CurveName], ...] = (
+    made: list[tuple[Layout, CurveName]] = [
+        *((layout, "z") for layout in LAYOUTS),
         ("brick", "hilbert"),
         ("voxel", "hilbert"),
         ("voxel", "lexicographic"),
-    )
-    for layout, curve in others:
-        evaluation.say(f"SQLite, {layout}, {curve}: import")
-        place = str(evaluation.folder / f"{layout}-{curve}.db")
-        made.append((layout, curve, evaluation.make(place, layout, curve)))
-    for layout, curve, url in made:
+    ]
+    for layout, curve in made:
         evaluation.say(f"SQLite, {layout}, {curve}")
+        url = str(evaluation.folder / f"{layout}.db")
+        if curve != "z":
+            url = evaluation.make(str(evaluation.folder / f"{layout}-{curve}.db"), layout, curve)
         with hapticdb.open(url, read_only=True) as env:
-            cache = limited(env, PAPER_CACHE)
-            subject = Subject(env, "sample", cache)
+            subject = Subject(env, "sample", limited(env, PAPER_CACHE))
             task = evaluation.work[layout].slide
-            evaluation.add("layouts", experiments.cached(subject, task, evaluation.budget))
-
-
-def peers(evaluation: Evaluation) -> None:
-    """Measure other systems on the same poses, and other voxelizers."""
-    evaluation.say("peers")
-    with hapticdb.open(evaluation.folder / "brick.db", read_only=True) as env:
-        compare(evaluation, env, None)
-    evaluation.say("voxelizing")
-    path = evaluation.data / VOXELIZED if evaluation.data else evaluation.files.car
-    evaluation.keep(
-        "voxelizing", measure_voxelizers(read_assembly(path), 10 * evaluation.budget.cell_s)
-    )
-
-
-def compare(evaluation: Evaluation, env: Environment, among: Sequence[Peer] | None) -> None:
-    """Measure frames of an environment in bricks, and of the given peers (None: all peers)."""
-    task = evaluation.work["brick"].slide
-    radius = RADIUS_VOXELS * env.grid.voxel_size
-    ball = trimesh.creation.icosphere(subdivisions=3, radius=radius)
-    folder = evaluation.folder / "peers"
-    folder.mkdir(exist_ok=True)
-    fifteen = [binaries for binaries in find_binaries() if binaries.major == POINTCLOUD_MAJOR]
-    work = PeerWork(
-        env,
-        task.shell,
-        evaluation.files.car,
-        (np.asarray(ball.vertices), np.asarray(ball.faces)),
-        folder,
-        fifteen[0] if fifteen else None,
-    )
-    note = f"{env.engine}: with a database cache of {limited(env, PAPER_CACHE)}"
-    evaluation.notes += [note] if note not in evaluation.notes else []
-    measured = measure_peers(work, task.poses, 2 * evaluation.budget.cell_s, among)
-    conditions = {"environment": "sample", "poses": "slide", "shell": "sphere"}
-    cells = [cell | conditions for cell in measured.cells]
-    evaluation.keep("peers", PeerResults(cells, measured.notes))
-
-
-PARTS: dict[str, Callable[[Evaluation], None]] = {"curves": curves, "peers": peers}
-ENGINES = "engines"
+            evaluation.add({"layouts": experiments.cached(subject, task, evaluation.budget)})
 
 
 def evaluate(
-    folder: Path, bits: int, budget: Budget, data: Path | None, parts: tuple[str, ...]
+    folder: Path, bits: int, budget: Budget, data: Path | None
 ) -> dict[str, dict[str, Any]]:
-    """Run the named parts, and return results by name."""
+    """Run all experiments, and return results by name."""
     files = write_sample(folder / "sample", budget.frames)
-    evaluation = Evaluation(folder, files, bits, budget, data, with_peers=peers.__name__ in parts)
+    evaluation = Evaluation(folder, files, bits, budget, data)
     hapticdb.warm_up()
     on_sqlite(evaluation)
     table_1(evaluation)
-    for name, part in PARTS.items():
-        if name in parts:
-            part(evaluation)
-    if ENGINES in parts:
-        for binaries in find_binaries():
-            on_postgres(evaluation, binaries)
-    inputs = dict(records.INPUTS) | {
+    layouts(evaluation)
+    for binaries in find_binaries():
+        on_postgres(evaluation, binaries)
+    inputs = dict(INPUTS) | {
         "sample": f"the sample car, {bits} bits, extent {EXTENT}",
         "PostgreSQL": "private server, Unix socket, fsync off",
-        "processors": "kept awake by processes of idle priority",
+        "awake": "processors are kept awake by processes of idle priority",
     }
     evaluation.say("done")
-    return {
-        name: records.result(name, cells, inputs=inputs, notes=evaluation.notes)
-        for name, cells in evaluation.found.items()
-    }
+    return {name: records.result(name, cells, inputs) for name, cells in evaluation.found.items()}
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Read the command line, measure, write JSON, plots and the report."""
+def main() -> None:
+    """Measure, write JSON and plots, and fill the page's tables."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="a coarse sample, few frames")
-    parser.add_argument("--bits", type=int, help="of the grid; 11 unless given, 9 when quick")
-    parser.add_argument("--out", type=Path, help="for JSON and plots; results unless quick")
-    parser.add_argument("--report", type=Path, help="docs/evaluation.md unless quick")
-    parser.add_argument(
-        "--parts", default=",".join([*PARTS, ENGINES]), help="some of these, and SQLite always"
-    )
-    chosen = parser.parse_args(arguments)
-    out = chosen.out or Path("results-quick" if chosen.quick else "results")
-    report = chosen.report or (out / run.PAGE if chosen.quick else Path("docs/evaluation.md"))
+    given = parser.parse_args()
+    out = Path("results-quick" if given.quick else "results")
     data = os.environ.get("HAPTICDB_TEST_DATA")
     # SIGTERM raises an exit, so that servers are stopped and files removed
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     with awake(), tempfile.TemporaryDirectory(prefix="hapticdb-figures-") as folder:
         found = evaluate(
             Path(folder),
-            chosen.bits or (9 if chosen.quick else 11),
-            QUICK if chosen.quick else Budget(),
+            9 if given.quick else 11,
+            QUICK if given.quick else Budget(),
             Path(data) if data else None,
-            tuple(chosen.parts.split(",")),
         )
     records.write(out, found)
-    redraw(out, report)
-    print(report)
-
-
-def redraw(out: Path, report: Path) -> None:
-    """Draw plots and write the report from all JSON in a folder, also that of `make scale`."""
-    results = records.read(out)
-    draw(results, out, REPORT_KINDS)
-    report.parent.mkdir(parents=True, exist_ok=True)
-    write_report(results, report, os.path.relpath(out, report.parent))
+    draw(found, out)
+    page_tables.refill("docs/evaluation.md", out, out / "evaluation.md" if given.quick else None)
 
 
 if __name__ == "__main__":

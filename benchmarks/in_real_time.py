@@ -1,11 +1,11 @@
 """Real time: frames against memory beside a dense bitmap, and sessions beside an empty loop.
 
-    make realtime                              # the sample car, ten seconds a session
-    python benchmarks/in_real_time.py --model FILE --seconds 60 --out results/realtime.json
+    make realtime                              # the vintage car, or the sample car
+    make realtime ARGS=--quick                 # short sessions, into results-quick/
 
 Frames: the resident cells' kernels and the same flat loop over one dense bitmap take turns on the
-same poses. Sessions: `hapticdb feel` as a user runs it, on SQLite and on a private server. Edits:
-the time until a session feels a commit of another process.
+same poses, and so do both laws. Sessions: `hapticdb feel` as a user runs it, on SQLite and on a
+private server. Edits: the time until a session feels a commit of another process.
 """
 
 import argparse
@@ -16,7 +16,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,15 +25,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
+import page_tables
+import records
 from awake import awake
 from dense_frame import dense_bitmap, dense_feel
 from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
-from hapticdb.bench import records
+from hapticdb.demo import write_along
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
 from hapticdb.kernels.resident.feeling import feel_kernel
-from hapticdb.mesh import read_file
 from hapticdb.poses import read_poses, write_poses
+from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -41,32 +44,41 @@ from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import find_binaries
 from places import serving
 
-BITS = 11
+CAR = "demo_vintage_car/vintage_car.glb"
 EXTENT = 1.6
-"""Grid: bits an axis, and its edge as a multiple of the model's longest side."""
+"""Edge of the grid as a multiple of the model's longest side."""
 ROUNDS = 15
 """Number of timed passes over all poses; the result is their median."""
-LIFT = 1.0
-"""Way in metres by which a part is lifted out of the car."""
-N_LIFTED = 40
-"""Number of poses on that way."""
-PARTS = ("body/hood", "body/door_front_left", "supply/fuel_tank", "seats/bench_cushion")
 RUNS = {"flat": 0, "clusters": None}
 """Argument `run` of `ResidentFrames` (points of a cluster): 0 for none, None for the default."""
-RATES = (1000, 5000, 10_000)
+LAWS: dict[str, ForceLaw] = {"plane": TangentPlane(), "smooth": DistanceField()}
+RATES = (1000, 5000)
+"""Frames a second of the sessions."""
+FRAMES = 1000
+"""Poses of the path over a model."""
 LARGE = 100_000
 """Number of points of the large shells."""
 PATIENCE = 600.0
 """Seconds beyond its own duration after which a command is killed."""
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Seconds of a session, edits that it feels, and bits of the grid on each axis."""
+
+    seconds: float = 60.0
+    edits: int = 60
+    bits: int = 11
+
+
+QUICK = Effort(2.0, 5, 8)
 SETTINGS = {"shared_buffers": "256MB"}
 
 
-def measure_frames(
-    database: Path, shell: PointShell, poses: NDArray[np.float64], exclude: Sequence[int]
-) -> dict[str, Any]:
+def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]) -> dict[str, Any]:
     """Medians, in us a frame, of the flat loop, clusters and the dense bitmap, in turns."""
     with hapticdb.open(database, read_only=True) as env, CellTable.create() as table:
-        residency = Residency(env.store, table, exclude)
+        residency = Residency(env.store, table)
         frames = {name: ResidentFrames(residency, shell, run=run) for name, run in RUNS.items()}
         frames["flat"].feel(poses)
         bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
@@ -101,7 +113,6 @@ def measure_frames(
         return {
             "points": len(shell),
             "poses": len(poses),
-            "extent_m": np.ptp(shell.points, axis=0).round(3).tolist(),
             "hits": float(found["dense"][:, 6].mean()),
             "cells": residency.writer.n_resident,
             "bitmap_mb": bitmap.nbytes / 1e6,
@@ -110,27 +121,35 @@ def measure_frames(
         }
 
 
-def lifted(database: Path, model: Path, name: str) -> dict[str, Any]:
-    """Frames of a part of the car, with 100,000 points, that is lifted out of the car."""
-    with hapticdb.open(database, read_only=True) as env:
-        (own,) = [obj for obj in env.objects() if obj.name == name]
-    (part,) = [part for part in read_file(model).parts if part.name == name]
-    assert part.faces is not None
-    placed = part.vertices @ part.world_from_part[:3, :3].T + part.world_from_part[:3, 3]
-    shell = PointShell.from_mesh(placed, part.faces, points=LARGE)
-    poses = np.tile(np.eye(4), (N_LIFTED, 1, 1))
-    poses[:, 2, 3] = np.linspace(0.0, LIFT, N_LIFTED)
-    return {"part": name} | measure_frames(database, shell, poses, [own.id])
+def measure_laws(database: Path, shell: PointShell, poses: NDArray[np.float64]) -> dict[str, Any]:
+    """Medians, in us a frame, of both laws over the same cells, in turns."""
+    with (
+        hapticdb.open(database, read_only=True) as env,
+        CellTable.create(distances=True) as table,
+        awake(),
+    ):
+        residency = Residency(env.store, table)
+        frames = {name: ResidentFrames(residency, shell, law) for name, law in LAWS.items()}
+        times: dict[str, list[float]] = {name: [] for name in LAWS}
+        for _ in range(ROUNDS + 1):
+            for name, spent in times.items():
+                started = time.perf_counter()
+                frames[name].feel(poses)
+                spent.append((time.perf_counter() - started) / len(poses) * 1e6)
+        medians = {name: float(np.median(spent[1:])) for name, spent in times.items()}
+        return {
+            "points": len(shell),
+            "us_per_frame": medians,
+            "ratio": medians["smooth"] / medians["plane"],
+        }
 
 
-def session(
-    url: str, tool: Path, path: Path, rate: int, seconds: float, options: Sequence[str] = ()
-) -> dict[str, Any]:
+def session(url: str, tool: Path, path: Path, rate: int, seconds: float) -> dict[str, Any]:
     """Report of `hapticdb feel`; if it fails, exit with its error text."""
     command = [
         str(Path(sys.executable).with_name("hapticdb")), "feel", url, "--tool", str(tool),
         "--device", str(path), "--loop", "--speed", "0.2", "--rate", str(rate),
-        "--seconds", str(seconds), "--json", *options,
+        "--seconds", str(seconds), "--json",
     ]  # fmt: skip
     limit = seconds + PATIENCE
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)
@@ -141,9 +160,9 @@ def session(
 
 
 @contextlib.contextmanager
-def environments(folder: Path, model: Path) -> Iterator[dict[str, str]]:
+def environments(folder: Path, model: Path, bits: int) -> Iterator[dict[str, str]]:
     """The model on SQLite and on the newest PostgreSQL found: engine -> URL."""
-    options = ImportOptions(grid=GridOptions(bits=BITS, extent=EXTENT), distances=False)
+    options = ImportOptions(grid=GridOptions(bits=bits, extent=EXTENT))
     file = str(folder / "environment.db")
     hapticdb.import_files(file, [model], options)
     binaries = max(find_binaries(), key=lambda found: found.major)
@@ -153,114 +172,51 @@ def environments(folder: Path, model: Path) -> Iterator[dict[str, str]]:
         yield {"SQLite": file, f"PostgreSQL {binaries.major}": url}
 
 
-def about() -> dict[str, Any]:
-    """Commit, machine and versions: the head of both result files of a run."""
-    return {
-        **records.conditions(),
-    }
-
-
-def measure(
-    folder: Path, model: Path | None, seconds: float, rates: Sequence[int]
-) -> dict[str, Any]:
-    """Measure frames, sessions and edits; results as records for JSON."""
+def measure(folder: Path, model: Path | None, effort: Effort) -> dict[str, Any]:
+    """Measure frames, laws, sessions and edits; results as records for JSON."""
     sample = write_sample(folder)
-    results: dict[str, Any] = about() | {"seconds": seconds}
-    with environments(folder, model or sample.car) as urls:
+    results = records.conditions() | {"seconds": effort.seconds}
+    with environments(folder, model or sample.car, effort.bits) as urls:
         database = Path(urls["SQLite"])
         tool, path = sample.wrench, sample.path
         if model is not None:
-            along = folder / "along"
-            command = [str(Path(sys.executable).with_name("hapticdb")), "sample", str(along)]
-            command += ["--along", str(database)]
-            subprocess.run(command, check=True, capture_output=True, timeout=PATIENCE)
-            tool, path = along / "wrench.stl", along / "path.csv"
+            tool, path = write_along(folder / "along", database, FRAMES)
         with hapticdb.open(database, read_only=True) as env:
             results["object_voxels"] = sum(obj.voxels for obj in env.objects())
-            results["voxel_size"] = env.grid.voxel_size
         poses = read_poses(path)
         round_trip = folder / "round_trip.csv"  # a loop without a jump back
         write_poses(round_trip, np.concatenate([poses, poses[::-1]]))
-        results["frames"] = [
-            {"part": "wrench, sliding"}
-            | measure_frames(database, PointShell.from_file(tool, points), poses[::step], [])
-            for points, step in ((300, 1), (LARGE, 20))
-        ]
-        if model is None:
-            results["frames"] += [lifted(database, sample.car, name) for name in PARTS]
-        results["sessions"] = [
-            {"engine": engine} | session(url, tool, round_trip, rate, seconds)
-            for engine, url in urls.items()
-            for rate in rates
-        ]
-        results["edits"] = [
-            {"engine": engine} | edits(url, tool, round_trip) for engine, url in urls.items()
-        ]
+        results |= {"frames": [], "laws": [], "sessions": [], "edits": []}
+        for points, step in ((300, 1), (LARGE, 20)):
+            shell = PointShell.from_file(tool, points)
+            for kind, one in (("frames", measure_frames), ("laws", measure_laws)):
+                found = one(database, shell, poses[::step])
+                results[kind].append({"part": "wrench, sliding"} | found)
+        for engine, url in urls.items():
+            for rate in RATES:
+                found = session(url, tool, round_trip, rate, effort.seconds)
+                results["sessions"].append({"engine": engine} | found)
+            results["edits"].append({"engine": engine} | edits(url, tool, round_trip, effort.edits))
     return results
 
 
-def table(results: dict[str, Any]) -> str:
-    """The figures as Markdown."""
-    lines = [
-        "| shell | points | hits | dense bitmap, us | flat, times dense | clusters, times dense |",
-        "| --- | --- | --- | --- | --- | --- |",
-    ]
-    lines += [
-        f"| {one['part']} | {one['points']:,} | {one['hits']:,.0f} | "
-        f"{one['us_per_frame']['dense']:,.1f} | {one['ratio']['flat']:.2f} | "
-        f"{one['ratio']['clusters']:.2f} |"
-        for one in results["frames"]
-    ]
-    lines += [
-        "",
-        (
-            "| engine | rate asked | rate | missed | late p50 / p99 / p99.9 / worst, us | "
-            "computing, us | empty loop: rate, missed, late | unknown frames |"
-        ),
-        "| --- | --- | --- | --- | --- | --- | --- | --- |",
-    ]
-    for one in results["sessions"]:
-        loop, empty = one["loop"], one["empty"]
-        lines.append(
-            f"| {one['engine']} | {one['rate']:,.0f} | {loop['rate']:,.1f} | {loop['missed']:,} | "
-            f"{_spread(loop['lateness'])} | {_spread(loop['elapsed'])} | "
-            f"{empty['rate']:,.1f}, {empty['missed']:,}, {_spread(empty['lateness'])} | "
-            f"{one['unknown_frames']:,} |"
-        )
-    lines += [
-        "",
-        "| engine | edits | voxels | felt after p50 / p90 / worst, ms | unknown frames |",
-        "| --- | --- | --- | --- | --- |",
-    ]
-    for one in results["edits"]:
-        felt = " / ".join(f"{ms:,.1f}" for ms in one["felt_after_ms"].values())
-        lines.append(
-            f"| {one['engine']} | {one['edits']:,} | {one['voxels']:,} | {felt} | "
-            f"{one['unknown_frames']:,} |"
-        )
-    return "\n".join(lines)
-
-
-def _spread(spread: dict[str, float]) -> str:
-    return " / ".join(f"{1e6 * spread[name]:,.1f}" for name in ("p50", "p99", "p999", "worst"))
-
-
 def main() -> None:
-    """Measure, print the figures, and write them to files."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
-    parser.add_argument("--model", type=Path, help="a car or another model; the sample otherwise")
-    parser.add_argument("--seconds", type=float, default=10.0, help="of each session")
-    parser.add_argument("--rates", default=",".join(map(str, RATES)), help="of the sessions, Hz")
-    parser.add_argument("--out", type=Path, default=Path("results/realtime.json"))
+    """Measure, and fill the tables of docs/evaluation.md."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="short sessions, a coarse sample")
     given = parser.parse_args()
+    out = Path("results-quick" if given.quick else "results")
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
+    real = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), CAR)
+    model = None if given.quick or not real.is_file() else real
     with tempfile.TemporaryDirectory(prefix="hapticdb-realtime-") as folder:
-        rates = [int(word) for word in given.rates.split(",") if word]
-        results = measure(Path(folder), given.model, given.seconds, rates)
-    print(table(results))
-    kept = about() | {"edits": results.pop("edits")}
-    given.out.write_text(json.dumps(results, indent=1) + "\n")
-    given.out.with_name("edits.json").write_text(json.dumps(kept, indent=1) + "\n")
+        results = measure(Path(folder), model, QUICK if given.quick else Effort())
+    records.write(out, {"realtime": results})
+    made = {"realtime": results}
+    for one in (page_tables.frames, page_tables.laws, page_tables.sessions, page_tables.edits):
+        print(one(made), end="\n\n")
+    if not given.quick:
+        page_tables.refill("docs/evaluation.md", out)
 
 
 if __name__ == "__main__":

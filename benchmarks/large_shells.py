@@ -1,13 +1,13 @@
 """Large tools: sleeping clusters beside the flat loop, at 10^5 and 10^6 points.
 
     make paths
-    python benchmarks/large_shells.py --out results/large_shells.json
+    python benchmarks/large_shells.py --quick
 
 A sheet of points slides over a box as a hand moves it, at 0.5 m/s and 1 kHz, up and down and with
-small turns. The box lies below a given share of the sheet. The flat loop, runs that are tested in
-every frame, and sleeping clusters take turns on the same poses, and give the same wrenches bit for
-bit. Sleeping clusters with a budget of points take their turns, too, where more points are near;
-their wrenches differ, and it is said by how much. Cells are resident; one processor computes.
+small turns. The box lies below a given share of the sheet. The flat loop and sleeping clusters take
+turns on the same poses, and give the same wrenches bit for bit. Sleeping clusters with a budget of
+points take their turns, too, where more points are near; their wrenches differ, and it is said by
+how much. Cells are resident; one processor computes.
 """
 
 import argparse
@@ -23,9 +23,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
+import page_tables
+import records
 from awake import awake
 from hapticdb import DistanceField, GridOptions, ImportOptions, PointShell, TangentPlane
-from hapticdb.bench import records
 from hapticdb.kernels.large.budget import feel_within
 from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.resident.cells import RESULTS
@@ -38,6 +39,12 @@ from hapticdb.resident.table import CellTable
 
 Floats = NDArray[np.float64]
 LAWS: dict[str, ForceLaw] = {"plane": TangentPlane(), "smooth": DistanceField()}
+SIZES = (100_000, 1_000_000)
+"""Points of the sheet."""
+SHARES = (0.05, 0.25)
+"""Of the sheet that the box is below."""
+BITS = 11
+"""Of the grid on each axis."""
 EDGE = 1.0
 """Edge of the sheet, metres."""
 SPEED, RATE = 0.5, 1000.0
@@ -109,7 +116,6 @@ def measure(
         residency = Residency(env.store, table)
         ways = {
             "flat": ResidentFrames(residency, shell, LAWS[law], run=0),
-            "tested": ResidentFrames(residency, shell, LAWS[law]),
             "sleeping": ResidentFrames(residency, shell, LAWS[law], sleeps=True),
             "budget": ResidentFrames(residency, shell, LAWS[law], budget_points=BUDGET),
         }
@@ -205,23 +211,18 @@ def compare(
 
 
 def main() -> None:
-    """Measure, print the figures, and write them to a file."""
+    """Measure, and fill the table of docs/realtime.md."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--points", default="1e5,1e6", help="sizes of the sheet")
-    parser.add_argument(
-        "--shares", default="0.025,0.05,0.25", help="of the sheet that the box is below"
-    )
-    parser.add_argument("--frames", type=int, default=500)
-    parser.add_argument("--bits", type=int, default=11, help="of the grid on each axis")
-    parser.add_argument("--out", type=Path, default=Path("results/large_shells.json"))
+    parser.add_argument("--quick", action="store_true", help="few frames, into results-quick/")
     given = parser.parse_args()
+    out = Path("results-quick" if given.quick else "results")
     os.environ.setdefault("NUMBA_NUM_THREADS", "1")
-    sizes = [int(float(word)) for word in given.points.split(",")]
-    shares = [float(word) for word in given.shares.split(",")]
+    sizes, count = (SIZES[:1], 50) if given.quick else (SIZES, 500)
     with tempfile.TemporaryDirectory(prefix="hapticdb-large-") as folder:
-        lines = compare(Path(folder), sizes, shares, given.frames, given.bits)
-    found = records.conditions() | {"lines": lines}
-    given.out.write_text(json.dumps(found, indent=1) + "\n")
+        lines = compare(Path(folder), sizes, SHARES, count, BITS)
+    records.write(out, {"large_shells": records.conditions() | {"lines": lines}})
+    if not given.quick:
+        page_tables.refill("docs/realtime.md", out)
 
 
 if __name__ == "__main__":

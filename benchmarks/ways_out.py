@@ -1,19 +1,15 @@
 """Ways out: which parts are found to come out, how soon, and what exact meshes say of the paths.
 
-    python benchmarks/ways_out.py                      # questions of the sample car, an order
-    python benchmarks/ways_out.py --model FILE --bits 10 --parts 40,57,140 --out ways_out.json
+    python benchmarks/ways_out.py      # questions of the sample car, an order, ten bricks
 
 coal compares the triangles of the part with those of all that stands, at each found path's poses at
 half the steps of its sweep. So no voxels, points or bounds of hapticdb take part in its answer.
 """
 
 import argparse
-import json
 import os
 import tempfile
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,8 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
+import page_tables
+import records
+from batch_peers import mesh_of, tree_of_boxes
 from hapticdb import Environment, Extraction, GridOptions, ImportOptions
-from hapticdb.bench import records
 from hapticdb.ingest.originals import parts_of
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.sample import SamplePart, write_sample
@@ -31,15 +29,13 @@ from hapticdb.sample import shapes as s
 from hapticdb.sample.parts import CAST, CHROME
 from hapticdb.sample.write import car_scene
 from hapticdb.sweeps.record import depth_record
-from peers.coal_meshes import tree_of_boxes
 
 Floats = NDArray[np.float64]
 BITS = 11
+VINTAGE = "demo_vintage_car/vintage_car.glb"
 SECONDS = 60.0
 ORDER_SECONDS = 1200.0
 """Time of the search for an order."""
-ANSWER_PATIENCE = 3600.0
-"""Seconds that any answer, with its proofs and coal's distances, takes at most."""
 MOTIONS = 20_000
 MOST_POSES = 4000
 """Greatest number of poses of a path that coal looks at; of a longer one, every n-th."""
@@ -59,14 +55,6 @@ class Question(NamedTuple):
 WHEEL = ("wheels/tyre_front_left", "wheels/rim_front_left")
 BOLTS = ("wheels/wheel_bolt_front_left_*",)
 AROUND_BATTERY = ("supply/wiring_harness", "body/hood", "body/hood_lining")
-AROUND_DOOR = (
-    "body/pillar_a_left",
-    "body/pillar_b_left",
-    "body/windscreen",
-    "cabin/dashboard",
-    "cabin/door_trim_front_left",
-    "trim/mirror_left",
-)
 AROUND_SEAT = (
     "cabin/floor_pan",
     "cabin/carpet",
@@ -78,20 +66,14 @@ SAMPLE = (
     Question(WHEEL, BOLTS),
     Question(WHEEL),
     Question(("body/hood",)),
-    Question(("body/door_front_left",)),
-    Question(("seats/seat_*_left",)),
     Question(("supply/battery",)),
     Question(("supply/battery",), AROUND_BATTERY),
-    Question(("body/door_front_left",), AROUND_DOOR),
     Question(("seats/seat_*_left",), AROUND_SEAT),
     Question(("engine/spark_plug",), ("body/hood*",)),
 )
-"""Of the sample car: the first, the second and the hood come out. Bolts hold the wheel. The door's
-triangles cross those of pillars, dashboard, windscreen and lining, the seat's those of the floor,
-and the harness goes through the battery. Without what holds them, and what is above the battery and
-in front of the door, these two come out. Without floor, carpet and door the seat goes forward, up,
-and then out by the door. The spark plug, which is added to the car, comes out along
-the bore of its seat."""
+"""Of the sample car. Bolts hold the wheel; the harness goes through the battery, and the seat's
+triangles cross those of the floor. Without floor, carpet and door the seat goes forward, up, and
+then out by the door. The spark plug, which is added to the car, comes out along its bore."""
 SEAT = (1.15, 0.40, 0.80)
 """Middle of the spark plug's seat in the engine bay, metres."""
 BORE, PLUG = 0.024, 0.012
@@ -184,7 +166,8 @@ def by_meshes(found: Extraction, standing: Sequence[hapticdb.Object]) -> dict[st
     others = [
         part.triangles(obj.transform) for obj, part in parts_of(standing, "compared", "import it")
     ]
-    tool, scene = _tree(surface.triangles), _tree(np.concatenate(others))
+    tool = tree_of_boxes(*mesh_of(surface.triangles))
+    scene = tree_of_boxes(*mesh_of(np.concatenate(others)))
     here, request = coal.Transform3s(), coal.DistanceRequest()
     least = np.inf
     for pose in path.at(places):
@@ -194,24 +177,16 @@ def by_meshes(found: Extraction, standing: Sequence[hapticdb.Object]) -> dict[st
     return {"mesh_distance_m": float(least), "mesh_poses": len(places)}
 
 
-def _tree(triangles: Floats) -> Any:  # noqa: ANN401 - coal has no types
-    corners = triangles.reshape(-1, 3)
-    return tree_of_boxes(corners, np.arange(len(corners)).reshape(-1, 3))
-
-
 def measure(
     folder: Path,
     model: Path | None,
     bits: int,
     questions: Sequence[Question],
-    seconds: float,
-    motions: int = MOTIONS,
-    processes: int = 1,
+    order: Sequence[str] = (),
 ) -> dict[str, Any]:
     """Import the model, the sample car with a spark plug unless one is given, and ask all.
 
-    Several processes ask at the same time: what they find is the same where no search ends by its
-    time, the seconds are not.
+    order : words of the parts for which an order is searched.
     """
     file = model or write_sample(folder / "sample").car
     files = [file]
@@ -222,25 +197,16 @@ def measure(
     hapticdb.import_files(url, files, ImportOptions(grid=GridOptions(bits=bits)))
     with hapticdb.open(url, read_only=True) as env:
         voxel_size = env.grid.voxel_size
-    found: dict[str, Any] = {
-        "commit": records.commit(),
-        "load_before": os.getloadavg()[0],
-        "conditions": {
-            "model": file.name, "bits": bits, "seconds": seconds, "voxel_m": voxel_size
-        },
+    found: dict[str, Any] = records.conditions() | {
+        "inputs": {"model": file.name, "bits": bits, "seconds": SECONDS, "voxel_m": voxel_size},
         "rows": [],
-    }  # fmt: skip
-    fresh = get_context("spawn")  # kernels and threads do not survive a fork
-    with ProcessPoolExecutor(processes, mp_context=fresh) as pool:
-        # the order takes longest, so it begins first
-        order = None if model else pool.submit(measured_order, url, WHEEL, ORDER_SECONDS)
-        asked = [pool.submit(measured, url, one, seconds, motions) for one in questions]
-        for answer in asked:
-            found["rows"].append(answer.result(ANSWER_PATIENCE))
-            print(_line(found["rows"][-1]), flush=True)
-        if order:
-            found["order"] = order.result(ANSWER_PATIENCE)
-            print(f"order for {', '.join(WHEEL)}: {found['order']['verdict']}", flush=True)
+    }
+    for question in questions:
+        found["rows"].append(measured(url, question, SECONDS, MOTIONS))
+        print(_line(found["rows"][-1]), flush=True)
+    if order:
+        found["order"] = measured_order(url, order, ORDER_SECONDS)
+        print(f"order for {', '.join(order)}: {found['order']['verdict']}", flush=True)
     return found
 
 
@@ -257,21 +223,17 @@ def _line(row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    """Measure, print, and write the figures."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--model", type=Path, help="a model in place of the sample car")
-    parser.add_argument("--bits", type=int, default=BITS, help="of the grid on each axis")
-    parser.add_argument("--parts", help="names or ids, by commas; each is a question of its own")
-    parser.add_argument("--seconds", type=float, default=SECONDS, help="of each search")
-    parser.add_argument("--out", type=Path, help="file of figures, JSON")
-    given = parser.parse_args()
-    questions: Sequence[Question] = SAMPLE
-    if given.parts:
-        questions = [Question((word,)) for word in given.parts.split(",")]
+    """Measure, print, and fill the table of docs/paths.md."""
+    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
+    vintage = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), VINTAGE)
+    bricks = [Question((f"{n}",)) for n in (1, *range(20, 200, 20))]
     with tempfile.TemporaryDirectory() as folder:
-        found = measure(Path(folder), given.model, given.bits, questions, given.seconds)
-    if given.out:
-        given.out.write_text(json.dumps(found, indent=1) + "\n")
+        found = {"ways_out": measure(Path(folder), None, BITS, SAMPLE, WHEEL)}
+    if vintage.is_file():
+        with tempfile.TemporaryDirectory() as folder:
+            found["ways_out_vintage"] = measure(Path(folder), vintage, 10, bricks)
+    records.write(Path("results"), found)
+    page_tables.refill("docs/paths.md", Path("results"))
 
 
 if __name__ == "__main__":

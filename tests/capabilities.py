@@ -4,9 +4,9 @@ The contract suites skip the tests of these, and the header of each run lists th
 """
 
 STORE_LACKS = {
-    "SQLite": frozenset({"server", "grouping threshold"}),
+    "SQLite": frozenset({"grouping threshold"}),
     "PostgreSQL": frozenset({"caches"}),
-    "memory": frozenset({"statement", "caches", "watch", "server", "grouping threshold"}),
+    "memory": frozenset({"statement", "caches", "watch", "grouping threshold"}),
 }
 ENGINE_LACKS = {
     "SQLite": frozenset({"grant"}),

@@ -16,9 +16,9 @@ from websockets.sync.client import ClientConnection, connect
 
 from children import PATIENCE, PIPE, child
 from contact_server import TOKEN, save_shell
-from hapticdb.bench.feel.ground import Ground
-from hapticdb.bench.feel.scenes import plane
-from hapticdb.bench.feel.tools import flat_tool
+from feel.ground import Ground
+from feel.scenes import plane
+from feel.tools import flat_tool
 from hapticdb.client.contact_proxy import ContactProxy
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.protocol.contacts import HandState, ProxyWish, pack_hand, pack_wish, unpack_terms

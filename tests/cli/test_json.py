@@ -73,13 +73,3 @@ def test_demo_has_the_figures_of_every_strategy(run: Run) -> None:
         for felt in one["strategies"].values():
             assert list(felt) == ["median_us", "p99_us", "statements", "ranges", "rows", "used"]
     assert Path(found["picture"]).is_file()
-
-
-@pytest.mark.long
-def test_bench_prints_what_it_writes(run: Run, scene: Path) -> None:
-    code, out, err = run("bench", scene, "--quick", "--out", "b", "--json")
-    assert code == 0, err
-    results = [json.loads(line) for line in out.splitlines()]
-    files = {path.stem: json.loads(path.read_text()) for path in Path("b").glob("*.json")}
-    assert {found["name"]: found for found in results} == files
-    assert "database cache" in err

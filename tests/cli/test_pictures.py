@@ -48,7 +48,7 @@ LINES = {
 """Arguments of each verb, without a picture."""
 REFUSED = {"grant": 2}
 """Verbs with an exit code other than 0: an SQLite file has no roles."""
-DRAWING = {"demo", "bench"}
+DRAWING = {"demo"}
 """Verbs that always draw."""
 LONG = {"feel", "replay", "sweep", "extract", "calibrate", "sample", "warm", "view", "serve"}
 TRIANGLE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n"

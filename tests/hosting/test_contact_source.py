@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hapticdb.bench.feel.couplings import SmoothHand, Terms, posed, straight
-from hapticdb.bench.feel.ground import Ground
-from hapticdb.bench.feel.scenes import convex_edge, plane, slope_axes
-from hapticdb.bench.feel.sliding import SPEED, way_round_edge
-from hapticdb.bench.feel.tools import ball
+from feel.couplings import SmoothHand, Terms, posed, straight
+from feel.ground import Ground
+from feel.scenes import convex_edge, plane, slope_axes
+from feel.sliding import SPEED, way_round_edge
+from feel.tools import ball
 from hapticdb.client.proxy_force import ProxyForce
 from hapticdb.hosting.contact_source import ContactSource
 from hapticdb.pointshell.shell import PointShell

@@ -30,7 +30,7 @@ FLOORS: list[set[str]] = [
     {"cli"},
     {"server"},
     {"page"},
-    {"bench", "demo", "pictures"},
+    {"demo", "pictures"},
     {"pool", "warm"},
     {"client", "hosting"},
     {"edits", "extraction", "realtime", "sweeps"},

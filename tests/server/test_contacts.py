@@ -22,8 +22,8 @@ from websockets.typing import Origin
 from children import child, joined
 from contact_hands import DEPTH, SIZE, STILL, Served, granted, hand_at, pressed, serving
 from contact_server import TOKEN
-from hapticdb.bench.feel.ground import Ground
-from hapticdb.bench.feel.scenes import plane
+from feel.ground import Ground
+from feel.scenes import plane
 from hapticdb.client.contact_proxy import ContactProxy
 from hapticdb.errors import AccessError, ConnectionLostError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for

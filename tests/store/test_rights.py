@@ -392,7 +392,6 @@ def lines(url: str) -> dict[str, list[str]]:
         "sweep": [url, *by, "--path", "path.csv"],
         "move": [url, "1", "--translate", "0,0,0.01"],
         **{verb: [url, "copy.db"] for verb in ("copy", "diff")},
-        "bench": [url, "--quick"],
         "grant": [url, "pg_monitor", "--as", "viewer"],
         **{verb: [url, "1"] for verb in ("extract", "remove")},
         "demo": ["shown", "--url", url],

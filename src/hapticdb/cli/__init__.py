@@ -14,7 +14,6 @@ from itertools import takewhile
 from hapticdb import interrupting
 from hapticdb.cli import render
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
-from hapticdb.cli.verbs.benching import bench
 from hapticdb.cli.verbs.checking import check
 from hapticdb.cli.verbs.editing import move, remove
 from hapticdb.cli.verbs.feeling import feel
@@ -62,7 +61,6 @@ VERBS: dict[Callable[..., None], str] = {
     upgrade: "Give distances to objects imported without.",
     calibrate: "Measure what queries cost on this machine.",
     analyze: "Renew the statistics of the keys.",
-    bench: "Measure the paper's experiments, with a report.",
     grant: "Say what a role may do, on PostgreSQL.",
     sample: "Write a sample: a car, a wrench and its path.",
     demo: "Make, import, touch and draw the sample.",

@@ -449,21 +449,6 @@ class HasGroupingThreshold(Protocol):
         """Least number of distinct keys; None if a lookup reads each leaf page only once anyway."""
 
 
-@runtime_checkable
-class SupportsServer(Protocol):
-    """An engine with a server process, which holds the rows and the caches: for benchmarks."""
-
-    def looping(self) -> "Store":
-        """The same store, but its `scan` loops over the ranges inside the server, one at a time.
-
-        That is the paper's form of a scan. Raises DatabaseError when the user may not make a
-        temporary function, as in a store that was opened to read only.
-        """
-
-    def server_cache(self) -> int:
-        """Bytes of pages that the server keeps in memory, for all its connections."""
-
-
 class Checker(Protocol):
     """Answers of an engine for `hapticdb check`: pages, indexes, and all rows in their order."""
 

@@ -11,7 +11,6 @@ from hapticdb.store.base import (
     LocatedShell,
     Store,
     SupportsCaches,
-    SupportsServer,
     SupportsStatement,
     SupportsWatch,
 )
@@ -24,7 +23,6 @@ STORE_CAPABILITIES: dict[str, Any] = {
     "statement": SupportsStatement,
     "caches": SupportsCaches,
     "watch": SupportsWatch,
-    "server": SupportsServer,
     "grouping threshold": HasGroupingThreshold,
 }
 """Capabilities that only some stores have: the protocol of each, by its name in
@@ -81,20 +79,6 @@ class CapabilitiesContract(StoreCase):
         store.drop_caches()
         for found, expected in zip(everything(store), before, strict=True):
             np.testing.assert_array_equal(found, expected)
-
-    def test_a_loop_inside_the_server_scans_the_same_rows(
-        self, store: Store, plain: dict[int, set[int]]
-    ) -> None:
-        """Scans of one range and of many ranges are tested."""
-        self.need("server")
-        assert isinstance(store, SupportsServer)
-        known = np.array(sorted(plain), dtype=np.int64)
-        lows, highs = known[::9].copy(), known[4::9].copy()
-        lows = lows[: len(highs)].copy()
-        pairs = zip(store.looping().scan(lows, highs), store.scan(lows, highs), strict=True)
-        for found, expected in pairs:
-            np.testing.assert_array_equal(found, expected)
-        assert store.server_cache() > 0
 
     def test_a_grouping_threshold_is_a_number_of_keys(self, store: Store) -> None:
         """It is None if grouping never saves time."""

@@ -1,15 +1,13 @@
 """An environment in a schema of a PostgreSQL database."""
 
 import contextlib
-from typing import cast
 
 from hapticdb.grid import Grid
-from hapticdb.store.base import Layout, Store
+from hapticdb.store.base import Layout
 from hapticdb.store.engines import Lag
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.looping import LoopInServer
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.tables.statistics import PostgresStatistics
@@ -125,15 +123,6 @@ class PostgresStore:
             return None
         found = self._connection.rows(REPLAYED)
         return Lag(*found[0]) if found else None
-
-    def looping(self) -> Store:
-        """The same store, but its `scan` loops over the ranges inside the server, one at a time."""
-        return cast("Store", LoopInServer(self, self._connection))
-
-    def server_cache(self) -> int:
-        """Bytes of pages that the server keeps in memory, for all its connections."""
-        rows = self._connection.rows("SELECT pg_size_bytes(current_setting('shared_buffers'))")
-        return int(rows[0][0])
 
     def checker(self) -> PostgresChecker:
         """Answers of this engine for `hapticdb check`."""

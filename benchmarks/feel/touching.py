@@ -1,0 +1,127 @@
+"""Measures of `touch`: the force of a frame while a tool moves over closed forms."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from feel.couplings import posed
+from feel.figures import largest_step, ripple
+from feel.ground import Ground
+from feel.scenes import (
+    FILLING,
+    Scene,
+    planes,
+)
+from feel.tools import flat_tool
+from hapticdb.kernels.field.law import ONSET
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
+
+Floats = NDArray[np.float64]
+
+SIZE = 0.005
+"""Voxel size, metres."""
+STIFFNESS = 1000.0
+"""K of the laws, N/m."""
+DEPTHS = (0.1, 0.2, 0.35, 0.5, 0.65, 0.8)
+"""Depths below the onset of contact, voxels."""
+APART = 0.0001
+"""Distance of neighbouring poses, metres."""
+SHALLOW = 0.5
+"""Depth, voxels, up to which steps are told on their own: deeper, distances have a kink."""
+SLIDE = 10.0
+"""Way of a slide, voxels."""
+ACROSS = (3, 10, 17)
+"""Points along an edge of the flat tools: 9, 100, 289 points."""
+SHOWN = ("0 degrees", "20 degrees", "45 degrees")
+"""Planes whose force against depth is drawn."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """A law of `touch`.
+
+    onset : voxels before the surface at which contact begins; layers : depths of the sheets of a
+    scene, voxels: the tangent plane gets a solid one; force : the law itself.
+    """
+
+    name: str
+    onset: float
+    layers: tuple[float, ...]
+    force: ForceLaw
+    distances: bool
+
+    def forces(self, ground: Ground, shell: PointShell, poses: Floats) -> Floats:
+        """Forces (M, 3) of `touch` at poses (M, 4, 4)."""
+        touches = ground.environment.touch_many(shell, poses, law=self.force)
+        return np.asarray(touches.forces)
+
+
+PLANE = Law("plane", 0.0, FILLING, TangentPlane(STIFFNESS), distances=False)
+SMOOTH = Law("smooth", ONSET, (0.0,), DistanceField(STIFFNESS), distances=True)
+
+
+def slide_poses(ground: Ground, scene: Scene, height: float) -> Floats:
+    """Poses (M, 4, 4) of a slide, askew to the axes, at a height in voxels over a plane."""
+    ways = np.arange(0.0, SLIDE * SIZE, APART)
+    x, y, z = scene.axes.T
+    along = np.cos(np.pi / 6) * x + np.sin(np.pi / 6) * y
+    poses = np.tile(posed(ground.origins[scene.name] + height * SIZE * z), (len(ways), 1, 1))
+    poses[:, :3, 3] += ways[:, None] * along
+    return poses
+
+
+def slides_of_touch(law: Law, folder: Path, n_random: int) -> dict[str, dict[str, Any]]:
+    """Worst ripple, and largest step within 0.1 mm, on planes: each tool's worst of all depths."""
+    scenes = planes(law.layers, n_random)
+    rows: list[dict[str, Any]] = []
+    curve: list[float] = []
+    with Ground.of_scenes(folder, scenes, SIZE, distances=law.distances) as ground:
+        for scene in scenes:
+            for across in ACROSS:
+                shell = flat_tool(across, SIZE, scene.axes)
+                for depth in DEPTHS:
+                    poses = slide_poses(ground, scene, law.onset - depth)
+                    forces = law.forces(ground, shell, poses)
+                    normal = forces @ scene.axes[:, 2]
+                    row = {"plane": scene.name, "points": across**2, "depth": depth}
+                    rows.append(row | {"ripple": ripple(normal), "step": largest_step(forces)})
+                    if (scene.name, across, depth) == ("20 degrees", 3, 0.5):
+                        curve = normal.tolist()
+    ripples = [worst_ripple(r["ripple"] for r in rows if r["points"] == n**2) for n in ACROSS]
+    unfelt = sum(row["ripple"] == np.inf for row in rows)
+    ways = (np.arange(len(curve)) * APART * 1e3).tolist()
+    return {
+        "touch_ripple": {"values": ripples, "unfelt": unfelt, "slides": len(rows)},
+        "touch_step": {"values": [step_to(rows, SHALLOW), step_to(rows, DEPTHS[-1])]},
+        "curve": {"label": "20 degrees, 9 points, depth 0.5 voxels", "x": ways, "y": curve},
+    }
+
+
+def step_to(rows: Iterable[dict[str, Any]], depth: float) -> float:
+    """Largest step of all slides down to a depth in voxels."""
+    return max(float(row["step"]) for row in rows if row["depth"] <= depth)
+
+
+def worst_ripple(ripples: Iterable[float]) -> float:
+    """Largest finite ripple; a slide on which nothing is felt has none."""
+    return max(value for value in ripples if value < np.inf)
+
+
+def depth_curves(law: Law, folder: Path) -> list[dict[str, Any]]:
+    """Force against depth, -0.5 to 2 voxels below the onset, 9 points, on a few planes."""
+    scenes = [scene for scene in planes(law.layers, 0) if scene.name in SHOWN]
+    depths = np.linspace(-0.5, 2.0, 251)
+    curves = []
+    with Ground.of_scenes(folder, scenes, SIZE, distances=law.distances) as ground:
+        for scene in scenes:
+            z = scene.axes[:, 2]
+            origin = ground.origins[scene.name]
+            poses = np.stack([posed(origin + (law.onset - d) * SIZE * z) for d in depths])
+            forces = law.forces(ground, flat_tool(3, SIZE, scene.axes), poses)
+            curves.append({"label": scene.name, "x": depths.tolist(), "y": (forces @ z).tolist()})
+    return curves

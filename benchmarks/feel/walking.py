@@ -1,0 +1,114 @@
+"""A walk over a model: one path of the hand, and the force on it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from feel.couplings import RATE, SmoothHand, Terms, drive, posed, straight
+from feel.figures import largest_step
+from feel.ground import Ground
+from feel.tools import ball
+from hapticdb.demo import slide_along
+from hapticdb.environment import Environment
+from hapticdb.kernels.field.law import ONSET
+
+Floats = NDArray[np.float64]
+
+RADIUS = 12.0
+"""Radius of the ball that walks, voxels."""
+POINTS = 300
+"""Its points."""
+PLACES = 1000
+"""Places of the path that are taken from the map of heights; neighbours are a voxel or two apart.
+More: a longer walk."""
+SMOOTHING = 12.0
+"""Places over which the path's heights are smoothed: the map has steps of a voxel, which a hand
+does not make."""
+PRESS = 0.002
+"""Metres by which the hand goes below the surface."""
+SPEED_LENGTHS = 0.1
+"""Speed of the hand, lengths of the walk a second."""
+SPEEDS = (0.02, 0.2)
+"""Slowest and fastest speed of a hand, m/s."""
+TREMBLE_HZ = 30.0
+"""Frequencies above this one are no part of the hand's way: what is felt there is roughness."""
+MOST_DRAWN = 2000
+"""Samples of a curve that are kept for plots. More: larger files."""
+NEAR = 48.0
+"""Voxels around the path whose cells are fetched."""
+
+
+@dataclass(frozen=True)
+class Walk:
+    """A hand's way over a model.
+
+    hand (M, 3): positions, metres, one a period; speed, m/s; voxel_size, metres.
+    """
+
+    hand: Floats
+    speed: float
+    voxel_size: float
+
+
+def plan_walk(env: Environment, places: int = PLACES) -> Walk:
+    """A path over the model's largest objects, pressed in and smoothed."""
+    size = env.grid.voxel_size
+    shell = ball(RADIUS, size, POINTS)
+    raw = slide_along(env, shell.points, places)[:, :3, 3]
+    smooth = gaussian_filter1d(raw, SMOOTHING, axis=0, mode="nearest")
+    smooth[:, 2] -= PRESS
+    steps = np.linalg.norm(np.diff(smooth, axis=0), axis=1)
+    ways = np.concatenate([[0.0], np.cumsum(steps)])
+    speed = float(np.clip(SPEED_LENGTHS * ways[-1], *SPEEDS))
+    count = max(round(ways[-1] / speed * RATE), 2)
+    even = np.linspace(0.0, ways[-1], count)
+    hand = np.column_stack([np.interp(even, ways, smooth[:, axis]) for axis in range(3)])
+    return Walk(gaussian_filter1d(hand, 10.0, axis=0, mode="nearest"), speed, size)
+
+
+def descent(env: Environment, walk: Walk) -> Floats:
+    """Straight way (M, 3) of the hand from above all objects, where the tool is free, to the walk.
+
+    A tool that begins in something feels nothing until it is free.
+    """
+    top = max(float(obj.bounds[1, 2]) for obj in env.objects())
+    start = walk.hand[0].copy()
+    start[2] = max(top, start[2]) + (RADIUS + NEAR) * walk.voxel_size
+    return straight(start, walk.hand[0], walk.speed)
+
+
+def walk_over(url: str | Path, places: int = PLACES) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Walk over an environment: figures, and the force over time."""
+    with Ground(url, distances=True) as ground:
+        walk = plan_walk(ground.environment, places)
+        lead = descent(ground.environment, walk)
+        apart = max(round(16.0 * ground.size / (walk.speed / RATE)), 1)
+        for place in np.concatenate([lead[::apart], walk.hand[::apart]]):
+            ground.fetch(place, NEAR)
+        shell = ball(RADIUS, ground.size, POINTS)
+        above = np.array([0.0, 0.0, ONSET * ground.size])
+        hand = SmoothHand(ground, shell, posed(lead[0] + above), Terms())
+        drive(hand, lead + above)
+        return _figures_of(drive(hand, walk.hand + above).forces)
+
+
+def _figures_of(forces: Floats) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Figures of the forces (M, 3) of a walk, and their size over time."""
+    sizes = np.linalg.norm(forces, axis=1)
+    every = max(len(sizes) // MOST_DRAWN, 1)
+    times = (np.arange(len(sizes)) / RATE)[::every].tolist()
+    mean, peak = float(sizes.mean()), float(sizes.max())
+    figures = {"values": [largest_step(forces), trembling(forces)], "mean": mean, "peak": peak}
+    return figures, {"label": "force", "x": times, "y": sizes[::every].tolist()}
+
+
+def trembling(forces: Floats) -> float:
+    """Root mean square, N, of the part of forces (M, 3) above `TREMBLE_HZ`."""
+    transformed = np.fft.rfft(forces - forces.mean(axis=0), axis=0)
+    transformed[np.fft.rfftfreq(len(forces), 1.0 / RATE) < TREMBLE_HZ] = 0.0
+    rough = np.fft.irfft(transformed, len(forces), axis=0)
+    return float(np.sqrt(np.mean(np.sum(rough**2, axis=1))))

@@ -1,0 +1,247 @@
+"""The tables of the pages, made from results/.
+
+    python benchmarks/page_tables.py        # fill the tables of all pages anew
+
+A page is written by hand. Below each line ``<!-- table: NAME -->`` stands a table, or a list, made
+from results; it is replaced, up to the next empty line.
+"""
+
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import records
+
+Result = Mapping[str, Any]
+Results = Mapping[str, Result]
+ROOT = Path(__file__).parent.parent
+MARK = re.compile(r"(<!-- table: ([\w-]+) -->\n)((?:.+\n)*)")
+NONE = "-"
+"""Stands where nothing was measured."""
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """Markdown table; columns of numbers are aligned to the right."""
+    body = [[" ".join(text.split()).replace("|", "\\|") for text in row] for row in rows]
+    columns = list(zip(*body, strict=True)) or [()] * len(head)
+    rules = [
+        "---:" if all(text == NONE or text[:1].isdigit() for text in column) else "---"
+        for column in columns
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in [list(head), rules, *body])
+
+
+def us_text(value: float) -> str:
+    """Microseconds to two or three digits."""
+    if value >= 99.5:
+        return f"{value:,.0f}"
+    return f"{value:.1f}" if value >= 9.95 else f"{value:.2g}"
+
+
+def facts(found: Result) -> str:
+    """Commit, machine, versions and inputs of a result."""
+    said = [("commit", found["commit"])]
+    for part in ("machine", "versions", "inputs"):
+        said += found.get(part, {}).items()
+    return table(["", ""], [(key, f"{value}") for key, value in said])
+
+
+# --- in real time --------------------------------------------------------------------------------
+
+
+def _times(spread: Mapping[str, float], shares: Sequence[str] = ("p50", "p99")) -> str:
+    """Percentiles of times, microseconds, in one cell of a table."""
+    return " / ".join(f"{1e6 * spread[share]:,.0f}" for share in shares)
+
+
+def sessions(results: Results) -> str:
+    """Rates, and times in microseconds, beside those of an empty loop."""
+    rows = [
+        [
+            one["engine"],
+            f"{one['rate']:,.0f}",
+            f"{one['loop']['rate']:,.0f}",
+            _times(one["loop"]["lateness"]),
+            _times(one["loop"]["elapsed"]),
+            f"{one['empty']['rate']:,.0f}",
+            _times(one["empty"]["lateness"]),
+        ]
+        for one in results["realtime"]["sessions"]
+    ]
+    head = ["engine", "asked, Hz", "reached", "late", "computing", "empty loop: reached", "late"]
+    return table(head, rows)
+
+
+def frames(results: Results) -> str:
+    """Microseconds of the dense bitmap, and the others' times as multiples of it."""
+    rows = [
+        [
+            one["part"],
+            f"{one['points']:,}",
+            f"{one['us_per_frame']['dense']:,.1f}",
+            f"{one['ratio']['flat']:.2f}",
+            f"{one['ratio']['clusters']:.2f}",
+        ]
+        for one in results["realtime"]["frames"]
+    ]
+    head = [
+        "frame",
+        "points",
+        "dense bitmap in memory, us",
+        "flat loop over cells",
+        "with clusters",
+    ]
+    return table(head, rows)
+
+
+def laws(results: Results) -> str:
+    """Microseconds a frame under both laws, and their ratio."""
+    rows = [
+        [
+            one["part"],
+            f"{one['points']:,}",
+            *(f"{one['us_per_frame'][law]:,.1f}" for law in ("plane", "smooth")),
+            f"{one['ratio']:.2f}",
+        ]
+        for one in results["realtime"]["laws"]
+    ]
+    return table(["frame", "points", "plane, us", "smooth, us", "smooth / plane"], rows)
+
+
+def edits(results: Results) -> str:
+    """Milliseconds from the commit of an edit to the first frame that felt it."""
+    rows = [
+        [
+            one["engine"],
+            f"{one['edits']}",
+            f"{one['voxels']:,}",
+            *(f"{ms:.1f}" for ms in one["felt_after_ms"].values()),
+        ]
+        for one in results["realtime"]["edits"]
+    ]
+    head = ["engine", "moves", "voxels", "median, ms", "90 % within, ms", "worst, ms"]
+    return table(head, rows)
+
+
+def large_shells(results: Results) -> str:
+    """Medians of the loops and p99 of the sleeping ones, without and with a budget, us."""
+    rows = []
+    for one in results["large_shells"]["lines"]:
+        us, near = one["us"], 100 * one["near_share"]
+        within = us.get("budget")
+        rows.append(
+            [
+                f"{one['points']:,}",
+                f"{near:.1f} %" if near < 10 else f"{near:.0f} %",
+                one["law"],
+                *(f"{us[way]['p50']:,.0f}" for way in ("flat", "sleeping")),
+                f"{us['sleeping']['p99']:,.0f}",
+                f"{one['ratio']['sleeping']:.2f}",
+                *(f"{within[p]:,.0f}" if within else NONE for p in ("p50", "p99")),
+            ]
+        )
+    head = ["points", "near", "law", "flat, us", "sleeping, us", "p99", "of the flat loop"]
+    return table([*head, "budget, us", "p99"], rows)
+
+
+# --- docs/query.md, docs/paths.md, docs/protocol.md -----------------------------------------------
+
+
+def batch_ratios(results: Results) -> str:
+    """How many times as many poses a second as the fastest of the others, of wall time."""
+    rows: dict[tuple[str, str], list[str]] = {}
+    for cell in results["batches"]["cells"]:
+        row = rows.setdefault((cell["situation"], f"{cell['points']:,}"), [])
+        for ratio in (cell["times_best_peer_one_thread"], cell["times_best_peer"]):
+            row.append(f"{ratio:.{0 if ratio >= 9.95 else 1}f}" if ratio else NONE)
+    head = ["tool is", "points", "touch, one thread", "all threads", "how far, one thread"]
+    return table([*head, "all threads"], [[*place, *row] for place, row in rows.items()])
+
+
+def ways_out(results: Results) -> str:
+    """Answer, seconds and lengths of each question; what blocks first where no way was found."""
+    rows = []
+    for one in results["ways_out"]["rows"]:
+        answer, lengths = one["verdict"], [NONE] * 4
+        if "length_m" in one:
+            keys = ["length_m", "proved_from_m", "clearance_m", "mesh_distance_m"]
+            lengths = [f"{1e3 * one[key]:,.{0 if key == 'length_m' else 2}f}" for key in keys]
+        elif one["blockers"]:
+            answer += f", {one['blockers'][0][0]} named first"
+        rows.append([one["parts"], answer, f"{one['s']:.1f}", *lengths])
+    head = ["part", "answer", "seconds", "path, mm", "proved from, mm", "proved gap, mm"]
+    return table([*head, "gap of the triangles, mm"], rows)
+
+
+def contact_proxies(results: Results) -> str:
+    """Round trips (median), ages (p50 / p99) and errors, with their shares of the force."""
+    rows = []
+    for one in results["contact_proxies"]["lines"]:
+        error, force, age = one["error"], one["force"], one["age"]
+        rows.append(
+            [
+                one["path"],
+                f"{1e3 * one['added']:.0f}",
+                f"{1e3 * one['round_trip']:.1f}",
+                f"{1e3 * age['p50']:.0f} / {1e3 * age['p99']:.0f}",
+                f"{error['rms']:.2f} ({100 * error['rms'] / force['rms']:.1f} %)",
+                f"{error['max']:.2f} ({100 * error['max'] / force['max']:.0f} %)",
+                f"{one['bytes']:.0f}",
+            ]
+        )
+    head = ["path", "added, ms", "round trip, ms", "age, ms", "RMS error, N"]
+    return table([*head, "largest, N", "bytes"], rows)
+
+
+# --- pages ----------------------------------------------------------------------------------------
+
+
+def tables() -> dict[str, Callable[[Results], str]]:
+    """Every table by its name."""
+    from feel.measures import table_of, walls_of  # noqa: PLC0415 - both use this module
+    from paper.tables import EVALUATION  # noqa: PLC0415
+
+    return {
+        "sessions": sessions,
+        "frames": frames,
+        "laws": laws,
+        "edits": edits,
+        "large-shells": large_shells,
+        "batch-ratios": batch_ratios,
+        "ways-out": ways_out,
+        "contact-proxies": contact_proxies,
+        "feel": lambda results: table_of(results["feel"]["cells"]),
+        "walls": lambda results: walls_of(results["feel"]["cells"]),
+        "feel-conditions": lambda results: facts(results["feel"]),
+        **EVALUATION,
+    }
+
+
+def filled(text: str, results: Results) -> str:
+    """The text of a page with its tables made anew; a table whose results are missing is left."""
+    made = tables()
+
+    def anew(mark: re.Match[str]) -> str:
+        try:
+            return f"{mark[1]}{made[mark[2]](results)}\n"
+        except KeyError:
+            return mark[0]
+
+    return MARK.sub(anew, text)
+
+
+def refill(page: str, folder: Path, out: Path | None = None) -> None:
+    """Fill a page's tables from the results in a folder; `out` is another file for the page."""
+    path = ROOT / page
+    text = filled(path.read_text(), records.read(folder))
+    if out is not None:
+        text = text.replace("../results/", f"{os.path.relpath(folder, out.parent)}/")
+    (out or path).write_text(text)
+
+
+if __name__ == "__main__":
+    for found in sorted((ROOT / "docs").glob("*.md")):
+        if MARK.search(found.read_text()):
+            refill(f"docs/{found.name}", ROOT / "results")

@@ -1,0 +1,122 @@
+"""An opened environment under stated conditions, and the alternatives that are measured on it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+from hapticdb.environment import Environment
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.calibration import calibrate
+from hapticdb.query.cost_model import CostModel
+from hapticdb.query.frame import HapticQuery, Query, Strategy
+from hapticdb.query.quantiles import QuantileVector
+from hapticdb.store.base import SupportsCaches
+from hapticdb.store.postgres.store import PostgresStore
+from paper.cells import ALL_CACHED, ONE_STATEMENT
+from paper.looping import looping, server_cache
+from paper.measure import Alternative, Cell, Pose
+from paper.workload import Task
+
+PAPER_CACHE = 4 << 20
+"""Bytes of the paper's database cache: 500 blocks of 8 KB."""
+CURVES = {"z": "z-order", "hilbert": "hilbert", "lexicographic": "lexicographic"}
+
+
+@dataclass
+class Subject:
+    """An opened environment under stated conditions.
+
+    name : the environment's; cache : size of the database's cache, as plots show it; drop : empties
+    all caches, or None where this process cannot.
+    """
+
+    env: Environment
+    name: str
+    cache: str
+    drop: Callable[[], None] | None = None
+
+    @cached_property
+    def costs(self) -> CostModel:
+        """Cost model fitted under these conditions. It is not stored: they end with the run."""
+        return calibrate(self.env.store)
+
+    @cached_property
+    def quantiles(self) -> QuantileVector:
+        """Quantile vector that `cbgroup` and `auto` use."""
+        return self.env.quantiles()
+
+    def conditions(self, task: Task) -> Cell:
+        """What every cell of this subject and task says."""
+        return {
+            "environment": self.name,
+            "engine": self.env.engine,
+            "layout": self.env.layout,
+            "curve": CURVES[self.env.grid.curve],
+            "cache": self.cache,
+            "file": "cached",
+            "poses": task.name,
+            "shell": task.tool,
+            "points": len(task.shell),
+            "resolution": self.quantiles.resolution,
+            **({"region": task.region, "density": task.density} if task.region else {}),
+        }
+
+    def query(self, quantiles: QuantileVector | None = None) -> HapticQuery:
+        """Frames on this environment, with its quantiles unless others are given."""
+        statistics = (quantiles or self.quantiles, self.costs)
+        return HapticQuery(self.env.store, lambda: statistics)
+
+    @cached_property
+    def looping_query(self) -> HapticQuery | None:
+        """Frames whose ranges a loop inside the server scans, with costs fitted to that loop."""
+        if not isinstance(self.env.store, PostgresStore):
+            return None
+        loop = looping(self.env.store)
+        statistics = (self.quantiles, calibrate(loop))
+        return HapticQuery(loop, lambda: statistics)
+
+    def alternative(
+        self,
+        task: Task,
+        strategy: Strategy,
+        *,
+        gap: int | None = None,
+        query: HapticQuery | None = None,
+        **more: Any,  # noqa: ANN401 - what a cell says is JSON's
+    ) -> Alternative:
+        """A strategy over a task. `gap` is MAXGAP, for the strategy maxgap alone."""
+        cell = {
+            **self.conditions(task),
+            "strategy": strategy,
+            "form": ONE_STATEMENT,
+            **({"maxgap": gap} if gap is not None else {}),
+            **more,
+        }
+        return Alternative(cell, asking(query or self.query(), task.shell, strategy, gap))
+
+    def asked_rows(self, task: Task) -> list[int]:
+        """Rows under each pose's own keys."""
+        query = self.query()
+        return [query.run(task.shell, pose, "array").query.rows for pose in task.poses]
+
+
+def asking(
+    query: HapticQuery, shell: PointShell, strategy: Strategy, gap: int | None = None
+) -> Callable[[Pose], Query]:
+    """Frames of one shell by one strategy."""
+    if gap is None:
+        return lambda pose: query.run(shell, pose, strategy).query
+    return lambda pose: query.run(shell, pose, strategy, gap).query
+
+
+def limited(env: Environment, size_bytes: int) -> str:
+    """Limit the connection's cache, and return how plots name its size.
+
+    A server has one cache for all connections: it is not changed, and its size is named.
+    """
+    if isinstance(env.store, SupportsCaches):
+        env.store.limit_cache(size_bytes)
+    elif isinstance(env.store, PostgresStore):
+        size_bytes = server_cache(env.store)
+    return ALL_CACHED if size_bytes >= env.size().bytes else f"{size_bytes / (1 << 20):.0f} MB"

@@ -1,0 +1,67 @@
+"""Results as JSON: what was measured, at which commit, on which machine, with which versions."""
+
+import json
+import os
+import platform
+import re
+import subprocess
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+PACKAGES = ("numpy", "numba", "apsw", "psycopg")
+"""Whose versions a result names; hapticdb itself is named by its commit."""
+ROOT = Path(__file__).parent.parent
+GIT_S = 10.0
+"""Seconds that git may take to name the commit; a larger value waits longer for a slow disk."""
+
+
+def conditions() -> dict[str, Any]:
+    """What every record says first: commit, machine and versions."""
+    asked = ["git", "-C", str(ROOT), "describe", "--always", "--dirty"]
+    done = subprocess.run(asked, capture_output=True, text=True, check=True, timeout=GIT_S)
+    return {
+        "commit": done.stdout.strip(),
+        "machine": machine(),
+        "versions": {name: version(name) for name in PACKAGES},
+    }
+
+
+def result(
+    name: str,
+    cells: Sequence[Mapping[str, Any]],
+    inputs: Mapping[str, Any],
+    notes: Sequence[str] = (),
+) -> dict[str, Any]:
+    """One experiment as its file holds it."""
+    about = {"inputs": dict(inputs), "notes": list(notes), "cells": list(cells)}
+    return {"name": name} | conditions() | about
+
+
+def write(folder: Path, results: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write each result to `NAME.json`; lists of numbers or words stand on one line."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, found in results.items():
+        text = json.dumps(found, indent=1, default=float)
+        text = re.sub(
+            r"\[\s+([^\[\]{}]*?)\s+\]", lambda m: "[" + re.sub(r"\s*\n\s*", " ", m[1]) + "]", text
+        )
+        (folder / f"{name}.json").write_text(f"{text}\n")
+
+
+def read(folder: Path) -> dict[str, dict[str, Any]]:
+    """All results in a folder, by name."""
+    return {path.stem: json.loads(path.read_text()) for path in sorted(folder.glob("*.json"))}
+
+
+def machine() -> dict[str, Any]:
+    """Processor, memory and system. It names neither the machine nor its owner."""
+    found = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
+    return {
+        "processor": found[1].strip() if found else platform.processor(),
+        "processors": os.cpu_count(),
+        "memory_gib": round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30),
+        "system": f"{platform.system()} {platform.release()} {platform.machine()}",
+        "python": platform.python_version(),
+    }

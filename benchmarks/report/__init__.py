@@ -1,1 +1,0 @@
-"""The written evaluation (docs/evaluation.md): its chapters, reasons and plots, from results/."""

@@ -1,1 +1,0 @@
-"""Plots of measured cells as SVG files."""

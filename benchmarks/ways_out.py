@@ -15,7 +15,10 @@ from typing import Any, NamedTuple
 
 import coal
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
+from trimesh import creation
+from trimesh.transformations import translation_matrix
 
 import hapticdb
 import page_tables
@@ -24,10 +27,7 @@ from batch_peers import mesh_of, tree_of_boxes
 from hapticdb import Environment, Extraction, GridOptions, ImportOptions
 from hapticdb.ingest.originals import parts_of
 from hapticdb.pointshell.orientation import Surface
-from hapticdb.sample import SamplePart, write_sample
-from hapticdb.sample import shapes as s
-from hapticdb.sample.parts import CAST, CHROME
-from hapticdb.sample.write import car_scene
+from hapticdb.sample import write_sample
 from hapticdb.sweeps.record import depth_record
 
 Floats = NDArray[np.float64]
@@ -76,24 +76,23 @@ triangles cross those of the floor. Without floor, carpet and door the seat goes
 then out by the door. The spark plug, which is added to the car, comes out along its bore."""
 SEAT = (1.15, 0.40, 0.80)
 """Middle of the spark plug's seat in the engine bay, metres."""
-BORE, PLUG = 0.024, 0.012
-"""Radii of the seat's bore, which is closed below, and of the plug, metres: 3.6 voxels between."""
+BORE, PLUG, SEAT_RADIUS = 0.024, 0.012, 0.045
+"""Radii of the seat's bore, which is closed below, of the plug and of the seat, metres: 3.6 voxels
+between bore and plug."""
 
 
-def plug_parts() -> list[SamplePart]:
-    """A spark plug in a seat whose bore is along z and open at the top only."""
-    x, y, z = SEAT
-    seat = s.join(
-        [
-            s.bored_block(0.09, 0.09, 0.05, BORE),
-            s.moved(s.box(0.09, 0.09, 0.01, 0.001), s.shift(z=-0.03)),
-        ]
-    )
-    plug = s.turned([(0.008, 0.0), (PLUG, 0.002), (PLUG, 0.05), (0.006, 0.055), (0.005, 0.09)], 24)
-    return [
-        SamplePart("engine/spark_plug_seat", seat, s.shift(x, y, z), CAST),
-        SamplePart("engine/spark_plug", plug, s.shift(x, y, z - 0.012), CHROME),
-    ]
+def plug_scene() -> Any:  # noqa: ANN401 - trimesh has no types
+    """A spark plug in a round seat whose bore is along z and open at the top only."""
+    bored = creation.annulus(BORE, SEAT_RADIUS, 0.05)
+    bottom = creation.cylinder(SEAT_RADIUS, segment=[[0.0, 0.0, -0.035], [0.0, 0.0, -0.025]])
+    profile = [(0, 0), (0.008, 0), (PLUG, 0.002), (PLUG, 0.05), (0.006, 0.055), (0.005, 0.09)]
+    plug = creation.revolve([*profile, (0, 0.09)], sections=24)
+    plug.apply_translation([0.0, 0.0, -0.012])
+    scene = trimesh.Scene()
+    scene.graph.update(frame_to="engine", matrix=translation_matrix(SEAT))
+    scene.add_geometry(bored + bottom, "spark_plug_seat", parent_node_name="engine")
+    scene.add_geometry(plug, "spark_plug", parent_node_name="engine")
+    return scene
 
 
 def measured(url: Path, question: Question, seconds: float, motions: int) -> dict[str, Any]:
@@ -192,7 +191,7 @@ def measure(
     files = [file]
     if model is None:
         files.append(folder / "plug.glb")
-        files[1].write_bytes(car_scene(plug_parts()).export(file_type="glb"))
+        files[1].write_bytes(plug_scene().export(file_type="glb"))
     url = folder / "scene.db"
     hapticdb.import_files(url, files, ImportOptions(grid=GridOptions(bits=bits)))
     with hapticdb.open(url, read_only=True) as env:

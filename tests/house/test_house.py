@@ -55,7 +55,7 @@ NARROW: dict[str, set[str]] = {
     "protocol": {"errors"},
     "mesh": {"errors", "units"},
     "devices": {"errors", "kernels", "poses"},
-    "sample": {"poses", "errors"},
+    "sample": {"errors"},
 }
 PUBLIC = hapticdb.__all__
 

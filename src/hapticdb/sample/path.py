@@ -1,11 +1,10 @@
 """Paths that slide a tool over the upper side of a scene.
 
-The scene is seen from above: a map of heights, from its triangles or from its voxels. The tool
-follows a swaying line over it, turns slowly, is tilted to lie along the surface, and at every
-pose is let down until its first point touches, then pressed in by a set depth.
+The scene is seen from above: a map of the heights of its voxels. The tool follows a swaying line
+over it, turns slowly, is tilted to lie along the surface, and at every pose is let down until its
+first point touches, then pressed in.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -13,25 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d
 
 from hapticdb.errors import UsageError
-from hapticdb.sample.parts import SamplePart
-from hapticdb.sample.shapes import Floats
+
+Floats = NDArray[np.float64]
 
 STEEPEST = 1.2
 """Slope of the tool's own way, rise over run: where the scene falls off faster, it glides down."""
 
-STEP = 0.003
-"""Metres between the heights that are taken from triangles."""
-
 DENSER = 4
 """Poses tried for each one kept: so many that equal steps of the tool can be picked among them."""
-
-LIFT = 0.05
-"""Metres above its place at which the tool of the sample's path begins. More than two voxels of a
-coarse grid, since a session in which the tool begins in something feels nothing. Larger: a longer
-way."""
-
-LANDING = 1 / 40
-"""Share of the sample's path on which the tool comes down. Larger: it slides over less."""
 
 
 class HeightMap(NamedTuple):
@@ -64,40 +52,6 @@ def heights_of_voxels(centers: ArrayLike, voxel_size: float) -> HeightMap:
     top = np.full(tuple(cell.max(axis=0) + 1), -np.inf)
     np.maximum.at(top, (cell[:, 0], cell[:, 1]), points[:, 2] + 0.5 * voxel_size)
     return HeightMap(corner, voxel_size, top)
-
-
-def heights_of_triangles(triangles: ArrayLike, step: float = STEP) -> HeightMap:
-    """Map of the upper side of triangles (T, 3, 3), exact at the middle of each cell."""
-    t = np.asarray(triangles, dtype=np.float64)
-    corner = t[..., :2].min(axis=(0, 1))
-    shape = np.floor((t[..., :2].max(axis=(0, 1)) - corner) / step).astype(np.int64) + 1
-    top = np.full(tuple(shape), -np.inf)
-    normal = np.cross(t[:, 1] - t[:, 0], t[:, 2] - t[:, 0])
-    t, normal = t[normal[:, 2] > 1e-12], normal[normal[:, 2] > 1e-12]
-    if len(t) == 0:
-        raise UsageError("no triangle faces upward: there is nothing to slide over")
-    # height = c0 + cx x + cy y over a triangle, whose three sides are where e0 + ex x + ey y = 0
-    plane = -normal[:, :2] / normal[:, 2:]
-    lines = [np.column_stack([t[:, 0, 2] - (plane * t[:, 0, :2]).sum(axis=1), plane])]
-    for k in range(3):
-        start, edge = t[:, k, :2], t[:, (k + 1) % 3, :2] - t[:, k, :2]
-        across = np.column_stack([-edge[:, 1], edge[:, 0]])
-        lines.append(np.column_stack([-(across * start).sum(axis=1), across]))
-    low = np.ceil((t[..., :2].min(axis=1) - corner) / step - 0.5).astype(np.int64)
-    high = np.floor((t[..., :2].max(axis=1) - corner) / step - 0.5).astype(np.int64)
-    size = np.maximum(high - low + 1, 0)
-    cells = size[:, 0] * size[:, 1]
-    for chunk in np.array_split(np.arange(len(t)), max(1, int(cells.sum()) // 500_000)):
-        owner = np.repeat(chunk, cells[chunk])
-        first = np.repeat(np.cumsum(cells[chunk]) - cells[chunk], cells[chunk])
-        rank = np.arange(len(owner)) - first
-        i = low[owner, 0] + rank // size[owner, 1]
-        j = low[owner, 1] + rank % size[owner, 1]
-        x, y = corner[0] + (i + 0.5) * step, corner[1] + (j + 0.5) * step
-        height, *sides = (f[owner, 0] + f[owner, 1] * x + f[owner, 2] * y for f in lines)
-        over = (sides[0] >= -1e-12) & (sides[1] >= -1e-12) & (sides[2] >= -1e-12)
-        np.maximum.at(top, (i[over], j[over]), height[over])
-    return HeightMap(corner, step, top)
 
 
 def _walk(map_: HeightMap, reach: float, count: int, seed: int, longest: float) -> Floats:
@@ -162,43 +116,49 @@ def _gliding(heights: Floats, rise: float) -> Floats:
     return np.asarray(np.maximum(forward, backward))
 
 
-def slide_over(
-    map_: HeightMap,
-    tool_points: ArrayLike,
-    count: int,
-    press: Floats | float,
-    seed: int = 0,
-    longest: float = np.inf,
+def _evenly(poses: Floats, reach: float, count: int) -> NDArray[np.int64]:
+    """Numbers of `count` poses between which the tool's farthest point moves about equally."""
+    shifts = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
+    turns = np.linalg.norm(np.diff(poses[:, :3, :3], axis=0), axis=(1, 2)) * 0.5 * reach
+    way = np.concatenate([[0.0], np.cumsum(shifts + turns)])
+    return np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(poses) - 1)
+
+
+def slide_over_voxels(
+    centers: ArrayLike, voxel_size: float, tool_points: ArrayLike, count: int = 1000, seed: int = 0
 ) -> Floats:
-    """Poses that slide a tool over a map of heights.
+    """Poses that slide a tool over voxels, pressed in by 0.5 to 1.5 voxels.
+
+    A step is a voxel or two: in a scene too long for that, the path keeps to its middle.
 
     Parameters
     ----------
-    map_ : HeightMap
-        The scene from above.
+    centers : array_like
+        (V, 3) centres of voxels, metres.
+    voxel_size : float
+        Metres.
     tool_points : array_like
         (N, 3) points of the tool's surface, metres, tool frame; its underside towards -z.
     count : int
         How many poses.
-    press : float or ndarray
-        Metres, or (count,) metres, by which the deepest point is pressed in.
     seed : int
-        Chooses where the line sways.
-    longest : float
-        Metres that the line may run at most.
+        Chooses where the path sways.
 
     Returns
     -------
     ndarray
         (count, 4, 4) `world_from_tool`; neighbours are nearly equally far apart.
     """
+    if not voxel_size > 0.0:
+        raise UsageError(f"a voxel's edge must be positive, not {voxel_size}")
+    map_ = heights_of_voxels(centers, voxel_size)
     if count < 2:
         raise UsageError(f"a path needs two poses or more, not {count}")
     tool = np.asarray(tool_points, dtype=np.float64).reshape(-1, 3)
     if len(tool) == 0:
         raise UsageError("the tool has no points")
     reach = float(np.ptp(tool[:, :2], axis=0).max())
-    places = _walk(map_, reach, DENSER * count, seed, longest)
+    places = _walk(map_, reach, DENSER * count, seed, count * voxel_size)
     run = float(np.linalg.norm(places[1] - places[0]))
     blur = max(0.35 * reach / max(run, 1e-12), 1.0)
     blur = min(blur, 0.05 * len(places))
@@ -213,41 +173,6 @@ def slide_over(
     poses[:, :3, :3] = rotations
     poses[:, :3, 3] = np.column_stack([places, _gliding(heights, STEEPEST * run)])
     chosen = poses[_evenly(poses, reach, count)]
-    chosen[:, 2, 3] -= press
+    press = 1.0 - 0.5 * np.cos(np.linspace(0.0, 10.0 * np.pi, count))
+    chosen[:, 2, 3] -= voxel_size * press
     return np.asarray(chosen)
-
-
-def _evenly(poses: Floats, reach: float, count: int) -> NDArray[np.int64]:
-    """Numbers of `count` poses between which the tool's farthest point moves about equally."""
-    shifts = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1)
-    turns = np.linalg.norm(np.diff(poses[:, :3, :3], axis=0), axis=(1, 2)) * 0.5 * reach
-    way = np.concatenate([[0.0], np.cumsum(shifts + turns)])
-    return np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(poses) - 1)
-
-
-def slide_over_voxels(
-    centers: ArrayLike, voxel_size: float, tool_points: ArrayLike, count: int = 1000, seed: int = 0
-) -> Floats:
-    """Poses (count, 4, 4) that slide a tool over voxels, pressed in by 0.5 to 1.5 voxels.
-
-    centers (V, 3), voxel_size and tool_points (N, 3) in metres. A step is a voxel or two:
-    in a scene too long for that, the path keeps to its middle.
-    """
-    if not voxel_size > 0.0:
-        raise UsageError(f"a voxel's edge must be positive, not {voxel_size}")
-    press = voxel_size * (1.0 - 0.5 * np.cos(np.linspace(0.0, 10.0 * np.pi, count)))
-    map_ = heights_of_voxels(centers, voxel_size)
-    return slide_over(map_, tool_points, count, press, seed, longest=count * voxel_size)
-
-
-def slide_path(parts: Sequence[SamplePart], tool_points: ArrayLike, count: int = 1000) -> Floats:
-    """Poses (count, 4, 4) over the sample's car: hood, windscreen, roof, rear window, boot.
-
-    The tool comes down from above. Then its deepest point is pressed 1 mm below the surface itself,
-    so that the path touches whatever the edge of the voxels that the car is imported with.
-    """
-    outside = [p.triangles() for p in parts if p.name.startswith(("body/", "trim/"))]
-    n_landing = int(LANDING * count)
-    press = np.full(count, 0.001)
-    press[:n_landing] -= np.linspace(LIFT, 0.0, n_landing, endpoint=False)
-    return slide_over(heights_of_triangles(np.concatenate(outside)), tool_points, count, press)

@@ -12,7 +12,9 @@ if TYPE_CHECKING:
     from hapticdb.demo import Comparison, DemoScene, Imported, LayoutFigures
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
-FramesOption = Annotated[int, typer.Option(metavar="N", help="Poses of the path.")]
+FramesOption = Annotated[
+    int, typer.Option(metavar="N", help="Poses of the path; the sample's has 1,000.")
+]
 
 
 def sample(

@@ -186,7 +186,7 @@ def test_the_desk_tells_which_shard_was_away(scene: Scene) -> None:
     assert scene.until(lambda: outages_of(table) != () and outages_of(table)[0].seconds > 0.0)
     (told,) = outages_of(table)
     assert told == ShardOutage(SHARD, told.seconds, 1, is_away=True)
-    scene.fetcher.report_lost()
+    scene.fetcher.count_loss()
     assert not outages_of(table)[0].is_away
     scene.fetcher.reopen()
     assert scene.until(lambda: outages_of(table)[0].is_away)

@@ -123,7 +123,7 @@ class Asking:
     application_state = WebSocketState.CONNECTED
 
     def __init__(self, message: bytes) -> None:
-        self.headers = {"authorization": "Bearer a-token"}
+        self.headers = {"authorization": "Bearer a-token-for-toucher"}
         self.message = message
         self.closed: tuple[int, str] | None = None
 
@@ -152,7 +152,7 @@ def test_a_wrong_wish_is_refused_before_cells_and_tools_are_made(
         raise AssertionError
 
     monkeypatch.setattr(ServedContacts, "_open", made)
-    access = Access({"a-token": Role.TOUCHER})
+    access = Access({"a-token-for-toucher": Role.TOUCHER})
     served = cast(
         "Served", type("", (), {"access": access, "tools": (str(tmp_path / "plate.stl"),)})
     )

@@ -346,7 +346,7 @@ class Environment(Queries):
 
     def _forget(self) -> None:
         """Drop cached values that an edit of this environment has made stale."""
-        self._figures.drop_statistics()
+        self._figures.rows_changed()
         self._touching.known.forget()
 
     def _check_writable(self) -> None:

@@ -29,6 +29,7 @@ from recordings import header
 ABOVE = "0,0,0.3"
 LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
 PLAY = ("--device", "path.csv", "--rate", 500)
+OPENED = "hapticdb: felt.hdbrec names scene.db, which is opened\n"
 LIMITED = (*PLAY, "--record", "felt.hdbrec", "--record-limit")
 
 
@@ -78,7 +79,7 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert children() == before
 
     code, out, err = run("replay", "felt.hdbrec")
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, OPENED)
     assert out.startswith("equal: ")
     code, out, _ = run("replay", "felt.hdbrec", "scene.db", "--json")
     replayed = json.loads(out)
@@ -97,7 +98,7 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
 
     assert run("move", "scene.db", 1, "--translate", "0,0,0.05")[0] == 0
     code, out, err = run("replay", "felt.hdbrec")
-    assert (code, err) == (1, "")
+    assert (code, err) == (1, OPENED)
     parted = re.match(r"parts at frame (\d+) \(\d+\.\d{3} s\)", out)
     assert parted
     frames = recorded(scene.with_name("felt.hdbrec"))
@@ -116,7 +117,7 @@ def test_a_budget_of_points_is_told_recorded_and_replayed(run: Run, scene: Path)
     )  # fmt: skip
     assert Recording(scene.with_name("felt.hdbrec")).header.budget_points == 40
     code, out, err = run("replay", "felt.hdbrec")
-    assert (code, err) == (0, "")
+    assert (code, err) == (0, OPENED)
     assert out.startswith("equal: ")
     report = json.loads(run(*wish, "--json")[1])
     assert report["budget_points"] == 40
@@ -258,6 +259,33 @@ def test_a_recording_is_gone_on_with_or_replaced(run: Run, scene: Path) -> None:
     assert 0 < len(Recording(path)) < both
 
 
+def test_a_database_that_is_gone_is_told_while_the_session_runs(scene: Path) -> None:
+    device = ("--device", "random", "--at", ABOVE, "--seconds", 3600, "--record", "s.hdbrec")
+    with child(command(*feel(*device)), cwd=scene.parent) as process:
+        until(scene.with_name("s.hdbrec").exists)
+        scene.unlink()
+        assert process.stderr is not None
+        line = process.stderr.readline()
+        assert line.startswith("hapticdb: scene.db cannot be reached any more ")
+        assert line.endswith("; until then no force is felt\n")
+        process.send_signal(signal.SIGTERM)
+    assert process.returncode == 128 + signal.SIGTERM
+
+
+def test_a_session_that_ends_without_its_database_fails(scene: Path) -> None:
+    """The file is cut short, although all cells that the tool needs are in memory."""
+    device = ("--device", "random", "--at", ABOVE, "--seconds", 4, "--record", "s.hdbrec")
+    with child(command(*feel(*device, "--json")), cwd=scene.parent) as process:
+        until(scene.with_name("s.hdbrec").exists)
+        os.truncate(scene, 8192)
+        out, err = process.communicate(timeout=PATIENCE)
+    assert process.returncode == 1
+    lost = json.loads(out)["database_lost"]
+    assert lost.startswith("scene.db ")
+    assert len(err.splitlines()) == 1
+    assert err.startswith("hapticdb: scene.db ")
+
+
 @pytest.mark.long
 def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) -> None:
     path = scene.with_name("felt.hdbrec")
@@ -268,12 +296,14 @@ def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) 
     code, out, err = run("replay", path)
     assert (code, out.startswith("equal: ")) == (0, True)
     assert re.fullmatch(
-        r"hapticdb: .*felt\.hdbrec: the last [\d,]+ bytes are an incomplete chunk.*\n", err
+        r"hapticdb: .*felt\.hdbrec: the last [\d,]+ bytes are an incomplete chunk.*\n"
+        r"hapticdb: .*felt\.hdbrec names .*scene\.db, which is opened\n",
+        err,
     )
     start = path.stat().st_size - len(whole) + len(whole) // 2
     path.write_bytes(whole[:start] + b"?" * 64 + whole[start + 64 :])
     refused(run("replay", path), "damaged at frame", "--until-damage")
-    code, out, err = run("replay", path, "--until-damage")
+    code, out, err = run("replay", path, "scene.db", "--until-damage")
     assert (code, out.startswith("equal: "), err) == (0, True, "")
 
 
@@ -285,7 +315,7 @@ def test_a_replay_of_nothing_is_one_line(run: Run) -> None:
 
 def test_a_replay_that_compares_no_frame_says_so_and_fails(run: Run, scene: Path) -> None:
     with hapticdb.open(scene) as env:
-        empty = header(environment=str(scene), grid=env.grid)
+        empty = header(environment=scene.name, grid=env.grid)
     path = scene.with_name("empty.hdbrec")
     Recorder(path, empty).close()
     assert run("replay", path)[:2] == (1, "nothing to compare: 0 skipped (unknown or held)\n")

@@ -37,8 +37,6 @@ LINES = {
     "backup": "scene.db whole.db",
     "restore": "scene.db put.db",
     "upgrade": "scene.db",
-    "calibrate": "scene.db",
-    "analyze": "scene.db",
     "grant": "scene.db anna --as viewer",
     "sample": "made --frames 2",
     "warm": "",
@@ -50,7 +48,7 @@ REFUSED = {"grant": 2}
 """Verbs with an exit code other than 0: an SQLite file has no roles."""
 DRAWING = {"demo"}
 """Verbs that always draw."""
-LONG = {"feel", "replay", "sweep", "extract", "calibrate", "sample", "warm", "view", "serve"}
+LONG = {"feel", "replay", "sweep", "extract", "sample", "warm", "view", "serve"}
 TRIANGLE = "v 0 0 0\nv 0.1 0 0\nv 0 0.1 0\nf 1 2 3\n"
 
 

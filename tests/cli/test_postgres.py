@@ -23,13 +23,13 @@ from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixtur
     test_a_summary_without_json,
     test_a_translation_counts_from_where_the_object_is,
     test_an_excluded_object_is_not_felt,
-    test_analyze_renews_what_an_edit_made_stale,
     test_calibrate_prints_figures_with_their_spread,
     test_every_strategy_prints_the_same_wrench,
     test_info_json_has_the_documented_keys,
     test_info_speaks_to_people,
     test_objects_are_listed_by_id,
     test_remove_takes_all_or_nothing,
+    test_statistics_are_renewed_after_many_edits,
     test_stiffness_scales_the_force,
     test_touch_json_has_a_line_a_pose,
     test_touch_json_is_the_librarys_answer_to_the_bit,
@@ -119,8 +119,7 @@ LINES: tuple[tuple[str, ...], ...] = (
     ("info", "--json"),
     ("objects",),
     ("objects", "--json"),
-    ("calibrate",),
-    ("analyze",),
+    ("info", "--calibrate"),
     ("move", "1", "--translate", "0,0,0.01"),
     ("move", "1", "--translate", "90,0,0"),
     ("touch", "--tool", "tool.npz", "--poses", "path.csv"),
@@ -239,7 +238,7 @@ def test_a_private_server_goes_with_a_command_that_the_system_ends(
 
 
 def test_reading_sets_no_server_up(run: Run, tmp_path: Path) -> None:
-    for verb, *rest in (("info",), ("move", "1", "--translate", "0,0,1"), ("analyze",)):
+    for verb, *rest in (("info",), ("move", "1", "--translate", "0,0,1")):
         refused(run(verb, PRIVATE, *rest), "no environment", "hapticdb import URL FILE")
     (tmp_path / "empty.obj").write_bytes(b"")
     refused(run("import", PRIVATE, "empty.obj"), "empty.obj")

@@ -12,7 +12,7 @@ import pytest
 
 import hapticdb
 from children import finished
-from command_line import Run, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, boxes, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.cli.csv_files import SWEPT
 from hapticdb.sweeps import run as sweeping
 
@@ -159,6 +159,22 @@ def test_what_the_tool_touches_at_its_start_is_left_out_and_named(run: Run, scen
     assert [one["name"] for one in found["depths"]] == ["box0"]
     assert [one["name"] for one in found["left_at_start"]] == ["box0"]
     assert found["tool"]["excluded"] == []
+
+
+def test_nothing_comes_out_of_what_it_may_cut(run: Run, scene: Path) -> None:
+    """The file of what the tool touches at its start is gone: it is not known how deep it goes."""
+    file = boxes(scene.parent / "own.glb")
+    assert run("import", "own.db", file, "--bits", 6)[0] == 0
+    file.unlink()
+    poses(scene.parent / "up.csv", (0.0, 0.0, 0.055), (0.0, 0.0, 0.2))
+    up = ("sweep", "own.db", *TOOL, "--path", "up.csv", "--leave-start")
+    code, out, _ = run(*up)
+    assert code == 3
+    assert "comes out" not in out
+    line = out.splitlines()[0]
+    assert line.startswith("not decided: meets nothing else, but how deep it goes into box0 ")
+    code, out, _ = run(*up, "--json")
+    assert (code, json.loads(out)["verdict"], json.loads(out)["line"]) == (3, "not decided", line)
 
 
 @pytest.mark.usefixtures("through")

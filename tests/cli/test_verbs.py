@@ -18,7 +18,7 @@ from hapticdb.query.frame import STRATEGIES
 Scene = Path | str
 """A path or a URL: a file in this module; cli/test_postgres.py runs the same tests on servers."""
 
-# -- info, objects, calibrate, analyze -----------------------------------------------------------
+# -- info, objects -------------------------------------------------------------------------------
 
 
 def test_info_json_has_the_documented_keys(run: Run, scene: Scene) -> None:
@@ -48,20 +48,14 @@ def test_info_speaks_to_people(run: Run, scene: Scene) -> None:
     assert re.search(r"^statistics +computed and kept; fresh$", out, re.MULTILINE)
 
 
-def test_analyze_renews_what_an_edit_made_stale(run: Run, scene: Scene) -> None:
-    assert run("remove", scene, 2)[0] == 0
+def test_statistics_are_renewed_after_many_edits(run: Run, scene: Scene) -> None:
+    """Of 3 objects each edit is many; a store alone counts what passes."""
+    with hapticdb.open(scene) as env:
+        env.store.remove(2, lambda _: ((0, 2**62),))
     assert "1 write behind" in run("info", scene)[1]
-    code, out, err = run("analyze", scene)
-    assert (code, err) == (0, "")
-    assert "10,000 buckets over" in out
-    assert "before: 1 write behind" in out
-    code, out, err = run("analyze", scene, "--json")
-    assert (code, err) == (0, "")
-    found = json.loads(out)
-    assert list(found) == ["source", "buckets", "rows", "before"]
-    assert found["before"] == {"revision": 4, "changes": 0, "rows": 0}
-    assert (found["source"], found["buckets"]) == ("kept", 10_000)
-    assert found["rows"] == json.loads(run("info", scene, "--json")[1])["rows"]
+    assert run("move", scene, 3, "--translate", "0,0,0.01")[0] == 0
+    found = json.loads(run("info", scene, "--json")[1])["statistics"]
+    assert (found["source"], found["changes"]) == ("kept", 0)
 
 
 def test_objects_are_listed_by_id(run: Run, scene: Scene) -> None:
@@ -84,14 +78,18 @@ def test_a_name_in_brackets_is_printed_as_it_is(run: Run, tmp_path: Path) -> Non
 
 
 def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> None:
-    code, out, err = run("calibrate", scene, "--json")
+    with hapticdb.open(scene) as env:
+        env.store.remove(2, lambda _: ((0, 2**62),))
+    code, out, err = run("info", scene, "--calibrate", "--json")
     assert (code, err) == (0, "")
     found = json.loads(out)
-    assert found["kept"] is True
-    costs = [found["figures"][name] for name in ("statement", "descent", "block", "row")]
+    assert found["statistics"]["changes"] == 0
+    assert found["costs"]["kept"] is True
+    costs = [found["costs"]["figures"][name] for name in ("statement", "descent", "block", "row")]
     assert min(costs) >= 0.0 < sum(costs)
-    assert set(found["spread"]) < set(found["figures"])
-    assert "±" in run("calibrate", scene)[1]
+    assert set(found["costs"]["spread"]) < set(found["costs"]["figures"])
+    assert "±" in run("info", scene, "--calibrate")[1]
+    refused(run("info", scene, "--cold"), "--calibrate")
 
 
 # -- move, remove ---------------------------------------------------------------------------------
@@ -288,7 +286,7 @@ def test_a_few_poses_are_touched_without_measuring_costs_first(run: Run, scene: 
     args = ("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", "--json")
     used = {json.loads(line)["query"]["strategy"] for line in run(*args)[1].splitlines()}
     assert used == {"array"}
-    assert run("calibrate", scene)[0] == 0
+    assert run("info", scene, "--calibrate")[0] == 0
     used = {json.loads(line)["query"]["strategy"] for line in run(*args)[1].splitlines()}
     assert used <= set(STRATEGIES)
 

@@ -136,7 +136,7 @@ VERBS: tuple[tuple[str, str], ...] = (
     ("move", "move a.db 12 --translate 0,0,0.001"),
     ("copy", "copy a.db b.db --layout voxel --curve hilbert"),
     ("copy", "diff a.db b.db"),
-    ("calibrate", "calibrate a.db"),
+    ("calibrate", "info a.db --calibrate"),
 )
 
 

@@ -79,6 +79,11 @@ class Person(Browser):
         self.parts = SimpleNamespace(moving=self._part("leave"))  # type: ignore[assignment]
         self._unfelt, self._keeps_tool, self._over, self._is_closed = [], None, [], False
         self._beginning, self._swapping = threading.Lock(), threading.Lock()
+        self._holding, self.colour, self.touch = (
+            threading.Lock(),
+            (0, 0, 0),
+            self._part("show_place"),
+        )
 
     def _keep(self, words: tuple[str, ...]) -> None:
         self.told.append(": ".join(words))
@@ -129,6 +134,31 @@ def test_a_lost_session_is_ended_in_the_host_and_the_panel_knows(
     assert person.session is host.begun[1]  # type: ignore[comparison-overlap]
     assert person.said.count("session_ended") == person.said.count("rest") == 1
     assert person.told == ["Tool lost: its process ended; it begins again"]
+
+
+def test_a_tool_that_is_taken_six_times_at_once_is_drawn_once_at_a_time(
+    host: FakeHost, person: Person
+) -> None:
+    """As by the button "Back to the start": viser calls each click in a thread of its own."""
+    n_inside, together, pressed = 0, [], threading.Barrier(6)
+
+    def hold(*_: object) -> None:
+        nonlocal n_inside
+        n_inside += 1
+        threading.Event().wait(0.002)  # lets the other threads come
+        together.append(n_inside)
+        n_inside -= 1
+
+    def press(_: int) -> None:
+        pressed.wait(PATIENCE)
+        person.take_in_hand(person.tool, person.hand)
+
+    person.drawing = SimpleNamespace(hold=hold, rest=lambda: None)  # type: ignore[assignment]
+    with ThreadPoolExecutor(6) as viser:
+        list(viser.map(press, range(6)))
+    until(lambda: person.is_idle, patience=PATIENCE)
+    assert together == [1] * 6
+    assert sum(not session.is_over for session in host.begun) == 1
 
 
 def test_a_lost_session_of_a_browser_that_goes_is_ended(host: FakeHost, person: Person) -> None:

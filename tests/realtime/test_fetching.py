@@ -253,7 +253,7 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
             is_lost = False
             assert not step.table.cells.control[AWAY]
         except DatabaseError:
-            step.fetcher.report_lost()
+            step.fetcher.count_loss()
             is_lost = True
             n_lost += 1
             before = step.table.cells.control[HEARTBEAT]

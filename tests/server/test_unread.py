@@ -100,10 +100,14 @@ def test_a_client_that_does_not_read_the_last_message_is_cut(
 
 
 class Unwilling:
-    """A WebSocket that takes no close frame."""
+    """A WebSocket that sends something malformed and takes no close frame."""
 
     application_state = WebSocketState.CONNECTED
     headers = Headers()
+
+    @staticmethod
+    async def receive() -> dict[str, object]:
+        return {"type": "websocket.receive", "bytes": b"malformed"}
 
     @staticmethod
     async def close(*_: object) -> NoReturn:
@@ -118,7 +122,7 @@ def test_a_remote_hand_that_takes_no_close_frame_keeps_no_place(
     contacts = Contacts(cast("ResidentCells", None), {})
 
     async def work() -> None:
-        attending = contacts.attend(cast("WebSocket", Unwilling()), b"malformed")
+        attending = contacts.attend(cast("WebSocket", Unwilling()))
         await asyncio.wait_for(attending, PATIENCE)
 
     asyncio.run(work())

@@ -150,6 +150,6 @@ def test_it_refuses_to_be_written_in_one_line(pair: Pair, run: Run, made: Path) 
             ("grant", url, "pg_monitor", "--as", "viewer"),
         ):
             refused(run(*line), "is a standby: it can only be read", "target_session_attrs=primary")
-    assert run("calibrate", pair.both, "--json")[0] == 0
+    assert run("info", pair.both, "--calibrate", "--json")[0] == 0
     at_primary = pair.both.replace("prefer-standby", "primary")
     assert run("remove", at_primary, 1)[0] == 0

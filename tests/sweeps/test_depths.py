@@ -1,5 +1,6 @@
 """How deep a tool goes into what it touches at its start: closed forms, and exact boxes."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from scipy.spatial.transform import Rotation
 import hapticdb
 from extraction_scenes import box, imported, joined
 from hapticdb import Grid, PointShell
+from hapticdb.cli.csv_files import rows_of_sweep
 from hapticdb.kernels.surfaces import nearest, sides
 from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.sweeps.depths import MOST_LOOKS, DepthSearch
@@ -113,10 +115,31 @@ def test_what_is_open_on_both_sides_has_no_depth(tmp_path: Path) -> None:
     (depth,) = found.depths
     assert not depth.is_bounded
     assert not depth.is_cut
-    assert "nothing has an inside" in verdict_line(found, DOT)
+    assert (found.verdict, found.comes_out, found.at_least) == ("not decided", False, 0.0)
+    line = verdict_line(found, DOT)
+    assert line.startswith("not decided: meets nothing else, but how deep it goes into lower is")
+    assert "nothing has an inside" in line
+    assert line.endswith("free of lower, or leave that out by --exclude")
     shell = PointShell.from_mesh(upper.vertices, upper.faces, 20)
-    (record,) = sweep_record(found, shell, [], [])["depths"]
-    assert (record["deepest_most"], record["is_bounded"]) == (None, False)
+    record = sweep_record(found, shell, [], [])
+    assert (record["verdict"], record["comes_out"]) == ("not decided", False)
+    (depth_record,) = record["depths"]
+    assert (depth_record["deepest_most"], depth_record["is_bounded"]) == (None, False)
+    assert {row[9] for row in rows_of_sweep(found)} == {"not decided"}
+
+
+def test_a_depth_that_its_bounds_leave_open_is_not_decided(tmp_path: Path) -> None:
+    """The peg moves by what is allowed: no finer look tells whether it cuts."""
+    url = peg(tmp_path)
+    across = moved((0.5 * SIZE, 0.0, 0.0))
+    found = swept(url, "peg", across)
+    assert [one.object.name for one in found.undecided] == ["block"]
+    assert found.verdict == "not decided"
+    line = verdict_line(found, DOT)
+    assert "comes out" not in line
+    tolerance = re.search(r"--tolerance ([0-9.]+) may decide it$", line)
+    assert tolerance is not None
+    assert swept(url, "peg", across, 1e-3 * float(tolerance[1])).verdict == "comes out"
 
 
 def test_a_cut_is_told_although_another_depth_is_not_known(tmp_path: Path) -> None:
@@ -143,7 +166,7 @@ def test_a_file_that_is_gone_leaves_the_depth_open(tmp_path: Path) -> None:
         shell = env.shell("peg", spacing=0.5 * SIZE)
         (tmp_path / "parts.glb").unlink()
         found = sweep(env, shell, moved((0.0, 0.0, 0.2)), exclude=("peg",), leave_start=True)
-    assert found.verdict == "comes out"
+    assert found.verdict == "not decided"
     assert ["cannot be read" in one.why for one in found.depths] == [True]
 
 

@@ -20,7 +20,7 @@ from hapticdb.cli.verbs.feeling import feel
 from hapticdb.cli.verbs.granting import grant
 from hapticdb.cli.verbs.importing import import_
 from hapticdb.cli.verbs.keeping import backup, restore
-from hapticdb.cli.verbs.listing import analyze, calibrate, info, objects
+from hapticdb.cli.verbs.listing import info, objects
 from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.paths.extracting import HELP as EXTRACT_HELP
 from hapticdb.cli.verbs.paths.extracting import extract
@@ -42,7 +42,7 @@ PIPE_CLOSED = 141
 
 VERBS: dict[Callable[..., None], str] = {
     import_: "Import CAD files and point clouds.",
-    info: "Show engine, grid, layout, size and statistics.",
+    info: "Show engine, grid, layout, size; measure costs.",
     objects: "List the objects of an environment.",
     touch: "Touch with a tool along a path: force, torque, objects.",
     feel: "Feel in real time with a device.",
@@ -59,18 +59,20 @@ VERBS: dict[Callable[..., None], str] = {
     backup: "Copy an SQLite environment into a file, whole.",
     restore: "Put such a copy in an environment's place.",
     upgrade: "Give distances to objects imported without.",
-    calibrate: "Measure what queries cost on this machine.",
-    analyze: "Renew the statistics of the keys.",
     grant: "Say what a role may do, on PostgreSQL.",
-    sample: "Write a sample: a car, a wrench and its path.",
     demo: "Make, import, touch and draw the sample.",
+    sample: "Write a sample: a car, a wrench and its path.",
     warm: "Compile every kernel now, so that no verb has to.",
 }
 """The verbs, and the line about each in the list of verbs."""
+HIDDEN = {sample, warm}
+"""Verbs that the list leaves out: what they do, others do by themselves."""
 HELP = {sweep: SWEEP_HELP, extract: EXTRACT_HELP}
 """Help texts that are too long for a docstring, so that no function is over 60 lines."""
 for verb, summary in VERBS.items():
-    app.command(verb.__name__.rstrip("_"), short_help=summary, help=HELP.get(verb))(verb)
+    app.command(
+        verb.__name__.rstrip("_"), short_help=summary, help=HELP.get(verb), hidden=verb in HIDDEN
+    )(verb)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

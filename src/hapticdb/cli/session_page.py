@@ -181,6 +181,22 @@ class LooseNotes:
             self._looks = 0
 
 
+class DatabaseNotes:
+    """Tells on the command line when the database cannot be read, and when it can be again."""
+
+    def __init__(self) -> None:
+        self._is_lost = False
+
+    def look(self, session: "Session") -> None:
+        """Tell what has changed since the last look."""
+        lost = session.database_lost
+        if lost is not None and not self._is_lost:
+            render.note(f"{lost}; until then no force is felt")
+        elif lost is None and self._is_lost:
+            render.note("the database is back: surfaces are felt again")
+        self._is_lost = lost is not None
+
+
 def _lowered_clause(spring: "SettledCoupling") -> str:
     return "" if spring.lowered is None else f"; {spring.lowered}"
 

@@ -85,6 +85,7 @@ class Browser:
         self._keeps_tool: bool | None = None  # of the session to begin; None: none is wanted
         self._over: list[HostedSession] = []  # to be ended
         self._beginning, self._swapping = threading.Lock(), threading.Lock()
+        self._holding = threading.Lock()
         self._is_closed = False
         self._shared: list[Any] = []
         self._shown = np.full(7, np.inf)
@@ -182,11 +183,12 @@ class Browser:
 
     def take_in_hand(self, tool: HeldTool, pose: Floats | None = None) -> None:
         """Hold another tool, at a pose (7,) or at the start."""
-        self.tool = tool
-        self.hand = self._start() if pose is None else pose
-        self.drawing.hold(tool, self.colour, self.hand)
-        self.begin_anew(keeps_tool=False)
-        self.touch.show_place()
+        with self._holding:  # a button that is pressed again calls this in another thread
+            self.tool = tool
+            self.hand = self._start() if pose is None else pose
+            self.drawing.hold(tool, self.colour, self.hand)
+            self.begin_anew(keeps_tool=False)
+            self.touch.show_place()
 
     @property
     def unfelt(self) -> list[int]:

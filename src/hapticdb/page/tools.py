@@ -62,6 +62,10 @@ class HeldTool:
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
 
+BUILT_IN = ("ball", "peg")
+"""Names of the probes that every environment has."""
+
+
 def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTool]:
     """Probes that fit a scene: a ball and a peg.
 
@@ -77,12 +81,9 @@ def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTo
     shaft = np.array(
         [[slim, long / 4], [1.5 * slim, long / 4], [1.5 * slim, long / 2], [0, long / 2]]
     )
-    profiles = {
-        "ball": radius * np.column_stack([np.cos(ball), np.sin(ball)]),
-        "peg": np.concatenate([tip, shaft]),
-    }
+    profiles = radius * np.column_stack([np.cos(ball), np.sin(ball)]), np.concatenate([tip, shaft])
     found = []
-    for name, profile in profiles.items():
+    for name, profile in zip(BUILT_IN, profiles, strict=True):
         vertices, faces = _turned(profile)
         shell = PointShell.from_mesh(vertices, faces, POINTS, inset=inset)
         found.append(HeldTool(name, shell, vertices, faces, is_round=name == "ball"))

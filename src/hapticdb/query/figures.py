@@ -1,9 +1,16 @@
 """Statistics and costs of an opened database, on which grouping by cost decides."""
 
+from contextlib import suppress
+
+from hapticdb.errors import DatabaseError
 from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Store
+
+STALE = 0.2
+"""Writes since the statistics were made, as a share of the objects, after which they are renewed.
+Larger: edits renew them more seldom, and estimates of gaps are worse."""
 
 
 class QueryFigures:
@@ -13,6 +20,7 @@ class QueryFigures:
         self._store = store
         self._quantiles: QuantileVector | None = None
         self._costs: CostModel | None = None
+        self._n_objects: int | None = None
 
     def both(self) -> tuple[QuantileVector, CostModel]:
         """Quantile vector and cost model; a cost model is fitted in less than a second."""
@@ -39,9 +47,19 @@ class QueryFigures:
         self._costs = costs
         return costs
 
-    def drop_statistics(self) -> None:
-        """Drop the statistics because rows have changed: they are read again when needed next."""
+    def rows_changed(self) -> None:
+        """Read the statistics again when they are needed next; renew them after many writes.
+
+        The write is done: where they cannot be renewed now, a later one does.
+        """
         self._quantiles = None
+        with suppress(DatabaseError):
+            n_writes = self._store.freshness(DEFAULT_RESOLUTION).changes
+            if self._n_objects is None:
+                self._n_objects = len(self._store.objects())
+            if n_writes > STALE * self._n_objects:
+                self._store.analyze(DEFAULT_RESOLUTION)
+                self._n_objects = None
 
     def drop_empty_statistics(self) -> None:
         """Drop the statistics if they are those of an environment without rows."""

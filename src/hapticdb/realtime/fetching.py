@@ -239,9 +239,8 @@ class Fetcher:
 
     # -- when the database is away -----------------------------------------------------------
 
-    def report_lost(self) -> None:
-        """Mark the database as unreachable for all sessions, so that their forces fall to zero."""
-        self.table.cells.control[AWAY] = 1
+    def count_loss(self) -> None:
+        """Count that the database was lost."""
         self._figures["losses"] += 1
 
     def reopen(self) -> None:
@@ -297,11 +296,14 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
             is_lost, is_ready, patience = False, True, RETRY[0]
         except (GridError, UsageError):
             raise
-        except (HapticDBError, OSError):
+        except (HapticDBError, OSError) as error:
             if is_first and fetcher is None:
                 raise
-            if fetcher is not None and not is_lost:
-                fetcher.report_lost()
+            if not is_lost:
+                sender.send("lost", str(error))  # first, so that who sees the mark finds the cause
+                table.cells.control[AWAY] = 1
+                if fetcher is not None:
+                    fetcher.count_loss()
             is_lost = True
             time.sleep(patience)
             patience = min(2 * patience, at_most)

@@ -42,7 +42,7 @@ from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
 from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.frames import RUN, clusters_of, sleeps_by_itself
 from hapticdb.resident.sleepers import sleepers_of
-from hapticdb.resident.table import HEARTBEAT, STOP, CellTable
+from hapticdb.resident.table import AWAY, HEARTBEAT, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
 """Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
@@ -142,11 +142,17 @@ class Loop:
     # -- before the first frame --------------------------------------------------------------
 
     def prepare(self) -> float:
-        """Place the tool at the hand and wait for its cells; returns the seconds taken."""
+        """Place the tool at the hand and wait for its cells; returns the seconds taken.
+
+        Without a database it does not wait: what supervises the session tells of that at once.
+        """
         started = time.monotonic()
         session, asked = self.session, 0
+        control = self.cells.control
         self._place()
         while time.monotonic() - started < WARM_PATIENCE and not self._is_left():
+            if control[AWAY]:
+                break
             if asked and session["heard"] >= asked:
                 if session["n_missing"] == 0:
                     self.is_warm = True

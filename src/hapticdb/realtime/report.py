@@ -181,6 +181,8 @@ class Report:
         Frames in the recording, and frames that were overwritten before they were recorded.
     recording_ended : str or None
         One line: why the recording ended before the session; None if it did not.
+    database_lost : str or None
+        One line: why the database could not be read at the end; None if it could.
     proportions : Proportions or None
         Sizes and places of tool, path and scene at the start, and their misfits.
     conditions : dict
@@ -210,6 +212,7 @@ class Report:
     recorded_frames: int = 0
     lost_records: int = 0
     recording_ended: str | None = None
+    database_lost: str | None = None
     proportions: Proportions | None = None
     nowhere_frames: int = 0
     bad_reading: str | None = None

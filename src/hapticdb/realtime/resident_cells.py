@@ -142,6 +142,7 @@ class ResidentCells:
             raise
         self._restarted_at = 0.0
         self._failure: GridError | UsageError | None = None
+        self._lost_by = ""
         self._supervising = threading.Lock()
         self._pid = os.getpid()
 
@@ -211,6 +212,12 @@ class ResidentCells:
         control = self.table.cells.control
         return bool(control[AWAY]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
 
+    @property
+    def database_lost(self) -> str | None:
+        """One line: why the database cannot be read now; None while it can. As of `supervise`."""
+        is_lost = bool(self.table.cells.control[AWAY])
+        return (self._lost_by or f"{redact(self.url)} does not answer") if is_lost else None
+
     def supervise(self) -> None:
         """Start the fetching process again if it has ended. Sessions call it in `wait`.
 
@@ -222,9 +229,12 @@ class ResidentCells:
             If the cells have distances and an object was written that has none.
         """
         with self._supervising:
-            if self._process.is_alive or self.table.cells.control[STOP]:
+            if self.table.cells.control[STOP]:
                 return
-            self._raise_fatal_error()
+            is_alive = self._process.is_alive  # read first: its last message may come with its end
+            self._take_messages()
+            if is_alive:
+                return
             now = time.monotonic()
             if now - self._restarted_at < RESTART_EVERY:
                 return
@@ -237,11 +247,12 @@ class ResidentCells:
             )
             ended.end()
 
-    def _raise_fatal_error(self) -> None:
-        """Raise the error that ended the process, if a new process would fail with it, too."""
+    def _take_messages(self) -> None:
+        """Take what the process has sent; raises an error with which a new one would fail, too."""
         try:
-            while self._failure is None and self._process.receive(0.0):
-                pass
+            while self._failure is None and (message := self._process.receive(0.0)):
+                if message.word == "lost":
+                    self._lost_by = str(message.content)
         except (GridError, UsageError) as error:
             self._failure = error
         except HapticDBError:

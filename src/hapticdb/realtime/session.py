@@ -311,6 +311,11 @@ class Session:
         """One line: why the recording has ended before the session; None while it continues."""
         return None if self._recording is None else self._recording.ended
 
+    @property
+    def database_lost(self) -> str | None:
+        """One line: why the database cannot be read now; None while it can. As of `wait`."""
+        return self.cells.database_lost
+
     def last(self) -> Frames | None:
         """Latest frame, (1,) of `FRAME`; None before the first."""
         done = self.n_frames
@@ -390,6 +395,7 @@ class Session:
             loose_objects=self.loose_objects,
             recorded_frames=0 if recording is None else len(recording),
             recording_ended=self.recording_ended,
+            database_lost=self.database_lost,
             lost_records=0 if recording is None else recording.n_lost,
             proportions=self.proportions,
             law="smooth" if is_smooth(self.law) else "plane",

@@ -9,6 +9,7 @@ import contextlib
 import fcntl
 import io
 import os
+import re
 import zlib
 from collections.abc import Iterator
 from functools import cached_property
@@ -66,6 +67,28 @@ class Recording:
 
     def __len__(self) -> int:
         return self._scan.n_frames
+
+    def environment_beside(self) -> Path:
+        """Path of the recorded environment: an SQLite file in the recording's own folder.
+
+        Whoever wrote the recording chose what its header names. So nothing else is opened from it:
+        no server's address, no file in another folder, no symbolic link to one.
+
+        Raises
+        ------
+        UsageError
+            If the header names anything else.
+        """
+        name = self.header.environment
+        if not re.search(r"[/\\?:\0]", name):
+            file, folder = self.path.parent / name, self.path.parent
+            with contextlib.suppress(OSError, RuntimeError):  # a name too long, links in a circle
+                if file.is_file() and file.resolve().parent == folder.resolve():
+                    return file
+        raise UsageError(
+            f"{self.path} names the environment {name!a}, which is no file beside it: name the one "
+            "to open, 'hapticdb replay FILE URL'"
+        )
 
     @property
     def damaged_at(self) -> int | None:

@@ -41,6 +41,9 @@ class Limits:
         Bytes of a sign-in form.
     connections : int
         TCP connections at once; more are answered with 503.
+    silent : int
+        Connections at once whose next request has not come. One more cuts the one that has waited
+        longest, so that idle clients leave room for others. Larger: more browsers keep theirs.
     request_seconds : float
         Time for the headers of each request of a connection, and for a form. Larger: slow clients
         hold connections longer.
@@ -68,6 +71,7 @@ class Limits:
     sign_ins_at_once: float = 10.0
     form_bytes: int = 2048
     connections: int = 512
+    silent: int = 128
     request_seconds: float = 10.0
     fragments: int = 64
     pings_per_second: float = 2.0

@@ -4,6 +4,8 @@ import asyncio
 import socket
 from typing import Any, ClassVar
 
+from h11 import Request
+from uvicorn._types import ASGISendEvent
 from uvicorn.protocols.http.h11_impl import H11Protocol
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
 from websockets.frames import Frame
@@ -15,9 +17,13 @@ PROTOCOL_ERROR, POLICY = 1002, 1008
 
 
 class PatientHttp(H11Protocol):
-    """Begins every connection; cuts those that do not send each request in time."""
+    """Begins every connection; cuts those that do not send each request in time.
+
+    silent : connections whose next request has not come, the one that has waited longest first.
+    """
 
     limits: ClassVar[Limits] = Limits()
+    silent: ClassVar[dict["PatientHttp", None]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin the time for the first request; let small messages leave at once."""
@@ -29,6 +35,22 @@ class PatientHttp(H11Protocol):
         self._silence: asyncio.TimerHandle | None = None
         self._expect_request()
 
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Wait no longer."""
+        self.silent.pop(self, None)
+        super().connection_lost(exc)
+
+    def handle_events(self) -> None:
+        """Take what came, which may be the request."""
+        super().handle_events()
+        if self.cycle is not self._last:
+            self.silent.pop(self, None)
+
+    def handle_websocket_upgrade(self, event: Request) -> None:
+        """Hand the connection over."""
+        self.silent.pop(self, None)
+        super().handle_websocket_upgrade(event)
+
     def on_response_complete(self) -> None:
         """Begin the time for the next request."""
         self._expect_request()
@@ -38,13 +60,16 @@ class PatientHttp(H11Protocol):
         """Begin the time for a request, which becomes a cycle when its headers are complete."""
         if self._silence is not None:
             self._silence.cancel()
-        seconds = self.limits.request_seconds
-        self._silence = self.loop.call_later(seconds, self._cut_if_silent, self.cycle)
+        self._silence = self.loop.call_later(self.limits.request_seconds, self._cut_if_silent)
+        self._last = self.cycle
+        self.silent[self] = None
+        if len(self.silent) > self.limits.silent:
+            first = next(iter(self.silent))
+            del self.silent[first]
+            first.transport.abort()  # closing may wait for the client
 
-    def _cut_if_silent(self, last: object) -> None:
-        if self.transport.is_closing():  # one of TLS knows no protocol any more
-            return
-        if self.transport.get_protocol() is self and self.cycle is last:
+    def _cut_if_silent(self) -> None:
+        if self in self.silent:
             self.transport.close()
 
 
@@ -82,6 +107,12 @@ class StrictWebSocket(WebSocketsSansIOProtocol):
         else:
             self._fail(POLICY, "too many pongs")
 
+    async def send(self, message: ASGISendEvent) -> None:
+        """Send; an HTTP answer completes the handshake, which else is logged as an error."""
+        await super().send(message)
+        if self.initial_response is not None and self.close_sent:
+            self.handshake_complete = True
+
     def keepalive_timeout(self) -> None:
         """Cut a client that has not answered a ping; whoever waits to send to it goes on."""
         super().keepalive_timeout()
@@ -105,6 +136,6 @@ class StrictWebSocket(WebSocketsSansIOProtocol):
 def limited(limits: Limits) -> tuple[type[PatientHttp], type[StrictWebSocket]]:
     """Protocols under these limits."""
     return (
-        type("LimitedHttp", (PatientHttp,), {"limits": limits}),
+        type("LimitedHttp", (PatientHttp,), {"limits": limits, "silent": {}}),
         type("LimitedWebSocket", (StrictWebSocket,), {"limits": limits}),
     )

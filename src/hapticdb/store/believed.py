@@ -228,7 +228,9 @@ def histogram_of(url: str, bounds: object, n_rows: object) -> Histogram:
     """Read a kept histogram; bounds as bytes or as a list."""
     keys = _int64s(bounds)
     if keys is None or len(keys) < 2 or (np.diff(keys) < 0).any() or not _is_count(n_rows):
-        raise damaged(url, "kept statistics that are no ascending keys; 'hapticdb analyze' renews")
+        raise damaged(
+            url, "kept statistics that are no ascending keys; 'hapticdb info --calibrate' renews"
+        )
     return Histogram(keys, cast("int", n_rows), "kept")
 
 
@@ -236,7 +238,7 @@ def figures_of(url: str, text: object) -> Mapping[str, float]:
     """Read the kept figures of a cost model: finite numbers by name."""
     figures = _json_of(text)
     if figures is None or not all(_is_finite(value) for value in figures.values()):
-        raise damaged(url, "kept costs that are no numbers; 'hapticdb calibrate' renews")
+        raise damaged(url, "kept costs that are no numbers; 'hapticdb info --calibrate' renews")
     return cast("Mapping[str, float]", figures)
 
 
@@ -248,12 +250,12 @@ def findings_of_kept(
         with contextlib.suppress(DamagedError):
             histogram_of(url, *row)
             continue
-        yield "kept statistics are no ascending keys; 'hapticdb analyze' renews them"
+        yield "kept statistics are no ascending keys; 'hapticdb info --calibrate' renews them"
     for row in costs:
         with contextlib.suppress(DamagedError):
             figures_of(url, *row)
             continue
-        yield "kept costs are no numbers; 'hapticdb calibrate' renews them"
+        yield "kept costs are no numbers; 'hapticdb info --calibrate' renews them"
 
 
 def number_of(url: str, value: object, what: str) -> int:

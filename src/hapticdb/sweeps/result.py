@@ -290,6 +290,11 @@ class Swept:
         return tuple(one for one in self.depths if one.is_cut)
 
     @property
+    def undecided(self) -> tuple[ContactDepth, ...]:
+        """Those of `depths` that are neither bounded nor proved to cut."""
+        return tuple(one for one in self.depths if not (one.is_bounded or one.is_cut))
+
+    @property
     def caught(self) -> Moment | None:
         """First contact with an object that the tool does not only leave at the path's start."""
         in_way = [one.first_contact for one in self.objects if not one.is_left_at_once]
@@ -298,19 +303,27 @@ class Swept:
 
     @property
     def verdict(self) -> Verdict:
-        """Proved result: the tool hits something, it comes out, or neither is proved."""
+        """Proved result: the tool hits something, it comes out, or neither is proved.
+
+        It comes out only if all `depths` are bounded, too.
+        """
         if self.enclosed or self.cuts:
             return "hits"
-        if self.decision is not None:
-            if self.decision.is_clear and self.proof.is_inside_known:
-                return "comes out"
-            if self.decision.tolerance is not None:
-                return "hits" if self.decision.is_near else "not decided"
-        if self.hits:
-            return "hits"
-        if self.proof.is_clear and self.proof.is_inside_known:
-            return "comes out"
-        return "not decided"
+        if self.is_clear_beside:
+            return "not decided" if self.undecided else "comes out"
+        if self.decision is not None and self.decision.tolerance is not None:
+            return "hits" if self.decision.is_near else "not decided"
+        return "hits" if self.hits else "not decided"
+
+    @property
+    def is_clear_beside(self) -> bool:
+        """Whether it is proved that the tool meets nothing but what was left out at the start."""
+        if self.enclosed or not self.proof.is_inside_known:
+            return False
+        if self.decision is not None and self.decision.is_clear:
+            return True
+        is_asked = self.decision is not None and self.decision.tolerance is not None
+        return self.proof.is_clear and not self.hits and not is_asked
 
     @property
     def at_least(self) -> float:

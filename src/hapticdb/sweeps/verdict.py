@@ -35,7 +35,18 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
     if found.left_at_start:
         line += f"; left out, since touched at the start: {names_of(found.left_at_start)}"
         line += "".join(f"; in {one.object.name} {depth_text(one)}" for one in _told(found.depths))
+    if found.is_clear_beside and found.verdict == "not decided":
+        line += f"; {_next_for_depths(found.undecided)}"
     return line
+
+
+def _next_for_depths(undecided: Sequence[ContactDepth]) -> str:
+    """Say what may decide depths, or how to do without them."""
+    deeper = max(one.deepest_most - one.at_start for one in undecided)
+    if math.isfinite(deeper) and not any(one.why for one in undecided):
+        return f"--tolerance {math.ceil(1e4 * deeper) / 10:g} may decide it"
+    who = names_of([one.object for one in undecided])
+    return f"let the path begin where the tool is free of {who}, or leave that out by --exclude"
 
 
 def _told(depths: Sequence[ContactDepth]) -> Sequence[ContactDepth]:
@@ -67,6 +78,9 @@ def _line(found: Swept, shell: PointShell) -> str:
             return f"comes out with at least {length_text(found.at_least)}{_closer_clause(found)}"
         return f"comes out: no hit in {samples}{_clearance_clause(found.clearance)}"
     if found.verdict == "not decided":
+        if found.is_clear_beside:
+            who = names_of([one.object for one in found.undecided])
+            return f"not decided: meets nothing else, but how deep it goes into {who} is not proved"
         if found.hits:
             return _graze(found)
         return f"not decided: no hit in {samples}{_near_clause(found)}, but {_doubt(found, shell)}"

@@ -299,20 +299,24 @@ def _run(session: "Session", tool: str, force: ForceOptions) -> "tuple[Report, l
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:
-    """Leave with the exit code of the signal that ended the session, if one did."""
+    """Leave with the exit code of the signal that ended the session, or 1 without a database."""
     if signal.SIGTERM in signals:
         render.note(f"ended by SIGTERM after {report.loop.seconds:.3g} s")
         raise typer.Exit(TERMINATED)
     if signals:
         raise Interrupted(f"ended by Ctrl-C after {report.loop.seconds:.3g} s")
+    if report.database_lost is not None:
+        raise typer.Exit(1)
 
 
 def _waited_for(session: "Session") -> "Report":
     """Wait for a session's end; what a person should know at once is told at once."""
-    report, is_told, notes = None, False, session_page.LooseNotes()
+    report, is_told = None, False
+    notes, database_notes = session_page.LooseNotes(), session_page.DatabaseNotes()
     while report is None:
         report = session.wait(LOOK_EVERY)
         notes.look(session)
+        database_notes.look(session)
         if session.recording_ended is not None and not is_told:
             render.note(f"{session.recording_ended}; the session goes on without it")
             is_told = True

@@ -10,7 +10,7 @@ from hapticdb.cli.options import JsonOption, UrlArgument
 RightName = Literal["viewer", "toucher", "editor", "nobody"]
 MEANINGS: dict[RightName, str] = {
     "viewer": "may read and touch",
-    "toucher": "may read and touch, and keep what 'hapticdb calibrate' measures",
+    "toucher": "may read and touch, and keep what 'hapticdb info --calibrate' measures",
     "editor": "may import, move and remove objects",
     "nobody": "has no right here any more",
 }

@@ -1,4 +1,4 @@
-"""The verbs that look at an environment: info, objects, calibrate, analyze."""
+"""The verbs that look at an environment: info, objects."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
@@ -69,23 +69,49 @@ LimitOption = Annotated[
 ]
 PageOption = Annotated[int | None, typer.Option(metavar="N", help="Which page, from 1.")]
 
+CalibrateOption = Annotated[
+    bool,
+    typer.Option("--calibrate", help="Measure what queries cost on this machine, and keep it."),
+]
+ColdOption = Annotated[
+    bool,
+    typer.Option("--cold", help="With --calibrate: measure with empty caches, on SQLite."),
+]
 
-def info(url: UrlArgument, *, json: JsonOption = False) -> None:
+
+def info(
+    url: UrlArgument,
+    *,
+    calibrate: CalibrateOption = False,
+    cold: ColdOption = False,
+    json: JsonOption = False,
+) -> None:
     """Show an environment's engine, grid, layout, scene, size and statistics.
 
-    Example: hapticdb info car.db --json
+    With --calibrate, what statements, descents and rows cost is measured, and
+    the statistics are renewed. The figures are kept in the environment; the
+    strategies cbgroup and auto decide by them.
+
+    Example: hapticdb info car.db --calibrate
     """
     from contextlib import closing
 
+    from hapticdb.errors import UsageError
     from hapticdb.store.connect import open_store
 
+    if cold and not calibrate:
+        raise UsageError("--cold belongs to --calibrate: give it, too")
+    measured = _measured(url, cold=cold) if calibrate else None
     # the store: an Environment brings what touches and imports, a tenth of a second
     with closing(open_store(url, read_only=True)) as store:
         looked_at = _Overview.of(store)
     if json:
-        render.say_json(looked_at.record())
-    else:
-        render.show(render.facts(looked_at.facts()))
+        costs = {} if measured is None else {"costs": _costs_record(*measured)}
+        render.say_json(looked_at.record() | costs)
+        return
+    render.show(render.facts(looked_at.facts()))
+    if measured is not None:
+        _show_costs(measured[0])
 
 
 class _Overview(NamedTuple):
@@ -296,25 +322,12 @@ def size_text(obj: "Object") -> str:
     )
 
 
-def calibrate(
-    url: UrlArgument,
-    *,
-    cold: Annotated[
-        bool,
-        typer.Option(
-            "--cold", help="Measure with empty caches, on SQLite; these figures are then kept."
-        ),
-    ] = False,
-    json: JsonOption = False,
-) -> None:
-    """Measure what statements, descents and rows cost on this database and machine.
+def _measured(url: str, *, cold: bool) -> "tuple[CostModel, bool]":
+    """Costs as measured now, and whether they are kept; renews the statistics, too, if it may."""
+    from contextlib import suppress
 
-    The figures are kept in the environment; the strategies cbgroup and auto decide by them.
-
-    Example: hapticdb calibrate car.db
-    """
     import hapticdb
-    from hapticdb.errors import ReadOnlyError
+    from hapticdb.errors import AccessError, ReadOnlyError
 
     try:
         env = hapticdb.open(url)
@@ -324,51 +337,26 @@ def calibrate(
         is_kept = False
     with env:
         render.compile_kernels("calibrate")
+        if is_kept:
+            with suppress(AccessError):  # a role may keep costs only
+                env.analyze()
         costs = env.calibrate(cold=cold)
-        rows = env.size().rows
     if not is_kept:
         render.note(f"{env.url} can only be read: the figures were measured, and not kept")
-    if json:
-        known = costs.figures()
-        figures = {name: known[name] for name in (*MEANINGS, *RATIOS) if name in known}
-        render.say_json({"figures": figures, "spread": dict(costs.spread), "kept": is_kept})
-        return
+    return costs, is_kept
+
+
+def _costs_record(costs: "CostModel", is_kept: bool) -> dict[str, object]:  # noqa: FBT001 - private
+    known = costs.figures()
+    figures = {name: known[name] for name in (*MEANINGS, *RATIOS) if name in known}
+    return {"figures": figures, "spread": dict(costs.spread), "kept": is_kept}
+
+
+def _show_costs(costs: "CostModel") -> None:
     render.show(_costs_table(costs))
     worth = costs.descent / costs.row_in_gap if costs.row_in_gap else None
     when = "always" if worth is None else f"when it should hold fewer than {worth:.1f} rows"
-    render.say(
-        f"{render.counted(rows, 'row')}, {costs.rows_per_block:.0f} in a leaf block; "
-        f"a gap is scanned {when}"
-    )
-
-
-def analyze(url: UrlArgument, *, json: JsonOption = False) -> None:
-    """Renew the statistics of the keys: cbgroup and auto estimate from them what a gap holds.
-
-    An import renews them at its end, PostgreSQL's autovacuum from time to time.
-    This verb is for after many edits.
-
-    Example: hapticdb analyze car.db
-    """
-    import hapticdb
-
-    with hapticdb.open(url) as env:
-        before = env.freshness()
-        found = env.analyze()
-    if json:
-        render.say_json(
-            {
-                "source": found.source,
-                "buckets": found.resolution,
-                "rows": found.n_rows,
-                "before": before._asdict(),
-            }
-        )
-        return
-    render.say(
-        f"{env.url}: {SOURCES[found.source]}, {render.counted(found.resolution, 'bucket')} over "
-        f"{render.counted(found.n_rows, 'row')}; before: {_age(before)}"
-    )
+    render.say(f"{costs.rows_per_block:.0f} rows in a leaf block; a gap is scanned {when}")
 
 
 def _age(freshness: "Freshness") -> str:

@@ -1,5 +1,6 @@
 """The verb replay."""
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -19,7 +20,8 @@ def replay(
     url: Annotated[
         str | None,
         typer.Argument(
-            metavar="URL", help="The environment; unless given, the one that was recorded."
+            metavar="URL",
+            help="The environment; unless given, the recorded one if its file is beside FILE.",
         ),
     ] = None,
     *,
@@ -79,7 +81,13 @@ def _replayed(session: "Recording", url: str | None, *, until_damage: bool) -> "
     """Compute a recording's wrenches again."""
     import hapticdb
 
-    with hapticdb.open(url or session.header.environment, read_only=True) as env:
+    place: str | Path
+    if url is None:
+        place = session.environment_beside()
+        render.note(f"{session.path} names {place}, which is opened")
+    else:
+        place = url
+    with hapticdb.open(place, read_only=True) as env:
         render.compile_kernels("replay")
         if env.grid.is_hierarchical:
             compile_for_large(session.header.shell, session.header.budget_points)

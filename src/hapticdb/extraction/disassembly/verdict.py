@@ -14,7 +14,9 @@ def disassembly_line(found: Disassembly) -> str:
     before = _taken_off(found)[: -len(found.parts)]
     if not before:
         return f"nothing has to come out before: {last}"
-    return f"comes out after {names_of(before)}, each step proved: {last}"
+    if found.verdict == "comes out":
+        return f"comes out after {names_of(before)}, each step proved: {last}"
+    return f"comes out after {names_of(before)}, not every step proved while in contact: {last}"
 
 
 def step_line(found: Disassembly, number: int) -> str:

@@ -317,9 +317,9 @@ class PartsPanel:
     def put_back(self) -> None:
         """Put the part in hand back to its place; the first tool takes its place in the hand."""
         browser = self._browser
-        if browser.taken is not None:
-            browser.scene.show((browser.taken,))
-        browser.taken = None
+        taken, browser.taken = browser.taken, None
+        if taken is not None:
+            browser.scene.show((taken,))
         self._back.visible = False
         browser.take_in_hand(browser.site.tools[0])
         browser.touch.show_tool()

@@ -10,7 +10,7 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -120,36 +120,19 @@ class Contacts:
         """End the threads."""
         self._threads.shutdown(wait=True, cancel_futures=True)
 
-    async def attend(self, websocket: WebSocket, first: bytes | None = None) -> None:
+    async def attend(self, websocket: WebSocket, wish: ProxyWish | None = None) -> None:
         """Serve one accepted client until it leaves.
 
-        first: its first message, if that has been read already.
+        wish: what its first message asks for, if that has been read already.
         """
         self.n_clients += 1
         try:
-            await self._serve(websocket, first)
-        except OtherVersionError as error:
-            await self._refuse(websocket, CloseCode.VERSION, str(error))
-        except (ProtocolError, UsageError) as error:
-            await self._refuse(websocket, CloseCode.MALFORMED, str(error))
-        except TimeoutError:
-            await self._refuse(websocket, CloseCode.IDLE, "nothing came for too long")
-        except (WebSocketDisconnect, asyncio.CancelledError):
-            pass
-        except HapticDBError:
-            await self._refuse(websocket, CloseCode.FAILED, "the server's database fails now")
+            async with refusing(websocket):
+                await self._serve(websocket, wish or await read_wish(websocket, self._tools))
         finally:
             self.n_clients -= 1
 
-    async def _refuse(self, websocket: WebSocket, code: int, reason: str) -> None:
-        if websocket.application_state is WebSocketState.CONNECTED:
-            short = reason.encode()[:REASON_BYTES].decode("utf-8", "ignore")
-            with contextlib.suppress(TimeoutError, WebSocketDisconnect):  # it does not read
-                async with asyncio.timeout(CLOSING_WITHIN):
-                    await websocket.close(int(code), short)
-
-    async def _serve(self, websocket: WebSocket, first: bytes | None) -> None:
-        wish = unpack_wish(await first_message(websocket) if first is None else first)
+    async def _serve(self, websocket: WebSocket, wish: ProxyWish) -> None:
         loop = asyncio.get_running_loop()
         source = await loop.run_in_executor(self._threads, self._source, wish)
         state = _Client(self._rate)
@@ -179,12 +162,7 @@ class Contacts:
 
     def _source(self, wish: ProxyWish) -> ContactSource:
         """Tool for a wish."""
-        name = wish.tool
-        if not name and len(self._tools) == 1:
-            name = next(iter(self._tools))
-        if name not in self._tools:
-            raise UsageError(f"no tool of that name: there are {', '.join(sorted(self._tools))}")
-        return ContactSource(self._cells, self._tools[name], wish._replace(tool=name), self._rate)
+        return ContactSource(self._cells, self._tools[wish.tool], wish, self._rate)
 
     async def _listen(self, websocket: WebSocket, state: "_Client") -> None:
         """Keep the newest hand; read no faster than is allowed."""
@@ -249,9 +227,42 @@ def _timed_proxy(source: ContactSource, hand: HandState, arrived: float) -> tupl
     return message, time.perf_counter() - start
 
 
-async def first_message(websocket: WebSocket) -> bytes:
-    """Wait for a client's first message; TimeoutError after `FIRST_WITHIN`."""
-    return await asyncio.wait_for(_receive(websocket), FIRST_WITHIN)
+@contextlib.asynccontextmanager
+async def refusing(websocket: WebSocket) -> AsyncIterator[None]:
+    """Close the connection with a plain reason if the block fails."""
+    try:
+        yield
+    except OtherVersionError as error:
+        await _refuse(websocket, CloseCode.VERSION, str(error))
+    except (ProtocolError, UsageError) as error:
+        await _refuse(websocket, CloseCode.MALFORMED, str(error))
+    except TimeoutError:
+        await _refuse(websocket, CloseCode.IDLE, "nothing came for too long")
+    except (WebSocketDisconnect, asyncio.CancelledError):
+        pass
+    except HapticDBError:
+        await _refuse(websocket, CloseCode.FAILED, "the server's database fails now")
+
+
+async def _refuse(websocket: WebSocket, code: int, reason: str) -> None:
+    if websocket.application_state is WebSocketState.CONNECTED:
+        short = reason.encode()[:REASON_BYTES].decode("utf-8", "ignore")
+        with contextlib.suppress(TimeoutError, WebSocketDisconnect):  # it does not read
+            async with asyncio.timeout(CLOSING_WITHIN):
+                await websocket.close(int(code), short)
+
+
+async def read_wish(websocket: WebSocket, tools: Collection[str]) -> ProxyWish:
+    """Wait for a client's first message, and judge it; TimeoutError after `FIRST_WITHIN`.
+
+    tools : names of the tools that there are.
+    """
+    wish = unpack_wish(await asyncio.wait_for(_receive(websocket), FIRST_WITHIN))
+    if not wish.tool and len(tools) == 1:
+        return wish._replace(tool=next(iter(tools)))
+    if wish.tool not in tools:
+        raise UsageError(f"no tool of that name: there are {', '.join(sorted(tools))}")
+    return wish
 
 
 async def _receive(websocket: WebSocket) -> bytes:

@@ -4,16 +4,16 @@ import asyncio
 import logging
 from pathlib import Path
 
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
-from hapticdb.errors import HapticDBError, ProtocolError
+from hapticdb.errors import HapticDBError
 from hapticdb.kernels.compiling import entries_for, load
-from hapticdb.page.tools import POINTS, built_in, inset_of
+from hapticdb.page.tools import BUILT_IN, POINTS, built_in, inset_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.header import CloseCode
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Role
-from hapticdb.server.contacts.endpoint import Contacts, first_message, is_admitted
+from hapticdb.server.contacts.endpoint import Contacts, is_admitted, read_wish, refusing
 from hapticdb.server.served import Served
 from hapticdb.store.base import scene_bounds
 
@@ -35,6 +35,7 @@ class ServedContacts:
 
     def __init__(self, served: Served) -> None:
         self._served = served
+        self._tool_names = {Path(file).stem for file in served.tools} or {*BUILT_IN}
         self._changing = asyncio.Lock()
         self._contacts: Contacts | None = None
         self._cells: ResidentCells | None = None
@@ -52,19 +53,14 @@ class ServedContacts:
         self._n_clients += 1
         try:
             await websocket.accept()
-            # read before the wait: uvicorn answers no ping while a message is not taken
-            first = await first_message(websocket)
-            contacts = await self._opened()
-            if contacts is None:
-                await websocket.close(int(CloseCode.FAILED), FAILED)
-            else:
-                await contacts.attend(websocket, first)
-        except ProtocolError as error:
-            await websocket.close(int(CloseCode.MALFORMED), str(error))
-        except TimeoutError:
-            await websocket.close(int(CloseCode.IDLE), "a HELLO must come first")
-        except WebSocketDisconnect:
-            pass
+            async with refusing(websocket):
+                # read before the wait: uvicorn answers no ping while a message is not taken
+                wish = await read_wish(websocket, self._tool_names)
+                contacts = await self._opened()
+                if contacts is None:
+                    await websocket.close(int(CloseCode.FAILED), FAILED)
+                else:
+                    await contacts.attend(websocket, wish)
         finally:
             self._n_clients -= 1
             await asyncio.shield(self._rest())

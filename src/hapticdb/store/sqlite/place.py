@@ -46,6 +46,8 @@ class OpenedFile:
         self._connection: apsw.Connection | None = None
         self._beside: dict[str, Identity] = {}
         self.stamp: Stamp | None = None
+        self._size = 0
+        """Greatest size so far, bytes."""
         self.identity = self._found()
         self._mark = sqlite_log.check_log(self._real)
 
@@ -78,7 +80,7 @@ class OpenedFile:
         Raises
         ------
         ConnectionLostError
-            When the file, or SQLite's files beside it, were moved, deleted or replaced.
+            When the file, or SQLite's files beside it, were moved, deleted, replaced or cut short.
         DamagedError
             When another file was copied over it.
         """
@@ -165,6 +167,12 @@ class OpenedFile:
             raise ConnectionLostError(
                 f"{self._path} cannot be reached any more ({error.strerror}): put it back"
             ) from error
+        if status.st_size < self._size:
+            raise ConnectionLostError(
+                f"{self._path} has become shorter ({status.st_size} bytes of {self._size}): open "
+                "it again"
+            )
+        self._size = status.st_size
         return status.st_dev, status.st_ino
 
 

@@ -69,7 +69,9 @@ AsGivenOption = Annotated[
 LeaveStartOption = Annotated[
     bool,
     typer.Option(
-        "--leave-start", help="Leave out the objects that are hit at the first pose, and name them."
+        "--leave-start",
+        help="Leave out the objects that are hit at the first pose, if it is proved that the tool "
+        "goes no deeper into them.",
     ),
 ]
 ToleranceOption = Annotated[

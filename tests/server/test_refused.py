@@ -1,0 +1,162 @@
+"""Clients that are refused, or send nothing: they cost others nothing, and log no error."""
+
+import asyncio
+import contextlib
+import logging
+import socket
+from collections.abc import AsyncIterator
+from http.client import HTTPConnection
+from pathlib import Path
+from typing import cast
+
+import pytest
+import uvicorn
+from starlette.responses import PlainTextResponse
+from starlette.types import ASGIApp, Receive, Scope, Send
+from starlette.websockets import WebSocket, WebSocketState
+
+from children import PATIENCE
+from hapticdb.protocol.contacts import ProxyWish, pack_wish
+from hapticdb.protocol.header import CloseCode
+from hapticdb.server.access import Access, Role
+from hapticdb.server.contacts.serving import ServedContacts
+from hapticdb.server.guards import Guards
+from hapticdb.server.limits import Limits
+from hapticdb.server.served import Served
+from hapticdb.server.transports import limited
+
+UPGRADE = (
+    "GET / HTTP/1.1\r\nHost: {host}\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
+)
+
+
+async def answer(scope: Scope, receive: Receive, send: Send) -> None:
+    await PlainTextResponse("well")(scope, receive, send)
+
+
+@contextlib.asynccontextmanager
+async def serving(app: ASGIApp, limits: Limits) -> AsyncIterator[tuple[str, int]]:
+    """Address of a server under these limits."""
+    http, websocket = limited(limits)
+    config = uvicorn.Config(
+        app, http=http, ws=websocket, lifespan="off", log_config=None, timeout_graceful_shutdown=1,
+        limit_concurrency=limits.connections,
+    )  # fmt: skip
+    server = uvicorn.Server(config)
+    with socket.create_server(("127.0.0.1", 0), backlog=128) as listening:
+        running = asyncio.create_task(server.serve([listening]))
+        yield listening.getsockname()
+        server.should_exit = True
+        await asyncio.wait_for(running, PATIENCE)
+
+
+def status(place: tuple[str, int]) -> int:
+    """Status of the answer to a request."""
+    connection = HTTPConnection(*place, timeout=PATIENCE)
+    with contextlib.closing(connection):
+        connection.request("GET", "/healthz")
+        return connection.getresponse().status
+
+
+def test_idle_connections_leave_room_for_requests() -> None:
+    """More than the server takes at once; some have sent a part of a request."""
+    limits = Limits(connections=32, silent=8, request_seconds=PATIENCE)
+
+    async def work() -> None:
+        async with serving(answer, limits) as place:
+            with contextlib.ExitStack() as idle:
+                for n in range(2 * limits.connections):
+                    made = idle.enter_context(socket.create_connection(place, PATIENCE))
+                    made.sendall(b"GET / HTTP/1.1\r\nHost:" if n % 2 else b"")
+                    await asyncio.sleep(0)
+                assert await asyncio.to_thread(status, place) == 200
+
+    asyncio.run(work())
+
+
+def test_a_request_that_is_answered_is_not_cut_by_idle_connections() -> None:
+    limits = Limits(silent=2, request_seconds=PATIENCE)
+    may_answer = asyncio.Event()
+
+    async def answer_late(scope: Scope, receive: Receive, send: Send) -> None:
+        await may_answer.wait()
+        await answer(scope, receive, send)
+
+    async def work() -> None:
+        async with serving(answer_late, limits) as place:
+            asked = asyncio.create_task(asyncio.to_thread(status, place))
+            with contextlib.ExitStack() as idle:
+                while not asked.done():
+                    for _ in range(8):
+                        made = await asyncio.to_thread(socket.create_connection, place, PATIENCE)
+                        idle.enter_context(made)
+                    may_answer.set()
+                assert await asked == 200
+
+    asyncio.run(work())
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "rebound.example"])
+def test_a_refused_websocket_logs_no_error(host: str, caplog: pytest.LogCaptureFixture) -> None:
+    async def close(scope: Scope, receive: Receive, send: Send) -> None:
+        await WebSocket(scope, receive, send).close(1008)
+
+    def refused(place: tuple[str, int]) -> bytes:
+        with socket.create_connection(place, PATIENCE) as client:
+            client.sendall(UPGRADE.format(host=host).encode())
+            return client.recv(1 << 16)
+
+    async def work() -> None:
+        async with serving(Guards(close), Limits()) as place:
+            said = await asyncio.to_thread(refused, place)
+            assert said.startswith(b"HTTP/1.1 403 ")
+
+    with caplog.at_level(logging.WARNING):
+        asyncio.run(work())
+    assert caplog.records == []
+
+
+class Asking:
+    """A WebSocket that asks for something, and keeps why it is closed."""
+
+    application_state = WebSocketState.CONNECTED
+
+    def __init__(self, message: bytes) -> None:
+        self.headers = {"authorization": "Bearer a-token-for-toucher"}
+        self.message = message
+        self.closed: tuple[int, str] | None = None
+
+    async def accept(self) -> None:
+        pass
+
+    async def receive(self) -> dict[str, object]:
+        return {"type": "websocket.receive", "bytes": self.message}
+
+    async def close(self, code: int, reason: str) -> None:
+        self.closed = code, reason
+
+
+@pytest.mark.parametrize(
+    ("message", "code"),
+    [
+        (b"malformed", CloseCode.MALFORMED),
+        (b"hd\x02\x80" + bytes(96), CloseCode.VERSION),
+        (pack_wish(ProxyWish("hammer", 1.0, 1.0, 1.0, 1.0)), CloseCode.MALFORMED),
+    ],
+)
+def test_a_wrong_wish_is_refused_before_cells_and_tools_are_made(
+    message: bytes, code: CloseCode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def made(_: ServedContacts) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(ServedContacts, "_open", made)
+    access = Access({"a-token-for-toucher": Role.TOUCHER})
+    served = cast(
+        "Served", type("", (), {"access": access, "tools": (str(tmp_path / "plate.stl"),)})
+    )
+    asking = Asking(message)
+    asyncio.run(ServedContacts(served).serve(cast("WebSocket", asking)))
+    assert asking.closed is not None
+    assert asking.closed[0] == code

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from hapticdb.grid import Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field.lattice import BEYOND, HALF_WIDTH, ROW_SIDE, ROW_VALUES, STEPS
+from hapticdb.kernels.surfaces.distances import band_pieces
 from hapticdb.kernels.surfaces.voxelize import brick_voxels, voxelize
 
 Array = NDArray[np.float64]
@@ -96,4 +97,20 @@ def band_rows(triangles: Array, grid: Grid) -> BandRows:
         np.stack([bricks[k][1] for k in keys.tolist()]),
         voxels,
         {(i, j, k): q for (i, j, k), q in zip(named, steps[inside].tolist(), strict=True)},
+    )
+
+
+def band_of(
+    triangles: NDArray[np.float64], bits: int
+) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
+    """Band of triangles or points: keys (R,), packed rows and their ends; see `band_pieces`."""
+    pieces = list(band_pieces(triangles, bits))
+    starts = np.cumsum([0] + [len(data) for _, _, data, _ in pieces])
+    keys = [np.empty(0, dtype=np.int64), *(keys for _, keys, _, _ in pieces)]
+    packed = [np.empty(0, dtype=np.uint8), *(data for _, _, data, _ in pieces)]
+    ends = [ends + start for (_, _, _, ends), start in zip(pieces, starts, strict=False)]
+    return (
+        np.concatenate(keys),
+        np.concatenate(packed),
+        np.concatenate([np.empty(0, dtype=np.int64), *ends]),
     )

@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bands import band_of
 from hapticdb.errors import FileError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest import voxelizing
@@ -12,7 +13,6 @@ from hapticdb.ingest.layout import bricks_of_rows, merged, rows_of_bricks
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.kernels.field.lattice import BEYOND
 from hapticdb.kernels.field.packing import unpack
-from hapticdb.kernels.surfaces.distances import band_of
 from hapticdb.mesh import Part, read_file
 from mesh_files import text
 

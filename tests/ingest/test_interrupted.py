@@ -4,6 +4,7 @@ Each interrupted import is a process of its own that says how many parts it has 
 waits before the last of them, so that no signal comes when it has ended.
 """
 
+import os
 import signal
 import sys
 import time
@@ -168,6 +169,50 @@ def test_an_import_interrupted_while_it_reads_leaves_nothing(folder: Path, tmp_p
         assert process.returncode == -signal.SIGINT
     assert left_behind(tmp_path) == []
     until(lambda: not is_alive(parser))
+
+
+ENDLESS = """
+import sys, time
+from hapticdb.__main__ import main
+from hapticdb.kernels.surfaces import voxelize
+
+def endless(*given, real=voxelize.voxelize_pieces):
+    _, *bricks = next(real(*given))
+    print("begun", flush=True)
+    while True:
+        time.sleep(0.001)
+        yield 0.5, *bricks
+
+voxelize.voxelize_pieces = endless
+sys.exit(main())
+"""
+"""A program: the command line, where no part ever comes to its last piece."""
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "words"),
+    [
+        (signal.SIGINT, 130, "hapticdb: interrupted; what went in is whole, and the same command"),
+        (signal.SIGTERM, 143, ""),
+    ],
+)
+def test_an_import_ends_at_a_signal_in_the_middle_of_a_part(
+    folder: Path, tmp_path: Path, number: signal.Signals, code: int, words: str
+) -> None:
+    command = [sys.executable, "-c", ENDLESS, "import", str(tmp_path / "e.db")]
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    env = os.environ | {"TMPDIR": str(scratch)}
+    with child([*command, str(folder / "balls.obj")], env=env) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "begun\n"
+        process.send_signal(number)
+        _, told = process.communicate(timeout=PATIENCE)
+    assert process.returncode == code
+    assert told.count("\n") == bool(words)
+    assert told.startswith(words)
+    assert left_behind(tmp_path) == ["scratch"]
+    assert left_behind(scratch) == []
 
 
 def wait_for_parser(pid: int) -> int:

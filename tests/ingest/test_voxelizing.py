@@ -6,11 +6,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from children import PATIENCE
 from hapticdb.errors import FileError
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import ImportOptions, ImportProgress, import_files
 from hapticdb.ingest.layout import Bricks
-from hapticdb.ingest.voxelizing import bricks_of_triangles, merged_in_turn
+from hapticdb.ingest.voxelizing import (
+    ShareCallback,
+    bricks_of_pieces,
+    in_threads,
+    merged_in_turn,
+    pieces_of_points,
+)
 from hapticdb.kernels.surfaces import voxelize
 from mesh_files import text
 
@@ -34,7 +41,7 @@ def test_pieces_give_the_bits_of_the_whole(
 ) -> None:
     """Each piece begins and ends within a row of a triangle."""
     keys, occupancy = voxelize.voxelize(4 * given, BITS + 2)
-    found = bricks_of_triangles(4 * given, BITS + 2, "a part", most=most)
+    found = bricks_of_pieces(voxelize.voxelize_pieces(4 * given, BITS + 2, most), "a part")
     np.testing.assert_array_equal(found.keys, keys)
     np.testing.assert_array_equal(found.occupancy, occupancy)
 
@@ -47,6 +54,47 @@ def test_pieces_are_bounded_and_tell_their_share() -> None:
     assert max(len(keys) for _, keys, _ in pieces) <= 100 + 2 * 1024
     assert shares == sorted(shares)
     assert 0.0 < shares[0] < 0.5 < shares[-2] < shares[-1] == 1.0
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_piece_ends_also_where_many_triangles_meet_the_same_bricks(axis: int) -> None:
+    needle = np.full((3, 3), 3.5)
+    needle[:, axis] = 0.25, 2.0**21 - 0.25, 7.0
+    once = voxelize.voxelize(needle[None], 21)
+    found = list(voxelize.voxelize_pieces(np.repeat(needle[None], 12, axis=0), 21, 1 << 17))
+    assert len(found) >= 3
+    for _, *bricks in found:
+        np.testing.assert_array_equal(bricks[0], once[0])
+        np.testing.assert_array_equal(bricks[1], once[1])
+
+
+def test_a_cloud_is_marked_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    points = np.random.default_rng(1).uniform(0.0, 40.0, (1000, 1, 3))
+    monkeypatch.setattr("hapticdb.ingest.voxelizing.POINTS_AT_ONCE", 300)
+    found = list(pieces_of_points(points, BITS))
+    assert [share for share, *_ in found] == [0.3, 0.6, 0.9, 1.0]
+    bricks = bricks_of_pieces(found, "a part")
+    whole = voxelize.mark_points(points, BITS)
+    np.testing.assert_array_equal(bricks.keys, whole[0])
+    np.testing.assert_array_equal(bricks.occupancy, whole[1])
+    assert bricks_of_pieces(pieces_of_points(points[:0], BITS), "a part").keys.shape == (0,)
+
+
+def test_threads_stop_at_the_next_share_when_nobody_wants_their_results() -> None:
+    began = threading.Barrier(3, timeout=PATIENCE)
+
+    def work(item: int, share: ShareCallback) -> int:
+        if item == 0:
+            return item
+        if item < 3:
+            began.wait()
+        while True:
+            share(0.5)
+
+    results = in_threads(range(9), work, 2)
+    assert next(results) == 0
+    began.wait()
+    results.close()
 
 
 def test_a_merge_empties_its_list() -> None:
@@ -63,7 +111,7 @@ def test_a_part_that_does_not_fit_into_memory_is_refused_in_one_line(
     monkeypatch.setattr("hapticdb.ingest.voxelizing._MERGE_FROM", 100)
     monkeypatch.setattr("hapticdb.ingest.voxelizing.bytes_available", lambda: 50_000)
     with pytest.raises(FileError, match=r"a part: its rows take .*fewer --bits"):
-        bricks_of_triangles(HUGE, BITS, "a part", most=100)
+        bricks_of_pieces(voxelize.voxelize_pieces(HUGE, BITS, 100), "a part")
     path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     options = ImportOptions(grid=GridOptions(bits=BITS), layout="voxel")
     (report,) = import_files(tmp_path / "a.db", [path], options)
@@ -80,7 +128,7 @@ def test_an_import_tells_the_share_of_a_part(
     heard: list[ImportProgress] = []
 
     def slow(*given: object) -> "object":
-        given[3](0.5)  # type: ignore[operator]
+        given[2](0.5)  # type: ignore[operator]
         assert told.wait(60)
         return Bricks(*voxelize.voxelize(HUGE, BITS))
 
@@ -89,7 +137,7 @@ def test_an_import_tells_the_share_of_a_part(
         if now.share:
             told.set()
 
-    monkeypatch.setattr("hapticdb.ingest.voxelizing.bricks_of_triangles", slow)
+    monkeypatch.setattr("hapticdb.ingest.voxelizing.bricks_of_pieces", slow)
     path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     grid = GridOptions(bits=BITS)
     options = ImportOptions(grid=grid, layout=layout, distances=False)  # type: ignore[arg-type]

@@ -7,9 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from bands import band_of
 from hapticdb.kernels.field.lattice import BEYOND, HALF_WIDTH, VOXELS_A_STEP
 from hapticdb.kernels.field.packing import unpack
-from hapticdb.kernels.surfaces.distances import BLOCK, BLOCK_BRICKS, band_of, band_pieces
+from hapticdb.kernels.surfaces import distances
+from hapticdb.kernels.surfaces.distances import (
+    BLOCK,
+    BLOCK_BRICKS,
+    PAIRS_OF_PIECE,
+    band_pieces,
+)
 from hapticdb.kernels.surfaces.voxelize import voxelize
 from naive import z_order
 
@@ -180,6 +187,20 @@ def test_pieces_are_bounded_and_tell_their_share() -> None:
     assert shares == sorted(shares)
     assert shares[-1] == 1.0
     np.testing.assert_array_equal(keys, band_of(triangles, 9)[0])
+
+
+@pytest.mark.skipif(not JIT, reason="too slow without the JIT")
+def test_a_piece_ends_also_within_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that an import that many triangles crowd into one block can be ended."""
+    monkeypatch.setattr(distances, "TRIANGLES_AT_ONCE", 7000)
+    one = random_triangles(3, "medium", 1, 40.0)
+    shares = [share for share, *_ in band_pieces(np.repeat(one, 20_000, axis=0), 6)]
+    assert len([share for share in shares if share == 0.0]) == 3
+    assert len([share for share in shares if share > 0.0]) == 20_000 // PAIRS_OF_PIECE + 1
+    for found, alone in zip(
+        band_of(np.repeat(one, 20_000, axis=0), 6), band_of(one, 6), strict=True
+    ):
+        np.testing.assert_array_equal(found, alone)
 
 
 def test_nothing_has_no_rows() -> None:

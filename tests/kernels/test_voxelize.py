@@ -11,7 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from children import PATIENCE
-from hapticdb.kernels.surfaces.voxelize import brick_voxels, count_voxels, mark_points, voxelize
+from hapticdb.kernels.surfaces.voxelize import (
+    brick_voxels,
+    count_voxels,
+    mark_points,
+    voxelize,
+    voxelize_pieces,
+)
 from naive import Voxel, bricks_of_voxels, voxels_of_points, voxels_of_triangles, z_order
 
 JIT = not numba.config.DISABLE_JIT
@@ -37,6 +43,11 @@ def rectangle(a: list[float], b: list[float], c: list[float]) -> Triangles:
     """Two triangles that form the parallelogram of corner a and its neighbours b and c."""
     p, q, r = np.array(a), np.array(b), np.array(c)
     return np.array([[p, q, r], [q, q + r - p, r]])
+
+
+def numbers(rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Voxels (n, 3) as one number each, ascending."""
+    return np.sort(rows @ np.array([1 << 42, 1 << 21, 1]))
 
 
 def random_triangles(seed: int, count: int, size: float, edge: float) -> Triangles:
@@ -131,6 +142,51 @@ def test_a_face_between_two_layers_marks_both() -> None:
     square = rectangle([2, 2, 4], [5, 2, 4], [2, 5, 4])
     expected = {(i, j, k) for i in range(1, 6) for j in range(1, 6) for k in (3, 4)}
     assert voxels(square, 3) == expected
+
+
+def touched(low: float, high: float, side: int) -> NDArray[np.int64]:
+    """Voxels of an axis whose closed boxes meet low..high."""
+    return np.arange(max(int(np.ceil(low)) - 1, 0), min(int(np.floor(high)), side - 1) + 1)
+
+
+@settings(max_examples=20 if JIT else 3, deadline=None)
+@given(
+    st.integers(11, 15 if JIT else 11),
+    st.permutations(range(3)),
+    st.tuples(*[st.integers(0, 12)] * 4),
+    st.sampled_from([1, 7, 1 << 17]),
+)
+def test_wide_rectangles_mark_the_voxels_that_they_touch(
+    bits: int, axes: list[int], halves: tuple[int, int, int, int], most: int
+) -> None:
+    """Between two layers or within one, and their sides so, too: all is in halves of a voxel.
+
+    A row has more columns than are marked at once. Each piece begins and ends within a row.
+    """
+    side = 1 << bits
+    layer, begin, end, width = (n / 2 for n in halves)
+    low, high = np.array([begin, 3.0, layer]), np.array([side - end, 3.0 + width, layer])
+    corners = np.empty((4, 3))
+    corners[:, axes] = low
+    corners[[1, 2], axes[0]] = high[0]
+    corners[[2, 3], axes[1]] = high[1]
+    pieces = voxelize_pieces(corners[[[0, 1, 2], [0, 2, 3]]], bits, most)
+    found = [numbers(brick_voxels(keys, occupancy)) for _, keys, occupancy in pieces]
+    spans = [touched(low[n], high[n], side) for n in np.argsort(axes)]
+    expected = np.stack(np.meshgrid(*spans, indexing="ij"), axis=-1).reshape(-1, 3)
+    np.testing.assert_array_equal(np.unique(np.concatenate(found)), numbers(expected))
+
+
+@pytest.mark.parametrize(("axis", "layer"), [(0, 0), (1, 5), (2, 6)])
+def test_a_wide_triangle_between_two_layers_marks_both(axis: int, layer: int) -> None:
+    """Its corners are those of voxels, and so are points of its longest side."""
+    width, height = 1024, 1024 if JIT else 4
+    corners = np.array([[3, 2, layer], [3 + width, 2, layer], [3, 2 + height, layer]], np.float64)
+    found = brick_voxels(*voxelize(np.roll(corners, axis, axis=1)[None], 11))
+    i, j, k = np.indices((width + 2, height + 2, 2)) - np.array([1, 1, 1])[:, None, None, None]
+    is_met = np.maximum(i, 0) * height + np.maximum(j, 0) * width <= width * height
+    expected = np.stack([i + 3, j + 2, k + layer], axis=-1)[is_met & (k + layer >= 0)]
+    np.testing.assert_array_equal(numbers(found), numbers(np.roll(expected, axis, axis=1)))
 
 
 def test_a_face_inside_a_layer_marks_it_alone() -> None:

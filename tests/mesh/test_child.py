@@ -4,6 +4,7 @@ import os
 import signal
 import struct
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from subprocess import Popen
@@ -15,8 +16,10 @@ from children import child, finished, until
 from hapticdb.errors import MissingExtraError
 from hapticdb.mesh import Defects, parse_in_process, read_file
 from hapticdb.mesh import reader as reader_module
+from hapticdb.mesh import scratch as scratch_module
 from hapticdb.mesh.child import allowance
 from hapticdb.mesh.formats.gltf import bytes_beside
+from hapticdb.mesh.scratch import scratch_folder
 from hapticdb.resident.table import is_alive
 from mesh_files import cause, gltf, names, text, threemf
 
@@ -116,9 +119,10 @@ def test_what_a_parser_prints_does_not_mix_with_its_answer(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="elsewhere the limit of time ends the child")
-def test_no_child_outlives_a_killed_parent(
-    tmp_path: Path, fake_laspy: Callable[[str], Path]
+def test_what_a_killed_parent_leaves_ends_with_it_or_is_removed_by_the_next(
+    tmp_path: Path, fake_laspy: Callable[[str], Path], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Its child ends with it. Its folder is removed, but not the folder of a process that runs."""
     pid_file = tmp_path / "pid"
     path = fake_laspy(f"os.rename(_note(), {str(pid_file)!r}); time.sleep(600)")
     module = tmp_path / "laspy" / "__init__.py"
@@ -127,12 +131,21 @@ def test_no_child_outlives_a_killed_parent(
     module.write_text(module.read_text() + note)
     # No guard for the main module: a spawned child would run this script again.
     script = f"import sys\nsys.path.insert(0, {str(tmp_path)!r})\nfrom hapticdb.mesh import read_file\nread_file({str(path)!r})\n"  # noqa: E501
-    scratch = os.environ | {"TMPDIR": str(tmp_path)}  # a killed parent leaves its files behind
-    with child([sys.executable, "-c", script], cwd=tmp_path, env=scratch) as parent:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(scratch_module, "YOUNG_S", 0.0)
+    env = os.environ | {"TMPDIR": str(tmp_path)}
+    with child([sys.executable, "-c", script], cwd=tmp_path, env=env) as parent:
         until(pid_file.exists)
+        (left,) = tmp_path.glob("hapticdb-parser-*")
+        with scratch_folder():
+            assert left.exists()
         parser = int(pid_file.read_text())
         parent.kill()  # the parent alone, not its group
         until(lambda: not is_alive(parser))
+    with scratch_folder() as own:
+        assert not left.exists()
+        assert Path(own).exists()
+    assert not Path(own).exists()
 
 
 def test_an_interrupt_leaves_no_child(

@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     is_debugging = "--debug" in takewhile(lambda arg: arg.startswith("-"), args)
     _print_anything()
     try:
-        with leaving_in_order():
+        with leaving_in_order(), render.noting_warnings():
             code = app(args, standalone_mode=False, prog_name="hapticdb")
         sys.stdout.flush()
     except (BrokenPipeError, PipeClosedError):

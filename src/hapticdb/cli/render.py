@@ -5,6 +5,7 @@ import os
 import re
 import shutil
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -43,6 +44,14 @@ def printable(text: str) -> str:
 def note(text: str) -> None:
     """Say something on standard error, in a line."""
     print(f"hapticdb: {printable(' '.join(text.split(NEW_LINE)))}", file=sys.stderr)
+
+
+@contextmanager
+def noting_warnings() -> Iterator[None]:
+    """Say warnings of the library in a line each."""
+    with warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_, **__: note(str(message))
+        yield
 
 
 def say(text: str = "") -> None:

@@ -302,8 +302,10 @@ def ingest_file(
     """
     plan = _planned(store, mesh_file, options)
     jobs = options.jobs or os.cpu_count() or 1
+    id_of = {part.name: i for i, part in plan.changed.items()}
     anew = voxelize_parts(plan.changed.values(), mesh_file, store, options.unit, jobs)
-    n_replaced = replace_changed(store, anew, {part.name: i for i, part in plan.changed.items()})
+    with contextlib.closing(anew):
+        n_replaced = replace_changed(store, anew, id_of)
     added = _add_missing(store, mesh_file, plan, (options.unit, jobs), progress)
     n_dropped = drop_others(store, mesh_file) if options.replace else 0
     written = tuple(obj for obj in store.objects() if obj.id in added) if added else ()
@@ -381,12 +383,13 @@ def _add_missing(
             progress(ImportProgress(mesh_file.link, n_done, n_parts, voxels, share))
 
     parts = voxelize_parts(still_missing(), mesh_file, store, *unit_and_jobs, report_share)
-    for obj, rows in parts:
-        n_done += 1
-        if (new_id := added_or_present(store, obj, rows, plan.known)) is not None:
-            added.add(new_id)
-        voxels += obj.voxels
-        report_share(0.0)
+    with contextlib.closing(parts):
+        for obj, rows in parts:
+            n_done += 1
+            if (new_id := added_or_present(store, obj, rows, plan.known)) is not None:
+                added.add(new_id)
+            voxels += obj.voxels
+            report_share(0.0)
     return added
 
 

@@ -140,12 +140,13 @@ class _Run:
                 return _Measured(obj, error)
             return _Measured(obj, rows)
 
-        for obj, found in in_threads(self._found(objects), measured, jobs, self._tell):
-            self._link = obj.link
-            if isinstance(found, HapticDBError):
-                self._leave_out((obj,), found)
-            else:
-                self._write(obj, found)
+        with closing(in_threads(self._found(objects), measured, jobs, self._tell)) as done:
+            for obj, found in done:
+                self._link = obj.link
+                if isinstance(found, HapticDBError):
+                    self._leave_out((obj,), found)
+                else:
+                    self._write(obj, found)
 
     def _found(self, objects: Sequence[Object]) -> Iterator[tuple[Object, Part]]:
         """Objects with their parts; objects whose part is not found are left out."""

@@ -1,9 +1,10 @@
 """Voxelizes parts into rows: a part in pieces of bounded size, several parts at once in threads."""
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
 from functools import partial
+from threading import Event
 from typing import TypeVar
 
 import numpy as np
@@ -21,11 +22,15 @@ from hapticdb.store.base import BRICK_BYTES, Layout, Object, Rows, Store
 Item = TypeVar("Item")
 Done = TypeVar("Done")
 ShareCallback = Callable[[float], None]
-"""Called with the share of a part that is done, 0 to 1; from any thread."""
+"""Called often with the share of a part that is done, 0 to 1; from any thread. May raise an error,
+which ends the work."""
 SHARE_EVERY_S = 0.2
 """Seconds between two calls with the share of a long part. Larger: fewer calls."""
 BYTES_A_BRICK = 8 + BRICK_BYTES
 """Memory of a brick, bytes: its key and its occupancy."""
+POINTS_AT_ONCE = 1 << 22
+"""Points of a cloud that one call marks: less than a second of work. A larger value reports
+progress less often."""
 _VOXELS_SHARE = 0.1
 """Share of a part's time that its voxels take where distances are computed, too."""
 _MERGE_FROM = 8 * voxelize.MOST_BRICKS
@@ -65,13 +70,13 @@ def rows_of_part(
     voxels_alone = _VOXELS_SHARE if distances else 1.0
     if part.is_cloud:
         corners = _on_grid(part.world_points(world_from_part), grid)[:, None]
-        bricks = Bricks(*voxelize.mark_points(corners, grid.bits))
+        pieces = pieces_of_points(corners, grid.bits)
     else:
         corners = _on_grid(part.triangles(world_from_part), grid)
-        marking = _portion(progress, 0.0, voxels_alone)
-        bricks = bricks_of_triangles(corners, grid.bits, what, marking)
-        if layout == "voxel":
-            check_room(8 * voxelize.count_voxels(bricks.occupancy), what)
+        pieces = voxelize.voxelize_pieces(corners, grid.bits)
+    bricks = bricks_of_pieces(pieces, what, _portion(progress, 0.0, voxels_alone))
+    if layout == "voxel":
+        check_room(8 * voxelize.count_voxels(bricks.occupancy), what)
     if distances:
         measuring = _portion(progress, voxels_alone, 1.0)
         room = partial(check_room, what=what)
@@ -92,16 +97,24 @@ def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
     return np.clip(scaled, 0.0, float(grid.side), out=scaled)
 
 
-def bricks_of_triangles(
-    triangles: NDArray[np.float64],
-    bits: int,
+def pieces_of_points(
+    points: NDArray[np.float64], bits: int
+) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8]]]:
+    """Bricks of the voxels that hold points, as `voxelize.voxelize_pieces` yields them."""
+    end = max(len(points), 1)
+    for first in range(0, end, POINTS_AT_ONCE):
+        some = points[first : first + POINTS_AT_ONCE]
+        yield min(1.0, (first + POINTS_AT_ONCE) / end), *voxelize.mark_points(some, bits)
+
+
+def bricks_of_pieces(
+    found: Iterable[tuple[float, NDArray[np.int64], NDArray[np.uint8]]],
     what: str,
     progress: ShareCallback | None = None,
-    most: int = voxelize.MOST_BRICKS,
 ) -> Bricks:
-    """Bricks of the voxels that triangles (T, 3, 3) meet, in voxels from the grid's origin.
+    """Bricks of a part from pieces with the share that is done, keys and occupancy.
 
-    Needs memory for twice the result and one piece of `most` bricks. what : the name in errors.
+    Needs memory for twice the result and one piece. what : the name in errors.
 
     Raises
     ------
@@ -110,7 +123,7 @@ def bricks_of_triangles(
     """
     pieces: list[Bricks] = []
     n_waiting, merge_from = 0, _MERGE_FROM
-    for share, keys, occupancy in voxelize.voxelize_pieces(triangles, bits, most):
+    for share, keys, occupancy in found:
         pieces.append(Bricks(keys, occupancy))
         n_waiting += len(keys)
         if progress is not None and share < 1.0:
@@ -152,7 +165,7 @@ def voxelize_parts(
     unit: str | None,
     jobs: int,
     progress: ShareCallback = lambda _share: None,
-) -> Iterator[tuple[Object, Rows]]:
+) -> Generator[tuple[Object, Rows], None, None]:
     """Yield objects and rows of parts, in order; threads voxelize a few parts in advance.
 
     Threads suffice because the voxelizer runs without the interpreter lock.
@@ -180,22 +193,30 @@ def in_threads(
     work: Callable[[Item, ShareCallback], Done],
     jobs: int,
     progress: ShareCallback = lambda _share: None,
-) -> Iterator[Done]:
+) -> Generator[Done, None, None]:
     """Yield the results of `work` on items, in order; threads compute a few in advance.
+
+    When this generator ends early, so does the work: the next call with a share raises an error.
 
     Parameters
     ----------
     work : callable
-        Called in a thread with an item, and with what it calls with the share that is done.
+        Called in a thread with an item, and with what it calls often with the share that is done.
     jobs : int
         Number of threads.
     progress : callable
         Called in the caller's thread with the share of the item that it waits for.
     """
     shares: dict[int, float] = {}
+    ended = Event()
+
+    def note_share(number: int, share: float) -> None:
+        if ended.is_set():
+            raise CancelledError
+        shares[number] = share
 
     def worked(number: int, item: Item) -> Done:
-        return work(item, partial(shares.__setitem__, number))
+        return work(item, partial(note_share, number))
 
     waiting: deque[tuple[int, Future[Done]]] = deque()
 
@@ -215,6 +236,7 @@ def in_threads(
         while waiting:
             yield next_result()
     finally:
+        ended.set()
         pool.shutdown(wait=True, cancel_futures=True)
 
 

@@ -23,6 +23,7 @@ from hapticdb.mesh.clean import Cleaned, CleanPart
 from hapticdb.mesh.parse import READERS, parse
 from hapticdb.mesh.part import Defects, MeshFile, Part
 from hapticdb.mesh.raw import UnreadableError
+from hapticdb.mesh.scratch import scratch_folder
 from hapticdb.units import metres_of
 
 _EXTRAS = {"las": ("pointcloud", ("laspy", "lazrs")), "step": ("step", ("cascadio",))}
@@ -175,9 +176,8 @@ def _ask_child(request: dict[str, Any], seconds: float) -> Cleaned:
         "MKL_NUM_THREADS": "1",
         "MALLOC_ARENA_MAX": "2",
     }
-    # A child that is killed cannot remove its own files.
     with (
-        tempfile.TemporaryDirectory(prefix="hapticdb-", ignore_cleanup_errors=True) as scratch,
+        scratch_folder() as scratch,
         tempfile.TemporaryFile() as words,
     ):
         child = subprocess.Popen(  # noqa: S603 - our own interpreter and file

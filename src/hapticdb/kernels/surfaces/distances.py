@@ -25,7 +25,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import BYTES2, FLOATS3, INT, INTS, INTS2, entry, inlined, leaf
+from hapticdb.kernels._jit import (
+    BYTES,
+    BYTES2,
+    FLOATS,
+    FLOATS3,
+    INT,
+    INTS,
+    INTS2,
+    entry,
+    fields_of,
+    inlined,
+    leaf,
+)
 from hapticdb.kernels.curves import compact, z_encode
 from hapticdb.kernels.field.lattice import BEYOND, HALF_WIDTH, ROW_SIDE, ROW_VALUES, step_of
 from hapticdb.kernels.field.packing import pack
@@ -65,6 +77,11 @@ EDGE_X, EDGE_Y, EDGE_Z, INVERSE_SQUARE = 3, 4, 5, 6
 ROWS_OF_PIECE = 8 * BLOCK_BRICKS
 """Rows that one call makes at most: 4 MB. A larger value takes more memory and reports progress
 less often."""
+PAIRS_OF_PIECE = 1 << 12
+"""Triangles that one call enters into blocks at most: a second or two where each covers a block. A
+larger value reports progress less often."""
+TRIANGLES_AT_ONCE = 1 << 20
+"""Triangles, or points, whose blocks one call finds. A larger value reports progress less often."""
 
 
 class Prepared(NamedTuple):
@@ -91,6 +108,9 @@ class Block(NamedTuple):
     squares: NDArray[np.float64]
     spans: NDArray[np.int64]
     steps: NDArray[np.uint8]
+
+
+BLOCK_FIELDS = fields_of(Block, FLOATS, INTS2, BYTES)
 
 
 @leaf
@@ -391,25 +411,27 @@ def copy_row(steps, i, j, k, out, n):
     return least < BEYOND
 
 
-@entry(FLOATS3, INTS2, INTS, INT, INTS, BYTES2)
-def rows_of_blocks(triangles, pairs, at, bits, keys, out):
+@entry(FLOATS3, INTS2, BLOCK_FIELDS, INTS, INT, INTS, BYTES2)
+def rows_of_blocks(triangles, pairs, block, at, bits, keys, out):
     """Rows of the blocks from pair at[0] on; returns how many rows were made.
 
-    pairs (P, 2) int64, as `find_blocks` gives them, ascending; at (1,) int64, where the next call
-    goes on. Stops before a block for which keys (R,) and out (R, 1000) may have no room.
+    pairs (P, 2) int64, as `find_blocks` gives them, ascending; block : the one under construction,
+    kept between calls; at (1,) int64, where the next call goes on. Stops before a block for which
+    keys (R,) and out (R, 1000) may have no room, and after `PAIRS_OF_PIECE`, also within a block.
     """
     shape = Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
-    block = Block(
-        np.empty(SIDE**3), np.empty((SIDE * SIDE, 2), np.int64), np.empty(SIDE**3, np.uint8)
-    )
     bricks = np.int64(1) << max(bits - 3, 0)
     n_rows = 0
+    end = at[0] + PAIRS_OF_PIECE
     while at[0] < pairs.shape[0] and n_rows + BLOCK_BRICKS <= out.shape[0]:
         key = pairs[at[0], 0]
         i, j, k = compact(key >> 2), compact(key >> 1), compact(key)
-        for line in range(SIDE * SIDE):
-            block.spans[line, 0] = block.spans[line, 1] = 0
+        if at[0] == 0 or pairs[at[0] - 1, 0] != key:  # the block is new
+            for line in range(SIDE * SIDE):
+                block.spans[line, 0] = block.spans[line, 1] = 0
         while at[0] < pairs.shape[0] and pairs[at[0], 0] == key:
+            if at[0] == end:
+                return n_rows
             kind = set_shape(triangles, pairs[at[0], 1], shape, 0.0)
             enter(shape, kind, block, i * BLOCK - 1, j * BLOCK - 1, k * BLOCK - 1)
             at[0] += 1
@@ -429,7 +451,7 @@ def rows_of_blocks(triangles, pairs, at, bits, keys, out):
 def band_pieces(
     triangles: NDArray[np.float64], bits: int, rows: int = ROWS_OF_PIECE
 ) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]]:
-    """Band of triangles or points, a bounded number of rows at a time.
+    """Band of triangles or points, a bounded number of rows and a bounded time at once.
 
     Parameters
     ----------
@@ -440,7 +462,7 @@ def band_pieces(
     bits : int
         Bits an axis of the grid, 1 to 21.
     rows : int
-        Rows of a piece; at least `BLOCK_BRICKS`.
+        Most rows of a piece; at least `BLOCK_BRICKS`.
 
     Yields
     ------
@@ -448,37 +470,29 @@ def band_pieces(
         How much is done, 0 to 1.
     bricks_z : NDArray[np.int64]
         (R,) Z-order keys of bricks, ascending through all pieces, each once: all bricks of the
-        grid whose row has a distance of up to h.
+        grid whose row has a distance of up to h. A piece may have none.
     data, ends : arrays
         Their packed rows, as `hapticdb.kernels.field.packing.pack` gives them.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64)
-    pairs = np.empty((4 * len(corners) + 64, 2), dtype=np.int64)
-    n_pairs = find_blocks(corners, bits, pairs)
-    if n_pairs > len(pairs):
-        pairs = np.empty((n_pairs, 2), dtype=np.int64)
-        find_blocks(corners, bits, pairs)
-    pairs = pairs[:n_pairs]
-    pairs = np.ascontiguousarray(pairs[np.argsort(pairs[:, 0], kind="stable")])
-    at = np.zeros(1, dtype=np.int64)
     keys = np.empty(rows, dtype=np.int64)
     out = np.empty((rows, ROW_VALUES), dtype=np.uint8)
-    while at[0] < n_pairs:
-        n_rows = rows_of_blocks(corners, pairs, at, bits, keys, out)
-        yield float(at[0]) / n_pairs, keys[:n_rows].copy(), *pack(out[:n_rows])
-
-
-def band_of(
-    triangles: NDArray[np.float64], bits: int
-) -> tuple[NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]:
-    """Band of triangles or points: keys (R,), packed rows and their ends; see `band_pieces`."""
-    pieces = list(band_pieces(triangles, bits))
-    starts = np.cumsum([0] + [len(data) for _, _, data, _ in pieces])
-    keys = [np.empty(0, dtype=np.int64), *(keys for _, keys, _, _ in pieces)]
-    packed = [np.empty(0, dtype=np.uint8), *(data for _, _, data, _ in pieces)]
-    ends = [ends + start for (_, _, _, ends), start in zip(pieces, starts, strict=False)]
-    return (
-        np.concatenate(keys),
-        np.concatenate(packed),
-        np.concatenate([np.empty(0, dtype=np.int64), *ends]),
-    )
+    found = [np.empty((0, 2), dtype=np.int64)]
+    for first in range(0, len(corners), TRIANGLES_AT_ONCE):
+        some = corners[first : first + TRIANGLES_AT_ONCE]
+        pairs = np.empty((4 * len(some) + 64, 2), dtype=np.int64)
+        n_pairs = find_blocks(some, bits, pairs)
+        if n_pairs > len(pairs):
+            pairs = np.empty((n_pairs, 2), dtype=np.int64)
+            find_blocks(some, bits, pairs)
+        pairs[:n_pairs, 1] += first
+        found.append(pairs[:n_pairs])
+        yield 0.0, keys[:0], *pack(out[:0])
+    pairs = np.concatenate(found)
+    found.clear()
+    pairs = np.ascontiguousarray(pairs[np.argsort(pairs[:, 0], kind="stable")])
+    block = Block(np.empty(SIDE**3), np.empty((SIDE**2, 2), np.int64), np.empty(SIDE**3, np.uint8))
+    at = np.zeros(1, dtype=np.int64)
+    while at[0] < len(pairs):
+        n_rows = rows_of_blocks(corners, pairs, block, at, bits, keys, out)
+        yield float(at[0]) / len(pairs), keys[:n_rows].copy(), *pack(out[:n_rows])

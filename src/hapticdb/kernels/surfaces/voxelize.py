@@ -42,6 +42,7 @@ from hapticdb.kernels.surfaces.bricks import (
     RUN_LAST,
     RUNS_AT_ONCE,
     brick_voxels,
+    bricks_of_run,
     count_voxels,
     mark_points,
     mark_runs,
@@ -67,15 +68,19 @@ AXIS_X, AXIS_Y, AXIS_Z = np.int64(0), np.int64(1), np.int64(2)
 OUTSIDE, CUT, WHOLE = 0, 1, 2
 """Part of a triangle's bounding box that lies in the grid: nothing, a part, all."""
 AT_TRIANGLE, AT_ROW, AT_COLUMN, ROWS_DONE = 0, 1, 2, 3
-"""Fields of `resume`, where voxelizing goes on: the triangle; the row and the column in it, the row
--1 where the triangle is new; thousandths of its rows that are done."""
+"""Fields of `resume`, where voxelizing goes on: the triangle; the row in it, counted from the first
+row of its bounding box, or -1 where the triangle is new; the column; thousandths of its rows that
+are done."""
 MOST_BRICKS = 1 << 17
 """Bricks of a piece: 10 MB, and as much again while they are sorted. A larger value takes more
 memory and reports progress less often; a smaller one sorts and merges more pieces."""
-RUNS_A_BRICK = 64
-"""Runs of voxels after which a piece ends, for each brick that it may have. So a piece ends, and
-progress is reported, also where many triangles meet few bricks. A larger value reports less
-often."""
+VISITS_A_BRICK = 128
+"""Bricks that runs of voxels may cross before a piece ends, for each brick that it may have. So a
+piece ends, and progress is reported, also where many triangles meet the same bricks. A larger value
+reports less often."""
+VOXELS_AT_ONCE = 1 << 23
+"""Voxels that the runs collected before they are marked may have: a fraction of a second. A smaller
+value marks fewer runs at once where triangles are very long."""
 STEEP = 1e40
 """Stands for 1 / 0 in the slope of an axis that is square to the direction solved for."""
 
@@ -320,8 +325,7 @@ def write_run(runs, n, axes, voxel, last):
 def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
     """Write the runs of voxels of triangles from resume on until `runs` is full; return how many.
 
-    resume (4,) int64 is where it stopped: the triangle, and row and column in it, or -1 where the
-    triangle is new. The other arrays keep what was computed for the triangle.
+    resume (4,) int64 is where it stopped. The other arrays keep what was computed for the triangle.
     """
     n_runs = 0
     for t in range(resume[AT_TRIANGLE], triangles.shape[0]):
@@ -346,7 +350,7 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
             set_axes(axes, plane, corners, normal, u, v, w)
             set_spans(axes, spans, box, v, w)
         else:
-            first_u = resume[AT_ROW]
+            first_u += resume[AT_ROW]
         box_intervals = (float(first_v), float(box[1, v]), float(box[0, w]), float(box[1, w]))
         for at_u in range(first_u, box[1, u] + 1):
             x = float(at_u)
@@ -366,7 +370,11 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
                 if first > last or low_w > high_w:
                     continue
                 if n_runs == runs.shape[0]:
-                    resume[AT_TRIANGLE], resume[AT_ROW], resume[AT_COLUMN] = t, at_u, at_v
+                    resume[AT_TRIANGLE], resume[AT_ROW], resume[AT_COLUMN] = (
+                        t,
+                        at_u - box[0, u],
+                        at_v,
+                    )
                     return n_runs
                 start = (at_u + move_u, at_v + move_v, first + move_w)
                 write_run(runs, n_runs, uvw, start, last + move_w)
@@ -379,19 +387,20 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
 def voxelize_kernel(triangles, bits, resume, most):
     """Bricks of the voxels that triangles (T, 3, 3) meet: packed keys, words (C, 8), count.
 
-    Stops after about `most` bricks, or many times as many runs of voxels. resume (4,) int64 is
-    where it begins and then where it has stopped: `AT_TRIANGLE`, `AT_ROW`, `AT_COLUMN` and
-    `ROWS_DONE`. All is done when the triangle is T.
+    Stops after about `most` bricks, or when runs of voxels have crossed many times as many.
+    resume (4,) int64 is where it begins and then where it has stopped: `AT_TRIANGLE`, `AT_ROW`,
+    `AT_COLUMN` and `ROWS_DONE`. All is done when the triangle is T.
     """
     edge = float(1 << bits)
     table, n_bricks = new_table(FIRST_CAPACITY), np.int64(0)
-    runs = np.empty((RUNS_AT_ONCE, 5), np.int64)
+    longest = longest_box(triangles, edge)
+    runs = np.empty((max(min(RUNS_AT_ONCE, VOXELS_AT_ONCE // longest), 1), 5), np.int64)
     corners = np.empty((3, 3))
     box = np.empty((3, 3), np.int64)
     axes = np.empty((9, 4))
     plane = np.empty(5)
-    spans = np.empty((longest_box(triangles, edge), 2))
-    n_done = np.int64(0)
+    spans = np.empty((longest, 2))
+    n_visits = np.int64(0)
     if resume[AT_ROW] >= 0:  # in the middle of a triangle: compute its axes again
         place_in_grid(triangles, resume[AT_TRIANGLE], edge, corners, box)
         normal = normal_of(corners)
@@ -401,16 +410,17 @@ def voxelize_kernel(triangles, bits, resume, most):
     while (
         resume[AT_TRIANGLE] < triangles.shape[0]
         and n_bricks < most
-        and n_done < RUNS_A_BRICK * most
+        and n_visits < VISITS_A_BRICK * most
     ):
         n_runs = fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs)
         table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
-        n_done += n_runs
+        for n in range(n_runs):
+            n_visits += bricks_of_run(runs[n, 2 - runs[n, RUN_AXIS]], runs[n, RUN_LAST])
     resume[ROWS_DONE] = 0
     if resume[AT_ROW] >= 0:
         u, v, w = order_axes(box, normal_of(corners))
         span = box[1, u] - box[0, u] + 1
-        resume[ROWS_DONE] = (1000 * (resume[AT_ROW] - box[0, u])) // span
+        resume[ROWS_DONE] = (1000 * resume[AT_ROW]) // span
     return table.keys, table.words, n_bricks
 
 

@@ -1,0 +1,103 @@
+"""Compiled kernels come from folders that nobody else can write into."""
+
+import os
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from children import finished
+from hapticdb.kernels._cache import LENT, cache_folder
+
+
+@pytest.fixture(autouse=True)
+def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A user's cache and a folder of temporary files."""
+    (tmp_path / "temporary").mkdir()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    monkeypatch.setenv(LENT, "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "temporary"))
+    return tmp_path
+
+
+def lend(folder: Path) -> None:
+    """Let the group write into a folder."""
+    folder.chmod(0o770)
+
+
+def give(folder: Path) -> None:
+    """Give a folder to another user."""
+    if os.geteuid():
+        pytest.skip("root alone gives folders away")
+    os.chown(folder, 4242, 4242)
+
+
+def link(folder: Path) -> None:
+    """Put a link in a folder's place."""
+    folder.rename(folder.with_suffix(".moved"))
+    folder.symlink_to(folder.with_suffix(".moved"))
+
+
+def open_around(folder: Path) -> None:
+    """Let all replace a folder."""
+    folder.parent.chmod(0o777)
+
+
+@pytest.mark.parametrize("spoil", [lend, give, link, open_around])
+@pytest.mark.parametrize("which", ["kernels", "outer"])
+def test_a_folder_that_others_could_write_into_is_not_used(
+    folders: Path, which: str, spoil: Callable[[Path], None]
+) -> None:
+    first = Path(cache_folder())
+    assert first.is_relative_to(folders / "cache")
+    assert cache_folder() == str(first)
+    spoil(first if which == "kernels" else first.parent)
+    with pytest.warns(RuntimeWarning, match=f"not kept in {first}: it is a link"):
+        second = Path(cache_folder())
+    assert second.is_relative_to(folders / "temporary")
+    spoil(second if which == "kernels" else second.parent)
+    with pytest.warns(RuntimeWarning) as told:
+        third = Path(cache_folder())
+    assert len(told) == 2
+    assert third.parent == folders / "temporary"
+    assert third.stat().st_mode & 0o777 == 0o700
+    assert cache_folder() == str(third)  # processes that this one starts use it, too
+
+
+def test_folders_are_made_for_the_user_alone(folders: Path) -> None:
+    (folders / "cache").mkdir()
+    before = os.umask(0)
+    try:
+        made = Path(cache_folder())
+    finally:
+        os.umask(before)
+    assert {path.stat().st_mode & 0o777 for path in (made, made.parent)} == {0o700}
+
+
+NOTED = """
+import subprocess, sys
+from hapticdb.cli.render import noting_warnings
+
+with noting_warnings():
+    from hapticdb.kernels._cache import CACHE_FOLDER
+print(CACHE_FOLDER, flush=True)
+if len(sys.argv) == 1:
+    subprocess.run([sys.executable, __file__, "started"], check=True)
+"""
+
+
+def test_a_process_without_a_folder_says_so_in_a_line_and_removes_its_own(folders: Path) -> None:
+    Path(cache_folder()).chmod(0o777)
+    (folders / f"temporary/hapticdb-{os.geteuid()}").touch()
+    script = folders / "script.py"
+    script.write_text(NOTED)
+    env = os.environ | {"TMPDIR": str(folders / "temporary")}
+    done = finished([sys.executable, str(script)], env=env, check=True)
+    own, started = done.stdout.splitlines()
+    assert own == started
+    assert Path(own).parent == folders / "temporary"
+    assert not Path(own).exists()
+    assert done.stderr.startswith(f"hapticdb: compiled kernels are not kept in {folders}/cache/")
+    assert done.stderr.count("\n") == 1

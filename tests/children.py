@@ -191,6 +191,24 @@ def until(claim: Callable[[], object], every: float = 0.01, patience: float = PA
         time.sleep(every)
 
 
+def descendants(pid: int) -> list[int]:
+    """Processes that a process has started, and those that they have started."""
+    found: list[int] = []
+    for task in Path(f"/proc/{pid}/task").glob("*/children"):
+        with contextlib.suppress(OSError):  # ended meanwhile
+            for child in map(int, task.read_text().split()):
+                found += [child, *descendants(child)]
+    return found
+
+
+def named(pid: int) -> str:
+    """Name of a process; empty where it has ended."""
+    try:
+        return Path(f"/proc/{pid}/comm").read_text().strip()
+    except OSError:
+        return ""
+
+
 def joined(thread: threading.Thread) -> None:
     """Wait for a thread's end."""
     thread.join(PATIENCE)

@@ -5,10 +5,11 @@ from pathlib import Path
 import pytest
 
 from damaging import WRONG, is_missed, outcomes, samples_in
+from draws import is_every
 
 
 @pytest.mark.parametrize(
-    "cases", [40, pytest.param(1000, marks=pytest.mark.long)], ids=["short", "long"]
+    "cases", [40, pytest.param(1000 if is_every() else 200, marks=pytest.mark.long)]
 )
 def test_damage_is_told_or_harmless_and_found_by_check(tmp_path: Path, cases: int) -> None:
     found = list(outcomes(samples_in(tmp_path), tmp_path, range(cases), seed=1))

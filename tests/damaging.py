@@ -1,21 +1,13 @@
 """Damages copies of small environments and compares what they answer.
 
-`store/test_damaged.py` runs a few cases. Each case takes one environment, damages a copy, and asks
-the copy everything that a user asks: open, grid and size, objects, touches by every strategy, and
-`check`. For many cases:
-
-    python tests/damaging.py 10000 --seed 0
+Each case takes one environment, damages a copy, and asks the copy everything that a user asks:
+open, grid and size, objects, touches by every strategy, and `check`.
 """
 
-import argparse
 import json
 import resource
 import shutil
-import signal
-import sys
-import tempfile
 import traceback
-from collections import Counter
 from collections.abc import Callable, Iterator
 from multiprocessing import get_context
 from multiprocessing.connection import Connection
@@ -295,43 +287,6 @@ def _received(pipe: Connection) -> Any:  # noqa: ANN401 - what the child sent
     return pipe.recv()
 
 
-_is_stopped: list[bool] = []
-
-
-def _stop(*_: object) -> None:
-    """Signal handler: print the outcomes so far."""
-    _is_stopped.append(True)
-
-
-def main() -> int:
-    """Run many cases and print their outcomes; return 1 if one was silent or worse."""
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("cases", type=int)
-    parser.add_argument("--seed", type=int, default=0)
-    args = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        samples = samples_in(Path(folder))
-        counts: Counter[tuple[str, str, str, str]] = Counter()
-        bad = 0
-        signal.signal(signal.SIGTERM, _stop)
-        for found in outcomes(samples, Path(folder), range(args.cases), args.seed):
-            if _is_stopped:
-                break
-            counts[found.sample.split("-")[0], found.damage, found.read, found.check] += 1
-            if found.read in WRONG or found.check in WRONG or is_missed(found):
-                bad += 1
-                last_line = found.words.strip().rpartition("\n")[2]
-                sys.stderr.write(" ".join([*found[:4], last_line]) + "\n")
-    for line, count in sorted(counts.items()):
-        sys.stdout.write("\t".join([f"{count:6}", *line]) + "\n")
-    for which in (2, 3):
-        totals: Counter[str] = Counter()
-        for line, count in counts.items():
-            totals[line[which]] += count
-        sys.stdout.write(f"{('reading', 'check')[which - 2]} {dict(totals)}\n")
-    return int(bad > 0)
-
-
 WRONG = ("silent", "traceback", "hang", "crash")
 
 
@@ -340,7 +295,3 @@ def is_missed(found: Outcome) -> bool:
     may_end = found.damage.startswith("cut") or found.damage.endswith("of the log")
     harmless = found.read == "right" or (found.read == "earlier" and may_end)
     return found.check == "sound" and not (may_end and harmless)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

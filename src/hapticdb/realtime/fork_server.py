@@ -205,10 +205,15 @@ def _answered(wanted: Order, descriptors: Sequence[int]) -> tuple[int, int]:
                 raise HapticDBError(
                     f"no process was started in {ANSWER_PATIENCE:g} s: this machine is too slow now"
                 ) from error
-            except BaseException as error:
+            except ConnectionError as error:
+                _end()
+                if is_last:
+                    raise HapticDBError(
+                        "no process can be started (Linux 5.3 or newer?): the errors are above"
+                    ) from error
+            except BaseException:
                 _end()  # its answer would be taken for that of the next order
-                if is_last or not isinstance(error, ConnectionError):
-                    raise
+                raise
     raise AssertionError
 
 
@@ -304,7 +309,8 @@ def _become(wanted: Order, descriptors: list[int], owning: int) -> None:
     for below, above in zip(kept, [*kept[1:], wanted.most_files[0]], strict=True):
         os.closerange(below + 1, above)
     module, name = wanted.work.split(":")
-    Path("/proc/self/comm").write_text(f"hdb-{module.rpartition('.')[2]}")
+    with contextlib.suppress(OSError):  # a name for `ps`, no more
+        Path("/proc/self/comm").write_text(f"hdb-{module.rpartition('.')[2]}")
     os.environ.clear()
     os.environ.update(wanted.environment)
     sys.path[:] = wanted.path

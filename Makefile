@@ -12,20 +12,22 @@ PYTEST := $(BIN)/pytest tests --numprocesses=auto --dist=worksteal
 demo: $(USER)
 	$(BIN)/hapticdb demo demo
 
-# what a person runs ten times a day: minutes, 25 examples a property
+# what a person runs ten times a day: minutes
 test: $(READY)
 	$(PYTEST) -m "not long and not browser" $(ARGS)
 
-# The long loops of kills, rights and recovery, every page's commands, and 200 examples a property.
+# Kills, rights, recovery and every page's commands; of each long loop a dozen steps drawn at random.
 # Three tests run on each two processors: most of them wait for servers half of their time.
 test-long: $(READY)
-	HYPOTHESIS_PROFILE=thorough $(PYTEST) --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) -m long $(ARGS)
+	$(PYTEST) --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) -m long $(ARGS)
 
 # Chromium draws with all processors: beside other tests its pages would be too slow.
 test-browser: $(READY)
 	$(BIN)/pytest tests -m browser $(ARGS)
 
-test-all: test test-long test-browser
+# Every step of every loop, on every PostgreSQL: before a release, not in CI.
+test-all: $(READY) test-browser
+	$(PYTEST) --every-step -m "not browser" $(ARGS)
 
 # the kernels as plain Python: what the JIT must not change
 test-plain: $(READY)

@@ -4,6 +4,7 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import apsw
 import numba
@@ -12,36 +13,56 @@ import pytest
 
 import capabilities
 import children
-import examples
+import draws
 from hapticdb import PointShell
 from hapticdb.kernels.compiling import NAMES, compile_missing
 from hapticdb.pointshell.shell import fibonacci_sphere
+from hapticdb.testing.scenes import KINDS
 from installed import toy_is_installed  # noqa: F401 - a fixture
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 
 NEWEST = {"cli", "house"}
 """Rooms tested on the newest PostgreSQL alone: what is said, not what a server is asked."""
+OLDER = {"test_contract_postgres.py", "test_session_edits.py"}
+"""Modules tested on every PostgreSQL that is found; the others only with --every-step."""
+QUICK_KINDS = {"brick-z", "voxel-lexicographic"}
+"""Layout and curve of the contract's quick tests on other engines than SQLite, which has all."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    draws.add_options(parser)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    examples.choose()
-    children.begin_run()
-    if not hasattr(config, "workerinput"):  # once, before the processes that run tests start
+    draws.choose(config)
+    of_a_worker: dict[str, str] | None = getattr(config, "workerinput", None)
+    if of_a_worker is None:  # once, before the processes that run tests start
+        children.begin_run()
         compile_missing(NAMES)
+    else:
+        children.begin_run(Path(of_a_worker["shared"]))
+
+
+def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 - xdist has no types
+    """Tell a process that runs tests which folder the run shares."""
+    node.workerinput["shared"] = str(children.shared_folder())
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """On older PostgreSQL, all but one server's contract is `long`, and `NEWEST` is left out."""
+    """Leave out, or for the long tests, what repeats a test on another version or engine."""
     older = set(map(named, FOUND[1:]))
     kept: list[pytest.Item] = []
     left_out: list[pytest.Item] = []
     for item in items:
-        params = getattr(getattr(item, "callspec", None), "id", "").split("-")
-        is_older = not older.isdisjoint(params)
-        is_left_out = is_older and item.path.parent.name in NEWEST
+        name, words = item.path.name, getattr(getattr(item, "callspec", None), "id", "")
+        is_older = not older.isdisjoint(words.split("-"))
+        is_wanted = name in OLDER or draws.is_every()
+        is_left_out = is_older and (item.path.parent.name in NEWEST or not is_wanted)
         (left_out if is_left_out else kept).append(item)
-        is_contract = item.path.name.startswith("test_contract_postgres")
-        if is_older and not is_contract:
+        is_other = name.startswith("test_contract_") and name != "test_contract_sqlite.py"
+        kinds = {"-".join(kind) for kind in KINDS}
+        is_other_kind = any(kind in words for kind in kinds - QUICK_KINDS)
+        if is_older or (is_other and is_other_kind):
             item.add_marker(pytest.mark.long)
     config.hook.pytest_deselected(items=left_out)
     items[:] = kept
@@ -62,6 +83,7 @@ def pytest_report_header() -> list[str]:
     servers = ", ".join(map(named, FOUND))
     return [
         f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, {servers}, JIT {jit}",
+        draws.header(),
         *capabilities.header(),
     ]
 

@@ -5,7 +5,6 @@
 import csv
 import errno
 import io
-import re
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +17,6 @@ from hapticdb.recording.file import Header, Recorder, Recording
 from hapticdb.recording.frame import FRAME
 from hapticdb.testing import floor_voxels, write_voxels
 
-ROOT = Path(__file__).parent.parent.parent
 TOUCH = ("touch", "scene.db", "--tool", "tool.npz", "--poses", "path.csv")
 
 
@@ -189,13 +187,3 @@ def test_a_mistake_is_one_line_and_writes_nothing(
     refused(result, *words)
     assert result[1] == ""
     assert {path.name: path.read_bytes() for path in scene.parent.iterdir()} == before
-
-
-def test_every_column_is_in_the_page() -> None:
-    page = (ROOT / "docs" / "format.md").read_text().partition("# The format of CSV files")[2]
-    told = set(re.findall(r"`(\w+)`", page))
-    columns = [*TOUCHED, *CONTACTS, *(name for names in FRAME_COLUMNS.values() for name in names)]
-    between = re.compile(r"_(y_N|y_Nm|y_m|qx|qy)$|_[vw]y_|^tool_[zq]|^tool_y|force_z|torque_[xz]")
-    assert {name for name in columns if name not in told and not between.search(name)} == set()
-    assert told - set(columns) == {"nan"}
-    assert list(FRAME_COLUMNS) == list(FRAME.names or ())

@@ -12,6 +12,7 @@ import pytest
 
 from children import PATIENCE, child, finished
 from command_line import Run, command, made, run, scene  # noqa: F401 - fixtures
+from draws import drawn
 
 AT_IMPORT = """
 import os, signal, sys, runpy
@@ -40,7 +41,7 @@ else:
 """A program: the command line, interrupted in the n-th import after its own module's."""
 
 
-@pytest.mark.parametrize("at", [1, 2, 5, 12, 40, 90, 150, 220, 300, 380, 450, 520])
+@pytest.mark.parametrize("at", drawn(range(1, 521), 5))
 def test_ctrl_c_within_any_import_is_one_line(scene: Path, at: int) -> None:
     how = "module" if at % 2 else "script"
     done = finished([sys.executable, "-c", AT_IMPORT, str(at), how, "objects", str(scene)])
@@ -51,7 +52,7 @@ def test_ctrl_c_within_any_import_is_one_line(scene: Path, at: int) -> None:
         assert (done.returncode, done.stderr) == (130, "hapticdb: interrupted\n")
 
 
-@pytest.mark.parametrize("at", [100, 400, 700, 1000])
+@pytest.mark.parametrize("at", drawn(range(50, 1001, 50), 2))
 def test_ctrl_c_within_an_import_of_a_touch_is_one_line(scene: Path, at: int) -> None:
     touch = ("touch", str(scene), "--tool", "tool.npz", "--poses", "path.csv")
     done = finished([sys.executable, "-c", AT_IMPORT, str(at), "module", *touch], cwd=scene.parent)
@@ -89,7 +90,7 @@ def test_llvmlite_notes_what_it_gave_away_before_ctrl_c_is_raised() -> None:
 def test_ctrl_c_after_any_delay_leaves_no_traceback_of_ours(scene: Path) -> None:
     """Before hapticdb's first line Python prints a traceback, which names no file of hapticdb."""
     codes = set()
-    for n in range(30):
+    for n in drawn(range(30)):
         with child(command("info", scene)) as process:
             with contextlib.suppress(TimeoutExpired):
                 process.wait(timeout=0.02 + 0.03 * n)

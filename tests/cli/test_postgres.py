@@ -19,20 +19,11 @@ from psycopg import sql
 from children import PATIENCE, child, finished
 from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixture `scene` below
     test_a_move_that_cannot_be_changes_nothing,
-    test_a_pose_and_a_matrix_replace_the_placement,
-    test_a_summary_without_json,
-    test_a_translation_counts_from_where_the_object_is,
-    test_an_excluded_object_is_not_felt,
     test_calibrate_prints_figures_with_their_spread,
-    test_every_strategy_prints_the_same_wrench,
     test_info_json_has_the_documented_keys,
     test_info_speaks_to_people,
-    test_objects_are_listed_by_id,
     test_remove_takes_all_or_nothing,
     test_statistics_are_renewed_after_many_edits,
-    test_stiffness_scales_the_force,
-    test_touch_json_has_a_line_a_pose,
-    test_touch_json_is_the_librarys_answer_to_the_bit,
 )
 from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
 from hapticdb.demo import prepare

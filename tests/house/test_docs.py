@@ -75,14 +75,6 @@ def test_the_postgresql_page_gives_the_settings_that_are_set() -> None:
     assert dict(shown) == link.SETTINGS
 
 
-def test_every_make_line_of_the_readme_is_run_by_ci() -> None:
-    ci = (ROOT / ".ci" / "run").read_text()
-    named = re.findall(r"^    (make \w+)", (ROOT / "README.md").read_text(), re.MULTILINE)
-    assert named == ["make demo", "make test"]
-    for line in named:
-        assert line in ci
-
-
 def test_the_docs_show_the_sql_that_runs() -> None:
     shown = SHOWN.findall((ROOT / "docs" / "query.md").read_text())
     assert len(shown) == 9

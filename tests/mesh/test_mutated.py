@@ -6,11 +6,12 @@ from pathlib import Path
 import pytest
 
 from children import finished
+from draws import is_every
 from hapticdb.mesh import SUFFIXES
 from mutate_files import FORMATS
 
 SCRIPT = Path(__file__).parent.parent / "mutate_files.py"
-SHORT, LONG = 450, 6000
+SHORT, LONG = 450, 6000 if is_every() else 1500
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is counted as Linux counts it")

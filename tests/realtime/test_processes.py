@@ -84,12 +84,12 @@ def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "END_PATIENCE", 0.5)
-    for word, status in (("wait", 0), ("hang", -signal.SIGKILL)):
+    for word in ("wait", "hang"):
         process = Process(WORKERS, (word, None), [])
         assert process.receive(LONG) is not None
         monkeypatch.setattr(module, "END_PATIENCE", 0.5 if word == "hang" else LONG)
         process.end()
-        assert process._popen.returncode == status
+        assert not process.is_alive
         process.end()
 
 
@@ -100,15 +100,15 @@ def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
         assert process.receive(LONG) == Message("tidied")
         assert process.receive(LONG) is None
         assert process.wait(LONG)
-        assert process._popen.returncode == 128 + signal.SIGTERM
 
 
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
 def test_a_request_that_is_cut_ends_it_quietly(share: float, tmp_path: Path) -> None:
-    content = pickle.dumps(sys.path) + pickle.dumps(("echo", list(range(1000))))
+    content = pickle.dumps(("echo", list(range(1000))))
     request = tmp_path / "request"
     request.write_bytes(content[: round(share * len(content))])
-    script = f"from {module.__name__} import serve; serve({WORKERS!r}, 1)"
+    start = f"run({WORKERS.partition(':')[0]!r}, 'work', os.pidfd_open(os.getppid()))"
+    script = f"import os; from {module.__name__} import run; {start}"
     with request.open("rb") as cut:
         done = finished([sys.executable, "-c", script], stdin=cut.fileno())
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
@@ -149,6 +149,27 @@ def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
         finally:
             if forks:
                 os.kill(forked, signal.SIGKILL)
+
+
+def test_another_server_is_started_where_it_was_killed() -> None:
+    with Process(WORKERS, ("wait", None), []) as first:
+        assert first.receive(LONG) == Message("waiting")
+        os.kill(int(Path(f"/proc/{first.pid}/stat").read_text().split()[3]), signal.SIGKILL)
+        with Process(WORKERS, ("wait", None), []) as second:
+            assert second.receive(LONG) == Message("waiting")
+            assert first.is_alive
+
+
+def test_each_has_the_surroundings_of_the_moment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("one", "other"):
+        folder = tmp_path / name
+        folder.mkdir()
+        monkeypatch.chdir(folder)
+        monkeypatch.setenv("HAPTICDB_TEST_WORD", name)
+        with Process(WORKERS, ("where", None), []) as process:
+            assert process.receive(LONG) == Message("here", (str(folder), name))
 
 
 def test_one_that_is_dropped_ends() -> None:

@@ -3,6 +3,7 @@
 import os
 import sys
 import time
+from pathlib import Path
 
 from hapticdb import DatabaseError
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
@@ -14,6 +15,8 @@ def work(request: tuple[str, object], sender: MessageSender) -> None:
         print("a driver's words")  # noqa: T201 - they must not mix with messages
         sender.send("heard", content)
         sender.send("again", (content, os.getpid()))
+    elif word == "where":
+        sender.send("here", (str(Path.cwd()), os.environ["HAPTICDB_TEST_WORD"]))
     elif word == "fail":
         raise DatabaseError("no such place: make it first")
     elif word == "break":

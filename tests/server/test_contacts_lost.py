@@ -15,7 +15,7 @@ import pytest
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.server import ServerConnection, serve
 
-from children import PATIENCE, joined, until
+from children import PATIENCE, descendants, joined, named, until
 from contact_hands import (
     DEPTH,
     STILL,
@@ -77,15 +77,15 @@ def test_the_force_comes_back_with_a_server_that_is_started_again(mortal: Served
 
 
 def test_the_process_that_fetches_is_started_again(mortal: Served) -> None:
-    def children() -> set[str]:
-        tasks = Path(f"/proc/{mortal.process.pid}/task").glob("*/children")
-        return {pid for task in tasks for pid in task.read_text().split()}
+    def fetching() -> set[int]:
+        found = descendants(mortal.process.pid)
+        return {pid for pid in found if named(pid) == "hdb-fetching"}
 
     with ContactProxy(mortal.url()) as proxy:
         pressed(mortal, proxy)
-        (fetching,) = children()
-        os.kill(int(fetching), signal.SIGKILL)
-        until(lambda: children() not in (set(), {fetching}))
+        (first,) = fetching()
+        os.kill(first, signal.SIGKILL)
+        until(lambda: fetching() not in (set(), {first}))
         pressed(mortal, proxy)
         assert proxy.error is None
 

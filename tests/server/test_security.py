@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import connect
 
 import hapticdb
-from children import PATIENCE, until
+from children import PATIENCE, descendants, named, until
 from hapticdb.errors import UsageError
 from hapticdb.realtime.processes import Process
 from hapticdb.server import access, page_keeper, relay
@@ -149,14 +149,11 @@ def test_a_flood_is_slowed_down_and_then_closed(environment: Path) -> None:
 
 def test_the_page_is_started_again_and_browsers_come_back(environment: Path) -> None:
     serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:work")
-    before = _children()
     with running(serving) as server:
         with server.browser(Role.EDITOR) as browser:
             sent(browser, CAMERA)
             text_until(browser, "is a editor")
-            for pid in _children() - before:
-                if b"viser_page" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                    os.kill(pid, signal.SIGKILL)
+            _kill_pages()
             assert close_code(browser) in {1001, 1006}
         until(lambda: _is_back(server))
 
@@ -166,7 +163,6 @@ def test_a_machine_without_room_for_the_page_gets_it_later(
 ) -> None:
     """Neither a process nor a socket may be had for a moment; nothing stays open of the tries."""
     serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:work")
-    before = _children()
     tries: list[int] = []
 
     def begin(*given: Any) -> Process:  # noqa: ANN401 - as Process takes them
@@ -178,12 +174,16 @@ def test_a_machine_without_room_for_the_page_gets_it_later(
     monkeypatch.setattr(page_keeper, "FIRST_PAUSE", 0.05)
     with running(serving) as server:
         monkeypatch.setattr(page_keeper, "Process", begin)
-        for pid in _children() - before:
-            if b"viser_page" in Path(f"/proc/{pid}/cmdline").read_bytes():
-                os.kill(pid, signal.SIGKILL)
+        _kill_pages()
         until(lambda: len(tries) == 3)
         until(lambda: _is_back(server))
     assert tries[1] <= tries[0]
+
+
+def _kill_pages() -> None:
+    for pid in descendants(os.getpid()):
+        if named(pid) == "hdb-viser_page":
+            os.kill(pid, signal.SIGKILL)
 
 
 def _is_back(server: Running) -> bool:
@@ -193,18 +193,6 @@ def _is_back(server: Running) -> bool:
             return "is a viewer" in text_until(browser, "is a viewer")
     except (InvalidStatus, ConnectionClosed):
         return False
-
-
-def _children() -> set[int]:
-    found = set()
-    for path in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            fields = path.read_text().rpartition(")")[2].split()
-        except OSError:
-            continue
-        if fields[1] == str(os.getpid()):
-            found.add(int(path.parent.name))
-    return found
 
 
 def test_a_silent_connection_is_cut(environment: Path) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 import hapticdb
 from banded import write_points
+from draws import is_every
 from hapticdb import Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.query.frame import STRATEGIES, Strategy
@@ -142,7 +143,9 @@ def outcome(path: Path, content: bytes, log: bytes = b"") -> tuple[bool, str]:
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize(
-    "cases", [16, pytest.param(400, marks=pytest.mark.long)], ids=["short", "long"]
+    "cases",
+    [16, pytest.param(1000 if is_every() else 200, marks=pytest.mark.long)],
+    ids=["short", "long"],
 )
 def test_check_finds_all_damage_of_rows(
     tmp_path: Path, kind: tuple[Layout, CurveName, bool], cases: int

@@ -40,7 +40,10 @@ class WorkerLink:
         with theirs:
             request = WorkerRequest(board.descriptor, theirs.fileno(), rate)
             self._process = Process(
-                "hapticdb.hosting.worker:work", request, [board.descriptor, theirs.fileno()]
+                "hapticdb.hosting.worker:work",
+                request,
+                [board.descriptor, theirs.fileno()],
+                ["host"],
             )
         ours.settimeout(ANSWER_PATIENCE)
         self._channel = Channel(ours)

@@ -1,8 +1,7 @@
 """Processes of a real-time session: each gets a request and sends messages over a pipe.
 
-Each process is a plain ``python -c`` that calls a function of this package, so a user's script
-needs no ``if __name__ == "__main__"`` guard. The request and the messages are pickles, exchanged
-only between a process and its own child.
+Each process is a copy of the fork server (`fork_server`) and calls one function. The request and
+the messages are pickles, exchanged only between a process and what it has started.
 """
 
 import contextlib
@@ -10,21 +9,21 @@ import os
 import pickle
 import select
 import signal
-import subprocess
 import sys
 import time
 import weakref
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any, BinaryIO, NamedTuple, Self
+from typing import IO, Any, BinaryIO, NamedTuple, Self
 
 from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.realtime.fork_server import start
 
 END_PATIENCE = 5.0
 """Seconds that a process has to end by itself before it is killed. Larger: slower devices can
 close, a hanging process delays the end longer."""
-_starter = 0
-"""Id of the process that started this one."""
+_ends = select.poll()
+"""Tells that the process that started this one has ended, or has closed the pipe."""
 
 
 class Message(NamedTuple):
@@ -46,26 +45,34 @@ class Process:
         Argument of that function; picklable.
     descriptors : sequence of int
         File descriptors that the process inherits, under the same numbers.
+    purposes : sequence of str
+        What it calls kernels for (`kernels.compiling.PURPOSES`). It begins with them loaded, and
+        with the function's module; by default with neither.
     """
 
-    def __init__(self, work: str, request: object, descriptors: Sequence[int]) -> None:
-        content = pickle.dumps(sys.path) + pickle.dumps(request)
+    def __init__(
+        self, work: str, request: object, descriptors: Sequence[int], purposes: Sequence[str] = ()
+    ) -> None:
+        content = pickle.dumps(request)
         self._buffer = b""
-        self._popen = subprocess.Popen(  # noqa: S603 - our own module, by the running interpreter
-            [sys.executable, "-c", f"from {__name__} import serve; serve({work!r}, {os.getpid()})"],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            pass_fds=tuple(descriptors),
-            # Ctrl-C in a terminal goes to a whole process group; only the parent shall handle it
-            start_new_session=True,
-        )
-        assert self._popen.stdin is not None  # noqa: S101 - asked for above
+        (theirs, ours), (received, sent) = os.pipe(), os.pipe()
+        try:
+            self.pid, self._standing = start(work, purposes, [theirs, sent, 2], descriptors)
+        except BaseException:
+            os.close(ours)
+            os.close(received)
+            raise
+        finally:
+            os.close(theirs)
+            os.close(sent)
+        self._input, self._output = os.fdopen(ours, "wb"), os.fdopen(received, "rb", buffering=0)
         with contextlib.suppress(BrokenPipeError):  # the child died at once; `receive` reports that
-            self._popen.stdin.write(content)
-            self._popen.stdin.flush()
+            self._input.write(content)
+            self._input.flush()
         # The input stays open: when it closes, the child knows that this process has ended. The
-        # pipes of an unreferenced Popen would stay open, so the finalizer closes them.
-        weakref.finalize(self, _close, self._popen)
+        # pipes of an unreferenced object would stay open, so the finalizer closes them.
+        weakref.finalize(self, _close, self._input, self._output)
+        weakref.finalize(self, os.close, self._standing)
 
     def __enter__(self) -> Self:
         return self
@@ -74,14 +81,9 @@ class Process:
         self.end()
 
     @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._popen.pid
-
-    @property
     def is_alive(self) -> bool:
         """Whether the process runs."""
-        return self._popen.poll() is None
+        return not self.wait(0.0)
 
     def receive(self, seconds: float) -> Message | None:
         """Return the next message, or None if none comes in `seconds` or the process has ended.
@@ -91,8 +93,7 @@ class Process:
         HapticDBError
             If the process ended with this error.
         """
-        assert self._popen.stdout is not None  # noqa: S101 - asked for above
-        descriptor = self._popen.stdout.fileno()
+        descriptor = self._output.fileno()
         until = time.monotonic() + seconds
         arrived = select.poll()  # `select` refuses descriptors from 1024 on
         arrived.register(descriptor, select.POLLIN)
@@ -125,33 +126,30 @@ class Process:
 
     def send(self, content: object) -> None:
         """Send an object, which the process takes by `receive_from_parent`; nothing if it ended."""
-        assert self._popen.stdin is not None  # noqa: S101 - asked for above
         with contextlib.suppress(OSError, ValueError):  # `receive` reports that
-            self._popen.stdin.write(pickle.dumps(content))
-            self._popen.stdin.flush()
+            self._input.write(pickle.dumps(content))
+            self._input.flush()
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end of the process; returns whether it ended in `seconds`."""
-        try:
-            self._popen.wait(seconds)
-        except subprocess.TimeoutExpired:
-            return False
-        return True
+        ended = select.poll()
+        ended.register(self._standing, select.POLLIN)
+        return bool(ended.poll(1000.0 * seconds))
 
     def end(self) -> None:
         """End the process: close its input, and kill it if it does not end then."""
-        _close(self._popen)
+        _close(self._input, self._output)
         if not self.wait(END_PATIENCE):
-            self._popen.kill()
-            self._popen.wait()
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._standing, signal.SIGKILL)
+            self.wait(END_PATIENCE)
 
 
-def _close(popen: "subprocess.Popen[bytes]") -> None:
+def _close(*pipes: IO[bytes]) -> None:
     """Close the pipes to a process, which ends when its input is closed."""
-    for stream in (popen.stdin, popen.stdout):
-        if stream is not None:
-            with contextlib.suppress(OSError):
-                stream.close()
+    for pipe in pipes:
+        with contextlib.suppress(OSError):
+            pipe.close()
 
 
 class _EndQuietly(SystemExit):
@@ -176,18 +174,19 @@ class MessageSender:
             self._stream.flush()
 
 
-def serve(work: str, starter: int) -> None:
-    """Run the request in the process that `Process` started, and end that process."""
-    global _starter  # noqa: PLW0603 - one a process
-    _starter = starter
+def run(module: str, name: str, starter: int) -> None:
+    """Run the request in the process that `Process` started, and end that process.
+
+    `starter` is a descriptor that stands for the process that used `Process`.
+    """
+    for descriptor in (0, starter):
+        _ends.register(descriptor, select.POLLIN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     status = 0
     sender = MessageSender(os.fdopen(os.dup(1), "wb"))
     os.dup2(2, 1)  # output of drivers must not mix with messages
     try:
         signal.signal(signal.SIGTERM, _end)
-        sys.path[:] = _load()
-        module, name = work.split(":")
         function: Callable[[Any, MessageSender], None] = getattr(import_module(module), name)
         function(_request(), sender)
     except _EndQuietly as ended:
@@ -240,8 +239,8 @@ def _request() -> object:
 
 
 def parent_is_gone() -> bool:
-    """Whether the process that started this one has ended, or has closed the pipe."""
-    if os.getppid() != _starter:  # children that it forked may still hold the pipe open
-        return True
-    ready, _, _ = select.select([0], [], [], 0)
-    return bool(ready)
+    """Whether the process that started this one has ended, or has closed the pipe.
+
+    Processes that were forked from it may still hold the pipe open.
+    """
+    return bool(_ends.poll(0))

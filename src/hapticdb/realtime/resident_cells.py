@@ -11,6 +11,7 @@ from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.realtime.fetching import FetchRequest, Wrap
+from hapticdb.realtime.fork_server import prepare
 from hapticdb.realtime.processes import Process
 from hapticdb.resident.residency import check_cells, check_distances
 from hapticdb.resident.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellTable
@@ -18,6 +19,8 @@ from hapticdb.store.connect import open_store, redact
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 
+FETCH, PURPOSES = "hapticdb.realtime.fetching:fetch", ("resident",)
+"""What a fetching process runs, and what it calls kernels for."""
 START_PATIENCE = 60.0
 """Seconds in which a fetching process must be ready; a calibration may take seconds. Larger: a
 caller waits longer for a process that hangs."""
@@ -128,8 +131,9 @@ class ResidentCells:
     ) -> None:
         self.url = url
         self.felt = Filter(where, exclude)
+        prepare(FETCH, PURPOSES)  # while the environment is read
         self.grid, has_distances = self._read_environment(distances)
-        compile_missing(entries_for("resident"))  # now: two processes would each compile them
+        compile_missing(entries_for(*PURPOSES))  # now: two processes would each compile them
         self.table = CellTable.create(budget_bytes, distances=has_distances)
         self.restarts = 0
         self._request = FetchRequest(
@@ -173,10 +177,11 @@ class ResidentCells:
         finally:
             store.close()
 
+    def _begun(self) -> Process:
+        return Process(FETCH, self._request, [self.table.descriptor], PURPOSES)
+
     def _start_process(self) -> Process:
-        process = Process(
-            "hapticdb.realtime.fetching:fetch", self._request, [self.table.descriptor]
-        )
+        process = self._begun()
         try:
             is_ready = process.receive(START_PATIENCE) is not None
         except BaseException:
@@ -242,9 +247,7 @@ class ResidentCells:
             self.restarts += 1
             ended = self._process
             # Sessions use the table meanwhile: its last published version is complete.
-            self._process = Process(
-                "hapticdb.realtime.fetching:fetch", self._request, [self.table.descriptor]
-            )
+            self._process = self._begun()
             ended.end()
 
     def _take_messages(self) -> None:

@@ -244,7 +244,7 @@ class Session:
             budget_points=self.budget_points,
         )
         self._process = Process(
-            "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory]
+            "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory], purposes
         )
         table.desk.pids[self._row] = self._process.pid
         if self._process.receive(START_PATIENCE) is None:

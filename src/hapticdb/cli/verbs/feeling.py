@@ -201,6 +201,9 @@ def feel(
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
+    from hapticdb.realtime.fork_server import prepare
+
+    prepare("hapticdb.realtime.loop:work", ["resident", "feel"])  # while the rest is loaded here
     from hapticdb import Handle, Session
 
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)

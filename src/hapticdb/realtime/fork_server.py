@@ -1,0 +1,317 @@
+"""A server that forks the processes of sessions, which so begin with numba and kernels loaded.
+
+A process has one fork server from its first `Process` on. The server is a plain ``python -c``, so a
+user's script needs no ``if __name__ == "__main__"`` guard. It opens no database and no device, and
+has one thread, so that its copies are sound. It ends with the process that it serves.
+"""
+
+import atexit
+import contextlib
+import errno
+import fcntl
+import gc
+import os
+import pickle
+import resource
+import select
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import traceback
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import NamedTuple
+
+from hapticdb.errors import HapticDBError
+
+ANSWER_PATIENCE = 300.0
+"""Seconds that the server has for an answer: it may load numba and compile. Larger: a caller waits
+longer for a server that hangs."""
+MOST_DESCRIPTORS = 16
+"""Descriptors that a process can be given."""
+
+
+class Order(NamedTuple):
+    """What a process shall do, and in which surroundings.
+
+    work : function, as ``package.module:function``; purposes : of the kernels that are loaded
+    before the fork (`kernels.compiling.PURPOSES`), with the function's module; with none, neither
+    is; numbers : of the descriptors that it gets, or None where no process is wanted yet;
+    path, environment, most_files : as the process that gives the order has them.
+    """
+
+    work: str
+    purposes: tuple[str, ...]
+    numbers: tuple[int, ...] | None
+    path: list[str]
+    environment: dict[str, str]
+    most_files: tuple[int, int]
+
+
+def _order(work: str, purposes: Sequence[str], numbers: Sequence[int] | None) -> Order:
+    """An order for a process with the surroundings of this one."""
+    return Order(
+        work,
+        tuple(purposes),
+        None if numbers is None else tuple(numbers),
+        sys.path,
+        dict(os.environ),
+        resource.getrlimit(resource.RLIMIT_NOFILE),
+    )
+
+
+# -- in the process that is served -----------------------------------------------------------------
+
+
+class ForkServer:
+    """The fork server of this process, from its own side."""
+
+    def __init__(self) -> None:
+        self._owner = os.getpid()
+        self._channel, theirs = socket.socketpair()
+        self._channel.settimeout(ANSWER_PATIENCE)
+        call = f"from {__name__} import serve; serve({theirs.fileno()}, {self._owner})"
+        with theirs:
+            self._popen = subprocess.Popen(  # noqa: S603 - our own module, by this interpreter
+                [sys.executable, "-c", call],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                pass_fds=[theirs.fileno()],
+                # Ctrl-C in a terminal goes to a whole process group; only the owner handles it
+                start_new_session=True,
+            )
+
+    @property
+    def is_ours(self) -> bool:
+        """Whether it serves this process, and not the one that this one was forked from."""
+        return self._owner == os.getpid()
+
+    def give(self, wanted: Order, descriptors: Sequence[int] = ()) -> None:
+        """Give an order, with the descriptors of its process."""
+        content = pickle.dumps(wanted)
+        socket.send_fds(self._channel, [len(content).to_bytes(8, "little")], descriptors)
+        self._channel.sendall(content)
+
+    def started(self) -> tuple[int, int]:
+        """Process id of what the last order has started, and a descriptor that stands for it.
+
+        A negative number of an error, and -1, where the machine has no room for the process.
+        """
+        answer, descriptors, *_ = socket.recv_fds(self._channel, 8, 1)
+        if len(answer) < 8:
+            raise ConnectionResetError(errno.ECONNRESET, "the fork server has ended")
+        return int.from_bytes(answer, "little", signed=True), (*descriptors, -1)[0]
+
+    def end(self) -> None:
+        """End the server at once; what it has started goes on."""
+        self._channel.close()
+        self._popen.kill()
+        self._popen.wait()
+
+
+_server: ForkServer | None = None
+_lock = threading.Lock()
+
+
+def _forget_lock() -> None:
+    """In a forked copy: a thread that is not copied may hold it."""
+    global _lock  # noqa: PLW0603 - one a process
+    _lock = threading.Lock()
+
+
+os.register_at_fork(after_in_child=_forget_lock)
+
+
+def _known() -> ForkServer:
+    global _server  # noqa: PLW0603 - one a process
+    if _server is None or not _server.is_ours:
+        _server = ForkServer()
+    return _server
+
+
+@atexit.register
+def _end() -> None:
+    global _server  # noqa: PLW0603 - one a process
+    if _server is not None and _server.is_ours:
+        _server.end()
+    _server = None
+
+
+def prepare(work: str, purposes: Sequence[str]) -> None:
+    """Have the server load a function's module and the kernels of purposes, and go on here.
+
+    Kernels that are not compiled yet are left out. To be called as soon as it is known that a
+    process will be started.
+    """
+    with _lock:
+        try:
+            _known().give(_order(work, purposes, None))
+        except OSError:  # `start` tries again, and tells what is wrong
+            _end()
+
+
+def start(
+    work: str, purposes: Sequence[str], streams: Sequence[int], numbers: Sequence[int]
+) -> tuple[int, int]:
+    """Start a process that runs a function.
+
+    Parameters
+    ----------
+    work : str
+        The function, as ``package.module:function``.
+    purposes : sequence of str
+        What is loaded before: the function's module and the kernels of these purposes.
+    streams : sequence of int
+        Descriptors of its standard input, output and errors.
+    numbers : sequence of int
+        More descriptors, which it has under the same numbers.
+
+    Returns
+    -------
+    tuple
+        Process id, and a descriptor that stands for the process.
+
+    Raises
+    ------
+    OSError
+        If the machine has no room for another process.
+    HapticDBError
+        If the server does not answer.
+    """
+    wanted = _order(work, purposes, numbers)
+    folder = os.open(".", os.O_PATH)
+    try:
+        pid, standing = _answered(wanted, [*streams, folder, *numbers])
+    finally:
+        os.close(folder)
+    if pid < 0:
+        raise OSError(-pid, os.strerror(-pid))
+    return pid, standing
+
+
+def _answered(wanted: Order, descriptors: Sequence[int]) -> tuple[int, int]:
+    """Give an order and wait for the answer; a server that was killed is replaced once."""
+    with _lock:
+        for is_last in (False, True):
+            try:
+                server = _known()
+                server.give(wanted, descriptors)
+                return server.started()
+            except TimeoutError as error:
+                _end()
+                raise HapticDBError(
+                    f"no process was started in {ANSWER_PATIENCE:g} s: this machine is too slow now"
+                ) from error
+            except ConnectionError as error:
+                _end()
+                if is_last:
+                    raise HapticDBError(
+                        "no process can be started (Linux 5.3 or newer?): the errors are above"
+                    ) from error
+            except BaseException:
+                _end()  # its answer would be taken for that of the next order
+                raise
+    raise AssertionError
+
+
+# -- in the server ---------------------------------------------------------------------------------
+
+
+def serve(descriptor: int, owner: int) -> None:
+    """Run the server of the process `owner`, until that process ends or closes the channel."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with contextlib.suppress(ProcessLookupError):
+        owning = os.pidfd_open(owner)
+        if os.getppid() == owner:
+            _serve(socket.socket(fileno=descriptor), owning)
+
+
+def _serve(channel: socket.socket, owning: int) -> None:
+    children: dict[int, int] = {}
+    events = select.poll()
+    for number in (channel.fileno(), owning):
+        events.register(number, select.POLLIN)
+    while True:
+        for number, _ in events.poll():
+            if number in children:
+                os.waitpid(children.pop(number), 0)
+                events.unregister(number)
+                os.close(number)
+                continue
+            taken = None if number == owning else _taken(channel)
+            if taken is None:
+                return
+            wanted, descriptors = taken
+            if wanted.purposes:
+                _load(wanted.work, wanted.purposes, compiles=wanted.numbers is not None)
+            if wanted.numbers is None:
+                continue
+            try:
+                pid, child = _forked(wanted, descriptors, owning)
+            except OSError as error:
+                channel.sendall((-(error.errno or errno.EAGAIN)).to_bytes(8, "little", signed=True))
+            else:
+                children[child] = pid
+                events.register(child, select.POLLIN)
+                socket.send_fds(channel, [pid.to_bytes(8, "little")], [child])
+            for received in descriptors:
+                os.close(received)
+
+
+def _taken(channel: socket.socket) -> tuple[Order, list[int]] | None:
+    """Next order and its descriptors; None where the channel is closed."""
+    head, descriptors, *_ = socket.recv_fds(channel, 8, MOST_DESCRIPTORS)
+    n_bytes = int.from_bytes(head, "little")
+    content = channel.recv(n_bytes, socket.MSG_WAITALL) if n_bytes else b""
+    if len(content) < n_bytes or not content:
+        return None
+    return pickle.loads(content), descriptors  # noqa: S301 - from our owner
+
+
+def _load(work: str, purposes: Sequence[str], *, compiles: bool) -> None:
+    """Load a function's module and kernels; the process itself tells what cannot be loaded."""
+    with contextlib.suppress(Exception):
+        import_module(work.partition(":")[0])
+        compiling = import_module("hapticdb.kernels.compiling")
+        names = compiling.entries_for(*purposes)
+        if compiles or not compiling.missing(names):
+            compiling.load(names)
+            gc.freeze()  # collections in copies leave these pages shared
+
+
+def _forked(wanted: Order, descriptors: list[int], owning: int) -> tuple[int, int]:
+    """Fork a process; its id, and a descriptor that stands for it."""
+    pid = os.fork()
+    if pid == 0:
+        try:
+            _become(wanted, descriptors, owning)
+        except BaseException:  # noqa: BLE001 - nothing of the server may run in the copy
+            traceback.print_exc()
+        finally:
+            os._exit(1)
+    return pid, os.pidfd_open(pid)
+
+
+def _become(wanted: Order, descriptors: list[int], owning: int) -> None:
+    """In the copy: take on the surroundings that were ordered, and run the function."""
+    os.setsid()
+    resource.setrlimit(resource.RLIMIT_NOFILE, wanted.most_files)
+    targets = [0, 1, 2, *(wanted.numbers or ())]
+    first = max(targets) + 1
+    owning, *descriptors = [fcntl.fcntl(n, fcntl.F_DUPFD, first) for n in (owning, *descriptors)]
+    os.fchdir(descriptors.pop(3))
+    for number, target in zip(descriptors, targets, strict=True):
+        os.dup2(number, target)
+    kept = [*sorted(targets), owning]
+    for below, above in zip(kept, [*kept[1:], wanted.most_files[0]], strict=True):
+        os.closerange(below + 1, above)
+    module, name = wanted.work.split(":")
+    with contextlib.suppress(OSError):  # a name for `ps`, no more
+        Path("/proc/self/comm").write_text(f"hdb-{module.rpartition('.')[2]}")
+    os.environ.clear()
+    os.environ.update(wanted.environment)
+    sys.path[:] = wanted.path
+    import_module("hapticdb.realtime.processes").run(module, name, owning)

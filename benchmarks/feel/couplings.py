@@ -7,14 +7,13 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from hapticdb.kernels.hand.anchors import MET_ROWS
 from numpy.typing import NDArray
 
 from feel.ground import Ground
 from hapticdb.devices.protocol import Reading
 from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.near_points import FIELD_ROWS
+from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, SERVO, views_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.handle import Handle

@@ -28,10 +28,14 @@ RUN = "HAPTICDB_TEST_RUN"
 PIPE = subprocess.PIPE
 _line: list[IO[bytes]] = []
 """What the watchdog listens to, once there is one."""
+_shared: list[Path] = []
+"""The folder that all processes of the run share, once it is known."""
 
 
-def begin_run() -> None:
+def begin_run(shared: Path | None = None) -> None:
     """End all processes, servers and files of this run with it. To be called before any starts.
+
+    `shared` is the `shared_folder` of the run of which this process is a part, if it is one.
 
     A run may have been started with SIGINT ignored (``make test &`` in a script, cron). From now on
     it receives SIGINT as a run in the foreground does, because children inherit ignored signals
@@ -48,6 +52,7 @@ def begin_run() -> None:
     root = os.environ["PYTEST_DEBUG_TEMPROOT"]
     folder = Path(tempfile.mkdtemp(prefix="hapticdb-run-", dir=root)).resolve()
     folder.chmod(0o711)  # servers run under another account and must be able to enter
+    _shared.append(shared or folder)
     os.environ[RUN] = os.environ["TMPDIR"] = str(folder)
     tempfile.tempdir = None  # tempfile finds its folder again
     script = str(Path(__file__).with_name("watchdog.py"))
@@ -59,6 +64,11 @@ def begin_run() -> None:
     assert dog.stdin is not None
     _line.append(dog.stdin)
     atexit.register(_end_run, dog, os.getpid())
+
+
+def shared_folder() -> Path:
+    """Folder that the processes of the run share: it ends, and what runs in it, with the run."""
+    return _shared[0]
 
 
 def _end_run(dog: "subprocess.Popen[bytes]", pid: int) -> None:

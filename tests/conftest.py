@@ -4,6 +4,7 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import apsw
 import numba
@@ -26,9 +27,17 @@ NEWEST = {"cli", "house"}
 
 def pytest_configure(config: pytest.Config) -> None:
     examples.choose()
-    children.begin_run()
-    if not hasattr(config, "workerinput"):  # once, before the processes that run tests start
+    of_a_worker: dict[str, str] | None = getattr(config, "workerinput", None)
+    if of_a_worker is None:  # once, before the processes that run tests start
+        children.begin_run()
         compile_missing(NAMES)
+    else:
+        children.begin_run(Path(of_a_worker["shared"]))
+
+
+def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 - xdist has no types
+    """Tell a process that runs tests which folder the run shares."""
+    node.workerinput["shared"] = str(children.shared_folder())
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

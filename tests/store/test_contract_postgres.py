@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import psycopg
 import pytest
+from psycopg import conninfo
 
 import hapticdb
 from capabilities import ENGINE_LACKS, STORE_LACKS
@@ -183,6 +184,7 @@ def test_two_loaders_that_end_together_both_succeed(place: Place) -> None:
     # no advisory lock of a loader remains, so that the next killed import can be repaired
     free = store.connection.rows(
         "SELECT count(*) FROM pg_locks WHERE locktype = 'advisory' AND classid::bigint = %s"
+        " AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
         " AND objid::bigint = ('environment'::regclass::oid::bigint + 2147483648) %% 4294967296",
         (0x48415054,),
     )
@@ -276,7 +278,8 @@ def test_a_database_of_another_encoding_serves(place: Place, admin: psycopg.Conn
     admin.execute(
         "CREATE DATABASE other_encoding ENCODING 'SQL_ASCII' LOCALE 'C' TEMPLATE template0"
     )
-    where = place().replace("/postgres?", "/other_encoding?")
+    known = conninfo.conninfo_to_dict(admin.info.dsn)["dbname"]
+    where = place().replace(f"/{known}?", "/other_encoding?")
     with hapticdb.create(where, GRID) as env:
         write_voxels(env.store, blob(1, (30, 30, 30)), "中")
         assert [obj.name for obj in env.objects()] == ["中"]

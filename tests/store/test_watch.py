@@ -4,6 +4,7 @@
 
 import contextlib
 import itertools
+import os
 import sys
 import threading
 import time
@@ -383,7 +384,7 @@ def test_environments_of_long_and_strange_names_do_not_hear_each_other(
 
 
 def test_a_viewer_may_watch(url: str, admin: psycopg.Connection) -> None:
-    role = f"watching {next(numbers)}"
+    role = f"watching {os.getpid()} {next(numbers)}"
     admin.execute(sql.SQL("CREATE ROLE {} LOGIN").format(sql.Identifier(role)))
     try:
         grant(url, role, "viewer")

@@ -3,6 +3,7 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import itertools
+import os
 from collections.abc import Iterator
 
 import psycopg
@@ -34,7 +35,7 @@ FORGED = [
 @pytest.fixture
 def stranger(database: str, admin: psycopg.Connection) -> Iterator[psycopg.Connection]:
     """A connection of a role that has no right on any environment."""
-    role = sql.Identifier(f"stranger {next(numbers)}")
+    role = sql.Identifier(f"stranger {os.getpid()} {next(numbers)}")
     admin.execute(sql.SQL("CREATE ROLE {} LOGIN").format(role))
     with psycopg.connect(parse(database).conninfo, autocommit=True) as connection:
         connection.execute(sql.SQL("SET SESSION AUTHORIZATION {}").format(role))

@@ -33,8 +33,10 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     return "\n".join(f"| {' | '.join(line)} |" for line in [list(head), rules, *body])
 
 
-def us_text(value: float) -> str:
-    """Microseconds to two or three digits."""
+def us_text(value: float | None) -> str:
+    """Microseconds to two or three digits; a dash where too few frames were measured."""
+    if value is None:
+        return NONE
     if value >= 99.5:
         return f"{value:,.0f}"
     return f"{value:.1f}" if value >= 9.95 else f"{value:.2g}"

@@ -318,7 +318,8 @@ def _waited_for(session: "Session") -> "Report":
     notes, database_notes = session_page.LooseNotes(), session_page.DatabaseNotes()
     while report is None:
         report = session.wait(LOOK_EVERY)
-        notes.look(session)
+        if session.database_lost is None:  # without it the tool lies in nothing that is known
+            notes.look(session)
         database_notes.look(session)
         if session.recording_ended is not None and not is_told:
             render.note(f"{session.recording_ended}; the session goes on without it")

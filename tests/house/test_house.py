@@ -240,14 +240,13 @@ def _looks_at_clock(loop: ast.While) -> bool:
 
 def test_nothing_is_waited_for_without_an_end() -> None:
     """A wait without an end would let a failing test hang the run."""
-    # the last four wait in something that another part ends: processes of a session, a fake's
-    # thread, a process that reads damaged files
+    # the last three wait in something that another part ends: processes of a session, a fake's
+    # thread
     allowed = [
         "tests/children.py",
         "tests/realtime/workers.py",
         "tests/viser_page.py",
         "tests/devices/fake_hd.py",
-        "tests/damaging.py",
     ]
     found: list[str] = []
     for path in python_files():

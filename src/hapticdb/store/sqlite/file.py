@@ -111,7 +111,9 @@ def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFi
     check_kind(path)
     file = OpenedFile(path)
     is_immutable = read_only and needs_immutable(path)
-    has_log = os.path.exists(f"{path.resolve()}-wal")  # noqa: PTH110 - before the engine makes one
+    log, memory = (Path(f"{path.resolve()}{suffix}") for suffix in ("-wal", "-shm"))
+    # before the engine makes one; who was told so has left an empty one
+    is_log_taken = memory.exists() and not (log.exists() and log.stat().st_size)
     with named_errors(str(path)):
         connection = _connect_to_read(path) if read_only else _connect_to_write(path)
         try:
@@ -122,7 +124,7 @@ def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFi
         except BaseException as error:
             connection.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
             connection.close()
-            if isinstance(error, DamagedError) and "-wal" in str(error) and not has_log:
+            if isinstance(error, apsw.IOError) and is_log_taken:
                 raise BusyError(
                     f"{path}-wal was removed while another has {path} open: end all that has it "
                     "open, which puts what was committed into the file, then open it again"

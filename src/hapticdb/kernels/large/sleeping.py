@@ -141,7 +141,7 @@ felt_words = chosen_by_type(lambda law: _near_voxels if law is DistanceFieldLaw 
 felt_margin = chosen_by_type(lambda law: _no_margin if law is DistanceFieldLaw else _margin)
 
 
-@inlined
+@leaf
 def room_around(keys, slots, masks, used, which, x, y, z, half, most, side):
     """How far a cube may grow on each side before it meets an occupied brick or an unknown cell.
 
@@ -219,7 +219,7 @@ def way_on_axis(a, b, c, u, x, y, z, half_x, half_y, half_z):
     return abs(turn(a, b, c, x, y, z) + u) + turning
 
 
-@inlined
+@leaf
 def way_of_box(boxes, rests, block, transform):
     """Largest way on an axis, metres, of a point of a block's box since the block's rest began."""
     a, b, c, u, d, e, f, v, g, h, m, w = transform
@@ -240,7 +240,7 @@ def way_of_box(boxes, rests, block, transform):
     return max(along_x, along_y, along_z)
 
 
-@inlined
+@leaf
 def begin_block_rest(rests, block, transform, rest):
     """Enter the rest of a block from this pose on."""
     a, b, c, u, d, e, f, v, g, h, m, w = transform
@@ -275,7 +275,7 @@ def begin_rest(rests, n, x, y, z, rest):
     rests[n, 3] = rest
 
 
-@inlined
+@leaf
 def rest_of_run(
     keys, slots, words, masks, used, which, spheres, n, x, y, z, transform, place, margin, longest
 ):  # fmt: skip
@@ -303,7 +303,7 @@ def rest_of_run(
     return 0.0 if is_free else -1.0
 
 
-@inlined
+@leaf
 def rest_of_block(
     keys, slots, masks, used, which, boxes, block, transform, place, margin, longest
 ):  # fmt: skip
@@ -360,7 +360,7 @@ def list_near_runs(cells, which, shell, sleepers, transform, place, law):
     return count
 
 
-@inlined
+@leaf
 def points_listed(listed, count, run, n_points):
     """Number of points of the listed runs; only the last run of a shell may be shorter."""
     last = (n_points - 1) // run
@@ -368,7 +368,7 @@ def points_listed(listed, count, run, n_points):
     return count * run - (short if count > 0 and listed[count - 1] == last else 0)
 
 
-@inlined
+@leaf
 def skip_between(listed, count, skips):
     """Write the number of runs that a frame skips, from each run on that it comes to."""
     at = 0
@@ -381,7 +381,7 @@ def skip_between(listed, count, skips):
         skips[at, 0] = skips.shape[0] - at
 
 
-@inlined
+@leaf
 def chosen_of_group(group, stride):
     """Number of the one point that a frame looks at of a group of `stride` points of a shell.
 
@@ -394,7 +394,7 @@ def chosen_of_group(group, stride):
     return group * stride + ((mixed ^ (mixed >> 16)) & (stride - 1))
 
 
-@inlined
+@leaf
 def choose_points(listed, count, points, columns, run, budget, chosen, chosen_columns, indices):
     """Copy one point of each 2, 4, 8 ... of a shell if it is in a listed run; returns the number.
 

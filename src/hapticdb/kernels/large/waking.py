@@ -10,7 +10,7 @@ frame reads those between the version of its last frame and its own. If the ring
 of them any more, all clusters wake.
 """
 
-from hapticdb.kernels._jit import inlined
+from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.resident.cells import (
     CHANGED,
     CHANGES,
@@ -31,7 +31,7 @@ CELL_SIDE = 32.0
 """Side of a cell, voxels."""
 
 
-@inlined
+@leaf
 def changes_since(control, which, followed, changed):
     """Copy the lowest corners of the cells changed since `followed`, voxels, to changed (K, 3).
 
@@ -74,7 +74,7 @@ def is_met(changed, cell, low_x, low_y, low_z, high_x, high_y, high_z):
     )
 
 
-@inlined
+@leaf
 def wake_all(rests, block_rests, rest, state):
     """End all rests; counts the runs that slept. rest: column of `block_rests`."""
     for block in range(block_rests.shape[0]):
@@ -84,7 +84,7 @@ def wake_all(rests, block_rests, rest, state):
         rests[n, 3] = AWAKE
 
 
-@inlined
+@leaf
 def wake_runs(rests, spheres, start, end, changed, cell, margin, size):
     """End the rests of runs start .. end - 1 that a changed cell concerns -> their number."""
     woken = 0
@@ -99,7 +99,7 @@ def wake_runs(rests, spheres, start, end, changed, cell, margin, size):
     return woken
 
 
-@inlined
+@leaf
 def wake_changed(
     control, which, spheres, rests, block_rests, rest, block_size, state, changed, margin, size
 ):

@@ -77,21 +77,23 @@ def test_idle_connections_leave_room_for_requests() -> None:
 
 def test_a_request_that_is_answered_is_not_cut_by_idle_connections() -> None:
     limits = Limits(silent=2, request_seconds=PATIENCE)
-    may_answer = asyncio.Event()
-
-    async def answer_late(scope: Scope, receive: Receive, send: Send) -> None:
-        await may_answer.wait()
-        await answer(scope, receive, send)
 
     async def work() -> None:
+        has_come, may_answer = asyncio.Future[None](), asyncio.Future[None]()
+
+        async def answer_late(scope: Scope, receive: Receive, send: Send) -> None:
+            has_come.set_result(None)
+            await asyncio.wait_for(may_answer, PATIENCE)
+            await answer(scope, receive, send)
+
         async with serving(answer_late, limits) as place:
             asked = asyncio.create_task(asyncio.to_thread(status, place))
+            await asyncio.wait_for(has_come, PATIENCE)
             with contextlib.ExitStack() as idle:
-                while not asked.done():
-                    for _ in range(8):
-                        made = await asyncio.to_thread(socket.create_connection, place, PATIENCE)
-                        idle.enter_context(made)
-                    may_answer.set()
+                for _ in range(8):
+                    made = await asyncio.to_thread(socket.create_connection, place, PATIENCE)
+                    idle.enter_context(made)
+                may_answer.set_result(None)
                 assert await asked == 200
 
     asyncio.run(work())

@@ -33,7 +33,6 @@ if TYPE_CHECKING:
         NewerVersionError,
         NotAnEnvironmentError,
         ObjectNotFoundError,
-        OutdatedError,
         OutsideGridError,
         ProtocolError,
         ReadOnlyError,
@@ -108,7 +107,6 @@ __all__ = [
     "NotAnEnvironmentError",
     "Object",
     "ObjectNotFoundError",
-    "OutdatedError",
     "OutsideGridError",
     "PointShell",
     "Pool",
@@ -160,7 +158,7 @@ _HOMES = {
         "AccessError BusyError ConflictError ConnectionLostError DamagedError "
         "DatabaseError DeviceError EnvironmentExistsError EnvironmentNotFoundError "
         "FileError GeometryChangedError GridError HapticDBError MissingExtraError "
-        "NewerVersionError NotAnEnvironmentError ObjectNotFoundError OutdatedError "
+        "NewerVersionError NotAnEnvironmentError ObjectNotFoundError "
         "OutsideGridError ProtocolError ReadOnlyError StuckError "
         "UsageError"
     ),

@@ -17,12 +17,11 @@
         ├── EnvironmentExistsError (FileExistsError)
         ├── NotAnEnvironmentError             a file of another kind
         ├── NewerVersionError                 written by a newer hapticdb
-        ├── DamagedError                      an environment whose pages are broken
+        ├── DamagedError                      an environment whose contents are broken
         ├── ReadOnlyError (PermissionError)   a write where only reading is possible
         ├── AccessError (PermissionError)     the server does not let this user in
         ├── ConflictError                     another has written the object meanwhile
         ├── ConnectionLostError (ConnectionError)  the server went away
-        │   └── OutdatedError                 a snapshot that a server could not hold
         ├── BusyError (TimeoutError)          another writer held the database too long
         └── StuckError (TimeoutError)         the database took longer than a frame may
 
@@ -113,10 +112,6 @@ class ConflictError(DatabaseError):
 
 class ConnectionLostError(DatabaseError, ConnectionError):
     """The server went away, or was never there."""
-
-
-class OutdatedError(ConnectionLostError):
-    """A snapshot that a server could not hold: read all of it again."""
 
 
 class StuckError(DatabaseError, TimeoutError):

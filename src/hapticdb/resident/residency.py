@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticdb.errors import GridError, ObjectNotFoundError, OutdatedError, UsageError
+from hapticdb.errors import GridError, ObjectNotFoundError, UsageError
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, Place
 from hapticdb.resident.changes import known_cells_touched, writes_since
@@ -270,11 +270,7 @@ class Residency:
 
     def _read_now(self, cells: Keys) -> UnpublishedCells | None:
         """Read cells (n,) of the known revision; None if others have written since then."""
-        try:
-            read = self._read_batch(cells)
-        except OutdatedError:
-            self.writer.slots.free_lost()
-            return None
+        read = self._read_batch(cells)
         if self.store.version() == self._commit_count:
             return read
         self.writer.slots.give_back(read.slots)
@@ -290,14 +286,6 @@ class Residency:
         return n_writes
 
     def _follow_writes(self, asked: Keys) -> tuple[int, UnpublishedCells]:
-        """Update the known cells in one snapshot; in a second one if the first was outdated."""
-        try:
-            return self._follow_once(asked)
-        except OutdatedError:
-            self.writer.slots.free_lost()
-            return self._follow_once(asked)
-
-    def _follow_once(self, asked: Keys) -> tuple[int, UnpublishedCells]:
         """Update the known cells to the last revision, and read the unknown cells `asked` (n,).
 
         The most urgent touched cells are read again, the others are forgotten. So memory and time

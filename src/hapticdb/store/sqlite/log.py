@@ -226,7 +226,7 @@ class _Log:
             frame = self._read(FRAME_BYTES, at)
             if len(frame) < FRAME_BYTES:
                 return False
-            sums = log_checksum(np.frombuffer(frame, self._order), *sums)
+            sums = _log_checksum(np.frombuffer(frame, self._order), *sums)
             if sums != SUMS.unpack_from(frame, 16):
                 return False
             is_ours = is_ours or (number == LINEAGE_PAGE and self._lineage(at) is not None)
@@ -237,16 +237,16 @@ class _Log:
 
 def _header_sums(header: bytes, order: str) -> tuple[int, int]:
     """Checksum of a log's header."""
-    return words_checksum(np.frombuffer(header[:24], order).tolist(), 0, 0)
+    return _words_checksum(np.frombuffer(header[:24], order).tolist(), 0, 0)
 
 
-def log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:
+def _log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:
     """Both sums after a frame's words (2054,), from the sums before the frame, modulo 2^32.
 
     SQLite adds the page's number and size and then its content, word after word: s1 += word + s2,
     s2 += the next + s1. Both are linear in the words, with Fibonacci's numbers for weights.
     """
-    s1, s2 = words_checksum(frame[:2].tolist(), s1, s2)
+    s1, s2 = _words_checksum(frame[:2].tolist(), s1, s2)
     page = frame[6:].astype(np.uint32, copy=False)
     return (
         (int(_WEIGHTS[0].dot(page)) + _PAST[0] * s1 + _PAST[1] * s2) & 0xFFFFFFFF,
@@ -254,7 +254,7 @@ def log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:
     )
 
 
-def words_checksum(words: list[int], s1: int, s2: int) -> tuple[int, int]:
+def _words_checksum(words: list[int], s1: int, s2: int) -> tuple[int, int]:
     """Both sums after an even number of words, one by one."""
     for even, odd in zip(words[::2], words[1::2], strict=True):
         s1 = (s1 + even + s2) & 0xFFFFFFFF

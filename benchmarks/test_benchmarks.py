@@ -104,7 +104,10 @@ def test_the_spark_plug_comes_out_and_its_triangles_keep_the_proved_distance(
         pytest.importorskip("coal", reason="make peers installs it")
     import ways_out  # noqa: PLC0415 - loads coal
 
-    (row,) = ways_out.measure(tmp_path, None, ways_out.BITS, ways_out.SAMPLE[-1:])["rows"]
+    model = tmp_path / "plug.glb"
+    model.write_bytes(ways_out.plug_scene().export(file_type="glb"))
+    question = ways_out.Question(("engine/spark_plug",))
+    (row,) = ways_out.measure(tmp_path, model, 7, [question])["rows"]
     assert (row["verdict"], row["how"]) == ("comes out", "pull")
     assert 0.0 < row["clearance_m"] <= row["mesh_distance_m"]
 

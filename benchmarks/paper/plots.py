@@ -9,7 +9,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from paper.cells import (
-    ALL_CACHED,
     FRAME_US,
     Cell,
     Results,
@@ -17,6 +16,7 @@ from paper.cells import (
     grouped,
     named,
     typical,
+    with_paper_cache,
 )
 
 SMALLEST_GAP = 3.0
@@ -80,7 +80,7 @@ def against_maxgap(cells: Sequence[Cell], by: Sequence[str]) -> Figure:
 
 def figure_9(cells: Sequence[Cell]) -> Figure:
     """MaxGap against CBGroup with the paper's cache, in both forms."""
-    return against_maxgap([cell for cell in cells if cell["cache"] != ALL_CACHED], ("form",))
+    return against_maxgap(with_paper_cache(cells), ("form",))
 
 
 def figure_10(cells: Sequence[Cell]) -> Figure:

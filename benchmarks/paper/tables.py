@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 from page_tables import NONE, facts, table, us_text
 from paper.cells import (
-    ALL_CACHED,
     FRAME_US,
     IN_THE_SERVER,
     ONE_STATEMENT,
@@ -18,6 +17,7 @@ from paper.cells import (
     named,
     place_of,
     typical,
+    with_paper_cache,
 )
 
 CLOSE = 1.05
@@ -116,8 +116,7 @@ def contest_table(name: str) -> Callable[[Results], str]:
     """The best MAXGAP, CBGroup and `array` of each contest with the paper's cache."""
 
     def of(results: Results) -> str:
-        cells = [cell for cell in cells_of(results, name) if cell["cache"] != ALL_CACHED]
-        found = list(contests(cells or cells_of(results, name)))
+        found = list(contests(with_paper_cache(cells_of(results, name))))
         has_loop = any(one.form == IN_THE_SERVER for one in found)
         rows = []
         for one in found:

@@ -44,7 +44,8 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_configure_node(node: Any) -> None:  # noqa: ANN401 - xdist has no types
-    """Tell a process that runs tests which folder the run shares."""
+    """Tell a process that runs tests which folder and which seed the run shares."""
+    draws.tell(node.workerinput)
     node.workerinput["shared"] = str(children.shared_folder())
 
 

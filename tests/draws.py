@@ -28,12 +28,19 @@ def choose(config: pytest.Config) -> None:
     Examples have no deadline: the first one compiles kernels, and the machine may be busy.
     """
     option = config.option
-    if option.draw is None:
-        option.draw = random.randrange(10**6)  # noqa: S311 - all processes have it
-    _chosen["seed"] = None if option.every_step else option.draw
+    of_a_worker: dict[str, int] = getattr(config, "workerinput", {})
+    seed = of_a_worker.get("draw", option.draw)
+    if seed is None:
+        seed = random.randrange(10**6)  # noqa: S311 - `tell` gives it to all processes
+    _chosen["seed"] = None if option.every_step else seed
     settings.register_profile("few", max_examples=25, deadline=None)
     settings.register_profile("many", max_examples=200, deadline=None)
     settings.load_profile("many" if option.every_step else "few")
+
+
+def tell(workerinput: dict[str, object]) -> None:
+    """Tell a process that runs tests which seed the run has."""
+    workerinput["draw"] = _chosen["seed"] or 0
 
 
 def is_every() -> bool:

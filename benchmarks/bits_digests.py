@@ -103,7 +103,7 @@ def stored(place: Place, env: hapticdb.Environment, results: Results) -> None:
 
 
 def touched(place: Place, env: hapticdb.Environment, tool: Tool, results: Results) -> None:
-    """Digest touches at all poses, by each strategy and by `touch_many`."""
+    """Digest touches at all poses, by each strategy and all at once."""
     for strategy in STRATEGIES:
         felt, asked, n_hit = Digest(), Digest(), 0
         for pose in tool.poses:
@@ -115,12 +115,11 @@ def touched(place: Place, env: hapticdb.Environment, tool: Tool, results: Result
         results[f"{place.name}/{strategy}"] = felt.entry(n_hit, f"of {len(tool.poses)} poses hit")
         if strategy not in MEASURED:
             results[f"{place.name}/{strategy} asks"] = asked.entry(len(tool.poses), "poses")
-    many = env.touch_many(tool.shell, tool.poses, contacts=True)
-    assert many.contacts is not None
+    many = env.touch(tool.shell, poses=tool.poses, objects=True)
     (digest := Digest()).feed(many.forces, many.torques, many.hits, many.n_contacts, many.deepest)
-    digest.feed(many.contacts, repr(many.ids), repr(many.query[1:4]))
+    digest.feed(many.ids, many.offsets)
     n_hit = int(np.count_nonzero(many.hits))
-    results[f"{place.name}/touch_many"] = digest.entry(n_hit, f"of {len(many)} poses hit")
+    results[f"{place.name}/at once"] = digest.entry(n_hit, f"of {len(many)} poses hit")
 
 
 def recorded(place: Place, tool: Tool, file: Path, results: Results) -> None:
@@ -144,7 +143,7 @@ def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Resul
     header, felt_again = recording.header, []
 
     def feel(poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        felt = env.touch_many(header.shell, poses, exclude=header.exclude, law=header.law)
+        felt = env.touch(header.shell, poses=poses, exclude=header.exclude, law=header.law)
         wrenches = np.hstack([felt.forces, felt.torques])
         felt_again.append(np.column_stack([wrenches, felt.hits]))
         return wrenches, felt.hits

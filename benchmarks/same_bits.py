@@ -15,10 +15,11 @@ the recordings of another commit instead of the run's own.
 
 The environments hold the vintage car at 2048 voxels an axis, on SQLite in both layouts and on every
 PostgreSQL found. Compared are: the stored rows; force, torque, hits, depths and objects at 10,000
-poses, for each strategy and for `touch_many`; the statements of a strategy, unless they depend on
-measured costs; the verdict of ``sweep``; and all frames of a simulated hand that the force pushes
-back. A session runs on a clock that counts its calls, so its frames do not depend on the machine's
-load. Only public names and the command line are used: modules may move between the two commits.
+poses, for each strategy and for all poses at once; the statements of a strategy, unless they depend
+on measured costs; the verdict of ``sweep``; and all frames of a simulated hand that the force
+pushes back. A session runs on a clock that counts its calls, so its frames do not depend on the
+machine's load. Only public names and the command line are used: modules may move between the two
+commits.
 """
 
 import argparse

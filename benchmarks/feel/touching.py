@@ -57,8 +57,7 @@ class Law:
 
     def forces(self, ground: Ground, shell: PointShell, poses: Floats) -> Floats:
         """Forces (M, 3) of `touch` at poses (M, 4, 4)."""
-        touches = ground.environment.touch_many(shell, poses, law=self.force)
-        return np.asarray(touches.forces)
+        return ground.environment.touch(shell, poses=poses, law=self.force).forces
 
 
 PLANE = Law("plane", 0.0, FILLING, TangentPlane(STIFFNESS), distances=False)

@@ -54,7 +54,7 @@ if TYPE_CHECKING:
     from hapticdb.query.frame import Query
     from hapticdb.query.law import DistanceField, TangentPlane
     from hapticdb.query.quantiles import QuantileVector
-    from hapticdb.query.touches import Touch, Touches
+    from hapticdb.query.touches import Touch
     from hapticdb.realtime.coupling import Coupling
     from hapticdb.realtime.handle import Handle
     from hapticdb.realtime.report import Report
@@ -125,7 +125,6 @@ __all__ = [
     "TangentPlane",
     "Touch",
     "TouchBatch",
-    "Touches",
     "UpgradeReport",
     "UsageError",
     "backup_environment",
@@ -188,7 +187,7 @@ _HOMES = {
     "query.quantiles": "QuantileVector",
     "store.base": "Object",
     "store.connect": "backup_environment restore_environment",
-    "query.touches": "Touch Touches",
+    "query.touches": "Touch",
     "transfer": "CopyReport copy_environment",
     "warm": "warm_up",
 }

@@ -171,7 +171,7 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
             env.touch(shell)  # type: ignore[call-overload]
         with pytest.raises(UsageError, match="one pose, or poses"):
             env.touch(shell, poses[0], poses=poses)  # type: ignore[call-overload]
-        with pytest.raises(UsageError, match="touch_many"):
+        with pytest.raises(UsageError, match="strategy 'array' for many poses"):
             env.touch(shell, strategy="array", poses=poses)  # type: ignore[call-overload]
         with pytest.raises(ObjectNotFoundError, match="exclude"):
             env.touch(shell, poses=poses, exclude=["no such part"])

@@ -268,6 +268,7 @@ def test_a_database_that_is_gone_is_told_while_the_session_runs(scene: Path) -> 
         assert line.startswith("hapticdb: scene.db cannot be reached any more ")
         assert line.endswith("; until then no force is felt\n")
         process.send_signal(signal.SIGTERM)
+        process.communicate(timeout=PATIENCE)
     assert process.returncode == 128 + signal.SIGTERM
 
 

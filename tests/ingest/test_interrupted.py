@@ -168,8 +168,8 @@ def test_an_import_interrupted_while_it_reads_leaves_nothing(folder: Path, tmp_p
 
 ENDLESS = """
 import sys, time
+import hapticdb.kernels.surfaces.voxelize as voxelize
 from hapticdb.__main__ import main
-from hapticdb.kernels.surfaces import voxelize
 
 def endless(*given, real=voxelize.voxelize_pieces):
     _, *bricks = next(real(*given))

@@ -64,9 +64,10 @@ def check_strategies(env: Environment, curve: CurveName) -> None:
         for strategy in STRATEGIES:
             if strategy != "statement":
                 assert_same(env.touch(shell, pose, strategy, exclude=exclude), wanted)
-        many = env.touch_many(shell, [pose, random_pose(seed + 1)], exclude=exclude)
+        poses = [pose, random_pose(seed + 1)]
+        many = env.touch(shell, poses=poses, exclude=exclude, objects=True)
         assert [*many.forces[0], *many.torques[0]] == [*wanted.force, *wanted.torque]
-        assert many.ids[0] == wanted.ids
+        assert many.ids_at(0) == wanted.ids
     assert n_contacts > 0
 
 
@@ -118,6 +119,6 @@ def test_the_default_law_follows_the_objects(env: Environment) -> None:
     with pytest.raises(UsageError, match=r"1 of 6 objects .* 'hapticdb upgrade"):
         env.touch(shell, pose, law="smooth")
     with pytest.raises(UsageError, match=r"1 of 6 objects .* 'hapticdb upgrade"):
-        env.touch_many(shell, [pose], law="smooth")
+        env.touch(shell, poses=[pose], law="smooth")
     with pytest.raises(UsageError, match="choose one of plane, smooth"):
         env.touch(shell, pose, law="soft")  # type: ignore[call-overload]

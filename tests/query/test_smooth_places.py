@@ -26,7 +26,7 @@ def poses() -> NDArray[np.float64]:
 
 
 def check_strategies(env: Environment, shell: PointShell) -> list[list[float]]:
-    """Check all strategies and `touch_many` against `array`; returns the wrenches."""
+    """Check all strategies and many poses at once against `array`; returns the wrenches."""
     path = poses()
     ones = [env.touch(shell, pose, "array") for pose in path]
     wrenches = [[*one.force, *one.torque] for one in ones]
@@ -42,14 +42,13 @@ def check_strategies(env: Environment, shell: PointShell) -> list[list[float]]:
             assert other.contact_depths.tolist() == one.contact_depths.tolist()
             assert other.contact_pairs.tolist() == one.contact_pairs.tolist()
             assert [obj.id for obj in other.objects] == [obj.id for obj in one.objects]
-        many = env.touch_many(shell, path, strategy, contacts=True)
-        assert np.column_stack([many.forces, many.torques]).tolist() == wrenches
-        assert many.hits.tolist() == [len(one.hits) for one in ones]
-        assert many.n_contacts.tolist() == [len(one.contacts) for one in ones]
-        assert many.ids == [[obj.id for obj in one.objects] for one in ones]
-        assert many.contacts is not None
-        assert many.contacts["point"].tolist() == [n for one in ones for n in one.contacts]
-        assert many.contacts["depth"].tolist() == [d for one in ones for d in one.contact_depths]
+    many = env.touch(shell, poses=path, objects=True)
+    assert np.column_stack([many.forces, many.torques]).tolist() == wrenches
+    assert many.hits.tolist() == [len(one.hits) for one in ones]
+    assert many.n_contacts.tolist() == [len(one.contacts) for one in ones]
+    assert many.deepest.tolist() == [one.contact_depths.max(initial=0.0) for one in ones]
+    for n, one in enumerate(ones):
+        assert many.ids_at(n) == [obj.id for obj in one.objects]
     return wrenches
 
 

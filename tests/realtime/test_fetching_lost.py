@@ -184,7 +184,7 @@ class Listener:
     def send(self, word: str, content: object = None) -> None:
         assert content
         self.sent.append(word)
-        self.table.cells.control[STOP] = 1
+        self.table.cells.control[STOP] = word == "ready"
 
 
 def test_a_connection_lost_while_warming_up_puts_ready_off(
@@ -203,7 +203,7 @@ def test_a_connection_lost_while_warming_up_puts_ready_off(
     with CellTable.create(LEAST_BUDGET) as table:
         listener: Any = Listener(table)
         fetching.fetch(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid), listener)
-        assert listener.sent == ["ready"]
+        assert listener.sent == ["lost", "ready"]
         assert next(losses, None) is None
         assert table.desk.figures["losses"] == 1
 

@@ -1,12 +1,13 @@
 """Feeler: a tool whose cells stay in memory, asked at batches of poses."""
 
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Self, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.batches.nearest import DEFAULT_REACH, NearestSearch, run_first_hits
+from hapticdb.batches.nearest import DEFAULT_REACH, NearestSearch, first_hits_at
 from hapticdb.batches.order import order_of
 from hapticdb.batches.result import ClearanceBatch, Named, TouchBatch
 from hapticdb.batches.threads import BatchThreads, ThreadMemory, available_jobs
@@ -14,11 +15,9 @@ from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.kernels.law import reads_distances
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS, WRENCH
 from hapticdb.kernels.resident.feeling import feel_kernel
-from hapticdb.kernels.resident.first_hits import UNDECIDED
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import HapticQuery, as_poses
-from hapticdb.query.grouping import DEFAULT_MAXGAP
 from hapticdb.query.law import ForceLaw
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
@@ -209,11 +208,12 @@ class Feeler:
         """
         places = as_poses(poses)
         order = order_of(places, self.shell.center, self._residency.grid)
+        search = partial(first_hits_at, self._frames, self._threads)
 
         def searched() -> Bools:
             collides = np.zeros(len(places), dtype=np.bool_)
             for chosen in self._pieces(order, progress):
-                collides[chosen] = self._collides(places[chosen])
+                collides[chosen] = self._frames.collides(places[chosen], search)
             return collides
 
         return self._at_one_revision(searched)
@@ -296,19 +296,6 @@ class Feeler:
             out[now] = felt
         return out
 
-    def _collides(self, poses: Floats) -> Bools:
-        """Whether a point hits at each of poses (B,); first where all cells are in memory."""
-        found = np.empty(len(poses), dtype=np.int64)
-        run_first_hits(self._frames, self._threads, poses, found)
-        pending = np.flatnonzero(found == UNDECIDED)
-        while len(pending):
-            n_poses = self._frames.fetch(poses[pending])
-            now, pending = pending[:n_poses], pending[n_poses:]
-            decided = np.empty(n_poses, dtype=np.int64)
-            run_first_hits(self._frames, self._threads, poses[now], decided)
-            found[now] = decided
-        return np.asarray(found >= 0)
-
     def _run(self, poses: Floats, out: Floats) -> None:
         """Frames at poses into out (B, RESULTS), in all threads."""
         cells, place, law = self._frames.cells, self._residency.place, self._frames.law
@@ -324,7 +311,5 @@ class Feeler:
     def _ids_at(self, poses: Floats) -> Iterator[list[int]]:
         """Ids of the objects at each of poses, as a touch names them."""
         exclude = self._residency.exclude
-        for answer in self._query.run_many(
-            self.shell, poses, "auto", DEFAULT_MAXGAP, exclude, self.law
-        ):
+        for answer in self._query.run_many(self.shell, poses, exclude, self.law):
             yield answer.ids

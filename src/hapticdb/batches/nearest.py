@@ -24,10 +24,9 @@ RUN = 16
 which is looked up by itself; with 64 a search of 300 points takes a third longer."""
 
 
-def run_first_hits(
-    frames: ResidentFrames, threads: BatchThreads, poses: Floats, found: Ints
-) -> None:
-    """Find a point that hits at each of poses, in cells that are in memory, into found (B,)."""
+def first_hits_at(frames: ResidentFrames, threads: BatchThreads, poses: Floats) -> Ints:
+    """Find a point (B,) that hits at each of poses, in cells that are in memory."""
+    found = np.empty(len(poses), dtype=np.int64)
     cells, place = frames.residency.table.cells.without_distances(), frames.residency.place
 
     def work(memory: ThreadMemory, one: slice) -> None:
@@ -36,6 +35,7 @@ def run_first_hits(
         )
 
     threads.run(work, len(poses))
+    return found
 
 
 class NearestSearch:
@@ -86,7 +86,7 @@ class NearestSearch:
         squares = np.full(n_poses, self._reach**2)
         nearest = np.full(n_poses, -1, dtype=np.int64)
         done = np.zeros(n_poses, dtype=np.int64)
-        hits = self._first_hits(poses)
+        hits = first_hits_at(self._frames, self._threads, poses)
         is_hit = hits >= 0
         squares[is_hit], nearest[is_hit], done[is_hit] = 0.0, hits[is_hit], n_points
         pending = np.flatnonzero(~is_hit)
@@ -100,12 +100,6 @@ class NearestSearch:
             if len(pending):
                 self._fetch(part[is_left], int(done[pending[0]]))
         return np.sqrt(squares), nearest
-
-    def _first_hits(self, poses: Floats) -> Ints:
-        """Points (B,) that hit, below 0 where none is known to: no cell is fetched."""
-        found = np.empty(len(poses), dtype=np.int64)
-        run_first_hits(self._frames, self._threads, poses, found)
-        return found
 
     def _run(self, poses: Floats, squares: Floats, nearest: Ints, done: Ints) -> None:
         place = self._frames.residency.place

@@ -11,7 +11,7 @@ from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import Strategy
 from hapticdb.query.grouping import DEFAULT_MAXGAP
 from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law
-from hapticdb.query.touches import Touch, Touches
+from hapticdb.query.touches import Touch
 from hapticdb.query.touching import Touching
 from hapticdb.store.base import Store
 from hapticdb.store.filtering import FiltersOfWords
@@ -113,45 +113,9 @@ class Queries:
             felt = self._filters.of(where, exclude)
             return self._touching.touch(shell, pose, strategy, maxgap, felt, as_law(law))
         if strategy != "auto":
-            raise UsageError(f"strategy {strategy!r} for many poses: leave it out, or touch_many")
+            raise UsageError(f"strategy {strategy!r} for many poses: leave it out")
         with self.feeler(shell, where=where, exclude=exclude, law=law) as feeler:
             return feeler.touch(poses, objects=objects, progress=progress)  # type: ignore[arg-type]
-
-    def touch_many(
-        self,
-        shell: PointShell,
-        poses: ArrayLike,
-        strategy: Strategy = "auto",
-        *,
-        where: Words = (),
-        exclude: Words = (),
-        maxgap: int = DEFAULT_MAXGAP,
-        law: ForceLaw | LawName | None = None,
-        contacts: bool = False,
-    ) -> Touches:
-        """Force and torque at many poses; the same as `touch` for each pose, bit for bit.
-
-        Parameters
-        ----------
-        poses : (n, 4, 4) array
-            world_from_tool for each frame, rigid, metres.
-        strategy : str
-            ``auto`` reads the rows of neighbouring poses in one statement; any other strategy
-            queries pose by pose, as `touch` does.
-        contacts : bool
-            Whether to list every contact, too.
-        shell, where, exclude, maxgap, law
-            As for `touch`.
-
-        Raises
-        ------
-        UsageError, ObjectNotFoundError
-            As for `touch`; nothing is returned then.
-        """
-        felt = self._filters.of(where, exclude)
-        return self._touching.touch_many(
-            shell, poses, strategy, maxgap, felt, as_law(law), contacts=contacts
-        )
 
     def collides(
         self,

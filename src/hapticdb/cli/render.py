@@ -8,7 +8,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, ParamSpec
 
 from hapticdb.cli.columns import Columns
 from hapticdb.units import length_text
@@ -28,7 +28,7 @@ _UNPRINTABLE = re.compile(
 )
 """Controls of a terminal, and of the direction of writing; a line's end is neither."""
 NEW_LINE = "\n"
-Progressed = TypeVar("Progressed")
+Progressed = ParamSpec("Progressed")
 """What a callback of the library is called with."""
 
 
@@ -200,10 +200,15 @@ def pull_bar() -> "AbstractContextManager[SearchCallback | None]":
     return _progress_bar("pulling", "pulls", lambda now: ("pulling", now.done, now.total, 0))
 
 
+def count_bar(doing: str, noun: str) -> "AbstractContextManager[Callable[[int, int], None] | None]":
+    """Show how many of something are done, of how many; see `_progress_bar`."""
+    return _progress_bar(doing, noun, lambda done, total: (doing, done, total, 0))
+
+
 @contextmanager
 def _progress_bar(
-    doing: str, noun: str, figures: "Callable[[Progressed], tuple[str, float, int, int]]"
-) -> "Iterator[Callable[[Progressed], None] | None]":
+    doing: str, noun: str, figures: "Callable[Progressed, tuple[str, float, int, int]]"
+) -> "Iterator[Callable[Progressed, None] | None]":
     """Show a bar with counts, voxels a second and time left while standard error is a terminal.
 
     figures : of a progress: what is being done, how much of it, of how much, voxels so far.
@@ -213,7 +218,7 @@ def _progress_bar(
         yield None
         return
     with _bar(doing, noun) as advance:
-        yield lambda now: advance(*figures(now))
+        yield lambda *now, **more: advance(*figures(*now, **more))
 
 
 @contextmanager

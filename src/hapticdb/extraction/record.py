@@ -5,8 +5,7 @@ from typing import Any
 from hapticdb.extraction.result import Extraction, WayOut
 from hapticdb.extraction.verdict import extraction_line
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.store.base import Object
-from hapticdb.sweeps.record import depth_record, sweep_record
+from hapticdb.sweeps.record import depth_record, named, sweep_record
 from hapticdb.sweeps.result import Swept
 
 
@@ -19,10 +18,10 @@ def extraction_record(found: Extraction, excluded: list[int]) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "line": extraction_line(found),
-        "parts": [_named(obj) for obj in found.parts],
+        "parts": [named(obj) for obj in found.parts],
         "way": found.way and _way(found.way, found.shell, parts, excluded),
-        "touched": [_named(obj) for obj in found.touched],
-        "blockers": [{**_named(one.object), "pulls": one.pulls} for one in found.blockers],
+        "touched": [named(obj) for obj in found.touched],
+        "blockers": [{**named(one.object), "pulls": one.pulls} for one in found.blockers],
         "pulls": found.pulls,
         "motions": found.motions,
         "poses": found.poses,
@@ -47,7 +46,3 @@ def _way(way: WayOut, shell: PointShell, parts: list[int], excluded: list[int]) 
         "depths": [depth_record(one) for one in way.depths],
         "beside": way.beside and proof(way.beside),
     }
-
-
-def _named(obj: Object) -> dict[str, object]:
-    return {"id": obj.id, "name": obj.name}

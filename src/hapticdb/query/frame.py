@@ -80,17 +80,6 @@ class Answer(NamedTuple):
     apart: NDArray[np.int64] = NO_POINTS
     apart_depths: NDArray[np.float64] = NO_DEPTHS
 
-    @property
-    def n_contacts(self) -> int:
-        """Number of points that are felt."""
-        return int(np.count_nonzero(self.depths)) + self.apart.size
-
-    @property
-    def deepest(self) -> float:
-        """Greatest depth of a felt point, metres; 0 when no point is felt."""
-        deepest = float(self.depths.max(initial=0.0))
-        return max(deepest, float(self.apart_depths.max())) if self.apart.size else deepest
-
     def contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
         """Indices (C,) of the points that are felt, ascending, and their depths (C,), above 0."""
         is_felt = self.depths > 0
@@ -230,26 +219,17 @@ class HapticQuery:
         self,
         shell: "PointShell",
         poses: NDArray[np.float64],
-        strategy: Strategy,
-        gap: int,
         exclude: Keys,
         law: ForceLaw,
     ) -> Iterator[Answer]:
-        """Answers at poses (n, 4, 4), in their order; see `Environment.touch_many`.
+        """Answers at poses (n, 4, 4), in their order; one statement reads the rows of several.
 
-        A statement that serves several poses is counted in the first pose's answer only.
+        Such a statement is counted in the first pose's answer only.
         """
-        _check_options(strategy, gap)
         batch: list[contact.Located] = []
         n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
-        for n, pose in enumerate(poses):
-            try:
-                if strategy != "auto":
-                    yield self.run(shell, pose, strategy, gap, exclude, law)
-                    continue
-                batch.append(self.locate(shell, pose))
-            except UsageError as error:
-                raise UsageError(f"pose {n}: {error}") from error
+        for pose in poses:
+            batch.append(self.locate(shell, pose))
             n_keys += len(batch[-1].keys)
             if n_keys >= MOST_KEYS or len(batch) >= most:
                 yield from self._look_up_together(batch, exclude, law)

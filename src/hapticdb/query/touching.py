@@ -1,7 +1,6 @@
 """Frames of an opened environment: the law, the objects and the revision that belong to each."""
 
 from collections.abc import Callable
-from time import perf_counter_ns
 from typing import TypeVar
 
 from numpy.typing import ArrayLike
@@ -9,10 +8,10 @@ from numpy.typing import ArrayLike
 from hapticdb.errors import ConnectionLostError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
-from hapticdb.query.frame import Answer, HapticQuery, Strategy, as_poses
+from hapticdb.query.frame import Answer, HapticQuery, Strategy
 from hapticdb.query.known_objects import KnownObjects
 from hapticdb.query.law import PLANE, ForceLaw
-from hapticdb.query.touches import Touch, Touches
+from hapticdb.query.touches import Touch
 from hapticdb.store.base import Store
 from hapticdb.store.filtering import Filter
 
@@ -93,33 +92,6 @@ class Touching:
         if self.known.learn():
             self._figures.drop_empty_statistics()
         return self.known.law_of(law)
-
-    def touch_many(
-        self,
-        shell: PointShell,
-        poses: ArrayLike,
-        strategy: Strategy,
-        maxgap: int,
-        felt: Filter,
-        law: ForceLaw | None,
-        *,
-        contacts: bool,
-    ) -> Touches:
-        """Compute the frames at many poses, at one revision."""
-        places, started = as_poses(poses), perf_counter_ns()
-
-        def all_felt() -> Touches:
-            with self._store.snapshot():
-                chosen = self._law_of_snapshot(law)
-                left_out = self.known.left_out(felt)
-                answers = self._query.run_many(shell, places, strategy, maxgap, left_out, chosen)
-                return Touches(len(places), has_contacts=contacts).gather(answers)
-
-        if strategy == "cbgroup":
-            self._figures.both()  # measured outside the snapshot
-        touches = _twice(all_felt)
-        self.known.check_words(felt)
-        return touches.name(self.known.by_id, (perf_counter_ns() - started) / 1000)
 
 
 def _twice(work: Callable[[], _Felt]) -> _Felt:

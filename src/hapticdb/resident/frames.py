@@ -1,5 +1,6 @@
 """Frames against resident cells in this process: exact, for paths, replays and benchmarks."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -244,21 +245,26 @@ class ResidentFrames:
             counts[:, sleeping.LEFT_OUT],
         )
 
-    def collides(self, poses: Floats) -> NDArray[np.bool_]:
+    def collides(
+        self, poses: Floats, search: Callable[[Floats], NDArray[np.int64]] | None = None
+    ) -> NDArray[np.bool_]:
         """Whether a point is in an occupied voxel at each of poses (M, 4, 4), rigid transforms.
 
         These are the poses at which `feel` counts hits under the plane law. The search of a pose
         ends at its first hit, and cells are fetched only where it does not know them.
+
+        search : looks for a point that hits at each pose, such as `first_hits` in several threads.
         """
-        found = self._first_hits(poses)
+        search = search or self.first_hits
+        found = search(poses)
         pending = np.flatnonzero(found == UNDECIDED)
         while len(pending):
             n_poses = self.fetch(poses[pending])
             now, pending = pending[:n_poses], pending[n_poses:]
-            found[now] = self._first_hits(poses[now])
+            found[now] = search(poses[now])
         return np.asarray(found >= 0)
 
-    def _first_hits(self, poses: Floats) -> NDArray[np.int64]:
+    def first_hits(self, poses: Floats) -> NDArray[np.int64]:
         """A point (M,) that hits at each of poses (M, 4, 4), `NOTHING` or `UNDECIDED`."""
         found = np.empty(len(poses), dtype=np.int64)
         cells = self.residency.table.cells.without_distances()

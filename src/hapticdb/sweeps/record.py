@@ -42,7 +42,7 @@ def sweep_record(
             "moment": _moment(deepest.moment),
         },
         "objects": [_met_object(one) for one in found.objects],
-        "enclosed": [_named(obj) for obj in found.enclosed],
+        "enclosed": [named(obj) for obj in found.enclosed],
         "hit_intervals": found.hit_intervals.tolist(),
         "contact_intervals": found.contact_intervals.tolist(),
         "clearance": clearance
@@ -67,7 +67,7 @@ def sweep_record(
         "proportions": found.proportions.record(),
         "at_least": found.at_least,
         "looked": found.looked,
-        "left_at_start": [_named(obj) for obj in found.left_at_start],
+        "left_at_start": [named(obj) for obj in found.left_at_start],
         "decision": found.decision and _decision(found.decision),
         "depths": [depth_record(one) for one in found.depths],
     }
@@ -80,7 +80,7 @@ def depth_record(one: ContactDepth) -> dict[str, object]:
         return depth if math.isfinite(depth) else None
 
     return {
-        **_named(one.object),
+        **named(one.object),
         "at_start": one.at_start,
         "at_start_most": known(one.at_start_most),
         "deepest": one.deepest,
@@ -106,7 +106,7 @@ def _decision(decision: Decision) -> dict[str, object]:
 
 def _met_object(one: MetObject) -> dict[str, object]:
     return {
-        **_named(one.object),
+        **named(one.object),
         "first": one.first,
         "last": one.last,
         "intervals": one.intervals.tolist(),
@@ -119,7 +119,8 @@ def _met_object(one: MetObject) -> dict[str, object]:
     }
 
 
-def _named(obj: Object) -> dict[str, object]:
+def named(obj: Object) -> dict[str, object]:
+    """Convert an object to its id and name."""
     return {"id": obj.id, "name": obj.name}
 
 
@@ -129,7 +130,7 @@ def _moment(moment: Moment | None) -> dict[str, object] | None:
         "fraction": moment.fraction,
         "segment": moment.segment,
         "pose": moment.pose.tolist(),
-        "objects": [_named(obj) for obj in moment.objects],
+        "objects": [named(obj) for obj in moment.objects],
     }
 
 

@@ -191,7 +191,6 @@ class _Output:
 
 
 def _record(index: int, touched: "Touch") -> dict[str, object]:
-    query = touched.query
     return {
         "pose": index,
         "law": getattr(touched.law, "name", ""),
@@ -200,25 +199,18 @@ def _record(index: int, touched: "Touch") -> dict[str, object]:
         "hits": len(touched.hits),
         "contacts": len(touched.contacts),
         "objects": [{"id": obj.id, "name": obj.name} for obj in touched.objects],
-        "query": {
-            "strategy": query.strategy,
-            "statements": query.statements,
-            "ranges": query.ranges,
-            "rows": query.rows,
-            "elapsed_us": query.elapsed_us,
-        },
+        "query": touched.query._asdict(),
     }
 
 
 @dataclass
 class _Summary:
-    """What a path felt like, gathered frame by frame."""
+    """What a path felt like, gathered frame by frame.
 
-    forces: list[float] = field(default_factory=list)
-    torques: list[float] = field(default_factory=list)
-    hits: list[int] = field(default_factory=list)
-    contacts: list[int] = field(default_factory=list)
-    queries: list[tuple[int, int, int, float]] = field(default_factory=list)
+    frames : force, N, torque, N m, hits and contacts; statements, ranges, rows and us of the query.
+    """
+
+    frames: list[tuple[float, ...]] = field(default_factory=list)
     strategies: Counter[str] = field(default_factory=Counter)
     laws: Counter[str] = field(default_factory=Counter)
     frames_of: Counter[int] = field(default_factory=Counter)
@@ -228,13 +220,10 @@ class _Summary:
         """Count one frame in."""
         import numpy as np
 
-        query = touched.query
-        self.forces.append(float(np.linalg.norm(touched.force)))
-        self.torques.append(float(np.linalg.norm(touched.torque)))
-        self.hits.append(len(touched.hits))
-        self.contacts.append(len(touched.contacts))
-        self.queries.append((query.statements, query.ranges, query.rows, query.elapsed_us))
-        self.strategies[query.strategy] += 1
+        force, torque = (float(np.linalg.norm(one)) for one in (touched.force, touched.torque))
+        strategy, *asked = touched.query
+        self.frames.append((force, torque, len(touched.hits), len(touched.contacts), *asked))
+        self.strategies[strategy] += 1
         self.laws[getattr(touched.law, "name", "")] += 1
         for obj in touched.objects:
             self.frames_of[obj.id] += 1
@@ -244,25 +233,25 @@ class _Summary:
         """Print it."""
         import numpy as np
 
-        peak, twist = int(np.argmax(self.forces)), int(np.argmax(self.torques))
-        statements, ranges, rows, elapsed = np.array(self.queries, dtype=float).T
+        forces, torques, hits, contacts, statements, ranges, rows, elapsed = np.array(self.frames).T
+        peak, twist = int(np.argmax(forces)), int(np.argmax(torques))
         median, p99 = np.percentile(elapsed, [50, 99])
         asked = (
             f"{statements.mean():.3g} statements, {ranges.mean():.3g} ranges, "
             f"reads {rows.mean():.3g} rows"
         )
-        n_hit, n_contact = np.count_nonzero(self.hits), np.count_nonzero(self.contacts)
+        n_hit, n_contact = np.count_nonzero(hits), np.count_nonzero(contacts)
         render.show(
             render.facts(
                 [
                     ("shell", shell_text(shell)),
-                    ("frames", f"{len(self.hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
+                    ("frames", f"{len(hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
                     (
                         "hits a frame",
-                        f"median {np.median(self.hits):.0f}, {max(self.hits)} at most",
+                        f"median {np.median(hits):.0f}, {hits.max():.0f} at most",
                     ),
-                    ("peak force", f"{self.forces[peak]:.4g} N at pose {peak}"),
-                    ("peak torque", f"{self.torques[twist]:.4g} N m at pose {twist}"),
+                    ("peak force", f"{forces[peak]:.4g} N at pose {peak}"),
+                    ("peak torque", f"{torques[twist]:.4g} N m at pose {twist}"),
                     ("frame time", f"median {median:.0f} µs, p99 {p99:.0f} µs"),
                     ("a frame asks", asked),
                     ("law", render.shares(self.laws)),

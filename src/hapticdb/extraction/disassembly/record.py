@@ -5,7 +5,7 @@ from typing import Any
 from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch
 from hapticdb.extraction.disassembly.verdict import disassembly_line
 from hapticdb.extraction.record import extraction_record
-from hapticdb.store.base import Object
+from hapticdb.sweeps.record import named
 
 
 def disassembly_record(found: Disassembly) -> dict[str, Any]:
@@ -17,7 +17,7 @@ def disassembly_record(found: Disassembly) -> dict[str, Any]:
     return {
         "verdict": found.verdict,
         "line": disassembly_line(found),
-        "parts": [_named(obj) for obj in found.parts],
+        "parts": [named(obj) for obj in found.parts],
         "steps": [
             {
                 "excluded": list(step.excluded),
@@ -34,13 +34,9 @@ def disassembly_record(found: Disassembly) -> dict[str, Any]:
 
 def _failed(one: FailedSearch) -> dict[str, Any]:
     return {
-        "parts": [_named(obj) for obj in one.parts],
+        "parts": [named(obj) for obj in one.parts],
         "after_steps": one.n_gone,
         "verdict": one.verdict,
         "reason": one.reason or None,
-        "blockers": [{**_named(each.object), "pulls": each.pulls} for each in one.blockers],
+        "blockers": [{**named(each.object), "pulls": each.pulls} for each in one.blockers],
     }
-
-
-def _named(obj: Object) -> dict[str, object]:
-    return {"id": obj.id, "name": obj.name}

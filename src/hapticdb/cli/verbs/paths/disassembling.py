@@ -1,5 +1,6 @@
-"""What `extract --disassemble` searches, prints and writes: a file for each step."""
+"""What `extract` writes, and what it prints of an order: a file for each step."""
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -8,7 +9,8 @@ from hapticdb.cli.verbs.paths.sweeping import UpName
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
-    from hapticdb.extraction.disassembly.result import Disassembly, Removal
+    from hapticdb.extraction.disassembly.result import Disassembly
+    from hapticdb.extraction.result import Extraction
 
 EXIT_CODES = {"comes out": 0, "comes out of contact": 3, "no order found": 1}
 MOST_FAILED = 12
@@ -37,27 +39,48 @@ def report(env: "Environment", found: "Disassembly", asked: Outputs) -> None:
     Nothing is written where no order was found.
     """
     from hapticdb.extraction.disassembly.record import disassembly_record
+
+    def tell() -> None:
+        if asked.json:
+            render.say_json(disassembly_record(found))
+        else:
+            _show(found, asked)
+
+    ways = [(step.found, step.excluded) for step in found.steps] if found.is_found else []
+    write(env, ways, asked, tell, numbered)
+
+
+def write(
+    env: "Environment",
+    ways: "Sequence[tuple[Extraction, Sequence[int]]]",
+    asked: Outputs,
+    tell: Callable[[], None],
+    name_of: Callable[[str, int], str] = lambda file, _: file,
+) -> None:
+    """Write the paths of ways that were found, `tell` the result, and draw what was asked for.
+
+    ways : each with the ids of what is not felt on it; name_of : name of a way's file.
+    """
+    from hapticdb.extraction.verdict import extraction_line
     from hapticdb.poses import write_poses
 
-    steps = found.steps if found.is_found else ()
-    if asked.path is not None:
-        for n, step in enumerate(steps):
-            assert step.found.way is not None  # noqa: S101 - steps are proved
-            write_poses(numbered(asked.path, n), step.found.way.poses)
-    if asked.json:
-        render.say_json(disassembly_record(found))
-    else:
-        _show(found, asked)
-    if asked.picture is not None:
-        for n, step in enumerate(steps):
-            _draw(numbered(asked.picture, n), env, step, asked.up)
-    if asked.animation is not None and steps:
+    for n, (found, _) in enumerate(ways):
+        if asked.path is not None and found.way is not None:
+            write_poses(name_of(asked.path, n), found.way.poses)
+    tell()
+    for n, (found, excluded) in enumerate(ways):
+        if asked.picture is not None and found.way is not None:
+            from hapticdb.pictures.sweep import draw_sweep
+
+            draw_sweep(
+                name_of(asked.picture, n), env, found.shell, found.way.swept, exclude=excluded,
+                verdict=extraction_line(found), up=asked.up,
+            )  # fmt: skip
+    if asked.animation is not None and ways:
         from hapticdb.page.animation import animate
 
-        animate(
-            asked.animation, env, [step.found for step in steps], exclude=steps[-1].excluded,
-            up=asked.up,
-        )  # fmt: skip
+        steps = [found for found, _ in ways]
+        animate(asked.animation, env, steps, exclude=ways[-1][1], up=asked.up)
 
 
 def _show(found: "Disassembly", asked: Outputs) -> None:
@@ -84,14 +107,3 @@ def _show(found: "Disassembly", asked: Outputs) -> None:
         if asked.animation is not None:
             facts.append(("animation", asked.animation))
     render.show(render.facts(facts))
-
-
-def _draw(picture: str, env: "Environment", step: "Removal", up: UpName | None) -> None:
-    from hapticdb.extraction.verdict import extraction_line
-    from hapticdb.pictures.sweep import draw_sweep
-
-    assert step.found.way is not None  # noqa: S101 - steps are proved
-    draw_sweep(
-        picture, env, step.found.shell, step.found.way.swept, exclude=step.excluded,
-        verdict=extraction_line(step.found), up=up,
-    )  # fmt: skip

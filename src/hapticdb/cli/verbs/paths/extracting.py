@@ -16,8 +16,8 @@ from hapticdb.cli.options import (
 )
 from hapticdb.cli.values import budget_bytes
 from hapticdb.cli.verbs.paths.disassembling import EXIT_CODES as ORDER_EXIT_CODES
-from hapticdb.cli.verbs.paths.disassembling import Outputs, report
-from hapticdb.cli.verbs.paths.sweeping import PictureOption, UpName, UpOption, check_picture
+from hapticdb.cli.verbs.paths.disassembling import Outputs, report, write
+from hapticdb.cli.verbs.paths.sweeping import PictureOption, UpOption, check_picture
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -193,20 +193,14 @@ def check_animation(animation: str | None) -> None:
 def _report(env: "Environment", found: "Extraction", left_out: list[int], asked: Outputs) -> None:
     """Print the verdict; write path, picture and animation of a path that was found."""
     from hapticdb.extraction.record import extraction_record
-    from hapticdb.poses import write_poses
 
-    if found.way is not None and asked.path is not None:
-        write_poses(asked.path, found.way.poses)
-    if asked.json:
-        render.say_json(extraction_record(found, left_out))
-    else:
-        _show(found, asked)
-    if found.way is not None and asked.picture is not None:
-        _draw(asked.picture, env, found, left_out, asked.up)
-    if found.way is not None and asked.animation is not None:
-        from hapticdb.page.animation import animate
+    def tell() -> None:
+        if asked.json:
+            render.say_json(extraction_record(found, left_out))
+        else:
+            _show(found, asked)
 
-        animate(asked.animation, env, [found], exclude=left_out, up=asked.up)
+    write(env, [] if found.way is None else [(found, left_out)], asked, tell)
 
 
 def _show(found: "Extraction", asked: Outputs) -> None:
@@ -234,16 +228,3 @@ def _show(found: "Extraction", asked: Outputs) -> None:
             if file is not None:
                 facts.append((name, file))
     render.show(render.facts(facts))
-
-
-def _draw(
-    picture: str, env: "Environment", found: "Extraction", excluded: list[int], up: UpName | None
-) -> None:
-    from hapticdb.extraction.verdict import extraction_line
-    from hapticdb.pictures.sweep import draw_sweep
-
-    if found.way is not None:
-        draw_sweep(
-            picture, env, found.shell, found.way.swept, exclude=excluded,
-            verdict=extraction_line(found), up=up,
-        )  # fmt: skip

@@ -1,7 +1,5 @@
 """The verb sweep."""
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -163,7 +161,7 @@ def sweep(
             env, shell, poses, exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=True,
         )  # fmt: skip
-        with _bar("sweeping") as progress:
+        with render.count_bar("sweeping", "samples") as progress:
             found = sweep_path(
                 env, shell, poses, where=felt.where, exclude=felt.exclude, proportions=fit,
                 budget_bytes=budget_bytes(budget), clearance_limit=clearance, refine=refine,
@@ -235,7 +233,7 @@ def _shell(
 ) -> "PointShell":
     """Shell of the tool's file, or of the parts, with its covering radius."""
     spacing = DENSE * env.grid.voxel_size if points is None else None
-    with _bar("spreading points"):
+    with render.count_bar("spreading points", "points"):
         if tool is not None:
             shell = shell_of(tool, tool_unit, points, seed, spacing)
         else:
@@ -256,19 +254,3 @@ def _draw(
 
     verdict = verdict_line(found, shell)
     draw_sweep(picture, env, shell, found, exclude=excluded, verdict=verdict, up=up)
-
-
-@contextmanager
-def _bar(what: str) -> Iterator[Callable[[int, int], None] | None]:
-    """Show a bar with time left; nothing where standard error is no terminal."""
-    import sys
-
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import Progress
-
-    with Progress(console=Console(file=sys.stderr), transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)

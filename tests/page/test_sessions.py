@@ -73,6 +73,7 @@ class Person(Browser):
         self.client, self.site = client, site  # type: ignore[assignment]
         self.scene = SimpleNamespace(hidden=())  # type: ignore[assignment]
         self.tool, self.scale = SimpleNamespace(shell=None), 1.0  # type: ignore[assignment]
+        self.stiffness = 1000.0
         self.hand, self.session = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), None
         self.drawing = SimpleNamespace(rest=lambda: self.said.append("rest"))  # type: ignore[assignment]
         self._unfelt, self._keeps_tool, self._over, self._is_closed = [], None, [], False

@@ -10,10 +10,10 @@ from websockets.sync.client import connect
 
 import hapticdb
 from children import PATIENCE, until
-from hapticdb.page.browser import Browser
-from hapticdb.page.link import PageRequest
+from hapticdb.page.link import PageRequest, Visitor
 from hapticdb.page.process import new_server, open_page
-from hapticdb.page.site import Site, Visitor
+from hapticdb.page.site import Site
+from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.recording.file import Recorder
 from page_person import PagePerson
 from recordings import HEADER
@@ -51,9 +51,6 @@ class NoHost:
     def begin(self, *_: object, **__: object) -> Any:  # noqa: ANN401 - in place of a HostedSession
         return OnlyRecords()
 
-    def sessions(self) -> list[Any]:
-        return []
-
 
 def two_parts(folder: Path) -> Path:
     """Make an environment of a box and a ball, each of a file of its own; returns its path."""
@@ -71,7 +68,7 @@ def two_parts(folder: Path) -> Path:
 @contextmanager
 def page_of(
     url: Path, *, folders: tuple[str, ...] | None = None, recordings: Path | None = None
-) -> Iterator[tuple[Site, PagePerson, Browser]]:
+) -> Iterator[tuple[Site, PagePerson, TabbedBrowser]]:
     """Open the page of an environment, with one editor at it."""
     server = new_server()
     request = PageRequest(
@@ -79,7 +76,7 @@ def page_of(
         None if recordings is None else str(recordings),
     )  # fmt: skip
     try:
-        site = Site(server, NoHost(), request)
+        site = Site(server, NoHost(), request)  # type: ignore[arg-type]
         try:
             open_page(site, lambda _: Visitor("Ada", "editor"))
             address = f"ws://127.0.0.1:{server.get_port()}"
@@ -90,7 +87,9 @@ def page_of(
                 person = PagePerson(connection)
                 until(lambda: (person.look(0.05), bool(site.browsers))[1])
                 person.find("Save a picture")
-                yield site, person, next(iter(site.browsers.values()))
+                (browser,) = site.browsers.values()
+                assert isinstance(browser, TabbedBrowser)
+                yield site, person, browser
         finally:
             site.close()
     finally:

@@ -65,17 +65,14 @@ def domain(path: Path) -> str:
 
 
 def imported(path: Path) -> Iterator[str]:
-    """Dotted names of all modules that a source imports, at its top or inside a function."""
+    """Dotted names of all that a source imports, at its top or inside a function."""
     for node in ast.walk(ast.parse(path.read_text())):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{named(path)} imports relatively"
             assert node.module is not None
-            if node.module == "hapticdb":
-                yield from (f"hapticdb.{alias.name}" for alias in node.names)
-            else:
-                yield node.module
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def own(path: Path) -> set[str]:
@@ -107,16 +104,38 @@ def test_modules_import_no_more_than_they_need() -> None:
             assert own(path) <= NARROW[domain(path)], f"{named(path)}: {own(path)}"
 
 
+def round_about(below: dict[str, set[str]]) -> set[str]:
+    """Names that import one another in a circle, or that import such names."""
+    left = dict(below)
+    while free := [name for name, needed in left.items() if not needed & left.keys()]:
+        for name in free:
+            del left[name]
+    return set(left)
+
+
 def test_no_two_domains_import_each_other() -> None:
     """Also within one floor, and also in imports for the type checker only."""
     below: dict[str, set[str]] = {}
     for path in modules():
         below.setdefault(domain(path), set()).update(own(path) & set(LEVELS))
-    while below:
-        free = [name for name, needed in below.items() if not needed & set(below)]
-        assert free, f"imports go round among {sorted(below)}"
-        for name in free:
-            del below[name]
+    assert round_about(below) == set()
+
+
+def test_no_two_modules_import_each_other() -> None:
+    """Nor several in a circle, also in imports for the type checker only."""
+    paths = {dotted(path): path for path in modules()}
+    below = {
+        name: {one if one in paths else one.rpartition(".")[0] for one in imported(path)} - {name}
+        for name, path in paths.items()
+    }
+    assert round_about(below) == set()
+    assert round_about({"a": {"b"}, "b": {"c"}, "c": {"b"}, "d": {"numpy"}}) == {"a", "b", "c"}
+
+
+def dotted(path: Path) -> str:
+    """Name by which a source is imported."""
+    parts = path.relative_to(PACKAGE.parent).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
 def test_kernels_import_numpy_numba_and_their_own_folder() -> None:

@@ -9,8 +9,8 @@ import pytest
 from hapticdb.errors import UsageError
 from hapticdb.page import process
 from hapticdb.page.browser import Browser
+from hapticdb.page.link import Visitor
 from hapticdb.page.panels.record import RecordPanel
-from hapticdb.page.site import Visitor
 
 
 class PretendServer:
@@ -45,11 +45,15 @@ class PretendSite:
         self.browsers: dict[int, Any] = {}
         self.numbers: set[int] = set()
         self.forgotten: list[object] = []
-        self.view = SimpleNamespace(forget=self.forgotten.append)
-        self.workers = SimpleNamespace(submit=lambda work: work())
+        self.view = SimpleNamespace(contents=SimpleNamespace(leave=self.forgotten.append))
+        self.workers = SimpleNamespace(submit=lambda work, client: work(client))
 
     def begin(self) -> None:
         pass
+
+    def leave(self, client: int) -> None:
+        if client in self.browsers:
+            self.browsers.pop(client).close()
 
     def take_number(self) -> int:
         self.numbers.add(len(self.numbers))
@@ -73,10 +77,9 @@ def site(monkeypatch: pytest.MonkeyPatch) -> PretendSite:
                 raise OSError("no room")
 
         def close(self) -> None:
-            assert self.site.browsers.pop(self.client.client_id) is self
             self.site.free_number(self.number)
 
-    monkeypatch.setattr(process, "Browser", PretendBrowser)
+    monkeypatch.setattr(process, "TabbedBrowser", PretendBrowser)
     return made
 
 
@@ -107,7 +110,7 @@ def test_a_browser_whose_panels_cannot_be_made_leaves_nothing(site: PretendSite)
         connect(site, "breaks")
     assert not site.browsers
     assert not site.numbers
-    assert site.forgotten == [site.server.clients[7]]
+    assert site.forgotten == [7]
 
 
 def test_a_browser_that_sends_no_picture_holds_no_thread_of_the_page() -> None:
@@ -165,8 +168,6 @@ def test_what_is_not_seen_is_not_felt_when_it_comes(
     browser.site = SimpleNamespace(objects=dict.fromkeys((1, 3, 7)))  # type: ignore[assignment]
     browser.scene = SimpleNamespace(hidden=hidden)  # type: ignore[assignment]
     browser.chosen, browser.taken, browser._unfelt = (), None, felt_without
-    nothing = SimpleNamespace(show_objects=lambda: None, moving=SimpleNamespace(renew=lambda: None))
-    browser.parts = nothing  # type: ignore[assignment]
     monkeypatch.setattr(browser, "begin_anew", lambda: begun.append(True))
     browser.objects_changed()
     assert len(begun) == n_begun

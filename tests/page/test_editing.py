@@ -14,9 +14,12 @@ from hapticdb.edits.editor import Editor
 from hapticdb.errors import ConflictError, HapticDBError, UsageError
 from hapticdb.page import database, editing
 from hapticdb.page.editing import Edits
+from hapticdb.page.folders import AllowedFolders
 from hapticdb.sample.write import write_sample
 from hapticdb.store.base import Object
 from hapticdb.store.connect import open_store
+
+EVERYWHERE = AllowedFolders(["/"])
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +46,7 @@ def done(edits: Edits, person: int, job: Any) -> Any:  # noqa: ANN401 - a job's 
 
 
 def test_two_people_who_move_one_part(sample: str) -> None:
-    edits = Edits(sample)
+    edits = Edits(sample, EVERYWHERE)
     try:
         with hapticdb.open(sample, read_only=True) as env:
             seen = env.objects()[0]
@@ -71,7 +74,7 @@ def test_two_people_who_move_one_part(sample: str) -> None:
 @pytest.mark.parametrize("tries_again", [False, True])
 def test_an_undo_after_another_persons_move_leaves_it(sample: str, tries_again: bool) -> None:
     """Whether the first is told of the conflict, or sees the other's move and goes on from it."""
-    edits = Edits(sample)
+    edits = Edits(sample, EVERYWHERE)
     up = np.eye(4)
     up[2, 3] = 0.002
     try:
@@ -102,7 +105,7 @@ def test_a_person_has_one_editor(sample: str, monkeypatch: pytest.MonkeyPatch) -
         return made[-1]
 
     monkeypatch.setattr(editing, "Editor", make)
-    edits = Edits(sample)
+    edits = Edits(sample, EVERYWHERE)
     try:
         for person in (3, 3, 4, 3):
             done(edits, person, lambda own: own.undo())
@@ -129,7 +132,7 @@ def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
         return open_store(*args, **options)
 
     monkeypatch.setattr(database, "open_store", wait_and_open)
-    edits = Edits(sample)
+    edits = Edits(sample, EVERYWHERE)
     try:
         for person in range(3):
             edits.ask(person, lambda own: own.undo(), answers.append, answers.append)
@@ -145,14 +148,14 @@ def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
 
 
 def test_an_error_does_not_tell_where_the_environment_is(sample: str, tmp_path: Path) -> None:
-    edits = Edits(sample)
+    edits = Edits(sample, EVERYWHERE)
     try:
         with hapticdb.open(sample, read_only=True) as env:
             gone = replace(env.objects()[0], id=999)
         found = done(edits, 0, lambda own: own.take_out(gone))
     finally:
         edits.close()
-    nowhere = done(Edits(str(tmp_path / "none.db")), 0, lambda own: own.undo())
+    nowhere = done(Edits(str(tmp_path / "none.db"), EVERYWHERE), 0, lambda own: own.undo())
     for error in (found, nowhere):
         assert isinstance(error, HapticDBError)
         assert str(Path(sample).parent) not in str(error)

@@ -11,8 +11,8 @@ import pytest
 import hapticdb
 from children import PATIENCE, until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
-from hapticdb.page.browser import Browser
 from hapticdb.page.panels.touch import PART
+from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.page.wording import FAULT, error_text
 from page_person import PagePerson
 from pages import page_of, two_parts
@@ -28,7 +28,7 @@ def scene(tmp_path: Path) -> Path:
     return two_parts(folder)
 
 
-def choose(browser: Browser, name: str) -> int:
+def choose(browser: TabbedBrowser, name: str) -> int:
     """Choose the part of a file, as by a click; its id."""
     (found,) = (obj for obj in browser.site.objects.values() if obj.link.endswith(f"/{name}"))
     browser.parts.choose((found.id,))

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from playwright.sync_api import Page
 
 import hapticdb
+from children import until as patiently
 from chromium import (
     Eye,
     chromium,
@@ -28,8 +29,11 @@ from chromium import (
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.page import tools
 from hapticdb.page.drawing import HAND_GIZMO
+from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.panels.moving import MOVING_GIZMO
 from hapticdb.page.process import new_server
+from hapticdb.page.scene.picking import Struck
+from hapticdb.page.scene.stage import framing
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.site import Stage
 from hapticdb.server.access import Role
@@ -74,6 +78,10 @@ def server(car: Path, tmp_path: Path) -> Iterator[Running]:
         yield found
 
 
+def first_of(view: SceneView, origin: Floats, way: Floats) -> Struck | None:
+    return view.contents.pick(origin, way, lambda _: True)
+
+
 class Aim:
     """The bonnet: on top of the car's front, the broadest part that a ball can touch alone.
 
@@ -84,9 +92,8 @@ class Aim:
 
     def __init__(self, view: SceneView, env: hapticdb.Environment) -> None:
         self.stage = stage = Stage.of(view)
-        framing = view.framing()
-        assert framing is not None
-        self.framing, self.up = framing, view.up
+        self.framing, self.up = framing(stage.bounds, view.up), view.up
+        eye = self.framing.position
         ball = tools.built_in(stage.diagonal, stage.voxel_size, smooth=stage.is_smooth)[0]
         self.radius = ball.radius
         view_middle = stage.bounds.mean(axis=0)
@@ -94,12 +101,12 @@ class Aim:
         for obj in view.objects.values():
             middle = obj.bounds.mean(axis=0)
             top = middle + stage.up * float((obj.bounds[1] - middle) @ stage.up)
-            over = view.pick(top + stage.up * stage.diagonal, -stage.up)
+            over = first_of(view, top + stage.up * stage.diagonal, -stage.up)
             if over is None or over.id != obj.id or (over.point - view_middle) @ stage.toward < 0.0:
                 continue
             place = np.eye(4)
             place[:3, 3] = over.point + stage.up * ((1.0 - PUSHED) * ball.radius)
-            seen = view.pick(framing.position, over.point - framing.position)
+            seen = first_of(view, eye, over.point - eye)
             if seen is None or seen.id != obj.id:
                 continue
             touched = env.touch(ball.shell, place)
@@ -109,7 +116,7 @@ class Aim:
                 found.append((float(np.prod(sides)), obj.id, place[:3, 3], over.point))
         assert found, "no part of the car can be touched alone from above"
         _, self.id, self.contact, self.seen = max(found, key=lambda one: one[0])
-        elsewhere = view.pick(framing.position, view_middle - framing.position)
+        elsewhere = first_of(view, eye, view_middle - eye)
         assert elsewhere is not None
         self.other = elsewhere.point
         obj = view.objects[self.id]
@@ -120,8 +127,11 @@ class Aim:
 def aim(car: Path) -> Iterator[Aim]:
     viser_server = new_server()
     try:
-        with SceneView(viser_server, str(car)) as view, hapticdb.open(car, read_only=True) as env:
-            assert view.wait_until_shown(60.0)
+        with (
+            SceneView(viser_server, str(car), AllowedFolders(["/"])) as view,
+            hapticdb.open(car, read_only=True) as env,
+        ):
+            patiently(lambda: view.contents.waiting() == 0)
             yield Aim(view, env)
     finally:
         viser_server.stop()

@@ -16,8 +16,8 @@ from hapticdb.page.link import (
     LATE,
     LONGEST_WORDS,
     MOST_FAILED,
-    Announced,
     PageLink,
+    Visitor,
     announcement,
 )
 from serving import CAMERA, close_code, sent
@@ -65,7 +65,7 @@ def test_an_announced_browser_is_let_in_under_its_name(
     ) as socket_:
         assert said(ours) == {"word": "connected", "port": port}
         assert socket_.recv(timeout=20.0)
-        assert link.announced(0) == Announced("Guest 1", "toucher")
+        assert link.announced(0) == Visitor("Guest 1", "toucher")
     assert said(ours)["word"] == "closed"
     until(lambda: _is_gone(link))
 

@@ -17,8 +17,8 @@ from children import joined
 from hapticdb.errors import HapticDBError
 from hapticdb.page.browser import Browser
 from hapticdb.page.editing import PersonsEdits
+from hapticdb.page.link import Visitor
 from hapticdb.page.panels.moving import MovingControls
-from hapticdb.page.site import Visitor
 from hapticdb.sample.write import write_sample
 
 CLIENT = 7

@@ -12,7 +12,7 @@ import pytest
 from children import until
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page.browser import Browser
-from hapticdb.page.site import Visitor
+from hapticdb.page.link import Visitor
 
 PATIENCE = 30.0
 """Seconds in which workers must do what takes them microseconds."""
@@ -66,33 +66,25 @@ class Person(Browser):
             client_id=0, add_notification=lambda *words, **_: self._keep(words)
         )
         site = SimpleNamespace(
-            host=host, workers=workers, objects={}, edits=None, browsers={0: self},
-            view=SimpleNamespace(forget=lambda _: None), free_number=lambda _: None,
+            host=host, workers=workers, objects={}, edits=None, free_number=lambda _: None,
+            view=SimpleNamespace(contents=SimpleNamespace(leave=lambda _: None)),
             stage=SimpleNamespace(is_smooth=False, diagonal=1.0), error_text=str,
         )  # fmt: skip
         self.client, self.site = client, site  # type: ignore[assignment]
         self.scene = SimpleNamespace(hidden=())  # type: ignore[assignment]
         self.tool, self.scale = SimpleNamespace(shell=None), 1.0  # type: ignore[assignment]
+        self.stiffness = 1000.0
         self.hand, self.session = np.array([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0]), None
-        self.drawing = self._part("rest")
-        self.record = self._part("tick", "session_ended")
-        self.parts = SimpleNamespace(moving=self._part("leave"))  # type: ignore[assignment]
+        self.drawing = SimpleNamespace(rest=lambda: self.said.append("rest"))  # type: ignore[assignment]
         self._unfelt, self._keeps_tool, self._over, self._is_closed = [], None, [], False
         self._beginning, self._swapping = threading.Lock(), threading.Lock()
-        self._holding, self.colour, self.touch = (
-            threading.Lock(),
-            (0, 0, 0),
-            self._part("show_place"),
-        )
+        self._holding, self.colour = threading.Lock(), (0, 0, 0)
 
     def _keep(self, words: tuple[str, ...]) -> None:
         self.told.append(": ".join(words))
 
-    def _part(self, *names: str) -> Any:  # noqa: ANN401 - in place of panels
-        def keeps(name: str) -> Any:  # noqa: ANN401
-            return lambda *_: self.said.append(name)
-
-        return SimpleNamespace(**{name: keeps(name) for name in names})
+    def session_ended(self) -> None:
+        self.said.append("session_ended")
 
     def _share(self) -> None:
         self.said.append("share")

@@ -1,4 +1,4 @@
-"""One browser: its session, its filter, and the panels through which a person uses them."""
+"""One browser: its session, its filter, and what its scene shows."""
 
 import logging
 import threading
@@ -10,24 +10,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import HapticDBError
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.hosting.hosted import HostedSession
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.page import checks, colours
 from hapticdb.page.drawing import HandDrawing, add_tool, place
-from hapticdb.page.panels.parts import PartsPanel
-from hapticdb.page.panels.record import RecordPanel
-from hapticdb.page.panels.sweeps import SweepPanel
-from hapticdb.page.panels.touch import TouchPanel
+from hapticdb.page.link import Visitor
+from hapticdb.page.scene.browser import BrowserScene
+from hapticdb.page.site import Site
 from hapticdb.page.tools import HeldTool, start_pose
 from hapticdb.page.wording import plain_name
 from hapticdb.poses import quaternion_of
 from hapticdb.realtime.coupling import Coupling
+from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
     from viser import ClientHandle, TransformControlsEvent
-
-    from hapticdb.hosting.hosted import HostedSession
-    from hapticdb.page.site import Site, Visitor
 
 LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
@@ -65,13 +63,11 @@ class Browser:
         Of the browser at this site, freed by `close`.
     """
 
-    def __init__(
-        self, site: "Site", client: "ClientHandle", visitor: "Visitor", number: int
-    ) -> None:
+    def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
         self.site, self.client, self.visitor = site, client, visitor
         self.number = number
         self.colour = colours.of_tool(self.number)
-        self.scene = site.view.browser(client)
+        self.scene = BrowserScene(client, site.view.contents)
         self.chosen: tuple[int, ...] = ()
         self.taken: int | None = None
         self.tool: HeldTool = site.tools[0]
@@ -91,20 +87,20 @@ class Browser:
         self._shown = np.full(7, np.inf)
         self.drawing = HandDrawing(client, site.stage.diagonal, CAP)
         self.drawing.gizmo.on_update(self._moved)
-        self._click: Callable[[NDArray[np.float64], NDArray[np.float64]], None] | None = None
-        gui = client.gui
-        tabs = gui.add_tab_group()
-        with tabs.add_tab("Touch"):
-            self.touch = TouchPanel(self, gui)
-        with tabs.add_tab("Parts"):
-            self.parts = PartsPanel(self, gui)
-        with tabs.add_tab("Sweep"):
-            self.sweeps = SweepPanel(self, gui)
-        with tabs.add_tab("Record"):
-            self.record = RecordPanel(self, gui)
-        client.scene.on_click()(self._clicked)
-        if visitor.may("toucher"):
-            self.take_in_hand(self.tool)
+
+    # -- what a page with panels shows, too ------------------------------------------------------
+
+    def place_changed(self) -> None:
+        """Show where the hand is now."""
+
+    def tool_changed(self) -> None:
+        """Show which tool is in the hand now."""
+
+    def session_ended(self) -> None:
+        """Show that the session is over, and with it a recording."""
+
+    def frame_came(self, frame: np.void, wrench: Floats, touched: list[Object], now: float) -> None:
+        """Show a frame of the session, its wrench (6,), and what it touches."""
 
     # -- callbacks ---------------------------------------------------------------------------
 
@@ -148,21 +144,13 @@ class Browser:
         """Tell an error, in words that name nothing of the server's machine."""
         self.tell("Not done", self.site.error_text(error))
 
-    def _clicked(self, event: Event) -> None:
-        def act(event: Event) -> None:
-            origin = checks.numbers_of(event.ray_origin, 3, checks.FARTHEST, "a ray")
-            way = checks.numbers_of(event.ray_direction, 3, checks.FARTHEST, "a ray")
-            self.parts.clicked(origin, way)
-
-        self.guarded("viewer", act)(event)
-
     async def _moved(self, event: "TransformControlsEvent") -> None:
         """Move the hand; on the event loop, so that events keep their order."""
 
         def act(event: Event) -> None:
             self.move_hand(checks.pose_of(event.target.position, event.target.wxyz))
             if event.phase == "end":
-                self.touch.show_place()
+                self.place_changed()
 
         self.guarded("toucher", act)(event)
 
@@ -179,7 +167,7 @@ class Browser:
         """Put hand and gizmo at a pose (4, 4)."""
         self.move_hand(pose)
         place(self.drawing.gizmo, self.hand)
-        self.touch.show_place()
+        self.place_changed()
 
     def take_in_hand(self, tool: HeldTool, pose: Floats | None = None) -> None:
         """Hold another tool, at a pose (7,) or at the start."""
@@ -188,13 +176,33 @@ class Browser:
             self.hand = self._start() if pose is None else pose
             self.drawing.hold(tool, self.colour, self.hand)
             self.begin_anew(keeps_tool=False)
-            self.touch.show_place()
+            self.tool_changed()
+            self.place_changed()
+
+    def put_back(self) -> None:
+        """Put the part in hand back to its place; the first tool takes its place in the hand."""
+        taken, self.taken = self.taken, None
+        if taken is not None:
+            self.scene.show((taken,))
+        self.take_in_hand(self.site.tools[0])
 
     @property
     def unfelt(self) -> list[int]:
         """Ids of objects that are neither seen nor felt here: hidden ones, and a part in hand."""
         taken = () if self.taken is None else (self.taken,)
         return sorted({*self.scene.hidden, *taken} & self.site.objects.keys())
+
+    def chosen_objects(self) -> list[Object]:
+        """Objects that are chosen, as far as they are there still."""
+        objects = self.site.objects
+        return [objects[i] for i in self.chosen if i in objects]
+
+    def only_chosen(self) -> Object:
+        """Return the chosen object; UsageError if there is none, or more than one."""
+        chosen = self.chosen_objects()
+        if len(chosen) != 1:
+            raise UsageError("choose one part first: click it, or take it from the list")
+        return chosen[0]
 
     def filter_changed(self) -> None:
         """Feel what is seen now: the session begins again if that is something else."""
@@ -257,14 +265,14 @@ class Browser:
         session = self.session
         if session is None or not self._give_up(session):
             return None
-        self.record.session_ended()
+        self.session_ended()
         try:
             frame = session.latest()
         except HapticDBError:  # it is over
             return None
         return None if frame is None else np.array(frame["tool"][0])
 
-    def _give_up(self, session: "HostedSession") -> bool:
+    def _give_up(self, session: HostedSession) -> bool:
         """Have no session any more; False if it was given up already. `_end_sessions` ends it."""
         with self._swapping:
             if self.session is not session:
@@ -284,7 +292,7 @@ class Browser:
                 LOG.exception("a session did not end well")
             self._tell_lost_frames(session)
 
-    def _tell_lost_frames(self, session: "HostedSession") -> None:
+    def _tell_lost_frames(self, session: HostedSession) -> None:
         n_lost, session.lost_frames = session.lost_frames, 0
         if n_lost:
             self.tell(
@@ -337,12 +345,11 @@ class Browser:
 
     def tick(self, now: float) -> None:
         """Show the newest frame of the session; called `site.TICKS` times a second."""
-        self.record.tick(now)  # viewers replay, too
         session = self.session
         if session is not None and session.is_over:
             if self._give_up(session):
                 self.drawing.rest()
-                self.record.session_ended()
+                self.session_ended()
                 self.tell("Tool lost", "its process ended; it begins again")
                 self.begin_anew()
             return
@@ -366,7 +373,7 @@ class Browser:
         self._begun = now if self._begun is None else self._begun
         force = float(np.linalg.norm(wrench[:3]))
         self.history.append((now - self._begun, force, 1000.0 * float(one["lateness"])))
-        self.touch.show(one, wrench, touched, now)
+        self.frame_came(one, wrench, touched, now)
 
     def objects_changed(self) -> None:
         """Objects were added, moved or removed by someone; called in the database's thread."""
@@ -374,20 +381,15 @@ class Browser:
         self.chosen = tuple(i for i in self.chosen if i in present)
         if self.taken is not None and self.taken not in present:
             self.taken = None
-        self.parts.show_objects()
-        self.parts.moving.renew()
         if not set(self.unfelt) <= set(self._unfelt):  # one that is not seen has come
             self.begin_anew()
 
     def close(self) -> None:
-        """End the session and take the tool out of everyone's view; again it does nothing."""
-        if self.site.browsers.pop(self.client.client_id, None) is None:
-            return
+        """End the session and take the tool out of everyone's view."""
         self._is_closed = True
-        self.site.view.forget(self.client)
+        self.site.view.contents.leave(self.client.client_id)
         if self.site.edits is not None:
             self.site.edits.forget(self.client.client_id)
-        self.parts.moving.leave()
         self._unshare()
         self.site.free_number(self.number)
         with self._swapping:

@@ -1,4 +1,7 @@
-"""Checks of values that a browser sent: a client may send anything in any field."""
+"""Checks of values that a browser sent: a client may send anything in any field.
+
+Each raises `UsageError` for any other value than it asks for.
+"""
 
 import math
 from collections.abc import Collection
@@ -7,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.poses import rotation_of
 
 FARTHEST = 1e6
 """Greatest distance from the origin that a hand may be sent to, metres. Larger: poses in which
@@ -14,13 +18,7 @@ distances of a voxel are lost in rounding are let through."""
 
 
 def number_of(value: object, low: float, high: float, what: str) -> float:
-    """Return a finite number between two bounds.
-
-    Raises
-    ------
-    UsageError
-        If it is no number, not finite, or out of its range.
-    """
+    """Return a finite number between two bounds."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise UsageError(f"{what}: give a number")
     number = float(value)
@@ -30,52 +28,28 @@ def number_of(value: object, low: float, high: float, what: str) -> float:
 
 
 def text_of(value: object, longest: int, what: str) -> str:
-    """Return a text of at most `longest` letters, on one line.
-
-    Raises
-    ------
-    UsageError
-        If it is no text, or longer.
-    """
+    """Return a text of at most `longest` letters, on one line."""
     if not isinstance(value, str) or len(value) > longest:
         raise UsageError(f"{what}: give a text of at most {longest} letters")
     return "".join(letter for letter in value if letter.isprintable())
 
 
 def choice_of(value: object, choices: Collection[str], what: str) -> str:
-    """Return one of the choices that are there now.
-
-    Raises
-    ------
-    UsageError
-        If it is none of them.
-    """
+    """Return one of the choices that are there now."""
     if not isinstance(value, str) or value not in choices:
         raise UsageError(f"{what}: choose one of the list")
     return value
 
 
 def flag_of(value: object, what: str) -> bool:
-    """Return a box's state, ticked or not.
-
-    Raises
-    ------
-    UsageError
-        If it is neither.
-    """
+    """Return a box's state, ticked or not."""
     if not isinstance(value, bool):
         raise UsageError(f"{what}: tick the box, or clear it")
     return value
 
 
 def numbers_of(value: object, n: int, most: float, what: str) -> NDArray[np.float64]:
-    """Return `n` finite numbers (n,), none larger than `most` without its sign.
-
-    Raises
-    ------
-    UsageError
-        If they are anything else.
-    """
+    """Return `n` finite numbers (n,), none larger than `most` without its sign."""
     try:
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -86,24 +60,13 @@ def numbers_of(value: object, n: int, most: float, what: str) -> NDArray[np.floa
 
 
 def pose_of(position: object, wxyz: object) -> NDArray[np.float64]:
-    """Pose (4, 4) of a gizmo: position in metres, quaternion scalar first, made unit here.
-
-    Raises
-    ------
-    UsageError
-        If it is not finite, farther than `FARTHEST`, or the quaternion is too short to be a turn.
-    """
+    """Pose (4, 4) of a gizmo: position in metres, quaternion scalar first, made unit here."""
     place = numbers_of(position, 3, FARTHEST, "a place")
     turn = numbers_of(wxyz, 4, FARTHEST, "a turn")
     length = float(np.linalg.norm(turn))
     if length < 1e-6:
         raise UsageError("a turn: give a quaternion that is not zero")
-    w, x, y, z = turn / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), place[0]],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x), place[1]],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y), place[2]],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
+    pose = np.eye(4)
+    pose[:3, :3] = rotation_of(turn / length)[0]
+    pose[:3, 3] = place
+    return pose

@@ -9,7 +9,14 @@ from hapticdb.page import colours
 from hapticdb.page.tools import HeldTool
 
 if TYPE_CHECKING:
-    from viser import ClientHandle, MeshHandle, SceneApi, SceneNodeHandle, TransformControlsHandle
+    from viser import (
+        ArrowsHandle,
+        ClientHandle,
+        MeshHandle,
+        SceneApi,
+        SceneNodeHandle,
+        TransformControlsHandle,
+    )
 
 Floats = NDArray[np.float64]
 
@@ -69,7 +76,6 @@ class HandDrawing:
         self._diagonal = diagonal
         self.cap = cap
         self._ghost: MeshHandle | None = None
-        self._is_touching = False
         self._seen = np.full(12, 1e300)
         self._marked = np.empty((0, 3))
         scene = client.scene
@@ -88,27 +94,21 @@ class HandDrawing:
             head_length=1.8 * head, visible=False,
         )  # fmt: skip
         self._tether = scene.add_line_segments(
-            "/tether",
-            np.zeros((1, 2, 3)),
-            (120, 120, 130),
-            thickness=2.0,
-            thickness_units="screen",
+            "/tether", nothing, (120, 120, 130), thickness=2.0, thickness_units="screen",
             visible=False,
-        )
+        )  # fmt: skip
         self._contacts = scene.add_point_cloud(
             "/contacts", np.zeros((1, 3)), colours.FORCE, point_size=CONTACT_SHARE * diagonal,
             point_shape="circle", precision="float32", visible=False,
         )  # fmt: skip
 
-    def hold(self, tool: HeldTool | None, colour: colours.Colour, pose: Floats) -> None:
-        """Show a tool's ghost at the gizmo, which goes to a pose (7,); None: an empty hand."""
+    def hold(self, tool: HeldTool, colour: colours.Colour, pose: Floats) -> None:
+        """Show a tool's ghost at the gizmo, which goes to a pose (7,)."""
         if self._ghost is not None:
             self._ghost.remove()
-            self._ghost = None
-        self.gizmo.visible = tool is not None
+        self.gizmo.visible = True
         place(self.gizmo, pose)
-        if tool is not None:
-            self._ghost = add_tool(self._client.scene, "/hand/ghost", tool, colour, 0.28)
+        self._ghost = add_tool(self._client.scene, "/hand/ghost", tool, colour, 0.28)
 
     def show(self, tool: Floats, hand: Floats, wrench: Floats) -> None:
         """Show the force and torque (6,) at the tool's place, and the line from hand to tool."""
@@ -123,22 +123,19 @@ class HandDrawing:
             lever = 0.03 * self._diagonal
             self._arrow(self._torque, middle, wrench[3:] * (longest / (self.cap * lever)))
             apart = float(np.linalg.norm(hand[:3] - middle))
-            is_apart = apart > 0.002 * self._diagonal
-            if is_apart:
+            self._tether.visible = apart > 0.002 * self._diagonal
+            if self._tether.visible:
                 self._tether.points = np.array([[middle, hand[:3]]], dtype=np.float32)
-            if self._tether.visible != is_apart:
-                self._tether.visible = is_apart
 
-    def _arrow(self, arrow: object, start: Floats, way: Floats) -> None:
+    def _arrow(self, arrow: "ArrowsHandle", start: Floats, way: Floats) -> None:
         length, longest = float(np.linalg.norm(way)), LONGEST_ARROW * self._diagonal
         is_seen = length > ARROW_BEGINS * longest
         if is_seen:
             way = way * (min(length, longest) / length)
-            arrow.points = np.array([[start, start + way]], dtype=np.float32)  # type: ignore[attr-defined]
-        if arrow.visible != is_seen:  # type: ignore[attr-defined]
-            arrow.visible = is_seen  # type: ignore[attr-defined]
+            arrow.points = np.array([[start, start + way]], dtype=np.float32)
+        arrow.visible = is_seen
 
-    def point(self, arrow: object, start: Floats, force: Floats) -> None:
+    def point(self, arrow: "ArrowsHandle", start: Floats, force: Floats) -> None:
         """Let an arrow show a force (3,), N, at a place."""
         self._arrow(arrow, start, force * (LONGEST_ARROW * self._diagonal / self.cap))
 
@@ -153,14 +150,10 @@ class HandDrawing:
             with self._client.atomic():
                 self._contacts.points = np.asarray(points, dtype=np.float32)
                 self._contacts.colors = palette
-        if is_touching != self._is_touching:
-            self._contacts.visible = is_touching
-            self._is_touching = is_touching
+        self._contacts.visible = is_touching
 
     def rest(self) -> None:
         """Show no force, no contact and no line."""
         self._seen = np.full(12, 1e300)
         for node in (self._force, self._torque, self._tether, self._contacts):
-            if node.visible:
-                node.visible = False
-        self._is_touching = False
+            node.visible = False

@@ -1,6 +1,5 @@
 """Edits that people make on the page: one thread, one writable connection, undo for each person."""
 
-import threading
 from collections.abc import Callable
 from typing import Any, TypeVar
 
@@ -75,14 +74,13 @@ class Edits:
     ----------
     url : str
         The environment, as one who may write reaches it.
-    folders : AllowedFolders or None
-        Where objects' files may be read; None: everywhere.
+    folders : AllowedFolders
+        Where objects' files may be read.
     """
 
-    def __init__(self, url: str, folders: AllowedFolders | None = None) -> None:
-        self._url, self._folders = url, folders
-        self._lock = threading.Lock()
-        self._thread: DatabaseThread | None = None
+    def __init__(self, url: str, folders: AllowedFolders) -> None:
+        self._url = url
+        self._database = DatabaseThread(url, folders, read_only=False)
         self._of: dict[int, PersonsEdits] = {}
 
     def ask(
@@ -114,13 +112,7 @@ class Edits:
                 own = self._of[person] = PersonsEdits(env)
             return job(own)
 
-        with self._lock:
-            if self._thread is None:
-                self._thread = DatabaseThread(
-                    self._url, read_only=False, folders=self._folders, opens_later=True
-                )
-            thread = self._thread
-        thread.ask(work, then, refused)
+        self._database.ask(work, then, refused)
 
     def _without_address(self, error: HapticDBError) -> HapticDBError:
         """Return an error as people elsewhere may read it."""
@@ -135,7 +127,4 @@ class Edits:
 
     def close(self) -> None:
         """End the thread."""
-        with self._lock:
-            thread = self._thread
-        if thread is not None:
-            thread.close()
+        self._database.close()

@@ -107,13 +107,6 @@ class FoldersEnvironment(Environment):
         self._allowed.checked(self.object(object_id).link)
         return super().move(object_id, transform, revision=revision)
 
-    def shift(self, object_ids: Iterable[int], way: ArrayLike) -> list[Object]:
-        """Shift objects by the same vector."""
-        ids = list(object_ids)
-        for object_id in ids:
-            self._allowed.checked(self.object(object_id).link)
-        return super().shift(ids, way)
-
 
 def _folders_of(links: Iterable[str]) -> set[Path]:
     """Folders of files, without symbolic links, as far as they are there."""

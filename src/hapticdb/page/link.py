@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from viser.infra import Message, WebsockClientConnection
 
 LOG = logging.getLogger("hapticdb.page")
+ROLES = ("viewer", "toucher", "editor")
+"""Roles, each with the rights of those before it: sees, feels, moves parts."""
 LONGEST_LINE = 4096
 """Most bytes of one message. A longer line means that something else writes there."""
 FORGOTTEN_AFTER = 256
@@ -30,8 +32,6 @@ LONGEST_WORDS = 200
 """Letters of an error of viser in the log. Larger: more of what a client sent stands there."""
 LATE = 1013
 """WebSocket close code "try again later", for a connection that was not announced."""
-
-
 BREAKS_RULES = 1008
 """WebSocket close code "policy violation"."""
 MOST_FAILED = 20
@@ -68,11 +68,15 @@ class PageRequest(NamedTuple):
     title: str = ""
 
 
-class Announced(NamedTuple):
-    """A browser that the server let in: how others see it, and what it may do."""
+class Visitor(NamedTuple):
+    """Who looks at the page through one browser: the name that others see, and the role."""
 
     name: str
     role: str
+
+    def may(self, role: str) -> bool:
+        """Whether the visitor has at least this role."""
+        return ROLES.index(self.role) >= ROLES.index(role)
 
 
 class PageLink:
@@ -87,8 +91,8 @@ class PageLink:
     def __init__(self, descriptor: int) -> None:
         self._socket = socket.socket(fileno=descriptor)
         self._lock = threading.Lock()
-        self._expected: dict[int, Announced] = {}
-        self._inside: dict[int, Announced] = {}
+        self._expected: dict[int, Visitor] = {}
+        self._inside: dict[int, Visitor] = {}
         self._thread = threading.Thread(target=self._listen, name="announcements", daemon=True)
         self._thread.start()
 
@@ -118,7 +122,7 @@ class PageLink:
         inner.on_client_connect(check)
         inner.on_client_disconnect(leave)
 
-    def announced(self, client_id: int) -> Announced:
+    def announced(self, client_id: int) -> Visitor:
         """Return who a client of the guarded server is.
 
         Raises
@@ -153,7 +157,7 @@ class PageLink:
         with contextlib.suppress(ConnectionError), self._socket.makefile("rb") as stream:
             while received := stream.readline(LONGEST_LINE):
                 message = json.loads(received)
-                announced = Announced(message["name"], message["role"])
+                announced = Visitor(message["name"], message["role"])
                 with self._lock:
                     self._expected[message["port"]] = announced
                     while len(self._expected) > FORGOTTEN_AFTER:

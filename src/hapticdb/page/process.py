@@ -7,9 +7,9 @@ import time
 from typing import TYPE_CHECKING
 
 from hapticdb.hosting.attached import AttachedHost
-from hapticdb.page.browser import Browser
-from hapticdb.page.link import PageLink, PageRequest
-from hapticdb.page.site import Site, Visitor
+from hapticdb.page.link import PageLink, PageRequest, Visitor
+from hapticdb.page.site import Site
+from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 
 if TYPE_CHECKING:
@@ -34,11 +34,7 @@ def work(request: PageRequest, sender: MessageSender) -> None:
     try:
         with AttachedHost(socket.socket(fileno=request.host)) as host:
             site = Site(server, host, request)
-
-            def visitor(client: "ClientHandle") -> Visitor:
-                return Visitor(*link.announced(client.client_id))
-
-            open_page(site, visitor)
+            open_page(site, link.announced)
             sender.send("ready", server.get_port())
             try:
                 while not parent_is_gone():
@@ -57,10 +53,10 @@ def new_server() -> "ViserServer":
         return viser.ViserServer("127.0.0.1", 0, verbose=False)
 
 
-def open_page(site: Site, visitor_of: "Callable[[ClientHandle], Visitor]") -> None:
+def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
     """Show the scene, and make panels for each browser that connects.
 
-    visitor_of : who a browser is; a KeyError if it has gone again.
+    visitor_of : who a client of viser is; a KeyError if it has gone again.
     """
     server = site.server
     server.gui.set_panel_label(site.title)
@@ -73,24 +69,22 @@ def open_page(site: Site, visitor_of: "Callable[[ClientHandle], Visitor]") -> No
 
     def connect(client: "ClientHandle") -> None:
         try:
-            visitor = visitor_of(client)
+            visitor = visitor_of(client.client_id)
         except KeyError:  # it has gone again
             return
         number = site.take_number()
         try:
-            browser = Browser(site, client, visitor, number)
+            browser = TabbedBrowser(site, client, visitor, number)
         except BaseException:
-            site.view.forget(client)
+            site.view.contents.leave(client.client_id)
             site.free_number(number)
             raise
         site.browsers[client.client_id] = browser
         if client.client_id not in server.get_clients():  # it has gone while that was made
-            site.workers.submit(browser.close)
+            disconnect(client)
 
     def disconnect(client: "ClientHandle") -> None:
-        browser = site.browsers.get(client.client_id)
-        if browser is not None:
-            site.workers.submit(browser.close)
+        site.workers.submit(site.leave, client.client_id)
 
     server.on_client_connect(connect)
     server.on_client_disconnect(disconnect)

@@ -3,34 +3,29 @@
 import logging
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
-from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.hosting.hosted import HostedSession
+from hapticdb.errors import UsageError
+from hapticdb.hosting.attached import AttachedHost
 from hapticdb.page import tools
 from hapticdb.page.database import DatabaseThread
 from hapticdb.page.editing import Edits
 from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.link import PageRequest
-from hapticdb.page.scene.view import SceneEdit, SceneView
+from hapticdb.page.scene.view import SceneView
 from hapticdb.page.wording import error_text
-from hapticdb.pointshell.shell import PointShell
-from hapticdb.realtime.coupling import Coupling
 from hapticdb.store.connect import open_store
 
 if TYPE_CHECKING:
     from viser import ViserServer
-
-    from hapticdb.page.browser import Browser
 
 LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
@@ -42,40 +37,19 @@ WORKERS = 4
 """Threads that begin sessions, so that a slow one delays no other browser much."""
 PAINTERS = 4
 """Threads that wait for pictures of browsers. Larger: more slow browsers are waited for at once."""
-ROLES = ("viewer", "toucher", "editor")
-"""Roles, each with the rights of those before it: sees, feels, moves parts."""
 
 
-class Host(Protocol):
-    """Runs sessions: a `hosting.SessionHost`, or what reaches one in another process."""
+class Updated(Protocol):
+    """What a site asks of each browser."""
 
-    def begin(
-        self,
-        shell: PointShell,
-        start: ArrayLike,
-        *,
-        where: Sequence[int | str] = (),
-        exclude: Sequence[int | str] = (),
-        coupling: Coupling | None = None,
-        scale: float = 1.0,
-        label: str = "",
-    ) -> HostedSession:
-        """Begin a session."""
+    def tick(self, now: float) -> None:
+        """Show what is new; called `TICKS` times a second, with seconds of a clock."""
 
-    def sessions(self) -> Sequence[HostedSession]:
-        """All sessions that run."""
+    def objects_changed(self) -> None:
+        """Show the objects as they are now."""
 
-
-@dataclass(frozen=True)
-class Visitor:
-    """Who looks at the page through one browser: the name that others see, and the role."""
-
-    name: str
-    role: str
-
-    def may(self, role: str) -> bool:
-        """Whether the visitor has at least this role."""
-        return ROLES.index(self.role) >= ROLES.index(role)
+    def close(self) -> None:
+        """End what the browser shows and does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +69,7 @@ class Stage:
     @classmethod
     def of(cls, view: SceneView) -> "Stage":
         """Stage of a view's objects; an empty environment has the box of its grid."""
-        box, objects = view.box(), view.objects.values()
+        box, objects = view.contents.box(), view.objects.values()
         bounds = view.grid.bounds if box is None else box
         toward = np.eye(3)[(view.up + 2) % 3]
         is_smooth = bool(objects) and all(obj.has_distances for obj in objects)
@@ -115,16 +89,16 @@ class Site:
     ----------
     server : ViserServer
         Serves the page.
-    host : Host
+    host : AttachedHost
         Runs the sessions.
     request : PageRequest
         The environment's addresses, the operator's tools, folders and title.
     """
 
     server: "ViserServer"
-    host: Host
+    host: AttachedHost
     request: PageRequest
-    browsers: "dict[int, Browser]" = field(default_factory=dict)
+    browsers: dict[int, Updated] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
@@ -141,16 +115,16 @@ class Site:
         self.folders = self._allowed()
         if "editor" in request.urls:
             self.edits = Edits(request.urls["editor"], self.folders)
-        self.view = SceneView(self.server, self.url, may_read=self._may_read)
+        self.view = SceneView(self.server, self.url, self.folders)
         self.objects = self.view.objects
         self.stage = stage = Stage.of(self.view)
-        self.database = DatabaseThread(self.url, folders=self.folders)
+        self.database = DatabaseThread(self.url, self.folders)
         self.tools = [
             *tools.from_files(request.tools, stage.voxel_size, smooth=stage.is_smooth),
             *tools.built_in(stage.diagonal, stage.voxel_size, smooth=stage.is_smooth),
         ]
         self._clock = threading.Thread(target=self._tick, name="page-clock", daemon=True)
-        self.view.on_edit(self._learn)
+        self.view.on_edit = self._learn
 
     def begin(self) -> None:
         """Start the clock that updates all browsers."""
@@ -161,7 +135,8 @@ class Site:
         self._is_ending.set()
         if self._clock.is_alive():
             self._clock.join(5.0)
-        self.everyone(lambda browser: browser.close())
+        for client in list(self.browsers):
+            self.leave(client)
         self.painting.shutdown(wait=False, cancel_futures=True)  # a browser may never answer
         self.sweeping.shutdown(cancel_futures=True)
         self.workers.shutdown(cancel_futures=True)
@@ -182,13 +157,22 @@ class Site:
         with self._lock:
             self._numbers.discard(number)
 
-    def everyone(self, act: "Callable[[Browser], None]") -> None:
+    def leave(self, client: int) -> None:
+        """End what a client of viser shows and does; again it does nothing."""
+        browser = self.browsers.pop(client, None)
+        if browser is not None:
+            try:
+                browser.close()
+            except Exception:
+                LOG.exception("a browser did not end well")
+
+    def everyone(self, act: Callable[[Updated], None]) -> None:
         """Do something for each browser; one that fails does not stop the others."""
         for browser in list(self.browsers.values()):
             try:
                 act(browser)
             except Exception:
-                LOG.exception("a browser's update or end failed")
+                LOG.exception("a browser's update failed")
 
     def error_text(self, error: BaseException) -> str:
         """Words of an error as any browser may read them; see `wording.error_text`."""
@@ -199,14 +183,6 @@ class Site:
             folders.add(request.recordings)
         return error_text(error, request.urls.values(), folders)
 
-    def _may_read(self, path: Path) -> bool:
-        """Whether the page may read an object's file: below the operator's folders alone."""
-        try:
-            self.folders.checked(str(path))
-        except HapticDBError:
-            return False
-        return True
-
     def _allowed(self) -> AllowedFolders:
         folders = self.request.folders
         if folders is not None:
@@ -214,7 +190,7 @@ class Site:
         with Environment(open_store(self.url, read_only=True)) as env:
             return AllowedFolders.of_links(obj.link for obj in env.objects())
 
-    def _learn(self, _: SceneEdit) -> None:
+    def _learn(self) -> None:
         """Objects have changed: somebody has edited the environment."""
         self.objects = self.view.objects
         self.everyone(lambda browser: browser.objects_changed())
@@ -223,13 +199,9 @@ class Site:
         """Update all browsers `TICKS` times a second; a late tick is not made up for."""
         while not self._is_ending.is_set():
             begun = time.monotonic()
-            self.everyone(partial(_tick, now=begun))
+            self.everyone(lambda browser: browser.tick(begun))  # noqa: B023 - called at once
             left = 1.0 / TICKS - (time.monotonic() - begun)
             self._is_ending.wait(max(left, 0.002))
-
-
-def _tick(browser: "Browser", now: float) -> None:
-    browser.tick(now)
 
 
 def checked_file(folder: Path | None, name: str) -> Path:

@@ -1,6 +1,7 @@
 """Moving a part by its gizmo, in the tab Parts: one transaction when it is let go of, and undo."""
 
 import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -8,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import UsageError
 from hapticdb.page import checks
+from hapticdb.page.browser import Browser
 from hapticdb.page.editing import PersonsEdits
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import short_name
@@ -17,8 +18,6 @@ from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent, TransformControlsEvent
-
-    from hapticdb.page.browser import Browser
 
 MOVING_GIZMO = 0.13
 """Size of a part's gizmo, as a share of the scene's diagonal; larger than the hand's, to tell both
@@ -32,16 +31,9 @@ lost; at 0 a click on the gizmo would be an edit."""
 class HeldPart:
     """A part on its gizmo.
 
-    Attributes
-    ----------
-    object : Object
-        The part, as this browser's moves are based on it.
-    start : (4, 4) float64
-        Pose of the gizmo at which the part is where `object` has it.
-    left : (4, 4) float64
-        Pose at which the gizmo was let go of last.
-    n_waiting : int
-        Moves that are not yet written.
+    object : as this browser's moves are based on it; start : pose (4, 4) of the gizmo at which the
+    part is where `object` has it; left : pose at which the gizmo was let go of last; n_waiting :
+    moves that are not yet written.
     """
 
     object: Object
@@ -61,15 +53,10 @@ class MovingControls:
     Drags come on viser's event loop, answers in the thread of the edits, others' edits in the
     follower's, and choices in viser's pool: one lock is held around what changes the gizmo.
 
-    Parameters
-    ----------
-    browser : Browser
-        Whose hand moves.
-    gui : GuiApi
-        Where the controls are made: inside the present container.
+    gui : where the panel is made, inside the present container.
     """
 
-    def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._lock = threading.RLock()
         self._held: HeldPart | None = None
@@ -135,7 +122,7 @@ class MovingControls:
     def _switch(self, event: "GuiEvent[Any]") -> None:
         if checks.flag_of(event.target.value, "moving") and len(self._browser.chosen) != 1:
             put(self._moves, value=False)
-            raise UsageError("choose one part first: click it, or take it from the list")
+            self._browser.only_chosen()
         self.follow()
 
     async def _dragged(self, held: HeldPart, event: "TransformControlsEvent") -> None:
@@ -197,28 +184,20 @@ class MovingControls:
 
     def _take_out(self, event: "GuiEvent[Any]") -> None:
         word = checks.choice_of(event.target.value, ("Take out", "Put back"), "a step")
-        browser = self._browser
-        edits = browser.site.edits
-        if edits is None:
-            return
         if word == "Put back":
-            edits.ask(
-                browser.client.client_id, lambda own: own.put_back(), self._written, browser.failed
-            )
-            return
-        if len(browser.chosen) != 1:
-            raise UsageError("choose one part first: click it, or take it from the list")
-        obj = browser.site.objects[browser.chosen[0]]
-        edits.ask(
-            browser.client.client_id, lambda own: own.take_out(obj), self._written, browser.failed
-        )
+            self._ask(lambda own: own.put_back())
+        else:
+            obj = self._browser.only_chosen()
+            self._ask(lambda own: own.take_out(obj))
 
     def _undo_last(self, _: object) -> None:
+        self._ask(lambda own: own.undo())
+
+    def _ask(self, job: Callable[[PersonsEdits], str]) -> None:
+        """Do an edit of this person, and tell what was done."""
         browser = self._browser
         if browser.site.edits is not None:
-            browser.site.edits.ask(
-                browser.client.client_id, lambda edits: edits.undo(), self._written, browser.failed
-            )
+            browser.site.edits.ask(browser.client.client_id, job, self._written, browser.failed)
 
     def _written(self, said: str) -> None:
         self._browser.tell("Done", said, is_good=True)

@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
 from hapticdb.page import checks, colours, tools
+from hapticdb.page.browser import Browser
 from hapticdb.page.panels.moving import MovingControls
 from hapticdb.page.scene.names import Branch
 from hapticdb.page.wording import note_html, plain_name, rows_html, short_name, size_text
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.store.base import Object
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent
-
-    from hapticdb.page.browser import Browser
 
 Floats = NDArray[np.float64]
 
@@ -47,15 +45,10 @@ class TreeLine:
 class PartsPanel:
     """Finds parts, says what they are, and sets what this browser shows and feels.
 
-    Parameters
-    ----------
-    browser : Browser
-        Whose view it is.
-    gui : GuiApi
-        Where the panel is made: inside the present container.
+    gui : where the panel is made, inside the present container.
     """
 
-    def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._client = browser.client
         self._opened = ""
@@ -92,7 +85,7 @@ class PartsPanel:
             )  # fmt: skip
             self._take.on_click(guard("toucher", self._take_out))
             self._back = gui.add_button("Put it back", visible=False)
-            self._back.on_click(guard("toucher", lambda _: self.put_back()))
+            self._back.on_click(guard("toucher", lambda _: browser.put_back()))
         with gui.add_folder("Distance", expand_by_default=False):
             self._measures = gui.add_checkbox("Measure between two clicks", initial_value=False)
             self._measures.on_update(guard("viewer", self._start_measuring))
@@ -142,8 +135,7 @@ class PartsPanel:
             button.label = short_name(line.label) + sign
             button.visible = True
         for button in self._buttons[len(self._lines) :]:
-            if button.visible:
-                button.visible = False
+            button.visible = False
 
     def _searched(self, event: "GuiEvent[Any]") -> None:
         checks.text_of(event.target.value, LONGEST_SEARCH, "a search")
@@ -195,18 +187,8 @@ class PartsPanel:
         if self._voxel_box.value:
             self._draw_voxels()
 
-    def _chosen(self) -> list[Object]:
-        objects = self._browser.site.objects
-        return [objects[i] for i in self._browser.chosen if i in objects]
-
-    def _only(self) -> Object:
-        chosen = self._chosen()
-        if len(chosen) != 1:
-            raise UsageError("choose one part first: click it, or take it from the list")
-        return chosen[0]
-
     def _say_chosen(self) -> None:
-        chosen = self._chosen()
+        chosen = self._browser.chosen_objects()
         if not chosen:
             said = note_html("Click a part, or choose one above.")
         elif len(chosen) == 1:
@@ -253,7 +235,7 @@ class PartsPanel:
 
     def _show_voxels(self, event: "GuiEvent[Any]") -> None:
         if checks.flag_of(event.target.value, "voxels"):
-            self._only()
+            self._browser.only_chosen()
             self._draw_voxels()
         else:
             self._clear_voxels()
@@ -264,7 +246,7 @@ class PartsPanel:
             drawn.remove()
 
     def _draw_voxels(self) -> None:
-        chosen = self._chosen()
+        chosen = self._browser.chosen_objects()
         if len(chosen) != 1:
             self._clear_voxels()
             return
@@ -293,7 +275,7 @@ class PartsPanel:
 
     def _take_out(self, _: object) -> None:
         browser = self._browser
-        obj = self._only()
+        obj = self._browser.only_chosen()
         stage = browser.site.stage
         inset = tools.inset_of(stage.voxel_size, smooth=stage.is_smooth)
 
@@ -309,20 +291,12 @@ class PartsPanel:
                 tools.from_shell(obj.name, found), np.array([*middle, 1.0, 0.0, 0.0, 0.0])
             )
             browser.scene.hide((obj.id,))
-            browser.touch.show_tool()
-            self._back.visible = True
 
         browser.site.database.ask(shell, hold, browser.failed)
 
-    def put_back(self) -> None:
-        """Put the part in hand back to its place; the first tool takes its place in the hand."""
-        browser = self._browser
-        taken, browser.taken = browser.taken, None
-        if taken is not None:
-            browser.scene.show((taken,))
-        self._back.visible = False
-        browser.take_in_hand(browser.site.tools[0])
-        browser.touch.show_tool()
+    def show_tool(self) -> None:
+        """Show whether a part is in hand."""
+        self._back.visible = self._browser.taken is not None
 
     # -- distances ---------------------------------------------------------------------------
 

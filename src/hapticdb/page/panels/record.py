@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, UsageError
 from hapticdb.page import checks, colours
+from hapticdb.page.browser import Browser
 from hapticdb.page.drawing import place
 from hapticdb.page.site import checked_file
 from hapticdb.page.widgets import put
@@ -20,8 +21,6 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from viser import GuiApi, GuiEvent
-
-    from hapticdb.page.browser import Browser
 
 Floats = NDArray[np.float64]
 
@@ -49,15 +48,10 @@ class Replay(NamedTuple):
 class RecordPanel:
     """Records this browser's session into the operator's folder, and replays what is there.
 
-    Parameters
-    ----------
-    browser : Browser
-        Whose session it is.
-    gui : GuiApi
-        Where the panel is made: inside the present container.
+    gui : where the panel is made, inside the present container.
     """
 
-    def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._is_painting = threading.Lock()
         self._replay: Replay | None = None
@@ -103,11 +97,7 @@ class RecordPanel:
         if session is None:
             raise UsageError("there is no tool to record yet: wait a moment")
         if self._is_recording:
-            n_frames = session.stop_recording()
-            self._is_recording = False
-            self._record.label = "Record"
-            self._state.content = note_html(f"Recorded {n_frames:,} frames.")
-            self._list.options = (NOTHING, *self._names())
+            self._stopped(f"Recorded {session.stop_recording():,} frames.")
             return
         at = datetime.now(UTC).strftime("%Y-%m-%d_%H-%M-%S")
         path = checked_file(browser.site.recordings, f"{at}_{browser.number}{SUFFIX}")
@@ -119,10 +109,13 @@ class RecordPanel:
     def session_ended(self) -> None:
         """Tell that a recording ended with its session."""
         if self._is_recording:
-            self._is_recording = False
-            self._record.label = "Record"
-            self._state.content = note_html("The recording ended: the session began anew.")
-            self._list.options = (NOTHING, *self._names())
+            self._stopped("The recording ended: the session began anew.")
+
+    def _stopped(self, said: str) -> None:
+        self._is_recording = False
+        self._record.label = "Record"
+        self._state.content = note_html(said)
+        self._list.options = (NOTHING, *self._names())
 
     # -- replay ------------------------------------------------------------------------------
 

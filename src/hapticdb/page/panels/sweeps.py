@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page import checks, colours, tools
+from hapticdb.page.browser import Browser
 from hapticdb.page.database import opened
 from hapticdb.page.drawing import add_tool, place
 from hapticdb.page.widgets import put
@@ -21,8 +22,6 @@ from hapticdb.sweeps.verdict import percent, verdict_line
 
 if TYPE_CHECKING:
     from viser import GuiApi
-
-    from hapticdb.page.browser import Browser
 
 LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
@@ -54,15 +53,10 @@ class SweepAnswer(NamedTuple):
 class SweepPanel:
     """Runs sweeps of this browser's tool or chosen part, and shows what they hit.
 
-    Parameters
-    ----------
-    browser : Browser
-        Whose tool, part and filter it uses.
-    gui : GuiApi
-        Where the panel is made: inside the present container.
+    gui : where the panel is made, inside the present container.
     """
 
-    def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
+    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._drawn: list[Any] = []
         self._is_running = False
@@ -93,11 +87,9 @@ class SweepPanel:
         is_part = checks.choice_of(self._what.value, self._what.options, "what").endswith("part")
         way = checks.choice_of(self._way.value, WAYS, "a way")
         length = checks.number_of(self._length.value, 0.0, self._farthest, "a length")
-        if is_part and len(browser.chosen) != 1 and browser.taken is None:
-            raise UsageError("choose one part first: click it, or take it from the list")
         part = None
         if is_part:
-            part = browser.taken if browser.taken is not None else browser.chosen[0]
+            part = browser.taken if browser.taken is not None else browser.only_chosen().id
         job = SweepJob(browser, part, way, length)
         self._is_running = True
         self._erase()
@@ -150,6 +142,7 @@ class SweepPanel:
         place(node, np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]]))
         self._drawn = [node]
         if len(found.marks):
+            word = "first hit" if swept.caught is None else "caught"
             size = self._browser.site.stage.diagonal
             self._drawn.append(
                 scene.add_point_cloud(
@@ -159,7 +152,7 @@ class SweepPanel:
             )  # fmt: skip
             self._drawn.append(
                 scene.add_label(
-                    "/swept_label", f"{_word_of(swept)} at {percent(moment.fraction)}",
+                    "/swept_label", f"{word} at {percent(moment.fraction)}",
                     position=found.marks.mean(axis=0), anchor="bottom-left",
                 )
             )  # fmt: skip
@@ -175,19 +168,11 @@ class SweepPanel:
 class SweepJob:
     """A sweep as it was asked for: later clicks do not change it.
 
-    Parameters
-    ----------
-    browser : Browser
-        Whose tool and filter it takes.
-    part : int or None
-        Id of the swept object; None: the tool.
-    way : str
-        One of `WAYS`.
-    length : float
-        Of a way along an axis, metres.
+    part : id of the swept object; None: the tool; way : one of `WAYS`; length : of a way along an
+    axis, metres.
     """
 
-    def __init__(self, browser: "Browser", part: int | None, way: str, length: float) -> None:
+    def __init__(self, browser: Browser, part: int | None, way: str, length: float) -> None:
         self._site = browser.site
         self._part = part
         self._way, self._length = WAYS[way], length
@@ -225,14 +210,10 @@ class SweepJob:
             last[axis, 3] += sign * self._length
         elif self._part is None:
             last = self._hand
-        elif self._part is not None:
+        else:
             middle = np.eye(4)
             middle[:3, 3] = tools.middle_of(shell)
             last = self._hand @ np.linalg.inv(middle)
         if math.isclose(float(np.abs(last - first).max()), 0.0, abs_tol=1e-12):
             raise UsageError("a way of no length: give a length, or move the hand")
         return np.stack([first, last])
-
-
-def _word_of(swept: Swept) -> str:
-    return "first hit" if swept.caught is None else "caught"

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.page import checks, colours
+from hapticdb.page.browser import Browser
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import (
     MOST_SAID,
@@ -20,9 +21,7 @@ from hapticdb.recording.frame import State
 from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
-    from viser import GuiApi, GuiEvent
-
-    from hapticdb.page.browser import Browser
+    from viser import GuiApi, GuiEvent, GuiUplotHandle
 
 SHOWN_EVERY = 0.2
 """Seconds from one update of numbers and plots to the next. Larger: less to send, and numbers that
@@ -40,47 +39,19 @@ SCALES = (0.05, 20.0)
 class TouchPanel:
     """Shows the session's newest frame, and sets the tool, its spring and its scale.
 
-    Parameters
-    ----------
-    browser : Browser
-        Whose session it is.
-    gui : GuiApi
-        Where the panel is made: inside the present container.
+    gui : where the panel is made, inside the present container.
     """
 
-    def __init__(self, browser: "Browser", gui: "GuiApi") -> None:
-        from viser.uplot import Axis, Legend, Scale, Series  # noqa: PLC0415 - the extra `view`
-
+    def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
-        self._gui = gui
         self._shown_at = 0.0
-        self._said = ""
         may_touch = browser.visitor.may("toucher")
         self._reading = gui.add_html(
             self._reading_html(0.0, 0.0, [], "The tool is being made ready.", is_held=may_touch)
         )
-        nothing = np.zeros(2)
-        axes = (Axis(space=60, size=32), Axis(size=40))
-        self._force = gui.add_uplot(
-            (np.array([-SECONDS, 0.0]), nothing),
-            (Series(label="s"), Series(label="N", stroke=_css(colours.FORCE), width=2)),
-            title="Force, N",
-            scales={
-                "x": Scale(time=False, min=-SECONDS, max=0.0),
-                "y": Scale(auto=False, min=0.0, max=8.0),
-            },
-            axes=axes, legend=Legend(show=False), height=130, visible=may_touch,
-        )  # fmt: skip
-        self._late = gui.add_uplot(
-            (np.array([-SECONDS, 0.0]), nothing),
-            (Series(label="s"), Series(label="ms", stroke="rgb(72,120,190)", width=1)),
-            title="Lateness of the loop, ms",
-            scales={
-                "x": Scale(time=False, min=-SECONDS, max=0.0),
-                "y": Scale(auto=False, min=0.0, max=2.0),
-            },
-            axes=axes, legend=Legend(show=False), height=100, visible=may_touch,
-        )  # fmt: skip
+        force = ("Force, N", "N", _css(colours.FORCE), 2, 8.0, 130)
+        late = ("Lateness of the loop, ms", "ms", "rgb(72,120,190)", 1, 2.0, 100)
+        self._force, self._late = (_plot(gui, *words, is_seen=may_touch) for words in (force, late))
         if may_touch:
             self._add_controls(gui)
 
@@ -122,14 +93,13 @@ class TouchPanel:
             return
         name = checks.choice_of(event.target.value, names, "a tool")
         if browser.taken is not None:
-            browser.parts.put_back()
+            browser.put_back()
         browser.take_in_hand(browser.site.tools[names.index(name)], browser.hand)
-        self.show_tool()
 
     def _go_home(self, _: object) -> None:
         browser = self._browser
         if browser.taken is not None:
-            browser.parts.put_back()
+            browser.put_back()
         browser.take_in_hand(browser.tool)
 
     def _type_place(self, event: "GuiEvent[Any]") -> None:
@@ -166,8 +136,7 @@ class TouchPanel:
         browser = self._browser
         names = [tool.name for tool in browser.site.tools]
         options = names if self._is_of_the_list else [*names, PART]
-        if list(self._tool.options) != options:
-            self._tool.options = options
+        self._tool.options = options
         put(self._tool, browser.tool.name if self._is_of_the_list else PART)
 
     def show_place(self) -> None:
@@ -190,10 +159,7 @@ class TouchPanel:
             trouble = "The tool lies in a part: move it free, then it feels."
         elif frame["unknown"]:
             trouble = "Cells are being fetched."
-        said = self._reading_html(force, torque, touched, trouble, is_held=True)
-        if said != self._said:
-            self._said = said
-            self._reading.content = said
+        self._reading.content = self._reading_html(force, torque, touched, trouble, is_held=True)
         history = np.array(self._browser.history)
         if len(history) > 1:
             times, force_then, late_then = last_seconds(history).T
@@ -248,3 +214,23 @@ def last_seconds(history: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _css(colour: colours.Colour) -> str:
     return f"rgb({colour[0]},{colour[1]},{colour[2]})"
+
+
+def _plot(
+    gui: "GuiApi", title: str, unit: str, stroke: str, width: int, top: float, height: int,
+    *, is_seen: bool,
+) -> "GuiUplotHandle":  # fmt: skip
+    """Add a plot of the last seconds, from 0 to `top`."""
+    from viser.uplot import Axis, Legend, Scale, Series  # noqa: PLC0415 - the extra `view`
+
+    return gui.add_uplot(
+        (np.array([-SECONDS, 0.0]), np.zeros(2)),
+        (Series(label="s"), Series(label=unit, stroke=stroke, width=width)),
+        title=title,
+        scales={
+            "x": Scale(time=False, min=-SECONDS, max=0.0),
+            "y": Scale(auto=False, min=0.0, max=top),
+        },
+        axes=(Axis(space=60, size=32), Axis(size=40)),
+        legend=Legend(show=False), height=height, visible=is_seen,
+    )  # fmt: skip

@@ -1,15 +1,15 @@
 """All objects of the scene, the nodes that draw them, and the audiences that see them."""
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from itertools import count
 from threading import RLock
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.page.scene.colours import Rgb, colour_of
+from hapticdb.page.colours import colour_of
 from hapticdb.page.scene.drawings import Audience, Drawing
-from hapticdb.page.scene.nodes import BatchNode, BoxNode, Member, Node, Sight, gathered
+from hapticdb.page.scene.nodes import BatchNode, Member, Node, Sight, gathered
 from hapticdb.page.scene.picking import Struck, Targets
 from hapticdb.page.scene.rigid import taken_apart
 from hapticdb.page.scene.shapes import PartShape
@@ -47,10 +47,6 @@ class Contents:
         self._loose: set[int] = set()
         self._preview: dict[int, NDArray[np.float64]] = {}
 
-    def __len__(self) -> int:
-        """Number of objects."""
-        return len(self.records)
-
     @property
     def n_nodes(self) -> int:
         """Nodes that all browsers are sent."""
@@ -81,7 +77,7 @@ class Contents:
                 pose = taken_apart(obj.transform).pose
                 members.append(Member(obj.id, pose, obj.bounds, colour_of(obj)))
             if members:
-                self._settle([BoxNode(self._name(), members)])
+                self._settle([BatchNode(self._name(), members, None)])
             self.refresh()
 
     def remove(self, ids: Iterable[int]) -> None:
@@ -142,18 +138,13 @@ class Contents:
             self._moved(member)
             return True
 
-    def placement(self, object_id: int) -> NDArray[np.float64]:
-        """World_from_part (4, 4) at which an object is shown now, previews included."""
-        with self.lock:
-            return self._preview.get(object_id, self.records[object_id].transform).copy()
-
     def _moved(self, member: Member) -> None:
         home = self._home[member.id]
         self._targets.put(member.id, member.shape, member.pose, member.box)
         if not home.is_cheap_to_move and member.shape and len(self._loose) < MOST_LOOSE:
             self._leave(member.id)
             self._loose.add(member.id)
-            self._settle([BatchNode(self._name(), member.shape, [member])])
+            self._settle([BatchNode(self._name(), [member], member.shape)])
         else:
             self._stale[home.name] = home
 
@@ -242,20 +233,14 @@ class Contents:
         with self.lock:
             return self._targets.first(origin, direction, sees)
 
-    def box(self, ids: Iterable[int] | None = None) -> NDArray[np.float64] | None:
-        """Lower and upper corner (2, 3) of objects as they are shown now; None without any."""
+    def box(self) -> NDArray[np.float64] | None:
+        """Lower and upper corner (2, 3) of all objects as they are shown now; None without any."""
         with self.lock:
-            wanted = self._members.keys() if ids is None else ids
-            boxes = [self._members[i].box for i in wanted if i in self._members]
+            boxes = [member.box for member in self._members.values()]
         if not boxes:
             return None
         stacked = np.stack(boxes)
         return np.stack([stacked[:, 0].min(axis=0), stacked[:, 1].max(axis=0)])
-
-    def colours(self) -> Mapping[int, Rgb]:
-        """Own colour of each object."""
-        with self.lock:
-            return {i: member.colour for i, member in self._members.items()}
 
     def waiting(self) -> int:
         """Number of objects that are still boxes."""

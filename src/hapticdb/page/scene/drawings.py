@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.page.scene.colours import sent
+from hapticdb.page.colours import sent
 from hapticdb.page.scene.facets import Facets
 
 if TYPE_CHECKING:
@@ -157,8 +157,3 @@ class Audience:
         blank = self._blanks.pop(name, None)
         if blank is not None:
             blank.remove()
-
-    def clear(self) -> None:
-        """Remove all nodes."""
-        for name in list(self.names):
-            self.drop(name)

@@ -1,6 +1,6 @@
 """Names of objects as a tree of sub-assemblies, and a search over them."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 
@@ -59,27 +59,18 @@ def _branch(known: dict[str, Branch], path: str) -> Branch:
     return branch
 
 
-def found_ids(folded: Iterable[tuple[int, str]], text: str) -> list[int]:
+def found_ids(names: Mapping[int, str], text: str) -> list[int]:
     """Ids of the names that hold each word of a text, in any order and whatever the case.
 
-    Parameters
-    ----------
-    folded : iterable of (int, str)
-        Ids and names after `str.casefold`.
-
-    Returns
-    -------
-    list of int
-        First those whose last element begins with the text, then those whose last element has a
-        word of it, then the rest; by name within each.
+    First those whose last element begins with the text, then those whose last element has a word of
+    it, then the rest; by name within each.
     """
     words = text.casefold().split()
-    if not words:
-        return []
     whole = " ".join(words)
     found = []
-    for object_id, name in folded:
-        if all(word in name for word in words):
+    for object_id, given in names.items():
+        name = given.casefold()
+        if words and all(word in name for word in words):
             last = name.rpartition("/")[2]
             rank = 0 if last.startswith(whole) else 1 if any(w in last for w in words) else 2
             found.append((rank, name, object_id))

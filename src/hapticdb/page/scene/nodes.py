@@ -1,17 +1,17 @@
 """Objects gathered into few nodes: batches of one shape, and merged shapes of one colour."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.page.scene.colours import Rgb
+from hapticdb.page.colours import Colour
 from hapticdb.page.scene.drawings import Drawing, Geometry
 from hapticdb.page.scene.facets import Facets, cube
-from hapticdb.page.scene.rigid import quaternions
 from hapticdb.page.scene.shapes import PartShape
+from hapticdb.poses import quaternion_of
 
 LEAST_SAVED = 2_000
 """Triangles that a batch must save, compared with merging its objects, to be a node of its own. A
@@ -35,11 +35,11 @@ class Member:
     id: int
     pose: NDArray[np.float64]
     box: NDArray[np.float64]
-    colour: Rgb
+    colour: Colour
     shape: PartShape | None = None
 
 
-Sight = Callable[[Member], Rgb | None]
+Sight = Callable[[Member], Colour | None]
 """Colour in which an audience sees an object; None if it does not."""
 
 
@@ -62,66 +62,48 @@ class Node(Protocol):
         """What an audience sees of it, by names of nodes; nodes without a drawing are gone."""
 
 
-def _gone() -> Rgb:
-    return (0, 0, 0)
-
-
 class BatchNode:
-    """One shape at one or more places."""
+    """One shape at one or more places; without a shape, the boxes of objects as cubes."""
 
-    def __init__(self, name: str, shape: PartShape, members: Sequence[Member]) -> None:
+    def __init__(self, name: str, members: Sequence[Member], shape: PartShape | None) -> None:
         self.name = name
         self.members = {member.id: member for member in members}
-        self._slots = [member.id for member in members]
-        self._poses = np.stack([member.pose for member in members])
-        self._geometry = Geometry(shape.serial, lambda: shape.drawn, shape.radius)
+        self._slots = list(members)
+        """Its members; one that has left is not seen, and keeps its place."""
+        self._is_boxes = shape is None
+        if shape is None:
+            self._geometry = Geometry("box", _cube32, 0.87, BOX_OPACITY)
+        else:
+            self._geometry = Geometry(shape.serial, lambda: shape.drawn, shape.radius)
+        self._poses = np.tile(np.eye(4), (len(members), 1, 1))
+        self._edges = np.ones((len(members), 3))
 
     @property
     def is_cheap_to_move(self) -> bool:
-        """Whether a moved object sends few bytes: its node's places, 28 bytes each."""
-        return len(self._slots) <= 256
+        """Whether a moved object sends few bytes: its node's places, 28 bytes each.
+
+        Boxes are there for a few seconds only.
+        """
+        return self._is_boxes or len(self._slots) <= 256
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
         """Its only node; hidden objects have size 0."""
-        colours, sizes = _seen(self._slots, self.members, sight)
-        for slot, object_id in enumerate(self._slots):
-            if object_id in self.members:
-                self._poses[slot] = self.members[object_id].pose
-        poses = self._poses
-        drawing = Drawing(
-            self._geometry, quaternions(poses[:, :3, :3]), poses[:, :3, 3].copy(), sizes, colours
-        )
-        return {} if drawing.is_blank else {self.name: drawing}
-
-
-class BoxNode:
-    """Boxes of objects whose shapes are not there yet."""
-
-    def __init__(self, name: str, members: Sequence[Member]) -> None:
-        self.name = name
-        self.members = {member.id: member for member in members}
-        self._slots = [member.id for member in members]
-        self._boxes = np.stack([member.box for member in members])
-        self._geometry = Geometry("box", _cube32, 0.87, BOX_OPACITY)
-
-    @property
-    def is_cheap_to_move(self) -> bool:
-        """Whether a moved object sends few bytes; boxes are there for a few seconds only."""
-        return True
-
-    def drawings(self, sight: Sight) -> dict[str, Drawing]:
-        """Its only node; hidden objects have size 0."""
-        colours, sizes = _seen(self._slots, self.members, sight)
-        for slot, object_id in enumerate(self._slots):
-            if object_id in self.members:
-                self._boxes[slot] = self.members[object_id].box
-        boxes = self._boxes
+        colours = [sight(one) if one.id in self.members else None for one in self._slots]
+        is_seen = np.array([colour is not None for colour in colours], dtype=np.float64)
+        for slot, member in enumerate(self._slots):
+            if member.id not in self.members:
+                continue
+            if self._is_boxes:
+                self._poses[slot, :3, 3] = member.box.mean(axis=0)
+                self._edges[slot] = np.maximum(member.box[1] - member.box[0], 1e-9)
+            else:
+                self._poses[slot] = member.pose
         drawing = Drawing(
             self._geometry,
-            np.tile(_UNTURNED, (len(boxes), 1)),
-            boxes.mean(axis=1),
-            sizes[:, None] * np.maximum(boxes[:, 1] - boxes[:, 0], 1e-9),
-            colours,
+            quaternion_of(self._poses[:, :3, :3]),
+            self._poses[:, :3, 3].copy(),
+            is_seen[:, None] * self._edges if self._is_boxes else is_seen,
+            np.array([colour or (0, 0, 0) for colour in colours], dtype=np.uint8),
         )
         return {} if drawing.is_blank else {self.name: drawing}
 
@@ -129,15 +111,6 @@ class BoxNode:
 def _cube32() -> Facets:
     vertices, faces = cube()
     return Facets(vertices.astype(np.float32), faces.astype(np.uint32))
-
-
-def _seen(
-    slots: Iterable[int], members: dict[int, Member], sight: Sight
-) -> tuple[NDArray[np.uint8], NDArray[np.float64]]:
-    """Colours (N, 3) and sizes (N,) of places; size 0 where nothing is seen."""
-    colours = [sight(members[i]) if i in members else None for i in slots]
-    sizes = np.array([0.0 if colour is None else 1.0 for colour in colours])
-    return np.array([colour or _gone() for colour in colours], dtype=np.uint8), sizes
 
 
 class MergedNode:
@@ -161,7 +134,7 @@ class MergedNode:
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
         """Its node, and one for each other colour."""
-        of_colour: dict[tuple[str, Rgb], list[Member]] = {}
+        of_colour: dict[tuple[str, Colour], list[Member]] = {}
         for member in self.members.values():
             colour = sight(member)
             if colour is not None:
@@ -170,7 +143,7 @@ class MergedNode:
                 of_colour.setdefault((name, colour), []).append(member)
         return {name: self._drawing(some, colour) for (name, colour), some in of_colour.items()}
 
-    def _drawing(self, members: list[Member], colour: Rgb) -> Drawing:
+    def _drawing(self, members: list[Member], colour: Colour) -> Drawing:
         key = tuple(
             (member.id, member.shape and member.shape.serial, member.pose.tobytes())
             for member in members
@@ -209,14 +182,14 @@ def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
     for member in members:
         of_shape.setdefault(id(member.shape), []).append(member)
     nodes: list[Node] = []
-    rest: dict[Rgb, list[Member]] = {}
+    rest: dict[Colour, list[Member]] = {}
     for same in of_shape.values():
         shape = same[0].shape
         if shape is None:
             continue
         saved = (len(same) - 1) * shape.n_triangles
         if saved >= LEAST_SAVED or shape.n_triangles > MOST_MERGED:
-            nodes.append(BatchNode(names(), shape, same))
+            nodes.append(BatchNode(names(), same, shape))
         else:
             for member in same:
                 rest.setdefault(member.colour, []).append(member)

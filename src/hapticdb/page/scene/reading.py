@@ -12,15 +12,15 @@ from time import monotonic
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.errors import FileError
 from hapticdb.ingest.originals import found_parts
 from hapticdb.mesh import Part
+from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.scene.facets import Facets
 from hapticdb.page.scene.rigid import taken_apart
 from hapticdb.page.scene.shapes import PartShape, draw_each
 from hapticdb.store.base import Object
 
-MayRead = Callable[[Path], bool]
-"""Whether the page may read a file, by its path with symbolic links resolved."""
 ShapedObject = tuple[Object, PartShape, NDArray[np.float64]]
 """An object, its shape, and the shape's pose (4, 4), world_from_shape."""
 READERS = 2
@@ -38,8 +38,8 @@ class ShapeReader:
 
     Parameters
     ----------
-    may_read : callable
-        Whether a file may be read.
+    folders : AllowedFolders
+        Where files may be read.
     show : callable
         Takes objects with their shapes, as they become known; called from the reader's thread.
     lost : callable
@@ -48,11 +48,11 @@ class ShapeReader:
 
     def __init__(
         self,
-        may_read: MayRead,
+        folders: AllowedFolders,
         show: Callable[[Sequence[ShapedObject]], None],
         lost: Callable[[Sequence[Object]], None],
     ) -> None:
-        self._may_read = may_read
+        self._folders = folders
         self._show = show
         self._lost = lost
         self._wanted: SimpleQueue[Sequence[Object] | None] = SimpleQueue()
@@ -70,10 +70,6 @@ class ShapeReader:
         self._ended.set()
         self._wanted.put(None)
 
-    def close_when_done(self) -> None:
-        """End the thread after it has read what waits."""
-        self._wanted.put(None)
-
     def join(self, timeout: float) -> None:
         """Wait until the thread has ended."""
         self._thread.join(timeout)
@@ -89,7 +85,7 @@ class ShapeReader:
         paths: dict[str, Path | None] = {}
         for obj in objects:
             if obj.link not in paths:
-                paths[obj.link] = _readable(obj.link, self._may_read)
+                paths[obj.link] = _readable(obj.link, self._folders)
             (lost if paths[obj.link] is None else allowed).append(obj)
         self._lost(lost)
         ready: list[ShapedObject] = []
@@ -139,13 +135,13 @@ def centred(pose: NDArray[np.float64], shape: PartShape) -> NDArray[np.float64]:
     return moved
 
 
-def _readable(link: str, may_read: MayRead) -> Path | None:
+def _readable(link: str, folders: AllowedFolders) -> Path | None:
     """The file behind a link, without symbolic links; None if it is gone or must not be read."""
     try:
-        path = Path(link).resolve(strict=True)
-        return path if may_read(path) and os.access(path, os.R_OK) else None
-    except (OSError, RuntimeError, ValueError):
+        path = folders.checked(link)
+    except FileError:
         return None
+    return path if os.access(path, os.R_OK) else None
 
 
 def _files(

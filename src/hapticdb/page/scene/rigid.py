@@ -55,30 +55,3 @@ def _taken_apart(placement: bytes) -> Placed:
     pose[:3, :3] = rotation
     pose.flags.writeable = stretch.flags.writeable = False
     return Placed(pose, stretch)
-
-
-def quaternions(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Unit quaternions w, x, y, z (n, 4) of rotations (n, 3, 3); Shepperd 1978."""
-    r = rotations
-    trace = r[:, 0, 0] + r[:, 1, 1] + r[:, 2, 2]
-    best = np.argmax(np.stack([trace, r[:, 0, 0], r[:, 1, 1], r[:, 2, 2]], axis=1), axis=1)
-    found = np.empty((len(r), 4))
-    some = best == 0
-    found[some] = np.stack(
-        [
-            1 + trace[some],
-            r[some, 2, 1] - r[some, 1, 2],
-            r[some, 0, 2] - r[some, 2, 0],
-            r[some, 1, 0] - r[some, 0, 1],
-        ],
-        axis=1,
-    )
-    for i in range(3):
-        j, k = (i + 1) % 3, (i + 2) % 3
-        some = best == i + 1
-        found[some, 0] = r[some, k, j] - r[some, j, k]
-        found[some, 1 + i] = 1 + r[some, i, i] - r[some, j, j] - r[some, k, k]
-        found[some, 1 + j] = r[some, j, i] + r[some, i, j]
-        found[some, 1 + k] = r[some, k, i] + r[some, i, k]
-    found /= np.linalg.norm(found, axis=1, keepdims=True)
-    return found

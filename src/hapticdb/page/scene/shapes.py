@@ -3,7 +3,7 @@
 from collections.abc import Iterable
 from functools import cache, cached_property
 from itertools import count
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +15,6 @@ _EMBREE_SIZE = 100.0
 are millimetres or kilometres."""
 
 _SERIALS = count()
-
-
-class RayHit(NamedTuple):
-    """Where a ray meets a shape: its distance in lengths of the direction, and the triangle."""
-
-    distance: float
-    face: int
 
 
 class PartShape:
@@ -81,21 +74,19 @@ class PartShape:
 
     def first_hit(
         self, origin: NDArray[np.float64], direction: NDArray[np.float64]
-    ) -> RayHit | None:
-        """The nearest triangle that a ray meets, from either side; None if it meets none.
+    ) -> float | None:
+        """Distance to the nearest triangle that a ray meets, from either side; None if it misses.
 
-        origin (3,) and direction (3,), of any length, are in the shape's frame. Embree finds the
+        origin (3,) and direction (3,), a unit vector, are in the shape's frame. Embree finds the
         triangle; the distance is computed in 64 bits from the triangle's plane.
         """
         scene, scale = self._embree
-        length = float(np.linalg.norm(direction))
-        way = direction / length
         # a start near the shape: 32 bits resolve its triangles however far away the eye is
-        skipped = max(float(-(origin @ way)) - 2 * self.radius, 0.0)
-        start = (origin + skipped * way) * scale
+        skipped = max(float(-(origin @ direction)) - 2 * self.radius, 0.0)
+        start = (origin + skipped * direction) * scale
         found = scene.run(  # type: ignore[attr-defined]
             start[None].astype(np.float32),
-            way[None].astype(np.float32),
+            direction[None].astype(np.float32),
             query="INTERSECT",
             output=True,
         )
@@ -104,19 +95,12 @@ class PartShape:
             return None
         a, b, c = self.facets.vertices[self.facets.faces[face]]
         normal = np.cross(b - a, c - a)
-        across = float(normal @ way)
+        across = float(normal @ direction)
         if across != 0.0:
             distance = float(normal @ (a - origin)) / across
             if abs(distance - skipped - float(found["tfar"][0]) / scale) < 1e-3 * self.radius:
-                return RayHit(distance / length, face)
-        return RayHit((skipped + float(found["tfar"][0]) / scale) / length, face)
-
-    def normal(self, face: int) -> NDArray[np.float64]:
-        """Unit normal (3,) of a triangle, in the shape's frame; zero for one without area."""
-        a, b, c = self.facets.vertices[self.facets.faces[face]]
-        across = np.cross(b - a, c - a)
-        length = float(np.linalg.norm(across))
-        return across / length if length > 0 else across
+                return distance
+        return skipped + float(found["tfar"][0]) / scale
 
 
 def draw_each(shapes: Iterable[PartShape]) -> None:

@@ -1,57 +1,36 @@
 """The scene that all browsers see: objects of an environment, followed as others edit them."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import CancelledError
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from pathlib import Path
-from threading import Condition
+from threading import Event
 from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError
 from hapticdb.grid import Grid
-from hapticdb.page.scene.browser import BrowserScene, Picked, picked
-from hapticdb.page.scene.colours import Rgb
+from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.scene.contents import Contents, is_same_shape
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened
 from hapticdb.page.scene.following import Followed, Follower
 from hapticdb.page.scene.names import Branch, found_ids, tree_of
-from hapticdb.page.scene.reading import MayRead, ShapedObject, ShapeReader, centred
+from hapticdb.page.scene.reading import ShapedObject, ShapeReader, centred
 from hapticdb.page.scene.shapes import PartShape
-from hapticdb.page.scene.stage import View, framing, set_stage
+from hapticdb.page.scene.stage import set_stage
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
-    from viser import ClientHandle, ViserServer
+    from viser import ViserServer
 
 MOST_BLOCKS = 6_000
 """Cubes that stand for an object whose file cannot be read; more voxels are drawn as larger cubes.
 A larger value shows more detail, and sends about 100 bytes more for each cube."""
 ENDS_WITHIN_S = 10.0
 """Seconds that `SceneView.close` waits for each of its threads."""
-
-
-@dataclass(frozen=True)
-class SceneEdit:
-    """What a commit, the view's own or another's, has changed.
-
-    revision : of the environment; written : ids of objects that were added, moved or replaced;
-    removed : ids of objects that are gone.
-    """
-
-    revision: int
-    written: tuple[int, ...]
-    removed: tuple[int, ...]
-
-
-def anywhere(_path: Path) -> bool:
-    """Let the page read every file that the process may read."""
-    return True
 
 
 class SceneView:
@@ -68,9 +47,8 @@ class SceneView:
         this view's.
     url : str
         The environment; it is opened to read, by a thread of the view's own.
-    may_read : callable
-        Takes the resolved path of a file, and says whether the page may read it. By default every
-        file.
+    folders : AllowedFolders
+        Where objects' files may be read.
 
     Raises
     ------
@@ -78,20 +56,20 @@ class SceneView:
         If the environment cannot be opened or read.
     """
 
-    def __init__(self, server: "ViserServer", url: str, *, may_read: MayRead = anywhere) -> None:
-        self._server = server
-        self._contents = Contents(Audience(server.scene))
-        self._listeners: list[Callable[[SceneEdit], None]] = []
-        self._browsers: dict[int, BrowserScene] = {}
-        self._folded: list[tuple[int, str]] | None = None
+    def __init__(self, server: "ViserServer", url: str, folders: AllowedFolders) -> None:
+        self._server, self._url = server, url
+        self.contents = Contents(Audience(server.scene))
+        """The objects, their nodes, and what each browser sees of them."""
+        self.on_edit: Callable[[], None] | None = None
+        """Called from a thread after each commit, the view's own or another's, is shown."""
+        self._is_closed = Event()
         self._tree: Branch | None = None
-        self._settled = Condition()
         self._staged = False
         self.up = 2
         """Number of the axis that points up: 0 for x, 1 for y, 2 for z."""
         self.revision = -1
         """Revision of the environment that is shown."""
-        self._reader = ShapeReader(may_read, self._show_shapes, self._show_voxels)
+        self._reader = ShapeReader(folders, self._show_shapes, self._show_voxels)
         self._follower = Follower(url, self._follow)
         try:
             self._follower.start()
@@ -107,9 +85,9 @@ class SceneView:
 
     def close(self) -> None:
         """End the view's threads and its connection. The browsers keep what they show."""
+        self._is_closed.set()
         self._reader.close()
-        self._follower.close()
-        self._follower.join(ENDS_WITHIN_S)
+        self._follower.close(ENDS_WITHIN_S)
         self._reader.join(ENDS_WITHIN_S)
 
     # -- what there is -----------------------------------------------------------------------
@@ -122,98 +100,22 @@ class SceneView:
     @property
     def objects(self) -> Mapping[int, Object]:
         """All objects by id, as of `revision`: a copy."""
-        with self._contents.lock:
-            return dict(self._contents.records)
-
-    @property
-    def n_waiting(self) -> int:
-        """Number of objects that are still shown as boxes."""
-        return self._contents.waiting()
-
-    @property
-    def n_nodes(self) -> int:
-        """Nodes of the browser's scene that draw the objects."""
-        return self._contents.n_nodes
-
-    @property
-    def n_triangles(self) -> int:
-        """Triangles of all objects that have their shape."""
-        return self._contents.n_triangles
-
-    @property
-    def bytes_sent(self) -> int:
-        """Bytes of triangles, places and colours sent to each browser, before compression."""
-        return self._contents.bytes_sent
-
-    def wait_until_shown(self, timeout: float) -> bool:
-        """Wait until no object is a box; False if that took longer than `timeout` seconds."""
-        with self._settled:
-            return self._settled.wait_for(lambda: self.n_waiting == 0, timeout)
+        with self.contents.lock:
+            return dict(self.contents.records)
 
     def tree(self) -> Branch:
         """All objects as sub-assemblies, by the elements of their names, with counts.
 
         The same object, which nobody may change, until objects come, go or get other names.
         """
-        with self._contents.lock:
+        with self.contents.lock:
             if self._tree is None:
-                self._tree = tree_of({i: obj.name for i, obj in self._contents.records.items()})
+                self._tree = tree_of({i: obj.name for i, obj in self.contents.records.items()})
             return self._tree
 
     def search(self, text: str) -> list[int]:
         """Ids of the objects whose name holds each word of a text, in any case; best first."""
-        with self._contents.lock:
-            if self._folded is None:
-                records = self._contents.records.items()
-                self._folded = [(i, obj.name.casefold()) for i, obj in records]
-            folded = self._folded
-        return found_ids(folded, text)
-
-    def colour_of(self, object_id: int) -> Rgb | None:
-        """An object's own colour, sRGB 0 to 255; None if there is none."""
-        return self._contents.colours().get(object_id)
-
-    def box(self, ids: Iterable[int] | None = None) -> NDArray[np.float64] | None:
-        """Lower and upper corner (2, 3) of objects, metres; of all without ids."""
-        return self._contents.box(ids)
-
-    def placement(self, object_id: int) -> NDArray[np.float64]:
-        """World_from_part (4, 4) at which an object is shown now, previews included.
-
-        Raises
-        ------
-        KeyError
-            If there is no such object.
-        """
-        return self._contents.placement(object_id)
-
-    def framing(self, ids: Iterable[int] | None = None) -> View | None:
-        """A view that shows objects whole, all without ids; None if there are none."""
-        box = self.box(ids)
-        return None if box is None else framing(box, self.up)
-
-    # -- browsers ----------------------------------------------------------------------------
-
-    def browser(self, client: "ClientHandle") -> BrowserScene:
-        """The scene as one browser sees it: the same object at each call, until `forget`."""
-        with self._contents.lock:
-            known = self._browsers.get(client.client_id)
-            if known is None:
-                known = BrowserScene(client, self._contents)
-                self._browsers[client.client_id] = known
-            return known
-
-    def forget(self, client: "ClientHandle") -> None:
-        """Forget a browser that has disconnected."""
-        with self._contents.lock:
-            known = self._browsers.pop(client.client_id, None)
-        if known is not None:
-            known.close()
-
-    def pick(self, origin: ArrayLike, direction: ArrayLike) -> Picked | None:
-        """The part that a ray meets first, whatever browsers have hidden."""
-        struck = self._contents.pick(origin, direction, lambda _: True)
-        return None if struck is None else picked(struck, self._contents)
+        return found_ids({i: obj.name for i, obj in self.objects.items()}, text)
 
     # -- edits -------------------------------------------------------------------------------
 
@@ -233,78 +135,68 @@ class SceneView:
             False if there is no such object.
         """
         with self._server.atomic():
-            moved = self._contents.move(object_id, transform)
-            self._contents.refresh()
+            moved = self.contents.move(object_id, transform)
+            self.contents.refresh()
         return moved
 
     def put_back(self, object_id: int) -> None:
         """Show an object where the database has it."""
-        with self._contents.lock:
-            obj = self._contents.records.get(object_id)
+        with self.contents.lock:
+            obj = self.contents.records.get(object_id)
             if obj is not None:
                 self.move(object_id, obj.transform)
 
-    def on_edit(self, tell: Callable[[SceneEdit], None]) -> None:
-        """Let a function know of each commit after it is shown; it is called from a thread."""
-        self._listeners.append(tell)
-
     def _follow(self, followed: Followed) -> None:
         """Show what was committed: the first time, all objects."""
-        with self._contents.lock, self._server.atomic():
+        with self.contents.lock, self._server.atomic():
             if self._has_other_names(followed):
-                self._folded = self._tree = None
-            self._contents.remove(followed.removed)
+                self._tree = None
+            self.contents.remove(followed.removed)
             anew = []
             for obj in followed.written:
-                known = self._contents.records.get(obj.id)
+                known = self.contents.records.get(obj.id)
                 if known is not None and is_same_shape(known, obj):
-                    self._contents.move(obj.id, obj.transform, obj)
+                    self.contents.move(obj.id, obj.transform, obj)
                 else:
                     anew.append(obj)
-            self._contents.add(anew)
+            self.contents.add(anew)
             self.revision = followed.revision
             self._set_stage()
         if anew:
             self._reader.read(anew)
-        edit = SceneEdit(
-            followed.revision,
-            tuple(obj.id for obj in followed.written),
-            tuple(followed.removed),
-        )
-        for tell in list(self._listeners):
-            tell(edit)
-        self._tell_settled()
+        if self.on_edit is not None:
+            self.on_edit()
 
     def _has_other_names(self, followed: Followed) -> bool:
         """Whether the names of the objects are others after a commit; a move leaves them."""
-        known = self._contents.records
+        known = self.contents.records
         return bool(followed.removed) or any(
             obj.id not in known or known[obj.id].name != obj.name for obj in followed.written
         )
 
     def _set_stage(self) -> None:
-        box = self._contents.box()
+        box = self.contents.box()
         if not self._staged and box is not None:
             self._staged = True
-            self.up = up_axis(self._contents.records.values())
+            self.up = up_axis(self.contents.records.values())
             set_stage(self._server, box, self.up)
 
     def _show_shapes(self, found: Sequence[ShapedObject]) -> None:
         with self._server.atomic():
-            self._contents.shape(found)
-        self._tell_settled()
+            self.contents.shape(found)
 
     def _show_voxels(self, objects: Sequence[Object]) -> None:
         """Show objects without a readable file as blocks of their voxels."""
-        for obj in objects:
-            with suppress(HapticDBError, CancelledError):  # removed, or the database is away
-                voxels = self._follower.voxels(obj.id, None).result()
-                if len(voxels):
-                    self._show_shapes([_blocks(obj, voxels, self.grid)])
-
-    def _tell_settled(self) -> None:
-        with self._settled:
-            self._settled.notify_all()
+        if not objects:
+            return
+        with suppress(HapticDBError), open_environment(self._url, read_only=True) as env:
+            for obj in objects:
+                if self._is_closed.is_set():
+                    return
+                with suppress(HapticDBError):  # removed, or the database is away
+                    voxels = env.voxels(obj.id)
+                    if len(voxels):
+                        self._show_shapes([_blocks(obj, voxels, self.grid)])
 
 
 def _blocks(obj: Object, voxels: NDArray[np.int64], grid: Grid) -> ShapedObject:

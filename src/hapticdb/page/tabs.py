@@ -1,0 +1,80 @@
+"""A browser with its tabs: the panels through which a person uses the page."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.page import checks
+from hapticdb.page.browser import Browser
+from hapticdb.page.link import Visitor
+from hapticdb.page.panels.parts import PartsPanel
+from hapticdb.page.panels.record import RecordPanel
+from hapticdb.page.panels.sweeps import SweepPanel
+from hapticdb.page.panels.touch import TouchPanel
+from hapticdb.page.site import Site
+from hapticdb.store.base import Object
+
+if TYPE_CHECKING:
+    from viser import ClientHandle
+
+
+class TabbedBrowser(Browser):
+    """A browser with the tabs Touch, Parts, Sweep and Record; parameters as for `Browser`."""
+
+    def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
+        super().__init__(site, client, visitor, number)
+        gui = client.gui
+        tabs = gui.add_tab_group()
+        with tabs.add_tab("Touch"):
+            self.touch = TouchPanel(self, gui)
+        with tabs.add_tab("Parts"):
+            self.parts = PartsPanel(self, gui)
+        with tabs.add_tab("Sweep"):
+            self.sweeps = SweepPanel(self, gui)
+        with tabs.add_tab("Record"):
+            self.record = RecordPanel(self, gui)
+        client.scene.on_click()(self.guarded("viewer", self._clicked))
+        if visitor.may("toucher"):
+            self.take_in_hand(self.tool)
+
+    def place_changed(self) -> None:
+        """Show where the hand is now."""
+        self.touch.show_place()
+
+    def tool_changed(self) -> None:
+        """Show which tool is in the hand now."""
+        self.touch.show_tool()
+        self.parts.show_tool()
+
+    def session_ended(self) -> None:
+        """Show that the session is over, and with it a recording."""
+        self.record.session_ended()
+
+    def frame_came(
+        self, frame: np.void, wrench: NDArray[np.float64], touched: list[Object], now: float
+    ) -> None:
+        """Show a frame of the session, its wrench (6,), and what it touches."""
+        self.touch.show(frame, wrench, touched, now)
+
+    def tick(self, now: float) -> None:
+        """Show the newest frame, of a replay, too."""
+        self.record.tick(now)
+        super().tick(now)
+
+    def objects_changed(self) -> None:
+        """Objects were added, moved or removed by someone; called in the database's thread."""
+        super().objects_changed()
+        self.parts.show_objects()
+        self.parts.moving.renew()
+
+    def close(self) -> None:
+        """End the session and take the tool out of everyone's view."""
+        self._is_closed = True
+        self.parts.moving.leave()
+        super().close()
+
+    def _clicked(self, event: Any) -> None:  # noqa: ANN401 - an event of viser
+        origin = checks.numbers_of(event.ray_origin, 3, checks.FARTHEST, "a ray")
+        way = checks.numbers_of(event.ray_direction, 3, checks.FARTHEST, "a ray")
+        self.parts.clicked(origin, way)

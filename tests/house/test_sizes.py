@@ -16,8 +16,7 @@ def test_no_file_is_longer_than_500_lines() -> None:
 MOST_LINES = 60
 """Longest function in lines, with signature and docstring."""
 LONG_FUNCTIONS = {
-    "src/hapticdb/kernels/hand/coupling.py:move_body": "one step of the coupling: smooth forces "
-    "replace it",
+    "src/hapticdb/cli/verbs/feeling.py:feel": "its signature has a line for each option",
     "src/hapticdb/kernels/resident/feeling.py:felt": "one pass over the points",
 }
 """Functions that may be longer than `MOST_LINES`, each with the reason."""

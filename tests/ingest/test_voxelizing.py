@@ -87,13 +87,13 @@ def test_threads_stop_at_the_next_share_when_nobody_wants_their_results() -> Non
         if item == 0:
             return item
         if item < 3:
-            began.wait()
+            began.wait(PATIENCE)
         while True:
             share(0.5)
 
     results = in_threads(range(9), work, 2)
     assert next(results) == 0
-    began.wait()
+    began.wait(PATIENCE)
     results.close()
 
 

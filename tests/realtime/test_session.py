@@ -6,20 +6,17 @@ import os
 import re
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import hapticdb
 from banded import write_points
 from children import PATIENCE, child, finished
 from hapticdb import Environment, PointShell
-from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
 from hapticdb.query.law import LawName
 from hapticdb.realtime.report import Report
@@ -29,10 +26,9 @@ from hapticdb.recording.file import Recorder, Recording
 from hapticdb.recording.frame import State
 from hapticdb.recording.replay import replay
 from hapticdb.resident.table import is_alive
-from hapticdb.testing import write_voxels
-from realtime.hands import Beckoned, Talking, Unplugged, at, still, stroking
+from realtime.hands import Talking, Unplugged, still, stroking
 from realtime.sessions import NEVER_STALE, RATE, Recorded, floor_points, floored, recorded, until
-from realtime.worlds import block, make
+from realtime.worlds import make
 from recordings import motion, write
 
 
@@ -401,118 +397,3 @@ def test_a_device_of_the_script_itself_is_refused_with_the_way_out(
     done = finished(args, env=environment, check=True)
     assert done.stderr == ""
     assert re.fullmatch(r".*Mine.*: define devices in a module .*\n", done.stdout)
-
-
-def held_for(frames: Recorded) -> NDArray[np.float64]:
-    """Seconds for which each frame's wrench had been held, by the coupling's own periods."""
-    out, kept = np.zeros(len(frames)), 0.0
-    for n, frame in enumerate(frames):
-        kept = kept + max(float(frame["dt"]), 0.0) if frame["state"] & State.HELD else 0.0
-        out[n] = kept
-    return out
-
-
-def check_falling(frames: Recorded) -> None:
-    """Check held wrenches: unchanged for 20 ms, zero from 40 ms on, never growing in between."""
-    seconds = held_for(frames)
-    sizes = np.linalg.norm(frames["applied"], axis=1)
-    kept = np.zeros(6)
-    for n, frame in enumerate(frames):
-        if seconds[n] == 0.0:
-            kept = frame["applied"]
-        elif seconds[n] <= 0.02:
-            np.testing.assert_array_equal(frame["applied"], kept)
-        elif seconds[n] >= 0.04:
-            assert not frame["applied"].any()
-        else:
-            assert sizes[n] <= sizes[n - 1]
-
-
-@pytest.mark.long
-def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
-    env: Environment, sphere: PointShell, tmp_path: Path
-) -> None:
-    path = tmp_path / "killed.hdbrec"
-    with (
-        ResidentCells(env.url, budget_bytes=1 << 20) as cells,
-        Session(
-            cells, sphere, still(0.010), law="plane", rate=RATE, staleness=0.2, record=path
-        ) as session,
-    ):
-        until(lambda: session.n_frames > 50, session)
-        killed = cells.pid
-        os.kill(killed, signal.SIGKILL)
-
-        def is_held() -> bool:
-            last = session.last()
-            return last is not None and bool(last["state"][0] & State.FADING)
-
-        until(is_held, session)
-        until(lambda: not is_held() and cells.pid != killed, session)
-        n_frames = session.n_frames
-        until(lambda: session.n_frames > n_frames + 50, session)
-        report = session.stop()
-    assert report.cache.restarts == 1
-    assert report.stale_frames > 0
-    frames = recorded(path)
-    check_falling(frames)
-    is_silent = frames["state"] & State.FADING > 0
-    assert not frames["applied"][is_silent][-1].any()
-    last = np.flatnonzero(is_silent)[-1]
-    assert frames["applied"][:50].any(axis=1).all()
-    assert frames["applied"][last + 1 :].any(axis=1).any()
-    assert replay(Recording(path), env).is_equal
-
-
-def test_unknown_cells_hold_and_fade_for_one_session_and_are_waited_for_by_another(
-    sphere: PointShell, tmp_path: Path
-) -> None:
-    """Both sessions share cells; the fetching process is stopped while the hand moves far."""
-    path = Player([0.0, 0.4, 1.5], [at(x, 0.0, 0.010) for x in (-0.45, 0.45, 0.45)])
-    hand = Beckoned(path, tmp_path / "come")
-    with make(tmp_path, bits=9) as env:
-        write_voxels(env.store, block((0, 240, 248), (511, 271, 255)), "floor, 1 m long")
-        with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
-            holding = Session(
-                cells,
-                sphere,
-                hand,
-                law="plane",
-                rate=RATE,
-                record=tmp_path / "a",
-                staleness=NEVER_STALE,
-            )
-            waiting = Session(
-                cells, sphere, hand, law="plane", rate=RATE, record=tmp_path / "b", policy="wait"
-            )
-            with holding, waiting:
-                until(lambda: min(holding.n_frames, waiting.n_frames) > 100, holding)
-                os.kill(cells.pid, signal.SIGSTOP)
-                try:
-                    hand.path.touch()
-                    until(lambda: held_now(holding), holding)
-                    time.sleep(0.2)
-                finally:
-                    os.kill(cells.pid, signal.SIGCONT)
-                reports = [session.wait(PATIENCE) for session in (holding, waiting)]
-        for report, name in zip(reports, "ab", strict=True):
-            assert report is not None
-            replayed = replay(Recording(tmp_path / name), env)
-            assert replayed.is_equal, replayed.describe()
-            assert replayed.n_skipped == (report.held_frames if name == "a" else 0)
-    frames = recorded(tmp_path / "a")
-    check_falling(frames)
-    is_unknown = frames["unknown"] > 0
-    assert is_unknown.any()
-    assert (frames["state"][is_unknown] & State.HELD > 0).all()
-    assert held_for(frames).max() > 0.04
-    assert frames["applied"][-1].any()
-    exact = recorded(tmp_path / "b")
-    assert not exact["unknown"].any()
-    assert not (exact["state"] & State.HELD).any()
-    assert exact["tool"][-1, 0] > exact["tool"][0, 0] + 0.1  # the tool lags behind the hand
-
-
-def held_now(session: Session) -> bool:
-    last = session.last()
-    return last is not None and bool(last["unknown"][0])

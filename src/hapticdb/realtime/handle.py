@@ -1,16 +1,17 @@
-"""Handle: where the hand is in the scene, after scale and clutch."""
+"""Handle: where the hand is in the scene, after scale and clutch, and its path if it is known."""
 
 import math
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.devices.scripted import Reading, pose_at
+from hapticdb.devices.scripted import Device, Player, RandomHand, Reading, Tumble, pose_at
+from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import carry, grip, is_somewhere
 from hapticdb.kernels.records import OFFSET, pose_numbers
 from hapticdb.kernels.rigid import is_rigid
-from hapticdb.poses import quaternion_of
+from hapticdb.poses import quaternion_of, rotation_of
 
 Floats = NDArray[np.float64]
 Hand = NDArray[np.void]
@@ -19,6 +20,10 @@ MOST_SCALE = 1e6
 """Greatest scale. A larger one would move any hand beyond the 1e6 m that a reading may have."""
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """Position and unit quaternion of no move and no turn."""
+
+SWAY = 1.0
+"""Greatest distance (m) of a `RandomHand` or `Tumble` from its centre. Larger: fewer misfits of the
+path are reported."""
 
 
 class Handle:
@@ -111,3 +116,26 @@ class Handle:
             hand["is_open"] = False
             grip(reading.pose, self.scale, self._offset, hand)
         carry(reading.pose, reading.velocity, self.scale, self._offset, hand)
+
+
+def path_of_hand(device: Device, handle: Handle) -> tuple[Floats | None, float]:
+    """Poses (M, 4, 4) that the tool will take, and how far it may leave them; metres of the scene.
+
+    None and 0 if the path is not known in advance: a real device, or a handle with its own start.
+    """
+    hand = device.hand if isinstance(device, SimulatedDevice) else device
+    if isinstance(hand, Player):
+        poses = np.tile(np.eye(4), (len(hand._knots), 1, 1))  # noqa: SLF001 - same room
+        poses[:, :3, 3] = hand._knots[:, 1:4]  # noqa: SLF001
+        poses[:, :3, :3] = rotation_of(hand._knots[:, 4:8])  # noqa: SLF001
+        sway = 0.0
+    elif isinstance(hand, (RandomHand, Tumble)):
+        poses, sway = np.array(hand._pose)[None].copy(), SWAY * handle.scale  # noqa: SLF001
+        if isinstance(hand, RandomHand):
+            poses[0] = hand._center  # noqa: SLF001
+    else:
+        return None, 0.0
+    if handle.starts_elsewhere:
+        return None, 0.0
+    poses[:, :3, 3] *= handle.scale
+    return poses, sway

@@ -18,8 +18,7 @@ from hapticdb.query.choosing import is_smooth
 from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law
 from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling, radius_of
 from hapticdb.realtime.deadlines import Timing
-from hapticdb.realtime.hand_path import path_of_hand
-from hapticdb.realtime.handle import Handle
+from hapticdb.realtime.handle import Handle, path_of_hand
 from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report

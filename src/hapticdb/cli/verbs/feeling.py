@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
+import hapticdb
 from hapticdb.cli import fitting, render, session_page
 from hapticdb.cli.choosing import Felt, felt_objects
 from hapticdb.cli.forces import ForceOptions
@@ -201,29 +202,35 @@ def feel(
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
-    from hapticdb.realtime.fork_server import prepare
-
-    prepare("hapticdb.realtime.loop:work", ["resident", "feel"])  # while the rest is loaded here
-    from hapticdb import Handle, Session
-
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
     _check_loop(processor, policy, device, budget_points)
+    _load_beside()
     given = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
-    hand, handle = given.open(path_speed := given.path_speed()), Handle(scale=scale, clutch=clutch)
+    hand, handle = (
+        given.open(speed := given.path_speed()),
+        hapticdb.Handle(scale=scale, clutch=clutch),
+    )
     compile_for(tool, "feel")
     with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
         chosen, coupling = force.law_and_coupling(cells)
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells), budget_points)
-        session = Session(
+        session = hapticdb.Session(
             cells, shell, hand, rate=rate, seconds=seconds, policy=policy, handle=handle,
             law=chosen, coupling=coupling, staleness=staleness, budget_points=budget_points,
             record=record, append_recording=append, replace_recording=replace, is_fifo=fifo,
             record_limit_bytes=limit_bytes, processor=processor, has_baseline=not no_baseline,
         )  # fmt: skip
         report, signals = _run(session, tool, force)
-        _show(report, cells, shell, record, path_speed, json=json)
+        _show(report, cells, shell, record, speed, json=json)
     _exit_after(signals, report)
+
+
+def _load_beside() -> None:
+    """Have the session's processes load their kernels while this process loads its own."""
+    from hapticdb.realtime.fork_server import prepare
+
+    prepare("hapticdb.realtime.loop:work", ["resident", "feel"])
 
 
 def _shell(

@@ -204,13 +204,10 @@ def feel(
     """
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
-    _check_loop(processor, policy, device, budget_points)
-    _load_beside()
+    _begin_loop(processor, policy, device, budget_points)
     given = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
-    hand, handle = (
-        given.open(speed := given.path_speed()),
-        hapticdb.Handle(scale=scale, clutch=clutch),
-    )
+    hand = given.open(speed := given.path_speed())
+    handle = hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel")
     with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
         chosen, coupling = force.law_and_coupling(cells)
@@ -224,13 +221,6 @@ def feel(
         report, signals = _run(session, tool, force)
         _show(report, cells, shell, record, speed, json=json)
     _exit_after(signals, report)
-
-
-def _load_beside() -> None:
-    """Have the session's processes load their kernels while this process loads its own."""
-    from hapticdb.realtime.fork_server import prepare
-
-    prepare("hapticdb.realtime.loop:work", ["resident", "feel"])
 
 
 def _shell(
@@ -276,17 +266,19 @@ def _recording_limit(record: str | None, limit: str | None, *, is_continued: boo
     return limit_bytes
 
 
-def _check_loop(
+def _begin_loop(
     processor: int | None, policy: PolicyName, device: str, budget_points: int | None
 ) -> None:
-    """Refuse what the loop cannot do, before a kernel is compiled for it."""
+    """Refuse what the loop cannot do; have its processes load kernels while this one does."""
     from hapticdb.pointshell.shell import checked_budget
     from hapticdb.realtime.deadlines import Timing
+    from hapticdb.realtime.fork_server import prepare
 
     checked_budget(budget_points)
     Timing(processor=processor).check_granted()
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
+    prepare("hapticdb.realtime.loop:work", ["resident", "feel"])
 
 
 def _felt(url: str, where: Sequence[str] | None, exclude: Sequence[str] | None) -> Felt:

@@ -83,7 +83,9 @@ hand = Line(np.zeros(3), np.ones(3), 0.1)
 smooth = folder / "smooth.db"
 hapticdb.import_files(smooth, [stl], hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6)))
 for url, law in ((folder / "0.db", "plane"), (smooth, "smooth")):
-    with hapticdb.Session(str(url), shell, hand, seconds=0.3, has_baseline=False) as session:
+    with hapticdb.Session(
+        str(url), shell, hand, law=law, seconds=0.3, has_baseline=False
+    ) as session:
         assert session.law.name == law
         report = session.wait(60)
     assert report is not None and report.loop.frames > 0

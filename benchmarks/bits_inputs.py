@@ -95,7 +95,7 @@ def import_car(folder: Path) -> list[Place]:
     try:
         with contextlib.nullcontext() if other.exists() else hidden(EMBEDDED):
             places.append(place_of(f"postgresql:///bits?data={other}", "brick"))
-    except hapticdb.DatabaseError as error:
+    except hapticdb.errors.DatabaseError as error:
         print(f"no second PostgreSQL: {error}", file=sys.stderr)
     done.touch()
     return list({place.name: place for place in places}.values())

@@ -81,7 +81,7 @@ def count_objects(url: Path | str) -> int:
     try:
         with hapticdb.open(url, read_only=True) as env:
             return len(env.objects())
-    except hapticdb.EnvironmentNotFoundError:
+    except hapticdb.errors.EnvironmentNotFoundError:
         return 0
 
 

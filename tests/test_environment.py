@@ -98,9 +98,9 @@ def test_an_object_is_linked_by_its_absolute_path(
 def test_what_is_not_there_is_told(env: Environment, missing: int) -> None:
     before = env.store.revision()
     for ask in (env.object, env.voxels, env.remove):
-        with pytest.raises(hapticdb.ObjectNotFoundError, match=f"no object {missing} in"):
+        with pytest.raises(hapticdb.errors.ObjectNotFoundError, match=f"no object {missing} in"):
             ask(missing)
-    with pytest.raises(hapticdb.ObjectNotFoundError):
+    with pytest.raises(hapticdb.errors.ObjectNotFoundError):
         env.move(missing, np.eye(4))
     assert env.store.revision() == before
 
@@ -241,7 +241,7 @@ def test_an_object_whose_file_is_gone_or_another_cannot_be_moved(
 ) -> None:
     before = rows_of(Path(env.url))
     spoil(file)
-    with pytest.raises(hapticdb.GeometryChangedError) as raised:
+    with pytest.raises(hapticdb.errors.GeometryChangedError) as raised:
         env.move(2, ELSEWHERE)
     for words in ("object 2 (box 1) cannot be moved", str(file)):
         assert words in str(raised.value)
@@ -254,7 +254,7 @@ def test_an_object_whose_file_is_gone_or_another_cannot_be_moved(
 def test_no_object_is_moved_out_of_the_grid(env: Environment) -> None:
     before = rows_of(Path(env.url))
     for far in (placement(0.3, 0, 0), placement(0, 0, -0.3), placement(1e300, 0, 0)):
-        with pytest.raises(hapticdb.OutsideGridError, match="part 'ball 0' spans"):
+        with pytest.raises(hapticdb.errors.OutsideGridError, match="part 'ball 0' spans"):
             env.move(1, far)
     assert rows_of(Path(env.url)) == before
 
@@ -265,7 +265,7 @@ def test_no_object_is_moved_out_of_the_grid(env: Environment) -> None:
 )
 def test_what_is_no_placement_is_refused(env: Environment, transform: NDArray[np.float64]) -> None:
     before = index_rows(env)
-    with pytest.raises(hapticdb.UsageError):
+    with pytest.raises(hapticdb.errors.UsageError):
         env.move(1, transform)
     assert index_rows(env) == before
 
@@ -306,7 +306,7 @@ def test_an_environment_opened_to_read_refuses_every_write(env: Environment, fil
         lambda: reader.remove(1),
         lambda: reader.move(1, ELSEWHERE),
     ):
-        with pytest.raises(hapticdb.ReadOnlyError, match="opened to read"):
+        with pytest.raises(hapticdb.errors.ReadOnlyError, match="opened to read"):
             write()
     assert rows_of(Path(env.url)) == before
 
@@ -377,7 +377,7 @@ def test_edits_of_another_process_are_felt_by_the_next_touch(
         edit("env.remove(2)")
         assert felt() == [(1, 0.0)]
         assert [o.id for o in env.objects()] == [1]
-        with pytest.raises(hapticdb.ObjectNotFoundError):
+        with pytest.raises(hapticdb.errors.ObjectNotFoundError):
             env.touch(sphere, pose, exclude=[2])
 
 
@@ -432,5 +432,5 @@ def test_an_empty_environment_is_felt_and_not_calibrated(
         assert not touch.force.any()
         assert touch.objects == []
         assert env.quantiles(3).n_rows == 0
-        with pytest.raises(hapticdb.UsageError, match="import a file before"):
+        with pytest.raises(hapticdb.errors.UsageError, match="import a file before"):
             env.calibrate()

@@ -26,7 +26,7 @@ def env(tmp_path: Path) -> Environment:
 @pytest.mark.parametrize("wrong", ["1", 1.7, None, [1]])
 def test_an_id_of_another_type_is_refused(env: Environment, wrong: Any) -> None:  # noqa: ANN401
     for ask in (env.voxels, env.object, env.remove):
-        with pytest.raises(hapticdb.UsageError, match="give an int"):
+        with pytest.raises(hapticdb.errors.UsageError, match="give an int"):
             ask(wrong)
     assert len(env.voxels(np.int64(1))) == env.object(1).voxels  # type: ignore[arg-type]
 
@@ -34,9 +34,9 @@ def test_an_id_of_another_type_is_refused(env: Environment, wrong: Any) -> None:
 @pytest.mark.parametrize("huge", [-1, 0, 2, 10**30])
 def test_an_id_that_no_object_has_is_told(env: Environment, sphere: PointShell, huge: int) -> None:
     for ask in (env.voxels, env.object, env.remove):
-        with pytest.raises(hapticdb.ObjectNotFoundError, match=f"no object {huge}"):
+        with pytest.raises(hapticdb.errors.ObjectNotFoundError, match=f"no object {huge}"):
             ask(huge)
-    with pytest.raises(hapticdb.ObjectNotFoundError, match=f"no object {huge}"):
+    with pytest.raises(hapticdb.errors.ObjectNotFoundError, match=f"no object {huge}"):
         env.touch(sphere, np.eye(4), exclude=[huge])
 
 
@@ -48,13 +48,13 @@ def test_exclude_takes_any_collection_and_no_single_id(
         assert len(env.touch(sphere, np.eye(4), exclude=nobody).hits)
     for floor in ([1], (1,), np.array([1, 1]), {1}, iter([1])):
         assert not len(env.touch(sphere, np.eye(4), exclude=floor).hits)
-    with pytest.raises(hapticdb.UsageError, match="give ids, names and patterns in a list"):
+    with pytest.raises(hapticdb.errors.UsageError, match="give ids, names and patterns in a list"):
         env.touch(sphere, np.eye(4), exclude=1)  # type: ignore[call-overload]
 
 
 def test_maxgap_is_checked_whatever_the_strategy(env: Environment, sphere: PointShell) -> None:
     for strategy in ("auto", "points", "maxgap"):
-        with pytest.raises(hapticdb.UsageError, match="MAXGAP -1"):
+        with pytest.raises(hapticdb.errors.UsageError, match="MAXGAP -1"):
             env.touch(sphere, np.eye(4), strategy, maxgap=-1)
 
 
@@ -63,7 +63,7 @@ def test_another_thread_is_told_to_open_its_own(env: Environment, sphere: PointS
 
     def use() -> None:
         for ask in (env.objects, lambda: env.remove(1), lambda: env.touch(sphere, np.eye(4))):
-            with pytest.raises(hapticdb.UsageError, match="the thread that opened it"):
+            with pytest.raises(hapticdb.errors.UsageError, match="the thread that opened it"):
                 ask()
         told.append("all")
 
@@ -75,9 +75,9 @@ def test_another_thread_is_told_to_open_its_own(env: Environment, sphere: PointS
 
 
 def test_files_are_a_list(tmp_path: Path) -> None:
-    with pytest.raises(hapticdb.UsageError, match="give a list"):
+    with pytest.raises(hapticdb.errors.UsageError, match="give a list"):
         hapticdb.import_files(tmp_path / "x.db", "part.stl")
-    with pytest.raises(hapticdb.UsageError, match="no files"):
+    with pytest.raises(hapticdb.errors.UsageError, match="no files"):
         hapticdb.import_files(tmp_path / "x.db", [])
 
 
@@ -86,13 +86,13 @@ def test_what_is_no_file_is_refused_before_anything_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(hapticdb.UsageError):
+    with pytest.raises(hapticdb.errors.UsageError):
         hapticdb.create(url, Grid(0.01, (0, 0, 0), 4))
     assert not list(tmp_path.iterdir())
 
 
 def test_a_transform_that_flattens_is_refused(env: Environment) -> None:
-    with pytest.raises(hapticdb.UsageError, match="flattens"):
+    with pytest.raises(hapticdb.errors.UsageError, match="flattens"):
         env.move(1, np.diag([1.0, 1.0, 0.0, 1.0]))
 
 
@@ -146,7 +146,7 @@ def test_what_is_no_array_of_real_numbers_is_no_pose(
         lambda: PointShell.from_mesh(wrong, [[0, 1, 2]]),
     )
     for ask in asked:
-        with pytest.raises(hapticdb.UsageError, match=told):
+        with pytest.raises(hapticdb.errors.UsageError, match=told):
             ask()
 
 
@@ -158,33 +158,33 @@ def test_integers_and_lists_are_poses(env: Environment, sphere: PointShell) -> N
 
 def test_what_only_looks_like_ids_excludes_nothing(env: Environment, sphere: PointShell) -> None:
     for wrong in ([True], b"\x01", bytearray(b"\x01"), memoryview(b"\x01"), [np.True_]):
-        with pytest.raises(hapticdb.UsageError, match=r"give an id|give ids"):
+        with pytest.raises(hapticdb.errors.UsageError, match=r"give an id|give ids"):
             env.touch(sphere, np.eye(4), exclude=wrong)  # type: ignore[arg-type]
-    with pytest.raises(hapticdb.UsageError, match="give an int"):
+    with pytest.raises(hapticdb.errors.UsageError, match="give an int"):
         env.object(True)
 
 
 def test_keys_are_integers(env: Environment) -> None:
     for wrong in ([1.5], ["1"], [1j], [True]):
-        with pytest.raises(hapticdb.GridError, match="keys of type"):
+        with pytest.raises(hapticdb.errors.GridError, match="keys of type"):
             env.grid.decode(wrong)
-    with pytest.raises(hapticdb.GridError, match="outside the curve"):
+    with pytest.raises(hapticdb.errors.GridError, match="outside the curve"):
         env.grid.decode(np.array([2**63], dtype=np.uint64))
     assert env.grid.decode([]).shape == (0, 3)
 
 
 def test_a_grid_ends_somewhere() -> None:
-    with pytest.raises(hapticdb.GridError, match="far end"):
+    with pytest.raises(hapticdb.errors.GridError, match="far end"):
         Grid(1e308, (0, 0, 0), 4)
-    with pytest.raises(hapticdb.GridError, match="far end"):
+    with pytest.raises(hapticdb.errors.GridError, match="far end"):
         Grid(1e300, (1.79e308, 0, 0), 20)
 
 
 @pytest.mark.parametrize("wrong", [1.5, "12", True, None, np.float64(3)])
 def test_points_and_seeds_are_whole_numbers(wrong: Any) -> None:  # noqa: ANN401
-    with pytest.raises(hapticdb.UsageError, match="whole number"):
+    with pytest.raises(hapticdb.errors.UsageError, match="whole number"):
         PointShell.sphere(0.5, wrong)
-    with pytest.raises(hapticdb.UsageError, match="whole number"):
+    with pytest.raises(hapticdb.errors.UsageError, match="whole number"):
         PointShell.from_mesh(np.eye(3), [[0, 1, 2]], seed=wrong)
     assert len(PointShell.sphere(0.5, np.int64(12))) == 12  # type: ignore[arg-type]
 
@@ -197,7 +197,7 @@ def test_a_forked_process_is_told_to_open_its_own(env: Environment, sphere: Poin
         try:
             env.touch(sphere, np.eye(4))
             told = "nothing was refused"
-        except hapticdb.UsageError as error:
+        except hapticdb.errors.UsageError as error:
             told = str(error)
         os.write(question, told.encode())
         os._exit(0)

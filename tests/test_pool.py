@@ -74,7 +74,7 @@ def test_who_waits_too_long_is_told(pool: Pool) -> None:
     with (
         pool.environment(),
         pool.environment(),
-        pytest.raises(hapticdb.BusyError, match="all 2 environments") as told,
+        pytest.raises(hapticdb.errors.BusyError, match="all 2 environments") as told,
         pool.environment(timeout=0.05),
     ):
         pass
@@ -103,11 +103,11 @@ def test_who_waits_gets_what_another_gives_back(pool: Pool) -> None:
 def test_what_was_given_back_is_no_longer_ones_own(pool: Pool, sphere: PointShell) -> None:
     with pool.environment() as env:
         pass
-    with pytest.raises(hapticdb.UsageError, match="belongs to the thread"):
+    with pytest.raises(hapticdb.errors.UsageError, match="belongs to the thread"):
         env.touch(sphere, np.eye(4))
     with pool.environment() as again, ThreadPoolExecutor(1) as thread:
         assert again is env
-        with pytest.raises(hapticdb.UsageError, match="belongs to the thread"):
+        with pytest.raises(hapticdb.errors.UsageError, match="belongs to the thread"):
             thread.submit(env.objects).result(PATIENCE)
 
 
@@ -120,9 +120,9 @@ def test_a_member_that_was_closed_is_replaced(pool: Pool) -> None:
 
 def test_a_member_that_failed_is_replaced(pool: Pool) -> None:
     def fail(env: Environment) -> None:
-        raise hapticdb.DamagedError(f"{env.url} is damaged")
+        raise hapticdb.errors.DamagedError(f"{env.url} is damaged")
 
-    with pytest.raises(hapticdb.DamagedError), pool.environment() as first:
+    with pytest.raises(hapticdb.errors.DamagedError), pool.environment() as first:
         fail(first)
     with pool.environment() as one, pool.environment() as two:
         assert first is not one
@@ -134,7 +134,7 @@ def test_a_member_that_failed_is_replaced(pool: Pool) -> None:
 
 
 def test_members_read_unless_asked_to_write(url: str, pool: Pool) -> None:
-    with pytest.raises(hapticdb.ReadOnlyError), pool.environment() as env:
+    with pytest.raises(hapticdb.errors.ReadOnlyError), pool.environment() as env:
         env.remove(1)
     with Pool(url, read_only=False) as editors, editors.environment() as env:
         env.remove(1)
@@ -146,9 +146,9 @@ def test_a_closed_pool_lends_nothing_and_leaves_nothing_open(pool: Pool) -> None
     with pool.environment() as env:
         pool.close()
         assert len(env.objects()) == 1  # a lent environment stays usable until returned
-    with pytest.raises(hapticdb.DatabaseError, match="has been closed"):
+    with pytest.raises(hapticdb.errors.DatabaseError, match="has been closed"):
         env.objects()
-    with pytest.raises(hapticdb.DatabaseError, match="make a new one"), pool.environment():
+    with pytest.raises(hapticdb.errors.DatabaseError, match="make a new one"), pool.environment():
         pass
     pool.close()
 
@@ -164,7 +164,7 @@ def test_closing_wakes_those_who_wait(url: str) -> None:
             waiting = thread.submit(borrow)
             time.sleep(0.05)
             pool.close()
-            with pytest.raises(hapticdb.DatabaseError, match="has been closed"):
+            with pytest.raises(hapticdb.errors.DatabaseError, match="has been closed"):
                 waiting.result(PATIENCE)
 
 
@@ -172,13 +172,13 @@ def test_a_member_that_cannot_be_opened_takes_no_place(
     url: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(_: Pool) -> Environment:
-        raise hapticdb.AccessError("not now")
+        raise hapticdb.errors.AccessError("not now")
 
     with Pool(url, size=2) as pool, pool.environment():
         for _ in range(3):
             with monkeypatch.context() as patch:
                 patch.setattr(Pool, "_opened", refuse)
-                with pytest.raises(hapticdb.AccessError), pool.environment():
+                with pytest.raises(hapticdb.errors.AccessError), pool.environment():
                     pass
         with pool.environment(timeout=1) as env:
             assert env.objects()
@@ -186,15 +186,15 @@ def test_a_member_that_cannot_be_opened_takes_no_place(
 
 @pytest.mark.parametrize("size", [0, -1])
 def test_a_pool_has_a_member_at_least(url: str, size: int) -> None:
-    with pytest.raises(hapticdb.UsageError, match="give 1 or more"):
+    with pytest.raises(hapticdb.errors.UsageError, match="give 1 or more"):
         Pool(url, size=size)
-    with pytest.raises(hapticdb.UsageError, match="timeout"):
+    with pytest.raises(hapticdb.errors.UsageError, match="timeout"):
         Pool(url, timeout=-1)
 
 
 def test_what_is_not_there_is_told_when_the_pool_is_made(tmp_path: Path, place: Place) -> None:
     for where in (str(tmp_path / "none.db"), place()):
-        with pytest.raises(hapticdb.EnvironmentNotFoundError):
+        with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
             Pool(where)
 
 

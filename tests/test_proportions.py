@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from command_line import Run, made, poses, refused, run, scene, tool  # noqa: F401 - fixtures
-from hapticdb import Object, PointShell, Proportions, UsageError, compare_proportions
+from hapticdb import Object, PointShell, Proportions, compare_proportions
+from hapticdb.errors import UsageError
 from hapticdb.poses import rotation_of
 from hapticdb.sweeps.path import SweepPath
 from hapticdb.units import UNITS

@@ -221,7 +221,7 @@ def test_the_same_part_otherwise_is_a_conflict_before_anything_is_written(
         tmp_path / "b.db", sql, "DELETE FROM brick WHERE id = 2", "DELETE FROM object WHERE id=2"
     )
     before = rows_of(tmp_path / "b.db")
-    with pytest.raises(hapticdb.ConflictError, match=rf"object 5 \(blob 2\) of .* {word}"):
+    with pytest.raises(hapticdb.errors.ConflictError, match=rf"object 5 \(blob 2\) of .* {word}"):
         copy_environment(source, tmp_path / "b.db")
     assert rows_of(tmp_path / "b.db") == before
 
@@ -235,7 +235,7 @@ def test_an_environment_is_not_copied_onto_itself(tmp_path: Path, spelling: str)
     (tmp_path / "x").mkdir()
     (tmp_path / "link.db").symlink_to(source)
     before = rows_of(source)
-    with pytest.raises(hapticdb.UsageError, match="are one"):
+    with pytest.raises(hapticdb.errors.UsageError, match="are one"):
         copy_environment(source, spelling.format(source, tmp_path))
     assert rows_of(source) == before
 
@@ -251,7 +251,7 @@ def test_an_environment_is_not_copied_onto_itself(tmp_path: Path, spelling: str)
 def test_a_target_of_another_grid_is_refused(tmp_path: Path, grid: Grid, word: str) -> None:
     source = make_blobs(tmp_path / "a.db")
     hapticdb.create(tmp_path / "b.db", grid).close()
-    with pytest.raises(hapticdb.GridError, match=word):
+    with pytest.raises(hapticdb.errors.GridError, match=word):
         copy_environment(source, tmp_path / "b.db")
     found = diff_environments(source, tmp_path / "b.db")
     assert not found.is_same_grid
@@ -267,7 +267,7 @@ def test_a_target_of_another_kind_than_asked_is_refused(
 ) -> None:
     source = make_blobs(tmp_path / "a.db", ("voxel", "hilbert"))
     make(tmp_path / "b.db").close()
-    with pytest.raises(hapticdb.UsageError, match=word):
+    with pytest.raises(hapticdb.errors.UsageError, match=word):
         copy_environment(source, tmp_path / "b.db", **asked)
     assert copy_environment(source, tmp_path / "b.db").copied == 4
 
@@ -286,7 +286,7 @@ def test_what_cannot_be_made_is_refused_before_anything_is_made(
 ) -> None:
     source = make_blobs(tmp_path / "a.db", kind)
     before = left_behind(tmp_path)
-    with pytest.raises(hapticdb.UsageError, match=word):
+    with pytest.raises(hapticdb.errors.UsageError, match=word):
         copy_environment(source, tmp_path / "b.db", **asked)
     assert set(left_behind(tmp_path)) - {"a.db-wal", "a.db-shm"} == set(before)
 
@@ -297,13 +297,15 @@ def test_a_damaged_object_is_told_and_an_empty_target_discarded(
 ) -> None:
     source = make_blobs(tmp_path / "a.db", ("voxel", "z"))
     change(source, "DELETE FROM voxel WHERE z_val = (SELECT min(z_val) FROM voxel WHERE id = 2)")
-    with pytest.raises(hapticdb.DamagedError, match=r"object 2, blob 0, has \d+ voxels instead"):
+    with pytest.raises(
+        hapticdb.errors.DamagedError, match=r"object 2, blob 0, has \d+ voxels instead"
+    ):
         copy_environment(source, tmp_path / "b.db", layout=other[0], curve=other[1])
     assert not (tmp_path / "b.db").exists()
 
 
 def test_a_source_that_is_not_there_makes_no_target(tmp_path: Path) -> None:
-    with pytest.raises(hapticdb.EnvironmentNotFoundError):
+    with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
         copy_environment(tmp_path / "a.db", tmp_path / "b.db")
     assert left_behind(tmp_path) == []
 
@@ -333,7 +335,7 @@ def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
     found = diff_environments(source, tmp_path / "b.db")
     assert [obj.id for obj in found.only_in_b] == [9]
     assert [pair[0].id for pair in found.moved] == [5]
-    with pytest.raises(hapticdb.ConflictError, match="object 5"):
+    with pytest.raises(hapticdb.errors.ConflictError, match="object 5"):
         copy_environment(source, tmp_path / "b.db")
 
 
@@ -487,7 +489,7 @@ def test_damaged_distances_are_not_copied(tmp_path: Path) -> None:
         ijk = blob(1, PLACES[0])
         env.store.add(voxel_object(grid, ijk), with_packed(ijk, grid, 1))
     change(tmp_path / "a.db", "DELETE FROM band WHERE z_val = (SELECT min(z_val) FROM band)")
-    with pytest.raises(hapticdb.DamagedError, match="distances other than those"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="distances other than those"):
         copy_environment(tmp_path / "a.db", tmp_path / "b.db")
     findings = check_environment(tmp_path / "a.db").findings
     assert findings[-1].endswith("its distances are not those that were written")

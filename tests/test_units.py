@@ -139,6 +139,6 @@ def test_which_axis_points_up_comes_from_the_file(
 
 
 def test_an_unknown_unit_names_those_known(run: Run, tmp_path: Path) -> None:
-    with pytest.raises(hapticdb.UsageError, match=r"furlong.*ft"):
+    with pytest.raises(hapticdb.errors.UsageError, match=r"furlong.*ft"):
         read_file(stl(tmp_path / "a.stl"), unit="furlong")
     refused(run("import", "a.db", "a.stl", "--unit", "furlong"), "--unit")

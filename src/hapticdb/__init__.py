@@ -9,36 +9,15 @@
 from importlib import import_module
 from typing import TYPE_CHECKING
 
+from hapticdb import errors as errors
+
 if TYPE_CHECKING:
     from hapticdb.batches.feeler import Feeler
     from hapticdb.batches.result import ClearanceBatch, TouchBatch
     from hapticdb.check import CheckReport, check_environment
     from hapticdb.difference import Difference, diff_environments
     from hapticdb.environment import Environment, create, open  # noqa: A004 - as in tarfile.open
-    from hapticdb.errors import (
-        AccessError,
-        BusyError,
-        ConflictError,
-        ConnectionLostError,
-        DamagedError,
-        DatabaseError,
-        DeviceError,
-        EnvironmentExistsError,
-        EnvironmentNotFoundError,
-        FileError,
-        GeometryChangedError,
-        GridError,
-        HapticDBError,
-        MissingExtraError,
-        NewerVersionError,
-        NotAnEnvironmentError,
-        ObjectNotFoundError,
-        OutsideGridError,
-        ProtocolError,
-        ReadOnlyError,
-        StuckError,
-        UsageError,
-    )
+    from hapticdb.errors import HapticDBError
     from hapticdb.extraction.disassembly.result import Disassembly
     from hapticdb.extraction.disassembly.run import disassemble
     from hapticdb.extraction.result import Extraction
@@ -73,60 +52,39 @@ if TYPE_CHECKING:
     from hapticdb.warm import warm_up
 
 __all__ = [
-    "AccessError",
-    "BusyError",
     "CheckReport",
     "ClearanceBatch",
-    "ConflictError",
-    "ConnectionLostError",
     "CopyReport",
     "CostModel",
     "Coupling",
-    "DamagedError",
-    "DatabaseError",
-    "DeviceError",
     "Difference",
     "Disassembly",
     "DistanceField",
     "Environment",
-    "EnvironmentExistsError",
-    "EnvironmentNotFoundError",
     "Extraction",
     "Feeler",
-    "FileError",
     "FileReport",
-    "GeometryChangedError",
     "Grid",
-    "GridError",
     "GridOptions",
     "Handle",
     "HapticDBError",
     "ImportOptions",
-    "MissingExtraError",
-    "NewerVersionError",
-    "NotAnEnvironmentError",
     "Object",
-    "ObjectNotFoundError",
-    "OutsideGridError",
     "PointShell",
     "Pool",
     "Proportions",
-    "ProtocolError",
     "QuantileVector",
     "Query",
-    "ReadOnlyError",
     "Recording",
     "Replayed",
     "Report",
     "ResidentCells",
     "Session",
-    "StuckError",
     "Swept",
     "TangentPlane",
     "Touch",
     "TouchBatch",
     "UpgradeReport",
-    "UsageError",
     "backup_environment",
     "check_environment",
     "compare_proportions",
@@ -153,14 +111,7 @@ _HOMES = {
     "check": "CheckReport check_environment",
     "difference": "Difference diff_environments",
     "environment": "Environment create open",
-    "errors": (
-        "AccessError BusyError ConflictError ConnectionLostError DamagedError "
-        "DatabaseError DeviceError EnvironmentExistsError EnvironmentNotFoundError "
-        "FileError GeometryChangedError GridError HapticDBError MissingExtraError "
-        "NewerVersionError NotAnEnvironmentError ObjectNotFoundError "
-        "OutsideGridError ProtocolError ReadOnlyError StuckError "
-        "UsageError"
-    ),
+    "errors": "HapticDBError",
     "extraction.disassembly.result": "Disassembly",
     "extraction.disassembly.run": "disassemble",
     "extraction.result": "Extraction",

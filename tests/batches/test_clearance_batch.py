@@ -8,8 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticdb import Environment, PointShell, UsageError
+from hapticdb import Environment, PointShell
 from hapticdb.batches import threads
+from hapticdb.errors import UsageError
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.testing import write_voxels
 from realtime.worlds import HIERARCHICAL, SIZE, block, cloud, ids_by_voxel, make, poses_in, scatter

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 import hapticdb
-from hapticdb import ConnectionLostError, ObjectNotFoundError, UsageError
+from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.resident.residency import Residency
 from hapticdb.store.base import Keys
 from hapticdb.testing import write_voxels

@@ -9,10 +9,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from banded import write_points
-from hapticdb import Environment, Grid, ObjectNotFoundError, PointShell, UsageError
+from hapticdb import Environment, Grid, PointShell
 from hapticdb import create as create_environment
 from hapticdb.batches import threads
 from hapticdb.batches.result import TouchBatch
+from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.testing import write_voxels
 from realtime.worlds import HIERARCHICAL, block, cloud, make, poses_in, scatter

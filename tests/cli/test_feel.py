@@ -255,7 +255,7 @@ def has_frames(path: Path) -> bool:
     """Whether a recording has begun, so that all cells that the tool needs are in memory."""
     try:
         return len(Recording(path)) > 0
-    except hapticdb.FileError:
+    except hapticdb.errors.FileError:
         return False
 
 

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticdb import UsageError
 from hapticdb.devices import stability
 from hapticdb.devices.profiles import (
     PROFILES,
@@ -23,6 +22,7 @@ from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.devices.vendors.force_dimension import ForceDimensionDevice
 from hapticdb.devices.vendors.haply import HaplyDevice
 from hapticdb.devices.vendors.openhaptics import OpenHapticsDevice
+from hapticdb.errors import UsageError
 
 # cap N, stiffness N/m, damping N s/m, as CHAI3D's sources give them
 TABLE = {

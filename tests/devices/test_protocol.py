@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 
 from devices.readings import FAULTS, Change
-from hapticdb import DeviceError, PointShell, Session, UsageError
+from hapticdb import PointShell, Session
 from hapticdb.devices.protocol import Reader
 from hapticdb.devices.scripted import Reading, Tumble
 from hapticdb.devices.simulated import SimulatedDevice
+from hapticdb.errors import DeviceError, UsageError
 from realtime.hands import Odd, still
 
 

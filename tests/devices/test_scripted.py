@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticdb import DeviceError, FileError, HapticDBError, UsageError, write_poses
+from hapticdb import HapticDBError, write_poses
 from hapticdb.devices.scripted import (
     CYCLE,
     Circle,
@@ -28,6 +28,7 @@ from hapticdb.devices.scripted import (
     capped,
     pose_at,
 )
+from hapticdb.errors import DeviceError, FileError, UsageError
 from hapticdb.poses import quaternion_of, rotation_of
 
 

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticdb import UsageError
 from hapticdb.devices.scripted import Player, RandomHand, Reading, SupportsEnd
 from hapticdb.devices.simulated import SimulatedDevice
+from hapticdb.errors import UsageError
 from hapticdb.poses import quaternion_of, rotation_of
 
 

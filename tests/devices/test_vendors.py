@@ -16,12 +16,12 @@ from devices.fake_dhd import install as install_dhd
 from devices.fake_haply import IDENTITY, FakeHaply, vector
 from devices.fake_hd import INVALID_HANDLE, FakeHd
 from devices.fake_hd import install as install_hd
-from hapticdb import DeviceError, MissingExtraError, UsageError
 from hapticdb.devices.scripted import Device, SupportsClose, SupportsOpen
 from hapticdb.devices.vendors import VelocityWindow, load
 from hapticdb.devices.vendors.force_dimension import ForceDimensionDevice
 from hapticdb.devices.vendors.haply import HaplyDevice
 from hapticdb.devices.vendors.openhaptics import OpenHapticsDevice
+from hapticdb.errors import DeviceError, MissingExtraError, UsageError
 
 PUSH = np.array([30.0, 0.0, 40.0, 0.0, 3.0, 0.0])
 

@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
-from hapticdb import ConflictError, Environment, ObjectNotFoundError, UsageError
+from hapticdb import Environment
 from hapticdb.edits.editor import Editor
+from hapticdb.errors import ConflictError, ObjectNotFoundError, UsageError
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
@@ -250,7 +251,7 @@ def test_a_file_that_is_gone_is_told_and_the_step_stays(
 ) -> None:
     one.take_out(1)
     (tmp_path / "boxes.glb").rename(tmp_path / "aside.glb")
-    with pytest.raises(hapticdb.GeometryChangedError, match="cannot be put back"):
+    with pytest.raises(hapticdb.errors.GeometryChangedError, match="cannot be put back"):
         one.undo()
     assert one.can_undo
     (tmp_path / "aside.glb").rename(tmp_path / "boxes.glb")

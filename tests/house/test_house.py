@@ -19,7 +19,6 @@ import pytest
 
 import hapticdb
 from children import finished
-from hapticdb import errors
 from hapticdb.kernels._cache import cache_folder, sources_digest
 from sources import PACKAGE, ROOT, modules, named, python_files
 
@@ -307,18 +306,6 @@ def test_public_names() -> None:
 def test_the_version_is_one() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     assert hapticdb.__version__ == project["version"] == version("hapticdb")
-
-
-def error_classes() -> dict[str, type[Exception]]:
-    return {
-        name: kind
-        for name, kind in inspect.getmembers(errors, inspect.isclass)
-        if issubclass(kind, Exception) and kind.__module__ == errors.__name__
-    }
-
-
-def test_every_error_is_public() -> None:
-    assert set(error_classes()) <= set(PUBLIC)
 
 
 # --- the kernels' cache -------------------------------------------------------------------------

@@ -221,10 +221,10 @@ def test_equal_grid_options_are_accepted_and_differing_ones_refused(
         (GridOptions(origin=(0, 0, 0)), "origin"),
         (GridOptions(curve="z"), "curve z instead of hilbert"),
     ]:
-        with pytest.raises(hapticdb.GridError, match=words) as raised:
+        with pytest.raises(hapticdb.errors.GridError, match=words) as raised:
             hapticdb.import_files(database, [file], ImportOptions(grid=grid))
         assert "\n" not in str(raised.value)
-    with pytest.raises(hapticdb.UsageError, match="layout voxel, not brick"):
+    with pytest.raises(hapticdb.errors.UsageError, match="layout voxel, not brick"):
         hapticdb.import_files(database, [file], ImportOptions(layout="brick"))
     assert rows_of(database) == before
 
@@ -243,7 +243,7 @@ def test_the_same_command_again_is_accepted_with_its_extent(tmp_path: Path, file
     options = ImportOptions(grid=GridOptions(bits=5, extent=2.0))
     import_one(database, file, options)
     assert import_one(database, file, options).status == "complete"
-    with pytest.raises(hapticdb.GridError, match="extent 3"):
+    with pytest.raises(hapticdb.errors.GridError, match="extent 3"):
         import_one(database, file, ImportOptions(grid=GridOptions(bits=5, extent=3.0)))
 
 
@@ -257,7 +257,7 @@ def test_what_lies_outside_the_grid_is_named_and_nothing_of_its_file_goes_in(
         tmp_path / "far.obj",
         {"near": ball((0, 0, 0), 0.05), "gone far": box((0.1, 0, 0), (0.2, 0.01, 0.01))},
     )
-    line = refusal(import_one(database, far), hapticdb.OutsideGridError)
+    line = refusal(import_one(database, far), hapticdb.errors.OutsideGridError)
     for words in ("far.obj", "'gone far'", "(0.1, 0, 0) to (0.2, 0.01, 0.01)", "--extent"):
         assert words in line
     assert rows_of(database) == before
@@ -331,8 +331,8 @@ def test_a_bad_file_is_skipped_and_the_others_go_in(tmp_path: Path, file: Path) 
     given = [tmp_path / "bad.stl", file, tmp_path / "gone.obj", other]
     reports = hapticdb.import_files(tmp_path / "e.db", given, small_options())
     assert [r.status for r in reports] == ["failed", "imported", "failed", "imported"]
-    assert "bad.stl" in refusal(reports[0], hapticdb.FileError)
-    assert "there is no such file" in refusal(reports[2], hapticdb.FileError)
+    assert "bad.stl" in refusal(reports[0], hapticdb.errors.FileError)
+    assert "there is no such file" in refusal(reports[2], hapticdb.errors.FileError)
     with hapticdb.open(tmp_path / "e.db") as env:
         assert [o.link for o in env.objects()] == [str(file)] * 7 + [str(other)]
         assert [o.id for o in reports[3].added] == [8]
@@ -349,7 +349,7 @@ def test_nothing_usable_leaves_no_database_behind(
     elif cause == "outside":
         grid = GridOptions(bits=5, voxel_size=0.001, origin=(0, 0, 0))
         report = import_one(tmp_path / "e.db", file, ImportOptions(grid=grid))
-        refusal(report, hapticdb.OutsideGridError)
+        refusal(report, hapticdb.errors.OutsideGridError)
     else:
 
         def interrupted(*_: object) -> FileReport:
@@ -389,7 +389,7 @@ def test_geometry_that_has_changed_is_told(tmp_path: Path) -> None:
     changed = assembly(3)
     changed["box 1"] = box((0, 0, 0), (0.01, 0.01, 0.02))
     write_obj(both, changed)
-    line = refusal(import_one(database, both), hapticdb.GeometryChangedError)
+    line = refusal(import_one(database, both), hapticdb.errors.GeometryChangedError)
     assert "both.obj" in line
     assert "'box 1' has changed" in line
     assert rows_of(database) == before
@@ -428,9 +428,9 @@ def test_progress_grows_to_the_whole(tmp_path: Path, file: Path) -> None:
 def test_options_that_cannot_be_are_refused_before_anything_is_made(
     tmp_path: Path, file: Path, options: dict[str, str]
 ) -> None:
-    with pytest.raises(hapticdb.UsageError):
+    with pytest.raises(hapticdb.errors.UsageError):
         import_one(tmp_path / "e.db", file, small_options(**options))  # type: ignore[arg-type]
-    with pytest.raises(hapticdb.UsageError, match="name at least one"):
+    with pytest.raises(hapticdb.errors.UsageError, match="name at least one"):
         hapticdb.import_files(tmp_path / "e.db", [])
     assert left_behind(tmp_path) == []
 
@@ -481,5 +481,5 @@ def test_a_part_that_stays_in_the_way_is_told(
         raise present_already(record, "a.db")
 
     monkeypatch.setattr(SQLiteWriter, "add", refused)
-    with pytest.raises(hapticdb.EnvironmentExistsError, match="remove it first"):
+    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match="remove it first"):
         import_one(tmp_path / "a.db", file)

@@ -10,8 +10,9 @@ from typer.testing import CliRunner
 
 import hapticdb
 from assemblies import assembly, small_grid, small_options, write_obj
-from hapticdb import PointShell, UsageError
+from hapticdb import PointShell
 from hapticdb.cli import app
+from hapticdb.errors import UsageError
 from hapticdb.ingest.files import ImportOptions, import_files
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import parse_in_process

@@ -221,7 +221,9 @@ def test_voxels_are_compared_bit_by_bit_in_pieces(
 
 def test_the_layout_voxel_is_refused(file: Path, tmp_path: Path) -> None:
     hapticdb.import_files(tmp_path / "v.db", [file], small_options(layout="voxel"))
-    with pytest.raises(hapticdb.UsageError, match="has the layout voxel, which has no distances"):
+    with pytest.raises(
+        hapticdb.errors.UsageError, match="has the layout voxel, which has no distances"
+    ):
         upgrade_environment(tmp_path / "v.db")
-    with pytest.raises(hapticdb.UsageError, match="0 jobs"):
+    with pytest.raises(hapticdb.errors.UsageError, match="0 jobs"):
         upgrade_environment(tmp_path / "v.db", jobs=0)

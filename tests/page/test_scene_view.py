@@ -94,5 +94,5 @@ def test_voxels_stand_for_files_that_are_gone_or_must_not_be_read(
 def test_an_environment_that_is_not_there_is_an_error(
     server: viser.ViserServer, tmp_path: Path
 ) -> None:
-    with pytest.raises(hapticdb.EnvironmentNotFoundError):
+    with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
         SceneView(server, str(tmp_path / "none.db"), EVERYWHERE)

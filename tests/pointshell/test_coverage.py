@@ -9,7 +9,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticdb import PointShell, UsageError
+from hapticdb import PointShell
+from hapticdb.errors import UsageError
 from hapticdb.pointshell.coverage import Interior, covering_radius
 from hapticdb.pointshell.orientation import orient
 

@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 import hapticdb
-from hapticdb import Environment, Grid, ObjectNotFoundError, UsageError
+from hapticdb import Environment, Grid
+from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.query.frame import STRATEGIES

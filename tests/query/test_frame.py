@@ -210,7 +210,7 @@ def test_excluding_everything_leaves_nothing(env: Environment) -> None:
 
 
 def test_excluding_an_unknown_object_is_told(env: Environment) -> None:
-    with pytest.raises(hapticdb.ObjectNotFoundError, match="no object 77"):
+    with pytest.raises(hapticdb.errors.ObjectNotFoundError, match="no object 77"):
         env.touch(random_shell(1, 3), random_pose(1), exclude=[77])
 
 
@@ -226,14 +226,14 @@ def test_excluding_an_unknown_object_is_told(env: Environment) -> None:
     ],
 )
 def test_a_pose_that_is_not_rigid_is_refused(env: Environment, pose: NDArray[Any]) -> None:
-    with pytest.raises(hapticdb.UsageError, match="pose"):
+    with pytest.raises(hapticdb.errors.UsageError, match="pose"):
         env.touch(random_shell(1, 3), pose)
 
 
 def test_an_unknown_strategy_is_refused(env: Environment) -> None:
-    with pytest.raises(hapticdb.UsageError, match="choose one of auto"):
+    with pytest.raises(hapticdb.errors.UsageError, match="choose one of auto"):
         env.touch(random_shell(1, 3), np.eye(4), "fastest")  # type: ignore[call-overload]
-    with pytest.raises(hapticdb.UsageError, match="MAXGAP -1"):
+    with pytest.raises(hapticdb.errors.UsageError, match="MAXGAP -1"):
         env.touch(random_shell(1, 3), np.eye(4), "maxgap", maxgap=-1)
 
 
@@ -274,7 +274,7 @@ def test_contacts_have_places_normals_and_depths(env: Environment) -> None:
 
 
 def test_a_law_that_reads_distances_is_refused_where_there_are_none(env: Environment) -> None:
-    with pytest.raises(hapticdb.UsageError, match=r"distances to (their )?surfaces"):
+    with pytest.raises(hapticdb.errors.UsageError, match=r"distances to (their )?surfaces"):
         env.touch(random_shell(5, 300), random_pose(5), law=hapticdb.DistanceField())
 
 
@@ -284,7 +284,7 @@ def test_stiffness_scales_the_wrench(env: Environment) -> None:
     hard = env.touch(shell, pose, law=TangentPlane(stiffness=4000))
     np.testing.assert_allclose(hard.force, 4 * soft.force, rtol=1e-12)
     for bad in (-1.0, float("nan"), float("inf")):
-        with pytest.raises(hapticdb.UsageError, match="stiffness"):
+        with pytest.raises(hapticdb.errors.UsageError, match="stiffness"):
             TangentPlane(stiffness=bad)
-        with pytest.raises(hapticdb.UsageError, match="stiffness"):
+        with pytest.raises(hapticdb.errors.UsageError, match="stiffness"):
             hapticdb.DistanceField(stiffness=bad)

@@ -12,7 +12,8 @@ import pytest
 from numpy.typing import NDArray
 
 import hapticdb
-from hapticdb import Environment, Grid, PointShell, UsageError
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.errors import UsageError
 from hapticdb.kernels import law as kernels
 from hapticdb.kernels.query import contact, refining
 from hapticdb.kernels.records import RESULTS

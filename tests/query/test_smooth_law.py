@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import hapticdb
-from hapticdb import DistanceField, Environment, UsageError
+from hapticdb import DistanceField, Environment
+from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
 from hapticdb.kernels.field.packing import pack
 from hapticdb.query.calibration import calibrate

@@ -6,9 +6,10 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from hapticdb import PointShell, UsageError
+from hapticdb import PointShell
 from hapticdb.devices.profiles import PROFILES, SCRIPTED, DeviceProfile
 from hapticdb.devices.stability import allow
+from hapticdb.errors import UsageError
 from hapticdb.realtime.coupling import Coupling, radius_of
 
 OMNI = PROFILES["omni"]

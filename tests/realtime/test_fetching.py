@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 import hapticdb
 from children import PATIENCE
-from hapticdb import DatabaseError, Environment, Grid, HapticDBError, PointShell
+from hapticdb import Environment, Grid, HapticDBError, PointShell
 from hapticdb.devices.scripted import RandomHand
+from hapticdb.errors import DatabaseError
 from hapticdb.kernels.hand import servo
 from hapticdb.kernels.records import TOLD
 from hapticdb.kernels.resident.cells import cell_key
@@ -295,11 +296,11 @@ def test_the_heartbeat_waits_for_an_answer(
     assert int(control[HEARTBEAT]) > heard
 
     def unanswered() -> int:
-        raise hapticdb.ConnectionLostError("gone")
+        raise hapticdb.errors.ConnectionLostError("gone")
 
     monkeypatch.setattr(step.fetcher.store, "revision", unanswered, raising=False)
     heard = int(control[HEARTBEAT])
-    with pytest.raises(hapticdb.ConnectionLostError):
+    with pytest.raises(hapticdb.errors.ConnectionLostError):
         step.run(2 * CONFIRM_EVERY)
     assert int(control[HEARTBEAT]) == heard
 
@@ -465,11 +466,11 @@ def test_a_process_killed_at_any_moment_is_replaced_and_frames_are_right_again(
 def test_what_fails_at_the_start_is_told_in_one_line(
     tmp_path: Path, world: Environment, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(hapticdb.EnvironmentNotFoundError):
+    with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
         ResidentCells(str(tmp_path / "nothing.db"))
-    with pytest.raises(hapticdb.ObjectNotFoundError, match="no object 99"):
+    with pytest.raises(hapticdb.errors.ObjectNotFoundError, match="no object 99"):
         ResidentCells(world.url, exclude=[99])
-    with pytest.raises(hapticdb.UsageError, match="give 1048576 or more"):
+    with pytest.raises(hapticdb.errors.UsageError, match="give 1048576 or more"):
         ResidentCells(world.url, budget_bytes=1000)
     with pytest.raises(DatabaseError, match=r"^[^\n]* is not for us: ask another$"):
         ResidentCells(world.url, wrap=refuse)

@@ -120,7 +120,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         before, grid = side.reader.feel(pose)[0], env.grid
         env.close()
         remove_file(Path(env.url))
-        with pytest.raises(hapticdb.EnvironmentNotFoundError):
+        with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
             fetching.reopen()
         assert fetching.store.revision() == 1  # SQLite still reads the deleted file
         other = make(tmp_path)
@@ -190,7 +190,7 @@ class Listener:
 def test_a_connection_lost_while_warming_up_puts_ready_off(
     env: Environment, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    losses = iter([hapticdb.ConnectionLostError("gone")] * 2)
+    losses = iter([hapticdb.errors.ConnectionLostError("gone")] * 2)
     warm_up: Callable[[Fetcher], None] = Fetcher.warm_up
 
     def lost_at_first(fetcher: Fetcher) -> None:
@@ -219,11 +219,11 @@ def test_a_table_goes_when_its_process_does_not_start(
         return made[-1]
 
     def refuse(_: ResidentCells) -> Process:
-        raise hapticdb.ConnectionLostError("gone")
+        raise hapticdb.errors.ConnectionLostError("gone")
 
     monkeypatch.setattr(CellTable, "create", noted)
     monkeypatch.setattr(ResidentCells, "_start_process", refuse)
-    with pytest.raises(hapticdb.ConnectionLostError):
+    with pytest.raises(hapticdb.errors.ConnectionLostError):
         ResidentCells(env.url)
     assert [table.descriptor for table in made] == [-1]
 

@@ -12,7 +12,8 @@ from pathlib import Path
 import pytest
 
 from children import PATIENCE, child, finished
-from hapticdb import DatabaseError, HapticDBError
+from hapticdb import HapticDBError
+from hapticdb.errors import DatabaseError
 from hapticdb.realtime import processes as module
 from hapticdb.realtime.processes import Message, Process
 from hapticdb.resident.table import is_alive

@@ -383,7 +383,7 @@ class Mine:
     def apply(self, wrench): ...
 try:
     Session(sys.argv[1], hapticdb.PointShell.load(sys.argv[2]), Mine(), law="plane")
-except hapticdb.UsageError as error:
+except hapticdb.errors.UsageError as error:
     print(error)
 """
 

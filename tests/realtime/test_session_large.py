@@ -11,8 +11,9 @@ import pytest
 
 from banded import write_points
 from children import PATIENCE
-from hapticdb import Environment, Grid, PointShell, UsageError
+from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.scripted import Player
+from hapticdb.errors import UsageError
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.query.law import LawName
 from hapticdb.realtime.report import Report

@@ -9,9 +9,10 @@ import pytest
 
 from banded import write_points
 from children import PATIENCE
-from hapticdb import Coupling, Environment, Handle, PointShell, TangentPlane, UsageError
+from hapticdb import Coupling, Environment, Handle, PointShell, TangentPlane
 from hapticdb.devices.scripted import Device, Player
 from hapticdb.devices.simulated import SimulatedDevice
+from hapticdb.errors import UsageError
 from hapticdb.query.law import DistanceField
 from hapticdb.realtime.coupling import SettledCoupling
 from hapticdb.realtime.report import Report

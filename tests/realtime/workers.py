@@ -5,7 +5,7 @@ import sys
 import time
 from pathlib import Path
 
-from hapticdb import DatabaseError
+from hapticdb.errors import DatabaseError
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 
 

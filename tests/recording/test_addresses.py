@@ -78,7 +78,7 @@ def test_a_recording_opens_nothing_but_a_file_beside_it(
         name = named.format(port=listening.getsockname()[1], folder=scene.parent)
         Recorder(scene.with_name("s.hdbrec"), header(environment=name, grid=grid)).close()
         refused(run("replay", "s.hdbrec"), "s.hdbrec names the environment", "replay FILE URL")
-        with pytest.raises(hapticdb.UsageError, match="no file beside it"):
+        with pytest.raises(hapticdb.errors.UsageError, match="no file beside it"):
             Recording("s.hdbrec").environment_beside()
         scene.with_name("s.hdbrec").unlink()
     assert not [*scene.with_name("beside").iterdir()]
@@ -105,7 +105,7 @@ def test_an_object_whose_link_is_an_address_has_no_file(
     with hapticdb.open(scene) as env:
         for address in addresses:
             removed = env.remove(1)
-            with pytest.raises(hapticdb.GeometryChangedError, match="there is no such file"):
+            with pytest.raises(hapticdb.errors.GeometryChangedError, match="there is no such file"):
                 env.restore(replace(removed, link=address))
             env.restore(removed)
 
@@ -120,7 +120,7 @@ def test_addresses_in_a_file_of_geometry_are_not_followed(
     address = f"http://127.0.0.1:{listening.getsockname()[1]}/more"
     (tmp_path / name).write_text(text.format(address=address))
     if name in {"a.gltf", "a.dae"}:  # they need what is behind the address
-        with pytest.raises(hapticdb.FileError):
+        with pytest.raises(hapticdb.errors.FileError):
             read_file(tmp_path / name)
     else:
         assert len(read_file(tmp_path / name).parts) == 1

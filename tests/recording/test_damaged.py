@@ -15,7 +15,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from children import exit_code
-from hapticdb import FileError
+from hapticdb.errors import FileError
 from hapticdb.recording.chunks import HEAD, MOST_FRAMES, Chunk
 from hapticdb.recording.file import Recorder, Recording
 from hapticdb.recording.header import MAGIC, PREAMBLE

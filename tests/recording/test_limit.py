@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from children import PATIENCE
-from hapticdb import FileError, PointShell, UsageError
+from hapticdb import PointShell
+from hapticdb.errors import FileError, UsageError
 from hapticdb.realtime.session import Session
 from hapticdb.recording import file as module
 from hapticdb.recording.file import CHUNK, FRAME, LEFT_FREE, Frames, Recorder, Recording

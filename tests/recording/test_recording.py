@@ -13,8 +13,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from hapticdb import Coupling, FileError, PointShell, TangentPlane, UsageError
+from hapticdb import Coupling, PointShell, TangentPlane
 from hapticdb.devices.profiles import PROFILES
+from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import DistanceField

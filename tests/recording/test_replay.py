@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 import hapticdb
-from hapticdb import Environment, Grid, GridError, PointShell, TangentPlane
+from hapticdb import Environment, Grid, PointShell, TangentPlane
+from hapticdb.errors import GridError
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.recording.file import FRAME, Frames, Header, Recorder, Recording, State
 from hapticdb.recording.replay import replay, resident, touching
@@ -235,6 +236,6 @@ def test_frames_before_damage_can_be_replayed(env: Environment, session: Recordi
     content[-200] ^= 1
     session.path.write_bytes(content)
     damaged = Recording(session.path)
-    with pytest.raises(hapticdb.FileError, match="damaged at frame 50"):
+    with pytest.raises(hapticdb.errors.FileError, match="damaged at frame 50"):
         replay(damaged, env)
     assert replay(damaged, env, until_damage=True).n_compared == 50

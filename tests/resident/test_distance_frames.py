@@ -7,7 +7,8 @@ import pytest
 from numpy.typing import NDArray
 
 from banded import move_points, write_points
-from hapticdb import Environment, PointShell, UsageError
+from hapticdb import Environment, PointShell
+from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
 from hapticdb.kernels.field.law import DistanceFieldLaw
 from hapticdb.kernels.field.packing import unpack

@@ -8,8 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from banded import move_points, steps_to, write_points
-from hapticdb import Environment, UsageError
-from hapticdb.errors import DatabaseError
+from hapticdb import Environment
+from hapticdb.errors import DatabaseError, UsageError
 from hapticdb.grid import CurveName
 from hapticdb.kernels.field.lattice import BEYOND, VOXELS_A_STEP
 from hapticdb.kernels.resident.cells import UNKNOWN

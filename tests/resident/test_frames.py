@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hapticdb import PointShell, UsageError
+from hapticdb import PointShell
+from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
 from hapticdb.resident.frames import RUN, ResidentFrames
 from hapticdb.resident.residency import Residency

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 import hapticdb
 from children import joined
-from hapticdb import Environment, PointShell, UsageError
-from hapticdb.errors import GridError
+from hapticdb import Environment, PointShell
+from hapticdb.errors import GridError, UsageError
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.resident.cells import BUFFERS, READER_STRIDE, UNKNOWN, cell_key
 from hapticdb.resident import changes
@@ -321,10 +321,10 @@ def test_slots_of_a_load_that_failed_are_used_again(
 
     def read_and_fail(asked: NDArray[np.int64]) -> None:
         read_batch(asked)
-        raise hapticdb.ConnectionLostError("gone")
+        raise hapticdb.errors.ConnectionLostError("gone")
 
     monkeypatch.setattr(residency, "_read_batch", read_and_fail)
-    with pytest.raises(hapticdb.ConnectionLostError):
+    with pytest.raises(hapticdb.errors.ConnectionLostError):
         residency.load(cells[30:40])
     monkeypatch.undo()
     residency.reopened(open_store(env.url, read_only=True))

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from banded import move_points, write_points
-from hapticdb import Environment, PointShell, UsageError
+from hapticdb import Environment, PointShell
+from hapticdb.errors import UsageError
 from hapticdb.kernels.field.law import DistanceFieldLaw
 from hapticdb.kernels.large.sleeping import BLOCK, REST, way_of_box
 from hapticdb.resident.frames import FeltFrames, ResidentFrames

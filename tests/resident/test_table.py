@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from children import child, joined, until
-from hapticdb import UsageError
+from hapticdb.errors import UsageError
 from hapticdb.kernels.field.lattice import BEYOND, CELL_VALUES
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, READER_STRIDE
 from hapticdb.resident.table import (

@@ -128,7 +128,7 @@ def test_a_copy_beside_a_writer_in_another_process_is_a_revision_of_it(
 
 def test_a_file_that_is_there_is_replaced_only_when_that_is_said(copy: Path, path: Path) -> None:
     before = files(copy.parent)
-    with pytest.raises(hapticdb.EnvironmentExistsError, match="exists already"):
+    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match="exists already"):
         backup_environment(path, copy)
     assert files(copy.parent) == before
     copy.chmod(0o640)
@@ -174,7 +174,7 @@ def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
     content = bytearray(path.read_bytes())
     content[-8192:] = bytes(8192)
     path.write_bytes(content)
-    with pytest.raises(hapticdb.DamagedError, match="what was to be copied is damaged"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="what was to be copied is damaged"):
         backup_environment(path, tmp_path / "copy.db")
     assert sorted(files(tmp_path)) == ["q.db"]
 
@@ -187,7 +187,7 @@ def test_a_copy_under_the_log_of_what_it_was_copied_from_is_refused(
     backup_environment(path, tmp_path / "copy.db")
     write(store, 2)
     shutil.copy(f"{path}-wal", tmp_path / "copy.db-wal")
-    with pytest.raises(hapticdb.DamagedError, match=r"copy\.db-wal"):
+    with pytest.raises(hapticdb.errors.DamagedError, match=r"copy\.db-wal"):
         hapticdb.open(tmp_path / "copy.db")
     store.close()
 
@@ -250,7 +250,7 @@ def test_a_file_that_is_open_is_not_replaced(path: Path, copy: Path, read_only: 
     )
     before = path.read_bytes()
     with closing(SQLiteStore.open(path, read_only=read_only)) as store:  # in this process
-        with pytest.raises(hapticdb.BusyError, match="is open"):
+        with pytest.raises(hapticdb.errors.BusyError, match="is open"):
             restore_environment(copy, path)
         assert len(store.objects()) == 3
     command = [sys.executable, "-c", script, str(path), str(read_only)]
@@ -258,7 +258,7 @@ def test_a_file_that_is_open_is_not_replaced(path: Path, copy: Path, read_only: 
         assert holder.stdout is not None
         assert holder.stdin is not None
         holder.stdout.readline()
-        with pytest.raises(hapticdb.BusyError, match="is open"):
+        with pytest.raises(hapticdb.errors.BusyError, match="is open"):
             restore_environment(copy, path)
         holder.stdin.close()
         holder.stdin = None
@@ -279,7 +279,7 @@ def test_a_restore_killed_between_file_and_log_is_finished_by_the_same_command(
     with pytest.raises(SystemExit):
         restore_environment(copy, path)
     monkeypatch.undo()
-    with pytest.raises(hapticdb.DamagedError, match="-wal"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="-wal"):
         hapticdb.open(path)
     restore_environment(copy, path)
     assert names(path) == ["floor", "blob 1"]
@@ -307,11 +307,11 @@ def test_what_is_no_environment_is_neither_replaced_nor_copied(
     other = tmp_path / "other"
     make(other)
     before = files(tmp_path)
-    with pytest.raises(hapticdb.NotAnEnvironmentError):
+    with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
         restore_environment(copy, other)
-    with pytest.raises(hapticdb.NotAnEnvironmentError):
+    with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
         backup_environment(copy, other, replace=True)
-    with pytest.raises(hapticdb.NotAnEnvironmentError):
+    with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
         restore_environment(other, tmp_path / "q.db")
     assert files(tmp_path) == before
 
@@ -319,9 +319,9 @@ def test_what_is_no_environment_is_neither_replaced_nor_copied(
 def test_a_log_without_its_file_is_not_given_to_a_new_one(path: Path, copy: Path) -> None:
     killed(path, 3)
     path.unlink()
-    with pytest.raises(hapticdb.EnvironmentExistsError, match=r"q\.db-wal was left"):
+    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match=r"q\.db-wal was left"):
         hapticdb.create(path, GRID)
-    with pytest.raises(hapticdb.EnvironmentExistsError, match=r"q\.db-wal was left"):
+    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match=r"q\.db-wal was left"):
         backup_environment(copy, path)
     assert not path.exists()
 

@@ -180,6 +180,6 @@ def test_damage_that_a_fetching_process_reads_is_one_line(tmp_path: Path) -> Non
     content = bytearray(path.read_bytes())
     content[(int(root) - 1) * PAGE_BYTES : int(root) * PAGE_BYTES] = bytes(PAGE_BYTES)
     path.write_bytes(content)
-    with pytest.raises(hapticdb.DamagedError, match="is damaged") as caught:
+    with pytest.raises(hapticdb.errors.DamagedError, match="is damaged") as caught:
         hapticdb.ResidentCells(str(path))
     assert "\n" not in str(caught.value)

@@ -64,7 +64,7 @@ def test_a_crafted_schema_is_told_and_found(
             try:
                 with hapticdb.open(url, read_only=True) as env:
                     env.touch(sphere, pose, strategy)
-            except hapticdb.DatabaseError as error:
+            except hapticdb.errors.DatabaseError as error:
                 said = str(error)
             else:
                 said = ""

@@ -218,7 +218,7 @@ def test_a_snapshot_does_not_go_on_over_another_connection(
             env.objects()
             cut_off(env)
             for _ in range(2):
-                with pytest.raises(hapticdb.ConnectionLostError, match="run the same again"):
+                with pytest.raises(hapticdb.errors.ConnectionLostError, match="run the same again"):
                     env.objects()
         assert len(env.objects()) == N_PARTS
         with env.store.snapshot():  # everything was read before the connection was lost

@@ -70,14 +70,14 @@ def url(place: Place) -> str:
 
 
 def test_creating_never_replaces_an_environment(url: str) -> None:
-    with pytest.raises(hapticdb.EnvironmentExistsError, match="exists already"):
+    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match="exists already"):
         hapticdb.create(url, GRID)
     with hapticdb.open(url) as env:
         assert len(env.objects()) == 1
 
 
 def test_what_is_not_there_is_told(place: Place) -> None:
-    with pytest.raises(hapticdb.EnvironmentNotFoundError, match="hapticdb import"):
+    with pytest.raises(hapticdb.errors.EnvironmentNotFoundError, match="hapticdb import"):
         hapticdb.open(place())
 
 
@@ -87,16 +87,16 @@ def test_a_foreign_schema_is_told_apart_and_left_alone(
     where = place()
     name = parse(where).environment
     admin.execute(f"CREATE SCHEMA {name} CREATE TABLE theirs (a int)")
-    with pytest.raises(hapticdb.NotAnEnvironmentError, match="no hapticdb environment"):
+    with pytest.raises(hapticdb.errors.NotAnEnvironmentError, match="no hapticdb environment"):
         hapticdb.open(where)
-    with pytest.raises(hapticdb.EnvironmentExistsError):
+    with pytest.raises(hapticdb.errors.EnvironmentExistsError):
         hapticdb.create(where, GRID)
     assert admin.execute(f"SELECT count(*) FROM {name}.theirs").fetchone() == (0,)
 
 
 def test_a_newer_format_is_refused(url: str, admin: psycopg.Connection) -> None:
     admin.execute(f"UPDATE {parse(url).environment}.environment SET format = 99")
-    with pytest.raises(hapticdb.NewerVersionError, match="install a newer"):
+    with pytest.raises(hapticdb.errors.NewerVersionError, match="install a newer"):
         hapticdb.open(url)
 
 
@@ -104,7 +104,7 @@ def test_an_environment_whose_rows_lie_elsewhere_is_refused_and_not_empty(
     url: str, admin: psycopg.Connection
 ) -> None:
     admin.execute(f"CREATE TABLE {parse(url).environment}.distribution (id int)")
-    with pytest.raises(hapticdb.NotAnEnvironmentError, match="rows on several servers"):
+    with pytest.raises(hapticdb.errors.NotAnEnvironmentError, match="rows on several servers"):
         hapticdb.open(url, read_only=True)
 
 
@@ -133,21 +133,21 @@ def test_an_environment_of_format_2_is_read_as_it_is_and_brought_up_to_date_by_i
 
 def test_a_dropped_table_is_damage(url: str, admin: psycopg.Connection) -> None:
     admin.execute(f"DROP TABLE {parse(url).environment}.brick")
-    with pytest.raises(hapticdb.DamagedError, match="is damaged"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="is damaged"):
         hapticdb.open(url, read_only=True).store.lookup(np.arange(9))
 
 
 def test_a_read_only_environment_refuses_to_be_written(url: str) -> None:
     env = hapticdb.open(url, read_only=True)
-    with pytest.raises(hapticdb.ReadOnlyError, match="opened to read"):
+    with pytest.raises(hapticdb.errors.ReadOnlyError, match="opened to read"):
         env.remove(1)
-    with pytest.raises(hapticdb.ReadOnlyError):
+    with pytest.raises(hapticdb.errors.ReadOnlyError):
         env.store.save_costs("here", {})
 
 
 def test_no_other_thread_may_use_it(url: str) -> None:
     env = hapticdb.open(url, read_only=True)
-    with ThreadPoolExecutor(1) as pool, pytest.raises(hapticdb.UsageError, match="thread"):
+    with ThreadPoolExecutor(1) as pool, pytest.raises(hapticdb.errors.UsageError, match="thread"):
         pool.submit(env.objects).result(PATIENCE)
 
 
@@ -221,7 +221,7 @@ def test_an_environment_that_another_is_loading_is_not_discarded(place: Place) -
 @pytest.mark.parametrize("name", ["a%24%24b", "pg_mine", "public", "", "a%0Ab", "x\udcff"])
 def test_what_cannot_be_a_name_is_refused(database: str, name: str) -> None:
     where = f"{database}{'&' if '?' in database else '?'}environment={name}"
-    with pytest.raises(hapticdb.UsageError, match="environment's name"):
+    with pytest.raises(hapticdb.errors.UsageError, match="environment's name"):
         hapticdb.create(where, GRID)
 
 
@@ -260,7 +260,7 @@ def test_names_may_be_long(url: str) -> None:
     store = PostgresStore.open(url)
     name = "".join(chr(0x4E00 + n % 20000) for n in range(4000))
     write_voxels(store, blob(1, (30, 30, 30)), name)
-    with pytest.raises(hapticdb.EnvironmentExistsError):
+    with pytest.raises(hapticdb.errors.EnvironmentExistsError):
         write_voxels(store, blob(2, (30, 30, 30)), name)
 
 

@@ -115,7 +115,7 @@ def version_of(path: Path) -> int:
 
 def test_creating_never_replaces_a_file(path: Path) -> None:
     content = path.read_bytes()
-    with pytest.raises(hapticdb.EnvironmentExistsError, match="exists already"):
+    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match="exists already"):
         hapticdb.create(path, GRID)
     assert path.read_bytes() == content
     assert sorted(p.name for p in path.parent.iterdir()) == ["e.db"]
@@ -156,14 +156,14 @@ def empty(path: Path) -> None:
 @pytest.mark.parametrize(
     ("damage", "error", "words"),
     [
-        (write_text, hapticdb.NotAnEnvironmentError, "no hapticdb environment"),
-        (write_other_database, hapticdb.NotAnEnvironmentError, "no hapticdb environment"),
-        (empty, hapticdb.NotAnEnvironmentError, "is empty"),
-        (write_newer_version, hapticdb.NewerVersionError, "install a newer"),
-        (cut_off, hapticdb.DamagedError, "is damaged"),
-        (cut_header, hapticdb.DamagedError, "is damaged"),
-        (drop_table, hapticdb.DamagedError, "no such table"),
-        (Path.unlink, hapticdb.EnvironmentNotFoundError, "no environment at"),
+        (write_text, hapticdb.errors.NotAnEnvironmentError, "no hapticdb environment"),
+        (write_other_database, hapticdb.errors.NotAnEnvironmentError, "no hapticdb environment"),
+        (empty, hapticdb.errors.NotAnEnvironmentError, "is empty"),
+        (write_newer_version, hapticdb.errors.NewerVersionError, "install a newer"),
+        (cut_off, hapticdb.errors.DamagedError, "is damaged"),
+        (cut_header, hapticdb.errors.DamagedError, "is damaged"),
+        (drop_table, hapticdb.errors.DamagedError, "no such table"),
+        (Path.unlink, hapticdb.errors.EnvironmentNotFoundError, "no environment at"),
     ],
 )
 @pytest.mark.parametrize("read_only", [False, True])
@@ -189,12 +189,12 @@ def test_pages_overwritten_with_noise_end_in_one_error(
     content = bytearray(path.read_bytes())
     content[4096 * 2 :] = np.random.default_rng(0).bytes(len(content) - 4096 * 2)
     path.write_bytes(content)
-    with pytest.raises(hapticdb.DamagedError, match="restore a copy"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="restore a copy"):
         hapticdb.open(path).touch(sphere, np.eye(4), "array")
 
 
 def test_a_folder_is_no_environment(tmp_path: Path) -> None:
-    with pytest.raises(hapticdb.NotAnEnvironmentError):
+    with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
         hapticdb.open(tmp_path)
 
 
@@ -220,9 +220,9 @@ def test_readers_go_on_while_a_writer_commits(path: Path) -> None:
 
 def test_a_read_only_environment_refuses_to_be_written(path: Path) -> None:
     env = hapticdb.open(path, read_only=True)
-    with pytest.raises(hapticdb.ReadOnlyError, match=r"can only be read|opened to read"):
+    with pytest.raises(hapticdb.errors.ReadOnlyError, match=r"can only be read|opened to read"):
         env.remove(1)
-    with pytest.raises(hapticdb.ReadOnlyError):
+    with pytest.raises(hapticdb.errors.ReadOnlyError):
         env.store.save_costs("here", {})
 
 
@@ -264,7 +264,7 @@ def test_an_immutable_reader_notices_a_writer(path: Path, monkeypatch: pytest.Mo
     assert len(reader.objects()) == 1
     writer = SQLiteStore.open(path)
     write_voxels(writer, blob(1, (30, 30, 30)), "blob")
-    with pytest.raises(hapticdb.BusyError, match="open it again"):
+    with pytest.raises(hapticdb.errors.BusyError, match="open it again"):
         reader.objects()
 
 
@@ -284,7 +284,10 @@ def test_a_database_in_use_is_told_after_a_while(
 ) -> None:
     monkeypatch.setattr("hapticdb.store.sqlite.file.BUSY_TIMEOUT_MS", 50)
     first, second = SQLiteStore.open(path), SQLiteStore.open(path)
-    with first._connection.writing(), pytest.raises(hapticdb.BusyError, match="another process"):
+    with (
+        first._connection.writing(),
+        pytest.raises(hapticdb.errors.BusyError, match="another process"),
+    ):
         write_voxels(second, blob(1, (30, 30, 30)), "blob")
     write_voxels(second, blob(1, (30, 30, 30)), "blob")
     assert len(first.objects()) == 2

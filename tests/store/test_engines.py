@@ -12,7 +12,7 @@ import trimesh
 import hapticdb
 from children import finished
 from command_line import Run, boxes, poses, refused, run  # noqa: F401 - fixtures
-from hapticdb import UsageError
+from hapticdb.errors import UsageError
 from hapticdb.store.engines import BUILT_IN, engine_of
 from hapticdb.store.urls import scheme_of
 from installed import PAGE, install_toy
@@ -64,7 +64,7 @@ def test_an_engine_whose_driver_is_missing_says_what_brings_it(
 ) -> None:
     monkeypatch.setitem(sys.modules, "psycopg", None)
     with pytest.raises(
-        hapticdb.MissingExtraError, match=r"pip install 'hapticdb\[postgres\]'"
+        hapticdb.errors.MissingExtraError, match=r"pip install 'hapticdb\[postgres\]'"
     ) as e:
         hapticdb.open("postgresql://me:secret@host/plant")
     assert "secret" not in str(e.value)

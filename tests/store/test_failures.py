@@ -7,7 +7,8 @@ import psycopg
 import pytest
 
 import hapticdb
-from hapticdb import ConnectionLostError, HapticDBError, ReadOnlyError
+from hapticdb import HapticDBError
+from hapticdb.errors import ConnectionLostError, ReadOnlyError
 from hapticdb.store.postgres.connecting import failures
 
 ADVICE = "\n\tIs the server running on that host and accepting TCP/IP connections?"

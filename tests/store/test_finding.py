@@ -8,7 +8,8 @@ import pytest
 import trimesh
 
 import hapticdb
-from hapticdb import Environment, ObjectNotFoundError, UsageError
+from hapticdb import Environment
+from hapticdb.errors import ObjectNotFoundError, UsageError
 
 NAMES = (
     "wheels/front/tyre",
@@ -137,7 +138,7 @@ def test_a_shell_of_nothing_or_of_points_is_refused(car: Environment, tmp_path: 
 def test_a_shift_moves_all_of_them_or_none(car: Environment) -> None:
     ids = [obj.id for obj in car.find("wheels")]
     before = [obj.transform for obj in car.find("wheels")]
-    with pytest.raises(hapticdb.OutsideGridError):
+    with pytest.raises(hapticdb.errors.OutsideGridError):
         car.shift([*ids, 11], (2.0, 0, 0))  # only object 11 would leave the grid
     assert all(
         np.array_equal(a.transform, b) for a, b in zip(car.find("wheels"), before, strict=True)

@@ -233,7 +233,7 @@ def test_a_lock_held_too_long_is_told(url: str) -> None:
     with hapticdb.open(impatient) as env:
         with unfinished_move(url):
             for edit in (partial(env.remove, 1), partial(env.move, 1, np.eye(4))):
-                with pytest.raises(hapticdb.BusyError, match="try again later") as told:
+                with pytest.raises(hapticdb.errors.BusyError, match="try again later") as told:
                     edit()
                 assert "\n" not in str(told.value)
             assert len(env.objects()) == 1
@@ -318,7 +318,9 @@ def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) 
         for strategy in STRATEGIES:
             with admin.transaction():
                 admin.execute(f"LOCK TABLE {name}.brick IN ACCESS EXCLUSIVE MODE")
-                with pytest.raises(hapticdb.StuckError, match="did not answer in time") as told:
+                with pytest.raises(
+                    hapticdb.errors.StuckError, match="did not answer in time"
+                ) as told:
                     env.touch(shell, np.eye(4), strategy, law="plane")
             assert "\n" not in str(told.value)
             assert env.touch(shell, np.eye(4), strategy, law="plane").hits.tolist() == expected
@@ -349,7 +351,7 @@ def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
         asks.append(partial(env.voxels, 1))
         for ask in asks:
             with stopped(backend_of(env)):
-                with pytest.raises(hapticdb.StuckError, match="did not answer") as told:
+                with pytest.raises(hapticdb.errors.StuckError, match="did not answer") as told:
                     ask()
                 assert "\n" not in str(told.value)
                 assert env.touch(shell, np.eye(4)).hits.tolist() == expected

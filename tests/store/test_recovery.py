@@ -61,7 +61,7 @@ def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
 ) -> None:
     for n_parts, delay in moments(1):
         killer = Killer(n_parts, delay, server.kill)
-        with pytest.raises(hapticdb.ConnectionLostError) as told:
+        with pytest.raises(hapticdb.errors.ConnectionLostError) as told:
             hapticdb.import_files(url, [file], options(layout), killer)
         assert "\n" not in str(told.value)
         server.start()
@@ -108,7 +108,9 @@ def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
             for step in steps_of(name):
                 with pytest.MonkeyPatch.context() as patch:
                     After(patch, PostgresWriter, step, server.kill)
-                    with pytest.raises(hapticdb.ConnectionLostError, match="cannot be reached"):
+                    with pytest.raises(
+                        hapticdb.errors.ConnectionLostError, match="cannot be reached"
+                    ):
                         edit(env)
                 server.start()
                 assert contents(env) == before, step
@@ -179,7 +181,7 @@ def test_a_touch_tells_in_one_line_that_the_server_stays_away_and_is_usable_afte
         expected = felt(env, sphere, np.eye(4))
         server.kill()
         for ask in (lambda: env.touch(sphere, np.eye(4)), env.objects, env.size):
-            with pytest.raises(hapticdb.ConnectionLostError) as told:
+            with pytest.raises(hapticdb.errors.ConnectionLostError) as told:
                 ask()
             assert "\n" not in str(told.value)
         server.start()

@@ -82,7 +82,7 @@ def test_a_write_into_a_file_that_is_gone_is_refused(
     write(store, 1)
     event(path)
     for _ in range(2):  # also on the second try
-        with pytest.raises(hapticdb.ConnectionLostError) as told:
+        with pytest.raises(hapticdb.errors.ConnectionLostError) as told:
             change(store)
         assert "\n" not in str(told.value)
         assert str(path) in str(told.value)
@@ -96,7 +96,7 @@ def test_a_file_that_goes_while_it_is_written_is_not_reported_as_written(
     store = SQLiteStore.open(path)
     write(store, 1)
     with (
-        pytest.raises(hapticdb.ConnectionLostError, match=r"written last|cannot be reached"),
+        pytest.raises(hapticdb.errors.ConnectionLostError, match=r"written last|cannot be reached"),
         store._connection.writing(),
     ):
         event(path)
@@ -113,7 +113,7 @@ def test_a_write_through_a_link_is_refused_too(
     store = SQLiteStore.open(link)
     write(store, 1)
     event(path)
-    with pytest.raises(hapticdb.ConnectionLostError):
+    with pytest.raises(hapticdb.errors.ConnectionLostError):
         write(store, 2)
     store.close()
 
@@ -124,7 +124,7 @@ def test_a_replaced_file_keeps_what_is_its_own(path: Path) -> None:
     write(store, 1)
     replaced(path)
     before = path.read_bytes()
-    with pytest.raises(hapticdb.ConnectionLostError, match="another file"):
+    with pytest.raises(hapticdb.errors.ConnectionLostError, match="another file"):
         write(store, 2)
     store.close()
     assert path.read_bytes() == before
@@ -138,7 +138,7 @@ def test_a_moved_file_takes_its_log_along_when_both_are_moved(path: Path) -> Non
     write(store, 1)
     for suffix in ("", "-wal", "-shm"):
         Path(f"{path}{suffix}").rename(path.with_name(f"elsewhere.db{suffix}"))
-    with pytest.raises(hapticdb.ConnectionLostError, match="cannot be reached"):
+    with pytest.raises(hapticdb.errors.ConnectionLostError, match="cannot be reached"):
         write(store, 2)
     store.close()
     assert names(path.with_name("elsewhere.db")) == ["floor", "blob 1"]
@@ -151,7 +151,7 @@ def test_what_was_committed_goes_into_the_file_though_the_logs_name_is_gone(
     store = SQLiteStore.open(path)
     write(store, 1)
     event(path)
-    with pytest.raises(hapticdb.ConnectionLostError, match=r"q\.db-(wal|shm) was removed"):
+    with pytest.raises(hapticdb.errors.ConnectionLostError, match=r"q\.db-(wal|shm) was removed"):
         write(store, 2)
     store.close()
     assert names(path) == ["floor", "blob 1"]
@@ -164,7 +164,7 @@ def test_nobody_opens_a_file_whose_log_was_taken_from_who_has_it_open(
     script = (
         "import sys, hapticdb\n"
         "try: hapticdb.open(sys.argv[1], read_only=sys.argv[2] == 'True')\n"
-        "except hapticdb.BusyError as error: print(error)\n"
+        "except hapticdb.errors.BusyError as error: print(error)\n"
     )
     store = SQLiteStore.open(path)
     write(store, 1)
@@ -203,7 +203,7 @@ def test_a_reader_of_a_replaced_file_is_told(
         env.touch(sphere, np.eye(4))
         replaced(path)
         for ask in (lambda: env.touch(sphere, np.eye(4)), env.objects, env.store.revision):
-            with pytest.raises(hapticdb.ConnectionLostError, match="open it again"):
+            with pytest.raises(hapticdb.errors.ConnectionLostError, match="open it again"):
                 ask()
 
 
@@ -217,14 +217,14 @@ def test_a_reader_never_feels_commits_into_another_file(
         replaced(path)
         with closing(SQLiteStore.open(path)) as other:
             write(other, 1)
-            with pytest.raises(hapticdb.ConnectionLostError, match="another file"):
+            with pytest.raises(hapticdb.errors.ConnectionLostError, match="another file"):
                 env.touch(sphere, np.eye(4))
 
 
 def test_an_empty_environment_that_another_has_replaced_is_not_discarded(path: Path) -> None:
     store = SQLiteStore.open(path)
     replaced(path)
-    with pytest.raises(hapticdb.ConnectionLostError):
+    with pytest.raises(hapticdb.errors.ConnectionLostError):
         store.discard()
     assert path.exists()
     store.close()

@@ -21,9 +21,10 @@ from psycopg.errors import InsufficientPrivilege
 
 import hapticdb
 from command_line import PLACES, Run, boxes, poses, refused, run, tool  # noqa: F401 - fixtures
-from hapticdb import AccessError, Grid, HapticDBError, PointShell, ReadOnlyError, UsageError
+from hapticdb import Grid, HapticDBError, PointShell
 from hapticdb.cli import app
 from hapticdb.difference import diff_environments
+from hapticdb.errors import AccessError, ReadOnlyError, UsageError
 from hapticdb.query import cost_model, quantiles
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.connect import grant, redact
@@ -313,7 +314,7 @@ def test_a_right_withdrawn_from_an_open_environment_is_told(
     with pytest.raises(ReadOnlyError, match="may not do that"):
         env.remove(1)
     grant(url, roles["editor"], "nobody")
-    with pytest.raises(hapticdb.DamagedError, match="or this user may no longer use it"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="or this user may no longer use it"):
         env.objects()
     with pytest.raises(AccessError, match="may not read"):
         hapticdb.open(granted["editor"])

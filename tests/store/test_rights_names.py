@@ -10,7 +10,8 @@ import pytest
 from psycopg import sql
 
 from children import finished
-from hapticdb import Grid, UsageError
+from hapticdb import Grid
+from hapticdb.errors import UsageError
 from hapticdb.store.connect import create_store, grant, open_store
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment

@@ -82,7 +82,9 @@ def test_an_old_copy_under_a_newer_log_is_refused_and_left_alone(
     stale: Path, read_only: bool
 ) -> None:
     before = folder_bytes(stale.parent)
-    with pytest.raises(hapticdb.DamagedError, match=r"q\.db-wal and q\.db-shm.*restore") as told:
+    with pytest.raises(
+        hapticdb.errors.DamagedError, match=r"q\.db-wal and q\.db-shm.*restore"
+    ) as told:
         hapticdb.open(stale, read_only=read_only)
     assert "\n" not in str(told.value)
     assert folder_bytes(stale.parent) == before
@@ -92,7 +94,7 @@ def test_a_link_to_such_a_file_is_refused_too(stale: Path, tmp_path: Path) -> No
     (tmp_path / "elsewhere").mkdir()
     link = tmp_path / "elsewhere" / "link.db"
     link.symlink_to(stale)
-    with pytest.raises(hapticdb.DamagedError, match=r"q\.db-wal"):
+    with pytest.raises(hapticdb.errors.DamagedError, match=r"q\.db-wal"):
         hapticdb.open(link)
 
 
@@ -118,14 +120,14 @@ def test_another_database_under_a_log_is_refused(stale: Path, other: str) -> Non
             plain.execute("PRAGMA page_size = 8192")
             plain.execute("CREATE TABLE t (a)")
         stale.with_name("other.db").rename(stale)
-    with pytest.raises(hapticdb.DatabaseError, match=r"-wal|no hapticdb environment"):
+    with pytest.raises(hapticdb.errors.DatabaseError, match=r"-wal|no hapticdb environment"):
         hapticdb.open(stale)
 
 
 def test_a_copy_from_before_format_2_is_refused_under_a_newer_log(stale: Path) -> None:
     make_old(stale.with_name("backup"))
     shutil.copy(stale.with_name("backup"), stale)
-    with pytest.raises(hapticdb.DamagedError, match="-wal"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="-wal"):
         hapticdb.open(stale)
 
 
@@ -144,11 +146,11 @@ def test_a_file_copied_over_one_that_is_being_written_is_noticed_by_the_next_wri
     store = SQLiteStore.open(path)
     write(store, 2)
     shutil.copy(tmp_path / "backup", path)  # overwrites the file in the same inode
-    with pytest.raises(hapticdb.DamagedError, match="-wal"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="-wal"):
         write(store, 3)
     store.close()
     assert path.read_bytes() == (tmp_path / "backup").read_bytes()
-    with pytest.raises(hapticdb.DamagedError, match="-wal"):
+    with pytest.raises(hapticdb.errors.DamagedError, match="-wal"):
         hapticdb.open(path)
 
 
@@ -372,7 +374,7 @@ def test_every_older_copy_is_refused(taped: tuple[dict[str, bytes], Tape], tmp_p
     for old in olds:
         path = lay_out(tmp_path, files | {"q.db": bytearray(old)})
         if sqlite_log.file_mark(path) != base:
-            with pytest.raises(hapticdb.DamagedError):
+            with pytest.raises(hapticdb.errors.DamagedError):
                 sqlite_log.check_log(path)
             refused += 1
     assert refused > 5

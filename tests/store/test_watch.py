@@ -98,7 +98,9 @@ def test_a_closed_reader_is_told_so(file: str, url: str) -> None:
         reader.watch()
         reader.close()
         for ask in (reader.watch, reader.has_changed):
-            with pytest.raises(hapticdb.DatabaseError, match="has been closed: open it again"):
+            with pytest.raises(
+                hapticdb.errors.DatabaseError, match="has been closed: open it again"
+            ):
                 ask()
 
 
@@ -117,9 +119,9 @@ def test_an_immutable_reader_is_told_by_the_files_stamp(
     change(file)
     for _ in range(2):  # the reader stays unusable
         assert reader.has_changed()
-        with pytest.raises(hapticdb.BusyError, match="open it again"):
+        with pytest.raises(hapticdb.errors.BusyError, match="open it again"):
             reader.objects()
-        with pytest.raises(hapticdb.BusyError, match="open it again"), reader.snapshot():
+        with pytest.raises(hapticdb.errors.BusyError, match="open it again"), reader.snapshot():
             pass
     reader.close()
 
@@ -140,7 +142,7 @@ def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
         (tmp_path / "other.db").rename(file)
         words = "is another file than before: open it again"
     for _ in range(2):
-        with pytest.raises(hapticdb.ConnectionLostError, match=words):
+        with pytest.raises(hapticdb.errors.ConnectionLostError, match=words):
             reader.has_changed()
     kept.replace(file)
     assert not reader.has_changed()
@@ -247,7 +249,7 @@ def test_a_server_that_comes_back_is_found_within_half_a_second(
 
     def refused_at_first(connection: ServerConnection, seconds: float) -> None:
         if len(pauses) < 8:
-            raise hapticdb.ConnectionLostError("refused")
+            raise hapticdb.errors.ConnectionLostError("refused")
         connect(connection, seconds)
 
     monkeypatch.setattr(ServerConnection, "connect", refused_at_first)
@@ -301,7 +303,9 @@ def test_an_environment_made_anew_is_told_from_the_one_before(
     create_store(url, GRID).close()
     write(url)  # the same revision as before
     for _ in range(2):
-        with pytest.raises(hapticdb.ConnectionLostError, match="another environment than before"):
+        with pytest.raises(
+            hapticdb.errors.ConnectionLostError, match="another environment than before"
+        ):
             is_noticed(reader)
     again = PostgresStore.open(url, read_only=True)
     assert again.identity != reader.identity
@@ -363,7 +367,7 @@ def test_a_viewer_may_watch(url: str, admin: psycopg.Connection) -> None:
         reader.watch()
         write(url)
         assert is_noticed(reader)
-        with pytest.raises(hapticdb.ReadOnlyError):
+        with pytest.raises(hapticdb.errors.ReadOnlyError):
             reader.save_costs("here", {})
         reader.close()
     finally:

@@ -14,8 +14,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
-from hapticdb import Environment, Grid, ObjectNotFoundError, PointShell, UsageError
-from hapticdb.errors import GeometryChangedError
+from hapticdb import Environment, Grid, PointShell
+from hapticdb.errors import GeometryChangedError, ObjectNotFoundError, UsageError
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.pointshell.shell import fibonacci_sphere
 from hapticdb.poses import rotation_of

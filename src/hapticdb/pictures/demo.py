@@ -1,5 +1,6 @@
 """The picture of a demo: the environment's voxels, the path, the hits by object, the force."""
 
+import os
 from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError
 from hapticdb.pictures.lettering import shortened
-from hapticdb.pictures.splat import Camera, Depths, shade, splat
+from hapticdb.pictures.splat import Camera, Depths, Image, shade, splat
 from hapticdb.store.attributes import up_axis
 
 if TYPE_CHECKING:
@@ -63,11 +64,7 @@ class Palette:
 def draw(path: Path, scene: "DemoScene", comparison: "Comparison") -> None:
     """Draw the first environment of a demo, what its tool felt, and write it as a PNG."""
     with open_environment(scene.imported[0].url, read_only=True) as env:
-        figure = compose(env, scene, comparison)
-    try:
-        figure.savefig(path, dpi=100, facecolor=PAPER)
-    except OSError as error:
-        raise FileError(f"cannot write {path}: {error.strerror}") from error
+        save(compose(env, scene, comparison), path)
 
 
 def compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> Figure:
@@ -115,12 +112,35 @@ def _draw_scene(axes: Axes, env: Environment, camera: Camera, palette: Palette) 
         splat(depths, camera, centers, env.grid.voxel_size, number)
         tints.append(mixed(BODY, palette.of(obj.id), 0.24 if obj.id in palette.colors else 0.0))
     image = shade(depths, camera, np.array(tints), np.array(to_rgb(PAPER)), env.grid.voxel_size)
+    show_scene(axes, image)
+
+
+def show_scene(axes: Axes, image: Image) -> None:
+    """Show the shaded scene, `SAMPLES` pixels of the image for each of the picture's, an axis."""
     small = image.reshape(SCENE[1], SAMPLES, SCENE[0], SAMPLES, 3).mean(axis=(1, 3))
     axes.imshow(np.clip(small, 0, 1), extent=(0, SCENE[0], SCENE[1], 0), interpolation="nearest")
     axes.set_xlim(0, SCENE[0])
     axes.set_ylim(SCENE[1], 0)
     axes.set_aspect("auto")
     axes.axis("off")
+
+
+def style(axes: Axes, size: int) -> None:
+    """Give a diagram below the scene its colours; size: of its numbers, points."""
+    axes.set_facecolor(PAPER)
+    axes.tick_params(colors=FAINT, labelsize=size, length=3)
+    for side in ("top", "right"):
+        axes.spines[side].set_visible(False)
+    for side in ("left", "bottom"):
+        axes.spines[side].set_color("#39424d")
+
+
+def save(figure: Figure, path: str | os.PathLike[str]) -> None:
+    """Write a picture as a PNG; FileError when the file cannot be written."""
+    try:
+        figure.savefig(path, dpi=100, facecolor=PAPER, format="png")
+    except OSError as error:
+        raise FileError(f"cannot write {path}: {error.strerror}") from error
 
 
 def mixed(one: str, other: str, share: float) -> tuple[float, float, float]:
@@ -196,7 +216,7 @@ def _draw_words(figure: Figure, scene: "DemoScene", comparison: "Comparison") ->
 
 def _draw_force(axes: Axes, trace: "Trace", palette: Palette) -> None:
     """Force over time at 1000 frames a second, filled in the colour of the object hit most."""
-    axes.set_facecolor(PAPER)
+    style(axes, 10)
     time = np.arange(len(trace.force))
     top = max(float(trace.force.max(initial=0.0)), 1e-9)
     main = _hit_most(trace)
@@ -216,28 +236,17 @@ def _draw_force(axes: Axes, trace: "Trace", palette: Palette) -> None:
     axes.set_ylim(0, 1.08 * top)
     axes.set_xlabel("time at 1000 frames a second, ms", color=FAINT, fontsize=11)
     axes.set_ylabel("force, N", color=FAINT, fontsize=11)
-    axes.tick_params(colors=FAINT, labelsize=10, length=3)
-    for side in ("top", "right"):
-        axes.spines[side].set_visible(False)
-    for side in ("left", "bottom"):
-        axes.spines[side].set_color("#39424d")
     room = LEGEND / (len(palette.names) + 1) - 45.0
-    marks = [
-        Line2D(
-            [],
-            [],
-            marker="s",
-            linestyle="",
-            markersize=8,
-            color=palette.colors[i],
-            label=shortened(axes.figure, name, 11, room),
-        )
+    labels = [
+        (shortened(axes.figure, name, 11, room), palette.colors[i])
         for i, name in palette.names.items()
     ]
-    if len(set(trace.ids.tolist())) > len(marks):
-        marks.append(
-            Line2D([], [], marker="s", linestyle="", markersize=8, color=REST, label="other parts")
-        )
+    if len(set(trace.ids.tolist())) > len(labels):
+        labels.append(("other parts", REST))
+    marks = [
+        Line2D([], [], marker="s", linestyle="", markersize=8, color=color, label=words)
+        for words, color in labels
+    ]
     axes.legend(
         handles=marks,
         loc="lower right",

@@ -13,7 +13,6 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
-from hapticdb.errors import FileError
 from hapticdb.pictures.demo import (
     BODY,
     COLORS,
@@ -25,6 +24,9 @@ from hapticdb.pictures.demo import (
     SIZE,
     TOWARDS,
     mixed,
+    save,
+    show_scene,
+    style,
 )
 from hapticdb.pictures.lettering import extent_of, in_lines, shortened, width_of
 from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat
@@ -102,11 +104,7 @@ def draw_sweep(
     FileError
         When the file cannot be written.
     """
-    figure = compose_sweep(env, shell, found, exclude=exclude, verdict=verdict, up=up)
-    try:
-        figure.savefig(path, dpi=100, facecolor=PAPER, format="png")
-    except OSError as error:
-        raise FileError(f"cannot write {path}: {error.strerror}") from error
+    save(compose_sweep(env, shell, found, exclude=exclude, verdict=verdict, up=up), path)
 
 
 def compose_sweep(
@@ -216,12 +214,7 @@ def _draw_scene(
     paper = np.array(mixed(PAPER, PAPER, 0.0))
     image = shade(depths, camera, np.array(tints), paper, env.grid.voxel_size)
     image = faded(image, camera, paper, FADE * SAMPLES)
-    small = image.reshape(SCENE[1], SAMPLES, SCENE[0], SAMPLES, 3).mean(axis=(1, 3))
-    axes.imshow(np.clip(small, 0, 1), extent=(0, SCENE[0], SCENE[1], 0), interpolation="nearest")
-    axes.set_xlim(0, SCENE[0])
-    axes.set_ylim(SCENE[1], 0)
-    axes.set_aspect("auto")
-    axes.axis("off")
+    show_scene(axes, image)
 
 
 def _in_view(env: Environment, camera: Camera, exclude: set[int]) -> list[Object]:
@@ -394,12 +387,7 @@ def _draw_profile(figure: Figure, found: Swept) -> None:
     bottom.yaxis.set_major_locator(MaxNLocator(3, integer=True))
     bottom.set_xlabel("per cent of the path", color=FAINT, fontsize=11, labelpad=1)
     for axes, label in ((top, f"clear, {unit}"), (bottom, "points hit")):
-        axes.set_facecolor(PAPER)
+        style(axes, 9)
         axes.set_xlim(0, 100)
         axes.set_ylabel(label, color=FAINT, fontsize=10)
-        axes.tick_params(colors=FAINT, labelsize=9, length=3)
-        for side in ("top", "right"):
-            axes.spines[side].set_visible(False)
-        for side in ("left", "bottom"):
-            axes.spines[side].set_color("#39424d")
     top.tick_params(labelbottom=False)

@@ -128,7 +128,7 @@ def recorded(place: Place, tool: Tool, file: Path, results: Results) -> None:
         Path(folder, "sitecustomize.py").write_text(CLOCK, encoding="utf-8")
         modules = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
         words = ["--tool", tool.mesh, "--device", tool.hand, *SESSION.split(), file]
-        command("feel", place.url, *words, PYTHONPATH=modules)
+        command("feel", place.url, "--law", "plane", *words, PYTHONPATH=modules)
     columns = hapticdb.Recording(file).columns(*COLUMNS)
     (digest := Digest()).feed(*columns)
     hits = columns[COLUMNS.index("hits")]

@@ -303,7 +303,7 @@ def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) 
     )
     start = path.stat().st_size - len(whole) + len(whole) // 2
     path.write_bytes(whole[:start] + b"?" * 64 + whole[start + 64 :])
-    refused(run("replay", path), "damaged at frame", "--until-damage")
+    refused(run("replay", path, scene), "damaged at frame", "--until-damage")
     code, out, err = run("replay", path, "scene.db", "--until-damage")
     assert (code, out.startswith("equal: "), err) == (0, True, "")
 

@@ -9,12 +9,13 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 import hapticdb
+from banded import write_points
 from children import child, until
 from hapticdb import Grid
 from hapticdb.cli.root import TERMINATED
 from hapticdb.recording.file import Recording
 from hapticdb.recording.replay import replay
-from hapticdb.testing import floor_voxels, write_voxels
+from hapticdb.testing import floor_voxels
 from page_person import PagePerson
 from serving import browser_at
 
@@ -28,7 +29,8 @@ def test_sigterm_keeps_a_recording_that_is_under_way(
 ) -> None:
     scene, folder = tmp_path / "scene.db", tmp_path / "recordings"
     with hapticdb.create(scene, GRID) as env:
-        write_voxels(env.store, floor_voxels(GRID), "floor")
+        floor = floor_voxels(GRID)
+        write_points(env.store, floor[floor[:, 2] == floor[:, 2].max()] + 0.5, "floor")
     folder.mkdir()
     command = [
         sys.executable, "-m", "hapticdb", verb, str(scene), option, "--recordings", str(folder),

@@ -3,6 +3,7 @@
 import os
 import signal
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -19,8 +20,15 @@ from hapticdb.recording.frame import State
 from hapticdb.recording.replay import replay
 from hapticdb.testing import write_voxels
 from realtime.hands import Beckoned, at, still
-from realtime.sessions import NEVER_STALE, RATE, Recorded, recorded, until
+from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until
 from realtime.worlds import block, make
+
+
+@pytest.fixture
+def env(tmp_path: Path) -> Iterator[Environment]:
+    """An environment on SQLite: a floor with its top at z = 0."""
+    with floored(make(tmp_path, bits=6)) as made:
+        yield made
 
 
 def held_for(frames: Recorded) -> NDArray[np.float64]:
@@ -61,13 +69,14 @@ def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
     ):
         until(lambda: session.n_frames > 50, session)
         killed = cells.pid
-        os.kill(killed, signal.SIGKILL)
+        os.kill(killed, signal.SIGSTOP)  # a new process would be there before the force fades
 
         def is_held() -> bool:
             last = session.last()
             return last is not None and bool(last["state"][0] & State.FADING)
 
         until(is_held, session)
+        os.kill(killed, signal.SIGKILL)
         until(lambda: not is_held() and cells.pid != killed, session)
         n_frames = session.n_frames
         until(lambda: session.n_frames > n_frames + 50, session)

@@ -150,7 +150,8 @@ def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
 
 
 def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> None:
-    answer, frames = run(Clutched(stroking(0.010, 0.5), 1 << 30, 0.0), handle=Handle(clutch=0))
+    hand = Clutched(stroking(0.010, 0.5), 1 << 30, 0.0)
+    answer, frames = run(hand, handle=Handle(clutch=0), seconds=1.0)
     is_open = frames["state"] & State.CLUTCH_OPEN > 0
     assert is_open.any()
     assert not is_open.all()

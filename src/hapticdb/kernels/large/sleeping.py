@@ -24,36 +24,23 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import (
     FLOATS2,
-    FLOATS3,
-    INT,
     INTS,
-    INTS2,
     chosen_by_type,
-    entry,
     fields_of,
     inlined,
     leaf,
 )
-from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
+from hapticdb.kernels.field.law import DistanceFieldLaw
 from hapticdb.kernels.large.waking import AWAKE, wake_changed
-from hapticdb.kernels.law import TANGENT_PLANE, felt_within
+from hapticdb.kernels.law import felt_within
 from hapticdb.kernels.resident.cells import (
-    CELLS,
-    CELLS_WITH_DISTANCES,
-    CLUSTERS,
     EMPTY_SLOT,
-    HITS,
-    PLACE,
-    Clusters,
-    begin_frame,
-    end_frame,
     key_of_cell,
     slot_of,
 )
 from hapticdb.kernels.resident.clearance import gap
-from hapticdb.kernels.resident.feeling import frame_of
 from hapticdb.kernels.resident.runs import is_sphere_free
-from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turn
+from hapticdb.kernels.rigid import moved, turn
 
 BLOCK = 64
 """Runs of a block. A larger value tests fewer blocks and wakes more runs at once."""

@@ -21,10 +21,10 @@ from psycopg.errors import InsufficientPrivilege
 
 import hapticdb
 from command_line import PLACES, Run, boxes, poses, refused, run, tool  # noqa: F401 - fixtures
-from hapticdb import Grid, HapticDBError, PointShell
+from hapticdb import Grid, PointShell
 from hapticdb.cli import app
 from hapticdb.difference import diff_environments
-from hapticdb.errors import AccessError, ReadOnlyError, UsageError
+from hapticdb.errors import AccessError, HapticDBError, ReadOnlyError, UsageError
 from hapticdb.query import cost_model, quantiles
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.connect import grant, redact
@@ -384,8 +384,7 @@ def test_what_is_no_secret_stays_readable(password: str) -> None:
 def lines(url: str) -> dict[str, list[str]]:
     """Arguments for each verb that takes a URL, in an order in which all succeed."""
     by = ("--tool", "tool.stl")
-    return {
-        "import": [url, "boxes.glb", "--bits", "6"],
+    return {"import": [url, "boxes.glb", "--bits", "6"]} | {
         **{verb: [url] for verb in ("info", "objects", "check", "upgrade")},
         "touch": [url, *by, "--poses", "path.csv"],
         "feel": [url, *by, "--device", "path.csv", "--seconds", "0.2", "--record", "felt.hdbrec"],

@@ -139,10 +139,6 @@ class HandState:
     is_open: bool = False
 
 
-def _none(*shape: int) -> Floats:
-    return np.zeros(shape)
-
-
 @dataclass(frozen=True)
 class ProxyState:
     """A proxy's message; see `hapticdb.kernels.records.CONTACT_MODEL` for the numbers' meaning.

@@ -104,10 +104,6 @@ class CostModel:
         """Expected cost of Figure 3."""
         return self.aggregate + self.point * n_points
 
-    def of_grouping(self, n_keys: int) -> float:
-        """Expected cost of grouping by cost itself."""
-        return self.group + self.group_key * n_keys
-
     def figures(self) -> dict[str, float]:
         """All figures by name, the spreads as ``name.spread``, as a store keeps them.
 

@@ -76,11 +76,6 @@ class Relay:
         self._arrivals = TokenBucket(limits.browsers_per_second, limits.browsers_at_once)
         self._numbers: set[int] = set()
 
-    @property
-    def n_browsers(self) -> int:
-        """Number of browsers that are connected."""
-        return len(self._numbers)
-
     async def browser(self, websocket: WebSocket) -> None:
         """Serve one browser until it or the page leaves, or a limit ends it."""
         reason = "refused"

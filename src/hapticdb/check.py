@@ -35,14 +35,14 @@ BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
 """Number of set bits of each byte."""
 
 
-class CheckProgress(NamedTuple):
+class _CheckProgress(NamedTuple):
     """Progress of a check: rows read, and all rows."""
 
     done: int
     total: int
 
 
-CheckCallback = Callable[[CheckProgress], None]
+CheckCallback = Callable[[_CheckProgress], None]
 
 
 @dataclass
@@ -102,7 +102,7 @@ def check_environment(
     url : str or path
         The environment; it is only read.
     progress : callable or None
-        Called after each batch of rows with a `CheckProgress`.
+        Called after each batch of rows with a `_CheckProgress`.
 
     Raises
     ------
@@ -221,7 +221,7 @@ def _row_findings(
         sums.add(rows)
         yield from places.findings(rows)
         if progress is not None:
-            progress(CheckProgress(min(report.rows, total), total))
+            progress(_CheckProgress(min(report.rows, total), total))
     report.voxels = sum(sums.voxels.values())
     if report.rows != total:
         yield f"{report.rows:,} rows were read, and {total:,} counted"

@@ -73,7 +73,7 @@ class DemoScene:
 
 
 @dataclass
-class StrategyFigures:
+class _StrategyFigures:
     """Times and counts of one strategy, frame by frame."""
 
     elapsed_us: list[float] = field(default_factory=list)
@@ -107,7 +107,7 @@ class LayoutFigures:
     """All strategies on one layout."""
 
     imported: Imported
-    felt: dict[Strategy, StrategyFigures]
+    felt: dict[Strategy, _StrategyFigures]
 
 
 @dataclass
@@ -242,7 +242,7 @@ def compare(scene: DemoScene) -> Comparison:
         with open_environment(imported.url, read_only=True) as env:
             layouts.append(LayoutFigures(imported, _race(env, scene, reference, disagreed)))
             if trace is None:
-                trace = trace_of(env, scene.shell, scene.poses)
+                trace = _trace_of(env, scene.shell, scene.poses)
     assert trace is not None  # noqa: S101 - the demo has two layouts
     compared = len(scene.poses) * len(COMPARED) * len(layouts)
     return Comparison(tuple(layouts), trace, compared, tuple(disagreed))
@@ -250,7 +250,7 @@ def compare(scene: DemoScene) -> Comparison:
 
 def _race(
     env: Environment, scene: DemoScene, reference: list[Any], disagreed: list[str]
-) -> dict[Strategy, StrategyFigures]:
+) -> dict[Strategy, _StrategyFigures]:
     """Figures of every strategy. Each pose's answer is compared with `reference`.
 
     The first layout's first strategy fills `reference`; differences are added to `disagreed`.
@@ -258,7 +258,7 @@ def _race(
     for strategy in COMPARED:
         for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
             env.touch(scene.shell, pose, strategy, law="plane")
-    felt: dict[Strategy, StrategyFigures] = {strategy: StrategyFigures() for strategy in COMPARED}
+    felt: dict[Strategy, _StrategyFigures] = {strategy: _StrategyFigures() for strategy in COMPARED}
     for index, pose in enumerate(scene.poses):
         # the first strategy at a pose brings its pages into the cache: they take turns at it
         turn = index % len(COMPARED)
@@ -283,7 +283,7 @@ def _found(touched: Touch) -> tuple[bytes, bytes, bytes, tuple[int, ...]]:
     )
 
 
-def trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) -> Trace:
+def _trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) -> Trace:
     """Touch along a path once, and keep force, hits and their places."""
     force, hits, points, ids, frames = [], [], [], [], []
     for index, pose in enumerate(poses):

@@ -58,7 +58,7 @@ class DistanceDifference(NamedTuple):
     n_rows: int
 
 
-class Totals(NamedTuple):
+class _Totals(NamedTuple):
     """Voxels that only a has, that only b has, and that both have, summed over all objects.
 
     A voxel with two objects counts twice. n_changed : objects that only one environment has, or
@@ -139,13 +139,13 @@ class Difference:
         return is_same_grid(*self.grids)
 
     @property
-    def totals(self) -> Totals | None:
+    def totals(self) -> _Totals | None:
         """Sums over all objects; None if the grids are not the same."""
         if not self.is_same_grid:
             return None
         both = (*self.voxels, *self.elsewhere)
         lone = [sum(obj.voxels for obj in objects) for objects in (self.only_in_a, self.only_in_b)]
-        return Totals(
+        return _Totals(
             lone[0] + sum(one.only_in_a for one in both),
             lone[1] + sum(one.only_in_b for one in both),
             self.n_shared,

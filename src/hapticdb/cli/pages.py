@@ -60,7 +60,7 @@ def _in_order_of_names(obj: "Object") -> tuple[list[tuple[int, str]], int]:
     ], obj.id
 
 
-def longest_side(obj: "Object") -> float:
+def _longest_side(obj: "Object") -> float:
     """Longest side of an object's bounding box, metres."""
     return float((obj.bounds[1] - obj.bounds[0]).max())
 
@@ -69,7 +69,7 @@ ORDERS: dict[Order, tuple[Callable[["Object"], Any], bool]] = {
     "id": (lambda obj: obj.id, False),
     "name": (_in_order_of_names, False),
     "voxels": (lambda obj: (obj.voxels, -obj.id), True),
-    "size": (lambda obj: (longest_side(obj), -obj.id), True),
+    "size": (lambda obj: (_longest_side(obj), -obj.id), True),
 }
 """Key of each order, and whether the largest comes first."""
 

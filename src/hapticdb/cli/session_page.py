@@ -41,7 +41,7 @@ def show(
     """
     render.show(_loop_table(report))
     facts = [("shell", shell_text(shell)), *_frame_facts(report)]
-    facts += [*force_facts(report), *_cell_facts(report)]
+    facts += [*_force_facts(report), *_cell_facts(report)]
     facts.append(("warm start", f"{1e3 * report.warm_up:.3g} ms" + _cold_clause(report)))
     if report.loose_frames:
         facts.append(("in something", loose_text(report, cells)))
@@ -106,7 +106,7 @@ def budget_text(report: "Report") -> str:
     return f"{budget}; {frames} left out {report.most_left_out:,} points at most"
 
 
-def force_facts(report: "Report") -> Facts:
+def _force_facts(report: "Report") -> Facts:
     """Law and coupling, the greatest force, and what was done to keep it stable."""
     from hapticdb.realtime.coupling import SettledCoupling
 
@@ -153,7 +153,7 @@ def loose_text(report: "Report", cells: "ResidentCells") -> str:
         if report.first_loose_frame == 0
         else f"from second {report.first_loose_frame / report.rate:.3g} on it was inside"
     )
-    inside = in_objects(cells, report.loose_objects)
+    inside = _in_objects(cells, report.loose_objects)
     end = "it never came free" if report.ended_loose else "until it was free"
     counted = render.counted(frames, "frame")
     return f"{start} {inside}: no force for {counted} ({frames / report.rate:.3g} s), {end}"
@@ -170,7 +170,7 @@ class LooseNotes:
         if session.is_loose:
             self._looks += 1
             if self._looks <= 2 and (self._looks == 2 or session.loose_objects):
-                inside = in_objects(session.cells, session.loose_objects)
+                inside = _in_objects(session.cells, session.loose_objects)
                 render.note(
                     f"the tool is inside {inside}: nothing is felt until it is free; draw it out"
                 )
@@ -253,7 +253,7 @@ def _recording_text(report: "Report", recording: str) -> str:
     return f"{report.recorded_frames:,} frames in {recording}{lost}{ended}"
 
 
-def in_objects(cells: "ResidentCells", ids: Sequence[int]) -> str:
+def _in_objects(cells: "ResidentCells", ids: Sequence[int]) -> str:
     """The names of the objects that a tool lies in, for a sentence."""
     return _names_after(cells, ids).removeprefix(": ") or "an object"
 

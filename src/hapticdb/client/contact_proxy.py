@@ -42,7 +42,7 @@ PATIENCE = 10.0
 """Seconds in which a server must answer at first."""
 
 
-class LinkFigures(NamedTuple):
+class _LinkFigures(NamedTuple):
     """Figures of a connection so far.
 
     proxies, late : proxies that arrived, and those of them that were too old to use; bytes : of all
@@ -196,11 +196,11 @@ class ContactProxy:
         """Whether the server is connected now."""
         return self._link is not None
 
-    def figures(self) -> LinkFigures:
+    def figures(self) -> _LinkFigures:
         """Figures of the connection so far."""
         proxies, late, n_bytes, losses = self._counts
         trips = self._trips[-1000:]
-        return LinkFigures(
+        return _LinkFigures(
             proxies, late, n_bytes, float(np.median(trips)) if trips else 0.0, losses
         )
 

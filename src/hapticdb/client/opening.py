@@ -41,7 +41,7 @@ BUSY = {HTTPStatus.SERVICE_UNAVAILABLE, HTTPStatus.TOO_MANY_REQUESTS}
 BEHIND_A_PROXY = {HTTPStatus.BAD_GATEWAY, HTTPStatus.GATEWAY_TIMEOUT}
 
 
-class ServerAddress(NamedTuple):
+class _ServerAddress(NamedTuple):
     """A URL taken apart.
 
     endpoint : URL of the WebSocket, without secrets; token : secret, or empty; ca : file of
@@ -66,7 +66,7 @@ class ServerAddress(NamedTuple):
             ) from error
 
 
-def parse_address(url: str) -> ServerAddress:
+def parse_address(url: str) -> _ServerAddress:
     """Take a URL apart.
 
     Raises
@@ -100,10 +100,10 @@ def parse_address(url: str) -> ServerAddress:
         raise UsageError(f"{shown}: ca is for wss://, whose server shows a certificate")
     host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
     place = (host if port is None else f"{host}:{port}") + parts.path.rstrip("/")
-    return ServerAddress(f"{scheme}://{place}{ENDPOINT}", token, given["ca"], shown)
+    return _ServerAddress(f"{scheme}://{place}{ENDPOINT}", token, given["ca"], shown)
 
 
-def open_websocket(address: ServerAddress, patience: float) -> "ClientConnection":
+def open_websocket(address: _ServerAddress, patience: float) -> "ClientConnection":
     """Connect to a server straight, without a proxy and without compression.
 
     Raises

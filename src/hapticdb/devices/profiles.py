@@ -125,7 +125,7 @@ SCRIPTED = DeviceProfile(
 
 
 @runtime_checkable
-class SupportsProfile(Protocol):
+class _SupportsProfile(Protocol):
     """A device that knows its profile, before it is opened."""
 
     @property
@@ -141,7 +141,7 @@ def profile_of(device: object) -> DeviceProfile:
     UsageError
         If the device's profile is no `DeviceProfile`.
     """
-    if not isinstance(device, SupportsProfile):
+    if not isinstance(device, _SupportsProfile):
         return UNKNOWN
     profile = device.profile
     if not isinstance(profile, DeviceProfile):

@@ -159,7 +159,7 @@ class Reader:
             reading = self._converted(reading)
             pose = reading.pose
         self._last = reading
-        return reading if is_rigid_enough(pose) else reading._replace(pose=self._nowhere)
+        return reading if _is_rigid_enough(pose) else reading._replace(pose=self._nowhere)
 
     def complaint(self) -> str:
         """One line: what is wrong with the last reading's numbers; empty if nothing is wrong."""
@@ -168,7 +168,7 @@ class Reader:
             return ""
         if not (np.isfinite(last.pose).all() and np.isfinite(last.velocity).all()):
             return self._said("numbers that are not finite", "finite ones")
-        if not is_rigid_enough(last.pose):
+        if not _is_rigid_enough(last.pose):
             return self._said(
                 "a pose that is no rigid transform",
                 f"a rotation to {SKEW:g}, and a last row 0 0 0 1",
@@ -215,7 +215,7 @@ class Reader:
         return f"{type(self.device).__name__}.read() returned {returned}; expected {expected}"
 
 
-def is_rigid_enough(pose: NDArray[np.float64]) -> bool:
+def _is_rigid_enough(pose: NDArray[np.float64]) -> bool:
     """Whether a pose (4, 4) has a rotation, exact to `SKEW`, and the last row 0 0 0 1."""
     # plain floats, products written out: a quarter of the time that array operations take
     (a, b, c, _), (d, e, f, _), (g, h, i, _), last = pose.tolist()

@@ -24,7 +24,7 @@ SMALLEST = 1.0
 
 
 @dataclass(frozen=True)
-class Allowance:
+class _Allowance:
     """Stiffness that a session gets, and why it is not the one that was asked for.
 
     Attributes
@@ -80,7 +80,7 @@ def stable_stiffness(profile: DeviceProfile, rate: float, delay: float) -> float
 
 def allow(
     profile: DeviceProfile, rate: float, asked: float | None = None, delay: float | None = None
-) -> Allowance:
+) -> _Allowance:
     """Lower a stiffness to what the device renders and what stays stable.
 
     Parameters
@@ -113,7 +113,7 @@ def allow(
             if profile.stiffness <= stable
             else _stable_text(profile, rate, late)
         )
-    return Allowance(wanted, given, late, lowered)
+    return _Allowance(wanted, given, late, lowered)
 
 
 def _stable_text(profile: DeviceProfile, rate: float, delay: float) -> str:

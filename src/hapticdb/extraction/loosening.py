@@ -188,13 +188,13 @@ class Loosening:
         center = pose[:3, :3] @ problem.center + pose[:3, 3]
         found = [
             twist
-            for twist in candidate_twists(points, normals, center, problem.radius, self._seed)
+            for twist in _candidate_twists(points, normals, center, problem.radius, self._seed)
             if twist.opposed <= MOST_OPPOSED
         ]
         return sorted(found, key=lambda twist: round(twist.opposed, 2))
 
 
-def candidate_twists(
+def _candidate_twists(
     points: Floats, normals: Floats, center: Floats, radius: float, seed: int
 ) -> list[Twist]:
     """Motions that contacts suggest: leaving all of them, shifts, and turns.

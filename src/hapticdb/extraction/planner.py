@@ -189,7 +189,7 @@ class Planner:
         turns = np.stack([one.poses[-1][:3, :3] for one in starts])
         if turn is None:
             turns = np.concatenate([turns, *(turns @ quarter for quarter in QUARTERS)])
-        turns = distinct_turns(turns)[:MOST_TURNS]
+        turns = _distinct_turns(turns)[:MOST_TURNS]
         goals = self._goals.poses(turns, is_guarded=is_guarded)
         first, last = self._rows(np.stack([one.poses[-1] for one in starts])), self._rows(goals)
         room = np.concatenate([first, last])[:, :3]
@@ -249,7 +249,7 @@ class Planner:
         return path
 
 
-def distinct_turns(turns: Floats) -> Floats:
+def _distinct_turns(turns: Floats) -> Floats:
     """Rotations (k, 3, 3) of rotations (n, 3, 3), each once, the first ones first."""
     kept: list[Floats] = []
     for turn in turns:

@@ -30,14 +30,14 @@ BLOCKS = (8, 64)
 soon, and at most; each block is twice as long as the one before."""
 
 
-class SearchProgress(NamedTuple):
+class _SearchProgress(NamedTuple):
     """Straight pulls tried, of so many."""
 
     done: int
     total: int
 
 
-SearchCallback = Callable[[SearchProgress], None]
+SearchCallback = Callable[[_SearchProgress], None]
 """Called after each straight pull."""
 
 
@@ -106,7 +106,7 @@ class Pulls:
             is_opposed = self._opposed[n] > MOST_OPPOSED
             self.done.append(self._blocked(n) if is_opposed else self._pull(n))
             if progress is not None:
-                progress(SearchProgress(n + 1, total))
+                progress(_SearchProgress(n + 1, total))
 
     def opposed_out(self, until: float) -> list[Pull]:
         """Pulls that lead out though they press against more than `MOST_OPPOSED` of the contacts.

@@ -241,11 +241,11 @@ class ContactSource:
             model["tool"][:3] - model["hand"][:3], model["tool"][3:].copy(),
             model["wrench"].copy(), model["stiffness"].copy(), float(model["spring"]),
             float(model["turn_spring"]),
-            rounded_planes(model, n, self._spring.radius, self._place.size),
+            _rounded_planes(model, n, self._spring.radius, self._place.size),
         )  # fmt: skip
 
 
-def rounded_planes(
+def _rounded_planes(
     model: NDArray[np.void], count: int, radius: float, size: float
 ) -> NDArray[np.void]:
     """Planes (count,) of `PLANE` of a model; its lengths in radii and voxels, m."""

@@ -46,7 +46,7 @@ def z_encode(i, j, k):
 
 
 @leaf
-def hilbert_encode(i, j, k, bits):
+def _hilbert_encode(i, j, k, bits):
     """Hilbert key of (i, j, k) on the curve of `bits` bits an axis."""
     level = bits - 1
     while level > 0:
@@ -80,7 +80,7 @@ def hilbert_encode(i, j, k, bits):
 
 
 @leaf
-def hilbert_decode(key, bits):
+def _hilbert_decode(key, bits):
     """Voxel (i, j, k) of a Hilbert key on the curve of `bits` bits an axis."""
     i = compact(key >> 2)
     j = compact(key >> 1)
@@ -115,7 +115,7 @@ def key_of(i, j, k, bits, curve):
     if curve == Z_ORDER:
         return z_encode(i, j, k)
     if curve == HILBERT:
-        return hilbert_encode(i, j, k, bits)
+        return _hilbert_encode(i, j, k, bits)
     return (i << (2 * bits)) | (j << bits) | k
 
 
@@ -125,7 +125,7 @@ def voxel_of(key, bits, curve):
     if curve == Z_ORDER:
         return compact(key >> 2), compact(key >> 1), compact(key)
     if curve == HILBERT:
-        return hilbert_decode(key, bits)
+        return _hilbert_decode(key, bits)
     mask = (1 << bits) - 1
     return (key >> (2 * bits)) & mask, (key >> bits) & mask, key & mask
 

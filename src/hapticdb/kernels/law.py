@@ -30,27 +30,27 @@ NOTHING_NEAR = math.inf
 """Sample of a point when the payload holds nothing near the point."""
 
 
-def no_sample_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001 - as every such leaf
+def _no_sample_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001 - as every such leaf
     """Sample, in rows, of a law that reads no payload."""
     return NOTHING_NEAR
 
 
-def no_sample_of_slot(law, payload, slot, x, y, z):  # noqa: ARG001 - likewise
+def _no_sample_of_slot(law, payload, slot, x, y, z):  # noqa: ARG001 - likewise
     """Sample, in a resident cell, of a law that reads no payload."""
     return NOTHING_NEAR
 
 
-def full_share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
+def _full_share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
     """Share, in rows, under a law for which the normal's direction does not matter."""
     return 1.0
 
 
-def full_share_of_slot(law, payload, slot, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
+def _full_share_of_slot(law, payload, slot, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
     """Share, in a resident cell, under such a law."""
     return 1.0
 
 
-def no_reach(law):  # noqa: ARG001 - the arguments of every such leaf
+def _no_reach(law):  # noqa: ARG001 - the arguments of every such leaf
     """Reach of a law that feels only hits."""
     return 0.0
 
@@ -78,12 +78,12 @@ class Leaves(NamedTuple):
     """
 
     respond: Callable[..., Any]
-    reach: Callable[..., Any] = no_reach
-    felt_within: Callable[..., Any] = no_reach
-    sample_rows: Callable[..., Any] = no_sample_of_rows
-    sample_slot: Callable[..., Any] = no_sample_of_slot
-    share_rows: Callable[..., Any] = full_share_of_rows
-    share_slot: Callable[..., Any] = full_share_of_slot
+    reach: Callable[..., Any] = _no_reach
+    felt_within: Callable[..., Any] = _no_reach
+    sample_rows: Callable[..., Any] = _no_sample_of_rows
+    sample_slot: Callable[..., Any] = _no_sample_of_slot
+    share_rows: Callable[..., Any] = _full_share_of_rows
+    share_slot: Callable[..., Any] = _full_share_of_slot
 
 
 LEAVES: dict[type, Leaves] = {}
@@ -97,7 +97,7 @@ def define(law_type: type, leaves: Leaves) -> None:
 
 def reads_distances(law: Any) -> bool:  # noqa: ANN401 - a NamedTuple of a type of its own
     """Whether frames of that law need the distances of rows as its payload."""
-    return LEAVES[type(law)].sample_rows is not no_sample_of_rows
+    return LEAVES[type(law)].sample_rows is not _no_sample_of_rows
 
 
 respond = chosen_by_type(lambda law_type: LEAVES[law_type].respond)
@@ -155,9 +155,9 @@ def depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz):
     return (cx - px) * nx + (cy - py) * ny + (cz - pz) * nz
 
 
-def tangent_plane(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # noqa: ARG001
+def _tangent_plane(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # noqa: ARG001
     """Depth below the tangent plane. Every hit counts in the average, even above the plane."""
     return depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz), 1.0
 
 
-define(TangentPlaneLaw, Leaves(respond=tangent_plane))
+define(TangentPlaneLaw, Leaves(respond=_tangent_plane))

@@ -50,7 +50,7 @@ def play(time, knots, pose, velocity):
 
 
 @leaf
-def wave(time, waves, axis):
+def _wave(time, waves, axis):
     """Value and rate of change of one axis's sum of sines, zero at time zero."""
     value = 0.0
     rate = 0.0
@@ -63,7 +63,7 @@ def wave(time, waves, axis):
 
 
 @leaf
-def angular_velocity(x, y, z, dx, dy, dz):
+def _angular_velocity(x, y, z, dx, dy, dz):
     """Angular velocity of the rotation exp(turn) as the turn changes by (dx, dy, dz) a second.
 
     The left Jacobian of the rotation group: w = d + a (t x d) + b t x (t x d) with
@@ -92,13 +92,13 @@ def sway(time, waves, center, pose, velocity):
     waves (6, K, 4): amplitude (m; rad for the last three axes, which are a turn), rad/s, phase, the
     phase's sine. center (4, 4): the pose. Writes pose (4, 4) and velocity (6,), exact derivatives.
     """
-    px, velocity[0] = wave(time, waves, np.int64(0))
-    py, velocity[1] = wave(time, waves, np.int64(1))
-    pz, velocity[2] = wave(time, waves, np.int64(2))
-    x, dx = wave(time, waves, np.int64(3))
-    y, dy = wave(time, waves, np.int64(4))
-    z, dz = wave(time, waves, np.int64(5))
-    velocity[3], velocity[4], velocity[5] = angular_velocity(x, y, z, dx, dy, dz)
+    px, velocity[0] = _wave(time, waves, np.int64(0))
+    py, velocity[1] = _wave(time, waves, np.int64(1))
+    pz, velocity[2] = _wave(time, waves, np.int64(2))
+    x, dx = _wave(time, waves, np.int64(3))
+    y, dy = _wave(time, waves, np.int64(4))
+    z, dz = _wave(time, waves, np.int64(5))
+    velocity[3], velocity[4], velocity[5] = _angular_velocity(x, y, z, dx, dy, dz)
     w, x, y, z = product(*quaternion_by(x, y, z), *quaternion_in(center))
     write_pose(px + center[0, 3], py + center[1, 3], pz + center[2, 3], w, x, y, z, pose)
 
@@ -114,13 +114,13 @@ def survey(waves, cycle, n_samples):
     turning = 0.0
     for n in range(n_samples):
         time = n * cycle / n_samples
-        px, vx = wave(time, waves, np.int64(0))
-        py, vy = wave(time, waves, np.int64(1))
-        pz, vz = wave(time, waves, np.int64(2))
-        x, dx = wave(time, waves, np.int64(3))
-        y, dy = wave(time, waves, np.int64(4))
-        z, dz = wave(time, waves, np.int64(5))
-        wx, wy, wz = angular_velocity(x, y, z, dx, dy, dz)
+        px, vx = _wave(time, waves, np.int64(0))
+        py, vy = _wave(time, waves, np.int64(1))
+        pz, vz = _wave(time, waves, np.int64(2))
+        x, dx = _wave(time, waves, np.int64(3))
+        y, dy = _wave(time, waves, np.int64(4))
+        z, dz = _wave(time, waves, np.int64(5))
+        wx, wy, wz = _angular_velocity(x, y, z, dx, dy, dz)
         reach = max(reach, px * px + py * py + pz * pz)
         speed = max(speed, vx * vx + vy * vy + vz * vz)
         turning = max(turning, wx * wx + wy * wy + wz * wz)

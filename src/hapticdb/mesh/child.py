@@ -76,11 +76,11 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
     try:
         reader_of(path)  # before the limit, so that its libraries do not count as the file's memory
         np.linalg.det(np.eye(3))  # OpenBLAS allocates its buffers now, before the limit
-        before = limit_memory(allowance(path), request["memory_limit"])
-        limit_time(request["time_limit"])
+        before = _limit_memory(allowance(path), request["memory_limit"])
+        _limit_time(request["time_limit"])
         if path.suffix.lower() == ".gltf" and request["memory_limit"] is None:
             # The files that it refers to are listed under the limit of this file alone.
-            limit_memory(allowance(path, _bytes_beside(path)), None)
+            _limit_memory(allowance(path, _bytes_beside(path)), None)
         cleaned = parse(path, request["metres"])
     except (UnreadableError, MemoryError, ImportError) as error:
         if before is not None:
@@ -150,7 +150,7 @@ def _bytes_beside(path: Path) -> int:
         return 0
 
 
-def limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
+def _limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
     """Limit the memory to what is held already plus a number of bytes; returns the former limit."""
     kind = _memory_kind()
     before = resource.getrlimit(kind)
@@ -160,7 +160,7 @@ def limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
     return before
 
 
-def limit_time(seconds: float) -> None:
+def _limit_time(seconds: float) -> None:
     """Limit the processor time, in case the parent is gone and cannot end this process."""
     _, hard = resource.getrlimit(resource.RLIMIT_CPU)
     # The limit counts the sum over a parser's threads.

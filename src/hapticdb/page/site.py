@@ -39,7 +39,7 @@ PAINTERS = 4
 """Threads that wait for pictures of browsers. Larger: more slow browsers are waited for at once."""
 
 
-class Updated(Protocol):
+class _Updated(Protocol):
     """What a site asks of each browser."""
 
     def tick(self, now: float) -> None:
@@ -98,7 +98,7 @@ class Site:
     server: "ViserServer"
     host: AttachedHost
     request: PageRequest
-    browsers: dict[int, Updated] = field(default_factory=dict)
+    browsers: dict[int, _Updated] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
@@ -166,7 +166,7 @@ class Site:
             except Exception:
                 LOG.exception("a browser did not end well")
 
-    def everyone(self, act: Callable[[Updated], None]) -> None:
+    def everyone(self, act: Callable[[_Updated], None]) -> None:
         """Do something for each browser; one that fails does not stop the others."""
         for browser in list(self.browsers.values()):
             try:

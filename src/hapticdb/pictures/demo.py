@@ -50,7 +50,7 @@ TOWARDS = (0.50, 0.76, 0.44)
 
 
 @dataclass(frozen=True)
-class Palette:
+class _Palette:
     """Colours and names by object id, of the objects touched most; the most touched first."""
 
     colors: dict[int, str]
@@ -64,10 +64,10 @@ class Palette:
 def draw(path: Path, scene: "DemoScene", comparison: "Comparison") -> None:
     """Draw the first environment of a demo, what its tool felt, and write it as a PNG."""
     with open_environment(scene.imported[0].url, read_only=True) as env:
-        save(compose(env, scene, comparison), path)
+        save(_compose(env, scene, comparison), path)
 
 
-def compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> Figure:
+def _compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> Figure:
     """Lay out the figure: the scene above, the force along the path below."""
     trace = comparison.trace
     palette = _palette(env, trace)
@@ -83,11 +83,11 @@ def compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> F
     return figure
 
 
-def _palette(env: Environment, trace: "Trace") -> Palette:
+def _palette(env: Environment, trace: "Trace") -> _Palette:
     known = {obj.id: obj.name for obj in env.objects()}
     most = [i for i, _ in Counter(trace.ids.tolist()).most_common(len(COLORS))]
     names = {i: known[i].rsplit("/", 1)[-1].replace("_", " ") for i in most}
-    return Palette(dict(zip(most, COLORS, strict=False)), names)
+    return _Palette(dict(zip(most, COLORS, strict=False)), names)
 
 
 def _camera(env: Environment) -> Camera:
@@ -103,7 +103,7 @@ def _camera(env: Environment) -> Camera:
     )
 
 
-def _draw_scene(axes: Axes, env: Environment, camera: Camera, palette: Palette) -> None:
+def _draw_scene(axes: Axes, env: Environment, camera: Camera, palette: _Palette) -> None:
     """Shade the voxels as the database holds them, object by object."""
     depths = Depths.empty(camera)
     tints = []
@@ -150,7 +150,7 @@ def mixed(one: str, other: str, share: float) -> tuple[float, float, float]:
 
 
 def _draw_path(
-    axes: Axes, camera: Camera, scene: "DemoScene", trace: "Trace", palette: Palette
+    axes: Axes, camera: Camera, scene: "DemoScene", trace: "Trace", palette: _Palette
 ) -> None:
     """Hits as points in the colour of their object, the tool at a few poses, and its path."""
     step = max(1, len(trace.points) // HITS_SHOWN)
@@ -214,7 +214,7 @@ def _draw_words(figure: Figure, scene: "DemoScene", comparison: "Comparison") ->
         figure.text(0.0225, 0.917 - 0.026 * number, line, color=FAINT, fontsize=12.5, va="center")
 
 
-def _draw_force(axes: Axes, trace: "Trace", palette: Palette) -> None:
+def _draw_force(axes: Axes, trace: "Trace", palette: _Palette) -> None:
     """Force over time at 1000 frames a second, filled in the colour of the object hit most."""
     style(axes, 10)
     time = np.arange(len(trace.force))

@@ -34,11 +34,11 @@ def shortened(figure: FigureBase, words: str, size: float, most: float) -> str:
     low, high = 0, len(words) - 1  # letters that are kept; `low` fits, if any number does
     while low < high:
         kept = (low + high + 1) // 2
-        if width_of(figure, without_middle(words, kept), size) <= most:
+        if width_of(figure, _without_middle(words, kept), size) <= most:
             low = kept
         else:
             high = kept - 1
-    return without_middle(words, low)
+    return _without_middle(words, low)
 
 
 def in_lines(figure: FigureBase, words: str, size: float, most: float, count: int) -> list[str]:
@@ -58,7 +58,7 @@ def in_lines(figure: FigureBase, words: str, size: float, most: float, count: in
     return [shortened(figure, line, size, most) for line in lines]
 
 
-def without_middle(words: str, kept: int) -> str:
+def _without_middle(words: str, kept: int) -> str:
     """Words with `kept` of their letters, half from either end, and an ellipsis between."""
     head = (kept + 1) // 2
     tail = kept - head

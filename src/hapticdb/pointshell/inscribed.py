@@ -99,7 +99,7 @@ class InscribedBalls:
     def __init__(self, surface: "Surface", greatest: float) -> None:
         self._center = surface.center
         self._normals = surface.normals
-        self._solids = solids_of(surface)
+        self._solids = _solids_of(surface)
         self._bodies = surface.bodies
         self._triangles = surface.triangles - surface.center
         self._greatest = greatest
@@ -118,7 +118,7 @@ class InscribedBalls:
         low = np.minimum(np.minimum(a, b), c)
         high = np.maximum(np.maximum(a, b), c)
         middles = 0.5 * (low + high)
-        reach = longest_of(pieces - middles[:, None])
+        reach = _longest_of(pieces - middles[:, None])
         octave = np.floor(np.log2(np.maximum(reach, 1e-3 * self._greatest))).astype(np.int64)
         places = np.column_stack([middles, self._apart * solids])
         self._pieces, self._tree = pieces, cKDTree(places)
@@ -137,7 +137,7 @@ class InscribedBalls:
         done: list[tuple[Floats, Ints]] = []
         n_done = 0
         while True:
-            is_long = longest_of(pieces - pieces[:, [1, 2, 0]]) > longest
+            is_long = _longest_of(pieces - pieces[:, [1, 2, 0]]) > longest
             n_pieces = n_done + len(pieces)
             if not is_long.any() or n_pieces > 2 * MOST_PIECES + len(self._triangles):
                 break
@@ -240,7 +240,7 @@ class InscribedBalls:
             _, nearest = self._tree.query(places, k=np.arange(n_near) + 1, workers=-1)
             smaller = radii[active]
             for pieces in np.asarray(nearest).T:
-                touched = nearest_on(self._pieces[pieces], centers)
+                touched = _nearest_on(self._pieces[pieces], centers)
                 some = _smaller(local[active], normals, radii[active], touched, centers)
                 smaller = np.minimum(smaller, some)
             is_held = smaller < radii[active]
@@ -302,7 +302,7 @@ class InscribedBalls:
         return np.asarray(is_crossed.reshape(-1, LINES).mean(axis=1) >= MATTER)
 
 
-def solids_of(surface: "Surface") -> Ints:
+def _solids_of(surface: "Surface") -> Ints:
     """Solid (F,) of each face: a closed body with the voids in it, or 0 for all open surfaces.
 
     A void belongs to the body with the smallest box around it.
@@ -353,7 +353,7 @@ def _shrink(
     radii, facing = radii.copy(), np.ones(len(positions))
     for _ in range(ROUNDS):
         centers = positions[ball] + radii[ball, None] * normals[ball]
-        touched = nearest_on(pieces, centers)
+        touched = _nearest_on(pieces, centers)
         distance = np.linalg.norm(centers - touched, axis=1)
         is_near = distance <= (1.0 + NEARLY) * radii[ball]
         ball, pieces, touched = ball[is_near], pieces[is_near], touched[is_near]
@@ -385,14 +385,14 @@ def _facings(
     return np.where(is_aligned | (distance < (1.0 + 0.1 * SLACK) * radii), cosines, 1.0)
 
 
-def longest_of(vectors: Floats) -> Floats:
+def _longest_of(vectors: Floats) -> Floats:
     """Greatest of the lengths of three vectors each, (P, 3, 3): (P,)."""
     squares = np.einsum("pck,pck->pc", vectors, vectors)
     a, b, c = squares[:, 0], squares[:, 1], squares[:, 2]
     return np.asarray(np.sqrt(np.maximum(np.maximum(a, b), c)))
 
 
-def nearest_on(triangles: Floats, positions: Floats) -> Floats:
+def _nearest_on(triangles: Floats, positions: Floats) -> Floats:
     """Nearest point (P, 3) of each triangle (P, 3, 3) to its position (P, 3); degenerate ones too.
 
     The nearest point lies in the triangle's plane, if the foot of the perpendicular is in the

@@ -42,7 +42,7 @@ larger value leaves more corners without points."""
 Floats = NDArray[np.float64]
 
 
-class Drawn(NamedTuple):
+class _Drawn(NamedTuple):
     """Points drawn inward."""
 
     points: Floats  # (N, 3)
@@ -50,7 +50,9 @@ class Drawn(NamedTuple):
     inset: Floats  # (N,) metres from the sample to its image
 
 
-def draw_inward(surface: "Surface", n_points: int, inset: float, rng: np.random.Generator) -> Drawn:
+def draw_inward(
+    surface: "Surface", n_points: int, inset: float, rng: np.random.Generator
+) -> _Drawn:
     """Spread points evenly over the surface drawn inward by `inset` metres; see the module.
 
     Points of open surfaces without matter behind them stay where they are.
@@ -79,7 +81,7 @@ def draw_inward(surface: "Surface", n_points: int, inset: float, rng: np.random.
     kept = np.flatnonzero(is_kept)
     share = len(kept) / len(samples)
     chosen = kept[_spread(samples[kept], images[kept], faces[kept], surface, n_points, share)]
-    return Drawn(images[chosen], faces[chosen], radius[chosen])
+    return _Drawn(images[chosen], faces[chosen], radius[chosen])
 
 
 def _is_late(samples: Floats, images: Floats, latest: float) -> NDArray[np.bool_]:

@@ -57,7 +57,7 @@ def prepare_follower(follower: Record, n_points: int, budget: int | None) -> Non
         follower["most_looked"] = budget if budget < n_points else 0
 
 
-class DriveInputs(Protocol):
+class _DriveInputs(Protocol):
     """What a drive reads: the loop has these."""
 
     cells: Cells
@@ -76,7 +76,7 @@ class DriveInputs(Protocol):
 class _Feeling:
     """Frames of the law at one pose, and the memory that they need."""
 
-    def __init__(self, scene: DriveInputs, cells: Cells, law: ForceLaw) -> None:
+    def __init__(self, scene: _DriveInputs, cells: Cells, law: ForceLaw) -> None:
         self._scene, self._cells, self._law = scene, cells, law.for_kernels
         self.met = np.empty(len(scene.clusters.points), dtype=np.int64)
         self.counts = counts_of(1)
@@ -106,7 +106,7 @@ class DirectDrive:
 
     Parameters
     ----------
-    scene : DriveInputs
+    scene : _DriveInputs
         Cells, tool and servo record.
     terms : DirectTerms
         What bounds the wrench.
@@ -117,7 +117,7 @@ class DirectDrive:
     """
 
     def __init__(
-        self, scene: DriveInputs, terms: direct.DirectTerms, radius: float, law: ForceLaw
+        self, scene: _DriveInputs, terms: direct.DirectTerms, radius: float, law: ForceLaw
     ) -> None:
         self._scene, self._terms = scene, terms
         self.radius, self.hold, self.least_share = radius, terms.hold, 1.0
@@ -161,7 +161,7 @@ class SmoothDrive:
 
     Parameters
     ----------
-    scene : DriveInputs
+    scene : _DriveInputs
         Cells, tool and servo record; the cells have distances.
     spring : DeviceSpring
         The spring between hand and tool.
@@ -170,7 +170,7 @@ class SmoothDrive:
         contacts of its own stiffness.
     """
 
-    def __init__(self, scene: DriveInputs, spring: DeviceSpring, law: ForceLaw) -> None:
+    def __init__(self, scene: _DriveInputs, spring: DeviceSpring, law: ForceLaw) -> None:
         self._scene, self._spring = scene, spring
         self._feeling = _Feeling(scene, scene.cells, law)
         self.radius, self.hold = spring.radius, spring.hold

@@ -66,7 +66,7 @@ def _order(work: str, purposes: Sequence[str], numbers: Sequence[int] | None) ->
 # -- in the process that is served -----------------------------------------------------------------
 
 
-class ForkServer:
+class _ForkServer:
     """The fork server of this process, from its own side."""
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class ForkServer:
         self._popen.wait()
 
 
-_server: ForkServer | None = None
+_server: _ForkServer | None = None
 _lock = threading.Lock()
 
 
@@ -125,10 +125,10 @@ def _forget_lock() -> None:
 os.register_at_fork(after_in_child=_forget_lock)
 
 
-def _known() -> ForkServer:
+def _known() -> _ForkServer:
     global _server  # noqa: PLW0603 - one a process
     if _server is None or not _server.is_ours:
-        _server = ForkServer()
+        _server = _ForkServer()
     return _server
 
 

@@ -31,7 +31,7 @@ Ranked = tuple[Keys, NDArray[np.float64]]
 
 
 @dataclass
-class TrackedSession:
+class _TrackedSession:
     """State of one session.
 
     sequence : number of the desk's row at its last reading; wish : the wish whose cells were
@@ -66,7 +66,7 @@ class SessionTracker:
     def __init__(self, table: CellTable, grid: Grid) -> None:
         self._table = table
         self._grid = grid
-        self.sessions: dict[int, TrackedSession] = {}
+        self.sessions: dict[int, _TrackedSession] = {}
 
     def read_desk(self, elapsed: float, lookahead: float) -> bool:
         """Read where the tools are; returns whether any now wants other cells.
@@ -76,7 +76,7 @@ class SessionTracker:
         desk = self._table.desk.sessions
         active = set(np.flatnonzero(desk["told"]["is_active"]).tolist())
         has_moved = active != set(self.sessions)
-        self.sessions = {row: self.sessions.get(row, TrackedSession()) for row in sorted(active)}
+        self.sessions = {row: self.sessions.get(row, _TrackedSession()) for row in sorted(active)}
         for row, session in self.sessions.items():
             motion = self._read_motion(row, session)
             if motion is None:
@@ -92,7 +92,7 @@ class SessionTracker:
             has_moved = True
         return has_moved
 
-    def _read_motion(self, row: int, session: TrackedSession) -> Motion | None:
+    def _read_motion(self, row: int, session: _TrackedSession) -> Motion | None:
         """Read a row of the desk completely; None if its loop died while it wrote the row."""
         desk = self._table.desk.sessions
         for _ in range(READ_ATTEMPTS):

@@ -132,7 +132,7 @@ class Surroundings(NamedTuple):
         return min(first + within, end - 1)
 
 
-def surroundings_of(clusters: Clusters, voxel_size: float, beyond: float) -> Surroundings:
+def _surroundings_of(clusters: Clusters, voxel_size: float, beyond: float) -> Surroundings:
     """Places of the runs: one place for a run with a radius of `SMALL` voxels or less.
 
     The reach has room for `beyond` voxels around the runs, in which frames look for voxels before
@@ -210,7 +210,7 @@ class ResidentFrames:
         self.sleepers = sleepers_of(self.clusters, budget_points) if sleeps else None
         self.budget = min(budget_points or len(shell), len(shell))
         self.met = np.empty(len(shell), dtype=np.int64)
-        self.surroundings = surroundings_of(self.clusters, size, felt_within(self.law))
+        self.surroundings = _surroundings_of(self.clusters, size, felt_within(self.law))
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._row = table.join()
 

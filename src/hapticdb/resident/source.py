@@ -28,7 +28,7 @@ ROWS_AT_ONCE = 1024
 smaller one merges the values while they are still in the processor's cache."""
 
 
-class CellsRead(NamedTuple):
+class _CellsRead(NamedTuple):
     """Result of one statement.
 
     is_empty (n,) : whether each cell has no voxel and no distances; n_rows : rows read; n_ranges :
@@ -67,7 +67,7 @@ class CellSource:
         may_measure = may_measure and self._quantiles.n_rows > 0
         self._costs = costs_at_start(store, clock, may_measure=may_measure)
 
-    def read(self, cells: Keys, table: CellTable, slots: Keys) -> CellsRead:
+    def read(self, cells: Keys, table: CellTable, slots: Keys) -> _CellsRead:
         """Read cells (n,), distinct, by one statement into slots (n,) that no frame can read."""
         grid, shift = self.store.grid, row_shift(self.store.layout)
         on_curve = np.empty(len(cells), dtype=np.int64)
@@ -89,7 +89,7 @@ class CellSource:
         if payload is not None:
             self._fill_distances(rows, on_curve, slots[order], payload, masks)
             mark_near_voxels(slots, payload, masks, words, table.cells.near)
-        return CellsRead(masks[slots] == 0, len(rows), len(ranges.lows))
+        return _CellsRead(masks[slots] == 0, len(rows), len(ranges.lows))
 
     def _fill_distances(
         self,

@@ -22,7 +22,7 @@ DENSER = 4
 """Poses tried for each one kept: so many that equal steps of the tool can be picked among them."""
 
 
-class HeightMap(NamedTuple):
+class _HeightMap(NamedTuple):
     """Tops of the columns of a scene.
 
     corner (2,) and step in metres; top (nx, ny) metres, -inf where there is nothing.
@@ -42,7 +42,7 @@ class HeightMap(NamedTuple):
         return np.asarray(np.where(inside, heights, -np.inf))
 
 
-def heights_of_voxels(centers: ArrayLike, voxel_size: float) -> HeightMap:
+def heights_of_voxels(centers: ArrayLike, voxel_size: float) -> _HeightMap:
     """Map of the tops of voxels; centers (V, 3) and voxel_size in metres."""
     points = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
     if len(points) == 0:
@@ -51,10 +51,10 @@ def heights_of_voxels(centers: ArrayLike, voxel_size: float) -> HeightMap:
     cell = np.floor((points[:, :2] - corner) / voxel_size).astype(np.int64)
     top = np.full(tuple(cell.max(axis=0) + 1), -np.inf)
     np.maximum.at(top, (cell[:, 0], cell[:, 1]), points[:, 2] + 0.5 * voxel_size)
-    return HeightMap(corner, voxel_size, top)
+    return _HeightMap(corner, voxel_size, top)
 
 
-def _walk(map_: HeightMap, reach: float, count: int, seed: int, longest: float) -> Floats:
+def _walk(map_: _HeightMap, reach: float, count: int, seed: int, longest: float) -> Floats:
     """Places (count, 2) along a swaying line over the longer side of the map.
 
     It keeps half the tool's reach off the ends, and is cut about its middle to `longest` metres.
@@ -71,7 +71,7 @@ def _walk(map_: HeightMap, reach: float, count: int, seed: int, longest: float) 
     return np.asarray(places + map_.corner + 0.5 * size)
 
 
-def _slopes(map_: HeightMap, places: Floats, reach: float) -> Floats:
+def _slopes(map_: _HeightMap, places: Floats, reach: float) -> Floats:
     """Slopes (M, 2) of the plane through the heights around each place."""
     offset = np.linspace(-0.4, 0.4, 9) * reach
     dx, dy = (axis.ravel() for axis in np.meshgrid(offset, offset))
@@ -98,7 +98,7 @@ def _rotations(slopes: Floats, yaw: Floats) -> Floats:
     return np.stack([ahead, np.cross(normal, ahead), normal], axis=2)
 
 
-def _let_down(map_: HeightMap, places: Floats, rotations: Floats, tool_points: Floats) -> Floats:
+def _let_down(map_: _HeightMap, places: Floats, rotations: Floats, tool_points: Floats) -> Floats:
     """Heights (M,) of the tool's origin at which its first point touches; -inf over nothing."""
     heights = np.empty(len(places))
     for chunk in np.array_split(np.arange(len(places)), max(1, len(places) // 500)):

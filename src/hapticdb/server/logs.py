@@ -14,7 +14,7 @@ LOGGERS = ("hapticdb", "uvicorn.error", "websockets.client")
 """What is written. uvicorn's log of requests is not: their addresses can hold a token."""
 
 
-class PlainLine(logging.Formatter):
+class _PlainLine(logging.Formatter):
     """Time, level, words, and what belongs to the event."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -25,7 +25,7 @@ class PlainLine(logging.Formatter):
         )
 
 
-class JsonLine(logging.Formatter):
+class _JsonLine(logging.Formatter):
     """One JSON object an event."""
 
     def format(self, record: logging.LogRecord) -> str:
@@ -57,7 +57,7 @@ def words_of(record: logging.LogRecord) -> str:
 def written(form: Literal["plain", "json"], level: int = logging.INFO) -> Iterator[None]:
     """Write the server's events to standard error inside the block."""
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(JsonLine() if form == "json" else PlainLine())
+    handler.setFormatter(_JsonLine() if form == "json" else _PlainLine())
     before = []
     for name in LOGGERS:
         logger = logging.getLogger(name)

@@ -61,7 +61,7 @@ class ScenePointerMessage(_Message, tag=True):
     modifier: Modifier = None
 
 
-class SceneNodeClickMessage(_Message, tag=True):
+class _SceneNodeClickMessage(_Message, tag=True):
     """A click on a part."""
 
     name: Name
@@ -82,21 +82,21 @@ class TransformControlsUpdateMessage(_Message, tag=True):
     owner: Name = ""
 
 
-class TransformControlsDragStartMessage(_Message, tag=True):
+class _TransformControlsDragStartMessage(_Message, tag=True):
     """A gizmo is taken."""
 
     name: Name
     owner: Name = ""
 
 
-class TransformControlsDragEndMessage(_Message, tag=True):
+class _TransformControlsDragEndMessage(_Message, tag=True):
     """A gizmo is let go."""
 
     name: Name
     owner: Name = ""
 
 
-class ValueUpdate(msgspec.Struct, forbid_unknown_fields=True):
+class _ValueUpdate(msgspec.Struct, forbid_unknown_fields=True):
     """The only attribute of a widget that a browser sets."""
 
     value: Value
@@ -106,7 +106,7 @@ class GuiUpdateMessage(_Message, tag=True):
     """A widget has a new value."""
 
     uuid: Name
-    updates: ValueUpdate
+    updates: _ValueUpdate
 
 
 class CommandTriggerMessage(_Message, tag=True):
@@ -131,18 +131,18 @@ class _Tag(msgspec.Struct):
 Known = (
     ViewerCameraMessage
     | ScenePointerMessage
-    | SceneNodeClickMessage
+    | _SceneNodeClickMessage
     | TransformControlsUpdateMessage
-    | TransformControlsDragStartMessage
-    | TransformControlsDragEndMessage
+    | _TransformControlsDragStartMessage
+    | _TransformControlsDragEndMessage
     | GuiUpdateMessage
     | CommandTriggerMessage
     | GetRenderResponseMessage
 )
 FOR_HANDS = (
     TransformControlsUpdateMessage,
-    TransformControlsDragStartMessage,
-    TransformControlsDragEndMessage,
+    _TransformControlsDragStartMessage,
+    _TransformControlsDragEndMessage,
 )
 """Messages of someone who holds a tool; a viewer holds none."""
 
@@ -210,7 +210,7 @@ def _is_finite(content: object) -> bool:
         return math.isfinite(content)
     if isinstance(content, list | tuple):
         return all(_is_finite(part) for part in content)
-    return not isinstance(content, ValueUpdate) or _is_finite(content.value)
+    return not isinstance(content, _ValueUpdate) or _is_finite(content.value)
 
 
 TYPES = frozenset(kind.__name__ for kind in Known.__args__)

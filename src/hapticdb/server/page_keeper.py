@@ -30,7 +30,7 @@ class PageAwayError(HapticDBError):
     """The page process does not answer now; it may be starting again."""
 
 
-class MakesRequest(Protocol):
+class _MakesRequest(Protocol):
     """Makes the request of a page process, given the descriptors that it inherits."""
 
     def __call__(self, *, link: int, host: int) -> object:
@@ -51,7 +51,7 @@ class PageKeeper:
     """
 
     def __init__(
-        self, work: str, request: MakesRequest, serve_host: Callable[[socket.socket], None]
+        self, work: str, request: _MakesRequest, serve_host: Callable[[socket.socket], None]
     ) -> None:
         self._work, self._request, self._serve_host = work, request, serve_host
         self._process: Process | None = None

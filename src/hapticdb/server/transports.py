@@ -16,14 +16,14 @@ PROTOCOL_ERROR, POLICY = 1002, 1008
 """WebSocket close codes."""
 
 
-class PatientHttp(H11Protocol):
+class _PatientHttp(H11Protocol):
     """Begins every connection; cuts those that do not send each request in time.
 
     silent : connections whose next request has not come, the one that has waited longest first.
     """
 
     limits: ClassVar[Limits] = Limits()
-    silent: ClassVar[dict["PatientHttp", None]] = {}
+    silent: ClassVar[dict["_PatientHttp", None]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
         """Begin the time for the first request; let small messages leave at once."""
@@ -133,9 +133,9 @@ class StrictWebSocket(WebSocketsSansIOProtocol):
         self.transport.close()
 
 
-def limited(limits: Limits) -> tuple[type[PatientHttp], type[StrictWebSocket]]:
+def limited(limits: Limits) -> tuple[type[_PatientHttp], type[StrictWebSocket]]:
     """Protocols under these limits."""
     return (
-        type("LimitedHttp", (PatientHttp,), {"limits": limits, "silent": {}}),
+        type("LimitedHttp", (_PatientHttp,), {"limits": limits, "silent": {}}),
         type("LimitedWebSocket", (StrictWebSocket,), {"limits": limits}),
     )

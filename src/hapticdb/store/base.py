@@ -236,7 +236,7 @@ class Size(NamedTuple):
     band_bytes: int = 0
 
 
-class ReadsRows(Protocol):
+class _ReadsRows(Protocol):
     """Reads rows of the index table, in ascending order of key and id.
 
     Each call is one statement, but for `lookup_each`. Arrays of keys and of bounds are ascending,
@@ -260,7 +260,7 @@ class ReadsRows(Protocol):
         """Rows of one object with a key in any closed range, ascending and disjoint."""
 
 
-class ReadsObjects(Protocol):
+class _ReadsObjects(Protocol):
     """Reads objects and committed changes."""
 
     def revision(self) -> int:
@@ -282,7 +282,7 @@ class ReadsObjects(Protocol):
         """Committed writes after that revision, oldest first."""
 
 
-class WritesObjects(Protocol):
+class _WritesObjects(Protocol):
     """Writes objects, each in one transaction: its rows, its record and its `Change`.
 
     Rows with distances are written into both tables, and the object has distances from then on.
@@ -320,7 +320,7 @@ class WritesObjects(Protocol):
         """Make `Store.wants_distances` true from now on, for all who open the environment."""
 
 
-class KeepsStatistics(Protocol):
+class _KeepsStatistics(Protocol):
     """Knows how large the environment is and how its keys are distributed; keeps cost figures."""
 
     def size(self) -> Size:
@@ -342,7 +342,7 @@ class KeepsStatistics(Protocol):
         """Keep the fitted cost figures of a machine."""
 
 
-class Store(ReadsRows, ReadsObjects, WritesObjects, KeepsStatistics, Protocol):
+class Store(_ReadsRows, _ReadsObjects, _WritesObjects, _KeepsStatistics, Protocol):
     """An opened environment. Methods take and return whole batches.
 
     A store belongs to the thread that opened it. Reads outside `snapshot` see what is committed
@@ -400,7 +400,7 @@ class Store(ReadsRows, ReadsObjects, WritesObjects, KeepsStatistics, Protocol):
     def snapshot(self) -> AbstractContextManager[None]:
         """All reads inside see one committed revision."""
 
-    def checker(self) -> "Checker":
+    def checker(self) -> "_Checker":
         """The checks of this engine for `hapticdb check`."""
 
 
@@ -449,7 +449,7 @@ class HasGroupingThreshold(Protocol):
         """Least number of distinct keys; None if a lookup reads each leaf page only once anyway."""
 
 
-class Checker(Protocol):
+class _Checker(Protocol):
     """Answers of an engine for `hapticdb check`: pages, indexes, and all rows in their order."""
 
     def findings(self) -> Iterator[str]:
@@ -458,7 +458,7 @@ class Checker(Protocol):
     def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
         """At most `limit` rows after (key, id), ascending by both; (-1, 0) starts at the first.
 
-        With `distances`, rows of the table of distances, as `ReadsRows` says.
+        With `distances`, rows of the table of distances, as `_ReadsRows` says.
         """
 
 

@@ -133,7 +133,7 @@ class SupportsBackup(Protocol):
         """Put a copy in an environment's place, whole or not at all."""
 
 
-class BuiltIn(NamedTuple):
+class _BuiltIn(NamedTuple):
     """An engine of this package, not imported yet.
 
     module : its attribute `ENGINE` is the engine; driver : module that it needs and that may be
@@ -147,9 +147,9 @@ class BuiltIn(NamedTuple):
 
 FILE_SCHEME = "sqlite"
 """The engine of paths, which have no scheme."""
-POSTGRES = BuiltIn("hapticdb.store.postgres.engine", "psycopg", "hapticdb[postgres]")
+POSTGRES = _BuiltIn("hapticdb.store.postgres.engine", "psycopg", "hapticdb[postgres]")
 BUILT_IN = {
-    FILE_SCHEME: BuiltIn("hapticdb.store.sqlite.engine"),
+    FILE_SCHEME: _BuiltIn("hapticdb.store.sqlite.engine"),
     "postgresql": POSTGRES,
     "postgres": POSTGRES,
 }

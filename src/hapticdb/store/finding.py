@@ -112,7 +112,7 @@ class Listing:
         ]
 
     def _fitting(self, word: str) -> list[Object]:
-        return named_like(self._objects, word) or having_attribute(self._objects, word)
+        return _named_like(self._objects, word) or having_attribute(self._objects, word)
 
 
 def checked_words(words: Words, what: str = "objects") -> tuple[int | str, ...]:
@@ -153,7 +153,7 @@ def _object_of(store: Store, object_id: int) -> Object:
     return store.object(object_id)
 
 
-def named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
+def _named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
     """Objects that a name or pattern chooses, by the rules of `find_objects`, in their order."""
     pattern = pattern.rstrip("/") or pattern
     branches = [_branches(obj.name, is_path="/" in pattern) for obj in objects]
@@ -176,9 +176,9 @@ def _nothing_like(word: str, objects: Sequence[Object], url: str) -> ObjectNotFo
     """Build the error for a name or pattern that fits nothing."""
     folded = [replace(obj, name=obj.name.casefold()) for obj in objects]
     names = {obj.id: obj.name for obj in objects}
-    if alike := named_like(folded, word.casefold()):
+    if alike := _named_like(folded, word.casefold()):
         hint = f", where case counts: there is {names[alike[0].id]!r}"
-    elif word.strip("*/ ") and (alike := named_like(folded, f"*{word.strip('*/ ').casefold()}*")):
+    elif word.strip("*/ ") and (alike := _named_like(folded, f"*{word.strip('*/ ').casefold()}*")):
         hint = f", but {names[alike[0].id]!r}" + (f" and {len(alike) - 1} more" * (len(alike) > 1))
     else:
         hint = attribute_hint(objects, word)

@@ -35,7 +35,7 @@ Dialect = Mapping[str, tuple[str, ...]]
 """Statements of each step of `STEPS` by its name; empty where an engine needs none."""
 
 
-class Migration(NamedTuple):
+class _Migration(NamedTuple):
     """A step in the words of one engine: the version that it leads to, and its statements."""
 
     version: int
@@ -43,9 +43,9 @@ class Migration(NamedTuple):
     readers_need_it: bool
 
 
-def migrations_after(version: int, dialect: Dialect) -> list[Migration]:
+def migrations_after(version: int, dialect: Dialect) -> list[_Migration]:
     """Steps that an environment of that format lacks, in their order."""
     return [
-        Migration(number, dialect[step.name], step.readers_need_it)
+        _Migration(number, dialect[step.name], step.readers_need_it)
         for number, step in enumerate(STEPS[version:], start=version + 1)
     ]

@@ -43,7 +43,7 @@ AT_ONCE = 1 << 17
 """Pieces looked at together. Larger: more memory."""
 
 
-class Border(NamedTuple):
+class _Border(NamedTuple):
     """Pieces of a surface that may be border of the solid, P of them.
 
     pieces : their middles, radii, triangles and sources; is_sure (P,): whether all of the piece is
@@ -59,7 +59,7 @@ class Border(NamedTuple):
 
 def border_of(
     surface: Surface, interior: Interior, pieces: Cut, finest: float, most: int
-) -> Border:
+) -> _Border:
     """Border of the solid of several closed bodies.
 
     pieces : all of the surface; finest : metres, radius at which an open piece is not cut any more;
@@ -89,7 +89,7 @@ def border_of(
     # between a place inside and one outside there is a place of the border
     sides_of = [interior.bodies_around(middles + way, None, LINES) > 0 for way in (aside, -aside)]
     across = sides_of[0] != sides_of[1]
-    return Border(found, is_sure, middles[across], unsure)
+    return _Border(found, is_sure, middles[across], unsure)
 
 
 def split_bodies(surface: Surface) -> Surface | None:

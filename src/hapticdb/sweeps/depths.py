@@ -249,8 +249,8 @@ class DepthSearch:
             why = "neither its surface nor the tool's is closed, so nothing has an inside"
             return _unknown(obj, self._allowed, why), ()
         try:
-            into, into_pieces = self._greatest(other, tool, to_world, steps)
-            back, back_pieces = self._greatest(tool, other, to_tool, steps)
+            into, into_pieces = self._greatest(other, tool, _to_world, steps)
+            back, back_pieces = self._greatest(tool, other, _to_tool, steps)
         except _TooMuchError:
             why = "the contact is too large or too long to bound it"
             return _unknown(obj, self._allowed, why), ()
@@ -336,11 +336,11 @@ class DepthSearch:
             raise _TooMuchError
 
 
-def to_world(places: Floats, pose: Floats) -> Floats:
+def _to_world(places: Floats, pose: Floats) -> Floats:
     """Places (n, 3) of the tool, in the world."""
     return np.asarray(places @ pose[:3, :3].T + pose[:3, 3])
 
 
-def to_tool(places: Floats, pose: Floats) -> Floats:
+def _to_tool(places: Floats, pose: Floats) -> Floats:
     """Places (n, 3) of the world, in the tool's frame."""
     return np.asarray((places - pose[:3, 3]) @ pose[:3, :3])

@@ -22,7 +22,7 @@ PLACES = {1: (20, 20, 20), 2: (24, 20, 20), 3: (28, 24, 20)}
 Content = dict[tuple[int, int], tuple[bytes, bytes]]
 
 
-def content_of(rows: Rows, object_id: int | None = None) -> Content:
+def _content_of(rows: Rows, object_id: int | None = None) -> Content:
     """Occupancy and packed distances of rows by key and id, which must ascend and be distinct."""
     assert rows.distances is not None
     ids = rows.ids.tolist() if object_id is None else [object_id] * len(rows)
@@ -37,7 +37,7 @@ def content_of(rows: Rows, object_id: int | None = None) -> Content:
     }
 
 
-def is_touched(change: Change, row_keys: Keys) -> bool:
+def _is_touched(change: Change, row_keys: Keys) -> bool:
     """Whether all voxels of these bricks lie in ranges of a change."""
     lows, shift = change.ranges[:, 0], row_shift("brick")
     at = np.searchsorted(lows, row_keys << shift, side="right") - 1
@@ -73,19 +73,19 @@ class DistancesContract(StoreCase):
         """Content of the table of distances, in the order of its rows."""
         found: Content = {}
         for object_id in object_ids:
-            found |= content_of(self.rows(store, object_id), object_id)
+            found |= _content_of(self.rows(store, object_id), object_id)
         return dict(sorted(found.items()))
 
     def test_scans_return_distances_and_occupancy_as_written(self, band: Store) -> None:
         """A brick without a voxel has zeros. Objects without distances have no rows."""
         everything = self.expected(band, 1, 3)
-        assert content_of(band.scan(*EVERYWHERE, distances=True)) == everything
+        assert _content_of(band.scan(*EVERYWHERE, distances=True)) == everything
         assert any(not any(brick) for brick, _ in everything.values())
         keys = np.array(sorted({key for key, _ in everything}), dtype=np.int64)
         lows, highs = keys[::5].copy(), keys[2::5].copy()
         lows = lows[: len(highs)].copy()
         inside = [range(lo, hi + 1) for lo, hi in zip(lows.tolist(), highs.tolist(), strict=True)]
-        assert content_of(band.scan(lows, highs, distances=True)) == {
+        assert _content_of(band.scan(lows, highs, distances=True)) == {
             place: row for place, row in everything.items() if any(place[0] in r for r in inside)
         }
 
@@ -94,15 +94,15 @@ class DistancesContract(StoreCase):
         everything = self.expected(band, 1, 3)
         keys = np.arange(0, max(key for key, _ in everything) + 3, dtype=np.int64)[::3].copy()
         wanted = {place: row for place, row in everything.items() if place[0] % 3 == 0}
-        assert content_of(band.lookup(keys, distances=True)) == wanted
-        assert content_of(band.lookup_each(keys, distances=True)) == wanted
+        assert _content_of(band.lookup(keys, distances=True)) == wanted
+        assert _content_of(band.lookup_each(keys, distances=True)) == wanted
 
     def test_rows_of_one_object_have_its_distances(self, band: Store) -> None:
         """The objects overlap."""
         for object_id in (1, 3):
             rows = band.rows_of(object_id, *EVERYWHERE, distances=True)
-            assert content_of(rows) == self.expected(band, object_id)
-        assert content_of(band.rows_of(2, *EVERYWHERE, distances=True)) == {}
+            assert _content_of(rows) == self.expected(band, object_id)
+        assert _content_of(band.rows_of(2, *EVERYWHERE, distances=True)) == {}
 
     def test_without_distances_reads_are_those_of_the_index_table(self, band: Store) -> None:
         """So are counts and statistics: a brick without a voxel has no row there."""
@@ -134,7 +134,7 @@ class DistancesContract(StoreCase):
             band.scan(NO_KEYS, NO_KEYS, distances=True),
             band.rows_of(1, NO_KEYS, NO_KEYS, distances=True),
         ):
-            assert content_of(empty) == {}
+            assert _content_of(empty) == {}
 
     def test_objects_say_whether_they_have_distances(self, band: Store) -> None:
         """Their checksums are those of the rows; an empty brick does not count as a row."""
@@ -147,21 +147,21 @@ class DistancesContract(StoreCase):
 
     def test_a_refused_write_leaves_no_distances(self, band: Store) -> None:
         """Both tables are written in one transaction."""
-        before = content_of(band.scan(*EVERYWHERE, distances=True))
+        before = _content_of(band.scan(*EVERYWHERE, distances=True))
         with pytest.raises(EnvironmentExistsError):
             self.write(band, 3, name="1")
-        assert content_of(band.scan(*EVERYWHERE, distances=True)) == before
+        assert _content_of(band.scan(*EVERYWHERE, distances=True)) == before
         assert band.revision() == 3
 
     def test_distances_go_with_their_object(self, band: Store) -> None:
         """The others stay. The change tells of all bricks that had distances."""
         band.remove(1, covering(band))
-        assert content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
+        assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
         band.remove(2, covering(band))
-        assert content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
+        assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
         for change in band.changes():
             if change.id != 2:
-                assert is_touched(change, self.rows(band, change.id).keys)
+                assert _is_touched(change, self.rows(band, change.id).keys)
 
     def test_replacing_gives_distances_and_takes_them(self, band: Store) -> None:
         """Rows without distances leave none of the former rows. The voxels stay the same."""
@@ -172,10 +172,10 @@ class DistancesContract(StoreCase):
             has_distances = new.distances is not None
             assert band.object(1).has_distances == has_distances
             wanted = self.expected(band, *([1, 3] if has_distances else [3]))
-            assert content_of(band.scan(*EVERYWHERE, distances=True)) == wanted
+            assert _content_of(band.scan(*EVERYWHERE, distances=True)) == wanted
             for found, column in zip(band.rows_of(1, *EVERYWHERE), voxels, strict=True):
                 np.testing.assert_array_equal(found, column)
-            assert is_touched(list(band.changes())[-1], rows.keys)
+            assert _is_touched(list(band.changes())[-1], rows.keys)
 
     def test_distances_are_added_to_an_object_without_any(self, band: Store) -> None:
         """Its voxels stay, and it can be removed. Other writes of it in between are conflicts."""
@@ -186,20 +186,20 @@ class DistancesContract(StoreCase):
             band.add_distances(replace(known, revision=1), union)
         band.add_distances(known, union)
         assert list(band.changes())[-1].action == "move"
-        assert is_touched(list(band.changes())[-1], union.keys)
+        assert _is_touched(list(band.changes())[-1], union.keys)
         found = band.object(1)
         assert found.revision == band.revision() == known.revision + 1
         assert (found.rows_crc, found.distances_crc) == (
             known.rows_crc,
             believed.distances_crc(union),
         )
-        assert content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 1, 3)
+        assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 1, 3)
         for column, was in zip(band.scan(*EVERYWHERE), voxels, strict=True):
             np.testing.assert_array_equal(column, was)
         with pytest.raises(ConflictError, match="has distances already"):
             band.add_distances(found, union)
         band.remove(1, covering(band))
-        assert content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
+        assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
 
     def test_a_snapshot_sees_the_distances_of_one_revision(self, band: Store) -> None:
         """A removal and an addition by another connection come after it."""
@@ -209,11 +209,11 @@ class DistancesContract(StoreCase):
             lambda: reader.lookup(self.rows(band, 1).keys, distances=True),
         ]
         with reader.snapshot():
-            before = [content_of(read()) for read in reads]
+            before = [_content_of(read()) for read in reads]
             band.remove(1, covering(band))
             self.write(band, 1)
-            assert [content_of(read()) for read in reads] == before
-        assert {object_id for _, object_id in content_of(reads[0]())} == {3, 4}
+            assert [_content_of(read()) for read in reads] == before
+        assert {object_id for _, object_id in _content_of(reads[0]())} == {3, 4}
         reader.close()
 
     def test_loading_ends_as_single_writes_do(self, band: Store) -> None:
@@ -222,10 +222,10 @@ class DistancesContract(StoreCase):
         with contextlib.suppress(ZeroDivisionError), fresh.loading():
             for object_id in PLACES:
                 self.write(fresh, object_id)
-            loaded = content_of(fresh.scan(*EVERYWHERE, distances=True))
+            loaded = _content_of(fresh.scan(*EVERYWHERE, distances=True))
             raise ZeroDivisionError
-        assert loaded == content_of(fresh.scan(*EVERYWHERE, distances=True))
-        assert loaded == content_of(band.scan(*EVERYWHERE, distances=True))
+        assert loaded == _content_of(fresh.scan(*EVERYWHERE, distances=True))
+        assert loaded == _content_of(band.scan(*EVERYWHERE, distances=True))
 
     def test_all_rows_are_read_in_pieces_for_check(self, band: Store) -> None:
         """The pieces together are what a scan returns."""
@@ -234,13 +234,13 @@ class DistancesContract(StoreCase):
         while len(rows := checker.rows_after(key, object_id, 7, distances=True)):
             assert len(rows) <= 7
             key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
-            found.update(content_of(rows))
+            found.update(_content_of(rows))
         assert found == self.expected(band, 1, 3)
 
     def test_a_wish_for_distances_stays(self, store: Store) -> None:
         """The layout voxel has none, and refuses the wish."""
         assert not store.wants_distances
-        assert content_of(store.scan(*EVERYWHERE, distances=True)) == {}
+        assert _content_of(store.scan(*EVERYWHERE, distances=True)) == {}
         if store.layout == "voxel":
             with pytest.raises(UsageError, match="the layout voxel has no distances"):
                 store.want_distances()

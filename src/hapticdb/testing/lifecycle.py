@@ -33,7 +33,7 @@ ANSWER_S = 60.0
 Result = TypeVar("Result")
 
 
-def in_another_thread(call: Callable[[], Result]) -> Result:
+def _in_another_thread(call: Callable[[], Result]) -> Result:
     """Run a call in a thread of its own; returns its result or raises its error."""
     with ThreadPoolExecutor(1) as threads:
         return threads.submit(call).result(ANSWER_S)
@@ -69,7 +69,7 @@ class LifecycleContract(StoreCase):
     def test_a_store_belongs_to_the_thread_that_opened_it(self, store: Store) -> None:
         """Another thread is refused, and the first can go on."""
         with pytest.raises(UsageError, match="belongs to the thread that opened it"):
-            in_another_thread(store.objects)
+            _in_another_thread(store.objects)
         assert len(store.objects()) == 2
 
     def test_a_store_is_handed_from_thread_to_thread(self, store: Store) -> None:
@@ -85,7 +85,7 @@ class LifecycleContract(StoreCase):
             store.give_to(NOBODY)
             return found
 
-        for found, wanted in zip(in_another_thread(borrowed), expected, strict=True):
+        for found, wanted in zip(_in_another_thread(borrowed), expected, strict=True):
             np.testing.assert_array_equal(found, wanted)
         store.give_to(this_thread())
         assert len(store.objects()) == 2

@@ -87,23 +87,23 @@ DISTANCE_FIELD = fields_of(DistanceFieldLaw, FLOAT)
 
 
 @leaf
-def distance_between(q000, q001, q010, q011, q100, q101, q110, q111, x, y, z):
+def _distance_between(q000, q001, q010, q011, q100, q101, q110, q111, x, y, z):
     """Distance u, voxels, between 8 stored values, at most `STEPS`; x, y, z from centre 000."""
     return VOXELS_A_STEP * trilinear(q000, q001, q010, q011, q100, q101, q110, q111, x, y, z)
 
 
-def least_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001
+def _least_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001
     """U at a point, in voxels from the grid's origin, from rows first .. end - 1 of its brick.
 
     payload (R, 1000) uint8; rows that do not count are left out; h without a row.
     """
-    return least_of_brick(
+    return _least_of_brick(
         payload, counts, first, end, x, y, z, np.int64(x) & -8, np.int64(y) & -8, np.int64(z) & -8
     )
 
 
 @inlined
-def least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
+def _least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
     """U at a point in, or under 1/2 voxel beside, the brick whose first voxel is (i, j, k)."""
     x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
     at = row_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k)
@@ -118,7 +118,7 @@ def least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
             q101 = min(q101, np.int64(payload[row, at + ROW_SIDE * ROW_SIDE + 1]))
             q110 = min(q110, np.int64(payload[row, at + ROW_SIDE * (ROW_SIDE + 1)]))
             q111 = min(q111, np.int64(payload[row, at + ROW_SIDE * (ROW_SIDE + 1) + 1]))
-    return distance_between(
+    return _distance_between(
         q000, q001, q010, q011, q100, q101, q110, q111, x - 0.5 - x0, y - 0.5 - y0, z - 0.5 - z0
     )
 
@@ -129,7 +129,7 @@ def depth_and_weight(sample, size):
     return size * (ONSET - sample), min(max((REACH - sample) / BLENDING, 0.0), 1.0)
 
 
-def below_onset(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # noqa: ARG001
+def _below_onset(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # noqa: ARG001
     """Depth below the onset in metres, negative above it, and the weight in the average."""
     return depth_and_weight(sample, size)
 
@@ -140,21 +140,21 @@ def agreement(sample, ahead):
     return min(max((ahead - sample) / (AHEAD * FULL_SLOPE), 0.0), 1.0)
 
 
-def share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
+def _share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
     """How far the normal agrees with the distances of rows first .. end - 1, 0 to 1."""
-    ahead = least_of_brick(
+    ahead = _least_of_brick(
         payload, counts, first, end, x + AHEAD * nx, y + AHEAD * ny, z + AHEAD * nz,
         np.int64(x) & -8, np.int64(y) & -8, np.int64(z) & -8,
     )  # fmt: skip
     return agreement(sample, ahead)
 
 
-def reach_of(law):  # noqa: ARG001
+def _reach_of(law):  # noqa: ARG001
     """Distance up to which a point counts, voxels."""
     return REACH
 
 
-def felt_within_of(law):  # noqa: ARG001
+def _felt_within_of(law):  # noqa: ARG001
     """Distance from all voxels from which on nothing is felt: no surface lies nearer than these."""
     return FELT_WITHIN
 
@@ -162,10 +162,10 @@ def felt_within_of(law):  # noqa: ARG001
 define(
     DistanceFieldLaw,
     Leaves(
-        respond=below_onset,
-        reach=reach_of,
-        felt_within=felt_within_of,
-        sample_rows=least_of_rows,
-        share_rows=share_of_rows,
+        respond=_below_onset,
+        reach=_reach_of,
+        felt_within=_felt_within_of,
+        sample_rows=_least_of_rows,
+        share_rows=_share_of_rows,
     ),
 )

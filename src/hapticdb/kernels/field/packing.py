@@ -55,7 +55,7 @@ LOWEST_BIT = np.array([max((m & -m).bit_length() - 1, 0) for m in range(1 << ROW
 
 
 @leaf
-def put_bits(out, at, held, n_held, value, n):
+def _put_bits(out, at, held, n_held, value, n):
     """Append the n bits of value to the bits held; whole bytes go to out from place `at` on."""
     held |= value << n_held
     n_held += n
@@ -68,19 +68,19 @@ def put_bits(out, at, held, n_held, value, n):
 
 
 @leaf
-def place_padded(line):
+def _place_padded(line):
     """Index of a line's first value in a padded row (11^3)."""
     return ((line // ROW_SIDE + 1) * PADDED + line % ROW_SIDE + 1) * PADDED + 1
 
 
 @leaf
-def set_residuals(values, n, padded, residuals):
+def _set_residuals(values, n, padded, residuals):
     """Set the residuals of row n of values (R, 1000), in the layout of `padded`.
 
     padded, residuals (11^3,) uint8. One loop without branches, which LLVM computes in vectors.
     """
     for line in range(LINES):
-        to = place_padded(line)
+        to = _place_padded(line)
         for z in range(ROW_SIDE):
             padded[to + z] = values[n, line * ROW_SIDE + z]
     y, x = PADDED, PADDED * PADDED
@@ -92,10 +92,10 @@ def set_residuals(values, n, padded, residuals):
 
 
 @leaf
-def set_masks(residuals, masks):
+def _set_masks(residuals, masks):
     """Set the mask of each line, masks (100,) int64."""
     for line in range(LINES):
-        at = place_padded(line)
+        at = _place_padded(line)
         mask = np.int64(0)
         for z in range(ROW_SIDE):
             mask |= np.int64(residuals[at + z] != 0) << z
@@ -103,21 +103,21 @@ def set_masks(residuals, masks):
 
 
 @leaf
-def put_mask(out, at, held, n_held, mask, back, up):
+def _put_mask(out, at, held, n_held, mask, back, up):
     """Append a line's mask, given those of the plane before and of the line before."""
     if mask == back:
-        return put_bits(out, at, held, n_held, np.int64(0), np.int64(1))
+        return _put_bits(out, at, held, n_held, np.int64(0), np.int64(1))
     if back == up:
-        return put_bits(out, at, held, n_held, (mask << 1) | 1, np.int64(11))
+        return _put_bits(out, at, held, n_held, (mask << 1) | 1, np.int64(11))
     if mask == up:
-        return put_bits(out, at, held, n_held, np.int64(1), np.int64(2))
-    return put_bits(out, at, held, n_held, (mask << 2) | 3, np.int64(12))
+        return _put_bits(out, at, held, n_held, np.int64(1), np.int64(2))
+    return _put_bits(out, at, held, n_held, (mask << 2) | 3, np.int64(12))
 
 
 @leaf
-def put_residuals(out, at, held, n_held, residuals, line, mask):
+def _put_residuals(out, at, held, n_held, residuals, line, mask):
     """Append the residuals of a line that its mask names."""
-    first, z = place_padded(line), np.int64(0)
+    first, z = _place_padded(line), np.int64(0)
     while mask >> z:
         if (mask >> z) & 1:
             residual = np.int64(residuals[first + z])
@@ -126,13 +126,13 @@ def put_residuals(out, at, held, n_held, residuals, line, mask):
             while number >> (n + 1):
                 n += 1
             code = n | ((number - (1 << n)) << 3)
-            at, held, n_held = put_bits(out, at, held, n_held, code, n + 3)
+            at, held, n_held = _put_bits(out, at, held, n_held, code, n + 3)
         z += 1
     return at, held, n_held
 
 
 @leaf
-def is_like_before(masks, first):
+def _is_like_before(masks, first):
     """Whether the masks of the plane from line `first` on are those of the plane before."""
     for line in range(first, first + ROW_SIDE):
         if masks[line] != (masks[line - ROW_SIDE] if first else 0):
@@ -141,20 +141,20 @@ def is_like_before(masks, first):
 
 
 @leaf
-def pack_row(masks, residuals, out, at):
+def _pack_row(masks, residuals, out, at):
     """Write the packed bytes of a row to out from `at` on; return where they end."""
     held, n_held = np.int64(0), np.int64(0)
     for first in range(0, LINES, ROW_SIDE):
-        is_same = is_like_before(masks, first)
-        at, held, n_held = put_bits(out, at, held, n_held, np.int64(is_same), np.int64(1))
+        is_same = _is_like_before(masks, first)
+        at, held, n_held = _put_bits(out, at, held, n_held, np.int64(is_same), np.int64(1))
         up = np.int64(0)
         for line in range(first, first + ROW_SIDE):
             mask = masks[line]
             if not is_same:
                 back = masks[line - ROW_SIDE] if first else np.int64(0)
-                at, held, n_held = put_mask(out, at, held, n_held, mask, back, up)
+                at, held, n_held = _put_mask(out, at, held, n_held, mask, back, up)
             if mask:
-                at, held, n_held = put_residuals(out, at, held, n_held, residuals, line, mask)
+                at, held, n_held = _put_residuals(out, at, held, n_held, residuals, line, mask)
             up = mask
     if n_held:
         out[at] = held
@@ -174,15 +174,15 @@ def pack_kernel(values, first, ends, out):
     masks = np.empty(LINES, np.int64)
     at = np.int64(0)
     for n in range(ends.shape[0]):
-        set_residuals(values, first + n, padded, residuals)
-        set_masks(residuals, masks)
-        at = pack_row(masks, residuals, out, at)
+        _set_residuals(values, first + n, padded, residuals)
+        _set_masks(residuals, masks)
+        at = _pack_row(masks, residuals, out, at)
         ends[n] = at
     return at
 
 
 @leaf
-def bits_at(row, at):
+def _bits_at(row, at):
     """Return 25 bits or more of a row's bytes from bit `at` on. Reads 4 bytes."""
     byte = at >> np.uint64(3)
     word = np.uint64(row[byte]) | (np.uint64(row[byte + ONE]) << np.uint64(8))
@@ -198,9 +198,9 @@ def added(a, b):
 
 
 @leaf
-def take_mask(row, at, back, up):
+def _take_mask(row, at, back, up):
     """Return a line's mask and the bit behind its code."""
-    word = bits_at(row, at)
+    word = _bits_at(row, at)
     if not word & ONE:
         return back, at + ONE
     if back == up:
@@ -217,7 +217,7 @@ def below(word, n):
 
 
 @leaf
-def take_line(row, at, mask):
+def _take_line(row, at, mask):
     """Read the residuals of a line that its mask names, and sum them up along the line.
 
     Returns the sums in bytes, 8 in the first word and 2 in the second, and the bit behind.
@@ -226,7 +226,7 @@ def take_line(row, at, mask):
     while mask:
         z = np.uint64(LOWEST_BIT[mask])
         mask &= mask - ONE
-        word = bits_at(row, at)
+        word = _bits_at(row, at)
         n = word & np.uint64(7)
         number = (ONE << n) | below(word >> np.uint64(3), n)
         at += n + np.uint64(3)
@@ -244,7 +244,7 @@ def take_line(row, at, mask):
 
 
 @leaf
-def put_line(out, n, at, low, high):
+def _put_line(out, n, at, low, high):
     """Write a line's values to row n of out."""
     for z in range(np.uint64(8)):
         out[n, at + z] = low >> (z << np.uint64(3)) & np.uint64(255)
@@ -253,7 +253,7 @@ def put_line(out, n, at, low, high):
 
 
 @leaf
-def unpack_row(row, masks, lines, out, n):
+def _unpack_row(row, masks, lines, out, n):
     """Unpack the bytes in `row` into row n of out (R, 1000); return how many bits they were.
 
     masks (10,) and lines (20,) uint64 are the last plane's masks and values. All numbers are
@@ -264,7 +264,7 @@ def unpack_row(row, masks, lines, out, n):
         lines[2 * y], lines[2 * y + 1] = ALL_BEYOND, ALL_BEYOND
     at = place = some = NONE
     for _ in range(ROW_SIDE):
-        is_same = bits_at(row, at) & ONE
+        is_same = _bits_at(row, at) & ONE
         at += ONE
         has_residuals = some or not is_same  # else the plane is the one before
         up = some = NONE
@@ -272,15 +272,15 @@ def unpack_row(row, masks, lines, out, n):
         for y in range(ROW_SIDE):
             if has_residuals:
                 if not is_same:
-                    up, at = take_mask(row, at, masks[y], up)
+                    up, at = _take_mask(row, at, masks[y], up)
                     masks[y] = up
                 if masks[y]:
                     some |= masks[y]
-                    low_more, high_more, at = take_line(row, at, masks[y])
+                    low_more, high_more, at = _take_line(row, at, masks[y])
                     low, high = added(low, low_more), added(high, high_more)
                 lines[2 * y] = added(lines[2 * y], low)
                 lines[2 * y + 1] = added(lines[2 * y + 1], high)
-            put_line(out, n, place, lines[2 * y], lines[2 * y + 1])
+            _put_line(out, n, place, lines[2 * y], lines[2 * y + 1])
             place += np.uint64(ROW_SIDE)
     return np.int64(at)
 
@@ -300,7 +300,7 @@ def unpack_rows(data, ends, wanted, out):
             continue
         for byte in range(size):
             row[byte] = data[start + byte]
-        n_bits = unpack_row(row, masks, lines, out, np.uint64(n))
+        n_bits = _unpack_row(row, masks, lines, out, np.uint64(n))
         if (n_bits + 7) >> 3 != size or np.int64(row[size - 1]) >> (((n_bits - 1) & 7) + 1):
             return n
     return -1

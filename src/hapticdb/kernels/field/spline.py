@@ -30,19 +30,19 @@ ALONG_I, ALONG_J = CELL_SIDE * CELL_SIDE, CELL_SIDE
 
 
 @leaf
-def spline_weights(t):
+def _spline_weights(t):
     """Weights of the centres before, at and after a point at t from the middle one, |t| <= 1/2."""
     return 0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)
 
 
 @leaf
-def from_center(x):
+def _from_center(x):
     """Way from the centre of the voxel that holds a coordinate to it, voxels, -1/2 to 1/2."""
     return x - np.floor(x) - 0.5
 
 
 @inlined
-def line_of_three(payload, slot, at, before, here, after, t):
+def _line_of_three(payload, slot, at, before, here, after, t):
     """Value and slope along k at three centres from index `at` on, in steps."""
     first = float(min(payload[slot, at], STEPS))
     second = float(min(payload[slot, at + 1], STEPS))
@@ -53,11 +53,11 @@ def line_of_three(payload, slot, at, before, here, after, t):
 
 
 @inlined
-def plane_of_nine(payload, slot, at, by, hy, ay, ty, bz, hz, az, tz):
+def _plane_of_nine(payload, slot, at, by, hy, ay, ty, bz, hz, az, tz):
     """Value and slopes along j and k at nine centres of one i, in steps."""
-    v0, z0 = line_of_three(payload, slot, at, bz, hz, az, tz)
-    v1, z1 = line_of_three(payload, slot, at + ALONG_J, bz, hz, az, tz)
-    v2, z2 = line_of_three(payload, slot, at + 2 * ALONG_J, bz, hz, az, tz)
+    v0, z0 = _line_of_three(payload, slot, at, bz, hz, az, tz)
+    v1, z1 = _line_of_three(payload, slot, at + ALONG_J, bz, hz, az, tz)
+    v2, z2 = _line_of_three(payload, slot, at + 2 * ALONG_J, bz, hz, az, tz)
     value = by * v0 + hy * v1 + ay * v2
     along_j = (ty - 0.5) * v0 - 2.0 * ty * v1 + (ty + 0.5) * v2
     return value, along_j, by * z0 + hy * z1 + ay * z2
@@ -69,14 +69,14 @@ def spline(payload, slot, x, y, z):
 
     (x, y, z): the point in voxels from the grid's origin. What is beyond the band counts as h.
     """
-    tx, ty, tz = from_center(x), from_center(y), from_center(z)
-    bx, hx, ax = spline_weights(tx)
-    by, hy, ay = spline_weights(ty)
-    bz, hz, az = spline_weights(tz)
+    tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
+    bx, hx, ax = _spline_weights(tx)
+    by, hy, ay = _spline_weights(ty)
+    bz, hz, az = _spline_weights(tz)
     at = cell_place((np.int64(x) & 31) - 1, (np.int64(y) & 31) - 1, (np.int64(z) & 31) - 1)
-    v0, y0, z0 = plane_of_nine(payload, slot, at, by, hy, ay, ty, bz, hz, az, tz)
-    v1, y1, z1 = plane_of_nine(payload, slot, at + ALONG_I, by, hy, ay, ty, bz, hz, az, tz)
-    v2, y2, z2 = plane_of_nine(payload, slot, at + 2 * ALONG_I, by, hy, ay, ty, bz, hz, az, tz)
+    v0, y0, z0 = _plane_of_nine(payload, slot, at, by, hy, ay, ty, bz, hz, az, tz)
+    v1, y1, z1 = _plane_of_nine(payload, slot, at + ALONG_I, by, hy, ay, ty, bz, hz, az, tz)
+    v2, y2, z2 = _plane_of_nine(payload, slot, at + 2 * ALONG_I, by, hy, ay, ty, bz, hz, az, tz)
     u = VOXELS_A_STEP * (bx * v0 + hx * v1 + ax * v2)
     gx = VOXELS_A_STEP * ((tx - 0.5) * v0 - 2.0 * tx * v1 + (tx + 0.5) * v2)
     gy = VOXELS_A_STEP * (bx * y0 + hx * y1 + ax * y2)
@@ -104,10 +104,10 @@ def weighted(payload, slot, at, bx, hx, ax, by, hy, ay, bz, hz, az):
 @inlined
 def second_derivatives(payload, slot, x, y, z):
     """Second derivatives of the spline at a point, as in `spline`: xx, yy, zz, xy, xz, yz."""
-    tx, ty, tz = from_center(x), from_center(y), from_center(z)
-    bx, hx, ax = spline_weights(tx)
-    by, hy, ay = spline_weights(ty)
-    bz, hz, az = spline_weights(tz)
+    tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
+    bx, hx, ax = _spline_weights(tx)
+    by, hy, ay = _spline_weights(ty)
+    bz, hz, az = _spline_weights(tz)
     sx, sy, sz = tx - 0.5, ty - 0.5, tz - 0.5  # slopes: t - 1/2, -2 t, t + 1/2
     at = cell_place((np.int64(x) & 31) - 1, (np.int64(y) & 31) - 1, (np.int64(z) & 31) - 1)
     xx = weighted(payload, slot, at, 1.0, -2.0, 1.0, by, hy, ay, bz, hz, az)
@@ -122,7 +122,7 @@ def second_derivatives(payload, slot, x, y, z):
 @inlined
 def lower_bound(payload, slot, x, y, z):
     """Voxels: no surface is nearer to a point of the slot's cell, by the 8 centres around it."""
-    tx, ty, tz = from_center(x), from_center(y), from_center(z)
+    tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
     at = cell_place(
         (np.int64(x) & 31) - np.int64(tx < 0.0),
         (np.int64(y) & 31) - np.int64(ty < 0.0),
@@ -149,7 +149,7 @@ def upper_bound(payload, slot, x, y, z):
 
     Infinite if all of them are farther than h from every surface.
     """
-    tx, ty, tz = from_center(x), from_center(y), from_center(z)
+    tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
     at = cell_place(
         (np.int64(x) & 31) - np.int64(tx < 0.0),
         (np.int64(y) & 31) - np.int64(ty < 0.0),
@@ -172,14 +172,14 @@ def upper_bound(payload, slot, x, y, z):
 @inlined
 def nearest_bound(payload, slot, x, y, z):
     """As `lower_bound`, by the nearest centre alone: lower, and a third of the time."""
-    tx, ty, tz = from_center(x), from_center(y), from_center(z)
+    tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
     at = cell_place(np.int64(x) & 31, np.int64(y) & 31, np.int64(z) & 31)
     u = min(payload[slot, at], STEPS) * VOXELS_A_STEP
     return max(u - math.sqrt(tx * tx + ty * ty + tz * tz) - 0.5 * VOXELS_A_STEP, 0.0)
 
 
 @leaf
-def depth_in_block(x, y, z, bits):
+def _depth_in_block(x, y, z, bits):
     """Way from a point to the border of its block of (1 << bits)^3 voxels, voxels."""
     side = float(1 << bits)
     x, y, z = x % side, y % side, z % side
@@ -189,4 +189,4 @@ def depth_in_block(x, y, z, bits):
 @leaf
 def bound_in_free_block(x, y, z, bits):
     """Lower bound of the distance in a block whose centres, and those around it, are BEYOND."""
-    return depth_in_block(x, y, z, bits) + 0.5 + FREE_BEYOND
+    return _depth_in_block(x, y, z, bits) + 0.5 + FREE_BEYOND

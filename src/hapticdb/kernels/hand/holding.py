@@ -66,9 +66,9 @@ def share_of_wrench(terms, tool, hand, is_held, dt):
     faded = 0.0
     if is_held:
         tool.held_for += dt
-        faded = faded_share(terms, tool.held_for)
+        faded = _faded_share(terms, tool.held_for)
     else:
-        tool.risen *= 1.0 - faded_share(terms, tool.held_for)
+        tool.risen *= 1.0 - _faded_share(terms, tool.held_for)
         tool.held_for = 0.0
         if not hand.is_open:
             tool.risen = min(tool.risen + min(passed, 1.0 / RISE_FRAMES), 1.0)
@@ -78,6 +78,6 @@ def share_of_wrench(terms, tool, hand, is_held, dt):
 
 
 @leaf
-def faded_share(terms, seconds):
+def _faded_share(terms, seconds):
     """Share, 0 to 1, by which a wrench has faded that was kept for so many seconds."""
     return min(max((seconds - terms.hold) / terms.fade, 0.0), 1.0)

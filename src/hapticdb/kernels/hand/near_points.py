@@ -90,7 +90,7 @@ def clamped_into(x, side):
 
 
 @leaf
-def outside_grid(u, gx, gy, gz, bound, dx, dy, dz):
+def _outside_grid(u, gx, gy, gz, bound, dx, dy, dz):
     """Distance, gradient and bound at a point outside the grid, from those where it was clamped to.
 
     (dx, dy, dz): the way out, voxels. All surfaces are in the grid, so the way out adds to u.
@@ -115,7 +115,7 @@ def distance_at(payload, slot, mask, x, y, z, dx, dy, dz):
     else:
         bound = bound_in_free_block(x, y, z, 5 if slot == EMPTY_SLOT else 3)
     if dx != 0.0 or dy != 0.0 or dz != 0.0:
-        u, gx, gy, gz, bound = outside_grid(u, gx, gy, gz, bound, dx, dy, dz)
+        u, gx, gy, gz, bound = _outside_grid(u, gx, gy, gz, bound, dx, dy, dz)
     return u, gx, gy, gz, bound
 
 
@@ -134,7 +134,7 @@ def bound_at(payload, slot, mask, x, y, z, dx, dy, dz):
 
 
 @leaf
-def write_row(field, rows, m, gx, gy, gz, rx, ry, rz):
+def _write_row(field, rows, m, gx, gy, gz, rx, ry, rz):
     """Write the gradient of near point m, with lever r, and its moment into its rows."""
     field[rows + ALONG, m], field[rows + ALONG + 1, m], field[rows + ALONG + 2, m] = gx, gy, gz
     ax, ay, az = moment(rx, ry, rz, gx, gy, gz)
@@ -181,7 +181,7 @@ def bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
 
 
 @leaf
-def write_bend(field, row, m, curvature, vx, vy, vz, rx, ry, rz):
+def _write_bend(field, row, m, curvature, vx, vy, vz, rx, ry, rz):
     """Write one bend of near point m into rows from `row` on; r: the point's lever."""
     field[row, m] = curvature
     field[row + 1, m], field[row + 2, m], field[row + 3, m] = vx, vy, vz
@@ -190,7 +190,7 @@ def write_bend(field, row, m, curvature, vx, vy, vz, rx, ry, rz):
 
 
 @leaf
-def bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m):
+def _bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m):
     """Write both bends of near point m, at (x, y, z) voxels with lever r, into its rows."""
     row = rows + BENDS
     field[row, m] = field[row + BEND_ROWS, m] = 0.0
@@ -199,31 +199,31 @@ def bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m):
     gx, gy, gz = field[rows + ALONG, m], field[rows + ALONG + 1, m], field[rows + ALONG + 2, m]
     xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, x, y, z)
     c, vx, vy, vz, d, wx, wy, wz = bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz)
-    write_bend(field, row, m, c, vx, vy, vz, rx, ry, rz)
-    write_bend(field, row + BEND_ROWS, m, d, wx, wy, wz, rx, ry, rz)
+    _write_bend(field, row, m, c, vx, vy, vz, rx, ry, rz)
+    _write_bend(field, row + BEND_ROWS, m, d, wx, wy, wz, rx, ry, rz)
 
 
 @inlined
-def goes_nearer(u, bound, last_u, last_bound):
+def _goes_nearer(u, bound, last_u, last_bound):
     """Whether a point would be too near a surface, and no farther from it than it was."""
     return (u < FLOOR and u <= last_u) or (bound < LEAST_BOUND and bound <= last_bound)
 
 
 @inlined
-def write_near(
+def _write_near(
     payload, slot, mask, x, y, z, rx, ry, rz, u, gx, gy, gz, bound, is_bent, field, rows, m
 ):
     """Write near point m, at (x, y, z) voxels with lever r, into its rows."""
     field[rows + U, m], field[rows + BOUND, m] = u, bound
-    write_row(field, rows, m, gx, gy, gz, rx, ry, rz)
+    _write_row(field, rows, m, gx, gy, gz, rx, ry, rz)
     if is_bent and u < ONSET:
-        bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m)
+        _bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m)
     else:
         field[rows + BENDS, m] = field[rows + BENDS + BEND_ROWS, m] = 0.0
 
 
 @leaf
-def look_at_run(
+def _look_at_run(
     cells, which, points, start, end, run, transform, place, center, follower, field, met, missed
 ):
     """Look at points start .. end, of run number `run` -> OPEN, or what ended it; see `look`."""
@@ -269,12 +269,12 @@ def look_at_run(
         run_due = min(run_due, field[DUE, n])
         if u >= ONSET + MARGIN and bound >= LEAST_BOUND:
             continue
-        if follower.is_walking and goes_nearer(u, bound, field[LAST_U, n], field[LAST_BOUND, n]):
+        if follower.is_walking and _goes_nearer(u, bound, field[LAST_U, n], field[LAST_BOUND, n]):
             return SHUT
         if 0 < most_near <= n_near and merged < MOST_MERGED:
             return MANY
         met[near, n_near] = n
-        write_near(
+        _write_near(
             payload, slot, mask, x, y, z, px - cx, py - cy, pz - cz, u, gx, gy, gz, bound,
             follower.is_bent, field, base, n_near,
         )  # fmt: skip
@@ -286,7 +286,7 @@ def look_at_run(
 
 
 @leaf
-def rest_of_sphere(cells, which, spheres, run, transform, place):
+def _rest_of_sphere(cells, which, spheres, run, transform, place):
     """Voxels that a run's sphere may go before a point of it can be near; not above 0 if one is."""
     x, y, z = placed_center(spheres, run, transform, place)
     return room_around(
@@ -296,7 +296,7 @@ def rest_of_sphere(cells, which, spheres, run, transform, place):
 
 
 @leaf
-def look_at_due_runs(
+def _look_at_due_runs(
     cells, which, shell, transform, place, center, way, follower, field, met, missed
 ):
     """Look at the points of all runs that are due -> OPEN, SHUT, CROWDED or MANY.
@@ -312,11 +312,11 @@ def look_at_due_runs(
             continue
         is_new = field[RUN_DUE, at] == -NEVER or field[RUN_DUE, at] >= travelled - way
         if follower.is_large and is_new:
-            rest = rest_of_sphere(cells, which, shell.spheres, at, transform, place)
+            rest = _rest_of_sphere(cells, which, shell.spheres, at, transform, place)
             if rest > 0.0:
                 field[RUN_DUE, at] = travelled + rest
                 continue
-        found = look_at_run(
+        found = _look_at_run(
             cells, which, points, start, min(start + run, points.shape[0]), at, transform, place,
             center, follower, field, met, missed,
         )  # fmt: skip
@@ -344,7 +344,7 @@ def look(cells, which, shell, pose, place, way, is_walking, follower, field, met
     follower.n_looks += 1
     follower.stride, follower.merged = max(follower.stride, 1), max(follower.merged, 1)
     while True:
-        found = look_at_due_runs(
+        found = _look_at_due_runs(
             cells, which, shell, transform, place, center, way, follower, field, met, missed
         )
         if found == CROWDED:  # points that were seen to be far are not looked at again

@@ -27,7 +27,7 @@ period takes longer."""
 
 
 @leaf
-def place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
+def _place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
     """Pose after a step at constant velocities, into next_pose (4, 4) -> position, quaternion.
 
     turned (4,): unit quaternion of pose (4, 4); step in s, velocities of the centre, m/s and rad/s.
@@ -54,7 +54,7 @@ def place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
 def place_on_way(tool, center, follower, done):
     """Tool's pose at a share of the step, into tool.tried_pose -> position and quaternion."""
     step = follower.step
-    return place_next(
+    return _place_next(
         tool.quaternion, center, tool.pose, tool.tried_pose, done,
         step[0], step[1], step[2], step[3], step[4], step[5],
     )  # fmt: skip
@@ -70,7 +70,7 @@ def way_of_step(follower, radius, size):
 
 
 @leaf
-def stride_on(cells, which, shell, place, way, done, tool, follower, field, met, missed):
+def _stride_on(cells, which, shell, place, way, done, tool, follower, field, met, missed):
     """Make one stride from share `done` of the step -> where the tool is then, and what was found.
 
     SHUT: not even a short stride is allowed, or the period has no looks left.
@@ -115,7 +115,7 @@ def walk(cells, which, shell, place, radius, tool, follower, field, met, missed)
     way = way_of_step(follower, radius, place.size)
     done, found = 0.0, OPEN
     while done < 1.0 and found == OPEN:
-        done, found = stride_on(
+        done, found = _stride_on(
             cells, which, shell, place, way, done, tool, follower, field, met, missed
         )
     if done > 0.0:

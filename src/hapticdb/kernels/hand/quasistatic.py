@@ -114,7 +114,7 @@ def has_moved(tool, follower):
 
 
 @leaf
-def meet_change(follower, field, met):
+def _meet_change(follower, field, met):
     """Compare the last look with the one before, at the same pose in an older version of the cells.
 
     Where a surface has come nearer, contact begins at the present distance, so that no force jumps.
@@ -132,7 +132,7 @@ def meet_change(follower, field, met):
 
 
 @leaf
-def look_here(cells, which, shell, place, tool, follower, field, met, missed):
+def _look_here(cells, which, shell, place, tool, follower, field, met, missed):
     """Look at the tool where it is, at the start or in a new version -> whether all is known."""
     is_first = tool.version == 0
     if is_first:
@@ -151,7 +151,7 @@ def look_here(cells, which, shell, place, tool, follower, field, met, missed):
     )  # fmt: skip
     if found == NOT_KNOWN:
         return False
-    is_sunk = not has_moved(tool, follower) and meet_change(follower, field, met)
+    is_sunk = not has_moved(tool, follower) and _meet_change(follower, field, met)
     settle(follower, field, met)
     keep_pose(tool, follower, px, py, pz, w, x, y, z)
     if is_first:
@@ -162,7 +162,7 @@ def look_here(cells, which, shell, place, tool, follower, field, met, missed):
 
 
 @leaf
-def look_at_more(cells, which, shell, place, tool, follower, field, met, missed):
+def _look_at_more(cells, which, shell, place, tool, follower, field, met, missed):
     """Look where the tool is, at points left out before -> OPEN or NOT_KNOWN.
 
     A point that comes back feels contact from where it is, so that no force jumps. It goes no
@@ -178,13 +178,13 @@ def look_at_more(cells, which, shell, place, tool, follower, field, met, missed)
         field, met, missed,
     )  # fmt: skip
     if found == OPEN:
-        meet_change(follower, field, met)
+        _meet_change(follower, field, met)
         settle(follower, field, met)
     return found
 
 
 @leaf
-def follow_loosely(cells, which, shell, place, spring, tool, hand, follower, field, met, missed):
+def _follow_loosely(cells, which, shell, place, spring, tool, hand, follower, field, met, missed):
     """Put a tool that lies in something at the hand -> OPEN or NOT_KNOWN."""
     measure_pull(spring, tool, hand, tool.pose, shell.center, follower)
     for axis in range(6):
@@ -243,7 +243,7 @@ def follow(cells, which, shell, place, spring, tool, hand, follower, field, met,
 
 
 @leaf
-def record_felt(follower, field, met, size, stiffness, felt):
+def _record_felt(follower, field, met, size, stiffness, felt):
     """Contacts at the tool's pose: indices into met[0], wrench on the tool and counts into felt.
 
     Hits are the near points that push or are about to; contacts are those that push.
@@ -271,7 +271,7 @@ def record_felt(follower, field, met, size, stiffness, felt):
 
 
 @leaf
-def push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
+def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
     """Wrench on the hand at the device, about the handle's origin, into wrench (6,) -> flags."""
     for axis in range(6):
         wrench[axis] = 0.0
@@ -312,10 +312,10 @@ def finish(spring, shell, place, tool, hand, follower, field, met, is_held, foun
         is_over = follower.n_looks >= MOST_LOOKS
         is_felt = follower.n_active > 0 or (found == SHUT and not is_over)
         is_felt = is_felt and not follower.is_loose
-        flags |= push_hand(spring, tool, hand, shell.center, follower, is_felt, dt, wrench)
+        flags |= _push_hand(spring, tool, hand, shell.center, follower, is_felt, dt, wrench)
         for n in range(6):
             kept[n] = wrench[n] if is_finite(wrench) else 0.0
-        record_felt(
+        _record_felt(
             follower, field, met, place.size, contact_stiffness(spring, place.size), tool.felt
         )
         flags |= IS_DROPPED if is_over else (IS_CUT if found == SHUT else 0)
@@ -328,20 +328,20 @@ def finish(spring, shell, place, tool, hand, follower, field, met, is_held, foun
 
 
 @leaf
-def move_tool(
+def _move_tool(
     cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
 ):
     """Move the tool after the hand, in the present version of the cells -> what was found."""
     found = OPEN
     if tool.version != version or has_moved(tool, follower):
-        if not look_here(cells, which, shell, place, tool, follower, field, met, missed):
+        if not _look_here(cells, which, shell, place, tool, follower, field, met, missed):
             return NOT_KNOWN
         tool.version = version
     elif take_more_points(follower, field):
-        found = look_at_more(cells, which, shell, place, tool, follower, field, met, missed)
+        found = _look_at_more(cells, which, shell, place, tool, follower, field, met, missed)
     if found == OPEN:
         if follower.is_loose:
-            found = follow_loosely(
+            found = _follow_loosely(
                 cells, which, shell, place, spring, tool, hand, follower, field, met, missed
             )
         else:
@@ -392,7 +392,7 @@ def advance(
     follower.most_left_out = 0
     found = OPEN
     if not is_held:
-        found = move_tool(
+        found = _move_tool(
             cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
         )
     revision = cells.control[REVISION + which]  # before end_frame: then the buffer may be reused

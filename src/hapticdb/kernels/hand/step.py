@@ -88,7 +88,7 @@ def factor(follower):
 
 
 @leaf
-def begin_equations(follower, extra, turn_extra):
+def _begin_equations(follower, extra, turn_extra):
     """Set the step's equations to the springs alone, and `extra` stiffness that only brakes."""
     matrix, right, pull = follower.matrix, follower.right, follower.pull
     for row in range(6):
@@ -102,7 +102,7 @@ def begin_equations(follower, extra, turn_extra):
 
 
 @leaf
-def predict_contacts(follower, field, met, size):
+def _predict_contacts(follower, field, met, size):
     """Put the near points that the step leaves in depth into the contact set -> whether it changed.
 
     The depth after the step is d_i - J_i . step, metres.
@@ -127,7 +127,7 @@ def predict_contacts(follower, field, met, size):
 
 
 @leaf
-def add_bends(follower, weight, field, rows, m):
+def _add_bends(follower, weight, field, rows, m):
     """Add the resistance of a hollow surface across the gradient of near point m.
 
     It is the part of the energy's second derivative that Gauss-Newton leaves out, -K d u'', where
@@ -158,9 +158,9 @@ def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
     follower.n_bends = 0
     for axis in range(6):
         step[axis] = 0.0
-    predict_contacts(follower, field, met, size)
+    _predict_contacts(follower, field, met, size)
     for _ in range(ROUNDS):
-        begin_equations(follower, extra, turn_extra)
+        _begin_equations(follower, extra, turn_extra)
         for m in range(follower.n_near):
             if field[ACTIVE, m] == 0.0:
                 continue
@@ -171,7 +171,7 @@ def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
                 field[base + ABOUT, m], field[base + ABOUT + 1, m], field[base + ABOUT + 2, m],
             )  # fmt: skip
             if follower.is_bent and depth > 0.0:
-                add_bends(follower, stiffness * depth / size, field, base, m)
+                _add_bends(follower, stiffness * depth / size, field, base, m)
         factor(follower)
-        if not predict_contacts(follower, field, met, size):
+        if not _predict_contacts(follower, field, met, size):
             return

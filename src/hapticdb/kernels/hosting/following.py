@@ -22,7 +22,7 @@ SILENCE_NS = 250_000_000
 
 
 @leaf
-def take_arrival(station, seat, hand, now):
+def _take_arrival(station, seat, hand, now):
     """Begin the way to a pose that has arrived on the board, if it is written to its end."""
     sequence = seat.hand_sequence
     if sequence == station.seen or sequence & 1:
@@ -57,7 +57,7 @@ def take_arrival(station, seat, hand, now):
 @leaf
 def follow_hand(station, seat, hand, now):
     """Write where the hand is at a time, ns; NaN while nobody holds the tool."""
-    take_arrival(station, seat, hand, now)
+    _take_arrival(station, seat, hand, now)
     position, turned, velocity = hand.position, hand.quaternion, hand.velocity
     if station.is_let_go:
         position[0] = math.nan

@@ -64,21 +64,21 @@ HELD, FADING, IN_OBJECT = 1, 2, 8
 
 
 @leaf
-def spring_of(station):
+def _spring_of(station):
     """Coupling of a session."""
     n = station.springs[station.coupling]
     return DeviceSpring(n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])
 
 
 @leaf
-def place_tool(tool, pose):
+def _place_tool(tool, pose):
     """Write the tool's pose (4, 4)."""
     at, w = tool.position, tool.quaternion
     pose_of_quaternion(at[0], at[1], at[2], w[0], w[1], w[2], w[3], pose)
 
 
 @leaf
-def feel_again(station, cells, shell, place, poses, met, missed, felts, servo):
+def _feel_again(station, cells, shell, place, poses, met, missed, felts, servo):
     """Compute the law's frame at the tool's pose, for a recording; into tool.felt."""
     tool, sent, law = servo.tool, servo.sent, DistanceFieldLaw(station.stiffness)
     which = begin_frame(cells, station.reader)
@@ -100,7 +100,7 @@ def feel_again(station, cells, shell, place, poses, met, missed, felts, servo):
 
 
 @leaf
-def report_tool(station, told, servo, shell, pose, radius):
+def _report_tool(station, told, servo, shell, pose, radius):
     """Say where tool and hand are, for the fetching process."""
     center, hand = shell.center, servo.hand
     transform = transform_of(pose)
@@ -118,7 +118,7 @@ def report_tool(station, told, servo, shell, pose, radius):
 
 
 @leaf
-def state_of_flags(flags):
+def _state_of_flags(flags):
     """State of a frame in a recording."""
     state = np.int64(0)
     if flags & IS_HELD:
@@ -133,7 +133,7 @@ def state_of_flags(flags):
 @leaf
 def step(station, seat, shell, place, dt, field, met, missed, poses, felts, is_shown):
     """Move the tool of a session; returns its radius, m."""
-    cells, spring = cells_of(station), spring_of(station)
+    cells, spring = cells_of(station), _spring_of(station)
     servo_record = array_at(station.servo, (), SERVO)
     follower_record = array_at(station.follower, (), FOLLOWER)
     servo, follower = servo_record[()], follower_record[()]
@@ -141,16 +141,16 @@ def step(station, seat, shell, place, dt, field, met, missed, poses, felts, is_s
         cells, station.reader, shell, place, spring, servo_record, follower_record, dt, field, met,
         missed,
     )  # fmt: skip
-    place_tool(servo.tool, poses[0])
+    _place_tool(servo.tool, poses[0])
     if is_shown:
         show_contacts(seat, shell, poses[0], place, spring, follower, field, met)
     if seat.is_recorded and not servo.sent.marks & IS_HELD:
-        feel_again(station, cells, shell, place, poses, met, missed, felts, servo)
+        _feel_again(station, cells, shell, place, poses, met, missed, felts, servo)
     return spring.radius
 
 
 @leaf
-def ask_objects(station, seat, session_record, shell, place, follower, sent, field, met, pose):
+def _ask_objects(station, seat, session_record, shell, place, follower, sent, field, met, pose):
     """Ask for the objects that are touched, and show those that were answered."""
     n_touching = list_touching(follower, field, met, sent.hits, (sent.marks & IS_LOOSE) != 0)
     name_voxels(
@@ -160,7 +160,7 @@ def ask_objects(station, seat, session_record, shell, place, follower, sent, fie
 
 
 @leaf
-def run_session(station, seat, ring, missed, poses, felts, due, moment):
+def _run_session(station, seat, ring, missed, poses, felts, due, moment):
     """Run a session's frame, which was due at a time, ns."""
     begun = now_ns(moment)
     servo_record = array_at(station.servo, (), SERVO)
@@ -180,17 +180,17 @@ def run_session(station, seat, ring, missed, poses, felts, due, moment):
     if is_shown:
         station.shown_at = begun
     radius = step(station, seat, shell, place, dt, field, met, missed, poses, felts, is_shown)
-    report_tool(station, told_record[()], servo, shell, poses[0], radius)
+    _report_tool(station, told_record[()], servo, shell, poses[0], radius)
     tell(session_record, told_record, missed)
     if begun - station.asked_at >= ASK_EVERY_NS:
         station.asked_at = begun
-        ask_objects(
+        _ask_objects(
             station, seat, session_record, shell, place, follower, sent, field, met, poses[0]
         )
     lateness, elapsed = 1e-9 * (begun - due), 1e-9 * (now_ns(moment) - begun)
     note(
         ring, seat.n_frames, 1e-9 * (begun - station.began), dt, lateness, elapsed, servo_record,
-        np.int64(0), state_of_flags(sent.marks),
+        np.int64(0), _state_of_flags(sent.marks),
     )  # fmt: skip
     fence()
     seat.n_frames += 1
@@ -224,7 +224,7 @@ def run(stations, misseds, poses, felts, seats, rings, pace_record, moment):
         for n in range(stations.shape[0]):
             if stations[n].is_running:
                 at = stations[n].seat
-                run_session(
+                _run_session(
                     stations[n], seats[at], rings[at], misseds[n], poses[n], felts[n], due, moment
                 )
         done = now_ns(moment)

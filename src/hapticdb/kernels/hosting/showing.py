@@ -44,7 +44,7 @@ def list_touching(follower, field, met, n_hits, is_loose):
 
 
 @leaf
-def show_contact(seat, at, transform, x, y, z, fx, fy, fz):
+def _show_contact(seat, at, transform, x, y, z, fx, fy, fz):
     """Write a contact at point (x, y, z) of the tool, with its force, world frame."""
     row = seat.contacts[at]
     row[0], row[1], row[2] = moved(transform, x, y, z)
@@ -74,7 +74,7 @@ def show_contacts(seat, shell, pose, place, spring, follower, field, met):
             n_met += 1
             if (n_met - 1) % every == 0:
                 force = stiffness * depth
-                show_contact(
+                _show_contact(
                     seat, n_shown, transform, points[n, 0], points[n, 1], points[n, 2],
                     force * field[rows + ALONG, m], force * field[rows + ALONG + 1, m],
                     force * field[rows + ALONG + 2, m],

@@ -60,7 +60,7 @@ class Asleep(NamedTuple):
 
 
 @leaf
-def runs_beside_unknown(cells, which, shell, listed, count, transform, place, margin, missed):
+def _runs_beside_unknown(cells, which, shell, listed, count, transform, place, margin, missed):
     """Number of the listed runs whose box meets an unknown cell; these cells go into `missed`."""
     keys, slots, spheres = cells.keys, cells.slots, shell.spheres
     top, n_missed, n_runs = place.side - 1.0, missed[LISTED], 0
@@ -108,7 +108,7 @@ def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, bu
     if n_near > budget:
         for hit in range(np.int64(out[HITS])):
             met[hit] = indices[met[hit]]
-        out[UNKNOWNS] += runs_beside_unknown(
+        out[UNKNOWNS] += _runs_beside_unknown(
             cells, which, shell, listed, count, transform, place, felt_margin(law), missed
         )
     counts[LOOKED_AT] = max(counts[LOOKED_AT], n_looked)

@@ -158,7 +158,7 @@ def room_around(keys, slots, masks, used, which, x, y, z, half, most, side):
                     least = dk
                 else:
                     used[slot] = 1
-                    least = nearest_brick(
+                    least = _nearest_brick(
                         masks[slot], 32.0 * ci, 32.0 * cj, 32.0 * ck, x, y, z, least
                     )
                 if least <= half:
@@ -167,7 +167,7 @@ def room_around(keys, slots, masks, used, which, x, y, z, half, most, side):
 
 
 @leaf
-def nearest_brick(mask, i, j, k, x, y, z, least):
+def _nearest_brick(mask, i, j, k, x, y, z, least):
     """Distance on the axis where it is largest, from (x, y, z) to the nearest brick of a cell.
 
     mask: of the cell, whose lowest corner is (i, j, k); all in voxels. `least` if none is nearer.
@@ -197,7 +197,7 @@ def placed_center(spheres, n, transform, place):
 
 
 @leaf
-def way_on_axis(a, b, c, u, x, y, z, half_x, half_y, half_z):
+def _way_on_axis(a, b, c, u, x, y, z, half_x, half_y, half_z):
     """Largest way on one axis of a point of a box, when that row of the pose changes by a, b, c, u.
 
     (x, y, z), half_x, half_y, half_z: the box's centre and half its sides.
@@ -212,15 +212,15 @@ def way_of_box(boxes, rests, block, transform):
     a, b, c, u, d, e, f, v, g, h, m, w = transform
     x, y, z = boxes[block, 0], boxes[block, 1], boxes[block, 2]
     half_x, half_y, half_z = boxes[block, 3], boxes[block, 4], boxes[block, 5]
-    along_x = way_on_axis(
+    along_x = _way_on_axis(
         a - rests[block, 0], b - rests[block, 1], c - rests[block, 2], u - rests[block, 3],
         x, y, z, half_x, half_y, half_z,
     )  # fmt: skip
-    along_y = way_on_axis(
+    along_y = _way_on_axis(
         d - rests[block, 4], e - rests[block, 5], f - rests[block, 6], v - rests[block, 7],
         x, y, z, half_x, half_y, half_z,
     )  # fmt: skip
-    along_z = way_on_axis(
+    along_z = _way_on_axis(
         g - rests[block, 8], h - rests[block, 9], m - rests[block, 10], w - rests[block, 11],
         x, y, z, half_x, half_y, half_z,
     )  # fmt: skip
@@ -228,7 +228,7 @@ def way_of_box(boxes, rests, block, transform):
 
 
 @leaf
-def begin_block_rest(rests, block, transform, rest):
+def _begin_block_rest(rests, block, transform, rest):
     """Enter the rest of a block from this pose on."""
     a, b, c, u, d, e, f, v, g, h, m, w = transform
     rests[block, 0] = a
@@ -247,14 +247,14 @@ def begin_block_rest(rests, block, transform, rest):
 
 
 @inlined
-def left_of_rest(rests, n, x, y, z):
+def _left_of_rest(rests, n, x, y, z):
     """How far the centre of run n, now at (x, y, z), may still go on each axis; all in voxels."""
     way = max(abs(x - rests[n, 0]), abs(y - rests[n, 1]), abs(z - rests[n, 2]))
     return rests[n, 3] - way
 
 
 @inlined
-def begin_rest(rests, n, x, y, z, rest):
+def _begin_rest(rests, n, x, y, z, rest):
     """Enter the rest of run n, whose centre is at (x, y, z)."""
     rests[n, 0] = x
     rests[n, 1] = y
@@ -263,7 +263,7 @@ def begin_rest(rests, n, x, y, z, rest):
 
 
 @leaf
-def rest_of_run(
+def _rest_of_run(
     keys, slots, words, masks, used, which, spheres, n, x, y, z, transform, place, margin, longest
 ):  # fmt: skip
     """Rest of run n, whose centre is at (x, y, z): zero if it is free only here, -1 if it is near.
@@ -291,7 +291,7 @@ def rest_of_run(
 
 
 @leaf
-def rest_of_block(
+def _rest_of_block(
     keys, slots, masks, used, which, boxes, block, transform, place, margin, longest
 ):  # fmt: skip
     """Rest of all runs of a block that are far from all bricks; zero if they must be tested."""
@@ -324,26 +324,26 @@ def list_near_runs(cells, which, shell, sleepers, transform, place, law):
         least = LONGEST
         rest = 0.0
         if block_rests[block, REST] >= AWAKE:  # it slept, or is to be tested anew
-            rest = rest_of_block(
+            rest = _rest_of_block(
                 keys, slots, masks, used, which, boxes, block, transform, place, margin, longest
             )
         for n in range(block * BLOCK, min((block + 1) * BLOCK, spheres.shape[0])):
             x, y, z = placed_center(spheres, n, transform, place)
-            left = left_of_rest(run_rests, n, x, y, z)
+            left = _left_of_rest(run_rests, n, x, y, z)
             if rest > 0.0:
                 left = rest
-                begin_rest(run_rests, n, x, y, z, left)
+                _begin_rest(run_rests, n, x, y, z, left)
             elif left < 0.0:
-                left = rest_of_run(
+                left = _rest_of_run(
                     keys, slots, felt, masks, used, which, spheres, n, x, y, z, transform, place,
                     margin, longest,
                 )  # fmt: skip
-                begin_rest(run_rests, n, x, y, z, left)
+                _begin_rest(run_rests, n, x, y, z, left)
                 if left < 0.0:
                     listed[count] = n
                     count += 1
             least = min(least, left)
-        begin_block_rest(block_rests, block, transform, least - ROUNDING)
+        _begin_block_rest(block_rests, block, transform, least - ROUNDING)
     return count
 
 
@@ -369,7 +369,7 @@ def skip_between(listed, count, skips):
 
 
 @leaf
-def chosen_of_group(group, stride):
+def _chosen_of_group(group, stride):
     """Number of the one point that a frame looks at of a group of `stride` points of a shell.
 
     stride: a power of two, at most 2^31. The place in the group is a hash of the group's number:
@@ -396,7 +396,7 @@ def choose_points(listed, count, points, columns, run, budget, chosen, chosen_co
         start = listed[n] * run
         end = min(start + run, points.shape[0])
         for group in range(start // stride, (end - 1) // stride + 1):
-            at = chosen_of_group(group, stride)
+            at = _chosen_of_group(group, stride)
             if at < start or at >= end:
                 continue
             if n_chosen == budget:

@@ -32,7 +32,7 @@ CELL_SIDE = 32.0
 
 
 @leaf
-def changes_since(control, which, followed, changed):
+def _changes_since(control, which, followed, changed):
     """Copy the lowest corners of the cells changed since `followed`, voxels, to changed (K, 3).
 
     which: the directory that the frame reads. Returns the number of changes up to that directory,
@@ -55,7 +55,7 @@ def changes_since(control, which, followed, changed):
 
 
 @inlined
-def cube_of_rest(rests, spheres, n, margin, size):
+def _cube_of_rest(rests, spheres, n, margin, size):
     """Half the side of the cube in which run n found its rest, voxels; its centre is in `rests`."""
     return spheres[n, 3] / size + margin + rests[n, 3] + SLACK
 
@@ -75,7 +75,7 @@ def is_met(changed, cell, low_x, low_y, low_z, high_x, high_y, high_z):
 
 
 @leaf
-def wake_all(rests, block_rests, rest, state):
+def _wake_all(rests, block_rests, rest, state):
     """End all rests; counts the runs that slept. rest: column of `block_rests`."""
     for block in range(block_rests.shape[0]):
         block_rests[block, rest] = AWAKE
@@ -85,13 +85,13 @@ def wake_all(rests, block_rests, rest, state):
 
 
 @leaf
-def wake_runs(rests, spheres, start, end, changed, cell, margin, size):
+def _wake_runs(rests, spheres, start, end, changed, cell, margin, size):
     """End the rests of runs start .. end - 1 that a changed cell concerns -> their number."""
     woken = 0
     for n in range(start, end):
         if rests[n, 3] < 0.0:
             continue
-        half = cube_of_rest(rests, spheres, n, margin, size)
+        half = _cube_of_rest(rests, spheres, n, margin, size)
         x, y, z = rests[n, 0], rests[n, 1], rests[n, 2]
         if is_met(changed, cell, x - half, y - half, z - half, x + half, y + half, z + half):
             rests[n, 3] = AWAKE
@@ -110,12 +110,12 @@ def wake_changed(
     the cubes of a block's sleeping runs first, then with each of these cubes.
     """
     followed = state[FOLLOWED]
-    end, count = changes_since(control, which, followed, changed)
+    end, count = _changes_since(control, which, followed, changed)
     if end == followed:
         return
     state[FOLLOWED] = end
     if count < 0:
-        wake_all(rests, block_rests, rest, state)
+        _wake_all(rests, block_rests, rest, state)
         return
     for block in range(block_rests.shape[0]):
         start = block * block_size
@@ -124,7 +124,7 @@ def wake_changed(
         high_x = high_y = high_z = -1e30
         for n in range(start, stop):
             if rests[n, 3] >= 0.0:
-                half = cube_of_rest(rests, spheres, n, margin, size)
+                half = _cube_of_rest(rests, spheres, n, margin, size)
                 x, y, z = rests[n, 0], rests[n, 1], rests[n, 2]
                 low_x, low_y, low_z = (
                     min(low_x, x - half),
@@ -135,7 +135,7 @@ def wake_changed(
                 high_z = max(high_z, z + half)
         for cell in range(count):
             if is_met(changed, cell, low_x, low_y, low_z, high_x, high_y, high_z):
-                woken = wake_runs(rests, spheres, start, stop, changed, cell, margin, size)
+                woken = _wake_runs(rests, spheres, start, stop, changed, cell, margin, size)
                 if woken > 0:
                     block_rests[block, rest] = AWAKE
                     state[WOKEN] += woken

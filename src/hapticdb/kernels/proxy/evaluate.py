@@ -33,7 +33,7 @@ that push."""
 
 
 @leaf
-def turned_by(w, x, y, z, a, b, c):
+def _turned_by(w, x, y, z, a, b, c):
     """Vector (a, b, c) turned by a unit quaternion."""
     ux, uy, uz = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
     return a + 2.0 * (y * uz - z * uy), b + 2.0 * (z * ux - x * uz), c + 2.0 * (x * uy - y * ux)
@@ -60,7 +60,7 @@ def measure_pull(model, hand, rx, ry, rz):
 
 
 @leaf
-def place_contacts(model):
+def _place_contacts(model):
     """Rows of the contacts at the tool's pose: gradient, its moment and depth, into model.rows.
 
     A point that has moved by a along the normal and by p and q across it is at the distance
@@ -77,7 +77,7 @@ def place_contacts(model):
         lever, normal, along, bends = (
             model.levers[n], model.normals[n], model.along[n], model.bends[n],
         )  # fmt: skip
-        rx, ry, rz = turned_by(tw, tx, ty, tz, lever[0], lever[1], lever[2])
+        rx, ry, rz = _turned_by(tw, tx, ty, tz, lever[0], lever[1], lever[2])
         dx = at[0] - first[0] + rx - lever[0]
         dy = at[1] - first[1] + ry - lever[1]
         dz = at[2] - first[2] + rz - lever[2]
@@ -104,7 +104,7 @@ def place_contacts(model):
 
 
 @leaf
-def predict(model):
+def _predict(model):
     """Put the contacts that the step leaves in depth into the set -> whether it changed."""
     step, n_changed = model.step, 0
     for n in range(model.n_planes):
@@ -119,7 +119,7 @@ def predict(model):
 
 
 @leaf
-def begin_step(model):
+def _begin_step(model):
     """Set the step's equations to the springs alone."""
     for row in range(6):
         for column in range(row):
@@ -130,7 +130,7 @@ def begin_step(model):
 
 
 @leaf
-def add_hollow(model, n):
+def _add_hollow(model, n):
     """Add what a hollow surface resists across the normal of contact n that is in depth."""
     row, lever = model.rows[n], model.levers[n]
     normal, along = model.normals[n], model.along[n]
@@ -151,9 +151,9 @@ def solve(model):
     """Solve for the step (6,), m and rad about the tool's centre, and its contact set."""
     for axis in range(6):
         model.step[axis] = 0.0
-    predict(model)
+    _predict(model)
     for _ in range(ROUNDS):
-        begin_step(model)
+        _begin_step(model)
         for n in range(model.n_planes):
             if model.is_active[n] == 1:
                 row = model.rows[n]
@@ -162,14 +162,14 @@ def solve(model):
                     row[0], row[1], row[2], row[3], row[4], row[5],
                 )  # fmt: skip
                 if row[6] > 0.0:
-                    add_hollow(model, n)
+                    _add_hollow(model, n)
         factor(model)
-        if not predict(model):
+        if not _predict(model):
             return
 
 
 @leaf
-def take_step(model):
+def _take_step(model):
     """Move the tool by the step -> the way that no point of it exceeds, m."""
     step, at, turned = model.step, model.position, model.quaternion
     for axis in range(3):
@@ -185,7 +185,7 @@ def take_step(model):
 
 
 @leaf
-def way_of_hand(model, hand, rx, ry, rz):
+def _way_of_hand(model, hand, rx, ry, rz):
     """Way that no point of the tool in the hand has exceeded since the proxy's pose, m."""
     first = model.hand
     x, y, z = hand[0] + rx - first[0], hand[1] + ry - first[1], hand[2] + rz - first[2]
@@ -205,23 +205,23 @@ def evaluate(model_record, hand, result):
     """
     model = model_record[()]
     center = model.center
-    rx, ry, rz = turned_by(hand[3], hand[4], hand[5], hand[6], center[0], center[1], center[2])
+    rx, ry, rz = _turned_by(hand[3], hand[4], hand[5], hand[6], center[0], center[1], center[2])
     for axis in range(3):
         model.position[axis] = model.tool[axis]
     for part in range(4):
         model.quaternion[part] = model.tool[3 + part]
     for n in range(RESULTS):
         result[n] = 0.0
-    result[WAY] = way_of_hand(model, hand, rx, ry, rz)
+    result[WAY] = _way_of_hand(model, hand, rx, ry, rz)
     if model.n_planes == 0:
         return
     for n in range(model.n_planes):
         model.is_active[n] = 0
     for _ in range(STEPS):
         measure_pull(model, hand, rx, ry, rz)
-        place_contacts(model)
+        _place_contacts(model)
         solve(model)
-        if take_step(model) < SETTLED:
+        if _take_step(model) < SETTLED:
             break
     count = 0
     for n in range(model.n_planes):

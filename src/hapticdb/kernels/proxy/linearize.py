@@ -59,7 +59,7 @@ on planes that may have ended."""
 
 
 @leaf
-def write_hand(spring, shell, tool, hand, follower, flags, model):
+def _write_hand(spring, shell, tool, hand, follower, flags, model):
     """Poses, springs and the wrench on the hand into a model."""
     lx, ly, lz = lever_in_hand(hand, shell.center)
     transform = transform_of(tool.pose)
@@ -90,7 +90,7 @@ def write_hand(spring, shell, tool, hand, follower, flags, model):
 
 
 @leaf
-def add_spring(model, start, stiffness, cap):
+def _add_spring(model, start, stiffness, cap):
     """Add the tangent stiffness of three axes from `start` on to model.stiffness (6, 6).
 
     A spring at its cap gives way along its pull and turns across it.
@@ -116,7 +116,7 @@ def add_spring(model, start, stiffness, cap):
 
 
 @leaf
-def add_contacts(model, rows, count):
+def _add_contacts(model, rows, count):
     """Add the stiffness of the rows in contact to the lower triangle of model.matrix."""
     bulge = 0.0
     for n in range(count):
@@ -141,20 +141,20 @@ def add_contacts(model, rows, count):
 
 
 @leaf
-def write_stiffness(model, rows, count):
+def _write_stiffness(model, rows, count):
     """Write K6 into model.stiffness, from the rows in contact and the springs."""
     for row in range(6):
         for column in range(6):
             model.stiffness[row, column] = 0.0
-    add_spring(model, 0, model.spring, model.cap)
-    add_spring(model, 3, model.turn_spring, model.turn_cap)
+    _add_spring(model, 0, model.spring, model.cap)
+    _add_spring(model, 3, model.turn_spring, model.turn_cap)
     spring, series = model.rows, model.series
     for row in range(6):
         for column in range(6):
             spring[row, column] = model.stiffness[row, column]
             model.matrix[row, column] = spring[row, column]
         model.matrix[row, row] += 1e-9 * (model.spring if row < 3 else model.turn_spring)
-    add_contacts(model, rows, count)
+    _add_contacts(model, rows, count)
     for row in range(6):
         for column in range(6):
             series[row, column] = model.matrix[row, column]
@@ -190,7 +190,7 @@ def linearize(
     """
     servo, follower, model = servo_record[()], follower_record[()], model_record[()]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
-    is_felt = write_hand(spring, shell, tool, hand, follower, sent.marks, model)
+    is_felt = _write_hand(spring, shell, tool, hand, follower, sent.marks, model)
     model.contact, model.onset = contact_stiffness(spring, place.size), ONSET * place.size
     model.n_planes, model.trust = 0, 0.0
     for row in range(6):
@@ -202,7 +202,7 @@ def linearize(
     count, trust = find_rows(cells, which, shell, place, tool, follower, field, rows)
     end_frame(cells, reader)
     if is_felt:
-        write_stiffness(model, rows, count)
+        _write_stiffness(model, rows, count)
     n_planes = group_rows(rows, count, spring.radius, place.size)
     write_planes(model, rows, count, n_planes, place.size)
     # below 0 in a narrow gap, where no gradient tells which side is nearer

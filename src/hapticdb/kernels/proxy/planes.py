@@ -51,19 +51,19 @@ taken for planes."""
 
 
 @leaf
-def bend_along(x, y, z, xx, yy, zz, xy, xz, yz):
+def _bend_along(x, y, z, xx, yy, zz, xy, xz, yz):
     """Second derivative along the unit vector (x, y, z), 1/voxel; 0 where it is FLAT."""
     bend = x * x * xx + y * y * yy + z * z * zz + 2.0 * (x * y * xy + x * z * xz + y * z * yz)
     return math.copysign(max(abs(bend) - FLAT, 0.0), bend)
 
 
 @leaf
-def write_bends(payload, slot, x, y, z, gx, gy, gz, size, row):
+def _write_bends(payload, slot, x, y, z, gx, gy, gz, size, row):
     """Curvatures of the surface at a point, positive where it bulges, into a row."""
     xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, x, y, z)
     _, vx, vy, vz, _, wx, wy, wz = bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz)
-    row[BEND] = bend_along(vx, vy, vz, xx, yy, zz, xy, xz, yz) / size
-    row[BEND + 1] = bend_along(wx, wy, wz, xx, yy, zz, xy, xz, yz) / size
+    row[BEND] = _bend_along(vx, vy, vz, xx, yy, zz, xy, xz, yz) / size
+    row[BEND + 1] = _bend_along(wx, wy, wz, xx, yy, zz, xy, xz, yz) / size
     row[ALONG], row[ALONG + 1], row[ALONG + 2] = vx, vy, vz
 
 
@@ -114,7 +114,7 @@ def find_rows(cells, which, shell, place, tool, follower, field, rows):
             row[ALONG], row[ALONG + 1], row[ALONG + 2] = 0.0, 0.0, 0.0
             is_inside = dx == 0.0 and dy == 0.0 and dz == 0.0
             if is_inside and (mask >> brick_bit(i, j, k)) & np.uint64(1):
-                write_bends(
+                _write_bends(
                     payload, slot, x, y, z, gx / length, gy / length, gz / length, size, row
                 )
             count += 1
@@ -171,7 +171,7 @@ def group_rows(rows, count, radius, size):
 
 
 @leaf
-def begin_planes(model, n_planes):
+def _begin_planes(model, n_planes):
     """Empty the planes."""
     model.n_planes = n_planes
     for p in range(n_planes):
@@ -188,7 +188,7 @@ def write_planes(model, rows, count, n_planes, size):
     others those count that are nearly as deep as the deepest.
     """
     scratch = model.rows
-    begin_planes(model, n_planes)
+    _begin_planes(model, n_planes)
     for n in range(count):
         p = np.int64(rows[n, CLUSTER])
         if p >= 0 and rows[n, DEPTH] > model.depths[p]:
@@ -215,11 +215,11 @@ def write_planes(model, rows, count, n_planes, size):
             model.normals[p, axis] += share * rows[n, NORMAL + axis]
             model.levers[p, axis] += share * rows[n, LEVER + axis]
     for m in range(n_planes):
-        finish_plane(model, m, scratch[m, 0], scratch[m, 1])
+        _finish_plane(model, m, scratch[m, 0], scratch[m, 1])
 
 
 @leaf
-def finish_plane(model, p, shares, depths):
+def _finish_plane(model, p, shares, depths):
     """Divide the sums of plane p; its direction `along` is made exactly across the normal."""
     normal, lever, along = model.normals[p], model.levers[p], model.along[p]
     x, y, z = normal[0], normal[1], normal[2]

@@ -45,7 +45,7 @@ def center_of(x, origin, size):
 
 
 @inlined
-def place_shell(points, normals, center, transform, placed):
+def _place_shell(points, normals, center, transform, placed):
     """Write points and normals of a placed shell, last its centre, to placed (N + 1, 6), world."""
     total = points.shape[0]
     for n in range(total):
@@ -65,7 +65,7 @@ def place_shell(points, normals, center, transform, placed):
 
 
 @inlined
-def number_of_key(table, found, count, key):
+def _number_of_key(table, found, count, key):
     """Number of a row key: its place in found (N,). A new key is entered there as number `count`.
 
     table (capacity,) int32: an open-addressing set of those numbers, -1 where free.
@@ -114,7 +114,7 @@ def locate_kernel(
     """`locate` into placed, asked and keys (N,); returns U, or -1 when the pose is not rigid."""
     if not is_rigid(pose):
         return -1
-    place_shell(points, normals, center, transform_of(pose), placed)
+    _place_shell(points, normals, center, transform_of(pose), placed)
     total = points.shape[0]
     ox, oy, oz = origin[0], origin[1], origin[2]
     side = float(1 << bits)
@@ -142,7 +142,7 @@ def locate_kernel(
             asked[0, n] = (row_key << 9) | z_encode(i & 7, j & 7, k & 7)
         if row_key != last_key:
             last_key = row_key
-            last_number = number_of_key(table, found, count, row_key)
+            last_number = _number_of_key(table, found, count, row_key)
             count = max(count, last_number + 1)
         asked[1, n] = last_number
     sort_keys(found, count, asked, keys)

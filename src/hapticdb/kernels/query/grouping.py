@@ -32,7 +32,7 @@ def first_bound(x, bounds, start):
 
 
 @leaf
-def rows_below_bound(x, low, bounds, rows_per_bucket):
+def _rows_below_bound(x, low, bounds, rows_per_bucket):
     """Expected rows with a key < x, given the first bound >= x.
 
     A bucket [b[i-1], b[i]) counts in proportion to its part below x. A bucket of zero width counts
@@ -47,7 +47,7 @@ def rows_below_bound(x, low, bounds, rows_per_bucket):
 
 
 @leaf
-def bound_after(x, bounds, start):
+def _bound_after(x, bounds, start):
     """Index of the first bound > x, at `start` or above it. x may be the largest int64."""
     if x >= bounds[bounds.shape[0] - 1]:
         return bounds.shape[0]
@@ -55,11 +55,11 @@ def bound_after(x, bounds, start):
 
 
 @leaf
-def rows_up_to(x, after, bounds, rows_per_bucket):
+def _rows_up_to(x, after, bounds, rows_per_bucket):
     """Expected rows with a key <= x, given the first bound > x."""
     if after == bounds.shape[0]:
         return (after - 1) * rows_per_bucket
-    return rows_below_bound(x + 1, after, bounds, rows_per_bucket)
+    return _rows_below_bound(x + 1, after, bounds, rows_per_bucket)
 
 
 @entry(INT, INT, INTS, FLOAT)
@@ -68,8 +68,8 @@ def gap_rows(left, right, bounds, rows_per_bucket):
     if right < left:
         return 0.0
     at = first_bound(left, bounds, np.int64(0))
-    after = bound_after(right, bounds, at)
-    return rows_up_to(right, after, bounds, rows_per_bucket) - rows_below_bound(
+    after = _bound_after(right, bounds, at)
+    return _rows_up_to(right, after, bounds, rows_per_bucket) - _rows_below_bound(
         left, at, bounds, rows_per_bucket
     )
 
@@ -117,7 +117,7 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, h
     at = 0
     for n in range(total):
         at = first_bound(keys[n], bounds, at)
-        below = rows_below_bound(keys[n], at, bounds, rows_per_bucket)
+        below = _rows_below_bound(keys[n], at, bounds, rows_per_bucket)
         gap = below - above
         if n > 0 and gap * row_cost <= descent_cost:
             highs[count - 1] = keys[n]
@@ -126,8 +126,8 @@ def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, h
             lows[count] = keys[n]
             highs[count] = keys[n]
             count += 1
-        at = bound_after(keys[n], bounds, at)
-        above = rows_up_to(keys[n], at, bounds, rows_per_bucket)
+        at = _bound_after(keys[n], bounds, at)
+        above = _rows_up_to(keys[n], at, bounds, rows_per_bucket)
         asked += above - below
     return count, asked, scanned
 
@@ -145,8 +145,8 @@ def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_
             expected = 0.0
             if left <= right:
                 at = first_bound(left, bounds, np.int64(0))
-                after = bound_after(right, bounds, at)
-                expected = rows_up_to(right, after, bounds, rows_per_bucket) - rows_below_bound(
+                after = _bound_after(right, bounds, at)
+                expected = _rows_up_to(right, after, bounds, rows_per_bucket) - _rows_below_bound(
                     left, at, bounds, rows_per_bucket
                 )
             if expected * row_cost <= descent_cost:
@@ -159,7 +159,7 @@ def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_
 
 
 @leaf
-def add_range(ranges, count, low, high):
+def _add_range(ranges, count, low, high):
     """Append a closed range; returns the array, larger when it was full, and the new count."""
     if count == ranges.shape[0]:
         larger = np.empty((2 * count, 2), dtype=np.int64)
@@ -186,7 +186,7 @@ def ranges_of_box(low, high, bits, curve, finest):
         step = (high[0] - low[0]) // 1024 + 1
         for i in range(low[0], high[0] + 1, step):
             last = min(i + step - 1, high[0])
-            ranges, count = add_range(
+            ranges, count = _add_range(
                 ranges,
                 count,
                 key_of(i, low[1], low[2], bits, curve),
@@ -221,7 +221,7 @@ def ranges_of_box(low, high, bits, curve, finest):
         )
         if is_inside or level <= finest:
             key = key_of(i, j, k, bits - level, curve) if level < bits else 0
-            ranges, count = add_range(
+            ranges, count = _add_range(
                 ranges, count, key << (3 * level), ((key + 1) << (3 * level)) - 1
             )
             continue

@@ -58,7 +58,7 @@ NO_DEPTHS = np.empty(0)
 
 
 @leaf
-def rows_of_keys(keys, row_keys):
+def _rows_of_keys(keys, row_keys):
     """Where the rows of each asked key begin and end, (U,) int64 each.
 
     One merge of two ascending lists; rows of keys that were not asked for are the false hits.
@@ -80,7 +80,7 @@ def rows_of_keys(keys, row_keys):
 
 
 @leaf
-def counting_rows(row_ids, exclude):
+def _counting_rows(row_ids, exclude):
     """Mask (R,) bool of the rows whose objects are not in exclude (E,), ascending and distinct.
 
     An excluded id has id - exclude[0] smaller ids before it, less the ids in between that are not
@@ -109,7 +109,7 @@ def counting_rows(row_ids, exclude):
 
 
 @inlined
-def has_voxel(occupancy, row, address):
+def _has_voxel(occupancy, row, address):
     """Whether a row has the voxel of an address; always true for a voxel row (no occupancy)."""
     if occupancy.shape[0] == 0:
         return True
@@ -117,7 +117,7 @@ def has_voxel(occupancy, row, address):
 
 
 @inlined
-def distinct_ids(touched, row_ids, met, start):
+def _distinct_ids(touched, row_ids, met, start):
     """Write the distinct ids of touched rows into met[start:], ascending -> number of ids."""
     count = np.int64(0)
     for row in range(row_ids.shape[0]):
@@ -127,7 +127,7 @@ def distinct_ids(touched, row_ids, met, start):
 
 
 @inlined
-def touch_near_rows(
+def _touch_near_rows(
     law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
     px, py, pz, nx, ny, nz, cx, cy, cz, size,
 ):  # fmt: skip
@@ -190,8 +190,8 @@ def refine_kernel(
     """
     total = asked.shape[1]
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
-    starts, ends = rows_of_keys(keys, row_keys)
-    counts = counting_rows(row_ids, exclude)
+    starts, ends = _rows_of_keys(keys, row_keys)
+    counts = _counting_rows(row_ids, exclude)
     ox, oy, oz = origin[0], origin[1], origin[2]
     mx, my, mz = placed[total, 0], placed[total, 1], placed[total, 2]
     fx = fy = fz = tx = ty = tz = weight = 0.0
@@ -208,7 +208,7 @@ def refine_kernel(
         sample = sample_rows(law, payload, counts, first, end, x, y, z)
         is_hit = False
         for row in range(first, end):
-            if counts[row] and has_voxel(occupancy, row, asked[0, n]):
+            if counts[row] and _has_voxel(occupancy, row, asked[0, n]):
                 is_hit = True
                 touched[row] = True
         if not is_hit and not sample <= reach(law):
@@ -228,7 +228,7 @@ def refine_kernel(
             felt[6 + total + n_apart] = depth
             n_apart += 1
         if depth > 0.0:
-            touch_near_rows(
+            _touch_near_rows(
                 law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
                 px, py, pz, nx, ny, nz, cx, cy, cz, size,
             )  # fmt: skip
@@ -236,7 +236,7 @@ def refine_kernel(
                 fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
             )
     average_into(felt, weight, fx, fy, fz, tx, ty, tz)
-    return n_hits, n_apart, distinct_ids(touched, row_ids, met, 2 * total)
+    return n_hits, n_apart, _distinct_ids(touched, row_ids, met, 2 * total)
 
 
 def refine(
@@ -276,8 +276,8 @@ def refine(
 @entry(INTS2, INTS, INTS, INTS, READ_BYTES, INTS, INTS)
 def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
     """Every (shell point, object) pair of a frame's hits, (P, 2) int64, ordered by both."""
-    starts, ends = rows_of_keys(keys, row_keys)
-    counts = counting_rows(row_ids, exclude)
+    starts, ends = _rows_of_keys(keys, row_keys)
+    counts = _counting_rows(row_ids, exclude)
     most = 0
     for h in range(hits.shape[0]):
         at = asked[1, hits[h]]
@@ -288,7 +288,7 @@ def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
         n = hits[h]
         at = asked[1, n]
         for row in range(starts[at], ends[at]):
-            if counts[row] and has_voxel(occupancy, row, asked[0, n]):
+            if counts[row] and _has_voxel(occupancy, row, asked[0, n]):
                 pairs[count, 0] = n
                 pairs[count, 1] = row_ids[row]
                 count += 1
@@ -303,11 +303,11 @@ def pairs_of_contacts(
 ):
     """Every (felt point, object) pair of a frame, (P, 2) int64, ordered by both.
 
-    A felt point touches the objects in whose voxel it is, and those of `touch_near_rows`. contacts
+    A felt point touches the objects in whose voxel it is, and those of `_touch_near_rows`. contacts
     (C,) are the felt points; the other arguments are those of `refine`.
     """
-    starts, ends = rows_of_keys(keys, row_keys)
-    counts = counting_rows(row_ids, exclude)
+    starts, ends = _rows_of_keys(keys, row_keys)
+    counts = _counting_rows(row_ids, exclude)
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
     ox, oy, oz = origin[0], origin[1], origin[2]
     most = 0
@@ -322,14 +322,14 @@ def pairs_of_contacts(
         first, end = starts[at], ends[at]
         is_hit = False
         for row in range(first, end):
-            touched[row] = counts[row] and has_voxel(occupancy, row, asked[0, n])
+            touched[row] = counts[row] and _has_voxel(occupancy, row, asked[0, n])
             is_hit |= touched[row]
         px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
         x, y, z = (px - ox) / size, (py - oy) / size, (pz - oz) / size
         sample = sample_rows(law, payload, counts, first, end, x, y, z)
         nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
         cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
-        touch_near_rows(
+        _touch_near_rows(
             law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
             px, py, pz, nx, ny, nz, cx, cy, cz, size,
         )  # fmt: skip

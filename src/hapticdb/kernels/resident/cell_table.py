@@ -97,13 +97,13 @@ def slots_of_cells(keys, slots, which, asked, out):
 
 
 @leaf
-def mark_brick(masks, slot, i, j, k):
+def _mark_brick(masks, slot, i, j, k):
     """Mark the brick that holds voxel (i, j, k) in the mask of its cell's slot."""
     masks[slot] |= np.uint64(1) << brick_bit(i, j, k)
 
 
 @leaf
-def fill_brick(words, slot, i, j, k, occupancy, start):
+def _fill_brick(words, slot, i, j, k, occupancy, start):
     """Set the voxels of the brick at (i, j, k), bytes from `start` -> whether it has a voxel."""
     has_any = False
     for byte in range(64):
@@ -153,16 +153,16 @@ def fill_cells(
         if has_bits:
             i, j, k = voxel_of(row_key, max(bits - 3, 0), curve)
             i, j, k = i << 3, j << 3, k << 3
-            if fill_brick(words, slot, i, j, k, occupancy, 64 * row):
-                mark_brick(masks, slot, i, j, k)
+            if _fill_brick(words, slot, i, j, k, occupancy, 64 * row):
+                _mark_brick(masks, slot, i, j, k)
         else:
             i, j, k = voxel_of(row_key, bits, curve)
             words[slot, column_of(i, j)] |= np.uint32(1) << np.uint32(k & 31)
-            mark_brick(masks, slot, i, j, k)
+            _mark_brick(masks, slot, i, j, k)
 
 
 @leaf
-def merge_row(payload, slot, i, j, k, last, values, row):
+def _merge_row(payload, slot, i, j, k, last, values, row):
     """Lower a slot's distances to those of the brick at (i, j, k), in `row` of values (R, 1000).
 
     Of the row's outer layer only what lies outside the cell is written. A centre in the cell
@@ -218,8 +218,8 @@ def fill_distances(
                 payload[slot, n] = BEYOND
         i, j, k = voxel_of(row_keys[row], max(bits - 3, 0), curve)
         i, j, k = i << 3, j << 3, k << 3
-        merge_row(payload, slot, i, j, k, last_brick, values, row)
-        mark_brick(masks, slot, i, j, k)
+        _merge_row(payload, slot, i, j, k, last_brick, values, row)
+        _mark_brick(masks, slot, i, j, k)
     return before
 
 

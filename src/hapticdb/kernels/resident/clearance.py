@@ -78,7 +78,7 @@ def gap(x, low, high):
 
 
 @leaf
-def window_of(x, radius, first):
+def _window_of(x, radius, first):
     """First and last voxel, 0 to 31, of a cell from `first` on whose gap to x may be below radius.
 
     Voxels of a cell that lies wholly on one side of x give its border voxel.
@@ -89,7 +89,7 @@ def window_of(x, radius, first):
 
 
 @inlined
-def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
+def _nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
     """Least squared distance from (x, y, z) to a voxel of one cell, and that voxel, packed.
 
     Returns `square` and `voxel` as given if no voxel is nearer. All lengths in voxels. Only columns
@@ -97,9 +97,9 @@ def nearest_in_cell(words, slot, mask, ci, cj, ck, x, y, z, square, voxel):
     """
     radius = math.sqrt(square)
     i0, j0, k0 = ci << 5, cj << 5, ck << 5
-    first_i, last_i = window_of(x, radius, i0)
-    first_j, last_j = window_of(y, radius, j0)
-    low, high = window_of(z, radius, k0)
+    first_i, last_i = _window_of(x, radius, i0)
+    first_j, last_j = _window_of(y, radius, j0)
+    low, high = _window_of(z, radius, k0)
     # columns begin at the place's own height
     middle = np.int64(min(max(math.floor(z) - k0, 0), 31))
     window = (np.int64(2) << high) - (np.int64(1) << low)
@@ -185,7 +185,7 @@ def nearest_voxel(keys, slots, words, masks, used, which, x, y, z, square, voxel
                 if slot == EMPTY_SLOT:
                     continue
                 used[slot] = 1
-                square, voxel = nearest_in_cell(
+                square, voxel = _nearest_in_cell(
                     words, slot, masks[slot], ci, cj, ck, x, y, z, square, voxel
                 )
     return square, voxel
@@ -207,7 +207,7 @@ def nearest_to(keys, slots, words, masks, used, which, x, y, z, cap, near, side)
 
 
 @inlined
-def far_run(
+def _far_run(
     keys, slots, words, masks, used, which, spheres, at, near, cap, transform, place
 ):  # fmt: skip
     """Lower bound, voxels, of the distance from a placed run's points to any occupied voxel.
@@ -291,7 +291,7 @@ def find_clearance(
             at = where[NEAREST] // run if turn_of < 0 else turn_of
             is_expired = of_runs[at] - travel < cap and turn_of >= 0
             if is_expired and spheres.shape[0] > 0 and spheres[at, 3] <= small * place.size:
-                bound = far_run(
+                bound = _far_run(
                     keys, slots, words, masks, used, which, spheres, at, nearest[at * run], cap,
                     transform, place,
                 )  # fmt: skip

@@ -52,7 +52,7 @@ numbers that a float has exactly.
 
 
 @inlined
-def near_of_run(
+def _near_of_run(
     keys, slots, words, masks, used, near, which, start, count, side, scratch, met, missed, n_hits,
     n_missed, last_key, slot, mask, base,
 ):  # fmt: skip
@@ -92,8 +92,8 @@ def near_of_run(
 
 
 @inlined
-def near_in_cells(words, near, start, count, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits):
-    """`near_of_run` for a run in the cells that `runs.cells_of_run` found: without a branch.
+def _near_in_cells(words, near, start, count, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits):
+    """`_near_of_run` for a run in the cells that `runs.cells_of_run` found: without a branch.
 
     Returns the numbers of near points and of hits. A hit is near, and a near voxel in a brick.
     """
@@ -111,7 +111,7 @@ def near_in_cells(words, near, start, count, n_cells, n_j, n_k, ci, cj, ck, scra
 
 
 @inlined
-def find_places(scratch, count, ahead):
+def _find_places(scratch, count, ahead):
     """Where to look up the first points of `scratch`, moved `ahead` voxels along their normals."""
     for at in range(count):
         x = scratch[3, at] + ahead * scratch[NORMAL, at]
@@ -125,7 +125,7 @@ def find_places(scratch, count, ahead):
 
 
 @inlined
-def look_up(payload, scratch, count, row):
+def _look_up(payload, scratch, count, row):
     """Distances u, voxels, at the places of the first points of `scratch`, into a row of it."""
     for at in range(count):
         scratch[row, at] = VOXELS_A_STEP * interpolated(
@@ -135,7 +135,7 @@ def look_up(payload, scratch, count, row):
 
 
 @inlined
-def weigh(payload, points, transform, size, scratch, count):
+def _weigh(payload, points, transform, size, scratch, count):
     """Turned normal, depth (at least 0) and weight of the first points of `scratch`.
 
     Distances are fetched into the cache while the normals are turned. This takes a seventh off a
@@ -144,7 +144,7 @@ def weigh(payload, points, transform, size, scratch, count):
     for row in range(NORMAL, NORMAL + 3):
         for at in range(count):
             scratch[row, at] = 0.0
-    find_places(scratch, count, 0.0)
+    _find_places(scratch, count, 0.0)
     for at in range(count):
         fetch_corners(payload, np.uint64(np.int64(scratch[LOOK_UP, at])))
     for at in range(count):
@@ -153,9 +153,9 @@ def weigh(payload, points, transform, size, scratch, count):
         scratch[NORMAL, at] = nx
         scratch[NORMAL + 1, at] = ny
         scratch[NORMAL + 2, at] = nz
-    look_up(payload, scratch, count, HERE)
-    find_places(scratch, count, AHEAD)
-    look_up(payload, scratch, count, THERE)
+    _look_up(payload, scratch, count, HERE)
+    _find_places(scratch, count, AHEAD)
+    _look_up(payload, scratch, count, THERE)
     for at in range(count):
         share = agreement(scratch[HERE, at], scratch[THERE, at])
         depth, weight = depth_and_weight(scratch[HERE, at], size)
@@ -187,11 +187,11 @@ def felt_by_distance(law, cells, which, shell, pose, place, met, missed, out):
             keys, slots, masks, used, which, n_run, place.side, scratch
         )
         if n_cells > 0:
-            n_near, n_hits = near_in_cells(
+            n_near, n_hits = _near_in_cells(
                 words, near, start, n_run, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits
             )
         elif n_cells < 0:
-            n_near, n_hits, n_missed, n_strange, last_key, slot, mask, base = near_of_run(
+            n_near, n_hits, n_missed, n_strange, last_key, slot, mask, base = _near_of_run(
                 keys, slots, words, masks, used, near, which, start, n_run, place.side, scratch,
                 met, missed, n_hits, n_missed, last_key, slot, mask, base,
             )  # fmt: skip
@@ -200,7 +200,7 @@ def felt_by_distance(law, cells, which, shell, pose, place, met, missed, out):
         start += n_run
         if n_near == 0:
             continue
-        weigh(payload, points, transform, place.size, scratch, n_near)
+        _weigh(payload, points, transform, place.size, scratch, n_near)
         for at in range(n_near):
             depth = scratch[DEPTH, at]
             weight += scratch[WEIGHT, at]

@@ -44,7 +44,7 @@ from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 
 @leaf
-def respond_at(law, is_hit, sample, transform, px, py, pz, nx, ny, nz, ox, oy, oz, size):
+def _respond_at(law, is_hit, sample, transform, px, py, pz, nx, ny, nz, ox, oy, oz, size):
     """Depth, weight and turned normal of a placed point p; n is its normal in the tool's frame."""
     nx, ny, nz = turned(transform, nx, ny, nz)
     cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
@@ -102,7 +102,7 @@ def felt(cells, which, shell, pose, place, law, met, missed, out):
                 continue
             n = start + at
             px, py, pz = scratch[0, at], scratch[1, at], scratch[2, at]
-            depth, counted, nx, ny, nz = respond_at(
+            depth, counted, nx, ny, nz = _respond_at(
                 law, is_hit, sample, transform, px, py, pz, points[n, 3], points[n, 4],
                 points[n, 5], ox, oy, oz, size,
             )  # fmt: skip
@@ -126,7 +126,7 @@ def felt(cells, which, shell, pose, place, law, met, missed, out):
     missed[LISTED] = n_missed
 
 
-def felt_plainly(law, cells, which, shell, pose, place, met, missed, out):
+def _felt_plainly(law, cells, which, shell, pose, place, met, missed, out):
     """`felt` under any law."""
     felt(cells, which, shell, pose, place, law, met, missed, out)
 
@@ -134,7 +134,7 @@ def felt_plainly(law, cells, which, shell, pose, place, met, missed, out):
 def _frame_of(law_type: type) -> Any:  # noqa: ANN401 - numba's functions are untyped
     """What computes frames under that type of law."""
     of_laws: dict[type, Any] = {DistanceFieldLaw: felt_by_distance, TangentPlaneLaw: felt_by_plane}
-    return of_laws.get(law_type, felt_plainly)
+    return of_laws.get(law_type, _felt_plainly)
 
 
 frame_of = chosen_by_type(_frame_of)

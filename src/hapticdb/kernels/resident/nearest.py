@@ -46,7 +46,7 @@ NOT_KNOWN["bound"] = -1.0
 
 
 @inlined
-def level_at(spheres, groups, run, point, largest):
+def _level_at(spheres, groups, run, point, largest):
     """What the search looks around next, where it has come to a point.
 
     It is the largest of GROUPED, RUN and POINT that begins there and has a radius of `largest` m or
@@ -60,7 +60,7 @@ def level_at(spheres, groups, run, point, largest):
 
 
 @inlined
-def ball_at(points, spheres, groups, run, point, level):
+def _ball_at(points, spheres, groups, run, point, level):
     """Centre and radius, tool frame, metres, of what is looked around, and its number of points."""
     if level == POINT:
         return points[point, 0], points[point, 1], points[point, 2], 0.0, np.int64(1)
@@ -79,7 +79,7 @@ def in_voxels(transform, place, x, y, z):
 
 
 @leaf
-def bounded_by(x, y, z, square, voxel):
+def _bounded_by(x, y, z, square, voxel):
     """Squared distance to a voxel, or -1, with which a search begins: the voxel if it is nearer."""
     if voxel >= 0 and square_to(x, y, z, voxel) < square:
         return square_to(x, y, z, voxel), voxel
@@ -111,7 +111,7 @@ def bound_at(
     cube = cubes[spread_key(key, cubes.shape[0])]
     far = wanted + 0.5 * math.sqrt(3.0) * edge
     if cube.key != key or (cube.nearest < 0 and cube.bound < far):
-        square, voxel = bounded_by(mx, my, mz, far * far, near)
+        square, voxel = _bounded_by(mx, my, mz, far * far, near)
         square, voxel = nearest_voxel(
             keys, slots, words, masks, used, which, mx, my, mz, square, voxel, side
         )
@@ -159,9 +159,9 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
         for turn in range(SURVEY if done[n] == 0 else ALL, ALL + 1):
             begin = done[n] if turn == ALL else np.int64(0)
             at, end = (first, first_end) if turn == NEAREST_BALL else (begin, total)
-            level = level_at(spheres, groups, run, at, largest)
+            level = _level_at(spheres, groups, run, at, largest)
             while at < end and within > 0.0 and (turn != SURVEY or level != POINT):
-                x, y, z, radius, n_points = ball_at(points, spheres, groups, run, at, level)
+                x, y, z, radius, n_points = _ball_at(points, spheres, groups, run, at, level)
                 x, y, z = in_voxels(transform, place, x, y, z)
                 radius /= size
                 bound, voxel = bound_at(
@@ -177,7 +177,7 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
                     level = RUN if level == GROUPED and spheres[at // run, 3] <= largest else POINT
                     continue
                 elif bound < within:
-                    limit, voxel = bounded_by(x, y, z, within * within, voxel)
+                    limit, voxel = _bounded_by(x, y, z, within * within, voxel)
                     limit, voxel = nearest_voxel(
                         keys, slots, words, masks, used, which, x, y, z, limit, voxel, side
                     )
@@ -186,7 +186,7 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
                     if voxel >= 0:
                         seed, square, best, within = voxel, limit, at, math.sqrt(limit)
                 at += n_points
-                level = level_at(spheres, groups, run, at, largest)
+                level = _level_at(spheres, groups, run, at, largest)
         squares[n], nearest[n] = square, best
         done[n] = total if square == 0.0 else min(at, total)
         hot = best

@@ -43,7 +43,7 @@ NORMAL, DEPTH = 6, 9
 
 
 @inlined
-def hits_in_cells(words, start, count, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_before):
+def _hits_in_cells(words, start, count, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_before):
     """Move the hits of a run in the cells of `runs.cells_of_run` to the front; returns n_hits.
 
     met takes their indices from `n_before` on; scratch, rows 0-5, their places.
@@ -60,11 +60,11 @@ def hits_in_cells(words, start, count, n_cells, n_j, n_k, ci, cj, ck, scratch, m
 
 
 @inlined
-def hits_of_run(
+def _hits_of_run(
     keys, slots, words, masks, used, which, start, count, side, scratch, met, n_before, missed,
     n_missed, last_key, slot, mask,
 ):  # fmt: skip
-    """`hits_in_cells` for any run, point by point.
+    """`_hits_in_cells` for any run, point by point.
 
     last_key, slot, mask: the cell of the last point. Returns the numbers of hits, of points in
     unknown cells, and of cells on the list `missed` so far, and then the cell of the last point.
@@ -95,7 +95,7 @@ def hits_of_run(
 
 
 @inlined
-def respond_to_hits(points, transform, place, met, n_before, count, scratch):
+def _respond_to_hits(points, transform, place, met, n_before, count, scratch):
     """Turned normals and depths (at least 0) of the first points of the scratch.
 
     The voxels' centres are those of `contact.center_of`, whose quotient is in the scratch already.
@@ -142,11 +142,11 @@ def felt_by_plane(law, cells, which, shell, pose, place, met, missed, out):
             keys, slots, masks, used, which, n_run, place.side, scratch
         )
         if n_cells > 0:
-            n_new = hits_in_cells(
+            n_new = _hits_in_cells(
                 words, start, n_run, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits
             )
         elif n_cells < 0:
-            n_new, n_strange, n_missed, last_key, slot, mask = hits_of_run(
+            n_new, n_strange, n_missed, last_key, slot, mask = _hits_of_run(
                 keys, slots, words, masks, used, which, start, n_run, place.side, scratch, met,
                 n_hits, missed, n_missed, last_key, slot, mask,
             )  # fmt: skip
@@ -155,7 +155,7 @@ def felt_by_plane(law, cells, which, shell, pose, place, met, missed, out):
         start += n_run
         if n_new == 0:
             continue
-        respond_to_hits(points, transform, place, met, n_hits, n_new, scratch)
+        _respond_to_hits(points, transform, place, met, n_hits, n_new, scratch)
         n_hits += n_new
         for at in range(n_new):
             depth = scratch[DEPTH, at]

@@ -72,7 +72,7 @@ the number of poses at which any point was looked at."""
 
 
 @leaf
-def farthest_in(x, y, z, voxel):
+def _farthest_in(x, y, z, voxel):
     """Distance from (x, y, z) to the farthest corner of a packed voxel's box, all in voxels."""
     i, j, k = unpacked(voxel)
     dx, dy, dz = max(x - i, i + 1.0 - x), max(y - j, j + 1.0 - y), max(z - k, k + 1.0 - z)
@@ -80,7 +80,7 @@ def farthest_in(x, y, z, voxel):
 
 
 @leaf
-def stored_bounds(payload, slot, x, y, z):
+def _stored_bounds(payload, slot, x, y, z):
     """Bounds, voxels, of the distance to a surface by the stored distances, if there are any."""
     if payload is None:
         return 0.0, np.inf
@@ -130,9 +130,9 @@ def prove(cells, reader, pieces, poses, travels, offs, place, slack, wanted, fir
                     return n
                 nearest[p] = voxel
                 distance = math.sqrt(square)
-                within = farthest_in(x, y, z, voxel) if voxel >= 0 else np.inf
+                within = _farthest_in(x, y, z, voxel) if voxel >= 0 else np.inf
                 if is_inside:
-                    low, high = stored_bounds(payload, slot, x, y, z)
+                    low, high = _stored_bounds(payload, slot, x, y, z)
                     distance, within = max(distance, low), min(within, high)
                 if within < state[WITHIN]:
                     state[WITHIN] = within

@@ -53,7 +53,7 @@ _COLUMNS = np.array(
 
 
 @inlined
-def is_something_near(
+def _is_something_near(
     keys, slots, words, masks, used, which, low_i, low_j, low_k, high_i, high_j, high_k
 ):
     """Whether a closed box in the grid holds a voxel of `words`, or may: unknown cells count, too.
@@ -111,7 +111,7 @@ def is_sphere_free(keys, slots, words, masks, used, which, spheres, n, transform
         return True
     if x - radius >= side or y - radius >= side or z - radius >= side:
         return True
-    return not is_something_near(
+    return not _is_something_near(
         keys, slots, words, masks, used, which,
         np.int64(max(x - radius, 0.0)),
         np.int64(max(y - radius, 0.0)),
@@ -167,7 +167,7 @@ def place_run(columns, start, count, transform, place, scratch):
 
 
 @inlined
-def voxel_on_axis(x):
+def _voxel_on_axis(x):
     """Voxel of a coordinate, 32 bits, so that the compiler converts several at once."""
     return np.int32(min(max(np.floor(x), -1.0), FURTHEST))
 
@@ -183,13 +183,13 @@ def cells_of_run(keys, slots, masks, used, which, count, side, scratch):
     is unknown, or it meets more than `MOST_CELLS`. The loop over points is plain, so that the
     compiler vectorizes it.
     """
-    i0 = i1 = voxel_on_axis(scratch[3, 0])
-    j0 = j1 = voxel_on_axis(scratch[4, 0])
-    k0 = k1 = voxel_on_axis(scratch[5, 0])
+    i0 = i1 = _voxel_on_axis(scratch[3, 0])
+    j0 = j1 = _voxel_on_axis(scratch[4, 0])
+    k0 = k1 = _voxel_on_axis(scratch[5, 0])
     for at in range(count):
-        i = voxel_on_axis(scratch[3, at])
-        j = voxel_on_axis(scratch[4, at])
-        k = voxel_on_axis(scratch[5, at])
+        i = _voxel_on_axis(scratch[3, at])
+        j = _voxel_on_axis(scratch[4, at])
+        k = _voxel_on_axis(scratch[5, at])
         i0, i1 = min(i0, i), max(i1, i)
         j0, j1 = min(j0, j), max(j1, j)
         k0, k1 = min(k0, k), max(k1, k)

@@ -141,7 +141,7 @@ def entered(voxels, voxel):
 
 
 @inlined
-def hits_of_pose(cells, which, shell, transform, place, sample, count, found):
+def _hits_of_pose(cells, which, shell, transform, place, sample, count, found):
     """Append hits of one placed shell to `found` -> its number of hits, -1 if a cell is unknown.
 
     sample: index of the pose, written with each hit.
@@ -193,7 +193,7 @@ def find_hits(cells, reader, shell, poses, samples, place, first, count, found):
     which = begin_frame(cells, reader)
     for at in range(first, samples.shape[0]):
         sample = samples[at]
-        now = hits_of_pose(
+        now = _hits_of_pose(
             cells, which, shell, transform_of(poses[sample]), place, sample, count, found
         )
         if now < 0:

@@ -9,7 +9,7 @@ While bricks are being filled, their key is *packed*: (i >> 3, j >> 3, k >> 3) i
 is cheaper to compute than the Z-order key, which each brick needs once, at the end.
 
 The table grows by doubling, so its memory is in proportion to the bricks that exist and never to
-the grid. Its arrays are those of one `BrickTable`; the caller counts the bricks in use.
+the grid. Its arrays are those of one `_BrickTable`; the caller counts the bricks in use.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ PACKED_BITS = 18
 PACKED_MASK = (1 << PACKED_BITS) - 1
 
 
-class BrickTable(NamedTuple):
+class _BrickTable(NamedTuple):
     """A hash table of bricks of capacity C. It has 2 C slots, so that probes stay short.
 
     keys (C,) int64, packed; words (C, 8) int64, zero where unused; slots (2 C,) int32, the index of
@@ -61,7 +61,7 @@ RUN_MASKS = _run_masks()
 
 
 @leaf
-def first_slot(key, mask):
+def _first_slot(key, mask):
     """Slot where the search for a packed key begins. No product has more than 63 bits."""
     mixed = (key & 0x7FFFFFF) * 0x5BD1E995 + (key >> 27) * 0x2545F491
     return (mixed >> 20 ^ mixed) & mask
@@ -79,7 +79,7 @@ def new_table(capacity):
     for n in range(256):
         recent[n, 0] = -1
         recent[n, 1] = -1
-    return BrickTable(keys, words, slots, recent)
+    return _BrickTable(keys, words, slots, recent)
 
 
 @leaf
@@ -94,7 +94,7 @@ def grown(table, n_bricks, wanted):
         larger.keys[n] = table.keys[n]
         for word in range(8):
             larger.words[n, word] = table.words[n, word]
-        slot = first_slot(larger.keys[n], mask)
+        slot = _first_slot(larger.keys[n], mask)
         while larger.slots[slot] >= 0:
             slot = (slot + 1) & mask
         larger.slots[slot] = n
@@ -129,7 +129,7 @@ def mark_while_room(table, n_bricks, runs, done, n_runs):
             key = column | ((at >> 1) << (PACKED_BITS * axis))
             memo = (key ^ (key >> 15) ^ (key >> 30)) & 255
             if recent[memo, 0] != key:
-                slot = first_slot(key, mask)
+                slot = _first_slot(key, mask)
                 while slots[slot] >= 0 and keys[slots[slot]] != key:
                     slot = (slot + 1) & mask
                 if slots[slot] < 0:

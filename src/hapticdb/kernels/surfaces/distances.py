@@ -84,7 +84,7 @@ TRIANGLES_AT_ONCE = 1 << 20
 """Triangles, or points, whose blocks one call finds. A larger value reports progress less often."""
 
 
-class Prepared(NamedTuple):
+class _Prepared(NamedTuple):
     """One triangle, prepared. All relative to its first corner where a direction is meant.
 
     sides (7, 8), edges (3, 7), box (2, 3) float64: its directions, edges and bounding box; corners
@@ -97,7 +97,7 @@ class Prepared(NamedTuple):
     corners: NDArray[np.float64]
 
 
-class Block(NamedTuple):
+class _Block(NamedTuple):
     """A block under construction.
 
     squares (66^3,) float64: least squared distances; unset outside the spans. spans (66^2, 2)
@@ -110,11 +110,11 @@ class Block(NamedTuple):
     steps: NDArray[np.uint8]
 
 
-BLOCK_FIELDS = fields_of(Block, FLOATS, INTS2, BYTES)
+BLOCK_FIELDS = fields_of(_Block, FLOATS, INTS2, BYTES)
 
 
 @leaf
-def set_side(shape, n, x, y, z, slope, reach):
+def _set_side(shape, n, x, y, z, slope, reach):
     """Set direction n to the unit vector along (x, y, z), or to no bound where that is null.
 
     slope : AT_Y or AT_Z, the axis that the direction is solved for; reach : half the edge of the
@@ -144,7 +144,7 @@ def set_side(shape, n, x, y, z, slope, reach):
 
 
 @leaf
-def set_edges(triangles, t, shape):
+def _set_edges(triangles, t, shape):
     """Set corners, bounding box and edges of triangle t; return the number of its longest edge.
 
     Returns -1 when all its corners coincide.
@@ -172,24 +172,24 @@ def set_edges(triangles, t, shape):
 
 
 @leaf
-def set_shape(triangles, t, shape, reach):
+def _set_shape(triangles, t, shape, reach):
     """Prepare triangle t of triangles (T, 3, 3), or point t of (T, 1, 3); return its kind."""
-    longest = set_edges(triangles, t, shape)
+    longest = _set_edges(triangles, t, shape)
     edges = shape.edges
     for m in range(3):  # square to each edge's shadow
-        set_side(shape, 4 + m, -edges[m, EDGE_Y], edges[m, EDGE_X], 0.0, AT_Y, reach)
+        _set_side(shape, 4 + m, -edges[m, EDGE_Y], edges[m, EDGE_X], 0.0, AT_Y, reach)
     if longest < 0:
         for n in range(4):
-            set_side(shape, n, 0.0, 0.0, 0.0, AT_Z, reach)
+            _set_side(shape, n, 0.0, 0.0, 0.0, AT_Z, reach)
         return POINT
     x, y, z = normal_of(shape.corners)
     if x != 0.0 or y != 0.0 or z != 0.0:
         length = np.sqrt(x * x + y * y + z * z)
         x, y, z = x / length, y / length, z / length
-        set_side(shape, 0, x, y, z, AT_Z, reach)
+        _set_side(shape, 0, x, y, z, AT_Z, reach)
         for m in range(3):
             u, v, w = edges[m, EDGE_X], edges[m, EDGE_Y], edges[m, EDGE_Z]
-            set_side(shape, 1 + m, y * w - z * v, z * u - x * w, x * v - y * u, AT_Z, reach)
+            _set_side(shape, 1 + m, y * w - z * v, z * u - x * w, x * v - y * u, AT_Z, reach)
         return FACE
     u, v, w = edges[longest, EDGE_X], edges[longest, EDGE_Y], edges[longest, EDGE_Z]
     if abs(u) <= min(abs(v), abs(w)):  # square to the edge and to the axis that it is farthest from
@@ -198,15 +198,15 @@ def set_shape(triangles, t, shape, reach):
         x, y, z = -w, 0.0, u
     else:
         x, y, z = v, -u, 0.0
-    set_side(shape, 0, x, y, z, AT_Z, reach)
-    set_side(shape, 1, v * z - w * y, w * x - u * z, u * y - v * x, AT_Z, reach)
-    set_side(shape, 2, u, v, w, AT_Z, reach)
-    set_side(shape, 3, 0.0, 0.0, 0.0, AT_Z, reach)
+    _set_side(shape, 0, x, y, z, AT_Z, reach)
+    _set_side(shape, 1, v * z - w * y, w * x - u * z, u * y - v * x, AT_Z, reach)
+    _set_side(shape, 2, u, v, w, AT_Z, reach)
+    _set_side(shape, 3, 0.0, 0.0, 0.0, AT_Z, reach)
     return LINE
 
 
 @inlined
-def y_interval(sides, x, least, greatest):
+def _y_interval(sides, x, least, greatest):
     """Narrow an interval of y to where the line at x comes near the shadow."""
     for n in range(4, N_SIDES):
         value = sides[n, AT_X] * x
@@ -216,7 +216,7 @@ def y_interval(sides, x, least, greatest):
 
 
 @inlined
-def z_interval(sides, x, y, least, greatest):
+def _z_interval(sides, x, y, least, greatest):
     """Narrow an interval of z to where the line at (x, y) comes near."""
     for n in range(4):
         value = sides[n, AT_X] * x + sides[n, AT_Y] * y
@@ -241,11 +241,11 @@ def find_blocks(triangles, bits, pairs):
     triangles (T, 3, 3), or (T, 1, 3) for points. pairs (P, 2) int64: the block's Z-order key and
     the triangle; those beyond P are counted only.
     """
-    shape = Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
+    shape = _Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
     last, half = (np.int64(1) << max(bits - BLOCK_BITS - 3, 0)) - 1, 0.5 * BLOCK
     n_pairs = 0
     for t in range(triangles.shape[0]):
-        set_shape(triangles, t, shape, REACH)
+        _set_shape(triangles, t, shape, REACH)
         sides, box = shape.sides, shape.box
         at_x, at_y, at_z = shape.corners[0, 0], shape.corners[0, 1], shape.corners[0, 2]
         more = REACH + HALF_WIDTH + SLACK
@@ -254,13 +254,13 @@ def find_blocks(triangles, bits, pairs):
         for i in range(first_i, end_i):
             x = i * BLOCK + half - at_x
             low, high = box[0, 1] - more - at_y, box[1, 1] + more - at_y
-            low, high = y_interval(sides, x, low, high)
+            low, high = _y_interval(sides, x, low, high)
             low, high = (low + at_y - half) / BLOCK, (high + at_y - half) / BLOCK
             first_j, end_j = whole(low, high, 0, last)
             for j in range(first_j, end_j):
                 y = j * BLOCK + half - at_y
                 low, high = box[0, 2] - more - at_z, box[1, 2] + more - at_z
-                low, high = z_interval(sides, x, y, low, high)
+                low, high = _z_interval(sides, x, y, low, high)
                 low, high = (low + at_z - half) / BLOCK, (high + at_z - half) / BLOCK
                 first_k, end_k = whole(low, high, 0, last)
                 for k in range(first_k, end_k):
@@ -272,7 +272,7 @@ def find_blocks(triangles, bits, pairs):
 
 
 @leaf
-def segment_square(x, y, z, u, v, w, inverse):
+def _segment_square(x, y, z, u, v, w, inverse):
     """Squared distance of (x, y, z) to the segment from 0 to (u, v, w); 1 / its squared length."""
     t = min(max((x * u + y * v + z * w) * inverse, 0.0), 1.0)
     x, y, z = x - t * u, y - t * v, z - t * w
@@ -300,7 +300,7 @@ def cover(squares, spans, line, first, end):
 
 
 @inlined
-def edge_square(sides, edges, is_line, x, y, z, u, v, w):
+def _edge_square(sides, edges, is_line, x, y, z, u, v, w):
     """Least squared distance of the centre (x, y, z) to the edges that it lies outside of, or 0.
 
     (u, v, w) is the same centre from the first corner. For a line, to all edges.
@@ -309,7 +309,7 @@ def edge_square(sides, edges, is_line, x, y, z, u, v, w):
     for m in range(3):
         s = sides[m + 1, AT_X] * u + sides[m + 1, AT_Y] * v + sides[m + 1, AT_Z] * w
         if is_line or s < sides[m + 1, LOW] or s > sides[m + 1, HIGH]:
-            found = segment_square(
+            found = _segment_square(
                 x - edges[m, 0], y - edges[m, 1], z - edges[m, 2],
                 edges[m, EDGE_X], edges[m, EDGE_Y], edges[m, EDGE_Z], edges[m, INVERSE_SQUARE],
             )  # fmt: skip
@@ -318,7 +318,7 @@ def edge_square(sides, edges, is_line, x, y, z, u, v, w):
 
 
 @inlined
-def enter_line(shape, kind, squares, at, x, y, base_z, first, end):
+def _enter_line(shape, kind, squares, at, x, y, base_z, first, end):
     """Enter a triangle into the centres first..end of a line along k.
 
     at : the place of the line's first centre in squares; x, y : the line's place in the grid;
@@ -340,7 +340,7 @@ def enter_line(shape, kind, squares, at, x, y, base_z, first, end):
             square = max(square, height * height)
         if square < squares[at + k]:
             if kind != POINT:
-                near = edge_square(sides, edges, kind == LINE, x, y, z, u, v, w)
+                near = _edge_square(sides, edges, kind == LINE, x, y, z, u, v, w)
                 square = max(square, near)
             squares[at + k] = min(squares[at + k], square)
 
@@ -358,20 +358,20 @@ def enter(shape, kind, block, i, j, k):
     first, end = whole(box[0, 0] - more - x0, box[1, 0] + more - x0, 0, SIDE - 1)
     for at_x in range(first, end):
         x = x0 + at_x
-        low, high = y_interval(sides, x - corner_x, low_y, high_y)
+        low, high = _y_interval(sides, x - corner_x, low_y, high_y)
         first_y, end_y = whole(low + corner_y - y0, high + corner_y - y0, 0, SIDE - 1)
         for at_y in range(first_y, end_y):
             y = y0 + at_y
-            low, high = z_interval(sides, x - corner_x, y - corner_y, low_z, high_z)
+            low, high = _z_interval(sides, x - corner_x, y - corner_y, low_z, high_z)
             first_z, end_z = whole(low + corner_z - z0, high + corner_z - z0, 0, SIDE - 1)
             if first_z < end_z:
                 line = at_x * SIDE + at_y
                 cover(squares, spans, line, first_z, end_z)
-                enter_line(shape, kind, squares, line * SIDE, x, y, z0, first_z, end_z)
+                _enter_line(shape, kind, squares, line * SIDE, x, y, z0, first_z, end_z)
 
 
 @leaf
-def quantise(block):
+def _quantise(block):
     """Set the steps of a block from its squared distances."""
     squares, spans, steps = block
     for n in range(steps.shape[0]):
@@ -383,7 +383,7 @@ def quantise(block):
 
 
 @leaf
-def has_span(spans, i, j, k):
+def _has_span(spans, i, j, k):
     """Whether a row that begins at centre (i, j, k) of a block meets a line's span."""
     for x in range(i, i + ROW_SIDE):
         for y in range(j, j + ROW_SIDE):
@@ -394,7 +394,7 @@ def has_span(spans, i, j, k):
 
 
 @leaf
-def copy_row(steps, i, j, k, out, n):
+def _copy_row(steps, i, j, k, out, n):
     """Copy the row that begins at centre (i, j, k) of a block to row n of out (R, 1000).
 
     Returns whether it has a distance.
@@ -419,7 +419,7 @@ def rows_of_blocks(triangles, pairs, block, at, bits, keys, out):
     kept between calls; at (1,) int64, where the next call goes on. Stops before a block for which
     keys (R,) and out (R, 1000) may have no room, and after `PAIRS_OF_PIECE`, also within a block.
     """
-    shape = Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
+    shape = _Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
     bricks = np.int64(1) << max(bits - 3, 0)
     n_rows = 0
     end = at[0] + PAIRS_OF_PIECE
@@ -432,17 +432,17 @@ def rows_of_blocks(triangles, pairs, block, at, bits, keys, out):
         while at[0] < pairs.shape[0] and pairs[at[0], 0] == key:
             if at[0] == end:
                 return n_rows
-            kind = set_shape(triangles, pairs[at[0], 1], shape, 0.0)
+            kind = _set_shape(triangles, pairs[at[0], 1], shape, 0.0)
             enter(shape, kind, block, i * BLOCK - 1, j * BLOCK - 1, k * BLOCK - 1)
             at[0] += 1
-        quantise(block)
+        _quantise(block)
         for brick in range(BLOCK_BRICKS):
             place = np.int64(brick)
             x, y, z = compact(place >> 2), compact(place >> 1), compact(place)
             if max((i << BLOCK_BITS) + x, (j << BLOCK_BITS) + y, (k << BLOCK_BITS) + z) >= bricks:
                 continue
             x, y, z = x * BRICK, y * BRICK, z * BRICK
-            if has_span(block.spans, x, y, z) and copy_row(block.steps, x, y, z, out, n_rows):
+            if _has_span(block.spans, x, y, z) and _copy_row(block.steps, x, y, z, out, n_rows):
                 keys[n_rows] = (key << (3 * BLOCK_BITS)) | brick
                 n_rows += 1
     return n_rows
@@ -491,7 +491,7 @@ def band_pieces(
     pairs = np.concatenate(found)
     found.clear()
     pairs = np.ascontiguousarray(pairs[np.argsort(pairs[:, 0], kind="stable")])
-    block = Block(np.empty(SIDE**3), np.empty((SIDE**2, 2), np.int64), np.empty(SIDE**3, np.uint8))
+    block = _Block(np.empty(SIDE**3), np.empty((SIDE**2, 2), np.int64), np.empty(SIDE**3, np.uint8))
     at = np.zeros(1, dtype=np.int64)
     while at[0] < len(pairs):
         n_rows = rows_of_blocks(corners, pairs, block, at, bits, keys, out)

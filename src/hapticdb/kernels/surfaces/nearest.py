@@ -16,7 +16,7 @@ Ints = NDArray[np.int64]
 
 
 @leaf
-def square_to_box(boxes, node, x, y, z):
+def _square_to_box(boxes, node, x, y, z):
     """Squared distance from (x, y, z) to the node's box; infinite if it holds no triangle."""
     dx = max(boxes[node, 0, 0] - x, x - boxes[node, 1, 0], 0.0)
     dy = max(boxes[node, 0, 1] - y, y - boxes[node, 1, 1], 0.0)
@@ -25,7 +25,7 @@ def square_to_box(boxes, node, x, y, z):
 
 
 @leaf
-def square_to_edge(px, py, pz, ux, uy, uz):
+def _square_to_edge(px, py, pz, ux, uy, uz):
     """Squared distance from p to the edge from the origin to u."""
     length = ux * ux + uy * uy + uz * uz
     share = 0.0
@@ -36,16 +36,16 @@ def square_to_edge(px, py, pz, ux, uy, uz):
 
 
 @leaf
-def square_to_triangle(corners, n, x, y, z):
+def _square_to_triangle(corners, n, x, y, z):
     """Squared distance from (x, y, z) to triangle n: to an edge, or to the plane above it."""
     ax, ay, az = corners[n, 0, 0], corners[n, 0, 1], corners[n, 0, 2]
     ux, uy, uz = corners[n, 1, 0] - ax, corners[n, 1, 1] - ay, corners[n, 1, 2] - az
     vx, vy, vz = corners[n, 2, 0] - ax, corners[n, 2, 1] - ay, corners[n, 2, 2] - az
     px, py, pz = x - ax, y - ay, z - az
     square = min(
-        square_to_edge(px, py, pz, ux, uy, uz),
-        square_to_edge(px, py, pz, vx, vy, vz),
-        square_to_edge(px - ux, py - uy, pz - uz, vx - ux, vy - uy, vz - uz),
+        _square_to_edge(px, py, pz, ux, uy, uz),
+        _square_to_edge(px, py, pz, vx, vy, vz),
+        _square_to_edge(px - ux, py - uy, pz - uz, vx - ux, vy - uy, vz - uz),
     )
     nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
     area = nx * nx + ny * ny + nz * nz
@@ -92,7 +92,7 @@ def distances_kernel(tree, places, own, normals, flat, enough, farthest, out):
     for q in range(places.shape[0]):
         x, y, z = places[q, 0], places[q, 1], places[q, 2]
         best = farthest * farthest
-        waiting[0], squares[0] = 0, square_to_box(boxes, np.int64(0), x, y, z)
+        waiting[0], squares[0] = 0, _square_to_box(boxes, np.int64(0), x, y, z)
         top = 1
         while top > 0 and best > enough * enough:
             top -= 1
@@ -101,8 +101,8 @@ def distances_kernel(tree, places, own, normals, flat, enough, farthest, out):
                 continue
             if node < first_leaf:
                 near, far = 2 * node + 1, 2 * node + 2
-                here = square_to_box(boxes, near, x, y, z)
-                there = square_to_box(boxes, far, x, y, z)
+                here = _square_to_box(boxes, near, x, y, z)
+                there = _square_to_box(boxes, far, x, y, z)
                 if there < here:
                     near, far, here, there = far, near, there, here
                 waiting[top], squares[top] = far, there
@@ -117,7 +117,7 @@ def distances_kernel(tree, places, own, normals, flat, enough, farthest, out):
                     tree.corners, n, x, y, z, normals[q, 0], normals[q, 1], normals[q, 2], flat
                 ):
                     continue
-                best = min(best, square_to_triangle(tree.corners, n, x, y, z))
+                best = min(best, _square_to_triangle(tree.corners, n, x, y, z))
         out[q] = np.sqrt(best)
 
 

@@ -25,7 +25,7 @@ sample."""
 
 
 @leaf
-def pair_weight(points, face_of, normals, a, b, reach, nearest, opposite):
+def _pair_weight(points, face_of, normals, a, b, reach, nearest, opposite):
     """Weigh a and b on each other: (1 - d / reach)^8, d the distance, at least `nearest`.
 
     Yuksel 2015, equations 2 and 5. Points on opposite sides of a sheet have a weight only
@@ -53,7 +53,7 @@ def pair_weight(points, face_of, normals, a, b, reach, nearest, opposite):
 
 
 @leaf
-def sift_down(heap, rank, weights, at, size):
+def _sift_down(heap, rank, weights, at, size):
     """Restore the heap, heaviest first, below `at`, whose weight may have fallen.
 
     rank (M,) int32 is the position of each candidate in the heap, -1 of one that was dropped.
@@ -93,12 +93,12 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
         for row in range(9):
             for b in range(ranges[cell, row, 0], ranges[cell, row, 1]):
                 if b != a:
-                    weight += pair_weight(points, face_of, normals, a, b, reach, nearest, opposite)
+                    weight += _pair_weight(points, face_of, normals, a, b, reach, nearest, opposite)
         weights[a] = weight
         heap[a] = a
         rank[a] = a
     for at in range(n_points // 2 - 1, -1, -1):
-        sift_down(heap, rank, weights, at, n_points)
+        _sift_down(heap, rank, weights, at, n_points)
     size = n_points
     while size > n_keep:
         item = np.int64(heap[0])
@@ -107,16 +107,16 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
         if size > 0:
             heap[0] = heap[size]
             rank[heap[0]] = 0
-            sift_down(heap, rank, weights, np.int64(0), size)
+            _sift_down(heap, rank, weights, np.int64(0), size)
         cell = cell_of[item]
         for row in range(9):
             for b in range(ranges[cell, row, 0], ranges[cell, row, 1]):
                 if rank[b] < 0:
                     continue
-                weight = pair_weight(points, face_of, normals, item, b, reach, nearest, opposite)
+                weight = _pair_weight(points, face_of, normals, item, b, reach, nearest, opposite)
                 if weight > 0.0:
                     weights[b] -= weight
-                    sift_down(heap, rank, weights, np.int64(rank[b]), size)
+                    _sift_down(heap, rank, weights, np.int64(rank[b]), size)
     return rank
 
 

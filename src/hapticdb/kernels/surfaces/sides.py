@@ -100,7 +100,7 @@ def triangle_tree(triangles: Floats, bodies: Ints) -> TriangleTree:
 
 
 @leaf
-def line_meets_box(ox, oy, oz, ix, iy, iz, boxes, node):
+def _line_meets_box(ox, oy, oz, ix, iy, iz, boxes, node):
     """Whether the line through o, of inverse direction i, meets the node's box."""
     a = (boxes[node, 0, 0] - ox) * ix
     b = (boxes[node, 1, 0] - ox) * ix
@@ -118,7 +118,7 @@ def line_meets_box(ox, oy, oz, ix, iy, iz, boxes, node):
 
 
 @leaf
-def crossing_side(ox, oy, oz, dx, dy, dz, corners, n, slack):
+def _crossing_side(ox, oy, oz, dx, dy, dz, corners, n, slack):
     """Where the line through o along d crosses triangle n: 1 ahead, -1 behind, TOUCH at o, or 0.
 
     Moeller and Trumbore, Journal of Graphics Tools 2(1), 1997.
@@ -167,7 +167,7 @@ def crossings(origin, direction, body, skip, tree, stack):
         node = stack[top]
         if tree.spans[node, 0] > body or tree.spans[node, 1] < body:
             continue
-        if not line_meets_box(ox, oy, oz, ix, iy, iz, tree.boxes, node):
+        if not _line_meets_box(ox, oy, oz, ix, iy, iz, tree.boxes, node):
             continue
         if node < first_leaf:
             stack[top] = 2 * node + 2
@@ -178,7 +178,7 @@ def crossings(origin, direction, body, skip, tree, stack):
         for n in range(start, min(start + LEAF_SIZE, n_triangles)):
             if tree.bodies[n] != body or tree.faces[n] == skip:
                 continue
-            side = crossing_side(ox, oy, oz, dx, dy, dz, tree.corners, n, tree.slack)
+            side = _crossing_side(ox, oy, oz, dx, dy, dz, tree.corners, n, tree.slack)
             if side == TOUCH:
                 return -1, -1, visits
             if side > 0:

@@ -86,7 +86,7 @@ STEEP = 1e40
 
 
 @leaf
-def exact_difference(a, b):
+def _exact_difference(a, b):
     """Return (d, e) with d + e = a - b exactly (Knuth, TwoDiff)."""
     d = a - b
     t = d - a
@@ -94,7 +94,7 @@ def exact_difference(a, b):
 
 
 @leaf
-def exact_product(a, b):
+def _exact_product(a, b):
     """Return (p, e) with p + e = a b exactly (Dekker 1971)."""
     p = a * b
     t = 134217729.0 * a
@@ -107,15 +107,15 @@ def exact_product(a, b):
 
 
 @leaf
-def exact_minor(corners, p, q):
+def _exact_minor(corners, p, q):
     """Return (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p, exact to the last bits."""
-    a, a_low = exact_difference(corners[1, p], corners[0, p])
-    b, b_low = exact_difference(corners[2, q], corners[0, q])
-    c, c_low = exact_difference(corners[1, q], corners[0, q])
-    d, d_low = exact_difference(corners[2, p], corners[0, p])
-    left, left_low = exact_product(a, b)
-    right, right_low = exact_product(c, d)
-    whole, low = exact_difference(left, right)
+    a, a_low = _exact_difference(corners[1, p], corners[0, p])
+    b, b_low = _exact_difference(corners[2, q], corners[0, q])
+    c, c_low = _exact_difference(corners[1, q], corners[0, q])
+    d, d_low = _exact_difference(corners[2, p], corners[0, p])
+    left, left_low = _exact_product(a, b)
+    right, right_low = _exact_product(c, d)
+    whole, low = _exact_difference(left, right)
     low += left_low - right_low
     return whole + (low + ((a * b_low + a_low * b) - (c * d_low + c_low * d)))
 
@@ -144,9 +144,9 @@ def normal_of(corners):
         dz = corners[m, 2] - corners[n, 2]
         longest = max(longest, dx * dx + dy * dy + dz * dz)
     if longest * np.sqrt(longest) > THIN * np.sqrt(x * x + y * y + z * z):
-        x = exact_minor(corners, AXIS_Y, AXIS_Z)
-        y = exact_minor(corners, AXIS_Z, AXIS_X)
-        z = exact_minor(corners, AXIS_X, AXIS_Y)
+        x = _exact_minor(corners, AXIS_Y, AXIS_Z)
+        y = _exact_minor(corners, AXIS_Z, AXIS_X)
+        z = _exact_minor(corners, AXIS_X, AXIS_Y)
         if np.sqrt(x * x + y * y + z * z) <= NULL_NORMAL * longest:
             return 0.0, 0.0, 0.0
     return x, y, z
@@ -159,7 +159,7 @@ def slope(along, length):
 
 
 @leaf
-def edge_axis(from_p, from_q, to_p, to_q, other_p, other_q):
+def _edge_axis(from_p, from_q, to_p, to_q, other_p, other_q):
     """Axis square to an edge in the plane of two axes p and q, to be solved for q.
 
     Returns the coefficient of p, the least and the greatest value of ``coefficient * p + rest * q``
@@ -181,7 +181,7 @@ def edge_axis(from_p, from_q, to_p, to_q, other_p, other_q):
 
 
 @leaf
-def set_normal_axis(plane, corners, normal, u, v, w):
+def _set_normal_axis(plane, corners, normal, u, v, w):
     """Like `set_edge_axis` for the normal: coefficients of u and v, bounds, 1 / that of w."""
     at_u, at_v, at_w = normal[u], normal[v], normal[w]
     if at_w < 0.0:
@@ -206,7 +206,7 @@ def set_normal_axis(plane, corners, normal, u, v, w):
 
 
 @leaf
-def place_in_grid(triangles, t, edge, corners, box):
+def _place_in_grid(triangles, t, edge, corners, box):
     """Move a triangle to its own corner and find the voxels of its bounding box.
 
     Writes corners (3, 3), and to box (3, 3) int64 the first and last voxel on each axis, counted
@@ -241,7 +241,7 @@ def place_in_grid(triangles, t, edge, corners, box):
 
 
 @leaf
-def order_axes(box, normal):
+def _order_axes(box, normal):
     """Axes (u, v, w): w crosses the fewest columns, and u has fewer rows than v."""
     x = box[1, 0] - box[0, 0]
     y = box[1, 1] - box[0, 1]
@@ -257,7 +257,7 @@ def order_axes(box, normal):
 
 
 @leaf
-def longest_box(triangles, edge):
+def _longest_box(triangles, edge):
     """Return the most voxels that a triangle's bounding box has along an axis, in the grid."""
     longest = 0.0
     for t in range(triangles.shape[0]):
@@ -268,24 +268,24 @@ def longest_box(triangles, edge):
 
 
 @leaf
-def set_axes(axes, plane, corners, normal, u, v, w):
+def _set_axes(axes, plane, corners, normal, u, v, w):
     """Set the ten axes of a triangle: rows 0-2 of (u, v), 3-5 of (u, w), 6-8 of (v, w); plane."""
     for n in range(3):
         m, o = (n + 1) % 3, (n + 2) % 3
         nu, nv, nw = corners[n, u], corners[n, v], corners[n, w]
         mu, mv, mw = corners[m, u], corners[m, v], corners[m, w]
         ou, ov, ow = corners[o, u], corners[o, v], corners[o, w]
-        at, low, high, steepness = edge_axis(nu, nv, mu, mv, ou, ov)
+        at, low, high, steepness = _edge_axis(nu, nv, mu, mv, ou, ov)
         axes[n, 0], axes[n, 1], axes[n, 2], axes[n, 3] = at, low, high, steepness
-        at, low, high, steepness = edge_axis(nu, nw, mu, mw, ou, ow)
+        at, low, high, steepness = _edge_axis(nu, nw, mu, mw, ou, ow)
         axes[n + 3, 0], axes[n + 3, 1], axes[n + 3, 2], axes[n + 3, 3] = at, low, high, steepness
-        at, low, high, steepness = edge_axis(nv, nw, mv, mw, ov, ow)
+        at, low, high, steepness = _edge_axis(nv, nw, mv, mw, ov, ow)
         axes[n + 6, 0], axes[n + 6, 1], axes[n + 6, 2], axes[n + 6, 3] = at, low, high, steepness
-    set_normal_axis(plane, corners, normal, u, v, w)
+    _set_normal_axis(plane, corners, normal, u, v, w)
 
 
 @leaf
-def set_spans(axes, spans, box, v, w):
+def _set_spans(axes, spans, box, v, w):
     """Set the interval of w for each v of a triangle's bounding box."""
     for at_v in range(box[0, v], box[1, v] + 1):
         y = float(at_v)
@@ -299,7 +299,7 @@ def set_spans(axes, spans, box, v, w):
 
 
 @inlined
-def row_intervals(axes, x, box_intervals):
+def _row_intervals(axes, x, box_intervals):
     """Narrow a bounding box's intervals of v and of w, both lowest first, to those of the row x."""
     low, high, low_row, high_row = box_intervals
     for n in range(3):
@@ -313,7 +313,7 @@ def row_intervals(axes, x, box_intervals):
 
 
 @inlined
-def write_run(runs, n, axes, voxel, last):
+def _write_run(runs, n, axes, voxel, last):
     """Write run n: it begins at a voxel, given on the axes (u, v, w), and ends at `last` on w."""
     u, v, w = axes
     runs[n, u], runs[n, v], runs[n, w] = voxel
@@ -322,7 +322,7 @@ def write_run(runs, n, axes, voxel, last):
 
 
 @leaf
-def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
+def _fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
     """Write the runs of voxels of triangles from resume on until `runs` is full; return how many.
 
     resume (4,) int64 is where it stopped. The other arrays keep what was computed for the triangle.
@@ -330,31 +330,31 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
     n_runs = 0
     for t in range(resume[AT_TRIANGLE], triangles.shape[0]):
         is_new = resume[AT_ROW] < 0
-        placed = place_in_grid(triangles, t, edge, corners, box) if is_new else CUT
+        placed = _place_in_grid(triangles, t, edge, corners, box) if is_new else CUT
         if placed == OUTSIDE:
             continue
         if n_runs == runs.shape[0]:
             resume[AT_TRIANGLE] = t
             return n_runs
         normal = normal_of(corners)
-        u, v, w = uvw = order_axes(box, normal)
+        u, v, w = uvw = _order_axes(box, normal)
         first_u, first_v = box[0, u], box[0, v]
         move_u, move_v, move_w = box[2, u], box[2, v], box[2, w]
         if placed == WHOLE and first_u == box[1, u] and first_v == box[1, v]:
             # a triangle in one column meets every voxel of it that its bounding box meets
             start = (first_u + move_u, first_v + move_v, box[0, w] + move_w)
-            write_run(runs, n_runs, uvw, start, box[1, w] + move_w)
+            _write_run(runs, n_runs, uvw, start, box[1, w] + move_w)
             n_runs += 1
             continue
         if is_new:
-            set_axes(axes, plane, corners, normal, u, v, w)
-            set_spans(axes, spans, box, v, w)
+            _set_axes(axes, plane, corners, normal, u, v, w)
+            _set_spans(axes, spans, box, v, w)
         else:
             first_u += resume[AT_ROW]
         box_intervals = (float(first_v), float(box[1, v]), float(box[0, w]), float(box[1, w]))
         for at_u in range(first_u, box[1, u] + 1):
             x = float(at_u)
-            low, high, low_row, high_row = row_intervals(axes, x, box_intervals)
+            low, high, low_row, high_row = _row_intervals(axes, x, box_intervals)
             if low_row > high_row or low > high:
                 resume[AT_ROW] = -1
                 continue
@@ -377,7 +377,7 @@ def fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
                     )
                     return n_runs
                 start = (at_u + move_u, at_v + move_v, first + move_w)
-                write_run(runs, n_runs, uvw, start, last + move_w)
+                _write_run(runs, n_runs, uvw, start, last + move_w)
                 n_runs += 1
     resume[AT_TRIANGLE] = triangles.shape[0]
     return n_runs
@@ -393,7 +393,7 @@ def voxelize_kernel(triangles, bits, resume, most):
     """
     edge = float(1 << bits)
     table, n_bricks = new_table(FIRST_CAPACITY), np.int64(0)
-    longest = longest_box(triangles, edge)
+    longest = _longest_box(triangles, edge)
     runs = np.empty((max(min(RUNS_AT_ONCE, VOXELS_AT_ONCE // longest), 1), 5), np.int64)
     corners = np.empty((3, 3))
     box = np.empty((3, 3), np.int64)
@@ -402,23 +402,23 @@ def voxelize_kernel(triangles, bits, resume, most):
     spans = np.empty((longest, 2))
     n_visits = np.int64(0)
     if resume[AT_ROW] >= 0:  # in the middle of a triangle: compute its axes again
-        place_in_grid(triangles, resume[AT_TRIANGLE], edge, corners, box)
+        _place_in_grid(triangles, resume[AT_TRIANGLE], edge, corners, box)
         normal = normal_of(corners)
-        u, v, w = order_axes(box, normal)
-        set_axes(axes, plane, corners, normal, u, v, w)
-        set_spans(axes, spans, box, v, w)
+        u, v, w = _order_axes(box, normal)
+        _set_axes(axes, plane, corners, normal, u, v, w)
+        _set_spans(axes, spans, box, v, w)
     while (
         resume[AT_TRIANGLE] < triangles.shape[0]
         and n_bricks < most
         and n_visits < VISITS_A_BRICK * most
     ):
-        n_runs = fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs)
+        n_runs = _fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs)
         table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
         for n in range(n_runs):
             n_visits += bricks_of_run(runs[n, 2 - runs[n, RUN_AXIS]], runs[n, RUN_LAST])
     resume[ROWS_DONE] = 0
     if resume[AT_ROW] >= 0:
-        u, v, w = order_axes(box, normal_of(corners))
+        u, v, w = _order_axes(box, normal_of(corners))
         span = box[1, u] - box[0, u] + 1
         resume[ROWS_DONE] = (1000 * resume[AT_ROW]) // span
     return table.keys, table.words, n_bricks

@@ -45,7 +45,7 @@ def item(items: list[dict[str, Any]], number: object, what: str) -> dict[str, An
     return items[n]
 
 
-def external_name(buffer: dict[str, Any]) -> str | None:
+def _external_name(buffer: dict[str, Any]) -> str | None:
     """File that holds a buffer; None if the glTF file itself holds it."""
     name = buffer.get("uri")
     if name is not None and not isinstance(name, str):
@@ -56,7 +56,7 @@ def external_name(buffer: dict[str, Any]) -> str | None:
 def external_bytes(tree: dict[str, Any], folder: Path) -> int:
     """Size of the existing files that a glTF file refers to; each file counts once."""
     sizes: dict[tuple[int, int], int] = {}
-    for name in {external_name(buffer) for buffer in objects_of(tree, "buffers")} - {None}:
+    for name in {_external_name(buffer) for buffer in objects_of(tree, "buffers")} - {None}:
         file = _beside(folder, str(name))
         if file is not None:
             status = file.stat()
@@ -159,7 +159,7 @@ class Accessors:
 
     def _content(self, number: int, buffer: dict[str, Any]) -> memoryview:
         """Bytes of a buffer; buffers of one file share them."""
-        name = external_name(buffer)
+        name = _external_name(buffer)
         file = None if name is None else _beside(self._folder, name)
         if name is not None and file is None:
             raise UnreadableError(f"it refers to {name}, which is not beside it")

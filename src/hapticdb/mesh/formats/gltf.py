@@ -36,7 +36,7 @@ _HARMLESS = (
 def read(path: Path) -> Parsed:
     """Parts of the file's default scene, in metres."""
     content = path.read_bytes()
-    tree = load_tree(content, path.suffix.lower())
+    tree = _load_tree(content, path.suffix.lower())
     chunks = chunks_of(content) if content[:4] == _MAGIC else []
     accessors = Accessors(tree, chunks, path.parent)
     _refuse_unreadable(tree, accessors)
@@ -60,7 +60,7 @@ def _up_axis(tree: dict[str, Any]) -> str:
     return up if isinstance(up, str) and up in {"x", "y", "z"} else "y"
 
 
-def load_tree(content: bytes, suffix: str) -> dict[str, Any]:
+def _load_tree(content: bytes, suffix: str) -> dict[str, Any]:
     """JSON part of a glTF or GLB file."""
     if content[:4] == _MAGIC:
         if len(content) < 20 or content[16:20] != b"JSON":
@@ -93,7 +93,7 @@ def load_tree(content: bytes, suffix: str) -> dict[str, Any]:
 
 def bytes_beside(path: Path) -> int:
     """Size of the existing files that a glTF file refers to; each file counts once."""
-    return external_bytes(load_tree(path.read_bytes(), path.suffix.lower()), path.parent)
+    return external_bytes(_load_tree(path.read_bytes(), path.suffix.lower()), path.parent)
 
 
 def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:

@@ -28,7 +28,7 @@ lost; at 0 a click on the gizmo would be an edit."""
 
 
 @dataclass(eq=False)
-class HeldPart:
+class _HeldPart:
     """A part on its gizmo.
 
     object : as this browser's moves are based on it; start : pose (4, 4) of the gizmo at which the
@@ -59,7 +59,7 @@ class MovingControls:
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._lock = threading.RLock()
-        self._held: HeldPart | None = None
+        self._held: _HeldPart | None = None
         self._gizmo: Any = None
         self._is_dragged = False
         is_seen = browser.visitor.may("editor") and browser.site.edits is not None
@@ -91,7 +91,7 @@ class MovingControls:
                 return
             start = np.eye(4)
             start[:3, 3] = obj.bounds.mean(axis=0)
-            self._held = HeldPart(obj, start, start)
+            self._held = _HeldPart(obj, start, start)
             size = browser.site.stage.diagonal
             self._gizmo = browser.client.scene.add_transform_controls(
                 "/move", scale=MOVING_GIZMO * size, line_width=3.5, position=start[:3, 3],
@@ -125,7 +125,7 @@ class MovingControls:
             self._browser.only_chosen()
         self.follow()
 
-    async def _dragged(self, held: HeldPart, event: "TransformControlsEvent") -> None:
+    async def _dragged(self, held: _HeldPart, event: "TransformControlsEvent") -> None:
         """Write the part's new placement when it is let go of, by a person who is still there."""
 
         def act(event: "TransformControlsEvent") -> None:
@@ -147,7 +147,7 @@ class MovingControls:
 
         self._browser.guarded("editor", act)(event)
 
-    def _let_go(self, held: HeldPart, pose: NDArray[np.float64]) -> None:
+    def _let_go(self, held: _HeldPart, pose: NDArray[np.float64]) -> None:
         """Write a move that ends at a pose; one that follows another is based on its result."""
         browser = self._browser
         if float(np.abs(pose @ np.linalg.inv(held.left) - np.eye(4)).max()) < LEAST_WAY:

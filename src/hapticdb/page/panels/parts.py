@@ -34,7 +34,7 @@ MOST_VOXELS = 60_000
 
 
 @dataclass(frozen=True)
-class TreeLine:
+class _TreeLine:
     """One line of the tree: a sub-assembly, or an object where `branch` is None."""
 
     label: str
@@ -53,7 +53,7 @@ class PartsPanel:
         self._client = browser.client
         self._opened = ""
         self._page = 0
-        self._lines: list[TreeLine] = []
+        self._lines: list[_TreeLine] = []
         self._ends: list[Floats] = []
         self._voxels: Any = None
         guard = browser.guarded
@@ -106,18 +106,18 @@ class PartsPanel:
         if search.strip():
             ids = site.view.search(search[:LONGEST_SEARCH])
             lines = [
-                TreeLine(plain_name(site.objects[i].name), (i,)) for i in ids if i in site.objects
+                _TreeLine(plain_name(site.objects[i].name), (i,)) for i in ids if i in site.objects
             ]
             where = f"{len(ids):,} of {len(site.objects):,} parts"
         else:
             branch = _branch_at(site.view.tree(), self._opened)
             self._opened = branch.path
             lines = [
-                TreeLine(f"▸ {below.name} ({below.count})", tuple(below.all_ids()), below)
+                _TreeLine(f"▸ {below.name} ({below.count})", tuple(below.all_ids()), below)
                 for below in branch.branches
             ]
             lines += [
-                TreeLine(site.objects[i].name.rpartition("/")[2], (i,))
+                _TreeLine(site.objects[i].name.rpartition("/")[2], (i,))
                 for i in branch.ids
                 if i in site.objects
             ]

@@ -37,7 +37,7 @@ WAYS = {
 """Ways of a sweep: the axis of the scene and its sign; None: from where it is to the hand."""
 
 
-class SweepAnswer(NamedTuple):
+class _SweepAnswer(NamedTuple):
     """A sweep's answer, to be drawn.
 
     shell : what was swept; swept : the result; moment : where it is caught, or else where it hits
@@ -90,7 +90,7 @@ class SweepPanel:
         part = None
         if is_part:
             part = browser.taken if browser.taken is not None else browser.only_chosen().id
-        job = SweepJob(browser, part, way, length)
+        job = _SweepJob(browser, part, way, length)
         self._is_running = True
         self._erase()
         put(self._bar, 0.0)
@@ -98,7 +98,7 @@ class SweepPanel:
         self._said.content = note_html("Waits for its turn, then moves it along.")
         browser.site.sweeping.submit(self._work, job)
 
-    def _work(self, job: "SweepJob") -> None:
+    def _work(self, job: "_SweepJob") -> None:
         """Sweep; in the site's thread for sweeps."""
         try:
             self._show(job.run(self._progress), job.name)
@@ -114,7 +114,7 @@ class SweepPanel:
     def _progress(self, done: int, total: int) -> None:
         put(self._bar, 100.0 * done / max(total, 1))
 
-    def _show(self, found: SweepAnswer, name: str) -> None:
+    def _show(self, found: _SweepAnswer, name: str) -> None:
         swept, scene = found.swept, self._browser.client.scene
         line = verdict_line(swept, found.shell)
         colour = {"hits": "#c62838", "comes out": "#1f8a4c"}.get(swept.verdict, "#a8730f")
@@ -165,7 +165,7 @@ class SweepPanel:
         self._clear.visible = False
 
 
-class SweepJob:
+class _SweepJob:
     """A sweep as it was asked for: later clicks do not change it.
 
     part : id of the swept object; None: the tool; way : one of `WAYS`; length : of a way along an
@@ -183,7 +183,7 @@ class SweepJob:
         obj = None if part is None else browser.site.objects[part]
         self.name = self._tool.name if obj is None else short_name(obj.name)
 
-    def run(self, progress: sweeps.SampleCallback) -> SweepAnswer:
+    def run(self, progress: sweeps.SampleCallback) -> _SweepAnswer:
         """Sweep on a connection of its own."""
         with opened(self._site.url, self._site.folders) as env:
             if self._part is None:
@@ -199,7 +199,7 @@ class SweepJob:
                 pose = moment.pose
                 touch = env.touch(shell, pose, exclude=present, law="plane")
                 marks = shell.points[touch.hits] @ pose[:3, :3].T + pose[:3, 3]
-        return SweepAnswer(shell, swept, moment, marks)
+        return _SweepAnswer(shell, swept, moment, marks)
 
     def _path(self, shell: PointShell) -> Floats:
         """Poses of the sweep: of the tool, or displacements of the part from its place."""

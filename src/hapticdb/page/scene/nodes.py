@@ -113,7 +113,7 @@ def _cube32() -> Facets:
     return Facets(vertices.astype(np.float32), faces.astype(np.uint32))
 
 
-class MergedNode:
+class _MergedNode:
     """Different shapes of one colour at their places, as one geometry.
 
     Objects that an audience sees in another colour are drawn by nodes beside it, one a colour. If
@@ -194,7 +194,7 @@ def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
             for member in same:
                 rest.setdefault(member.colour, []).append(member)
     for same in rest.values():
-        nodes.extend(MergedNode(names(), run) for run in _runs(same))
+        nodes.extend(_MergedNode(names(), run) for run in _runs(same))
     return nodes
 
 

@@ -54,7 +54,7 @@ def set_stage(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
     steps = np.linspace(0.0, 1.0, 64)[:, None, None]
     shades = (1 - steps) * np.array(ABOVE) + steps * np.array(BELOW)
     scene.set_background_image(np.tile(shades.astype(np.uint8), (1, 8, 1)), format="png")
-    set_ground(scene, box, up)
+    _set_ground(scene, box, up)
     view = framing(box, up)
     camera = server.initial_camera
     camera.fov = FIELD_OF_VIEW
@@ -64,7 +64,7 @@ def set_stage(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
     camera.position = tuple(view.position)
 
 
-def set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
+def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
     """Lines below the objects, a power of ten of metres apart."""
     radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
     cell = 10.0 ** np.floor(np.log10(radius / 2))

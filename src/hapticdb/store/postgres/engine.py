@@ -11,7 +11,7 @@ from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.store import PostgresStore
 
 
-class PostgresEngine:
+class _PostgresEngine:
     """Environments on servers."""
 
     title = "PostgreSQL"
@@ -49,4 +49,4 @@ class PostgresEngine:
             rights.grant(connection, role, right)
 
 
-ENGINE = PostgresEngine()
+ENGINE = _PostgresEngine()

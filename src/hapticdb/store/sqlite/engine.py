@@ -16,7 +16,7 @@ PREFIX = "sqlite:///"
 KEYWORDS = re.compile(r"^postgres(ql)?:|(^|\s)\w*password\s*=", re.IGNORECASE)
 
 
-class SQLiteEngine:
+class _SQLiteEngine:
     """Environments in files."""
 
     title = "SQLite"
@@ -26,23 +26,23 @@ class SQLiteEngine:
 
     def open(self, url: str, *, read_only: bool) -> Store:
         """Open an existing file."""
-        return SQLiteStore.open(path_of(url), read_only=read_only)
+        return SQLiteStore.open(_path_of(url), read_only=read_only)
 
     def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
         """Make a new file, which appears whole or not at all."""
-        return SQLiteStore.create(path_of(url), grid, layout, distances=distances)
+        return SQLiteStore.create(_path_of(url), grid, layout, distances=distances)
 
     def exists(self, url: str) -> bool:
         """Whether a file of that name is there."""
-        return path_of(url).exists()
+        return _path_of(url).exists()
 
     def beside(self, url: str, name: str) -> str:
         """Path of another file in the same folder."""
-        return str(path_of(url).with_name(f"{name}.db"))
+        return str(_path_of(url).with_name(f"{name}.db"))
 
     def name_of(self, url: str) -> str:
         """Name of a file without its ending."""
-        return path_of(url).stem
+        return _path_of(url).stem
 
     def back_up(
         self, url: str, copy: str, *, replace: bool, progress: BackupCallback | None
@@ -50,19 +50,19 @@ class SQLiteEngine:
         """Copy a file whole, as of one moment."""
         from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 
-        return back_up(path_of(url), path_of(copy), replace=replace, progress=progress)
+        return back_up(_path_of(url), _path_of(copy), replace=replace, progress=progress)
 
     def restore(self, copy: str, url: str, *, progress: BackupCallback | None) -> BackupReport:
         """Put a copy in a file's place, and remove the log of the former file."""
         from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 
-        return back_up(path_of(copy), path_of(url), replace=True, progress=progress)
+        return back_up(_path_of(copy), _path_of(url), replace=True, progress=progress)
 
 
-ENGINE = SQLiteEngine()
+ENGINE = _SQLiteEngine()
 
 
-def path_of(url: str) -> Path:
+def _path_of(url: str) -> Path:
     """Path of the file that a URL or a path means."""
     text = url
     if text.startswith(PREFIX):

@@ -68,7 +68,7 @@ def damaged(path: str, cause: str) -> DamagedError:
     )
 
 
-def check_kind(path: Path) -> None:
+def _check_kind(path: Path) -> None:
     """Refuse a missing file, a folder, a file of another kind, a file that is cut off.
 
     Reads the file's header of 100 bytes (https://sqlite.org/fileformat2.html, section 1.3) before
@@ -108,7 +108,7 @@ def check_kind(path: Path) -> None:
 
 def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFile]:
     """Open an existing environment; migrate it when it is older and may be written."""
-    check_kind(path)
+    _check_kind(path)
     file = OpenedFile(path)
     is_immutable = read_only and needs_immutable(path)
     log, memory = (Path(f"{path.resolve()}{suffix}") for suffix in ("-wal", "-shm"))

@@ -58,7 +58,7 @@ PAUSE_SECONDS = 0.02
 """Pause between attempts. A writer may change the log between the reads of file and log."""
 
 
-class Lineage(NamedTuple):
+class _Lineage(NamedTuple):
     """Mark of the last commit that a page has seen, and of the one before it."""
 
     mark: bytes
@@ -111,11 +111,11 @@ def file_mark(path: Path) -> bytes | None:
 
 def mark_in(page: bytes) -> bytes | None:
     """Mark on page 2 of a database."""
-    found = lineage_in(page)
+    found = _lineage_in(page)
     return found.mark if found else None
 
 
-def lineage_in(page: bytes) -> Lineage | None:
+def _lineage_in(page: bytes) -> _Lineage | None:
     """Lineage on the page of the table `environment`; None if the page is another one or broken."""
     try:
         if page[0] != LEAF_OF_TABLE or int.from_bytes(page[3:5], "big") != 1:
@@ -131,7 +131,7 @@ def lineage_in(page: bytes) -> Lineage | None:
         if len(kinds) < LINEAGE_COLUMN:
             return None
         if len(kinds) == LINEAGE_COLUMN or kinds[LINEAGE_COLUMN] == 0:
-            return Lineage(NO_MARK, NO_MARK)  # the file has no such column yet
+            return _Lineage(NO_MARK, NO_MARK)  # the file has no such column yet
         if kinds[LINEAGE_COLUMN] != BLOB_TYPE + 2 * 2 * MARK_BYTES:
             return None
         at = head + sum(_bytes_of(kind) for kind in kinds[:LINEAGE_COLUMN])
@@ -140,7 +140,7 @@ def lineage_in(page: bytes) -> Lineage | None:
         return None
     if len(lineage) < 2 * MARK_BYTES:
         return None
-    return Lineage(lineage[:MARK_BYTES], lineage[MARK_BYTES:])
+    return _Lineage(lineage[:MARK_BYTES], lineage[MARK_BYTES:])
 
 
 def _varint(page: bytes, at: int) -> tuple[int, int]:
@@ -216,8 +216,8 @@ class _Log:
             yield *SUMS.unpack_from(head), at
             at += FRAME_BYTES
 
-    def _lineage(self, at: int) -> Lineage | None:
-        return lineage_in(self._read(PAGE_BYTES, at + FRAME_HEADER))
+    def _lineage(self, at: int) -> _Lineage | None:
+        return _lineage_in(self._read(PAGE_BYTES, at + FRAME_HEADER))
 
     def _has_commit_of_ours(self) -> bool:
         """Whether SQLite would apply a page 2 of this log, judged by the checksums."""

@@ -134,7 +134,7 @@ def extract(
     from hapticdb.extraction.disassembly import run as orders
 
     check_picture(picture)
-    check_animation(animation)
+    _check_animation(animation)
     if not disassemble and (depth is not None or keep):
         raise UsageError("--depth and --keep go with --disassemble")
     asked = Outputs(path, picture, animation, up, json)
@@ -179,7 +179,7 @@ class _Options(TypedDict):
     progress: "SearchCallback | None"
 
 
-def check_animation(animation: str | None) -> None:
+def _check_animation(animation: str | None) -> None:
     """Refuse, before anything is searched, an animation that could not be written."""
     if animation is None:
         return

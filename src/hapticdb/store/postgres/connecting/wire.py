@@ -56,7 +56,7 @@ def int8s(values: NDArray[np.int64]) -> Parameter:
     return Parameter(INT8_ARRAY, _header(INT8, len(values)) + packed.tobytes())
 
 
-def float8s(values: NDArray[np.float64]) -> Parameter:
+def _float8s(values: NDArray[np.float64]) -> Parameter:
     """Pack double precision[] from (n,), bit for bit."""
     packed = np.empty(len(values), _FLOAT8S)
     packed["length"] = 8
@@ -69,7 +69,7 @@ def shell(frame: LocatedShell) -> list[Parameter]:
     count = len(frame.addresses)
     return [
         int8s(frame.addresses),
-        *(float8s(frame.placed[:count, column]) for column in range(6)),
+        *(_float8s(frame.placed[:count, column]) for column in range(6)),
         *(float8(float(x)) for x in (*frame.placed[count, :3], frame.stiffness)),
     ]
 

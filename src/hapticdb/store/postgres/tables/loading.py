@@ -27,7 +27,7 @@ LOADERS, MAKERS = 0x48415054, 0x48415055
 KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
 
-class Indexes:
+class _Indexes:
     """The indexes of an environment's rows, and the tables that they belong to."""
 
     def __init__(self, connection: ServerConnection, layout: Layout) -> None:
@@ -82,7 +82,7 @@ class Loading:
 
     def __init__(self, connection: ServerConnection, layout: Layout) -> None:
         self._connection = connection
-        self._indexes = Indexes(connection, layout)
+        self._indexes = _Indexes(connection, layout)
         self._depth = 0
         self._is_owner = False
         self._has_written = False

@@ -1,5 +1,6 @@
 """The page in this process, without a server, and with sessions that only record."""
 
+import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,7 +11,7 @@ from websockets.sync.client import connect
 
 import hapticdb
 from children import PATIENCE, until
-from hapticdb.page.link import PageRequest, Visitor
+from hapticdb.page.link import PageLink, PageRequest, Visitor, line
 from hapticdb.page.process import new_server, open_page
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
@@ -71,12 +72,14 @@ def page_of(
 ) -> Iterator[tuple[Site, PagePerson, TabbedBrowser]]:
     """Open the page of an environment, with one editor at it."""
     server = new_server()
+    ours, theirs = socket.socketpair()
+    ours.sendall(line({"word": "prepared"}))
     request = PageRequest(
         dict.fromkeys(("viewer", "toucher", "editor"), str(url)), (), folders, 0, 0,
         None if recordings is None else str(recordings),
     )  # fmt: skip
     try:
-        site = Site(server, NoHost(), request)  # type: ignore[arg-type]
+        site = Site(server, NoHost(), request, PageLink(theirs.detach()))  # type: ignore[arg-type]
         try:
             open_page(site, lambda _: Visitor("Ada", "editor"))
             address = f"ws://127.0.0.1:{server.get_port()}"
@@ -94,3 +97,4 @@ def page_of(
             site.close()
     finally:
         server.stop()
+        ours.close()

@@ -24,9 +24,10 @@ from hapticdb.protocol.contacts import (
 if TYPE_CHECKING:
     from websockets.sync.client import ClientConnection
 
-GRANTED_WITHIN = 60.0
+GRANTED_WITHIN = 180.0
 """Seconds in which a server that has answered must grant a tool: the first client's cells and tools
-are made then. Larger: a server that hangs is noticed later."""
+are made then, and at a server's first start its kernels. Larger: a server that hangs is noticed
+later."""
 
 
 class ContactLink:

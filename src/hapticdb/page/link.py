@@ -5,6 +5,8 @@ the server announces each browser before it connects: it binds the connection's 
 tells the page that port with the browser's name and role, waits for the answer, and connects from
 that port. The page closes every connection from another port.
 
+The page also asks the server for what a hand calls (``prepare``), and is told how far that is.
+
 The messages are lines of JSON on a socket pair that the page process inherits.
 """
 
@@ -13,8 +15,10 @@ import json
 import logging
 import socket
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
+
+from hapticdb.errors import HapticDBError
 
 if TYPE_CHECKING:
     import viser
@@ -34,6 +38,8 @@ LATE = 1013
 """WebSocket close code "try again later", for a connection that was not announced."""
 BREAKS_RULES = 1008
 """WebSocket close code "policy violation"."""
+PREPARED_EVERY = 0.2
+"""Seconds from one look for the page's end to the next while the server compiles."""
 MOST_FAILED = 20
 """Messages of one connection that viser cannot take in, such as a text for a slider, before it is
 closed. Larger: such a client fills the log longer."""
@@ -93,6 +99,11 @@ class PageLink:
         self._lock = threading.Lock()
         self._expected: dict[int, Visitor] = {}
         self._inside: dict[int, Visitor] = {}
+        self._asking = threading.Lock()
+        self._is_asked = False
+        self._is_prepared = threading.Event()
+        self.preparing = ""
+        """How far the server is with what a hand calls, in words; empty while it does nothing."""
         self._thread = threading.Thread(target=self._listen, name="announcements", daemon=True)
         self._thread.start()
 
@@ -133,6 +144,22 @@ class PageLink:
         with self._lock:
             return self._inside[client_id]
 
+    def prepare(self, is_ending: Callable[[], bool]) -> None:
+        """Wait until the server has compiled what a hand calls; the first call asks for it.
+
+        Raises
+        ------
+        HapticDBError
+            If the page ends before.
+        """
+        with self._asking:
+            if not self._is_asked:
+                self._is_asked = True
+                self.tell("prepare")
+        while not self._is_prepared.wait(PREPARED_EVERY):
+            if is_ending():
+                raise HapticDBError("the page ends")
+
     def tell(self, word: str, port: int = 0) -> None:
         """Send a message to the server; does nothing if it has ended."""
         with contextlib.suppress(OSError):
@@ -157,6 +184,12 @@ class PageLink:
         with contextlib.suppress(ConnectionError), self._socket.makefile("rb") as stream:
             while received := stream.readline(LONGEST_LINE):
                 message = json.loads(received)
+                if message["word"] == "preparing":
+                    self.preparing = message["text"]
+                    continue
+                if message["word"] == "prepared":
+                    self._is_prepared.set()
+                    continue
                 announced = Visitor(message["name"], message["role"])
                 with self._lock:
                     self._expected[message["port"]] = announced

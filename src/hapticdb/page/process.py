@@ -33,7 +33,7 @@ def work(request: PageRequest, sender: MessageSender) -> None:
     link.guard(server)
     try:
         with AttachedHost(socket.socket(fileno=request.host)) as host:
-            site = Site(server, host, request)
+            site = Site(server, host, request, link)
             open_page(site, link.announced)
             sender.send("ready", server.get_port())
             try:

@@ -19,7 +19,7 @@ from hapticdb.page import tools
 from hapticdb.page.database import DatabaseThread
 from hapticdb.page.editing import Edits
 from hapticdb.page.folders import AllowedFolders
-from hapticdb.page.link import PageRequest
+from hapticdb.page.link import PageLink, PageRequest
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.wording import error_text
 from hapticdb.store.connect import open_store
@@ -93,11 +93,14 @@ class Site:
         Runs the sessions.
     request : PageRequest
         The environment's addresses, the operator's tools, folders and title.
+    link : PageLink
+        To the server.
     """
 
     server: "ViserServer"
     host: AttachedHost
     request: PageRequest
+    link: PageLink
     browsers: dict[int, _Updated] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -144,6 +147,10 @@ class Site:
         self.database.close()
         if self.edits is not None:
             self.edits.close()
+
+    def prepare(self) -> None:
+        """Wait until what a hand calls is compiled; HapticDBError if the page ends before."""
+        self.link.prepare(self._is_ending.is_set)
 
     def take_number(self) -> int:
         """Return the smallest number that no browser has: it decides a tool's colour and place."""

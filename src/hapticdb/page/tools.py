@@ -4,14 +4,16 @@ Each has its origin in its middle, so that its gizmo is where the tool is.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import UsageError
+from hapticdb import mesh
+from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.pointshell.shell import PointShell
@@ -40,10 +42,10 @@ class HeldTool:
     ----------
     name : str
         Its name for people.
-    shell : PointShell
-        Points for the force, about the tool's middle, metres.
+    sample : callable
+        Makes the tool's shell, which calls kernels.
     vertices : (V, 3)
-        Corners of its surface in the same frame, metres.
+        Corners of its surface, about the tool's middle, metres.
     faces : (F, 3)
         Corners of each triangle.
     is_round : bool
@@ -51,10 +53,15 @@ class HeldTool:
     """
 
     name: str
-    shell: PointShell
+    sample: Callable[[], PointShell]
     vertices: Floats
     faces: NDArray[np.int64]
     is_round: bool = False
+
+    @cached_property
+    def shell(self) -> PointShell:
+        """Points for the force, about the tool's middle, metres; made when it is first used."""
+        return self.sample()
 
     @property
     def radius(self) -> float:
@@ -85,8 +92,8 @@ def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTo
     found = []
     for name, profile in zip(BUILT_IN, profiles, strict=True):
         vertices, faces = _turned(profile)
-        shell = PointShell.from_mesh(vertices, faces, POINTS, inset=inset)
-        found.append(HeldTool(name, shell, vertices, faces, is_round=name == "ball"))
+        sample = partial(PointShell.from_mesh, vertices, faces, POINTS, inset=inset)
+        found.append(HeldTool(name, sample, vertices, faces, is_round=name == "ball"))
     return found
 
 
@@ -99,10 +106,24 @@ def from_files(paths: Sequence[str], voxel_size: float, *, smooth: bool) -> list
         If a file cannot be read, or holds no surface.
     """
     inset = inset_of(voxel_size, smooth=smooth)
-    return [
-        from_shell(Path(path).stem, PointShell.from_file(path, POINTS, inset=inset))
-        for path in paths
-    ]
+    found = []
+    for path in map(Path, paths):
+        if path.suffix.lower() == ".npz":
+            found.append(from_shell(path.stem, PointShell.load(path)))
+            continue
+        parts = [part for part in mesh.read_file(path).parts if not part.is_cloud]
+        if not parts:
+            raise FileError(f"{path}: no triangles; a tool needs a surface")
+        vertices = np.concatenate([part.triangles() for part in parts]).reshape(-1, 3)
+        middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
+        faces = np.arange(len(vertices)).reshape(-1, 3)
+        sample = partial(_centred_shell, path, inset)
+        found.append(HeldTool(path.stem, sample, vertices - middle, faces))
+    return found
+
+
+def _centred_shell(path: Path, inset: float) -> PointShell:
+    return from_shell(path.stem, PointShell.from_file(path, POINTS, inset=inset)).shell
 
 
 def from_shell(name: str, shell: PointShell) -> HeldTool:
@@ -121,7 +142,7 @@ def from_shell(name: str, shell: PointShell) -> HeldTool:
     centred = replace(
         shell, points=shell.points - middle, center=shell.center - middle, surface=surface
     )
-    return HeldTool(name, centred, vertices, faces)
+    return HeldTool(name, lambda: centred, vertices, faces)
 
 
 def middle_of(shell: PointShell) -> Floats:

@@ -5,11 +5,11 @@ import contextlib
 import json
 import logging
 import socket
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable
 from typing import Protocol
 
 from hapticdb.errors import HapticDBError
-from hapticdb.page.link import LONGEST_LINE, announcement
+from hapticdb.page.link import LONGEST_LINE, announcement, line
 from hapticdb.realtime.processes import Process
 
 LOG = logging.getLogger("hapticdb.server")
@@ -48,12 +48,20 @@ class PageKeeper:
         Makes the request of each process that is started.
     serve_host : callable
         Takes the socket at whose other end the page begins its sessions.
+    prepare : callable
+        Compiles what hands call; the page asks for it when somebody first takes a tool in hand.
     """
 
     def __init__(
-        self, work: str, request: _MakesRequest, serve_host: Callable[[socket.socket], None]
+        self,
+        work: str,
+        request: _MakesRequest,
+        serve_host: Callable[[socket.socket], None],
+        prepare: Callable[[], Awaitable[None]],
     ) -> None:
         self._work, self._request, self._serve_host = work, request, serve_host
+        self._prepare = prepare
+        self._preparing: asyncio.Task[None] | None = None
         self._process: Process | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reader: asyncio.StreamReader | None = None
@@ -151,6 +159,23 @@ class PageKeeper:
             self._expected.pop(port, None)
         return self.port
 
+    def tell(self, word: str, text: str = "") -> None:
+        """Send the page a message of words; does nothing without a page."""
+        if self._writer is not None:
+            self._writer.write(line({"word": word, "text": text}))
+
+    def prepare(self) -> None:
+        """Compile what hands call, and tell the page when they may begin."""
+        self._preparing = asyncio.create_task(self._prepared())
+
+    async def _prepared(self) -> None:
+        try:
+            await self._prepare()
+        except (HapticDBError, OSError) as error:
+            # then each session compiles what it needs
+            LOG.error("kernels cannot be compiled ahead: %s", error)  # noqa: TRY400 - says all
+        self.tell("prepared")
+
     async def answers(self) -> bool:
         """Whether the page answers now."""
         try:
@@ -175,6 +200,8 @@ class PageKeeper:
                 answer = self._expected.get(message["port"])
                 if message["word"] == "expected" and answer is not None and not answer.done():
                     answer.set_result(None)
+                elif message["word"] == "prepare":
+                    self.prepare()
                 elif message["word"] == "refused":
                     LOG.warning("a connection to the page went round the server: closed")
 

@@ -17,17 +17,18 @@ import uvicorn
 
 from hapticdb.errors import UsageError
 from hapticdb.hosting.host import SessionHost
+from hapticdb.kernels.compiling import Compiled
 from hapticdb.page.link import PageRequest
 from hapticdb.server.access import Access, Role
 from hapticdb.server.app import application
 from hapticdb.server.client_page import client_page
-from hapticdb.server.contacts.serving import prepare
 from hapticdb.server.figures import Figures
 from hapticdb.server.guards import is_address
 from hapticdb.server.health import Doctor, HostCollector
 from hapticdb.server.limits import Limits
 from hapticdb.server.messages import LARGEST, LARGEST_PICTURE
 from hapticdb.server.page_keeper import PageKeeper
+from hapticdb.server.preparing import Preparation
 from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served
 from hapticdb.server.transports import limited
@@ -82,8 +83,8 @@ class Serving:
     page : str
         Function of the page's process.
     awaits_devices : bool
-        Whether devices on other machines are expected: the server is ready when what their
-        endpoints call is loaded. Otherwise the first one waits for it.
+        Whether devices on other machines are expected: what hands call is compiled from the start,
+        and not when somebody first feels something.
     """
 
     urls: Mapping[Role, str]
@@ -182,7 +183,12 @@ def listening(serving: Serving) -> socket.socket:
         ) from None
 
 
-async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Event) -> None:
+async def run(
+    serving: Serving,
+    ready: Callable[[int], None],
+    stop: asyncio.Event,
+    note: Callable[[str], None] = lambda _: None,
+) -> None:
     """Serve until `stop` is set; then end in order, so that no recording is lost.
 
     First no connection is taken any more and browsers are told to go; then the page ends its
@@ -196,6 +202,8 @@ async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Even
         Called with the port when browsers can come.
     stop : asyncio.Event
         Set when the server shall end.
+    note : callable
+        Called with a line of words on how far the compiling of what hands call is.
     """
     check(serving)
     page = await asyncio.to_thread(client_page, serving.title)
@@ -205,13 +213,25 @@ async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Even
         access = Access(serving.tokens, open_role=serving.open_role, port=port)
         host = await asyncio.to_thread(SessionHost, serving.urls[Role.VIEWER])
         ends.push_async_callback(asyncio.to_thread, host.close)
-        served = Served(serving.urls, serving.tools, access, serving.limits, Figures(), host)
+
+        def tell(now: Compiled) -> None:
+            text = f"preparing the hand: {now.done} of {now.total} kernels ..."
+            note(text)
+            keeper.tell("preparing", text)
+
+        purposes = ("host", "shell", *(("proxies",) if serving.awaits_devices else ()))
+        preparation = Preparation(*purposes, tell=tell)
+        served = Served(
+            serving.urls, serving.tools, access, serving.limits, Figures(), host, preparation
+        )
         served.figures.add(HostCollector(host))
-        keeper = PageKeeper(serving.page, partial(_page_request, serving), host.serve)
+        keeper = PageKeeper(
+            serving.page, partial(_page_request, serving), host.serve, preparation.done
+        )
         served.figures.page_starts.set_function(lambda: keeper.n_starts)
         ends.push_async_callback(keeper.stop)
-        preparing = asyncio.to_thread(prepare) if serving.awaits_devices else asyncio.sleep(0)
-        if not await _unless(stop, _together(keeper.start(), preparing)):
+        ends.callback(preparation.close)
+        if not await _unless(stop, keeper.start()):
             return
         keeping = asyncio.create_task(keeper.keep())
         ends.push_async_callback(_cancelled, keeping)
@@ -225,6 +245,8 @@ async def run(serving: Serving, ready: Callable[[int], None], stop: asyncio.Even
         running = asyncio.create_task(server.serve([sock]))
         ready(port)
         LOG.info("serving", extra={"port": port})
+        if serving.awaits_devices:
+            keeper.prepare()
         await _unless(stop, asyncio.shield(running))
         LOG.info("stopping")
         server.should_exit = True
@@ -252,10 +274,6 @@ async def _unless(stop: asyncio.Event, work: Awaitable[None]) -> bool:
     finally:
         stopping.cancel()
         working.cancel()
-
-
-async def _together(*works: Awaitable[None]) -> None:
-    await asyncio.gather(*works)
 
 
 async def _cancelled(task: "asyncio.Task[None]") -> None:

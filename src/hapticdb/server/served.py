@@ -7,6 +7,7 @@ from hapticdb.hosting.host import SessionHost
 from hapticdb.server.access import Access, Role
 from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits
+from hapticdb.server.preparing import Preparation
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,8 @@ class Served:
         Counters for the operator.
     host : SessionHost
         Where sessions run.
+    preparation : Preparation
+        Compiles what hands call.
     """
 
     urls: Mapping[Role, str]
@@ -35,3 +38,4 @@ class Served:
     limits: Limits
     figures: Figures
     host: SessionHost
+    preparation: Preparation

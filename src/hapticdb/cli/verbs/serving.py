@@ -268,7 +268,6 @@ def _run(
             "put a proxy with TLS in front"
         )
 
-    render.compile_kernels("host", "shell", *(["proxies"] if serving.awaits_devices else []))
     render.note(f"preparing {serving.title.partition(' - ')[0]}")
 
     async def work() -> list[int]:
@@ -281,7 +280,7 @@ def _run(
                 loop.call_later(seconds, stop.set)
 
         with ended_by_signals(lambda: loop.call_soon_threadsafe(stop.set)) as signals:
-            await running.run(serving, begun, stop)
+            await running.run(serving, begun, stop, render.note)
         return signals
 
     level = logging.WARNING if is_quiet else logging.INFO

@@ -45,6 +45,7 @@ class TouchPanel:
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._shown_at = 0.0
+        self._waits_for = ""
         may_touch = browser.visitor.may("toucher")
         self._reading = gui.add_html(
             self._reading_html(0.0, 0.0, [], "The tool is being made ready.", is_held=may_touch)
@@ -144,6 +145,12 @@ class TouchPanel:
         if hasattr(self, "_place"):
             x, y, z = (round(float(value), 4) for value in self._browser.hand[:3])
             put(self._place, (x, y, z))
+
+    def show_wait(self, text: str) -> None:
+        """Show what the session waits for, instead of a force."""
+        if text and text != self._waits_for:
+            self._waits_for = text
+            self._reading.content = self._reading_html(0.0, 0.0, [], text, is_held=True)
 
     def show(
         self, frame: np.void, wrench: NDArray[np.float64], touched: list[Object], now: float

@@ -7,7 +7,6 @@ from pathlib import Path
 from starlette.websockets import WebSocket
 
 from hapticdb.errors import HapticDBError
-from hapticdb.kernels.compiling import entries_for, load
 from hapticdb.page.tools import BUILT_IN, POINTS, built_in, inset_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.header import CloseCode
@@ -45,7 +44,8 @@ class ServedContacts:
         """Serve one client until it leaves.
 
         It is accepted at once, and granted its tool when cells and tools are there: that takes
-        seconds for the first one, in which pings are answered.
+        seconds for the first one, in which pings are answered; a minute where kernels are compiled
+        first.
         """
         role_of_headers = self._served.access.role_of_headers
         if not await is_admitted(websocket, role_of_headers, self._n_clients):
@@ -70,6 +70,7 @@ class ServedContacts:
         async with self._changing:
             if self._contacts is None:
                 try:
+                    await self._served.preparation.done()
                     await asyncio.to_thread(self._open)
                 except HapticDBError:
                     LOG.exception("contact proxies cannot be served")
@@ -99,11 +100,6 @@ class ServedContacts:
             contacts.close()
         if cells is not None:
             cells.close()
-
-
-def prepare() -> None:
-    """Load the kernels of contact proxies, so that the first client does not wait for them."""
-    load(entries_for("proxies", "shell"))
 
 
 def _tools(files: tuple[str, ...], cells: ResidentCells) -> dict[str, PointShell]:

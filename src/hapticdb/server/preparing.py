@@ -1,0 +1,77 @@
+"""Kernels of hands, compiled while the page is shown already, in a process of its own."""
+
+import asyncio
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable
+
+from hapticdb.errors import HapticDBError
+from hapticdb.kernels.compiling import Compiled, compile_missing, entries_for, missing
+from hapticdb.realtime.processes import MessageSender, Process, parent_is_gone
+
+LOOKED_EVERY = 0.2
+"""Seconds from one look for the server's end to the next. Larger: compiling ends later."""
+
+
+class Preparation:
+    """Compiles the kernels of some purposes, once, when somebody first waits for them.
+
+    Parameters
+    ----------
+    *purposes : str
+        As `kernels.compiling.PURPOSES` names them.
+    tell : callable
+        Called in the event loop with the progress; not at all if nothing has to be compiled.
+    """
+
+    def __init__(self, *purposes: str, tell: Callable[[Compiled], None]) -> None:
+        self._purposes, self._tell = purposes, tell
+        self._running = asyncio.Lock()
+        self._is_done = False
+        self._is_ending = threading.Event()
+
+    async def done(self) -> None:
+        """Wait until the kernels are compiled, or `close` is called.
+
+        Raises
+        ------
+        HapticDBError
+            If the process that compiles them cannot be started, or fails.
+        """
+        async with self._running:
+            if not self._is_done and not self._is_ending.is_set():
+                await asyncio.to_thread(self._compile, asyncio.get_running_loop())
+                self._is_done = True
+
+    def _compile(self, loop: asyncio.AbstractEventLoop) -> None:
+        if not missing(entries_for(*self._purposes)):
+            return
+        with Process("hapticdb.server.preparing:work", self._purposes, ()) as process:
+            while not self._is_ending.is_set():
+                message = process.receive(LOOKED_EVERY)
+                if message is not None:
+                    if message.word == "done":
+                        return
+                    loop.call_soon_threadsafe(self._tell, message.content)
+                elif process.wait(0.0):
+                    raise HapticDBError("the process that compiles kernels ended too early")
+
+    def close(self) -> None:
+        """End the compiling, if it runs."""
+        self._is_ending.set()
+
+
+def work(purposes: tuple[str, ...], sender: MessageSender) -> None:
+    """Compile what is missing; the work of the process, which ends with the server."""
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    compile_missing(entries_for(*purposes), lambda now: sender.send("compiled", now))
+    sender.send("done")
+
+
+def _end_with_parent() -> None:
+    """Raise an exit in the main thread when the server has ended: that ends the workers, too."""
+    while not parent_is_gone():
+        time.sleep(LOOKED_EVERY)
+    os.kill(os.getpid(), signal.SIGTERM)

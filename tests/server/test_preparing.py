@@ -1,0 +1,42 @@
+"""The address of the page is there before any kernel is; what hands call is compiled meanwhile."""
+
+import os
+import signal
+import sys
+from pathlib import Path
+
+from children import PATIENCE, child, until
+from hapticdb.kernels._cache import IN_WORKER, LENT
+from page_person import PagePerson
+from serving import browser_at
+
+HELD_BACK = f"""
+import os, pathlib, time
+if os.environ.get("{IN_WORKER}"):
+    pathlib.Path(__file__).with_name(f"{{os.getpid()}}.pid").touch()
+    time.sleep({PATIENCE})
+"""
+"""A `sitecustomize` that keeps processes from compiling anything."""
+
+
+def test_the_page_is_there_before_the_kernels_and_a_closed_server_compiles_no_more(
+    environment: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "sitecustomize.py").write_text(HELD_BACK)
+    path = os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")])
+    known = {k: v for k, v in os.environ.items() if k not in {LENT, "NUMBA_CACHE_DIR"}}
+    cold = known | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "PYTHONPATH": path}
+    view = [sys.executable, "-m", "hapticdb", "view", str(environment), "--no-browser"]
+    with child(view, env=cold) as process:
+        assert process.stdout is not None
+        place, _, token = process.stdout.readline().strip().partition("/?token=")
+        with browser_at(place.removeprefix("http://"), token) as connection:
+            person = PagePerson(connection)
+            told = "preparing the hand: 0 of "
+            until(lambda: (person.look(0.05), any(told in text for text in person.received))[1])
+            until(lambda: list(tmp_path.glob("*.pid")))
+        process.send_signal(signal.SIGTERM)
+        _, said = process.communicate(timeout=PATIENCE)
+    assert told in said
+    compiling = [Path("/proc", file.stem) for file in tmp_path.glob("*.pid")]
+    until(lambda: not any(file.exists() for file in compiling))

@@ -17,6 +17,7 @@ import uvicorn
 
 from hapticdb.errors import UsageError
 from hapticdb.hosting.host import SessionHost
+from hapticdb.hosting.preparing import Preparation
 from hapticdb.kernels.compiling import Compiled
 from hapticdb.page.link import PageRequest
 from hapticdb.server.access import Access, Role
@@ -28,7 +29,6 @@ from hapticdb.server.health import Doctor, HostCollector
 from hapticdb.server.limits import Limits
 from hapticdb.server.messages import LARGEST, LARGEST_PICTURE
 from hapticdb.server.page_keeper import PageKeeper
-from hapticdb.server.preparing import Preparation
 from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served
 from hapticdb.server.transports import limited
@@ -194,16 +194,8 @@ async def run(
     First no connection is taken any more and browsers are told to go; then the page ends its
     sessions; then the host ends those that are left and finishes their recordings.
 
-    Parameters
-    ----------
-    serving : Serving
-        What is served, and how.
-    ready : callable
-        Called with the port when browsers can come.
-    stop : asyncio.Event
-        Set when the server shall end.
-    note : callable
-        Called with a line of words on how far the compiling of what hands call is.
+    ready : called with the port when browsers can come; stop : set when the server shall end;
+    note : called with a line of words on how far the compiling of what hands call is.
     """
     check(serving)
     page = await asyncio.to_thread(client_page, serving.title)
@@ -215,8 +207,7 @@ async def run(
         ends.push_async_callback(asyncio.to_thread, host.close)
 
         def tell(now: Compiled) -> None:
-            text = f"preparing the hand: {now.done} of {now.total} kernels ..."
-            note(text)
+            note(text := f"preparing the hand: {now.done} of {now.total} kernels ...")
             keeper.tell("preparing", text)
 
         purposes = ("host", "shell", *(("proxies",) if serving.awaits_devices else ()))

@@ -4,10 +4,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from hapticdb.hosting.host import SessionHost
+from hapticdb.hosting.preparing import Preparation
 from hapticdb.server.access import Access, Role
 from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits
-from hapticdb.server.preparing import Preparation
 
 
 @dataclass(frozen=True)

@@ -48,7 +48,7 @@ class Preparation:
     def _compile(self, loop: asyncio.AbstractEventLoop) -> None:
         if not missing(entries_for(*self._purposes)):
             return
-        with Process("hapticdb.server.preparing:work", self._purposes, ()) as process:
+        with Process("hapticdb.hosting.preparing:work", self._purposes, ()) as process:
             while not self._is_ending.is_set():
                 message = process.receive(LOOKED_EVERY)
                 if message is not None:

@@ -14,6 +14,7 @@ import trimesh
 import hapticdb
 from children import until
 from hapticdb.cli import main
+from hapticdb.query.cost_model import CostModel, machine_name
 
 PLACES = ((0.0, 0.0, 0.0635), (0.0, 0.0, 0.3), (0.2, 0.0, -0.0635))
 Run = Callable[..., tuple[int, str, str]]
@@ -42,6 +43,7 @@ def command(*args: object) -> list[str]:
 HALTING = """
 import sys, time
 from hapticdb.cli import main
+from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.store.postgres.tables.writing import PostgresWriter
 from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 
@@ -131,6 +133,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     file = boxes(folder / "boxes.glb")
     assert main(["import", str(folder / "scene.db"), str(file), "--bits", "6"]) == 0
+    with hapticdb.open(folder / "scene.db") as env:  # so that no verb measures
+        env.store.save_costs(machine_name(), CostModel.of_equal_parts().figures())
     hapticdb.PointShell.from_file(tool(folder / "tool.stl")).save(folder / "tool.npz")
     poses(folder / "path.csv", *PLACES)
     return folder

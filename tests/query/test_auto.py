@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.query.auto import (
-    DEFAULT_THRESHOLD,
     KEYS_PER_RANGE,
     grouping_threshold,
     ranges_worth_scanning,
@@ -26,7 +25,7 @@ from servers import Place
 
 THRESHOLD = 100
 QUANTILES = QuantileVector(np.arange(0, 40_001, 100, dtype=np.int64), 40_000)
-CLOSE = CostModel(1.0, 10.0, 0.0, 1.0, 100.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+CLOSE = CostModel(1.0, 10.0, 0.0, 1.0, 100.0)
 """Gaps of at most 10 rows are closed; `QUANTILES` expects a row a key."""
 ONE_RANGE = replace(CLOSE, descent=1e9)
 NO_GAP_CLOSED = replace(CLOSE, descent=0.0, row=1e9)
@@ -69,7 +68,7 @@ def test_ranges_are_scanned_where_they_hold_two_keys_or_more(
     sizes: list[int], *, is_scanned: bool
 ) -> None:
     keys = clusters(*sizes)
-    expected = cbgroup(keys, QUANTILES, CLOSE).ranges
+    expected = cbgroup(keys, QUANTILES, CLOSE)
     assert len(expected.lows) == len(sizes)
     assert KEYS_PER_RANGE == 2
     ranges = ranges_worth_scanning(keys, THRESHOLD, lambda: (QUANTILES, CLOSE))
@@ -80,17 +79,7 @@ def test_ranges_are_scanned_where_they_hold_two_keys_or_more(
     np.testing.assert_array_equal(ranges, expected)
 
 
-def test_the_threshold_itself_is_grouped() -> None:
-    keys = np.arange(THRESHOLD, dtype=np.int64)
-    assert ranges_worth_scanning(keys, THRESHOLD, lambda: (QUANTILES, CLOSE)) is not None
-
-
 # --- the threshold of an engine -----------------------------------------------------------------
-
-
-def test_sqlite_groups_from_the_default_on(tmp_path: Path) -> None:
-    with make_scene(tmp_path / "e.db") as env:
-        assert grouping_threshold(env.store) == DEFAULT_THRESHOLD == 1024
 
 
 def test_postgres_groups_keys_itself_from_version_17_on(place: Place) -> None:
@@ -158,16 +147,6 @@ def test_auto_names_what_it_used_and_answers_as_every_strategy(
             assert touch.torque.tobytes() == auto.torque.tobytes()
             assert touch.hits.tolist() == auto.hits.tolist()
             assert touch.pairs.tolist() == auto.pairs.tolist()
-
-
-def test_a_small_first_frame_calibrates_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with make_scene(tmp_path / "e.db") as env:
-        monkeypatch.setattr("hapticdb.query.figures.calibrate", forbidden)
-        touch = env.touch(cloud(env, 300), middle(env))
-        assert touch.query.strategy == "array"
-        assert env.store.costs(machine_name()) is None
 
 
 def test_a_frame_is_asked_in_the_same_way_whatever_came_before_it(tmp_path: Path) -> None:

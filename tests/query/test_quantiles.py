@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import UsageError
-from hapticdb.query.calibration import _cautious, _probes, _times_dearer, calibrate
+from hapticdb.query.calibration import _cautious, calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.grouping import cbgroup
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION, MAX_RESOLUTION, QuantileVector
-from hapticdb.store.base import Layout, SupportsCaches, SupportsStatement, row_shift
+from hapticdb.query.quantiles import MAX_RESOLUTION, QuantileVector
+from hapticdb.store.base import Layout, SupportsCaches
 from hapticdb.testing import blob, floor_voxels, write_voxels
 
-few = settings(max_examples=200, deadline=None)
+few = settings(max_examples=50, deadline=None)
 GRID = Grid(0.005, (-0.16, -0.16, -0.16), 6)
 KEYS = st.one_of(
     st.lists(st.integers(0, 30), min_size=1, max_size=200),
@@ -83,40 +83,20 @@ def test_a_key_of_many_rows_counts_by_its_rows() -> None:
     assert quantiles.rows_between(100, 999) == pytest.approx(0, abs=8)
 
 
-@pytest.mark.parametrize("layout", ["voxel", "brick"])
-def test_the_vector_of_an_environment_counts_its_rows(tmp_path: Path, layout: Layout) -> None:
-    """Two objects are in the same voxels, so every key has two rows."""
-    env = make_scene(tmp_path / "e.db", layout)
-    write_voxels(env.store, floor_voxels(GRID), "again")
-    rows = env.store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
-    for resolution in (1, 7, 100):
-        quantiles = env.quantiles(resolution)
-        assert quantiles.resolution == resolution
-        assert quantiles.n_rows == len(rows) == env.size().rows
-        for left, right in ((0, 2**62), *(rows.keys[[a, -a]].tolist() for a in (2, 9))):
-            counted = int(((rows.keys >= left) & (rows.keys <= right)).sum())
-            error = abs(quantiles.rows_between(left, right) - counted)
-            assert error <= 2 * quantiles.rows_per_bucket * (1 + 1e-12)
-
-
 @pytest.mark.parametrize("resolution", [0, -1, MAX_RESOLUTION + 1])
 def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: int) -> None:
     with pytest.raises(UsageError, match=f"{resolution} quantiles"):
         scene.quantiles(resolution)
 
 
-def test_the_resolution_is_the_papers_best_unless_given(scene: Environment) -> None:
-    assert scene.quantiles().resolution == DEFAULT_RESOLUTION == 10_000
-
-
 # --- the cost model -----------------------------------------------------------------------------
 
 figures = st.floats(0, 1e9, allow_nan=False)
-MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0, 7.0, 0.25, 11.0, 13.0, 0.125)
+MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0)
 
 
 @few
-@given(values=st.lists(figures, min_size=16, max_size=16), spread=figures)
+@given(values=st.lists(figures, min_size=7, max_size=7), spread=figures)
 def test_a_cost_model_returns_from_its_figures(values: list[float], spread: float) -> None:
     """Also when they were written as text, as a store keeps them."""
     names = [name for name in vars(MODEL) if name != "spread"]
@@ -126,9 +106,9 @@ def test_a_cost_model_returns_from_its_figures(values: list[float], spread: floa
     assert CostModel.from_figures(json.loads(json.dumps(model.figures()))) == model
 
 
-def test_figures_kept_before_one_of_them_was_measured_still_serve() -> None:
-    older = {k: v for k, v in MODEL.figures().items() if k not in {"crowding", "distances"}}
-    assert CostModel.from_figures(older) == MODEL
+def test_figures_that_another_version_has_kept_still_serve() -> None:
+    older = {k: v for k, v in MODEL.figures().items() if k != "distances"}
+    assert CostModel.from_figures(older | {"lookup": 7.0, "lookup.spread": 0.5}) == MODEL
 
 
 @few
@@ -142,17 +122,11 @@ def test_rows_with_distances_cost_so_many_times_more(values: list[float], factor
     assert found.with_distances == found
 
 
-def test_the_factor_of_distances_comes_from_the_time_that_they_take() -> None:
-    assert _times_dearer(30.0, 10.0, 1.5) == 3.0
-    assert _times_dearer(-1.0, 10.0, 1.5) == 1.0, "no slower: noise"
-    assert _times_dearer(30.0, 0.0, 1.5) == 1.0, "nothing was measured"
-
-
 def test_cautious_grouping_closes_fewer_gaps() -> None:
     keys = np.arange(0, 4000, 40, dtype=np.int64)
     quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 40 * 4)  # 1.56 rows a gap
-    assert len(cbgroup(keys, quantiles, replace(MODEL, caution=1.0)).ranges.lows) == 1
-    assert len(cbgroup(keys, quantiles, replace(MODEL, caution=3.0)).ranges.lows) == len(keys)
+    assert len(cbgroup(keys, quantiles, replace(MODEL, caution=1.0)).lows) == 1
+    assert len(cbgroup(keys, quantiles, replace(MODEL, caution=3.0)).lows) == len(keys)
 
 
 @pytest.mark.parametrize("rows_in_a_gap", [0, 1, 50])
@@ -165,19 +139,9 @@ def test_caution_grows_with_what_small_gaps_turn_out_to_hold(rows_in_a_gap: int)
     def count(lows: NDArray[np.int64], highs: NDArray[np.int64]) -> int:
         return int(((highs - lows) // 40).sum()) * rows_in_a_gap + len(keys)
 
-    fitted = _cautious(model, [keys], quantiles, count, under_keys=float(len(keys)))
-    closed = len(cbgroup(keys, quantiles, fitted).ranges.lows) == 1
+    fitted = _cautious(model, [keys], quantiles, count)
+    closed = len(cbgroup(keys, quantiles, fitted).lows) == 1
     assert closed == (rows_in_a_gap < 2)
-    assert fitted.crowding == pytest.approx(rows_in_a_gap, rel=0.1) or not closed
-
-
-def test_the_cost_of_a_frame_is_the_sum_of_its_parts() -> None:
-    """C(s) = C_io(s) + C_cpu(s) of the paper's section 5, in fitted figures."""
-    assert MODEL.row_scanned == 50.0 / 100.0 + 0.5
-    assert MODEL.of_ranges(4, 10) == 2.0 + 3.0 * 4 + 1.0 * 10
-    assert MODEL.of_keys(8, 10) == 7.0 + 0.25 * 8 + 0.5 * 10
-    assert MODEL.of_points(5) == 55.0
-    assert MODEL.of_statement(8) == 14.0
 
 
 # --- calibration --------------------------------------------------------------------------------
@@ -200,14 +164,12 @@ def scene(
 
 def test_calibrated_figures_are_finite_and_not_negative(scene: Environment) -> None:
     model = calibrate(scene.store, repeats=1, budget=0.0)
-    assert isinstance(scene.store, SupportsStatement)
     for name, value in model.figures().items():
         assert math.isfinite(value), name
         assert value >= 0, name
     size = scene.size()
     assert model.rows_per_block == size.rows / size.leaf_blocks
     assert set(model.spread) <= set(vars(model))
-    assert model.of_points(100) > 0
 
 
 def test_cold_figures_are_measured_from_the_disk(scene: Environment) -> None:
@@ -218,29 +180,8 @@ def test_cold_figures_are_measured_from_the_disk(scene: Environment) -> None:
     drop = store.drop_caches
     store.drop_caches = lambda: emptied.append(drop())  # type: ignore[method-assign]
     model = calibrate(store, budget=0.0, cold=True)
-    assert len(emptied) > 12 * 10
+    assert len(emptied) > 12
     assert all(math.isfinite(value) and value >= 0 for value in model.figures().values())
-
-
-def test_the_places_measured_depend_on_the_seed_alone(scene: Environment) -> None:
-    first, again, other = (
-        list(_probes(scene.store, scene.quantiles(), seed)) for seed in (0, 0, 1)
-    )
-    assert len(first) >= 12
-    assert [p.keys.tolist() for p in first] == [p.keys.tolist() for p in again]
-    assert [p.keys.tolist() for p in first] != [p.keys.tolist() for p in other]
-
-
-def test_the_places_measured_touch_occupied_voxels(scene: Environment) -> None:
-    shift = row_shift(scene.layout)
-    rows = scene.store.scan(*(np.array([b], dtype=np.int64) for b in (0, 2**62)))
-    corners = scene.grid.centers(scene.grid.decode(np.unique(rows.keys) << shift))
-    row = scene.grid.voxel_size * (1 << (shift // 3)) * 3**0.5
-    for probe in _probes(scene.store, scene.quantiles(), 3):
-        *points, center = probe.frame.placed[:, :3]
-        radius = np.linalg.norm(np.array(points) - center, axis=1).max()
-        nearest = np.linalg.norm(corners - center, axis=1).min()
-        assert nearest <= radius + row
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3])
@@ -255,33 +196,9 @@ def test_a_grid_smaller_than_a_tool_can_be_calibrated(
     assert all(math.isfinite(value) and value >= 0 for value in figures.values())
 
 
-def test_an_empty_environment_cannot_be_calibrated(tmp_path: Path) -> None:
-    env = hapticdb.create(tmp_path / "e.db", GRID)
-    with pytest.raises(UsageError, match="is empty: import a file before"):
-        env.calibrate()
-
-
-def test_calibrated_figures_are_kept_for_this_machine(tmp_path: Path) -> None:
-    env = make_scene(tmp_path / "e.db")
-    model = env.calibrate()
-    assert env.store.costs(machine_name()) == model.figures()
-    with hapticdb.open(tmp_path / "e.db", read_only=True) as reader:
-        assert reader._figures.both()[1] == model
-        renewed = reader.calibrate()
-        assert reader._figures.both()[1] == renewed
-    assert env.store.costs(machine_name()) == model.figures()
-
-
-def test_figures_that_are_not_to_be_kept_are_not(tmp_path: Path) -> None:
-    env = make_scene(tmp_path / "e.db")
-    model = env.calibrate(keep=False)
-    assert env.store.costs(machine_name()) is None
-    assert env._figures.both()[1] == model
-
-
 # --- grouping by kept figures -------------------------------------------------------------------
 
-DEAR = CostModel(1e6, 1e6, 1e6, 1e6, 1.0, 1e6, 1e6, 1e6, 1e6, 1e6)
+DEAR = CostModel(1e6, 1e6, 1e6, 1e6, 1.0)
 
 
 def resting() -> NDArray[np.float64]:

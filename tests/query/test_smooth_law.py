@@ -86,7 +86,7 @@ def test_every_strategy_feels_the_same_on_a_server(place: Place, curve: CurveNam
 def test_gaps_are_closed_by_what_rows_cost_with_their_distances(env: Environment) -> None:
     """Rows cost nothing, but with their distances they are worth more than a descent."""
     shell, pose = random_shell(1, 200), random_pose(1)
-    costs = CostModel(1.0, 1.0, 0.0, 1e-9, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, distances=1e15)
+    costs = CostModel(1.0, 1.0, 0.0, 1e-9, 1.0, distances=1e15)
     env.store.save_costs(machine_name(), costs.figures())
     with hapticdb.open(env.url) as reader:
         plane, smooth = (reader.touch(shell, pose, "cbgroup", law=law) for law in LAW_NAMES)

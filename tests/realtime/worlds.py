@@ -15,6 +15,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.law import TangentPlaneLaw
 from hapticdb.kernels.resident.cells import HITS, RESULTS, UNKNOWNS, WRENCH, Cells, Place
 from hapticdb.kernels.resident.feeling import feel_kernel
+from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.resident.frames import clusters_of
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Layout, Store
@@ -35,10 +36,15 @@ SIZE = 0.002
 def make(
     folder: Path, bits: int = 7, layout: Layout = "brick", curve: CurveName = "z"
 ) -> Environment:
-    """An empty environment with 2 mm voxels; the world's origin is the grid's middle."""
+    """An empty environment with 2 mm voxels; the world's origin is the grid's middle.
+
+    Cost figures are kept in it, so that nothing is measured.
+    """
     half = SIZE * (1 << bits) / 2
     grid = Grid(SIZE, (-half, -half, -half), bits, curve)
-    return hapticdb.create(folder / f"{layout}-{curve}-{bits}.db", grid, layout=layout)
+    env = hapticdb.create(folder / f"{layout}-{curve}-{bits}.db", grid, layout=layout)
+    env.store.save_costs(machine_name(), CostModel.of_equal_parts().figures())
+    return env
 
 
 def scatter(env: Environment, n_objects: int = 3, n_voxels: int = 4000, seed: int = 0) -> None:

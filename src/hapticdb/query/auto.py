@@ -5,7 +5,7 @@ from collections.abc import Callable
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.grouping import Ranges, cbgroup
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import HasGroupingThreshold, Keys, Store
+from hapticdb.store.base import Keys, Store
 
 DEFAULT_THRESHOLD = 1024
 """Distinct keys of a frame from which `auto` groups, on engines that set no number of their own.
@@ -18,10 +18,12 @@ costs more than a key of a lookup, so ranges of one key each would be slower."""
 
 
 def grouping_threshold(store: Store) -> int | None:
-    """Distinct keys of a frame from which `auto` groups on this engine; None: it never groups."""
-    if isinstance(store, HasGroupingThreshold):
-        return store.grouping_threshold
-    return DEFAULT_THRESHOLD
+    """Distinct keys of a frame from which `auto` groups on this engine.
+
+    None where it never groups, because a lookup reads each leaf page only once anyway.
+    """
+    threshold: int | None = getattr(store, "grouping_threshold", DEFAULT_THRESHOLD)
+    return threshold
 
 
 def ranges_worth_scanning(
@@ -50,5 +52,5 @@ def ranges_worth_scanning(
     """
     if threshold is None or len(keys) < threshold:
         return None
-    ranges = cbgroup(keys, *quantiles_and_costs()).ranges
+    ranges = cbgroup(keys, *quantiles_and_costs())
     return ranges if KEYS_PER_RANGE * len(ranges.lows) <= len(keys) else None

@@ -14,14 +14,7 @@ from hapticdb.pointshell.shell import fibonacci_sphere
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import (
-    Keys,
-    LocatedShell,
-    Store,
-    SupportsCaches,
-    SupportsStatement,
-    row_shift,
-)
+from hapticdb.store.base import Keys, Store, SupportsCaches, row_shift
 
 CAUTIONS = tuple(2.0**n for n in range(-2, 8))
 """Candidate values of `CostModel.caution`; the one with the least cost is used."""
@@ -31,26 +24,21 @@ makes calibrating slower."""
 
 
 class _Probe(NamedTuple):
-    """A located shell of the calibration.
+    """Row keys (U,) of a shell, ascending; lowest and highest voxel key (U,) under each."""
 
-    frame : as `SupportsStatement` takes it; keys (U,) row keys, ascending; first, last (U,) lowest
-    and highest voxel key asked for under each.
-    """
-
-    frame: LocatedShell
     keys: Keys
     first: Keys
     last: Keys
 
 
 def calibrate(
-    store: Store, *, seed: int = 0, repeats: int = 5, budget: float = 0.9, cold: bool = False
+    store: Store, *, seed: int = 0, repeats: int = 5, budget: float = 0.5, cold: bool = False
 ) -> CostModel:
     """Measure what queries cost on this database, in real scans around its own surface.
 
     Spheres of shell points of several sizes are placed on occupied voxels drawn by the quantile
-    vector. Each sphere is asked for in every form of query, and the medians of the times are fitted
-    by least squares with non-negative figures.
+    vector. Their keys are scanned in ranges of several widths, and the medians of the times are
+    fitted by least squares with non-negative figures.
 
     Parameters
     ----------
@@ -59,7 +47,7 @@ def calibrate(
     seed : int
         Seed of the random places.
     repeats : int
-        Timings of each form at each place, after an untimed run. Their median is used.
+        Timings of each statement, after an untimed run. Their median is used.
     budget : float
         Seconds after which no further place is measured. At least 12 places are measured.
     cold : bool
@@ -94,7 +82,7 @@ def calibrate(
 
 
 class _Trials:
-    """Timings of every form at several places, and their fit."""
+    """Timings of scans at several places, and their fit."""
 
     def __init__(
         self,
@@ -112,15 +100,11 @@ class _Trials:
         self._repeats = repeats
         self._scans: list[tuple[float, ...]] = []
         self._counts: list[tuple[float, ...]] = []
-        self._lookups: list[tuple[float, ...]] = []
-        self._singles: list[tuple[float, ...]] = []
-        self._statements: list[tuple[float, ...]] = []
         self._keys: list[Keys] = []
-        self._under_keys = np.zeros(2)
         self._with_distances = np.zeros(2)
 
     def measure(self, probe: _Probe) -> None:
-        """Time every form of query for one shell."""
+        """Time the scans of one shell's keys."""
         store = self._store
         for gap in (0, 1 << 9, 1 << 13, 1 << 16):
             lows, highs = grouping.group_by_gap(probe.keys, probe.first, probe.last, gap)
@@ -134,29 +118,7 @@ class _Trials:
             if self._has_distances:
                 more = self._time(lambda lo=lows, hi=highs: store.scan(lo, hi, distances=True))  # type: ignore[misc]
                 self._with_distances += np.array([more - scan, rows])
-        rows = len(store.lookup(probe.keys))
-        asked = sum(self._quantiles.rows_between(key, key) for key in probe.keys.tolist())
-        self._under_keys += np.array([rows, asked])
         self._keys.append(probe.keys)
-        lookup = self._time(lambda: store.lookup(probe.keys))
-        self._lookups.append((1, len(probe.keys), rows, lookup))
-        few = probe.keys[:: max(1, len(probe.keys) // 20)].copy()
-        self._singles.append((len(few), self._time(lambda: store.lookup_each(few))))
-        if isinstance(store, SupportsStatement):
-            self._statements.append(
-                (1, len(probe.frame.addresses), self._time(self._figure_3(probe)))
-            )
-
-    def _figure_3(self, probe: _Probe) -> Callable[[], object]:
-        store = self._store
-        assert isinstance(store, SupportsStatement)  # noqa: S101 - narrows the type for mypy
-
-        def run() -> None:
-            with self._store.snapshot():
-                store.statement(probe.frame)
-                store.statement_hits(probe.frame)
-
-        return run
 
     def _time(self, query: Callable[[], object]) -> float:
         """Median time of a query, microseconds: after an untimed run, or each with empty caches."""
@@ -171,18 +133,6 @@ class _Trials:
             times.append(time.perf_counter_ns() - start)
         return statistics.median(times) / 1000
 
-    def _groupings(self) -> list[tuple[float, ...]]:
-        """Times of grouping by cost. Places take turns, since repeated keys are faster to group."""
-        equal = CostModel.of_equal_parts()
-        times = np.empty((self._repeats + 1, len(self._keys)))
-        for row in times:
-            for n, keys in enumerate(self._keys):
-                start = time.perf_counter_ns()
-                cbgroup(keys, self._quantiles, equal)
-                row[n] = (time.perf_counter_ns() - start) / 1000
-        medians = np.median(times[1:], axis=0).tolist()
-        return [(1, len(keys), us) for keys, us in zip(self._keys, medians, strict=True)]
-
     def fit(self, rows_per_block: float) -> CostModel:
         """Fit the cost model to all timings by least squares."""
         if not self._scans:  # every statement had more than `TOO_MANY_ROWS`
@@ -192,14 +142,6 @@ class _Trials:
         counted = min(counted, scanned)
         # A row's cost to the client is the cost of scanning it minus that of counting it.
         row = scanned - counted
-        # Keys and rows of lookups are correlated, so the cost of a row is that of the scans.
-        keyed = [(*n, max(us - row * rows, us / 10)) for *n, rows, us in self._lookups]
-        (lookup, probe), s_lookup = _least_squares(keyed)
-        (single,), s_single = _least_squares(self._singles)
-        (aggregate, point), s_statement = (
-            _least_squares(self._statements) if self._statements else ((np.inf, np.inf), (0.0, 0.0))
-        )
-        (group, group_key), s_group = _least_squares(self._groupings())
         more_time, rows = self._with_distances.tolist()
         model = CostModel(
             statement=statement,
@@ -207,31 +149,15 @@ class _Trials:
             block=counted * rows_per_block,
             row=row,
             rows_per_block=rows_per_block,
-            lookup=lookup,
-            probe=probe,
-            single=single,
-            aggregate=aggregate,
-            point=point,
-            presence=_ratio(*self._under_keys.tolist()),
-            group=group,
-            group_key=group_key,
             distances=_times_dearer(more_time, rows, counted + row),
             spread={
                 "statement": s_scan[0],
                 "descent": s_scan[1],
                 "row": s_scan[2],
                 "block": s_count[2],
-                "lookup": s_lookup[0],
-                "probe": s_lookup[1],
-                "single": s_single[0],
-                "aggregate": s_statement[0],
-                "point": s_statement[1],
-                "group": s_group[0],
-                "group_key": s_group[1],
             },
         )
-        found = float(self._under_keys[0])
-        return _cautious(model, self._keys, self._quantiles, self._store.count, found)
+        return _cautious(model, self._keys, self._quantiles, self._store.count)
 
 
 def _cautious(
@@ -239,27 +165,22 @@ def _cautious(
     frames: Sequence[Keys],
     quantiles: QuantileVector,
     count: Callable[[Keys, Keys], int],
-    under_keys: float,
 ) -> CostModel:
     """Return the model with the caution that costs least over the given frames.
 
-    frames : row keys (U,) of each frame; count : returns the number of rows in ranges;
-    under_keys : number of rows under the keys of all frames.
+    frames : row keys (U,) of each frame; count : returns the number of rows in ranges.
     """
     trials = []
     for caution in CAUTIONS:
         cautious = replace(model, caution=caution)
-        ranges = rows = expected = 0.0
+        ranges = rows = 0
         for keys in frames:
-            (lows, highs), _, in_gaps = cbgroup(keys, quantiles, cautious)
+            lows, highs = cbgroup(keys, quantiles, cautious)
             ranges += len(lows)
             rows += count(lows, highs)
-            expected += in_gaps
-        cost = model.descent * ranges + model.row_scanned * rows
         # Of two equal costs the greater caution is taken: it reads fewer rows.
-        trials.append((cost, -caution, rows, expected))
-    _, caution, rows, expected = min(trials)
-    return replace(model, caution=-caution, crowding=_ratio(rows - under_keys, expected))
+        trials.append((model.descent * ranges + model.row_scanned * rows, -caution))
+    return replace(model, caution=-min(trials)[1])
 
 
 def _times_dearer(more_time: float, rows: float, row_scanned: float) -> float:
@@ -267,11 +188,6 @@ def _times_dearer(more_time: float, rows: float, row_scanned: float) -> float:
     if more_time <= 0.0 or rows <= 0.0 or row_scanned <= 0.0:
         return 1.0
     return 1.0 + more_time / (rows * row_scanned)
-
-
-def _ratio(found: float, expected: float) -> float:
-    """Rows found divided by rows expected; 1 when no rows are expected."""
-    return max(found, 0.0) / expected if expected > 0 else 1.0
 
 
 def _least_squares(
@@ -317,12 +233,11 @@ def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
         # A tool lies on a surface or just below it; farther inside, gaps would hold more rows.
         away = rng.normal(size=3)
         pose[:3, 3] = surface + away / np.linalg.norm(away) * radius * rng.uniform(0.5, 1.0)
-        placed, asked, keys = contact.locate(
+        _, asked, keys = contact.locate(
             points, normals, middle, pose, origin, grid.voxel_size, *grid_codes, shift
         )
         if not len(keys):
             continue
         first, last = contact.spans_of_keys(asked, keys, *grid_codes, shift)
-        frame = LocatedShell(placed, asked[0], 1000.0, np.empty(0, dtype=np.int64))
-        probes.append(_Probe(frame, keys, first, last))
+        probes.append(_Probe(keys, first, last))
     return probes

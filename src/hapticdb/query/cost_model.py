@@ -1,6 +1,5 @@
 """The cost model of grouping: what the parts of a query cost (the paper, section 5)."""
 
-import math
 import platform
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -28,16 +27,6 @@ class CostModel:
         Each row passed to the client.
     rows_per_block : float
         Rows N divided by leaf blocks B.
-    lookup, probe : float
-        Fixed cost of a statement of keys, and each key in it (strategy `array`).
-    single : float
-        One point query of the sequence (strategy `points`).
-    aggregate, point : float
-        Fixed cost of Figure 3 with its second statement, and each shell point in it.
-    crowding, presence : float
-        Rows found divided by rows that the quantile vector expects: in the gaps that grouping
-        closes, and under a frame's keys. Both are above 1 near a surface, because the histogram
-        averages over whole buckets, with surface and without.
     caution : float
         Factor on the expected rows of a gap when CBGroup decides whether to close it. It is the
         factor with the least cost at the places measured. Small gaps near a surface are empty or
@@ -45,9 +34,7 @@ class CostModel:
     distances : float
         Cost of the rows in a range when their distances are read, too, divided by their cost
         without. It counts rows of the index, so it includes that there are more rows of distances.
-        1 where there are no distances, or the figures were kept before it was measured.
-    group, group_key : float
-        CBGroup itself: fixed cost for a frame, and each key in it.
+        1 where there are no distances.
     spread : mapping
         Relative standard error of each fitted figure.
     """
@@ -57,16 +44,7 @@ class CostModel:
     block: float
     row: float
     rows_per_block: float
-    lookup: float
-    probe: float
-    single: float
-    aggregate: float
-    point: float
-    crowding: float = 1.0
-    presence: float = 1.0
     caution: float = 1.0
-    group: float = 0.0
-    group_key: float = 0.0
     distances: float = 1.0
     spread: Mapping[str, float] = field(default_factory=dict)
 
@@ -88,43 +66,24 @@ class CostModel:
         in_blocks = self.block / self.rows_per_block
         return replace(self, row=self.row_scanned * self.distances - in_blocks, distances=1.0)
 
-    def of_ranges(self, n_ranges: int, rows: float) -> float:
-        """Expected cost of one statement of ranges."""
-        return self.statement + self.descent * n_ranges + self.row_scanned * rows
-
-    def of_keys(self, n_keys: int, rows: float) -> float:
-        """Expected cost of one statement of keys."""
-        return self.lookup + self.probe * n_keys + self.row * rows
-
-    def of_points(self, n_keys: int) -> float:
-        """Expected cost of the point query sequence."""
-        return self.single * n_keys
-
-    def of_statement(self, n_points: int) -> float:
-        """Expected cost of Figure 3."""
-        return self.aggregate + self.point * n_points
-
     def figures(self) -> dict[str, float]:
-        """All figures by name, the spreads as ``name.spread``, as a store keeps them.
-
-        Those of strategies that the engine lacks are infinite, and left out.
-        """
+        """All figures by name, the spreads as ``name.spread``, as a store keeps them."""
         plain = asdict(self)
         spread = plain.pop("spread")
-        every = plain | {f"{name}.spread": value for name, value in spread.items()}
-        return {name: value for name, value in every.items() if math.isfinite(value)}
+        return plain | {f"{name}.spread": value for name, value in spread.items()}
 
     @classmethod
     def of_equal_parts(cls) -> "CostModel":
         """Return a model whose figures are all 1, for an environment without rows to measure."""
-        return cls(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 1.0)
+        return cls(1.0, 1.0, 1.0, 1.0, 1.0)
 
     @classmethod
     def from_figures(cls, figures: Mapping[str, float]) -> "CostModel":
-        """Rebuild from `figures`; figures that were not stored get defaults."""
-        spread = {k.removesuffix(".spread"): v for k, v in figures.items() if k.endswith(".spread")}
-        plain = {k: v for k, v in figures.items() if not k.endswith(".spread")}
-        return cls(**{"aggregate": math.inf, "point": math.inf, **plain}, spread=spread)
+        """Rebuild from `figures`; other versions have kept fewer figures, or more."""
+        known = cls.__dataclass_fields__.keys() - {"spread"}
+        plain = {name: figures[name] for name in known if name in figures}
+        spread = {n: figures[f"{n}.spread"] for n in known if f"{n}.spread" in figures}
+        return cls(**plain, spread=spread)
 
 
 def machine_name() -> str:

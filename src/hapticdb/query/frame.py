@@ -298,7 +298,7 @@ class HapticQuery:
             first, last = contact.spans_of_keys(asked, keys, *self._curve)
             ranges = maxgap(keys, first, last, gap)
         elif strategy == "cbgroup":
-            ranges = cbgroup(keys, *self._figures(distances=distances)).ranges
+            ranges = cbgroup(keys, *self._figures(distances=distances))
         elif strategy == "auto":
             figures = partial(self._figures, distances=distances)
             ranges = ranges_worth_scanning(keys, self._grouping_threshold, figures)

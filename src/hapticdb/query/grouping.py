@@ -31,17 +31,6 @@ class Ranges(NamedTuple):
     highs: Keys
 
 
-class Grouping(NamedTuple):
-    """Ranges of CBGroup, and the rows that the quantile vector expects.
-
-    rows_asked : rows under the keys themselves; rows_in_gaps : rows in the closed gaps.
-    """
-
-    ranges: Ranges
-    rows_asked: float
-    rows_in_gaps: float
-
-
 def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
     """Group neighbouring keys p < q if and only if q - p <= gap, in voxel keys on both layouts.
 
@@ -60,14 +49,14 @@ def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
     return Ranges(*kernels.group_by_gap(keys, first, last, min(int(gap), 2**63 - 1)))
 
 
-def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping:
+def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Ranges:
     """Close a gap if and only if scanning it costs no more than another descent of the index.
 
     The gap between keys p < q covers p+1 .. q-1. The costs of gaps add up, so deciding each gap by
     itself gives the least cost over all groupings.
     """
     lows, highs = np.empty_like(keys), np.empty_like(keys)
-    count, asked, scanned = kernels.group_by_cost(
+    count, _, _ = kernels.group_by_cost(
         keys,
         quantiles.bounds,
         quantiles.rows_per_bucket,
@@ -76,7 +65,7 @@ def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Grouping
         lows,
         highs,
     )
-    return Grouping(Ranges(lows[:count], highs[:count]), asked, scanned)
+    return Ranges(lows[:count], highs[:count])
 
 
 def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostModel) -> Ranges:

@@ -24,16 +24,9 @@ MEANINGS = {
     "descent": "each range of a statement: a descent of the index",
     "block": "each leaf block scanned in the engine",
     "row": "each row handed to the client",
-    "lookup": "a statement of keys",
-    "probe": "each key of a statement of keys",
-    "single": "a statement of the strategy points: one key",
-    "aggregate": "a frame of the strategy statement, without its points",
-    "point": "each shell point of the strategy statement",
-    "group": "grouping by cost: a frame",
-    "group_key": "grouping by cost: each key of a frame",
 }
 """Figures of a cost model that are times, microseconds, and what each is the time of."""
-RATIOS = ("rows_per_block", "crowding", "presence", "caution", "distances")
+RATIOS = ("rows_per_block", "caution", "distances")
 """Figures of a cost model that are ratios, and not times."""
 SOURCES = {
     "server statistics": "the server's own statistics",
@@ -348,7 +341,7 @@ def _measured(url: str, *, cold: bool) -> "tuple[CostModel, bool]":
 
 def _costs_record(costs: "CostModel", is_kept: bool) -> dict[str, object]:  # noqa: FBT001 - private
     known = costs.figures()
-    figures = {name: known[name] for name in (*MEANINGS, *RATIOS) if name in known}
+    figures = {name: known[name] for name in (*MEANINGS, *RATIOS)}
     return {"figures": figures, "spread": dict(costs.spread), "kept": is_kept}
 
 
@@ -370,9 +363,9 @@ def _age(freshness: "Freshness") -> str:
 
 def _costs_table(costs: "CostModel") -> Columns:
     rows = []
-    figures = costs.figures()  # without those of strategies that the engine lacks
-    for name in filter(figures.__contains__, MEANINGS):
+    figures = costs.figures()
+    for name, meaning in MEANINGS.items():
         spread = costs.spread.get(name)
         known = "" if spread is None else f"± {100 * spread:.0f} %"
-        rows.append((name, f"{figures[name]:.3f}", known, MEANINGS[name]))
+        rows.append((name, f"{figures[name]:.3f}", known, meaning))
     return render.table(("figure", "µs>", "spread>", "what it is"), rows)

@@ -14,8 +14,7 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.proportions import Proportions, compare_proportions
-from hapticdb.query.choosing import is_smooth
-from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law
+from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
 from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling, radius_of
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle, path_of_hand

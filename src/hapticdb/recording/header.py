@@ -18,8 +18,7 @@ import numpy as np
 from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell, checked_budget
-from hapticdb.query.choosing import law_named
-from hapticdb.query.law import ForceLaw, TangentPlane
+from hapticdb.query.law import ForceLaw, TangentPlane, law_named
 from hapticdb.store.connect import redact
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words

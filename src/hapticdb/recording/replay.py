@@ -13,8 +13,7 @@ from hapticdb.errors import GridError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.choosing import is_smooth
-from hapticdb.query.law import ForceLaw
+from hapticdb.query.law import ForceLaw, is_smooth
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.frames import ResidentFrames, sleeps_by_itself
